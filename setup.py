@@ -1,4 +1,4 @@
-"""Installation with pip, and with colcon as an ament_python package; also on setuptools too old for [project] tables."""
+"""Installation with pip, and with colcon as an ament_python package."""
 
 import re
 from glob import glob
@@ -11,8 +11,8 @@ HERE = Path(__file__).resolve().parent
 # The text is searched: importing the package here would need its dependencies.
 VERSION = re.search(r'^__version__ = "(.+)"$', (HERE / NAME / "__init__.py").read_text(), re.MULTILINE).group(1)
 
-# ROS 2 Jazzy for machines that have no ROS. The wheels exist for Linux on x86-64 only. The versions are fixed because
-# they are one binary set, and the second half is what generating tf2_msgs and vision_msgs needs (ros/generate_interfaces).
+# ROS 2 Jazzy for machines without ROS, from wheels that exist for Linux on x86-64 only. The versions are fixed because
+# they are one binary set. From cmake on it is what generating tf2_msgs and vision_msgs needs (ros/generate_interfaces).
 JAZZY = [
     "ros-jazzy-rclpy[fastrtps]==7.1.6",
     "ros-jazzy-nav-msgs==5.3.6",
@@ -40,6 +40,7 @@ JAZZY = [
 ]
 WHERE_JAZZY_HAS_WHEELS = 'platform_machine == "x86_64" and sys_platform == "linux"'
 
+# Not a [project] table in pyproject.toml: the setuptools of ROS 2 Humble does not read one.
 setup(
     name=NAME,
     version=VERSION,
