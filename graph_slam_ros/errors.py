@@ -1,0 +1,25 @@
+"""The one family of errors a user may see: each message names the culprit and fits on one line."""
+
+
+class GraphSlamError(Exception):
+    """Something was refused: a file, a parameter, a topic, a graph. The command line turns it into exit code 2."""
+
+
+class NoiseError(GraphSlamError):
+    """A covariance or information matrix that is not symmetric positive definite."""
+
+
+class GaugeError(GraphSlamError):
+    """Nothing fixes the position of a part of the graph."""
+
+
+class SingularError(GraphSlamError):
+    """The edges do not determine a vertex."""
+
+
+class FormatError(GraphSlamError):
+    """A file that cannot be read as what it claims to be."""
+
+
+class ConfigError(GraphSlamError):
+    """A configuration key, value or combination that is not valid."""

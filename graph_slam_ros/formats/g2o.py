@@ -1,0 +1,286 @@
+"""g2o text files: SE(2) poses, planar point landmarks, relative poses, priors, FIX.
+
+Information matrices are taken as they are. Unknown tags are kept, word for word, and written back.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.errors import FormatError, NoiseError
+from graph_slam_ros.graph import (
+    INVERSE_RELATIVE_POSE,
+    LANDMARK_POSITION,
+    POSE_PRIOR,
+    R2,
+    RELATIVE_POSE,
+    SE2,
+    EdgeType,
+    Gaussian,
+    Graph,
+    VertexKind,
+)
+
+Array = NDArray[np.float64]
+
+# float() also accepts 1_0, inf, nan and digits of other scripts
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+_ID = re.compile(r"[+-]?\d{1,18}", re.ASCII)
+
+_VERTEX_TAGS: dict[str, VertexKind] = {"VERTEX_SE2": SE2, "VERTEX_XY": R2}
+_EDGE_TAGS: dict[str, EdgeType] = {
+    "EDGE_SE2": RELATIVE_POSE,
+    "EDGE_SE2_XY": LANDMARK_POSITION,
+    "EDGE_PRIOR_SE2": POSE_PRIOR,
+}
+ERROR_MAPS = {"relative": RELATIVE_POSE, "seed": INVERSE_RELATIVE_POSE}
+
+
+@dataclass(slots=True)
+class G2oFile:
+    """A graph as read from, or to be written to, a g2o file.
+
+    Attributes
+    ----------
+    ids : the file's id of each vertex of the graph
+    fixed : vertices (ids of the graph) that FIX lines hold
+    unknown : lines with tags that are not understood, in order
+    skipped : in lenient reading, what was wrong with each line left out
+    """
+
+    graph: Graph
+    ids: list[int]
+    fixed: list[int] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Edge:
+    line: int
+    vertices: tuple[int, ...]
+    measured: list[float]
+    information: list[float]
+
+
+class _Reader:
+    """State of one reading: what each line declared, before it becomes arrays."""
+
+    def __init__(self, name: str, lenient: bool) -> None:
+        self.name, self.lenient = name, lenient
+        self.vertices: dict[int, tuple[str, list[float]]] = {}
+        self.edges: dict[str, list[_Edge]] = {tag: [] for tag in _EDGE_TAGS}
+        self.fixed: list[tuple[int, int]] = []
+        self.unknown: list[str] = []
+        self.skipped: list[str] = []
+
+    def refuse(self, line: int, why: str) -> None:
+        message = f"{self.name}:{line}: {why}"
+        if not self.lenient:
+            raise FormatError(message)
+        self.skipped.append(message)
+
+    def take(self, line: int, text: str) -> None:
+        words = text.split()
+        if not words or words[0].startswith("#"):
+            return
+        tag = words[0]
+        try:
+            if tag in _VERTEX_TAGS:
+                self._vertex(tag, words)
+            elif tag in _EDGE_TAGS:
+                self.edges[tag].append(self._edge(line, tag, words))
+            elif tag == "FIX":
+                self.fixed += [(line, _integer(word)) for word in words[1:]]
+            else:
+                self.unknown.append(text.strip())
+        except FormatError as error:
+            self.refuse(line, str(error))
+
+    def _vertex(self, tag: str, words: list[str]) -> None:
+        kind = _VERTEX_TAGS[tag]
+        _expect(words, 1 + kind.size)
+        vertex, value = _integer(words[1]), _numbers(words[2:])
+        if vertex in self.vertices and self.vertices[vertex] != (tag, value):
+            raise FormatError(f"vertex {vertex} was declared before, with other values")
+        self.vertices[vertex] = (tag, value)
+
+    def _edge(self, line: int, tag: str, words: list[str]) -> _Edge:
+        edge = _EDGE_TAGS[tag]
+        slots, m = len(edge.accepts), edge.residual_size
+        _expect(words, slots + edge.measured_size + m * (m + 1) // 2)
+        vertices = tuple(_integer(word) for word in words[1 : 1 + slots])
+        numbers = _numbers(words[1 + slots :])
+        return _Edge(line, vertices, numbers[: edge.measured_size], numbers[edge.measured_size :])
+
+    def graph(self, relative_pose: EdgeType) -> G2oFile:
+        graph = Graph()
+        at: dict[int, int] = {}
+        for file_id, (tag, value) in self.vertices.items():
+            at[file_id] = graph.add_vertex(_VERTEX_TAGS[tag], value)
+        poses = sorted(file_id for file_id, (tag, _) in self.vertices.items() if tag == "VERTEX_SE2")
+        follows = dict(zip(poses, poses[1:], strict=False))
+        for tag, edges in self.edges.items():
+            edge_type = relative_pose if tag == "EDGE_SE2" else _EDGE_TAGS[tag]
+            for label, members in _by_label(tag, list(self._known(tag, edges)), follows):
+                self._add(graph, edge_type, label, members, at)
+        fixed = []
+        for line, file_id in self.fixed:
+            if file_id in at:
+                fixed.append(at[file_id])
+            else:
+                self.refuse(line, f"FIX names vertex {file_id}, which is not declared")
+        return G2oFile(graph, list(at), fixed, self.unknown, self.skipped)
+
+    def _known(self, tag: str, edges: Sequence[_Edge]) -> Iterator[_Edge]:
+        """Edges whose vertices exist and are of the right kind, and whose information is positive definite."""
+        for edge in edges:
+            for file_id, kinds in zip(edge.vertices, _EDGE_TAGS[tag].accepts, strict=True):
+                declared = self.vertices.get(file_id)
+                if declared is None:
+                    self.refuse(edge.line, f"edge to vertex {file_id}, which is not declared")
+                    break
+                if _VERTEX_TAGS[declared[0]] not in kinds:
+                    self.refuse(edge.line, f"{tag} to vertex {file_id}, which is a {declared[0]}")
+                    break
+            else:
+                if len(set(edge.vertices)) < len(edge.vertices):
+                    self.refuse(edge.line, f"edge from vertex {edge.vertices[0]} to itself")
+                    continue
+                yield edge
+
+    def _add(self, graph: Graph, edge_type: EdgeType, label: str, edges: list[_Edge], at: dict[int, int]) -> None:
+        information = _symmetric(np.array([e.information for e in edges]), edge_type.residual_size)
+        good = list(range(len(edges)))
+        try:
+            noise = Gaussian.from_information(information)
+        except NoiseError:
+            good = []
+            for k, edge in enumerate(edges):
+                try:
+                    Gaussian.from_information(information[k])
+                    good.append(k)
+                except NoiseError as error:
+                    self.refuse(edge.line, str(error).replace("information 0", "information", 1))
+            if not good:
+                return
+            noise = Gaussian.from_information(information[good])
+        graph.add_edges(
+            edge_type, [[at[v] for v in edges[k].vertices] for k in good], [edges[k].measured for k in good], noise, label
+        )
+
+
+def read_g2o(path: Path | str, *, error_map: str = "relative", lenient: bool = False) -> G2oFile:
+    """Read a g2o file.
+
+    Relative poses between one pose and the next (in order of id) are labelled ``odometry``, others ``closures``,
+    sightings ``landmarks``, priors ``priors``.
+
+    Parameters
+    ----------
+    error_map : ``relative`` (g2o's, ours) or ``seed`` (residual of the inverse, python-graphslam's)
+    lenient : leave out bad lines and list them in ``skipped`` instead of refusing the file
+
+    Raises
+    ------
+    FormatError
+        With file and line of the first fault.
+    """
+    path = Path(path)
+    if error_map not in ERROR_MAPS:
+        raise FormatError(f"error map {error_map!r}: choose {' or '.join(ERROR_MAPS)}")
+    reader = _Reader(path.name, lenient)
+    for number, text in _lines(path):
+        reader.take(number, text)
+    if not reader.vertices:
+        raise FormatError(f"{path.name}: no vertex in it; is it a g2o file?")
+    return reader.graph(ERROR_MAPS[error_map])
+
+
+def write_g2o(path: Path | str, file: G2oFile, values: Callable[[Sequence[int]], Array]) -> None:
+    """Write a graph; ``values(ids)`` gives the numbers of vertices of one kind, e.g. ``Solver.estimate``.
+
+    17 significant digits: what is read back is what was written.
+    """
+    graph, out = file.graph, []
+    tag_of_kind = {kind: tag for tag, kind in _VERTEX_TAGS.items()}
+    rows: list[tuple[int, str]] = []
+    for code, kind in enumerate(graph.kinds):
+        members = np.flatnonzero(graph.kind.values == code).tolist()
+        if kind not in tag_of_kind:
+            raise FormatError(f"g2o has no tag for a vertex {kind.name}")
+        for vertex, value in zip(members, values(members).tolist(), strict=True):
+            rows.append((vertex, f"{tag_of_kind[kind]} {file.ids[vertex]} {_text(value)}"))
+    out += [row for _, row in sorted(rows)]
+    out += [f"FIX {file.ids[vertex]}" for vertex in file.fixed]
+    tag_of_edge = {edge: tag for tag, edge in _EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
+    edges: list[tuple[int, str]] = []
+    for edge_type, table in graph.tables.items():
+        if edge_type not in tag_of_edge:
+            raise FormatError(f"g2o has no tag for an edge {edge_type.name}")
+        root = table.sqrt_information.values
+        upper = np.triu_indices(edge_type.residual_size)
+        information = (np.swapaxes(root, 1, 2) @ root)[:, upper[0], upper[1]]
+        for row in range(len(table)):
+            ends = " ".join(str(file.ids[v]) for v in table.vertices.values[row].tolist())
+            numbers = _text([*table.measured.values[row].tolist(), *information[row].tolist()])
+            edges.append((int(table.id.values[row]), f"{tag_of_edge[edge_type]} {ends} {numbers}"))
+    out += [row for _, row in sorted(edges)]
+    out += file.unknown
+    Path(path).write_text("\n".join(out) + "\n")
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    if not path.is_file():
+        raise FormatError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+    try:
+        with path.open(encoding="utf-8") as stream:
+            yield from enumerate(stream, start=1)
+    except UnicodeDecodeError:
+        raise FormatError(f"{path.name}: not a text file") from None
+    except OSError as error:
+        raise FormatError(f"{path}: {error.strerror}") from None
+
+
+def _expect(words: list[str], count: int) -> None:
+    if len(words) - 1 != count:
+        raise FormatError(f"{words[0]} needs {count} fields after the tag, found {len(words) - 1}")
+
+
+def _integer(word: str) -> int:
+    if not _ID.fullmatch(word):
+        raise FormatError(f"{word!r} is not an id")
+    return int(word)
+
+
+def _numbers(words: list[str]) -> list[float]:
+    for word in words:
+        if not _NUMBER.fullmatch(word) or float(word) in (np.inf, -np.inf):
+            raise FormatError(f"{word!r} is not a finite number")
+    return [float(word) for word in words]
+
+
+def _by_label(tag: str, edges: list[_Edge], follows: dict[int, int]) -> list[tuple[str, list[_Edge]]]:
+    if tag == "EDGE_SE2":
+        odometry = [e for e in edges if follows.get(e.vertices[0]) == e.vertices[1]]
+        closures = [e for e in edges if follows.get(e.vertices[0]) != e.vertices[1]]
+        groups = [("odometry", odometry), ("closures", closures)]
+    else:
+        groups = [("landmarks" if tag == "EDGE_SE2_XY" else "priors", edges)]
+    return [(label, members) for label, members in groups if members]
+
+
+def _symmetric(upper: Array, size: int) -> Array:
+    full = np.zeros((len(upper), size, size))
+    i, j = np.triu_indices(size)
+    full[:, i, j] = upper
+    full[:, j, i] = upper
+    return full
+
+
+def _text(numbers: Sequence[float]) -> str:
+    return " ".join(repr(float(n)) for n in numbers)

@@ -1,0 +1,181 @@
+"""The graph: append-only records of vertices and edges, kept as arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph.edges import EdgeType
+from graph_slam_ros.graph.noise import Gaussian
+from graph_slam_ros.graph.vertices import VertexKind
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class Column:
+    """An array that grows at its end; ``values`` is a view of what is there."""
+
+    __slots__ = ("_buffer", "_length")
+
+    def __init__(self, dtype: type, *shape: int) -> None:
+        self._buffer = np.empty((16, *shape), dtype=dtype)
+        self._length = 0
+
+    def __len__(self) -> int:
+        return self._length
+
+    @property
+    def values(self) -> NDArray:
+        return self._buffer[: self._length]
+
+    def extend(self, rows: ArrayLike, count: int) -> None:
+        """Append ``count`` rows; one row (or a scalar) is repeated."""
+        end = self._length + count
+        if end > len(self._buffer):
+            grown = np.empty((max(end, 2 * len(self._buffer)), *self._buffer.shape[1:]), dtype=self._buffer.dtype)
+            grown[: self._length] = self.values
+            self._buffer = grown
+        self._buffer[self._length : end] = rows
+        self._length = end
+
+
+@dataclass(slots=True, eq=False)
+class EdgeTable:
+    """All edges of one type, a row each.
+
+    Attributes
+    ----------
+    id : edge ids; vertices : (n, k) vertex ids; measured : (n, p); sqrt_information : (n, m, m)
+    label : codes into ``Graph.labels``; weight : a factor on the information, 0 = out of the problem
+    """
+
+    type: EdgeType
+    id: Column = field(init=False)
+    vertices: Column = field(init=False)
+    measured: Column = field(init=False)
+    sqrt_information: Column = field(init=False)
+    label: Column = field(init=False)
+    weight: Column = field(init=False)
+
+    def __post_init__(self) -> None:
+        m = self.type.residual_size
+        self.id = Column(np.int64)
+        self.vertices = Column(np.int64, len(self.type.accepts))
+        self.measured = Column(np.float64, self.type.measured_size)
+        self.sqrt_information = Column(np.float64, m, m)
+        self.label = Column(np.int64)
+        self.weight = Column(np.float64)
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+
+class Graph:
+    """Vertices with their initial values, and edges by type. Ids are dense and never reused.
+
+    An estimate does not live here: the solver owns it.
+
+    Attributes
+    ----------
+    kind : code of each vertex's kind, an index into ``kinds``
+    offset : where each vertex begins in ``initial``, the stored numbers of all vertices end to end
+    """
+
+    def __init__(self) -> None:
+        self.kinds: list[VertexKind] = []
+        self.kind = Column(np.int64)
+        self.offset = Column(np.int64)
+        self.initial = Column(np.float64)
+        self.tables: dict[EdgeType, EdgeTable] = {}
+        self.labels: list[str] = []
+        self._row_of_edge: list[tuple[EdgeTable, int]] = []
+
+    @property
+    def vertex_count(self) -> int:
+        return len(self.kind)
+
+    @property
+    def edge_count(self) -> int:
+        return len(self._row_of_edge)
+
+    def add_vertices(self, kind: VertexKind, values: ArrayLike) -> Index:
+        """Add n vertices with initial values (n, size); returns their ids."""
+        rows = np.asarray(values, dtype=float).reshape(-1, kind.size)
+        if not np.isfinite(rows).all():
+            raise GraphSlamError(f"an initial value of a vertex {kind.name} is not finite")
+        count, start = len(rows), len(self.initial)
+        ids = np.arange(self.vertex_count, self.vertex_count + count)
+        if kind not in self.kinds:
+            self.kinds.append(kind)
+        self.kind.extend(self.kinds.index(kind), count)
+        self.offset.extend(start + kind.size * np.arange(count), count)
+        self.initial.extend(rows.ravel(), rows.size)
+        return ids
+
+    def add_vertex(self, kind: VertexKind, value: ArrayLike) -> int:
+        """Add one vertex; returns its id."""
+        return int(self.add_vertices(kind, value)[0])
+
+    def add_edges(self, edge: EdgeType, vertices: ArrayLike, measured: ArrayLike, noise: Gaussian, label: str) -> Index:
+        """Add n edges of one type; returns their ids.
+
+        Parameters
+        ----------
+        vertices : (n, k) ids of existing vertices of the kinds the edge type accepts
+        measured : (n, p), finite
+        noise : one for all, or n
+        label : the class an edge is counted under, e.g. ``odometry``
+        """
+        at = np.asarray(vertices, dtype=np.int64).reshape(-1, len(edge.accepts))
+        z = np.asarray(measured, dtype=float).reshape(-1, edge.measured_size)
+        self._check(edge, at, z, noise)
+        table = self.tables.setdefault(edge, EdgeTable(edge))
+        ids, count = np.arange(self.edge_count, self.edge_count + len(at)), len(at)
+        self._row_of_edge.extend((table, row) for row in range(len(table), len(table) + count))
+        table.id.extend(ids, count)
+        table.vertices.extend(at, count)
+        table.measured.extend(z, count)
+        table.sqrt_information.extend(noise.sqrt_information, count)
+        table.label.extend(self._label_code(label), count)
+        table.weight.extend(1.0, count)
+        return ids
+
+    def add_edge(
+        self, edge: EdgeType, vertices: Sequence[int], measured: ArrayLike, noise: Gaussian, label: str
+    ) -> int:
+        """Add one edge; returns its id."""
+        return int(self.add_edges(edge, vertices, measured, noise, label)[0])
+
+    def kind_of(self, vertex: int) -> VertexKind:
+        """The kind of one vertex."""
+        return self.kinds[self.kind.values[vertex]]
+
+    def row(self, edge_id: int) -> tuple[EdgeTable, int]:
+        """The table and row of an edge."""
+        return self._row_of_edge[edge_id]
+
+    def _label_code(self, label: str) -> int:
+        if label not in self.labels:
+            self.labels.append(label)
+        return self.labels.index(label)
+
+    def _check(self, edge: EdgeType, at: Index, measured: Array, noise: Gaussian) -> None:
+        if len(at) != len(measured):
+            raise GraphSlamError(f"{edge.name}: {len(at)} edges but {len(measured)} measurements")
+        if noise.sqrt_information.shape[-1] != edge.residual_size or len(noise.sqrt_information.shape) == 3 and len(
+            noise.sqrt_information
+        ) != len(at):
+            raise GraphSlamError(f"{edge.name}: noise of shape {noise.sqrt_information.shape} does not fit")
+        if not np.isfinite(measured).all():
+            raise GraphSlamError(f"{edge.name}: a measurement is not finite")
+        if len(at) and (at.min() < 0 or at.max() >= self.vertex_count):
+            missing = int(at.max() if at.max() >= self.vertex_count else at.min())
+            raise GraphSlamError(f"{edge.name}: vertex {missing} does not exist")
+        for slot, kinds in enumerate(edge.accepts):
+            fits = np.array([kind in kinds for kind in self.kinds])[self.kind.values[at[:, slot]]]
+            if not fits.all():
+                vertex = int(at[~fits, slot][0])
+                raise GraphSlamError(f"{edge.name}: vertex {vertex} is {self.kind_of(vertex).name}, not {kinds[0].name}")

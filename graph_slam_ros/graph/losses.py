@@ -1,0 +1,38 @@
+"""Robust losses rho(s) of the squared whitened residual s = r' Omega r, used as IRLS weights rho'(s).
+
+Huber 1964; Cauchy as in Black and Rangarajan 1996. With loss ``none`` the cost is chi2 itself.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph_slam_ros.lie.jit import jitable
+
+NONE, HUBER, CAUCHY = 0, 1, 2
+NAMES = {"none": NONE, "huber": HUBER, "cauchy": CAUCHY}
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """A loss and its scale in standard deviations: residuals well below it count fully."""
+
+    kind: int = NONE
+    scale: float = 1.0
+
+    @classmethod
+    def named(cls, name: str, scale: float = 1.0) -> "Loss":
+        """From ``none``, ``huber`` or ``cauchy``."""
+        return cls(NAMES[name], scale)
+
+
+@jitable
+def weight_and_cost(kind: int, scale: float, s: float) -> tuple[float, float]:
+    """(rho'(s), rho(s)) for one squared residual."""
+    if kind == HUBER and s > scale * scale:
+        root = np.sqrt(s)
+        return scale / root, scale * (2.0 * root - scale)
+    if kind == CAUCHY:
+        ratio = s / (scale * scale)
+        return 1.0 / (1.0 + ratio), scale * scale * np.log1p(ratio)
+    return 1.0, s

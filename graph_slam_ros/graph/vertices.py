@@ -1,0 +1,44 @@
+"""Kinds of vertices: what is stored for an unknown and how a step changes it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.lie import se2
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class VertexKind:
+    """A manifold: ``size`` numbers are stored, a step has ``dof``.
+
+    Attributes
+    ----------
+    retract : (n, size), (n, dof) -> (n, size), the operator [+]
+    local : (n, size), (n, size) -> (n, dof), the operator [-]: ``retract(b, local(a, b)) == a``
+    """
+
+    name: str
+    size: int
+    dof: int
+    retract: Callable[[Array, Array], Array]
+    local: Callable[[Array, Array], Array]
+
+
+def _retract_se2(values: Array, steps: Array) -> Array:
+    return np.stack(se2.retract(tuple(values.T), tuple(steps.T)), axis=-1)
+
+
+def _local_se2(a: Array, b: Array) -> Array:
+    return np.stack(se2.local(tuple(a.T), tuple(b.T)), axis=-1)
+
+
+def _vector_kind(dof: int) -> VertexKind:
+    return VertexKind(f"R{dof}", dof, dof, np.add, np.subtract)
+
+
+SE2 = VertexKind("SE2", 3, 3, _retract_se2, _local_se2)
+R1, R2, R3 = _vector_kind(1), _vector_kind(2), _vector_kind(3)

@@ -1,0 +1,58 @@
+"""How kernels are compiled: Numba with a cache that cannot serve stale code.
+
+Numba keys its cache by the file of the compiled function and does not see a change in a file imported by it. So the
+cache lives in one folder per digest of all kernel sources.
+"""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.extending import register_jitable
+
+__all__ = ["CACHE_DIR", "jitable", "kernel"]
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+_KERNEL_FOLDERS = ("lie", "graph", "solver")
+
+
+def _digest() -> str:
+    sha = hashlib.sha256(numba.__version__.encode())
+    for folder in _KERNEL_FOLDERS:
+        for path in sorted((_PACKAGE / folder).glob("*.py")):
+            sha.update(path.name.encode())
+            sha.update(path.read_bytes())
+    return sha.hexdigest()[:16]
+
+
+def _cache_dir() -> Path:
+    root = os.environ.get("GRAPH_SLAM_CACHE") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    wanted = Path(root) / "graph_slam_ros" / f"kernels-{_digest()}"
+    try:
+        wanted.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=wanted):
+            return wanted
+    except OSError:  # a read-only home: compile into a folder of this user and this source
+        fallback = Path(tempfile.gettempdir()) / f"graph_slam_ros-{os.getuid()}-{_digest()}"
+        fallback.mkdir(mode=0o700, exist_ok=True)
+        return fallback
+
+
+CACHE_DIR = _cache_dir()
+numba.config.CACHE_DIR = str(CACHE_DIR)
+
+
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a loop over arrays; results do not depend on threads (never parallel, no unsafe maths)."""
+    compiled: Callable[..., Any] = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    return compiled
+
+
+def jitable(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Leave a formula plain Python (floats or whole arrays) and let kernels compile it inline."""
+    plain: Callable[..., Any] = register_jitable(function)
+    return plain

@@ -1,0 +1,123 @@
+"""SE(2): rigid motions of the plane.
+
+A pose is a tuple (x, y, theta) in metres and radians. Each component may be a float or an array: the same formula
+serves one pose, a whole path (``compose(tuple(a.T), tuple(b.T))``) and the compiled kernels.
+
+Formulas follow J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, section
+on SE(2); equation numbers below are theirs.
+"""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.lie.jit import jitable, kernel
+
+Pose: TypeAlias = tuple[Any, Any, Any]
+
+IDENTITY = (0.0, 0.0, 0.0)
+
+
+@jitable
+def wrap(angle: Any) -> Any:
+    """Angle in [-pi, pi), radians."""
+    return angle - 2.0 * np.pi * np.floor((angle + np.pi) / (2.0 * np.pi))
+
+
+@jitable
+def compose(a: Pose, b: Pose) -> Pose:
+    """``T_a_c = T_a_b T_b_c``; the angle is not wrapped."""
+    c, s = np.cos(a[2]), np.sin(a[2])
+    return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]
+
+
+@jitable
+def inverse(a: Pose) -> Pose:
+    """``T_b_a`` from ``T_a_b``."""
+    c, s = np.cos(a[2]), np.sin(a[2])
+    return -c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]
+
+
+@jitable
+def between(a: Pose, b: Pose) -> Pose:
+    """``inverse(a) b``: pose b seen from pose a, angle wrapped."""
+    c, s = np.cos(a[2]), np.sin(a[2])
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    return c * dx + s * dy, c * dy - s * dx, wrap(b[2] - a[2])
+
+
+@jitable
+def act(a: Pose, p: Any) -> tuple[Any, Any]:
+    """Point p = (x, y) of frame b in frame a."""
+    c, s = np.cos(a[2]), np.sin(a[2])
+    return a[0] + c * p[0] - s * p[1], a[1] + s * p[0] + c * p[1]
+
+
+@jitable
+def exp(d: Pose) -> Pose:
+    """Tangent vector (vx, vy, omega) to pose, eq. (156); exact at omega = 0 (sin(w/2)/(w/2) has no cancellation)."""
+    half = 0.5 * d[2]
+    sinc = np.sinc(half / np.pi)
+    a, b = sinc * np.cos(half), sinc * np.sin(half)
+    return a * d[0] - b * d[1], b * d[0] + a * d[1], d[2]
+
+
+@jitable
+def log(a: Pose) -> Pose:
+    """Pose to tangent vector, eq. (157), with omega in [-pi, pi)."""
+    omega = wrap(a[2])
+    half = 0.5 * omega
+    k = np.cos(half) / np.sinc(half / np.pi)
+    return k * a[0] + half * a[1], k * a[1] - half * a[0], omega
+
+
+@jitable
+def retract(a: Pose, d: Pose) -> Pose:
+    """``a [+] d = a Exp(d)``, angle wrapped."""
+    x, y, theta = compose(a, exp(d))
+    return x, y, wrap(theta)
+
+
+@jitable
+def local(a: Pose, b: Pose) -> Pose:
+    """``a [-] b = Log(b^-1 a)``."""
+    return log(between(b, a))
+
+
+def interpolate(a: Pose, b: Pose, fraction: float) -> Pose:
+    """Pose on the geodesic from a (fraction 0) to b (fraction 1)."""
+    x, y, omega = local(b, a)
+    return retract(a, (fraction * x, fraction * y, fraction * omega))
+
+
+def adjoint(a: Pose) -> NDArray[np.float64]:
+    """Adjoint matrix (3, 3) of one pose, eq. (159): ``a Exp(d) = Exp(Ad d) a``."""
+    c, s = np.cos(a[2]), np.sin(a[2])
+    return np.array([[c, -s, a[1]], [s, c, -a[0]], [0.0, 0.0, 1.0]])
+
+
+@kernel
+def propagate(covariance: NDArray[np.float64], step: Pose, added: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance of a motion lengthened by one step.
+
+    ``Sigma_ac = A Sigma_ab A' + Sigma_bc`` with ``A = Ad(T_b_c)^-1``: both in right tangent coordinates.
+
+    Parameters
+    ----------
+    covariance : (3, 3) of ``T_a_b``
+    step : the pose ``T_b_c``
+    added : (3, 3) covariance of the step
+    """
+    x, y, theta = inverse(step)
+    c, s = np.cos(theta), np.sin(theta)
+    a = np.array([[c, -s, y], [s, c, -x], [0.0, 0.0, 1.0]])
+    out = added.copy()
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                for m in range(3):
+                    total += a[i, k] * covariance[k, m] * a[j, m]
+            out[i, j] += total
+    return out

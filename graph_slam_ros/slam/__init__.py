@@ -1,0 +1,20 @@
+"""What the robot does: measurements in order of stamp become keyframes, edges and updates."""
+
+from graph_slam_ros.slam.config import Config
+from graph_slam_ros.slam.counters import Counters
+from graph_slam_ros.slam.graph_slam import GraphSlam, Keyframe, Landmark, Update
+from graph_slam_ros.slam.measurements import Control, Measurement, Odometry, Sighting, Sightings
+
+__all__ = [
+    "Config",
+    "Control",
+    "Counters",
+    "GraphSlam",
+    "Keyframe",
+    "Landmark",
+    "Measurement",
+    "Odometry",
+    "Sighting",
+    "Sightings",
+    "Update",
+]

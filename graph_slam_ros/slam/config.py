@@ -1,0 +1,242 @@
+"""The one tree of parameters: every default, unit, meaning and bound is here and nowhere else.
+
+YAML files, command-line settings and ROS parameters are all read through ``Config.from_mapping``; unknown names, wrong
+types and values out of range are refused with the name of the culprit.
+"""
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.graph import Loss
+from graph_slam_ros.solver import Settings
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """What is known of one parameter; ``low`` and ``high`` are inclusive."""
+
+    name: str
+    type: type
+    default: Any
+    meaning: str
+    unit: str
+    low: float | None
+    high: float | None
+    choices: tuple[str, ...]
+
+    def check(self, value: Any) -> Any:
+        """The value in its type. Raises ConfigError naming parameter, value and what is allowed."""
+        if self.type is float and type(value) is int:
+            value = float(value)
+        if type(value) is not self.type:
+            raise ConfigError(f"{self.name}: {value!r} is not {_ARTICLE[self.type]}")
+        if self.choices and value not in self.choices:
+            raise ConfigError(f"{self.name}: {value!r} is not one of {', '.join(self.choices)}")
+        if self.type in (int, float):
+            if not math.isfinite(value):
+                raise ConfigError(f"{self.name}: {value!r} is not finite")
+            if self.low is not None and value < self.low or self.high is not None and value > self.high:
+                raise ConfigError(f"{self.name}: {value!r} is not in {self.range_text()}")
+        return value
+
+    def range_text(self) -> str:
+        """The allowed interval in words."""
+        low = "-inf" if self.low is None else f"{self.low:g}"
+        return f"[{low}, {'inf' if self.high is None else f'{self.high:g}'}]"
+
+
+_ARTICLE = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
+
+
+def _setting(
+    default: Any,
+    meaning: str,
+    unit: str = "",
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    return field(default=default, metadata={"about": (meaning, unit, low, high, choices)})
+
+
+@dataclass(frozen=True, slots=True)
+class FramesConfig:
+    """Names of frames, REP-105."""
+
+    map: str = _setting("map", "frame of the corrected path")
+    odom: str = _setting("odom", "frame the odometry is given in")
+    base: str = _setting("base_link", "frame of the robot")
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryConfig:
+    """Noise of the motion between keyframes."""
+
+    noise: str = _setting(
+        "twist",
+        "twist: from each message's twist covariance where it has one, else the densities; density: always these",
+        choices=("twist", "density"),
+    )
+    translation_density: float = _setting(
+        0.02, "random walk of the position, along and across", "m/sqrt(s)", low=1e-6, high=10.0
+    )
+    rotation_density: float = _setting(0.05, "random walk of the heading", "rad/sqrt(s)", low=1e-6, high=10.0)
+    twist_correlation_s: float = _setting(
+        1.0, "how long the error of a velocity lasts: the noise of a step is covariance * dt * max(dt, this)", "s", low=0.0
+    )
+    still_m_s: float = _setting(1e-3, "slower than this and the next, the robot stands: no noise is added", "m/s", low=0.0)
+    still_rad_s: float = _setting(1e-3, "see still_m_s", "rad/s", low=0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframesConfig:
+    """When the robot's motion earns a new vertex."""
+
+    min_distance_m: float = _setting(0.25, "a keyframe after this distance", "m", low=1e-3)
+    min_angle_rad: float = _setting(0.25, "or after this change of heading", "rad", low=1e-3, high=math.pi)
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarksConfig:
+    """Landmark sightings."""
+
+    id_from: str = _setting(
+        "id", "which field of a detection is the landmark's identity", choices=("id", "class_id")
+    )
+    sigma_m: float = _setting(0.1, "position noise where a message's covariance is all zero (unknown)", "m", low=1e-4)
+    orientation_known_below_rad: float = _setting(
+        0.5, "a landmark is a full pose where its heading's standard deviation is below this", "rad", low=0.0
+    )
+    loss: str = _setting(
+        "huber_then_cauchy",
+        "robust loss; huber_then_cauchy converges with the first, then with the second",
+        choices=("none", "huber", "cauchy", "huber_then_cauchy"),
+    )
+    loss_scale: float = _setting(2.0, "residuals well below this many standard deviations count fully", "sigma", low=0.1)
+
+
+@dataclass(frozen=True, slots=True)
+class AnchorConfig:
+    """The prior on the first keyframe, which fixes the gauge: map begins where odom begins."""
+
+    sigma_m: float = _setting(1e-3, "standard deviation of its position", "m", low=1e-6)
+    sigma_rad: float = _setting(1e-3, "standard deviation of its heading", "rad", low=1e-6)
+
+
+@dataclass(frozen=True, slots=True)
+class OrderingConfig:
+    """The window in which messages are put in order of stamp."""
+
+    window_s: float = _setting(0.05, "how much later than newer odometry a message may come, in stamp time", "s", low=0.0)
+    max_waiting: int = _setting(1000, "landmark messages that may wait for odometry", "messages", low=1)
+
+
+@dataclass(frozen=True, slots=True)
+class SolveConfig:
+    """When and how the graph is solved."""
+
+    every_keyframes: int = _setting(10, "solve after this many keyframes", "keyframes", low=1)
+    closure_gap_s: float = _setting(
+        20.0, "and when a landmark returns that was not seen for this long", "s", low=0.0
+    )
+    method: str = _setting("gn", "gn (damped only where it fails to converge) or lm", choices=("gn", "lm"))
+    max_iterations: int = _setting(50, "of each stage of the losses", "", low=1, high=10_000)
+    step_tolerance: float = _setting(1e-5, "converged when no step is larger", "m, rad", low=0.0)
+    cost_tolerance: float = _setting(1e-6, "converged when the cost changes by a smaller fraction", "", low=0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class TfConfig:
+    """The transform map -> odom."""
+
+    publish: bool = _setting(True, "whether to broadcast map -> odom")
+    period_s: float = _setting(0.05, "broadcast this often, at most once per odometry stamp", "s", low=1e-3)
+    tolerance_s: float = _setting(0.1, "how far ahead of the odometry's stamp the transform is dated", "s", low=0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class InputsConfig:
+    """Subscriptions of the node."""
+
+    reliable: bool = _setting(False, "ask for reliable delivery (a best-effort publisher then does not connect)")
+    depth: int = _setting(1000, "messages the middleware may hold for a subscription", "messages", low=1)
+
+
+@dataclass(frozen=True, slots=True)
+class OutputConfig:
+    """What the node leaves behind."""
+
+    folder: str = _setting("graph_slam_run", "run folder written by ~/save and at shutdown; empty: none at shutdown")
+    pose_covariance_max: float = _setting(
+        1e6, "variance published for what a planar robot does not estimate (z, roll, pitch)", "m^2, rad^2", low=0.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """All parameters."""
+
+    frames: FramesConfig = FramesConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    keyframes: KeyframesConfig = KeyframesConfig()
+    landmarks: LandmarksConfig = LandmarksConfig()
+    anchor: AnchorConfig = AnchorConfig()
+    ordering: OrderingConfig = OrderingConfig()
+    solve: SolveConfig = SolveConfig()
+    tf: TfConfig = TfConfig()
+    inputs: InputsConfig = InputsConfig()
+    output: OutputConfig = OutputConfig()
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> "Config":
+        """From nested or dotted names to values; what is not named keeps its default.
+
+        Raises
+        ------
+        ConfigError
+            Unknown name (the nearest known one is suggested), wrong type, or a value out of range.
+        """
+        sections: dict[str, dict[str, Any]] = {}
+        known = {p.name: p for p in parameters()}
+        for name, value in _flatten(values):
+            if name not in known:
+                near = difflib.get_close_matches(name, known, 1, 0.0)
+                raise ConfigError(f"unknown parameter {name!r}; did you mean {near[0]!r}?")
+            section, key = name.split(".")
+            sections.setdefault(section, {})[key] = known[name].check(value)
+        return cls(**{s.name: type(s.default)(**sections.get(s.name, {})) for s in dataclasses.fields(cls)})  # type: ignore[operator]
+
+    def as_mapping(self) -> dict[str, dict[str, Any]]:
+        """Nested plain values, every parameter named."""
+        return dataclasses.asdict(self)
+
+    def solver_settings(self) -> Settings:
+        """How the solver is to be run."""
+        scale = self.landmarks.loss_scale
+        stages = [Loss.named(name, scale) for name in self.landmarks.loss.split("_then_")]
+        s = self.solve
+        return Settings(s.method, s.max_iterations, s.step_tolerance, s.cost_tolerance, {"landmarks": stages})
+
+
+def parameters() -> Iterator[Parameter]:
+    """Every parameter, in the order of the tree, named ``section.key``."""
+    for section in dataclasses.fields(Config):
+        for key in dataclasses.fields(section.default):  # type: ignore[arg-type]
+            meaning, unit, low, high, choices = key.metadata["about"]
+            name = f"{section.name}.{key.name}"
+            yield Parameter(name, type(key.default), key.default, meaning, unit, low, high, choices)
+
+
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{name}.")
+        else:
+            yield name, value

@@ -1,0 +1,28 @@
+"""Nothing is dropped or repaired silently: each case adds to a counter by (source, reason)."""
+
+from collections import Counter
+
+
+class Counters:
+    """Counts by (source, reason); a source is a topic or an input's name."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[tuple[str, str]] = Counter()
+
+    def count(self, source: str, reason: str, times: int = 1) -> None:
+        """Add to one counter."""
+        self._counts[source, reason] += times
+
+    def __getitem__(self, key: tuple[str, str]) -> int:
+        return self._counts[key]
+
+    def update(self, other: "Counters") -> None:
+        """Add all counts of another."""
+        self._counts.update(other._counts)
+
+    def as_dict(self) -> dict[str, dict[str, int]]:
+        """``{source: {reason: times}}``, sorted by name."""
+        out: dict[str, dict[str, int]] = {}
+        for (source, reason), times in sorted(self._counts.items()):
+            out.setdefault(source, {})[reason] = times
+        return out

@@ -1,0 +1,298 @@
+"""The pipeline: one object, one door. Node, replay and tests all call ``GraphSlam.process``.
+
+Its state is a function of the configuration and the sequence of accepted measurements, nothing else.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph import (
+    LANDMARK_POSITION,
+    POSE_PRIOR,
+    R2,
+    RELATIVE_POSE,
+    SE2,
+    TAG_POSITION,
+    Gaussian,
+    Graph,
+)
+from graph_slam_ros.lie import se2
+from graph_slam_ros.slam.config import Config
+from graph_slam_ros.slam.counters import Counters
+from graph_slam_ros.slam.measurements import Control, Measurement, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.motion import Motion
+from graph_slam_ros.slam.stamp_order import NS, StampOrder
+from graph_slam_ros.solver import Report, Solver
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A selected instant: its vertex, its stamp, and where odometry put it. No estimate: the solver owns that."""
+
+    vertex: int
+    stamp_ns: int
+    T_odom_base: se2.Pose
+
+
+@dataclass(slots=True)
+class Landmark:
+    """A landmark with identity: its vertex and how often and when it was seen."""
+
+    vertex: int
+    sightings: int
+    last_seen_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class SightingPose:
+    """Where the robot was when it saw something: a keyframe and the motion since."""
+
+    stamp_ns: int
+    keyframe: int
+    T_keyframe_base: se2.Pose
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """What ``process`` changed: indices of new keyframes, and the report of the last solve, if there was one."""
+
+    keyframes: tuple[int, ...] = ()
+    report: Report | None = None
+
+    def __bool__(self) -> bool:
+        return bool(self.keyframes) or self.report is not None
+
+
+class GraphSlam:
+    """Online pose-graph SLAM in the plane, from odometry and sightings of landmarks with known identity.
+
+    Parameters
+    ----------
+    config : the parameters
+    sink : called with every measurement that was accepted, in that order, before it takes effect
+    """
+
+    def __init__(self, config: Config | None = None, sink: Callable[[Measurement], None] | None = None) -> None:
+        self.config = config or Config()
+        self.counters = Counters()
+        self.graph = Graph()
+        self.solver = Solver(self.graph, self.config.solver_settings())
+        self.keyframes: list[Keyframe] = []
+        self.landmarks: dict[str, Landmark] = {}
+        self.sighting_poses: list[SightingPose] = []
+        self.reports: list[Report] = []
+        self._sink = sink
+        self._order = StampOrder(self.config.ordering, self.counters)
+        self._odometry: Odometry | None = None
+        self._motion = Motion(self.config.odometry)
+        self._waiting: list[Sightings] = []
+        self._covariance = np.zeros((3, 3))
+        self._unsolved_keyframes = 0
+        self._closure = False
+
+    # -- the door ------------------------------------------------------------------------------------------------
+
+    def process(self, measurement: Measurement) -> Update:
+        """Take one measurement or control event; returns what it changed."""
+        if not isinstance(measurement, Control) and not self._order.accepts(measurement):
+            return Update()
+        if self._sink is not None:
+            self._sink(measurement)
+        first_new, solves = len(self.keyframes), len(self.reports)
+        match measurement:
+            case Control("flush"):
+                self._use(self._order.flush())
+                self._drop_unreached()
+            case Control("optimize"):
+                self._solve()
+            case Control():
+                self.counters.count("control", f"unknown event {measurement.event}")
+            case _:
+                self._use(self._order.push(measurement))
+        report = self.reports[-1] if len(self.reports) > solves else None
+        return Update(tuple(range(first_new, len(self.keyframes))), report)
+
+    # -- what is known now ---------------------------------------------------------------------------------------
+
+    def trajectory(self) -> Array:
+        """Estimated poses ``T_map_base`` of all keyframes, (n, 3)."""
+        return self.solver.estimate([k.vertex for k in self.keyframes]).reshape(-1, 3)
+
+    def sighting_trajectory(self) -> Array:
+        """Estimated poses ``T_map_base`` at the stamps of the sightings, (n, 3)."""
+        if not self.sighting_poses:
+            return np.empty((0, 3))
+        keyframes = self.trajectory()[[s.keyframe for s in self.sighting_poses]]
+        since = np.array([s.T_keyframe_base for s in self.sighting_poses])
+        return np.stack(se2.compose(tuple(keyframes.T), tuple(since.T)), axis=-1)
+
+    @property
+    def T_map_odom(self) -> se2.Pose:  # noqa: N802
+        """The correction: odometry's drift at the newest keyframe."""
+        if not self.keyframes:
+            return se2.IDENTITY
+        newest = self.keyframes[-1]
+        return se2.compose(self._pose(newest), se2.inverse(newest.T_odom_base))
+
+    @property
+    def pose_covariance(self) -> Array:
+        """Covariance (3, 3) of the newest keyframe's pose in its tangent space.
+
+        The marginal of the last solve, lengthened by the odometry since.
+        """
+        return self._covariance.copy()
+
+    @property
+    def newest_odometry_ns(self) -> int | None:
+        """Stamp of the last odometry that was used."""
+        return None if self._odometry is None else self._odometry.stamp_ns
+
+    # -- odometry ------------------------------------------------------------------------------------------------
+
+    def _use(self, released: list[Odometry | Sightings]) -> None:
+        for m in released:
+            if isinstance(m, Odometry):
+                self._on_odometry(m)
+            else:
+                self._on_sightings(m)
+
+    def _on_odometry(self, m: Odometry) -> None:
+        if self._odometry is None:
+            self._odometry = m
+            self._first_keyframe(m)
+            return
+        if m.stamp_ns == self._odometry.stamp_ns:
+            self.counters.count("odometry", "duplicate" if m == self._odometry else "duplicate_stamp")
+            return
+        self._see_waiting(m)
+        self._motion.step(self._odometry, m)
+        self._odometry = m
+        x, y, theta = self._motion.T_keyframe_base
+        keyframes = self.config.keyframes
+        if x * x + y * y >= keyframes.min_distance_m**2 or abs(theta) >= keyframes.min_angle_rad:
+            self._next_keyframe(m)
+
+    def _first_keyframe(self, m: Odometry) -> None:
+        """Map begins where odom begins: the first pose is anchored at its odometry pose."""
+        vertex = self.graph.add_vertex(SE2, m.T_odom_base)
+        anchor = self.config.anchor
+        noise = Gaussian.from_sigmas(anchor.sigma_m, anchor.sigma_m, anchor.sigma_rad)
+        self._covariance = np.diag([anchor.sigma_m**2, anchor.sigma_m**2, anchor.sigma_rad**2])
+        edge = self.graph.add_edge(POSE_PRIOR, [vertex], m.T_odom_base, noise, "anchor")
+        self.solver.add([vertex], [edge])
+        self.keyframes.append(Keyframe(vertex, m.stamp_ns, m.T_odom_base))
+
+    def _next_keyframe(self, m: Odometry) -> None:
+        motion, last = self._motion, self.keyframes[-1]
+        vertex = self.graph.add_vertex(SE2, se2.compose(self._pose(last), motion.T_keyframe_base))
+        noise = Gaussian.from_covariance(motion.covariance)
+        edge = self.graph.add_edge(RELATIVE_POSE, [last.vertex, vertex], motion.T_keyframe_base, noise, "odometry")
+        self.solver.add([vertex], [edge])
+        self.keyframes.append(Keyframe(vertex, m.stamp_ns, m.T_odom_base))
+        self._covariance = se2.propagate(self._covariance, motion.T_keyframe_base, motion.covariance)
+        motion.restart()
+        self._unsolved_keyframes += 1
+        if self._unsolved_keyframes >= self.config.solve.every_keyframes:
+            self._solve()
+
+    # -- landmarks -----------------------------------------------------------------------------------------------
+
+    def _on_sightings(self, m: Sightings) -> None:
+        """Use what was seen at the newest odometry; what is newer waits for the odometry on its other side."""
+        if not self.keyframes or m.stamp_ns < self.keyframes[-1].stamp_ns:
+            self.counters.count(m.topic, "late" if self.keyframes else "before_odometry", len(m.sightings))
+        elif self._odometry is not None and m.stamp_ns == self._odometry.stamp_ns:
+            self._see(m, self._motion.T_keyframe_base, self._motion.covariance)
+        else:
+            self._waiting.append(m)
+
+    def _see_waiting(self, ahead: Odometry) -> None:
+        """Use what was seen between the last odometry and the one ahead, by interpolation."""
+        assert self._odometry is not None
+        for m in self._waiting:
+            between = self._motion.between(self._odometry, ahead, m.stamp_ns)
+            self._see(m, between.T_keyframe_base, between.covariance)
+        self._waiting.clear()
+
+    def _drop_unreached(self) -> None:
+        for m in self._waiting:
+            self.counters.count(m.topic, "after_odometry", len(m.sightings))
+        self._waiting.clear()
+
+    def _see(self, m: Sightings, T_keyframe_base: se2.Pose, covariance: Array) -> None:  # noqa: N803
+        """Carry sightings to the newest keyframe by the odometry since, whose noise adds to theirs."""
+        self.sighting_poses.append(SightingPose(m.stamp_ns, len(self.keyframes) - 1, T_keyframe_base))
+        for sighting in m.sightings:
+            self._add_sighting(sighting, m.stamp_ns, T_keyframe_base, covariance)
+        if self._closure:
+            self._solve()
+
+    def _add_sighting(
+        self, sighting: Sighting, stamp_ns: int, T_keyframe_base: se2.Pose, motion_covariance: Array  # noqa: N803
+    ) -> None:
+        keyframe = self.keyframes[-1]
+        landmark = self.landmarks.get(sighting.id)
+        is_point = len(sighting.measured) == 2 or (
+            landmark is not None and self.graph.kind_of(landmark.vertex) is R2
+        )
+        carry = _carry_point if is_point else _carry_pose
+        measured, covariance = carry(sighting, T_keyframe_base, motion_covariance)
+        new_vertices = []
+        if landmark is None:
+            act = se2.act if is_point else se2.compose
+            kind = R2 if is_point else SE2
+            vertex = self.graph.add_vertex(kind, act(self._pose(keyframe), measured))
+            landmark = self.landmarks[sighting.id] = Landmark(vertex, 0, stamp_ns)
+            new_vertices = [vertex]
+        if not is_point:
+            edge_type = RELATIVE_POSE
+        else:
+            edge_type = LANDMARK_POSITION if self.graph.kind_of(landmark.vertex) is R2 else TAG_POSITION
+        noise = Gaussian.from_covariance(covariance)
+        edge = self.graph.add_edge(edge_type, [keyframe.vertex, landmark.vertex], measured, noise, "landmarks")
+        self.solver.add(new_vertices, [edge])
+        if stamp_ns - landmark.last_seen_ns > self.config.solve.closure_gap_s * NS:
+            self._closure = True
+        landmark.sightings += 1
+        landmark.last_seen_ns = stamp_ns
+
+    # -- solving -------------------------------------------------------------------------------------------------
+
+    def _solve(self) -> None:
+        self._unsolved_keyframes, self._closure = 0, False
+        if not self.keyframes:
+            return
+        self.reports.append(self.solver.update())
+        (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
+
+    def _pose(self, keyframe: Keyframe) -> se2.Pose:
+        x, y, theta = self.solver.estimate([keyframe.vertex])[0].tolist()
+        return x, y, theta
+
+
+def _carry_point(s: Sighting, T_a_b: se2.Pose, motion_covariance: Array) -> tuple[tuple[float, ...], Array]:  # noqa: N803
+    """A point seen from b, seen from a: ``p_a = T_a_b p_b`` and the noise of both."""
+    x, y = s.measured[:2]
+    c, n = np.cos(T_a_b[2]), np.sin(T_a_b[2])
+    rotation = np.array([[c, -n], [n, c]])
+    if len(s.measured) == 2:
+        own = np.array(s.covariance).reshape(2, 2)
+    else:  # tangent space of the measured pose to the axes of b
+        c, n = np.cos(s.measured[2]), np.sin(s.measured[2])
+        turn = np.array([[c, -n], [n, c]])
+        own = turn @ np.array(s.covariance).reshape(3, 3)[:2, :2] @ turn.T
+    by_motion = np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
+    covariance = rotation @ (own + by_motion @ motion_covariance @ by_motion.T) @ rotation.T
+    return se2.act(T_a_b, (x, y)), covariance
+
+
+def _carry_pose(s: Sighting, T_a_b: se2.Pose, motion_covariance: Array) -> tuple[tuple[float, ...], Array]:  # noqa: N803
+    """A pose seen from b, seen from a: ``T_a_c = T_a_b T_b_c`` and the noise of both."""
+    own = np.array(s.covariance).reshape(3, 3)
+    measured: se2.Pose = (s.measured[0], s.measured[1], s.measured[2])
+    return se2.compose(T_a_b, measured), se2.propagate(motion_covariance, measured, own)

@@ -1,0 +1,61 @@
+"""Measurements arrive nearly in order of stamp; they are used exactly in order of stamp.
+
+Odometry is the clock: what is ``window_s`` of stamp time older than the newest odometry is released. A landmark message
+may come early (it waits for the odometry around it) or late within the window. No wall clock is read.
+"""
+
+import heapq
+
+from graph_slam_ros.slam.config import OrderingConfig
+from graph_slam_ros.slam.counters import Counters
+from graph_slam_ros.slam.measurements import Odometry, Sightings
+
+NS = 1_000_000_000
+
+
+class StampOrder:
+    """A bounded queue that releases measurements by (stamp, odometry first, topic, arrival)."""
+
+    def __init__(self, config: OrderingConfig, counters: Counters) -> None:
+        self._window_ns = round(config.window_s * NS)
+        self._max_waiting = config.max_waiting
+        self._counters = counters
+        self._heap: list[tuple[int, int, str, int, Odometry | Sightings]] = []
+        self._arrivals = 0
+        self._newest_odometry_ns: int | None = None
+        self._released_ns: int | None = None
+
+    def accepts(self, m: Odometry | Sightings) -> bool:
+        """Whether there is room, and an odometry message is not older than what was released; else it is counted."""
+        source = m.topic if isinstance(m, Sightings) else "odometry"
+        if len(self._heap) >= self._max_waiting and isinstance(m, Sightings):
+            self._counters.count(source, "overflow")
+            return False
+        if isinstance(m, Odometry) and self._released_ns is not None and m.stamp_ns < self._released_ns:
+            self._counters.count(source, "late")
+            return False
+        return True
+
+    def push(self, m: Odometry | Sightings) -> list[Odometry | Sightings]:
+        """Take one measurement; returns those whose turn has come."""
+        rank, topic = (0, "") if isinstance(m, Odometry) else (1, m.topic)
+        heapq.heappush(self._heap, (m.stamp_ns, rank, topic, self._arrivals, m))
+        self._arrivals += 1
+        if isinstance(m, Odometry):
+            self._newest_odometry_ns = max(m.stamp_ns, self._newest_odometry_ns or m.stamp_ns)
+        if self._newest_odometry_ns is None:
+            return []
+        return self._release(self._newest_odometry_ns - self._window_ns)
+
+    def flush(self) -> list[Odometry | Sightings]:
+        """Release everything that waits."""
+        return self._release(max((entry[0] for entry in self._heap), default=0))
+
+    def _release(self, until_ns: int) -> list[Odometry | Sightings]:
+        out = []
+        while self._heap and self._heap[0][0] <= until_ns:
+            stamp_ns, rank, _, _, m = heapq.heappop(self._heap)
+            if rank == 0:
+                self._released_ns = stamp_ns
+            out.append(m)
+        return out

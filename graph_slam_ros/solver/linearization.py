@@ -1,0 +1,109 @@
+"""From edges to whitened blocks: the only place of the solver that looks at an edge type, and only to call it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph import Graph, Loss
+from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.report import ClassCost
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Edges of one type, linearised, whitened and weighted.
+
+    Attributes
+    ----------
+    residual : (n, m); jacobian : (n, m, D)
+    chi2, cost : (n,) of each edge, without and with its loss
+    """
+
+    table: EdgeTable
+    rows: Index
+    residual: Array
+    jacobian: Array
+    chi2: Array
+    cost: Array
+
+
+@kernel
+def _whiten(
+    residual: Array,
+    jacobian: Array,
+    sqrt_information: Array,
+    weight: Array,
+    loss_kind: Index,
+    loss_scale: Array,
+) -> tuple[Array, Array]:
+    """Multiply rows by sqrt(weight * rho') R in place; returns chi2 and cost of each edge."""
+    n, m, width = jacobian.shape
+    chi2, cost = np.zeros(n), np.zeros(n)
+    r, j = np.zeros(m), np.zeros((m, width))
+    for e in range(n):
+        s = 0.0
+        for a in range(m):
+            r[a] = 0.0
+            for c in range(width):
+                j[a, c] = 0.0
+            for b in range(a, m):
+                root = sqrt_information[e, a, b]
+                r[a] += root * residual[e, b]
+                for c in range(width):
+                    j[a, c] += root * jacobian[e, b, c]
+            s += r[a] * r[a]
+        s *= weight[e]
+        slope, rho = weight_and_cost(loss_kind[e], loss_scale[e], s)
+        chi2[e], cost[e] = s, rho
+        factor = np.sqrt(weight[e] * slope)
+        for a in range(m):
+            residual[e, a] = factor * r[a]
+            for c in range(width):
+                jacobian[e, a, c] = factor * j[a, c]
+    return chi2, cost
+
+
+def linearize(
+    graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Mapping[str, Loss]
+) -> list[Block]:
+    """Linearise the given rows of each table at the stored values x, with the loss of each edge's label."""
+    by_code = [losses.get(label, Loss()) for label in graph.labels]
+    kinds = np.array([loss.kind for loss in by_code], dtype=np.int64)
+    scales = np.array([loss.scale for loss in by_code])
+    blocks = []
+    for table, chosen in rows.items():
+        at = graph.offset.values[table.vertices.values[chosen]]
+        residual, jacobian = table.type.linearize(x, at, table.measured.values[chosen])
+        label = table.label.values[chosen]
+        chi2, cost = _whiten(
+            residual,
+            jacobian,
+            table.sqrt_information.values[chosen],
+            table.weight.values[chosen],
+            kinds[label],
+            scales[label],
+        )
+        blocks.append(Block(table, chosen, residual, jacobian, chi2, cost))
+    return blocks
+
+
+def total(blocks: list[Block]) -> tuple[float, float]:
+    """(chi2, cost) of all edges."""
+    return float(sum(b.chi2.sum() for b in blocks)), float(sum(b.cost.sum() for b in blocks))
+
+
+def by_class(graph: Graph, blocks: list[Block]) -> dict[str, ClassCost]:
+    """chi2 and number of edges of each label."""
+    count, chi2 = np.zeros(len(graph.labels), dtype=np.int64), np.zeros(len(graph.labels))
+    for b in blocks:
+        label = b.table.label.values[b.rows]
+        np.add.at(count, label, 1)
+        np.add.at(chi2, label, b.chi2)
+    return {name: ClassCost(int(count[k]), float(chi2[k])) for k, name in enumerate(graph.labels) if count[k]}

@@ -1,0 +1,50 @@
+"""What an update did and why it stopped."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Iteration:
+    """One step: chi2 and cost after it, its largest component [m or rad], and the damping used (0: Gauss-Newton)."""
+
+    chi2: float
+    cost: float
+    step: float
+    damping: float
+
+
+@dataclass(frozen=True, slots=True)
+class ClassCost:
+    """How many edges a label has, and their share of chi2."""
+
+    edges: int
+    chi2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Result of ``Solver.update``.
+
+    ``chi2`` is the sum of r' Omega r without any loss; ``cost`` is what was minimised, losses applied.
+
+    Attributes
+    ----------
+    stop : ``step`` (largest step below its tolerance), ``cost`` (relative decrease below its tolerance),
+        ``max_iterations``, ``no_decrease`` (damping found no lower cost), ``diverged``, or ``nothing_to_do``
+    method : the method that gave the result; ``lm`` also where Gauss-Newton failed and was replaced
+    classes : by label
+    """
+
+    method: str
+    stop: str
+    chi2_initial: float
+    chi2_final: float
+    cost_initial: float
+    cost_final: float
+    iterations: tuple[Iteration, ...]
+    classes: dict[str, ClassCost]
+
+    @property
+    def converged(self) -> bool:
+        """Whether one of the two convergence rules ended it."""
+        return self.stop in ("step", "cost", "nothing_to_do")

@@ -1,0 +1,164 @@
+"""The seam between the problem and its solution: add, set_weight, hold, update, estimate, marginal."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.solver.descent import Problem, Settings, minimise
+from graph_slam_ros.solver.linearization import by_class, total
+from graph_slam_ros.solver.normal import NormalEquations, check_gauge
+from graph_slam_ros.solver.report import Report
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class Solver:
+    """Batch maximum-likelihood estimate of the vertices it was given; it owns their estimates.
+
+    Vertices and edges are records of a ``Graph``; the solver minimises over those that were added to it.
+    """
+
+    def __init__(self, graph: Graph, settings: Settings | None = None) -> None:
+        self.graph = graph
+        self.settings = settings or Settings()
+        self._x = np.empty(0)
+        self._inside = np.zeros(0, dtype=bool)
+        self._held = np.zeros(0, dtype=bool)
+        self._edges = np.zeros(0, dtype=bool)
+        self._problem: Problem | None = None
+        self._solved = False
+
+    def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
+        """Take vertices (at their initial values) and edges of the graph into the problem, by id, each once."""
+        new = np.asarray(vertices, dtype=np.int64).ravel()
+        self._grow()
+        if self._inside[new].any():
+            raise GraphSlamError(f"vertex {int(new[self._inside[new]][0])} was added before")
+        self._inside[new] = True
+        new_edges = np.asarray(edges, dtype=np.int64).ravel()
+        if self._edges[new_edges].any():
+            raise GraphSlamError(f"edge {int(new_edges[self._edges[new_edges]][0])} was added before")
+        self._edges[new_edges] = True
+        for table in self.graph.tables.values():
+            ends = table.vertices.values[self._edges[table.id.values]]
+            if not self._inside[ends].all():
+                self._edges[new_edges] = False
+                self._inside[new] = False
+                raise GraphSlamError(f"an edge needs vertex {int(ends[~self._inside[ends]][0])}, which was not added")
+        self._structure_changed()
+
+    def set_weight(self, edge: int, weight: float) -> None:
+        """Multiply the information of an edge; 0 takes it out of the structure, another value puts it back."""
+        if not (np.isfinite(weight) and weight >= 0.0):
+            raise GraphSlamError(f"edge {edge}: weight {weight} is not a finite number >= 0")
+        table, row = self.graph.row(edge)
+        was = table.weight.values[row]
+        table.weight.values[row] = weight
+        self._solved = False
+        if (was == 0.0) != (weight == 0.0):
+            self._structure_changed()
+
+    def hold(self, vertex: int) -> None:
+        """Keep a vertex at its present estimate."""
+        self._grow()
+        self._held[vertex] = True
+        self._structure_changed()
+
+    def update(self, settings: Settings | None = None) -> Report:
+        """Minimise the cost from the present estimate.
+
+        Raises
+        ------
+        GaugeError, SingularError
+            The estimate is left as it was.
+        """
+        settings = settings or self.settings
+        self._grow()
+        problem = self._structure()
+        if self._solved or not len(problem.normal.free):
+            blocks = problem.linearize(self._x, settings.stages()[-1])
+            chi2, cost = total(blocks)
+            return Report("gn", "nothing_to_do", chi2, chi2, cost, cost, (), by_class(self.graph, blocks))
+        check_gauge(self.graph, problem.normal.free, np.flatnonzero(self._inside & self._held), problem.rows)
+        self._x, report = minimise(problem, self._x, settings)
+        self._solved = True
+        return report
+
+    def estimate(self, ids: ArrayLike) -> Array:
+        """Values of vertices of one kind, (n, size)."""
+        at = np.asarray(ids, dtype=np.int64).ravel()
+        self._grow()
+        if not len(at):
+            return np.empty((0, 0))
+        codes = self.graph.kind.values[at]
+        if (codes != codes[0]).any():
+            raise GraphSlamError("estimate: the vertices are not of one kind")
+        size = self.graph.kinds[codes[0]].size
+        return self._x[self.graph.offset.values[at][:, None] + np.arange(size)]
+
+    def marginal(self, ids: ArrayLike) -> list[Array]:
+        """Covariance (dof, dof) of each vertex in its tangent space; zero for a held one.
+
+        Linearised at the present estimate with the last stage's losses.
+        """
+        normal = self._linearized()
+        lu = normal.factor()
+        out = []
+        for vertex in np.asarray(ids, dtype=np.int64).ravel().tolist():
+            dof = self.graph.kind_of(vertex).dof
+            if self._held[vertex]:
+                out.append(np.zeros((dof, dof)))
+                continue
+            k = int(normal.position[vertex])
+            if k < 0:
+                raise GraphSlamError(f"vertex {vertex} is not in the problem")
+            first = int(normal.first_dof[k])
+            unit = np.zeros((normal.size, dof))
+            unit[first + np.arange(dof), np.arange(dof)] = 1.0
+            block = lu.solve(unit)[first : first + dof]
+            out.append(0.5 * (block + block.T))
+        return out
+
+    def information_matrix(self) -> Array:
+        """H as a dense matrix at the present estimate, vertices in order of id: for tests and small examples."""
+        normal = self._linearized()
+        by_id = np.concatenate([normal.first_dof[k] + np.arange(normal.dof[k]) for k in np.argsort(normal.free)])
+        dense: Array = normal.matrix().toarray()[np.ix_(by_id, by_id)]
+        return dense
+
+    def _grow(self) -> None:
+        """Follow the graph's growth: new vertices start at their initial values."""
+        known = len(self._inside)
+        more = self.graph.vertex_count - known
+        if more:
+            start = len(self._x)
+            self._x = np.concatenate([self._x, self.graph.initial.values[start:]])
+            self._inside = np.concatenate([self._inside, np.zeros(more, dtype=bool)])
+            self._held = np.concatenate([self._held, np.zeros(more, dtype=bool)])
+        more = self.graph.edge_count - len(self._edges)
+        if more:
+            self._edges = np.concatenate([self._edges, np.zeros(more, dtype=bool)])
+
+    def _structure_changed(self) -> None:
+        self._problem = None
+        self._solved = False
+
+    def _structure(self) -> Problem:
+        if self._problem is None:
+            rows: dict[EdgeTable, Index] = {}
+            for table in self.graph.tables.values():
+                mine = self._edges[table.id.values] & (table.weight.values != 0.0)
+                if mine.any():
+                    rows[table] = np.flatnonzero(mine)
+            normal = NormalEquations(self.graph, np.flatnonzero(self._inside & ~self._held), rows)
+            self._problem = Problem(self.graph, rows, normal)
+        return self._problem
+
+    def _linearized(self) -> NormalEquations:
+        self._grow()
+        problem = self._structure()
+        problem.normal.assemble(problem.linearize(self._x, self.settings.stages()[-1]))
+        return problem.normal
