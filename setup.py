@@ -63,16 +63,16 @@ setup(
         "numpy>=1.23.5",
         "scipy>=1.9.3",
         "numba>=0.57.1",
-        "rosbags>=0.10.1",
-        "mcap>=1.1.1",
+        "rosbags>=0.10.9",
+        "mcap>=1.3.0",
         "PyYAML>=6.0",
         "matplotlib>=3.6.3",
-        "tqdm>=4.60",
+        "tqdm>=4.60.0",
     ],
     extras_require={
-        "evaluate": ["evo>=1.28"],  # GPL-3.0: never a requirement of the Apache-2.0 package itself
+        "evaluate": ["evo>=1.31.1"],  # GPL-3.0: never a requirement of the Apache-2.0 package itself
         "jazzy": [f"{line} ; {WHERE_JAZZY_HAS_WHEELS}" for line in JAZZY],
-        "test": ["hypothesis", "mypy", "pytest", "ruff", "types-PyYAML", "types-tqdm"],
+        "test": ["hypothesis>=6.82", "mypy>=1.8", "pytest>=7.4", "ruff>=0.6", "types-PyYAML>=6.0", "types-tqdm>=4.60"],
     },
     entry_points={
         "console_scripts": [

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 from importlib.util import find_spec
 from pathlib import Path
@@ -54,6 +56,7 @@ MANIFEST = """\
   <export><build_type>ament_cmake</build_type></export>
 </package>
 """
+DEBIAN_PACKAGES = "sudo apt install g++ python3-dev"
 # Left by the wheels' start-up hook or a sourced workspace, they would point the build's own Python elsewhere.
 FOREIGN_VARIABLES = ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "PYTHONPATH")
 
@@ -119,18 +122,34 @@ def generate(packages: list[str], prefix: Path) -> None:
             )
 
 
+def obstacle(missing: list[str]) -> str | None:
+    """Say why the packages cannot be generated here, and what would help; None if they can."""
+    ros = find_spec("rclpy")
+    if ros is None:
+        return "no ROS 2 here (its wheels are for Linux on x86-64): what needs none works, live graphs do not"
+    if not str(ros.origin).startswith(sys.prefix) or sys.prefix == sys.base_prefix:
+        packages = " ".join(f"ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{name.replace('_', '-')}" for name in missing)
+        return f"the installed ROS lacks {' and '.join(missing)}: sudo apt install {packages}"
+    has_compiler = os.environ.get("CXX") or any(map(shutil.which, ("c++", "g++", "clang++")))
+    if not has_compiler or not Path(sysconfig.get_path("include"), "Python.h").exists():
+        return f"no ROS 2 without a compiler and Python's headers for {' and '.join(missing)}: {DEBIAN_PACKAGES}"
+    return None
+
+
 def main() -> int:
-    """Generate what is missing; return the exit code."""
+    """Generate what is missing; return 0 if nothing is missing any more."""
     missing = [name for name in INTERFACES if not is_importable(name)]
     if not missing:
         return 0
-    if sys.prefix == sys.base_prefix:
-        sys.stderr.write(f"{' and '.join(missing)} missing: install them as packages of the system's ROS\n")
-        return 2
-    try:
-        generate(missing, Path(sys.prefix))
-    except (subprocess.CalledProcessError, OSError) as error:
-        sys.stderr.write(f"{getattr(error, 'output', None) or ''}cannot generate {' and '.join(missing)}: {error}\n")
+    reason = obstacle(missing)
+    if reason is None:
+        try:
+            generate(missing, Path(sys.prefix))
+        except (subprocess.CalledProcessError, OSError) as error:
+            sys.stderr.write(getattr(error, "output", ""))
+            reason = f"cannot generate {' and '.join(missing)}: {error}"
+    if reason is not None:
+        sys.stderr.write(f"graph_slam_ros: {reason}\n")
         return 2
     return 0
 
