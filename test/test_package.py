@@ -1,0 +1,170 @@
+"""The package as a whole: one version number, one direction of imports, requirements that fit each other."""
+
+import ast
+import re
+import subprocess
+import sys
+from importlib.metadata import requires, version
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+
+import graph_slam_ros
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "graph_slam_ros"
+FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
+
+# What a folder or file may import of the package, besides itself and errors.py. What is not named stands above all these.
+WITHIN = {
+    "lie": set(),
+    "graph": {"lie"},
+    "solver": {"lie", "graph"},
+    "slam": {"lie", "graph", "solver"},
+    "formats": {"lie", "graph"},
+    "ros/from_msg.py": {"lie", "slam", "ros"},
+    "ros/bag.py": {"lie", "slam", "ros"},
+    "ros/params.py": {"lie", "slam", "ros"},
+    "ros/to_msg.py": {"lie", "slam", "ros"},
+    "ros": {"lie", "graph", "solver", "slam", "formats"},
+    "simulation": {"lie", "graph", "solver", "slam", "formats", "ros"},
+}
+# What is not the standard library's and not ours.
+THIRD_PARTY = {
+    "errors.py": set(),
+    "lie": {"numpy", "numba"},
+    "graph": {"numpy", "numba"},
+    "solver": {"numpy", "numba", "scipy"},
+    "slam": {"numpy"},
+    "formats": {"numpy"},
+    "ros/from_msg.py": {"numpy", "rosbags", "mcap"},
+    "ros/bag.py": {"numpy", "rosbags", "mcap"},
+}
+BELOW_ROS_NEVER = {"random", "secrets", "threading", "time", "uuid"}
+NEVER = {
+    "graph": BELOW_ROS_NEVER | {"logging", "os", "pathlib"},
+    "solver": BELOW_ROS_NEVER,
+    "slam": BELOW_ROS_NEVER | {"datetime", "os", "pathlib"},
+    "ros/node.py": {"numpy", "scipy"},
+    "simulation": {"matplotlib"},
+    "evaluation.py": {"matplotlib"},
+    "replay.py": {"matplotlib"},
+    "ros": {"matplotlib"},
+}
+SPEAK_RCLPY = {"ros/node.py", "ros/player.py"}
+SPEAK_MESSAGES = SPEAK_RCLPY | {"ros/to_msg.py"}
+OUTSIDE_THE_SOLVER = {"cli.py", "report.py"}
+
+
+def imported(name):
+    """All modules that a file imports, wherever in it, by their full names."""
+    folder = ["graph_slam_ros", *name.split("/")[:-1]]
+    for node in ast.walk(ast.parse(FILES[name].read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parents = folder[: len(folder) - node.level + 1] if node.level else []
+            module = ".".join([*parents, *filter(None, [node.module])])
+            if module == "graph_slam_ros":
+                yield from (f"{module}.{alias.name}" for alias in node.names)
+            else:
+                yield module
+
+
+def rule(table, name):
+    """The rule for a file, else for its folder, else None."""
+    return table.get(name, table.get(name.split("/")[0]))
+
+
+def test_the_version_number_is_the_same_everywhere():
+    assert ElementTree.parse(ROOT / "package.xml").findtext("version") == graph_slam_ros.__version__
+    assert version("graph_slam_ros") == graph_slam_ros.__version__
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "config").glob("*.yaml")), ids=lambda path: path.name)
+def test_every_shipped_yaml_is_a_mapping(path):
+    assert isinstance(yaml.safe_load(path.read_text()), dict)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_imports_within_the_package_go_one_way(name):
+    allowed = rule(WITHIN, name)
+    ours = [module.split(".")[1:] for module in imported(name) if module.startswith("graph_slam_ros.")]
+    if allowed is not None:
+        assert {module[0] for module in ours} <= allowed | {name.split("/")[0], "errors", "__version__"}
+    if name in OUTSIDE_THE_SOLVER:
+        assert not [module for module in ours if module[0] == "solver" and len(module) > 1]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_folder_imports_only_the_libraries_it_is_built_on(name):
+    tops = {module.split(".")[0] for module in imported(name)} - {"graph_slam_ros"}
+    allowed = rule(THIRD_PARTY, name)
+    if allowed is not None:
+        assert tops - sys.stdlib_module_names <= allowed
+    assert not tops & ((NEVER.get(name) or set()) | (NEVER.get(name.split("/")[0]) or set()))
+    assert "evo" not in tops or name == "evaluation.py"
+    if name not in SPEAK_RCLPY:
+        assert "rclpy" not in tops
+    if name not in SPEAK_MESSAGES:
+        assert not [top for top in tops if re.fullmatch(r"\w+_(msgs|srvs|interfaces)", top)]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_only_the_command_line_prints(name):
+    calls = [node.func for node in ast.walk(ast.parse(FILES[name].read_text())) if isinstance(node, ast.Call)]
+    assert name == "cli.py" or not [call for call in calls if isinstance(call, ast.Name) and call.id == "print"]
+
+
+def test_everything_but_the_node_imports_without_ros():
+    modules = [
+        ".".join(["graph_slam_ros", *Path(name).with_suffix("").parts]).removesuffix(".__init__")
+        for name in FILES
+        if name not in SPEAK_MESSAGES
+    ]
+    script = f"""
+import importlib, sys
+class NoRos:
+    def find_spec(self, name, path=None, target=None):
+        if name == "rclpy" or name.endswith(("_msgs", "_srvs")):
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, NoRos())
+for module in {modules}:
+    importlib.import_module(module)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_package_itself_imports_nothing():
+    script = "import sys; before = set(sys.modules); import graph_slam_ros; print(*(set(sys.modules) - before))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.split() == ["graph_slam_ros"]
+
+
+def pins(file):
+    """Normalised names to the versions that a lock names for them, one for each kind of machine."""
+    found = re.findall(r"^([\w.-]+)==([^\s;]+)", (ROOT / file).read_text(), re.MULTILINE)
+    return {name: {v for n, v in found if n == name} for name, _ in found}
+
+
+def test_both_locks_fit_the_requirements():
+    latest, oldest = pins("requirements.txt"), pins("constraints-oldest.txt")
+    lines = [line for line in requires("graph_slam_ros") if "extra" not in line]
+    assert len(lines) > 5
+    for line in lines:
+        name, bound = re.fullmatch(r"([\w.-]+)>=([\d.]+)", line).groups()
+        name = re.sub(r"[-_.]+", "-", name).lower()
+        assert name in latest
+        (lowest,) = oldest[name]
+        assert [int(part) for part in lowest.split(".")] == [int(part) for part in bound.split(".")]
+
+
+def test_the_lock_names_no_server_and_has_a_hash_for_every_distribution():
+    text = (ROOT / "requirements.txt").read_text()
+    assert "://" not in text
+    assert "--index" not in text
+    blocks = re.split(r"\n(?=\w)", text)
+    assert [block for block in blocks[1:] if "--hash=sha256:" not in block] == []
