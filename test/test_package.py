@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "graph_slam_ros"
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
 
-# What a folder or file may import of the package, besides itself and errors.py. What is not named stands above all these.
+# What a folder or file may import of the package besides itself and errors.py. What is not named is above all these.
 WITHIN = {
     "lie": set(),
     "graph": {"lie"},
