@@ -1,0 +1,283 @@
+"""Bags: one iterator of CDR messages over mcap, sqlite3 and ROS 1 recordings, and a writer of mcap.
+
+mcap files are read through the stream reader, one path for whole and damaged ones: what is whole is read, what is lost
+is told. sqlite3 and ROS 1 bags are read by rosbags.
+"""
+
+import re
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol
+
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Message, Schema, Statistics
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, Writer
+from rosbags.highlevel import AnyReader
+from rosbags.highlevel.anyreader import AnyReaderError
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.ros.interfaces import typestore
+
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_MAX_CHUNK_BYTES = 256 * 2**20  # declared size, checked before anything is decompressed
+_MAX_RECORD_BYTES = 2**30
+
+
+class BagError(GraphSlamError):
+    """A recording that cannot be read, or does not hold what was asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A recorded topic.
+
+    Attributes
+    ----------
+    definition : the message definition recorded with it (ROS .msg text), or empty
+    """
+
+    name: str
+    type: str
+    count: int
+    definition: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class BagMessage:
+    """One recorded message: CDR bytes and the time it was received."""
+
+    topic: str
+    log_ns: int
+    cdr: bytes
+
+
+class Bag(Protocol):
+    """A recording, opened."""
+
+    topics: dict[str, Topic]
+    losses: list[str]
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        """Messages of the named topics in order of recording; what could not be read adds to ``losses``."""
+
+
+def open_bag(path: Path | str) -> Bag:
+    """Open a file (mcap, db3, ROS 1 bag) or a folder that holds them, split or not.
+
+    Raises
+    ------
+    BagError
+        No such file, not a recording, or nothing whole in it.
+    """
+    path = Path(path)
+    files = _files(path)
+    if all(_is_mcap(file) for file in files):
+        return _McapBag(files)
+    if path.is_dir() and (path / "metadata.yaml").exists():
+        files = [path]
+    return _RosbagsBag(files)
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_file():
+        if path.stat().st_size == 0:
+            raise BagError(f"{path}: the file is empty")
+        return [path]
+    if not path.exists():
+        raise BagError(f"{path}: no such file or folder")
+    if not path.is_dir():
+        raise BagError(f"{path}: neither a file nor a folder")
+    for suffix in (".mcap", ".db3", ".bag"):
+        found = sorted(path.glob(f"*{suffix}"), key=_natural)
+        if found:
+            return found
+    raise BagError(f"{path}: no recording (.mcap, .db3, .bag) in this folder")
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """bag_2 before bag_10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def _is_mcap(path: Path) -> bool:
+    try:
+        with path.open("rb") as stream:
+            return stream.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
+    except OSError as error:
+        raise BagError(f"{path}: {error.strerror}") from None
+
+
+class _McapBag:
+    def __init__(self, files: list[Path]) -> None:
+        self._files = files
+        self.losses: list[str] = []
+        self.topics: dict[str, Topic] = {}
+        self._expected: dict[Path, int] = {}
+        for file in files:
+            schemas, channels, counts = self._declared(file) or self._counted(file)
+            for channel in channels.values():
+                self._add_topic(file, channel, schemas.get(channel.schema_id), counts.get(channel.id, 0))
+            self._expected[file] = sum(counts.values())
+        if not self.topics:
+            raise BagError(f"{files[0]}: no topic in it")
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        for file in self._files:
+            names: dict[int, str] = {}
+            read = 0
+            for record in self._records(file, self.losses):
+                if isinstance(record, Message):
+                    read += 1
+                    name = names.get(record.channel_id, "")
+                    if name in topics:
+                        yield BagMessage(name, record.log_time, record.data)
+                elif isinstance(record, Channel):
+                    names[record.id] = record.topic
+            if read < self._expected[file]:
+                self.losses.append(f"{file.name}: {self._expected[file] - read} of its messages could not be read")
+
+    def _add_topic(self, file: Path, channel: Channel, schema: Schema | None, count: int) -> None:
+        if channel.message_encoding != "cdr":
+            return
+        definition = schema.data.decode(errors="replace") if schema and schema.encoding == "ros2msg" else ""
+        type_name = schema.name if schema else ""
+        if "/msg/" not in type_name and type_name.count("/") == 1:
+            type_name = type_name.replace("/", "/msg/")
+        old = self.topics.get(channel.topic)
+        if old is not None and old.type != type_name:
+            raise BagError(f"{file.name}: topic {channel.topic} is {type_name} here and {old.type} elsewhere in the bag")
+        self.topics[channel.topic] = Topic(channel.topic, type_name, count + (old.count if old else 0), definition)
+
+    def _declared(self, file: Path) -> tuple[dict[int, Schema], dict[int, Channel], dict[int, int]] | None:
+        """What the summary at the end says; None where there is no whole one."""
+        try:
+            with file.open("rb") as stream:
+                summary = make_reader(stream).get_summary()
+        except Exception:  # of a damaged file the library raises almost anything; it is then scanned
+            return None
+        if summary is None or summary.statistics is None or not summary.channels:
+            return None
+        return summary.schemas, summary.channels, summary.statistics.channel_message_counts
+
+    def _counted(self, file: Path) -> tuple[dict[int, Schema], dict[int, Channel], dict[int, int]]:
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        counts: dict[int, int] = {}
+        for record in self._records(file, []):
+            if isinstance(record, Message):
+                counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
+            elif isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+        return schemas, channels, counts
+
+    def _records(self, file: Path, losses: list[str]) -> Iterator[Any]:
+        """Schemas, channels and messages in order; a damaged chunk is passed over, a cut tail ends it."""
+        read = 0
+        with file.open("rb") as stream:
+            reader = StreamReader(stream, emit_chunks=True, record_size_limit=_MAX_RECORD_BYTES)
+            records = reader.records
+            while True:
+                try:
+                    record = next(records)
+                except StopIteration:
+                    return
+                except Exception as error:  # see _declared
+                    losses.append(
+                        f"{file.name}: cut off after {read} messages"
+                        f" ({type(error).__name__} at byte {stream.tell()} of {file.stat().st_size})"
+                    )
+                    return
+                if isinstance(record, Chunk):
+                    for inner in self._unpacked(file, record, losses):
+                        read += isinstance(inner, Message)
+                        yield inner
+                elif isinstance(record, Statistics):
+                    return
+                else:
+                    read += isinstance(record, Message)
+                    yield record
+
+    def _unpacked(self, file: Path, chunk: Chunk, losses: list[str]) -> list[Any]:
+        if chunk.uncompressed_size > _MAX_CHUNK_BYTES:
+            losses.append(f"{file.name}: a chunk of {chunk.uncompressed_size} bytes is over the limit, passed over")
+            return []
+        try:
+            return breakup_chunk(chunk, validate_crc=True)
+        except Exception as error:  # see _declared
+            losses.append(f"{file.name}: a damaged chunk was passed over ({type(error).__name__})")
+            return []
+
+
+class _RosbagsBag:
+    """sqlite3 and ROS 1 recordings; messages of ROS 1 are turned into CDR."""
+
+    def __init__(self, files: list[Path]) -> None:
+        self._name = files[0].name
+        self._reader = AnyReader(files, default_typestore=typestore())
+        self.losses: list[str] = []
+        try:
+            self._reader.open()
+        except Exception as error:  # rosbags raises asserts and parser errors on damaged files
+            what = str(error) or type(error).__name__
+            raise BagError(f"{files[0]}: not a readable recording ({what.splitlines()[0]})") from None
+        self.topics = {}
+        for connection in self._reader.connections:
+            old = self.topics.get(connection.topic)
+            count = connection.msgcount + (old.count if old else 0)
+            self.topics[connection.topic] = Topic(connection.topic, connection.msgtype, count, _text(connection))
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        connections = [c for c in self._reader.connections if c.topic in topics]
+        if not connections:  # to rosbags, no connection means all of them
+            return
+        records = self._reader.messages(connections)
+        while True:
+            try:
+                connection, log_ns, raw = next(records)
+                cdr = raw if self._reader.is2 else self._reader.typestore.ros1_to_cdr(raw, connection.msgtype)
+            except StopIteration:
+                return
+            except Exception as error:
+                self.losses.append(f"{self._name}: cut off ({type(error).__name__}: {error})")
+                return
+            yield BagMessage(connection.topic, log_ns, bytes(cdr))
+
+
+def _text(connection: Any) -> str:
+    return connection.msgdef.data if connection.msgdef.format.name == "MSG" else ""
+
+
+class BagWriter:
+    """Writes CDR messages into one mcap file that Foxglove and ``ros2 bag`` open; every chunk carries its CRC."""
+
+    def __init__(self, path: Path | str) -> None:
+        self._stream = Path(path).open("wb")
+        self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
+        self._writer.start(profile="ros2", library="graph_slam_ros")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._sequence: dict[str, int] = {}
+
+    def write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
+        """Append one message, received at ``stamp_ns``."""
+        if topic not in self._channels:
+            if type_name not in self._schemas:
+                text, _ = typestore().generate_msgdef(type_name, ros_version=2)
+                self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", text.encode())
+            self._channels[topic] = self._writer.register_channel(
+                topic, "cdr", self._schemas[type_name], {"offered_qos_profiles": ""}
+            )
+        sequence = self._sequence[topic] = self._sequence.get(topic, -1) + 1
+        self._writer.add_message(self._channels[topic], stamp_ns, cdr, stamp_ns, sequence)
+
+    def __enter__(self) -> "BagWriter":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._writer.finish()
+        self._stream.close()
