@@ -62,15 +62,16 @@ ifeq ($(SYSTEM_ROS),)
 	  echo 'graph_slam_ros: the ROS wheels cannot be installed, see above: going on without ROS'; \
 	  $(call without,platform_machine) && $(PIP) install --quiet --require-hashes -r $(VENV)/requirements.txt; }
 else
-	@$(call without,platform_machine|^numpy==) && \
+	@$(call without,platform_machine|^numpy==|^pandas==) && \
 	  $(PIP) install --quiet --require-hashes --no-deps -r $(VENV)/requirements.txt
 endif
 	@touch $@
 
-# The messages of an installed ROS are compiled for the major version of NumPy that it came with.
+# The messages of an installed ROS are compiled for the major version of NumPy that it came with, and pandas must fit.
+SAME_NUMPY = import numpy; print("numpy<%d" % (int(numpy.__version__.split(".")[0]) + 1))
 $(VENV)/package.stamp: setup.py setup.cfg pyproject.toml graph_slam_ros/__init__.py $(VENV)/requirements.stamp
-	@$(PIP) install --quiet --no-build-isolation -e . $(if $(SYSTEM_ROS),"$$($(PYTHON) -c \
-	  'import numpy; print("numpy<%d" % (int(numpy.__version__.split(".")[0]) + 1))')",--no-deps)
+	@$(PIP) install --quiet --no-build-isolation \
+	  $(if $(SYSTEM_ROS),-e '.[evaluate]' "$$($(PYTHON) -c '$(SAME_NUMPY)')",--no-deps -e .)
 	@touch $@
 
 # Without the stamp it is tried, and what is missing is said, every time.
