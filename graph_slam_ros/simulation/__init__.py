@@ -1,0 +1,67 @@
+"""Synthetic worlds with truth: the same seed gives the same recording.
+
+recording = simulate("warehouse", seed=7, aisles=5)
+write_bag(recording, "warehouse.mcap")
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.simulation import manhattan, pythonrobotics, warehouse
+from graph_slam_ros.simulation.bag import write_bag
+from graph_slam_ros.simulation.options import Option, fill, options_of
+from graph_slam_ros.simulation.pose_graph import CityGraph, city_graph, landmark_graph
+from graph_slam_ros.simulation.recording import Recording, Seen, measurements
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A world: its dataclass of options and the function that drives through it."""
+
+    options: type
+    drive: Callable[[int, Any], Recording]
+
+    @property
+    def about(self) -> str:
+        """One sentence on it."""
+        return (self.drive.__doc__ or "").strip().splitlines()[0]
+
+
+WORLDS: dict[str, World] = {
+    "pythonrobotics": World(pythonrobotics.PythonRobotics, pythonrobotics.simulate),
+    "manhattan": World(manhattan.Manhattan, manhattan.simulate),
+    "warehouse": World(warehouse.Warehouse, warehouse.simulate),
+}
+
+
+def simulate(world: str, seed: int, **options: Any) -> Recording:
+    """Drive through a world.
+
+    Raises
+    ------
+    GraphSlamError
+        Unknown world or option (those that exist are named), wrong type, or a value out of bounds.
+    """
+    if world not in WORLDS:
+        raise GraphSlamError(f"no world {world!r}; there are {', '.join(WORLDS)}")
+    if seed < 0:
+        raise GraphSlamError(f"seed {seed} is negative")
+    return WORLDS[world].drive(seed, fill(world, WORLDS[world].options, options))
+
+
+__all__ = [
+    "WORLDS",
+    "CityGraph",
+    "Option",
+    "Recording",
+    "Seen",
+    "World",
+    "city_graph",
+    "landmark_graph",
+    "measurements",
+    "options_of",
+    "simulate",
+    "write_bag",
+]

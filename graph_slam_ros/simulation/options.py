@@ -1,0 +1,63 @@
+"""Options of a world: a frozen dataclass whose fields carry unit, meaning and bounds, filled from names and values."""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from graph_slam_ros.errors import GraphSlamError
+
+Options = TypeVar("Options")
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """What is known of one option; ``low`` and ``high`` are inclusive."""
+
+    name: str
+    default: Any
+    meaning: str
+    unit: str
+    low: float
+    high: float
+
+    def check(self, world: str, value: Any) -> Any:
+        """The value in the option's type. Raises GraphSlamError naming world, option and what is allowed."""
+        kind = type(self.default)
+        if kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not kind:
+            raise GraphSlamError(f"{world}: {self.name}: {value!r} is not {_ARTICLE[kind]}")
+        if kind is not bool and not (math.isfinite(value) and self.low <= value <= self.high):
+            raise GraphSlamError(f"{world}: {self.name}: {value!r} is not in [{self.low:g}, {self.high:g}]")
+        return value
+
+
+_ARTICLE = {bool: "true or false", int: "an integer", float: "a number"}
+
+
+def option(default: Any, meaning: str, unit: str = "", low: float = 0.0, high: float = 1e6) -> Any:
+    """Dataclass field of an option."""
+    return field(default=default, metadata={"about": (meaning, unit, low, high)})
+
+
+def options_of(cls: type) -> Iterator[Option]:
+    """Every option of a world's dataclass, in order."""
+    for f in dataclasses.fields(cls):
+        yield Option(f.name, f.default, *f.metadata["about"])
+
+
+def fill(world: str, cls: type[Options], values: Mapping[str, Any]) -> Options:
+    """The dataclass with the named values; others keep their defaults.
+
+    Raises
+    ------
+    GraphSlamError
+        Unknown name, wrong type, or a value out of bounds.
+    """
+    known = {o.name: o for o in options_of(cls)}
+    for name in values:
+        if name not in known:
+            raise GraphSlamError(f"{world}: no option {name!r}; it has {', '.join(known)}")
+    return cls(**{name: known[name].check(world, value) for name, value in values.items()})

@@ -1,0 +1,127 @@
+"""A warehouse: a robot drives aisle after aisle and reads tags on the racks, each with its orientation."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import PCG64, Generator
+from numpy.typing import NDArray
+
+from graph_slam_ros.lie import se2
+from graph_slam_ros.simulation.drive import drive
+from graph_slam_ros.simulation.motion import VelocityNoise
+from graph_slam_ros.simulation.options import option
+from graph_slam_ros.simulation.recording import Recording
+from graph_slam_ros.simulation.sensing import RangeBearing
+
+Array = NDArray[np.float64]
+
+SPEED_M_S = 1.0
+TICK_NS = 20_000_000  # odometry at 50 Hz
+LOOK_EVERY = 8  # camera at 6.25 Hz
+AISLE_SPACING_M = 4.0
+RACK_DEPTH_M = 1.6
+TAG_SPACING_M = 3.0
+CORNER_RADIUS_M = 1.2
+CROSS_AISLE_M = 2.0  # from the ends of the racks to the middle of the cross aisle
+MAX_SLANT_RAD = np.deg2rad(65.0)  # a tag seen at a flatter angle is not read
+CAMERA = RangeBearing(0.05, np.deg2rad(0.5), 5.0, np.deg2rad(100.0))
+SIGMA_YAW_RAD = np.deg2rad(2.0)
+START = (0.0, -CROSS_AISLE_M, 0.5 * np.pi)
+
+
+@dataclass(frozen=True, slots=True)
+class Warehouse:
+    """Options: aisles along y, driven one after the other at 1 m/s; odometry at 50 Hz, tags read at 6.25 Hz."""
+
+    aisles: int = option(6, "aisles, 4 m apart", "", 2, 100)
+    aisle_m: float = option(16.0, "length of an aisle", "m", 4, 1000)
+    laps: int = option(
+        1, "how often all aisles are driven; the way back to the first one is always driven", "", 1, 1000
+    )
+    sigma_speed_m_s: float = option(0.05, "error of the measured speed", "m/s", 1e-6, 1)
+    sigma_sideways_m_s: float = option(0.01, "speed of slipping sideways", "m/s", 1e-6, 1)
+    sigma_turn_rad_s: float = option(0.05, "error of the measured turning speed", "rad/s", 1e-6, 1)
+    correlation_time_s: float = option(0.5, "how long such an error lasts (1/e)", "s", 0, 100)
+
+
+def simulate(seed: int, options: Warehouse) -> Recording:
+    """Drive all aisles in a serpentine, return to the first and enter it again."""
+    rng = Generator(PCG64(seed))
+    names, tags = _tags(options)
+
+    def look(T_world_base: se2.Pose) -> tuple[tuple[str, ...], Array, Array]:
+        at = CAMERA.visible(T_world_base, tags[:, :2])
+        at = at[_is_facing(T_world_base, tags[at])]
+        positions, covariance = CAMERA.measure(rng, T_world_base, tags[at, :2])
+        yaw = se2.wrap(tags[at, 2] - T_world_base[2] + SIGMA_YAW_RAD * rng.standard_normal(len(at)))
+        full = np.zeros((len(at), 3, 3))
+        full[:, :2, :2] = covariance
+        full[:, 2, 2] = SIGMA_YAW_RAD**2
+        return tuple(names[k] for k in at.tolist()), np.column_stack([positions, yaw]), full
+
+    twists = follow(_route(options), CORNER_RADIUS_M, SPEED_M_S, TICK_NS * 1e-9)
+    noise = VelocityNoise(
+        (options.sigma_speed_m_s, options.sigma_sideways_m_s, options.sigma_turn_rad_s), options.correlation_time_s
+    )
+    landmarks = dict(zip(names, (tuple(tag) for tag in tags.tolist()), strict=True))
+    return drive(rng, START, twists, TICK_NS, noise, look, LOOK_EVERY, landmarks)
+
+
+def _tags(options: Warehouse) -> tuple[list[str], Array]:
+    """Names and poses (m, 3); a tag's x axis points out of the rack, into the aisle."""
+    names, tags = [], []
+    count = max(1, int(options.aisle_m // TAG_SPACING_M))
+    along = (np.arange(count) + 0.5) * (options.aisle_m / count)
+    for rack in range(options.aisles + 1):
+        x = (rack - 0.5) * AISLE_SPACING_M
+        for side, name, theta in ((-1, "w", -np.pi), (1, "e", 0.0)):
+            for k, y in enumerate(along.tolist()):
+                names.append(f"r{rack}{name}{k}")
+                tags.append((x + side * 0.5 * RACK_DEPTH_M, y, theta))
+        for name, y, theta in (("s", 0.0, -0.5 * np.pi), ("n", options.aisle_m, 0.5 * np.pi)):
+            names.append(f"r{rack}{name}")
+            tags.append((x, y, theta))
+    return names, np.array(tags)
+
+
+def _is_facing(T_world_base: se2.Pose, tags: Array) -> NDArray[np.bool_]:
+    toward = np.arctan2(T_world_base[1] - tags[:, 1], T_world_base[0] - tags[:, 0])
+    return np.asarray(np.abs(se2.wrap(toward - tags[:, 2])) <= MAX_SLANT_RAD)
+
+
+def _route(options: Warehouse) -> Array:
+    """Waypoints (n, 2): a serpentine for each lap, then along a cross aisle and through the first aisle again."""
+    south, north = -CROSS_AISLE_M, options.aisle_m + CROSS_AISLE_M
+    points = [START[:2]]
+    for _ in range(options.laps):
+        for aisle in range(options.aisles):
+            y = points[-1][1]
+            points += [(aisle * AISLE_SPACING_M, y), (aisle * AISLE_SPACING_M, south if y == north else north)]
+        points.append((0.0, points[-1][1]))
+    points.append((0.0, south if points[-1][1] == north else north))
+    return np.array([p for k, p in enumerate(points) if k == 0 or p != points[k - 1]])
+
+
+def follow(waypoints: Array, radius_m: float, speed_m_s: float, dt_s: float) -> Array:
+    """Twists (n, 3) of a drive along right-angled waypoints (m, 2) at constant speed, corners rounded."""
+    legs = np.diff(waypoints, axis=0)
+    headings = np.unwrap(np.arctan2(legs[:, 1], legs[:, 0]))
+    pieces = list(_pieces(np.hypot(legs[:, 0], legs[:, 1]), headings, radius_m))
+    distance = np.cumsum([0.0, *(length for length, _ in pieces)])
+    heading = np.cumsum([headings[0], *(turn for _, turn in pieces)])
+    ticks = int(distance[-1] / (speed_m_s * dt_s))
+    at_tick = np.interp(speed_m_s * dt_s * np.arange(ticks + 1), distance, heading)
+    return np.column_stack([np.full(ticks, speed_m_s), np.zeros(ticks), np.diff(at_tick) / dt_s])
+
+
+def _pieces(lengths: Array, headings: Array, radius_m: float) -> Iterator[tuple[float, float]]:
+    """Straights and arcs as (length, turn)."""
+    cut = 0.0
+    for k, length in enumerate(lengths.tolist()):
+        turn = float(headings[k + 1] - headings[k]) if k + 1 < len(lengths) else 0.0
+        next_cut = radius_m * float(np.tan(0.5 * abs(turn)))
+        yield length - cut - next_cut, 0.0
+        if turn:
+            yield radius_m * abs(turn), turn
+        cut = next_cut
