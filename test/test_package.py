@@ -155,7 +155,7 @@ def test_both_locks_fit_the_requirements():
     lines = [line for line in requires("graph_slam_ros") if "extra" not in line]
     assert len(lines) > 5
     for line in lines:
-        name, bound = re.fullmatch(r"([\w.-]+)>=([\d.]+)", line).groups()
+        name, bound = re.fullmatch(r"([\w.-]+) ?>=([\d.]+)", line).groups()
         name = re.sub(r"[-_.]+", "-", name).lower()
         assert name in latest
         (lowest,) = oldest[name]
