@@ -12,7 +12,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.simulation import manhattan, pythonrobotics, warehouse
 from graph_slam_ros.simulation.bag import write_bag
 from graph_slam_ros.simulation.options import Option, fill, options_of
-from graph_slam_ros.simulation.pose_graph import CityGraph, city_graph, landmark_graph
+from graph_slam_ros.simulation.pose_graph import CityGraph, city_graph, landmark_graph, write_graph
 from graph_slam_ros.simulation.recording import Recording, Seen, measurements
 
 
@@ -64,4 +64,5 @@ __all__ = [
     "options_of",
     "simulate",
     "write_bag",
+    "write_graph",
 ]

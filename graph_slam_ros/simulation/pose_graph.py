@@ -1,12 +1,15 @@
 """The same worlds as graphs: cities with closures between poses, and drives among landmarks."""
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
+from graph_slam_ros.formats.g2o import G2oFile, write_g2o
 from graph_slam_ros.graph import LANDMARK_POSITION, R2, RELATIVE_POSE, SE2, Gaussian, Graph
 from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.manhattan import STEP_M, stroll
@@ -135,3 +138,13 @@ def landmark_graph(recording: Recording) -> Graph:
         pairs = [(pose, vertex_of[name]) for name in seen.ids]
         graph.add_edges(LANDMARK_POSITION, pairs, seen.measured, Gaussian.from_covariance(seen.covariance), "landmarks")
     return graph
+
+
+def write_graph(graph: Graph, path: Path | str) -> None:
+    """Write a graph as g2o at its initial values, with the first vertex held by a FIX line."""
+
+    def initial(ids: Sequence[int]) -> Array:
+        size = graph.kind_of(ids[0]).size
+        return np.asarray(graph.initial.values[graph.offset.values[ids][:, None] + np.arange(size)])
+
+    write_g2o(path, G2oFile(graph, list(range(graph.vertex_count)), [0]), initial)

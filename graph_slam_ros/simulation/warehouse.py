@@ -1,4 +1,4 @@
-"""A warehouse: a robot drives aisle after aisle and reads tags on the racks, each with its orientation."""
+"""A warehouse: a robot drives aisle after aisle and reads tags on racks and walls, each with its orientation."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,9 +21,10 @@ TICK_NS = 20_000_000  # odometry at 50 Hz
 LOOK_EVERY = 8  # camera at 6.25 Hz
 AISLE_SPACING_M = 4.0
 RACK_DEPTH_M = 1.6
-TAG_SPACING_M = 3.0
+TAG_SPACING_M = 2.0
 CORNER_RADIUS_M = 1.2
 CROSS_AISLE_M = 2.0  # from the ends of the racks to the middle of the cross aisle
+WALL_M = 3.5  # from the ends of the racks to the wall
 MAX_SLANT_RAD = np.deg2rad(65.0)  # a tag seen at a flatter angle is not read
 CAMERA = RangeBearing(0.05, np.deg2rad(0.5), 5.0, np.deg2rad(100.0))
 SIGMA_YAW_RAD = np.deg2rad(2.0)
@@ -34,10 +35,10 @@ START = (0.0, -CROSS_AISLE_M, 0.5 * np.pi)
 class Warehouse:
     """Options: aisles along y, driven one after the other at 1 m/s; odometry at 50 Hz, tags read at 6.25 Hz."""
 
-    aisles: int = option(6, "aisles, 4 m apart", "", 2, 100)
-    aisle_m: float = option(16.0, "length of an aisle", "m", 4, 1000)
+    aisles: int = option(3, "aisles, 4 m apart", "", 2, 100)
+    aisle_m: float = option(12.0, "length of an aisle", "m", 4, 1000)
     laps: int = option(
-        1, "how often all aisles are driven; the way back to the first one is always driven", "", 1, 1000
+        2, "how often all aisles are driven; with an odd number of them, from the other end each time", "", 1, 1000
     )
     sigma_speed_m_s: float = option(0.05, "error of the measured speed", "m/s", 1e-6, 1)
     sigma_sideways_m_s: float = option(0.01, "speed of slipping sideways", "m/s", 1e-6, 1)
@@ -69,20 +70,24 @@ def simulate(seed: int, options: Warehouse) -> Recording:
 
 
 def _tags(options: Warehouse) -> tuple[list[str], Array]:
-    """Names and poses (m, 3); a tag's x axis points out of the rack, into the aisle."""
-    names, tags = [], []
-    count = max(1, int(options.aisle_m // TAG_SPACING_M))
-    along = (np.arange(count) + 0.5) * (options.aisle_m / count)
+    """Names and poses (m, 3): along the racks, on their ends, and on the walls that aisles lead to.
+
+    A tag's x axis points at the reader, out of the rack or wall.
+    """
+    south, north = -0.5 * np.pi, 0.5 * np.pi
+    length = options.aisle_m
+    count = max(1, int(length // TAG_SPACING_M))
+    along = ((np.arange(count) + 0.5) * (length / count)).tolist()
+    tags: dict[str, se2.Pose] = {}
     for rack in range(options.aisles + 1):
         x = (rack - 0.5) * AISLE_SPACING_M
-        for side, name, theta in ((-1, "w", -np.pi), (1, "e", 0.0)):
-            for k, y in enumerate(along.tolist()):
-                names.append(f"r{rack}{name}{k}")
-                tags.append((x + side * 0.5 * RACK_DEPTH_M, y, theta))
-        for name, y, theta in (("s", 0.0, -0.5 * np.pi), ("n", options.aisle_m, 0.5 * np.pi)):
-            names.append(f"r{rack}{name}")
-            tags.append((x, y, theta))
-    return names, np.array(tags)
+        tags |= {f"rack{rack}w{k}": (x - 0.5 * RACK_DEPTH_M, y, -np.pi) for k, y in enumerate(along)}
+        tags |= {f"rack{rack}e{k}": (x + 0.5 * RACK_DEPTH_M, y, 0.0) for k, y in enumerate(along)}
+        tags |= {f"rack{rack}s": (x, 0.0, south), f"rack{rack}n": (x, length, north)}
+    for aisle in range(options.aisles):
+        x = aisle * AISLE_SPACING_M
+        tags |= {f"wall{aisle}s": (x, -WALL_M, north), f"wall{aisle}n": (x, length + WALL_M, south)}
+    return list(tags), np.array(list(tags.values()))
 
 
 def _is_facing(T_world_base: se2.Pose, tags: Array) -> NDArray[np.bool_]:
