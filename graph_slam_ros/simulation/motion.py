@@ -66,11 +66,9 @@ def right_jacobian(step: Array) -> Array:
     step : tangent vector (3,)
     """
     vx, vy, w = step
-    if abs(w) < 1e-4:  # the next term is w^3 / 24 of the speed: below 1e-13
-        a, b, p, q = 1.0 - w * w / 6.0, 0.5 * w, w / 6.0, 0.5 - w * w / 24.0
-    else:
-        a, b = np.sin(w) / w, (1.0 - np.cos(w)) / w
-        p, q = (w - np.sin(w)) / w**2, (1.0 - np.cos(w)) / w**2
+    a, q = np.sinc(w / np.pi), 0.5 * np.sinc(0.5 * w / np.pi) ** 2  # sin(w) / w and (1 - cos(w)) / w^2, exact at 0
+    b = w * q
+    p = (w - np.sin(w)) / w**2 if abs(w) > 1e-3 else w / 6.0 - w**3 / 120.0
     return np.array([[a, b, p * vx - q * vy], [-b, a, q * vx + p * vy], [0.0, 0.0, 1.0]])
 
 

@@ -1,0 +1,288 @@
+import itertools
+
+import numpy as np
+import pytest
+
+from graph_slam_ros import evaluation
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.evaluation import Trajectory
+from graph_slam_ros.graph import RELATIVE_POSE
+from graph_slam_ros.lie import se2
+from graph_slam_ros.ros.bag import open_bag
+from graph_slam_ros.ros.from_msg import Border
+from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.simulation import WORLDS, city_graph, landmark_graph, measurements, simulate, warehouse, write_bag
+from graph_slam_ros.simulation.motion import VelocityNoise, accumulated, integrate, right_jacobian
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry
+
+SMALL = {"pythonrobotics": {}, "manhattan": {"poses": 60, "blocks": 6}, "warehouse": {"aisles": 2, "laps": 1}}
+
+
+def true_twists(recording):
+    poses = recording.T_world_base
+    steps = se2.log(se2.between(tuple(poses[:-1].T), tuple(poses[1:].T)))
+    return np.stack(steps, axis=1) / (np.diff(recording.stamps_ns)[:, None] * 1e-9)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_same_seed_gives_the_same_recording_and_another_seed_another(world):
+    one, same, other = (simulate(world, seed, **SMALL[world]) for seed in (5, 5, 6))
+    for name in ("stamps_ns", "T_odom_base", "twist", "odom_covariance", "T_world_base"):
+        assert np.array_equal(getattr(one, name), getattr(same, name))
+    assert [s.ids for s in one.seen] == [s.ids for s in same.seen]
+    assert all(np.array_equal(a.measured, b.measured) for a, b in zip(one.seen, same.seen, strict=True))
+    assert not np.array_equal(one.T_odom_base, other.T_odom_base)
+
+
+@pytest.mark.parametrize(
+    "as_original, speed_m_s, turn_rad_s", [(False, 0.1, np.deg2rad(10.0)), (True, 0.01, np.deg2rad(10.0) ** 2)]
+)
+def test_velocity_errors_have_the_stated_standard_deviations(as_original, speed_m_s, turn_rad_s):
+    errors = []
+    for seed in range(40):
+        recording = simulate("pythonrobotics", seed, as_original=as_original)
+        errors.append(recording.twist[1:] - true_twists(recording))
+    errors = np.concatenate(errors)
+    # 2000 samples: the standard deviation is known to 1.6 %, a correlation to 0.022
+    assert errors.std(axis=0) == pytest.approx([speed_m_s, 1e-3, turn_rad_s], rel=0.06)
+    assert np.sqrt(np.diag(recording.twist_covariance)) == pytest.approx([speed_m_s, 1e-3, turn_rad_s])
+    assert np.abs(np.corrcoef(errors.T) - np.eye(3)).max() < 0.09
+
+
+@pytest.mark.parametrize("correlation_time_s", [0.0, 0.5])
+def test_velocity_errors_add_up_over_time_as_stated(correlation_time_s):
+    noise, dt_s, ticks = VelocityNoise((0.05, 0.01, 0.02), correlation_time_s), 0.02, 1000
+    errors = noise.draw(np.random.default_rng(1), 400 * ticks, dt_s)
+    assert errors.std(axis=0) == pytest.approx(noise.sigmas, rel=0.05)
+    moved = dt_s * errors.reshape(400, ticks, 3).sum(axis=1)
+    whitened = moved / np.sqrt(ticks * np.diag(noise.per_tick(dt_s)))
+    assert (whitened**2).mean() == pytest.approx(1.0, abs=0.16)  # 1200 samples: 4 sigma
+
+
+def test_an_error_that_lasts_half_a_second_is_a_density_of_its_variance_times_one_second():
+    noise = VelocityNoise((0.05, 0.01, 0.02), 0.5)
+    assert np.diag(noise.per_tick(0.02)) / 0.02 == pytest.approx(np.square(noise.sigmas) * 1.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-7, 1e-4, 0.99e-3, 1.01e-3, 0.3, -2.5])
+def test_the_right_jacobian_of_a_step_is_its_numeric_derivative(turn):
+    step, h = np.array([1.7, -0.4, turn]), 1e-6
+
+    def moved(d):
+        return np.array(se2.local(se2.exp(tuple(step + d)), se2.exp(tuple(step))))
+
+    numeric = np.stack([(moved(d) - moved(-d)) / (2 * h) for d in h * np.eye(3)], axis=1)
+    assert np.abs(right_jacobian(step) - numeric).max() < 1e-9
+
+
+def test_accumulated_covariance_is_that_of_the_dead_reckoned_pose():
+    noise, ticks, runs = VelocityNoise((0.02, 0.01, 0.01)), 30, 400
+    steps = np.tile([0.5, 0.0, 0.2], (ticks, 1))
+    truth, covariance = integrate(se2.IDENTITY, steps)[-1], accumulated(steps, noise.per_tick(1.0))[-1]
+    rng = np.random.default_rng(2)
+    ends = np.array([integrate(se2.IDENTITY, steps + noise.draw(rng, ticks, 1.0))[-1] for _ in range(runs)])
+    errors = np.stack(se2.local(tuple(ends.T), tuple(truth)), axis=1)
+    nees = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(covariance), errors).mean()
+    assert nees == pytest.approx(3.0, abs=4.0 * np.sqrt(6.0 / runs))
+    assert np.cov(errors.T) == pytest.approx(covariance, abs=0.25 * np.sqrt(np.outer(*2 * [np.diag(covariance)])).max())
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_sightings_are_off_the_truth_by_what_their_covariance_says(world):
+    chi2, size = 0.0, 0
+    for seed in range(5):
+        recording = simulate(world, seed, **SMALL[world])
+        at = {stamp_ns: tuple(p) for stamp_ns, p in zip(recording.stamps_ns, recording.T_world_base, strict=True)}
+        for seen in recording.seen:
+            for name, z, covariance in zip(seen.ids, seen.measured, seen.covariance, strict=True):
+                true = se2.between(at[seen.stamp_ns], recording.landmarks[name])
+                error = z - np.array(true[: len(z)])
+                if len(z) == 3:
+                    error[2] = se2.wrap(error[2])
+                chi2 += error @ np.linalg.solve(covariance, error)
+                size += len(z)
+    assert size > 1000
+    # the covariance is taken at the measured bearing, which adds a little: the bound is 5 sigma
+    assert chi2 / size == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / size))
+
+
+def test_all_five_radio_tags_are_seen_at_every_tick_of_the_pythonrobotics_world():
+    recording = simulate("pythonrobotics", 0)
+    assert [p[:2] for p in recording.landmarks.values()] == [(10, -2), (15, 10), (3, 15), (-5, 20), (-5, 5)]
+    assert np.diff(recording.stamps_ns).tolist() == [2_000_000_000] * 50
+    assert [s.ids for s in recording.seen] == [("0", "1", "2", "3", "4")] * 50
+    assert true_twists(recording) == pytest.approx(np.tile([1.0, 0.0, 0.1], (50, 1)))
+
+
+def test_a_tag_is_read_only_in_range_in_view_and_from_its_front():
+    recording = simulate("warehouse", 0)
+    at = {stamp_ns: tuple(p) for stamp_ns, p in zip(recording.stamps_ns, recording.T_world_base, strict=True)}
+    pairs = [(at[s.stamp_ns], recording.landmarks[name]) for s in recording.seen for name in s.ids]
+    robots, tags = (tuple(np.array(side).T) for side in zip(*pairs, strict=True))
+    x, y, _ = se2.between(robots, tags)
+    assert np.hypot(x, y).max() <= 5.0
+    assert np.abs(np.arctan2(y, x)).max() <= np.deg2rad(50.0)
+    x, y, _ = se2.between(tags, robots)
+    assert np.abs(np.arctan2(y, x)).max() <= np.deg2rad(65.0)
+    assert {name[:4] for s in recording.seen for name in s.ids} == {"rack", "wall"}
+
+
+def test_the_robot_drives_through_the_aisles_and_not_through_racks():
+    recording = simulate("warehouse", 0)
+    x, y, _ = recording.T_world_base.T
+    beside_racks = (y > 0.0) & (y < 12.0)
+    from_aisle = np.abs(x - 4.0 * np.round(x / 4.0))
+    assert from_aisle[beside_racks].max() < 4.0 / 2 - 1.6 / 2
+    assert sorted(set(np.round(x[beside_racks] / 4.0))) == [0.0, 1.0, 2.0]
+    assert 120.0 < (recording.stamps_ns[-1] - recording.stamps_ns[0]) * 1e-9 < 180.0
+
+
+def test_following_waypoints_ends_at_the_last_one():
+    waypoints = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 7.0], [3.0, 7.0], [3.0, 20.0]])
+    poses = integrate((0.0, 0.0, 0.0), 0.02 * warehouse.follow(waypoints, 1.2, 1.0, 0.02))
+    assert poses[-1] == pytest.approx([3.0, 20.0, np.pi / 2], abs=0.05)  # a tick is 0.02 m
+
+
+def test_the_manhattan_robot_stays_on_the_streets():
+    recording = simulate("manhattan", 3, poses=200, blocks=3)
+    x, y, _ = recording.T_world_base.T
+    assert min(x.min(), y.min()) > -1e-6
+    assert max(x.max(), y.max()) < 12.0 + 1e-6
+    off_street = np.minimum(np.abs(x - 4.0 * np.round(x / 4.0)), np.abs(y - 4.0 * np.round(y / 4.0)))
+    assert off_street.max() < 1e-6
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_bag_decodes_to_the_measurements_it_was_made_of(world, tmp_path):
+    recording = simulate(world, 1, **SMALL[world])
+    write_bag(recording, tmp_path / "bag.mcap")
+    counters = Counters()
+    border = Border(Config(), counters)
+    decoded = []
+    for record in open_bag(tmp_path / "bag.mcap").messages(["/odom", "/landmarks"]):
+        odometry = record.topic == "/odom"
+        decoded.append(border.odometry(record.cdr) if odometry else border.sightings(record.topic, record.cdr))
+    for a, b in itertools.zip_longest(decoded, measurements(recording)):
+        assert (type(a), a.stamp_ns) == (type(b), b.stamp_ns)
+        if isinstance(a, Odometry):
+            assert a.T_odom_base == pytest.approx(b.T_odom_base, abs=1e-12)
+            assert a.twist_covariance == pytest.approx(b.twist_covariance)
+            continue
+        for one, other in zip(a.sightings, b.sightings, strict=True):
+            assert one.id == other.id
+            assert one.measured == pytest.approx(other.measured, abs=1e-12)
+            assert one.covariance == pytest.approx(other.covariance, abs=1e-12)
+    assert counters.as_dict() == {}
+
+
+def test_a_bag_holds_the_truth_in_world_and_everything_in_order_of_stamp(tmp_path):
+    recording = simulate("warehouse", 1, **SMALL["warehouse"])
+    write_bag(recording, tmp_path / "bag.mcap")
+    bag = open_bag(tmp_path / "bag.mcap")
+    assert {t.name: t.type for t in bag.topics.values()} == {
+        "/odom": "nav_msgs/msg/Odometry",
+        "/landmarks": "vision_msgs/msg/Detection3DArray",
+        "/ground_truth": "geometry_msgs/msg/PoseStamped",
+        "/landmarks_ground_truth": "vision_msgs/msg/Detection3DArray",
+    }
+    order = [(r.log_ns, list(bag.topics).index(r.topic)) for r in bag.messages(list(bag.topics))]
+    assert [stamp_ns for stamp_ns, _ in order] == sorted(stamp_ns for stamp_ns, _ in order)
+    messages = {
+        topic: [typestore().deserialize_cdr(r.cdr, bag.topics[topic].type) for r in bag.messages([topic])]
+        for topic in bag.topics
+    }
+    assert {m.header.frame_id for m in messages["/ground_truth"]} == {"world"}
+    (landmarks,) = messages["/landmarks_ground_truth"]
+    assert landmarks.header.frame_id == "world"
+    assert {d.id: (d.bbox.center.position.x, d.bbox.center.position.y) for d in landmarks.detections} == {
+        name: pose[:2] for name, pose in recording.landmarks.items()
+    }
+    odometry = messages["/odom"][-1]
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_link")
+    assert np.diag(odometry.pose.covariance.reshape(6, 6))[2:5].tolist() == [1e6] * 3
+    assert np.diag(odometry.twist.covariance.reshape(6, 6)) == pytest.approx([0.05**2, 1e-4, 1e6, 1e6, 1e6, 0.05**2])
+    known = evaluation.read_truth(tmp_path / "bag.mcap")
+    assert known.trajectory.poses == pytest.approx(recording.T_world_base)
+
+
+@pytest.mark.parametrize(
+    "world, options, named",
+    [
+        ("mars", {}, "pythonrobotics, manhattan, warehouse"),
+        ("warehouse", {"isles": 3}, "aisles"),
+        ("warehouse", {"aisles": 2.5}, "2.5 is not an integer"),
+        ("warehouse", {"aisles": 1}, "aisles: 1 is not in [2, 100]"),
+        ("manhattan", {"sigma_turn_rad_s": float("nan")}, "sigma_turn_rad_s: nan"),
+        ("pythonrobotics", {"as_original": 1}, "1 is not true or false"),
+    ],
+)
+def test_a_wrong_world_or_option_is_refused_by_name(world, options, named):
+    with pytest.raises(GraphSlamError) as refused:
+        simulate(world, 0, **options)
+    assert named in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def chi2_at(graph, values, label):
+    table = graph.tables[RELATIVE_POSE]
+    residual, _ = RELATIVE_POSE.linearize(values.ravel(), 3 * table.vertices.values, table.measured.values)
+    mine = table.label.values == graph.labels.index(label)
+    whitened = np.einsum("nij,nj->ni", table.sqrt_information.values[mine], residual[mine])
+    return float((whitened**2).sum()), int(mine.sum())
+
+
+@pytest.mark.parametrize("factor", [1.0, 5.0])
+def test_the_truth_explains_a_city_graph_within_its_noise(factor):
+    graph, truth = city_graph(4, poses=3000, blocks=10, odometry_noise_factor=factor)
+    for label in ("odometry", "closures"):
+        chi2, edges = chi2_at(graph, truth, label)
+        assert chi2 / (3 * edges) == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / (3 * edges)))
+    chi2, _ = chi2_at(graph, graph.initial.values.reshape(-1, 3), "odometry")
+    assert chi2 < 1e-12  # it starts at the odometry
+    information = graph.tables[RELATIVE_POSE].sqrt_information.values
+    assert information[0, 0, 0] == pytest.approx(1.0 / (0.05 * factor))
+    assert information[-1, 0, 0] == pytest.approx(1.0 / 0.05)
+
+
+def test_a_city_graph_has_one_closure_per_three_poses_and_each_leads_to_an_old_place_nearby():
+    graph, truth = city_graph(5, poses=6000, blocks=10)
+    table = graph.tables[RELATIVE_POSE]
+    closures = table.vertices.values[table.label.values == graph.labels.index("closures")]
+    assert len(closures) == pytest.approx(6000 / 3, rel=0.02)
+    earlier, later = closures.T
+    assert (later - earlier).min() >= 20
+    assert np.abs(truth[earlier, :2] - truth[later, :2]).max() <= 2.0
+    assert len(np.unique(later)) == len(later)
+    assert [truth[:, :2].min(), truth[:, :2].max()] == [0.0, 40.0]
+
+
+def test_the_noise_of_a_landmark_graphs_odometry_explains_the_true_motion():
+    chi2, size = 0.0, 0
+    for seed in range(20):
+        recording = simulate("pythonrobotics", seed, as_original=True)
+        graph = landmark_graph(recording)
+        table = graph.tables[RELATIVE_POSE]
+        residual, _ = RELATIVE_POSE.linearize(
+            recording.T_world_base.ravel(), 3 * table.vertices.values, table.measured.values
+        )
+        chi2 += float((np.einsum("nij,nj->ni", table.sqrt_information.values, residual) ** 2).sum())
+        size += residual.size
+    assert chi2 / size == pytest.approx(1.0, abs=0.1)  # 3000 residuals: 4 sigma
+
+
+def test_slam_halves_the_position_error_of_dead_reckoning_on_twenty_of_twenty_seeds():
+    pytest.importorskip("evo")
+    ratios = []
+    for seed in range(20):
+        recording = simulate("pythonrobotics", seed)
+        slam = GraphSlam()
+        for measurement in [*measurements(recording), Control("flush"), Control("optimize")]:
+            slam.process(measurement)
+        stamps_s = np.array([s.stamp_ns for s in slam.sighting_poses]) / 1e9
+        at = np.searchsorted(recording.stamps_ns, [s.stamp_ns for s in slam.sighting_poses])
+        truth = Trajectory(recording.stamps_ns / 1e9, recording.T_world_base)
+        estimate = evaluation.path_error(Trajectory(stamps_s, slam.sighting_trajectory()), truth)
+        odometry = evaluation.path_error(Trajectory(stamps_s, recording.T_odom_base[at]), truth)
+        assert estimate.n == odometry.n == 50
+        ratios.append(estimate.position_m["rmse"] / odometry.position_m["rmse"])
+    assert max(ratios) <= 0.5
