@@ -228,15 +228,23 @@ def read_tum(path: Path) -> Trajectory:
         No such file, nothing in it, or rows that are not eight numbers.
     """
     try:
-        rows = np.loadtxt(path, ndmin=2, dtype=float) if path.stat().st_size else np.empty((0, 8))
+        lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
         raise GraphSlamError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
-        raise GraphSlamError(f"{path}: {str(error).splitlines()[0]}") from None
-    if not rows.size:
+    except (OSError, UnicodeDecodeError) as error:
+        raise GraphSlamError(f"{path}: not a readable text file ({type(error).__name__})") from None
+    found = []
+    for number, line in enumerate(lines, start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            try:
+                found.append([float(word) for word in line.split()])
+            except ValueError as error:
+                raise GraphSlamError(f"{path}:{number}: {error}") from None
+            if len(found[-1]) != 8 or not np.isfinite(found[-1]).all():
+                raise GraphSlamError(f"{path}:{number}: a row of a TUM file is eight finite numbers")
+    if not found:
         raise GraphSlamError(f"{path}: no pose in it")
-    if rows.shape[1] != 8 or not np.isfinite(rows).all():
-        raise GraphSlamError(f"{path}: a row of a TUM file is eight finite numbers")
+    rows = np.array(found)
     return _trajectory(rows[:, 0], rows[:, 1:3], rows[:, 4:])
 
 

@@ -1,0 +1,264 @@
+import math
+import sys
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.evaluation import (
+    Trajectory,
+    alignment,
+    associate,
+    evaluate,
+    path_error,
+    read_truth,
+    read_tum,
+)
+from graph_slam_ros.lie import se2
+from graph_slam_ros.ros.bag import BagWriter
+from graph_slam_ros.ros.to_msg import encode, header, heading, make, point, pose, pose_stamped, vector
+from graph_slam_ros.simulation import simulate, write_bag
+
+pytest.importorskip("evo")
+
+START_S = 1_700_000_000
+
+
+def write_tum(path, stamps_s, poses):
+    rows = zip(np.asarray(stamps_s).tolist(), np.asarray(poses).tolist(), strict=True)
+    path.write_text(
+        "".join(f"{s:.9f} {x} {y} 0 0 0 {math.sin(0.5 * a)} {math.cos(0.5 * a)}\n" for s, (x, y, a) in rows)
+    )
+
+
+def write_truth(path, stamps_s, poses, topic="/ground_truth"):
+    with BagWriter(path) as bag:
+        for stamp, p in zip(stamps_s, poses, strict=True):
+            stamp_ns = round(stamp * 1e9)
+            bag.write(topic, "geometry_msgs/msg/PoseStamped", stamp_ns, pose_stamped(stamp_ns, "world", tuple(p)))
+
+
+def eight(count=200, dt_s=0.1):
+    """A figure of eight, which has no symmetry that an alignment could confuse after its first half."""
+    t = np.linspace(0.0, 5.0, count)
+    poses = np.column_stack([4.0 * np.sin(t), 3.0 * np.sin(2.0 * t) + 0.2 * t, se2.wrap(t)])
+    return Trajectory(START_S + dt_s * np.arange(count), poses)
+
+
+def ring(radii, turn=0.0):
+    """Four corners of a square per radius: what moves them outward moves neither their centre nor their direction."""
+    corners = np.arange(4) * 0.5 * np.pi
+    poses = [(r * np.cos(a), r * np.sin(a), turn) for r in radii for a in corners]
+    return Trajectory(START_S + np.arange(len(poses), dtype=float), np.array(poses))
+
+
+def test_known_errors_come_out_with_their_statistics_and_units():
+    error = path_error(ring([2.1, 5.3], turn=0.25).moved((30.0, -7.0, 2.0)), ring([2.0, 5.0]).moved((0.0, 0.0, 0.0)))
+    assert error.position_m == pytest.approx({"rmse": np.sqrt(0.05), "median": 0.2, "max": 0.3})
+    assert error.heading_rad == pytest.approx({"rmse": 0.25, "median": 0.25, "max": 0.25})
+    assert error.n == 8
+
+
+def test_a_rigid_motion_is_no_error():
+    error = path_error(eight().moved((5.0, -3.0, 2.1)), eight())
+    assert error.position_m["max"] < 1e-9
+    assert error.heading_rad["max"] < 1e-7
+
+
+def test_a_wrong_scale_is_an_error():
+    error = path_error(ring([1.1]), ring([1.0]))
+    assert error.position_m["rmse"] == pytest.approx(0.1)
+
+
+def test_the_alignment_stays_in_the_plane_and_never_mirrors():
+    truth = eight().poses[:, :2]
+    mirrored = truth * (1.0, -1.0)
+    x, y = se2.act(alignment(mirrored, truth), tuple(mirrored.T))
+    assert np.hypot(x - truth[:, 0], y - truth[:, 1]).max() > 1.0  # turned over in space it would fit exactly
+    line = np.column_stack([np.arange(5.0), np.zeros(5)])
+    assert alignment(line, line[:, ::-1]) == pytest.approx((0.0, 0.0, np.pi / 2))
+
+
+def test_positions_in_one_place_cannot_be_aligned():
+    with pytest.raises(GraphSlamError, match="in one place"):
+        alignment(np.ones((5, 2)), np.ones((5, 2)))
+
+
+def test_headings_are_compared_across_the_turn_from_plus_to_minus_pi():
+    truth, estimate = eight(), eight()
+    truth.poses[:, 2], estimate.poses[:, 2] = np.pi - 0.01, -np.pi + 0.02
+    assert path_error(estimate, truth).heading_rad["max"] == pytest.approx(0.03)
+
+
+def test_only_stamps_within_a_twentieth_of_a_second_of_the_truth_are_scored():
+    truth = eight()
+    kept = (truth.stamps_s < START_S + 5.0) | (truth.stamps_s > START_S + 12.0)
+    gappy = Trajectory(truth.stamps_s[kept], truth.poses[kept])
+    estimate = Trajectory(truth.stamps_s + 0.04, truth.poses)
+    mine, theirs = associate(estimate, gappy)
+    assert np.abs(mine.stamps_s - theirs.stamps_s).max() < 0.05
+    inside_gap = (mine.stamps_s > START_S + 5.0) & (mine.stamps_s < START_S + 12.0)
+    assert not inside_gap.any()
+    assert len(mine.stamps_s) == kept.sum() - 1  # the last one is past the truth's end
+
+
+def test_nothing_before_or_after_the_truth_is_scored_but_its_ends_are():
+    truth = Trajectory(START_S + np.array([1.0, 2.0, 3.0]), np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
+    stamps = START_S + np.array([0.97, 1.0, 2.0, 3.0, 3.03])
+    mine, _ = associate(Trajectory(stamps, np.zeros((5, 3))), truth)
+    assert (mine.stamps_s - START_S).tolist() == [1.0, 2.0, 3.0]
+
+
+def test_paths_without_common_stamps_are_refused_with_both_spans():
+    truth = eight()
+    with pytest.raises(GraphSlamError, match=r"0 of 200 stamps .* 1700000100\.000 .* 1700000000\.000"):
+        associate(Trajectory(truth.stamps_s + 100.0, truth.poses), truth)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run with a perfect estimate, a dead reckoning of wrong scale, and a map that is 0.1 m wrong."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    truth = eight()
+    write_tum(folder / "sightings.tum", truth.stamps_s, truth.moved((1.0, 2.0, 0.5)).poses)
+    write_tum(folder / "odometry.tum", truth.stamps_s, truth.poses * (1.1, 1.1, 1.0))
+    write_tum(folder / "path.tum", truth.stamps_s[::2], truth.moved((1.0, 2.0, 0.5)).poses[::2])
+    rows = ["id,kind,x,y,theta,sightings,cov_xx,cov_xy,cov_yy"]
+    rows += [f"{name},point,{x},{y},,3,1,0,1" for name, x, y in (("a", 7, 0), ("b", 0, 7), ("c", -7, 0), ("d", 0, -7))]
+    (folder / "landmarks.csv").write_text("\n".join([*rows, "never surveyed,point,50,50,,1,1,0,1"]) + "\n")
+    write_truth(tmp_path / "truth.mcap", truth.stamps_s, truth.poses)
+    return folder
+
+
+def add_true_landmarks(path, landmarks):
+    """A bag with the true path of ``eight`` and the landmarks."""
+    truth = eight()
+
+    def detection(name, x, y):
+        at = pose((x, y, 0.0))
+        box = make("vision_msgs/msg/BoundingBox3D", center=at, size=vector(0, 0))
+        return make("vision_msgs/msg/Detection3D", header=header(1, "world"), results=[], bbox=box, id=name)
+
+    found = [detection(name, x, y) for name, (x, y) in landmarks.items()]
+    message = make("vision_msgs/msg/Detection3DArray", header=header(1, "world"), detections=found)
+    with BagWriter(path) as bag:
+        bag.write("/landmarks_ground_truth", "vision_msgs/msg/Detection3DArray", 1, encode(message))
+        for stamp, p in zip(truth.stamps_s, truth.poses, strict=True):
+            cdr = pose_stamped(round(stamp * 1e9), "world", tuple(p))
+            bag.write("/ground_truth", "geometry_msgs/msg/PoseStamped", round(stamp * 1e9), cdr)
+
+
+def test_the_map_is_aligned_by_itself_and_only_what_both_know_counts(run, tmp_path):
+    # the run's square of 7 m, a quarter turn and 100 m away, and 0.1 m smaller
+    turned = {"a": (100.0, 6.9), "b": (93.1, 0.0), "c": (100.0, -6.9), "d": (106.9, 0.0)}
+    add_true_landmarks(tmp_path / "map.mcap", turned | {"never seen": (0.0, 0.0)})
+    assert evaluate(run, tmp_path / "map.mcap").map_rmse_m == pytest.approx(0.1)
+
+
+def test_a_map_with_fewer_than_two_shared_landmarks_has_no_score(run, tmp_path):
+    add_true_landmarks(tmp_path / "map.mcap", {"a": (0.0, 0.0), "other": (1.0, 1.0)})
+    assert evaluate(run, tmp_path / "map.mcap").as_dict()["map_m"] is None
+
+
+def test_the_scores_as_plain_values_are_exactly_these(run, tmp_path):
+    add_true_landmarks(tmp_path / "map.mcap", {"a": (7.0, 0.0), "b": (0.0, 7.0)})
+    scores = evaluate(run, str(tmp_path / "map.mcap")).as_dict()
+    three = {"rmse", "median", "max"}
+    assert set(scores) == {"position_m", "heading_rad", "map_m", "n", "odometry"}
+    assert set(scores["position_m"]) == set(scores["heading_rad"]) == three
+    assert set(scores["map_m"]) == {"rmse"}
+    assert set(scores["odometry"]) == {"position_m", "heading_rad", "n"}
+    assert scores["n"] == scores["odometry"]["n"] == 200
+    assert scores["position_m"]["max"] < 1e-6 < scores["odometry"]["position_m"]["rmse"]
+
+
+def test_a_run_without_dead_reckoning_or_landmarks_is_scored_without(run, tmp_path):
+    (run / "odometry.tum").unlink()
+    (run / "landmarks.csv").unlink()
+    scores = evaluate(run, tmp_path / "truth.mcap", "path.tum")
+    assert (scores.odometry, scores.map_rmse_m, scores.estimate.n) == (None, None, 100)
+
+
+def test_the_table_tells_metres_and_degrees(run, tmp_path):
+    poses = np.add(eight().poses, (0.0, 0.0, np.deg2rad(3.0)))
+    write_tum(run / "sightings.tum", eight().stamps_s, poses)
+    lines = str(evaluate(run, tmp_path / "truth.mcap")).splitlines()
+    assert [line.split() for line in lines if "estimate" in line] == [
+        ["estimate,", "position", "[m]", "0.000", "0.000", "0.000"],
+        ["estimate,", "heading", "[deg]", "3.00", "3.00", "3.00"],
+    ]
+    assert len({len(line) for line in lines if "landmarks" not in line}) == 1
+
+
+def test_truth_is_read_from_every_type_of_pose(tmp_path):
+    at, q = point(1.0, 2.0, 9.0), heading(2.5)
+    bare = make("geometry_msgs/msg/Pose", position=at, orientation=q)
+    spread = make("geometry_msgs/msg/PoseWithCovariance", pose=bare, covariance=np.zeros(36))
+    still = make("geometry_msgs/msg/Twist", linear=vector(0, 0), angular=vector(0, 0))
+    twist = make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36))
+    moved = make("geometry_msgs/msg/Transform", translation=vector(1.0, 2.0, 9.0), rotation=q)
+    kinds = {
+        "geometry_msgs/msg/PoseStamped": {"pose": bare},
+        "geometry_msgs/msg/PoseWithCovarianceStamped": {"pose": spread},
+        "nav_msgs/msg/Odometry": {"child_frame_id": "base_link", "pose": spread, "twist": twist},
+        "geometry_msgs/msg/TransformStamped": {"child_frame_id": "base_link", "transform": moved},
+    }
+    stamp_ns = START_S * 10**9 + 123_456_789
+    for number, (kind, fields) in enumerate(kinds.items()):
+        with BagWriter(tmp_path / f"{number}.mcap") as bag:
+            bag.write("/here", kind, 1, encode(make(kind, header=header(stamp_ns, "world"), **fields)))
+        trajectory = read_truth(f"{tmp_path / str(number)}.mcap:/here").trajectory
+        assert trajectory.stamps_s.tolist() == [float("1700000000.123456789")]
+        assert trajectory.poses == pytest.approx(np.array([[1.0, 2.0, 2.5]]))
+
+
+def test_the_only_topic_of_poses_besides_the_odometry_is_the_truth(tmp_path):
+    recording = simulate("pythonrobotics", 0, poses=3)
+    write_bag(recording, tmp_path / "bag.mcap")
+    named = read_truth(f"{tmp_path / 'bag.mcap'}:/odom").trajectory.poses
+    assert named == pytest.approx(recording.T_odom_base)
+    assert read_truth(tmp_path / "bag.mcap").trajectory.poses == pytest.approx(recording.T_world_base)
+    write_truth(tmp_path / "vicon.mcap", [1.0, 2.0], [(1, 2, 0), (3, 4, 0)], topic="/vicon")
+    assert read_truth(tmp_path / "vicon.mcap").trajectory.poses[:, 0].tolist() == [1.0, 3.0]
+
+
+def test_an_unknown_topic_is_refused_with_those_that_exist(run, tmp_path):
+    write_bag(simulate("pythonrobotics", 0, poses=3), tmp_path / "bag.mcap")
+    with pytest.raises(GraphSlamError, match=r"no topic /mocap of poses; with poses there are /ground_truth, /odom$"):
+        evaluate(run, f"{tmp_path / 'bag.mcap'}:/mocap")
+    with pytest.raises(GraphSlamError, match=r"no topic /landmarks of poses"):
+        evaluate(run, f"{tmp_path / 'bag.mcap'}:/landmarks")
+
+
+@pytest.mark.parametrize(
+    "text, reason",
+    [
+        ("", "no pose in it"),
+        ("# only a comment\n", "no pose in it"),
+        ("1 2 3\n", "eight finite numbers"),
+        ("1 2 3 0 0 0 nan 1\n", "eight finite numbers"),
+        ("1 two 3 0 0 0 0 1\n", "two"),
+    ],
+)
+def test_a_file_that_is_no_path_is_refused_by_name_in_one_line(tmp_path, text, reason):
+    (tmp_path / "bad.tum").write_text(text)
+    with pytest.raises(GraphSlamError, match=reason) as refused:
+        read_tum(tmp_path / "bad.tum")
+    assert "bad.tum" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_missing_files_are_named(run, tmp_path):
+    with pytest.raises(GraphSlamError, match=r"fused\.tum: no such file"):
+        evaluate(run, tmp_path / "truth.mcap", "fused.tum")
+    with pytest.raises(GraphSlamError, match=r"nowhere\.tum: no such file"):
+        evaluate(run, "nowhere.tum")
+    with pytest.raises(GraphSlamError, match=r"nowhere\.mcap"):
+        evaluate(run, "nowhere.mcap:/ground_truth")
+
+
+def test_without_evo_the_error_says_how_to_get_it(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "evo.core", None)
+    with pytest.raises(GraphSlamError, match=r"pip install 'graph_slam_ros\[evaluate\]'"):
+        evaluate(run, tmp_path / "truth.mcap")
