@@ -64,7 +64,7 @@ def draw_run(run: Path, truth: str | Path | None, out_png: Path) -> None:
         )
     start_x, start_y = path.moved(T_world_map).poses[0, :2]
     axes.plot(start_x, start_y, "o", color=_ESTIMATE, markeredgecolor="white", markersize=7, zorder=7, label="start")
-    _legend(axes)
+    _legend(axes, at=0.5, side="center")
     _save(figure, out_png)
 
 
@@ -99,7 +99,7 @@ def draw_graph(
         elif not edges:
             axes.plot(values[:, 0], values[:, 1], ".", color=_ODOMETRY, markersize=2)
         axes.autoscale_view()
-    _legend(pair[0])
+    _legend(pair[1], at=1.0, side="right")
     _save(figure, out_png)
 
 
@@ -160,11 +160,13 @@ def _figure(count: int = 1) -> Any:
     return figure, (axes[0] if count == 1 else axes)
 
 
-def _legend(axes: Any) -> None:
+def _legend(axes: Any, *, at: float, side: str) -> None:
     """Above the axes, where it covers nothing; faint lines are shown in full colour."""
     handles, labels = axes.get_legend_handles_labels()
-    look = {"frameon": False, "fontsize": 9.5, "columnspacing": 1.6, "handlelength": 1.6}
-    legend = axes.figure.legend(handles, labels, loc="outside upper center", ncols=max(1, len(handles)), **look)
+    if not handles:
+        return
+    look = {"frameon": False, "fontsize": 9.5, "columnspacing": 1.6, "handlelength": 1.6, "borderaxespad": 0.0}
+    legend = axes.legend(handles, labels, loc=f"lower {side}", bbox_to_anchor=(at, 1.01), ncols=len(handles), **look)
     for line in legend.get_lines():
         line.set_alpha(1.0)
         line.set_linewidth(max(1.2, line.get_linewidth()))

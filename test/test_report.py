@@ -83,7 +83,7 @@ def test_paths_have_their_colors_and_axes_their_units_and_one_scale(run, figures
     colors = {line.get_label(): to_hex(line.get_color()) for line in axes.get_lines()}
     assert (colors["truth"], colors["dead reckoning"], colors["estimate"]) == ("#1f6fd6", "#1a1a1a", "#d62728")
     assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_aspect()) == ("x [m]", "y [m]", 1.0)
-    (legend,) = figures[0].legends
+    legend = axes.get_legend()
     assert {text.get_text() for text in legend.get_texts()} == set(colors) | {"landmarks", "true landmarks"}
     image = imread(run / "run.png")
     assert min(image.shape[:2]) > 1000
@@ -125,7 +125,7 @@ def test_a_graph_is_drawn_before_and_after_with_closures_unlike_odometry(tmp_pat
         assert to_hex(drawn["odometry"].get_color()[0]) != to_hex(drawn["closures"].get_color()[0])
         low, high = axes.get_xlim()
         assert low < 0.0 < 10.0 < high
-    (legend,) = figures[0].legends
+    legend = figures[0].axes[1].get_legend()
     assert [text.get_text() for text in legend.get_texts()] == ["odometry", "closures"]
 
 
