@@ -11,19 +11,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
 
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, Message, Schema, Statistics
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
-from rosbags.highlevel.anyreader import AnyReaderError
 
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.mcap_records import contents, is_mcap, records
 from graph_slam_ros.ros.interfaces import typestore
-
-_MCAP_MAGIC = b"\x89MCAP0\r\n"
-_MAX_CHUNK_BYTES = 256 * 2**20  # declared size, checked before anything is decompressed
-_MAX_RECORD_BYTES = 2**30
 
 
 class BagError(GraphSlamError):
@@ -37,12 +31,14 @@ class Topic:
     Attributes
     ----------
     definition : the message definition recorded with it (ROS .msg text), or empty
+    encoding : of its messages
     """
 
     name: str
     type: str
     count: int
     definition: str = ""
+    encoding: str = "cdr"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +70,11 @@ def open_bag(path: Path | str) -> Bag:
     """
     path = Path(path)
     files = _files(path)
-    if all(_is_mcap(file) for file in files):
-        return _McapBag(files)
+    try:
+        if all(is_mcap(file) for file in files):
+            return _McapBag(files)
+    except OSError as error:
+        raise BagError(f"{path}: {error.strerror}") from None
     if path.is_dir() and (path / "metadata.yaml").exists():
         files = [path]
     return _RosbagsBag(files)
@@ -102,14 +101,6 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def _is_mcap(path: Path) -> bool:
-    try:
-        with path.open("rb") as stream:
-            return stream.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
-    except OSError as error:
-        raise BagError(f"{path}: {error.strerror}") from None
-
-
 class _McapBag:
     def __init__(self, files: list[Path]) -> None:
         self._files = files
@@ -117,10 +108,10 @@ class _McapBag:
         self.topics: dict[str, Topic] = {}
         self._expected: dict[Path, int] = {}
         for file in files:
-            schemas, channels, counts = self._declared(file) or self._counted(file)
-            for channel in channels.values():
-                self._add_topic(file, channel, schemas.get(channel.schema_id), counts.get(channel.id, 0))
-            self._expected[file] = sum(counts.values())
+            found = contents(file)
+            self._expected[file] = sum(found.counts.values())
+            for channel in found.channels.values():
+                self._add_topic(file, channel, found.schemas.get(channel.schema_id), found.counts.get(channel.id, 0))
         if not self.topics:
             raise BagError(f"{files[0]}: no topic in it")
 
@@ -128,7 +119,7 @@ class _McapBag:
         for file in self._files:
             names: dict[int, str] = {}
             read = 0
-            for record in self._records(file, self.losses):
+            for record in records(file, self.losses):
                 if isinstance(record, Message):
                     read += 1
                     name = names.get(record.channel_id, "")
@@ -140,77 +131,16 @@ class _McapBag:
                 self.losses.append(f"{file.name}: {self._expected[file] - read} of its messages could not be read")
 
     def _add_topic(self, file: Path, channel: Channel, schema: Schema | None, count: int) -> None:
-        if channel.message_encoding != "cdr":
-            return
-        definition = schema.data.decode(errors="replace") if schema and schema.encoding == "ros2msg" else ""
-        type_name = schema.name if schema else ""
-        if "/msg/" not in type_name and type_name.count("/") == 1:
+        encoding, type_name = channel.message_encoding, schema.name if schema else ""
+        if type_name.count("/") == 1:
             type_name = type_name.replace("/", "/msg/")
+        definition = schema.data.decode(errors="replace") if schema and schema.encoding == "ros2msg" else ""
         old = self.topics.get(channel.topic)
         if old is not None and old.type != type_name:
-            raise BagError(f"{file.name}: topic {channel.topic} is {type_name} here and {old.type} elsewhere in the bag")
-        self.topics[channel.topic] = Topic(channel.topic, type_name, count + (old.count if old else 0), definition)
-
-    def _declared(self, file: Path) -> tuple[dict[int, Schema], dict[int, Channel], dict[int, int]] | None:
-        """What the summary at the end says; None where there is no whole one."""
-        try:
-            with file.open("rb") as stream:
-                summary = make_reader(stream).get_summary()
-        except Exception:  # of a damaged file the library raises almost anything; it is then scanned
-            return None
-        if summary is None or summary.statistics is None or not summary.channels:
-            return None
-        return summary.schemas, summary.channels, summary.statistics.channel_message_counts
-
-    def _counted(self, file: Path) -> tuple[dict[int, Schema], dict[int, Channel], dict[int, int]]:
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        counts: dict[int, int] = {}
-        for record in self._records(file, []):
-            if isinstance(record, Message):
-                counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
-            elif isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-        return schemas, channels, counts
-
-    def _records(self, file: Path, losses: list[str]) -> Iterator[Any]:
-        """Schemas, channels and messages in order; a damaged chunk is passed over, a cut tail ends it."""
-        read = 0
-        with file.open("rb") as stream:
-            reader = StreamReader(stream, emit_chunks=True, record_size_limit=_MAX_RECORD_BYTES)
-            records = reader.records
-            while True:
-                try:
-                    record = next(records)
-                except StopIteration:
-                    return
-                except Exception as error:  # see _declared
-                    losses.append(
-                        f"{file.name}: cut off after {read} messages"
-                        f" ({type(error).__name__} at byte {stream.tell()} of {file.stat().st_size})"
-                    )
-                    return
-                if isinstance(record, Chunk):
-                    for inner in self._unpacked(file, record, losses):
-                        read += isinstance(inner, Message)
-                        yield inner
-                elif isinstance(record, Statistics):
-                    return
-                else:
-                    read += isinstance(record, Message)
-                    yield record
-
-    def _unpacked(self, file: Path, chunk: Chunk, losses: list[str]) -> list[Any]:
-        if chunk.uncompressed_size > _MAX_CHUNK_BYTES:
-            losses.append(f"{file.name}: a chunk of {chunk.uncompressed_size} bytes is over the limit, passed over")
-            return []
-        try:
-            return breakup_chunk(chunk, validate_crc=True)
-        except Exception as error:  # see _declared
-            losses.append(f"{file.name}: a damaged chunk was passed over ({type(error).__name__})")
-            return []
+            raise BagError(f"{file.name}: topic {channel.topic} is {type_name} here, {old.type} elsewhere in the bag")
+        self.topics[channel.topic] = Topic(
+            channel.topic, type_name, count + (old.count if old else 0), definition, encoding
+        )
 
 
 class _RosbagsBag:
@@ -275,9 +205,13 @@ class BagWriter:
         sequence = self._sequence[topic] = self._sequence.get(topic, -1) + 1
         self._writer.add_message(self._channels[topic], stamp_ns, cdr, stamp_ns, sequence)
 
+    def close(self) -> None:
+        """Write the index and close the file."""
+        self._writer.finish()
+        self._stream.close()
+
     def __enter__(self) -> "BagWriter":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._writer.finish()
-        self._stream.close()
+        self.close()

@@ -84,11 +84,14 @@ class OdometryConfig:
         choices=("twist", "density"),
     )
     translation_density: float = _setting(
-        0.02, "random walk of the position, along and across", "m/sqrt(s)", low=1e-6, high=10.0
+        0.02, "random walk of the position along x of the base", "m/sqrt(s)", low=1e-6, high=10.0
+    )
+    lateral_density: float = _setting(
+        0.005, "random walk across; small for wheels, raise it for what can slide or hover", "m/sqrt(s)", low=1e-6, high=10.0
     )
     rotation_density: float = _setting(0.05, "random walk of the heading", "rad/sqrt(s)", low=1e-6, high=10.0)
     twist_correlation_s: float = _setting(
-        1.0, "how long the error of a velocity lasts: the noise of a step is covariance * dt * max(dt, this)", "s", low=0.0
+        0.25, "how long the error of a velocity lasts: the noise of a step is covariance * dt * max(dt, this)", "s", low=0.0
     )
     still_m_s: float = _setting(1e-3, "slower than this and the next, the robot stands: no noise is added", "m/s", low=0.0)
     still_rad_s: float = _setting(1e-3, "see still_m_s", "rad/s", low=0.0)
@@ -100,6 +103,10 @@ class KeyframesConfig:
 
     min_distance_m: float = _setting(0.25, "a keyframe after this distance", "m", low=1e-3)
     min_angle_rad: float = _setting(0.25, "or after this change of heading", "rad", low=1e-3, high=math.pi)
+    max_interval_s: float = _setting(
+        1.0, "or after this much time in motion: odometry's noise grows with time, and sightings in between share it", "s",
+        low=1e-3,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +117,9 @@ class LandmarksConfig:
         "id", "which field of a detection is the landmark's identity", choices=("id", "class_id")
     )
     sigma_m: float = _setting(0.1, "position noise where a message's covariance is all zero (unknown)", "m", low=1e-4)
+    added_sigma_m: float = _setting(
+        0.05, "position noise added to every sighting for what messages leave out: clocks, mounting, size", "m", low=0.0
+    )
     orientation_known_below_rad: float = _setting(
         0.5, "a landmark is a full pose where its heading's standard deviation is below this", "rad", low=0.0
     )
@@ -118,7 +128,7 @@ class LandmarksConfig:
         "robust loss; huber_then_cauchy converges with the first, then with the second",
         choices=("none", "huber", "cauchy", "huber_then_cauchy"),
     )
-    loss_scale: float = _setting(2.0, "residuals well below this many standard deviations count fully", "sigma", low=0.1)
+    loss_scale: float = _setting(3.0, "residuals well below this many standard deviations count fully", "sigma", low=0.1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,14 +151,15 @@ class OrderingConfig:
 class SolveConfig:
     """When and how the graph is solved."""
 
-    every_keyframes: int = _setting(10, "solve after this many keyframes", "keyframes", low=1)
+    every_keyframes: int = _setting(20, "solve after this many keyframes", "keyframes", low=1)
     closure_gap_s: float = _setting(
-        20.0, "and when a landmark returns that was not seen for this long", "s", low=0.0
+        30.0, "and when a landmark returns that was not seen for this long", "s", low=0.0
     )
     method: str = _setting("gn", "gn (damped only where it fails to converge) or lm", choices=("gn", "lm"))
     max_iterations: int = _setting(50, "of each stage of the losses", "", low=1, high=10_000)
     step_tolerance: float = _setting(1e-5, "converged when no step is larger", "m, rad", low=0.0)
-    cost_tolerance: float = _setting(1e-6, "converged when the cost changes by a smaller fraction", "", low=0.0)
+    cost_tolerance: float = _setting(1e-3, "converged when the cost changes by a smaller fraction", "", low=0.0)
+    final_cost_tolerance: float = _setting(1e-9, "the same, for the solve at the end of a run", "", low=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,12 +227,13 @@ class Config:
         """Nested plain values, every parameter named."""
         return dataclasses.asdict(self)
 
-    def solver_settings(self) -> Settings:
-        """How the solver is to be run."""
+    def solver_settings(self, final: bool = False) -> Settings:
+        """How the solver is to be run, online or at the end."""
         scale = self.landmarks.loss_scale
         stages = [Loss.named(name, scale) for name in self.landmarks.loss.split("_then_")]
         s = self.solve
-        return Settings(s.method, s.max_iterations, s.step_tolerance, s.cost_tolerance, {"landmarks": stages})
+        tolerance = s.final_cost_tolerance if final else s.cost_tolerance
+        return Settings(s.method, s.max_iterations, s.step_tolerance, tolerance, {"landmarks": stages})
 
 
 def parameters() -> Iterator[Parameter]:

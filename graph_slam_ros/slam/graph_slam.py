@@ -25,9 +25,11 @@ from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.measurements import Control, Measurement, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.motion import Motion
 from graph_slam_ros.slam.stamp_order import NS, StampOrder
-from graph_slam_ros.solver import Report, Solver
+from graph_slam_ros.solver import Report, Settings, Solver
 
 Array = NDArray[np.float64]
+
+_LEAST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-10])  # 0.1 mm, 0.01 mrad: a motion is never certain
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +111,7 @@ class GraphSlam:
                 self._use(self._order.flush())
                 self._drop_unreached()
             case Control("optimize"):
-                self._solve()
+                self._solve(self.config.solver_settings(final=True))
             case Control():
                 self.counters.count("control", f"unknown event {measurement.event}")
             case _:
@@ -125,10 +127,15 @@ class GraphSlam:
 
     def sighting_trajectory(self) -> Array:
         """Estimated poses ``T_map_base`` at the stamps of the sightings, (n, 3)."""
-        if not self.sighting_poses:
-            return np.empty((0, 3))
-        keyframes = self.trajectory()[[s.keyframe for s in self.sighting_poses]]
-        since = np.array([s.T_keyframe_base for s in self.sighting_poses])
+        return self._at_sightings(self.trajectory())
+
+    def sighting_odometry(self) -> Array:
+        """What odometry alone says, ``T_odom_base`` at the stamps of the sightings, (n, 3)."""
+        return self._at_sightings(np.array([k.T_odom_base for k in self.keyframes]).reshape(-1, 3))
+
+    def _at_sightings(self, keyframe_poses: Array) -> Array:
+        keyframes = keyframe_poses[[s.keyframe for s in self.sighting_poses]]
+        since = np.array([s.T_keyframe_base for s in self.sighting_poses]).reshape(-1, 3)
         return np.stack(se2.compose(tuple(keyframes.T), tuple(since.T)), axis=-1)
 
     @property
@@ -172,10 +179,13 @@ class GraphSlam:
         self._see_waiting(m)
         self._motion.step(self._odometry, m)
         self._odometry = m
-        x, y, theta = self._motion.T_keyframe_base
-        keyframes = self.config.keyframes
-        if x * x + y * y >= keyframes.min_distance_m**2 or abs(theta) >= keyframes.min_angle_rad:
+        if self._keyframe_due():
             self._next_keyframe(m)
+
+    def _keyframe_due(self) -> bool:
+        due, (x, y, theta) = self.config.keyframes, self._motion.T_keyframe_base
+        far = x * x + y * y >= due.min_distance_m**2 or abs(theta) >= due.min_angle_rad
+        return far or self._motion.moving_s >= due.max_interval_s
 
     def _first_keyframe(self, m: Odometry) -> None:
         """Map begins where odom begins: the first pose is anchored at its odometry pose."""
@@ -190,7 +200,7 @@ class GraphSlam:
     def _next_keyframe(self, m: Odometry) -> None:
         motion, last = self._motion, self.keyframes[-1]
         vertex = self.graph.add_vertex(SE2, se2.compose(self._pose(last), motion.T_keyframe_base))
-        noise = Gaussian.from_covariance(motion.covariance)
+        noise = Gaussian.from_covariance(motion.covariance + _LEAST_COVARIANCE)
         edge = self.graph.add_edge(RELATIVE_POSE, [last.vertex, vertex], motion.T_keyframe_base, noise, "odometry")
         self.solver.add([vertex], [edge])
         self.keyframes.append(Keyframe(vertex, m.stamp_ns, m.T_odom_base))
@@ -204,9 +214,11 @@ class GraphSlam:
 
     def _on_sightings(self, m: Sightings) -> None:
         """Use what was seen at the newest odometry; what is newer waits for the odometry on its other side."""
-        if not self.keyframes or m.stamp_ns < self.keyframes[-1].stamp_ns:
-            self.counters.count(m.topic, "late" if self.keyframes else "before_odometry", len(m.sightings))
-        elif self._odometry is not None and m.stamp_ns == self._odometry.stamp_ns:
+        if self._odometry is None or m.stamp_ns < self.keyframes[0].stamp_ns:
+            self.counters.count(m.topic, "before_odometry", len(m.sightings))
+        elif m.stamp_ns < self._odometry.stamp_ns:
+            self.counters.count(m.topic, "late", len(m.sightings))
+        elif m.stamp_ns == self._odometry.stamp_ns:
             self._see(m, self._motion.T_keyframe_base, self._motion.covariance)
         else:
             self._waiting.append(m)
@@ -253,6 +265,7 @@ class GraphSlam:
             edge_type = RELATIVE_POSE
         else:
             edge_type = LANDMARK_POSITION if self.graph.kind_of(landmark.vertex) is R2 else TAG_POSITION
+        covariance[:2, :2] += self.config.landmarks.added_sigma_m**2 * np.eye(2)
         noise = Gaussian.from_covariance(covariance)
         edge = self.graph.add_edge(edge_type, [keyframe.vertex, landmark.vertex], measured, noise, "landmarks")
         self.solver.add(new_vertices, [edge])
@@ -263,11 +276,11 @@ class GraphSlam:
 
     # -- solving -------------------------------------------------------------------------------------------------
 
-    def _solve(self) -> None:
+    def _solve(self, settings: Settings | None = None) -> None:
         self._unsolved_keyframes, self._closure = 0, False
         if not self.keyframes:
             return
-        self.reports.append(self.solver.update())
+        self.reports.append(self.solver.update(settings))
         (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
 
     def _pose(self, keyframe: Keyframe) -> se2.Pose:

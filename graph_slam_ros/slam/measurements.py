@@ -63,7 +63,11 @@ _NAMES = {cls: name for name, cls in _TYPES.items()}
 
 def to_record(measurement: Measurement) -> dict[str, Any]:
     """Plain dictionary of a measurement; floats survive JSON exactly."""
-    return {"type": _NAMES[type(measurement)], **asdict(measurement)}
+    match measurement:
+        case Odometry(stamp_ns, pose, covariance):  # by hand: thousands a second
+            return {"type": "odometry", "stamp_ns": stamp_ns, "T_odom_base": pose, "twist_covariance": covariance}
+        case _:
+            return {"type": _NAMES[type(measurement)], **asdict(measurement)}
 
 
 def from_record(record: dict[str, Any]) -> Measurement:

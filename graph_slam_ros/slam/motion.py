@@ -17,18 +17,20 @@ class Motion:
     since errors of velocity last for about tau. A robot that stands gathers none.
     """
 
-    __slots__ = ("T_keyframe_base", "_config", "_density", "covariance")
+    __slots__ = ("T_keyframe_base", "_config", "_density", "covariance", "moving_s")
 
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config
-        t, r = config.translation_density, config.rotation_density
-        self._density = np.diag([t * t, t * t, r * r])
+        self._density = np.diag(
+            np.square([config.translation_density, config.lateral_density, config.rotation_density])
+        )
         self.restart()
 
     def restart(self) -> None:
         """Begin at a new keyframe."""
         self.T_keyframe_base: se2.Pose = se2.IDENTITY
         self.covariance: Array = np.zeros((3, 3))
+        self.moving_s = 0.0
 
     def step(self, a: Odometry, b: Odometry) -> None:
         """Go on from odometry a to odometry b."""
@@ -51,6 +53,7 @@ class Motion:
         c = self._config
         if step[0] ** 2 + step[1] ** 2 < (c.still_m_s * dt) ** 2 and abs(step[2]) < c.still_rad_s * dt:
             return np.zeros((3, 3))
+        self.moving_s += dt
         if c.noise == "twist" and source.twist_covariance is not None:
             return np.array(source.twist_covariance).reshape(3, 3) * (dt * max(dt, c.twist_correlation_s))
         return self._density * dt

@@ -29,7 +29,7 @@ class Solver:
         self._held = np.zeros(0, dtype=bool)
         self._edges = np.zeros(0, dtype=bool)
         self._problem: Problem | None = None
-        self._solved = False
+        self._solved_with: Settings | None = None
 
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Take vertices (at their initial values) and edges of the graph into the problem, by id, each once."""
@@ -57,7 +57,7 @@ class Solver:
         table, row = self.graph.row(edge)
         was = table.weight.values[row]
         table.weight.values[row] = weight
-        self._solved = False
+        self._solved_with = None
         if (was == 0.0) != (weight == 0.0):
             self._structure_changed()
 
@@ -78,13 +78,13 @@ class Solver:
         settings = settings or self.settings
         self._grow()
         problem = self._structure()
-        if self._solved or not len(problem.normal.free):
+        if self._solved_with == settings or not len(problem.normal.free):
             blocks = problem.linearize(self._x, settings.stages()[-1])
             chi2, cost = total(blocks)
             return Report("gn", "nothing_to_do", chi2, chi2, cost, cost, (), by_class(self.graph, blocks))
         check_gauge(self.graph, problem.normal.free, np.flatnonzero(self._inside & self._held), problem.rows)
         self._x, report = minimise(problem, self._x, settings)
-        self._solved = True
+        self._solved_with = settings
         return report
 
     def estimate(self, ids: ArrayLike) -> Array:
@@ -144,7 +144,7 @@ class Solver:
 
     def _structure_changed(self) -> None:
         self._problem = None
-        self._solved = False
+        self._solved_with = None
 
     def _structure(self) -> Problem:
         if self._problem is None:

@@ -1,0 +1,96 @@
+"""Parameter files: YAML as ROS reads it, strictly. One file serves ``ros2 launch`` and ``graph_slam replay``."""
+
+from collections.abc import Hashable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from graph_slam_ros.errors import ConfigError
+
+_MAX_BYTES = 2**20
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Refuses a key given twice, of which YAML would silently keep the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=deep)
+            if key in seen:
+                raise ConfigError(f"line {key_node.start_mark.line + 1}: {key!r} is given twice")
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def read_parameters(path: Path | str) -> dict[str, Any]:
+    """Nested values of a parameter file; a ROS wrapper (``/**: ros__parameters: ...``) is taken off.
+
+    Raises
+    ------
+    ConfigError
+        Naming the file and what is wrong.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ConfigError(f"{path}: larger than {_MAX_BYTES} bytes")
+        values = yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(f"{path}: not valid YAML ({' '.join(str(error).split())[:200]})") from None
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: not a mapping of parameters")
+    return _unwrapped(path, values)
+
+
+def _unwrapped(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
+    wrapped = [v for v in values.values() if isinstance(v, dict) and "ros__parameters" in v]
+    if wrapped and len(values) > 1:
+        raise ConfigError(f"{path}: parameters of several nodes ({', '.join(map(str, values))}); give a file of one")
+    inner = wrapped[0]["ros__parameters"] if wrapped else values
+    if not isinstance(inner, dict):
+        raise ConfigError(f"{path}: ros__parameters is not a mapping")
+    for key in inner:
+        if not isinstance(key, str):
+            raise ConfigError(f"{path}: {key!r} is not a name")
+    return inner
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """``key=value`` of a command line, the value read as YAML reads it."""
+    key, separator, value = text.partition("=")
+    if not separator or not key:
+        raise ConfigError(f"{text!r} is not key=value")
+    try:
+        return key, yaml.load(value, Loader=_StrictLoader)
+    except yaml.YAMLError:
+        raise ConfigError(f"{key}: {value!r} is not a valid value") from None
+
+
+def parameters_text(values: Mapping[str, Mapping[str, Any]], notes: Mapping[str, str] | None = None) -> str:
+    """A parameter file with every value, and a comment above each that has a note (by ``section.key``)."""
+    lines = ["/**:", "  ros__parameters:"]
+    for section, members in values.items():
+        lines.append(f"    {section}:")
+        for key, value in members.items():
+            note = (notes or {}).get(f"{section}.{key}")
+            if note:
+                lines.append(f"      # {note}")
+            lines.append(f"      {key}: {_scalar(value)}")
+    return "\n".join(lines) + "\n"
+
+
+def _scalar(value: Any) -> str:
+    if isinstance(value, float):  # YAML 1.1 reads 1e-05 as a text
+        text = repr(value)
+        return text if "." in text or "e" not in text else text.replace("e", ".0e")
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f'"{value}"' if isinstance(value, str) else str(value)

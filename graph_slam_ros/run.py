@@ -1,0 +1,190 @@
+"""The run folder: everything a run leaves behind, written the same way by the node and by replay.
+
+``graph.g2o`` and ``graph_vertices.csv`` (stamp and name of each vertex), ``path.tum``, ``sightings.tum``,
+``odometry.tum``, ``landmarks.csv``, ``run.mcap``, ``ingest.mcap``, ``config.yaml``, ``run.json``.
+"""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros import __version__
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.g2o import G2oFile, write_g2o
+from graph_slam_ros.formats.ingest import IngestWriter, ingest_files
+from graph_slam_ros.formats.parameters import parameters_text, read_parameters
+from graph_slam_ros.formats.tum import tum_text
+from graph_slam_ros.ros import results
+from graph_slam_ros.ros.bag import BagWriter
+from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
+from graph_slam_ros.slam.measurements import to_record
+
+SUMMARY = "run.json"
+
+_PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
+
+
+class RunError(GraphSlamError):
+    """A run folder that cannot be written or read."""
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder holds a run: an ingest sequence and the configuration it was taken with."""
+    return folder.is_dir() and (folder / "config.yaml").is_file() and bool(ingest_files(folder))
+
+
+def run_config(folder: Path) -> Config:
+    """The configuration a run was made with."""
+    return Config.from_mapping(read_parameters(folder / "config.yaml"))
+
+
+class RunRecorder:
+    """Records a run while it goes on, and saves its results.
+
+    Parameters
+    ----------
+    folder : made if it is not there; an earlier run in it is replaced, other contents are refused
+    """
+
+    def __init__(self, folder: Path | str, config: Config) -> None:
+        self.folder = Path(folder)
+        self._part = 0
+        self._ingest: IngestWriter | None = None
+        self._bag: BagWriter | None = None
+        self._next_path_at = 1.0
+        _make_room(self.folder)
+        _replace(self.folder / "config.yaml", parameters_text(config.as_mapping()))
+
+    def sink(self, measurement: Measurement) -> None:
+        """Append to the ingest sequence: the sink of ``GraphSlam``."""
+        if self._ingest is None:
+            self._ingest = IngestWriter(self._part_of("ingest"))
+        self._ingest.write(to_record(measurement))
+
+    def record(self, slam: GraphSlam, update: Update) -> None:
+        """Append what an update changed: pose and TF, and the path and the landmarks when they have grown."""
+        if not update.keyframes:
+            return
+        stamp = slam.keyframes[-1].stamp_ns
+        self._write("/tf", results.TF, stamp, results.map_to_odom(slam, stamp))
+        self._write("/tf", results.TF, stamp, results.odom_to_base(slam))
+        self._write("/pose", results.POSE, stamp, results.pose(slam))
+        if len(slam.keyframes) >= self._next_path_at:
+            self._next_path_at = len(slam.keyframes) * _PATH_GROWTH
+            self._record_map(slam)
+
+    def save(self, slam: GraphSlam, summary: dict[str, Any] | None = None) -> Path:
+        """Write all results; recording may go on, in new parts of ``ingest`` and ``run``. Returns the folder."""
+        if slam.keyframes:
+            self._record_map(slam)
+        self.close()
+        _write_graph(self.folder, slam)
+        stamps = [k.stamp_ns for k in slam.keyframes]
+        _replace(self.folder / "path.tum", tum_text(stamps, slam.trajectory()))
+        stamps = [s.stamp_ns for s in slam.sighting_poses]
+        _replace(self.folder / "sightings.tum", tum_text(stamps, slam.sighting_trajectory()))
+        _replace(self.folder / "odometry.tum", tum_text(stamps, slam.sighting_odometry()))
+        _replace(self.folder / "landmarks.csv", _landmark_table(slam))
+        _replace(self.folder / SUMMARY, json.dumps(summarize(slam) | (summary or {}), indent=2) + "\n")
+        return self.folder
+
+    def close(self) -> None:
+        """End the present part of the recording."""
+        for writer in (self._ingest, self._bag):
+            if writer is not None:
+                writer.close()
+        if self._ingest is not None or self._bag is not None:
+            self._part += 1
+        self._ingest = self._bag = None
+
+    def _record_map(self, slam: GraphSlam) -> None:
+        stamp = slam.keyframes[-1].stamp_ns
+        self._write("/path", results.PATH, stamp, results.path(slam))
+        self._write("/landmarks", results.LANDMARKS, stamp, results.landmarks(slam))
+
+    def _write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
+        if self._bag is None:
+            self._bag = BagWriter(self._part_of("run"))
+        self._bag.write(topic, type_name, stamp_ns, cdr)
+
+    def _part_of(self, name: str) -> Path:
+        return self.folder / (f"{name}_{self._part}.mcap" if self._part else f"{name}.mcap")
+
+
+def summarize(slam: GraphSlam) -> dict[str, Any]:
+    """What happened, in numbers."""
+    last = slam.reports[-1] if slam.reports else None
+    return {
+        "version": __version__,
+        "keyframes": len(slam.keyframes),
+        "landmarks": len(slam.landmarks),
+        "sightings": sum(landmark.sightings for landmark in slam.landmarks.values()),
+        "edges": slam.graph.edge_count,
+        "solves": len(slam.reports),
+        "chi2": last.chi2_final if last else 0.0,
+        "cost": last.cost_final if last else 0.0,
+        "converged": last.converged if last else True,
+        "stop": last.stop if last else "nothing_to_do",
+        "classes": {name: {"edges": c.edges, "chi2": c.chi2} for name, c in (last.classes if last else {}).items()},
+        "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
+        "counters": slam.counters.as_dict(),
+    }
+
+
+def _write_graph(folder: Path, slam: GraphSlam) -> None:
+    """Poses are numbered from 0 in order of time, landmarks after them: other tools read odometry from that."""
+    names: list[tuple[int, str, int | str, str]] = []
+    for k, keyframe in enumerate(slam.keyframes):
+        names.append((keyframe.vertex, "keyframe", keyframe.stamp_ns, str(k)))
+    for name, landmark in slam.landmarks.items():
+        names.append((landmark.vertex, "landmark", "", name))
+    ids = [0] * slam.graph.vertex_count
+    rows = ["id,vertex,stamp_ns,name"]
+    for file_id, (vertex, what, stamp, name) in enumerate(names):
+        ids[vertex] = file_id
+        rows.append(f"{file_id},{what},{stamp},{_csv(name)}")
+    target = folder / "graph.g2o"
+    write_g2o(_temporary(target), G2oFile(slam.graph, ids), slam.solver.estimate)
+    os.replace(_temporary(target), target)
+    _replace(folder / "graph_vertices.csv", "\n".join(rows) + "\n")
+
+
+def _landmark_table(slam: GraphSlam) -> str:
+    rows = ["id,kind,x,y,theta,sightings,cov_xx,cov_xy,cov_yy"]
+    for name, value, covariance in results.landmark_estimates(slam):
+        kind, theta = ("pose", repr(value[2])) if len(value) == 3 else ("point", "")
+        spread = f"{covariance[0, 0]:.6e},{covariance[0, 1]:.6e},{covariance[1, 1]:.6e}"
+        seen = slam.landmarks[name].sightings
+        rows.append(f"{_csv(name)},{kind},{value[0]!r},{value[1]!r},{theta},{seen},{spread}")
+    return "\n".join(rows) + "\n"
+
+
+def _csv(text: str) -> str:
+    return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\n\r') else text
+
+
+def _make_room(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        present = list(folder.iterdir())
+        if present and not is_run(folder):
+            raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
+        for file in present:
+            if file.name == SUMMARY or file.suffix == ".mcap" and file.stem.split("_")[0] in ("ingest", "run"):
+                file.unlink()
+    except OSError as error:
+        raise RunError(f"{folder}: {error.strerror}") from None
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(path.name + ".new")
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write whole or not at all."""
+    try:
+        _temporary(path).write_text(text, encoding="utf-8")
+        os.replace(_temporary(path), path)
+    except OSError as error:
+        raise RunError(f"{path}: {error.strerror}") from None
