@@ -28,7 +28,7 @@ def draw_run(run: Path, truth: str | Path | None, out_png: Path) -> None:
 
     Parameters
     ----------
-    run : folder with ``path.tum``, ``sightings.tum`` and, where there are any, ``odometry.tum`` and ``landmarks.csv``
+    run : folder with ``path.tum`` and, where there are any, ``sightings.tum``, ``odometry.tum`` and ``landmarks.csv``
     truth : ``BAG``, ``BAG:TOPIC``, ``FILE.tum`` or None
 
     Raises
@@ -45,7 +45,9 @@ def draw_run(run: Path, truth: str | Path | None, out_png: Path) -> None:
     if truth is not None:
         known = evaluation.read_truth(truth)
         true_landmarks = known.landmarks
-        T_world_map = _onto(evaluation.read_tum(run / "sightings.tum"), known.trajectory)
+        scored = run / "sightings.tum"
+        has_sightings = scored.exists() and scored.stat().st_size > 0
+        T_world_map = _onto(evaluation.read_tum(scored) if has_sightings else path, known.trajectory)
         if odometry is not None:
             odometry = odometry.moved(_onto(odometry, known.trajectory))
         _draw_path(axes, _with_gaps(_within(known.trajectory, path)), "truth", _TRUTH, 2.4, 2)

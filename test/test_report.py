@@ -99,6 +99,16 @@ def test_without_truth_or_landmarks_the_run_is_drawn_in_its_own_frame(run, recor
     assert lines(axes)["estimate"] == pytest.approx(np.add(recording.T_world_base[:, :2], (40.0, 0.0)), abs=1e-6)
 
 
+@pytest.mark.parametrize("left", [None, ""])
+def test_a_run_that_saw_nothing_is_aligned_by_its_keyframes(run, recording, figures, left):
+    pytest.importorskip("evo")
+    (run / "sightings.tum").unlink()
+    if left is not None:
+        (run / "sightings.tum").write_text(left)
+    draw_run(run, run / "bag.mcap", run / "run.png")
+    assert lines(figures[0].axes[0])["estimate"] == pytest.approx(recording.T_world_base[:, :2], abs=1e-6)
+
+
 def test_no_line_crosses_a_gap_in_the_truth_and_none_of_it_outside_the_run_is_drawn(run, recording, figures):
     pytest.importorskip("evo")
     stamps_s = recording.stamps_ns / 1e9
