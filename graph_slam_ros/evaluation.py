@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 MAX_STAMP_DIFFERENCE_S = 0.05
 TRUTH_TOPIC = "/ground_truth"
 TRUE_LANDMARKS_TOPIC = "/landmarks_ground_truth"
+_ODOMETRY_TOPIC = "/odom"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _POSE_TYPES = (
     "geometry_msgs/msg/PoseStamped",
@@ -286,12 +287,13 @@ def read_truth(truth: str | Path) -> Truth:
 
 
 def _truth_topic(bag: Bag, path: Path) -> str:
-    """``/ground_truth``, or the only topic of poses that is not odometry."""
+    """``/ground_truth``, or the only topic of poses besides the odometry (of its type only where there is no other)."""
     if TRUTH_TOPIC in bag.topics:
         return TRUTH_TOPIC
-    poses = [t.name for t in bag.topics.values() if t.type in _POSE_TYPES and t.type != _ODOMETRY]
-    if len(poses) == 1:
-        return poses[0]
+    poses = [t for t in bag.topics.values() if t.type in _POSE_TYPES and t.name != _ODOMETRY_TOPIC]
+    best = [t.name for t in poses if t.type != _ODOMETRY] or [t.name for t in poses]
+    if len(best) == 1:
+        return best[0]
     raise GraphSlamError(f"{path}: no topic {TRUTH_TOPIC}; name the truth as BAG:TOPIC, {_listed(bag)}")
 
 

@@ -213,14 +213,43 @@ def test_truth_is_read_from_every_type_of_pose(tmp_path):
         assert trajectory.poses == pytest.approx(np.array([[1.0, 2.0, 2.5]]))
 
 
-def test_the_only_topic_of_poses_besides_the_odometry_is_the_truth(tmp_path):
-    recording = simulate("pythonrobotics", 0, poses=3)
-    write_bag(recording, tmp_path / "bag.mcap")
-    named = read_truth(f"{tmp_path / 'bag.mcap'}:/odom").trajectory.poses
-    assert named == pytest.approx(recording.T_odom_base)
-    assert read_truth(tmp_path / "bag.mcap").trajectory.poses == pytest.approx(recording.T_world_base)
-    write_truth(tmp_path / "vicon.mcap", [1.0, 2.0], [(1, 2, 0), (3, 4, 0)], topic="/vicon")
-    assert read_truth(tmp_path / "vicon.mcap").trajectory.poses[:, 0].tolist() == [1.0, 3.0]
+def write_topics(path, **kinds):
+    """A bag with one message, at x = 1, 2, ..., on each of the topics."""
+    with BagWriter(path) as bag:
+        for x, (name, kind) in enumerate(kinds.items(), start=1):
+            fields = {"header": header(1, "world"), "pose": pose((x, 0, 0))}
+            if kind == "nav_msgs/msg/Odometry":
+                still = make("geometry_msgs/msg/Twist", linear=vector(0, 0), angular=vector(0, 0))
+                fields["pose"] = make(
+                    "geometry_msgs/msg/PoseWithCovariance", pose=fields["pose"], covariance=np.zeros(36)
+                )
+                fields["twist"] = make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36))
+                fields["child_frame_id"] = "base_link"
+            bag.write(f"/{name}", kind, 1, encode(make(kind, **fields)))
+
+
+@pytest.mark.parametrize(
+    "topics, chosen",
+    [
+        ({"a": "PoseStamped", "odom": "Odometry", "ground_truth": "PoseStamped"}, 3),
+        ({"odom": "Odometry", "vicon": "PoseStamped"}, 2),
+        ({"wheels": "Odometry", "vicon": "PoseStamped"}, 2),
+        ({"odom": "Odometry", "vicon": "Odometry"}, 2),
+    ],
+)
+def test_the_truth_is_its_usual_topic_or_the_only_one_of_poses_besides_the_odometry(tmp_path, topics, chosen):
+    kinds = {"PoseStamped": "geometry_msgs/msg/PoseStamped", "Odometry": "nav_msgs/msg/Odometry"}
+    write_topics(tmp_path / "bag.mcap", **{name: kinds[kind] for name, kind in topics.items()})
+    assert read_truth(tmp_path / "bag.mcap").trajectory.poses[:, 0].tolist() == [chosen]
+
+
+@pytest.mark.parametrize("names", [["odom"], ["wheels", "vicon"]])
+def test_where_the_truth_cannot_be_told_it_must_be_named(tmp_path, names):
+    write_topics(tmp_path / "bag.mcap", **dict.fromkeys(names, "nav_msgs/msg/Odometry"))
+    with pytest.raises(GraphSlamError, match="name the truth as BAG:TOPIC") as refused:
+        read_truth(tmp_path / "bag.mcap")
+    assert all(f"/{name}" in str(refused.value) for name in names)
+    assert read_truth(f"{tmp_path / 'bag.mcap'}:/{names[0]}").trajectory.poses[:, 0].tolist() == [1.0]
 
 
 def test_an_unknown_topic_is_refused_with_those_that_exist(run, tmp_path):
