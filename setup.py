@@ -77,7 +77,7 @@ setup(
     entry_points={
         "console_scripts": [
             "graph_slam = graph_slam_ros.cli:main",
-            "graph_slam_node = graph_slam_ros.ros.node:main",
+            "graph_slam_node = graph_slam_ros.cli:node_main",
         ],
     },
 )

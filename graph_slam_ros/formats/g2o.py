@@ -19,6 +19,7 @@ from graph_slam_ros.graph import (
     R2,
     RELATIVE_POSE,
     SE2,
+    TAG_POSITION,
     EdgeType,
     Gaussian,
     Graph,
@@ -36,6 +37,7 @@ _EDGE_TAGS: dict[str, EdgeType] = {
     "EDGE_SE2": RELATIVE_POSE,
     "EDGE_SE2_XY": LANDMARK_POSITION,
     "EDGE_PRIOR_SE2": POSE_PRIOR,
+    "EDGE_SE2_POSITION": TAG_POSITION,  # ours: of a landmark that is a pose, only the position was seen
 }
 ERROR_MAPS = {"relative": RELATIVE_POSE, "seed": INVERSE_RELATIVE_POSE}
 
@@ -270,7 +272,7 @@ def _by_label(tag: str, edges: list[_Edge], follows: dict[int, int]) -> list[tup
         closures = [e for e in edges if follows.get(e.vertices[0]) != e.vertices[1]]
         groups = [("odometry", odometry), ("closures", closures)]
     else:
-        groups = [("landmarks" if tag == "EDGE_SE2_XY" else "priors", edges)]
+        groups = [("priors" if tag == "EDGE_PRIOR_SE2" else "landmarks", edges)]
     return [(label, members) for label, members in groups if members]
 
 

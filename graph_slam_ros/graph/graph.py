@@ -82,6 +82,7 @@ class Graph:
     ----------
     kind : code of each vertex's kind, an index into ``kinds``
     offset : where each vertex begins in ``initial``, the stored numbers of all vertices end to end
+    table_of_edge, row_of_edge : of each edge, its table (counted in the order of ``tables``) and row
     """
 
     def __init__(self) -> None:
@@ -91,7 +92,8 @@ class Graph:
         self.initial = Column(np.float64)
         self.tables: dict[EdgeType, EdgeTable] = {}
         self.labels: list[str] = []
-        self._row_of_edge: list[tuple[EdgeTable, int]] = []
+        self.table_of_edge = Column(np.int64)
+        self.row_of_edge = Column(np.int64)
 
     @property
     def vertex_count(self) -> int:
@@ -99,7 +101,7 @@ class Graph:
 
     @property
     def edge_count(self) -> int:
-        return len(self._row_of_edge)
+        return len(self.row_of_edge)
 
     def add_vertices(self, kind: VertexKind, values: ArrayLike) -> Index:
         """Add n vertices with initial values (n, size); returns their ids."""
@@ -134,7 +136,8 @@ class Graph:
         self._check(edge, at, z, noise)
         table = self.tables.setdefault(edge, EdgeTable(edge))
         ids, count = np.arange(self.edge_count, self.edge_count + len(at)), len(at)
-        self._row_of_edge.extend((table, row) for row in range(len(table), len(table) + count))
+        self.table_of_edge.extend(list(self.tables).index(edge), count)
+        self.row_of_edge.extend(np.arange(len(table), len(table) + count), count)
         table.id.extend(ids, count)
         table.vertices.extend(at, count)
         table.measured.extend(z, count)
@@ -155,7 +158,7 @@ class Graph:
 
     def row(self, edge_id: int) -> tuple[EdgeTable, int]:
         """The table and row of an edge."""
-        return self._row_of_edge[edge_id]
+        return list(self.tables.values())[self.table_of_edge.values[edge_id]], int(self.row_of_edge.values[edge_id])
 
     def _label_code(self, label: str) -> int:
         if label not in self.labels:

@@ -18,7 +18,7 @@ class Gaussian:
 
     Attributes
     ----------
-    sqrt_information : (m, m) or (n, m, m), upper triangular R with ``R'R = Omega``: ``R r`` has unit covariance.
+    sqrt_information : (m, m) or (n, m, m), R with ``R'R = Omega``: ``R r`` has unit covariance.
     """
 
     sqrt_information: Array
@@ -31,8 +31,7 @@ class Gaussian:
     @classmethod
     def from_covariance(cls, covariance: ArrayLike) -> "Gaussian":
         """From Sigma, (m, m) or (n, m, m). Raises NoiseError naming the first matrix that is not SPD."""
-        lower = _cholesky(covariance, "covariance")
-        return cls.from_information(np.linalg.inv(lower @ np.swapaxes(lower, -1, -2)))
+        return cls(np.linalg.inv(_cholesky(covariance, "covariance")))
 
     @classmethod
     def from_sigmas(cls, *sigmas: float) -> "Gaussian":
@@ -49,23 +48,32 @@ def _cholesky(matrices: ArrayLike, what: str) -> Array:
     a = np.asarray(matrices, dtype=float)
     if a.ndim not in (2, 3) or a.shape[-1] != a.shape[-2]:
         raise NoiseError(f"{what}: expected a square matrix or a stack of them, got shape {a.shape}")
-    stack = a.reshape(-1, *a.shape[-2:])
+    transposed = np.swapaxes(a, -1, -2)
+    with np.errstate(invalid="ignore"):
+        asymmetry = np.abs(a - transposed).max(axis=(-1, -2), initial=0.0)
+        symmetric = asymmetry <= _ASYMMETRY * np.abs(a).max(axis=(-1, -2), initial=0.0)
+    if symmetric.all():  # false for what is not finite, too
+        try:
+            return np.linalg.cholesky(0.5 * (a + transposed))
+        except np.linalg.LinAlgError:
+            pass
+    raise NoiseError(_fault(a.reshape(-1, *a.shape[-2:]), what))
 
-    def refuse(bad: NDArray[np.bool_], why: str) -> None:
-        if bad.any():
-            row = int(np.flatnonzero(bad)[0])
-            raise NoiseError(f"{what} {row} is {why}: {np.array2string(stack[row], separator=', ')}".replace("\n", ""))
 
-    refuse(~np.isfinite(stack).all(axis=(1, 2)), "not finite")
-    transposed = np.swapaxes(stack, 1, 2)
-    largest = np.abs(stack).max(axis=(1, 2))
-    refuse(np.abs(stack - transposed).max(axis=(1, 2)) > _ASYMMETRY * largest, "not symmetric")
-    symmetric = 0.5 * (stack + transposed)
-    try:
-        return np.linalg.cholesky(symmetric).reshape(a.shape)
-    except np.linalg.LinAlgError:
-        refuse(np.array([not _is_definite(m) for m in symmetric]), "not positive definite")
-        raise
+def _fault(stack: Array, what: str) -> str:
+    """The first matrix that is not symmetric positive definite, and why."""
+    for row, matrix in enumerate(stack):
+        if not np.isfinite(matrix).all():
+            why = "not finite"
+        elif np.abs(matrix - matrix.T).max() > _ASYMMETRY * np.abs(matrix).max():
+            why = "not symmetric"
+        elif not _is_definite(matrix):
+            why = "not positive definite"
+        else:
+            continue
+        text = np.array2string(matrix, separator=", ").replace("\n", "")
+        return f"{what} {row} is {why}: {text}"
+    return f"{what}: not symmetric positive definite"
 
 
 def _is_definite(matrix: Array) -> bool:

@@ -97,6 +97,32 @@ def adjoint(a: Pose) -> NDArray[np.float64]:
     return np.array([[c, -s, a[1]], [s, c, -a[0]], [0.0, 0.0, 1.0]])
 
 
+@jitable
+def right_jacobian(d: Pose) -> NDArray[np.float64]:
+    """``Exp(d + e) = Exp(d) Exp(J e)`` to first order in e, eq. (163), exact at omega = 0; (3, 3) of one vector."""
+    vx, vy, w = d
+    a, q = np.sinc(w / np.pi), 0.5 * np.sinc(0.5 * w / np.pi) ** 2  # sin(w) / w and (1 - cos(w)) / w^2
+    b = w * q
+    p = (w - np.sin(w)) / w**2 if abs(w) > 1e-3 else w / 6.0 - w**3 / 120.0
+    return np.array([[a, b, p * vx - q * vy], [-b, a, q * vx + p * vy], [0.0, 0.0, 1.0]])
+
+
+@kernel
+def noise_during(step: Pose, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Noise (3, 3) of velocities that acted all through a step, in the tangent space at its end.
+
+    With ``d = Log(step)`` and the covariance of d given, that of ``Exp(d)`` is ``J Sigma J'``.
+    """
+    j = right_jacobian(log(step))
+    out = np.zeros((3, 3))
+    for r in range(3):
+        for c in range(3):
+            for k in range(3):
+                for m in range(3):
+                    out[r, c] += j[r, k] * covariance[k, m] * j[c, m]
+    return out
+
+
 @kernel
 def propagate(covariance: NDArray[np.float64], step: Pose, added: NDArray[np.float64]) -> NDArray[np.float64]:
     """Covariance of a motion lengthened by one step.

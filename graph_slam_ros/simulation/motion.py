@@ -58,24 +58,9 @@ def integrate(start: se2.Pose, steps: Array) -> Array:
     return np.stack([x, y, se2.wrap(theta)], axis=1)
 
 
-def right_jacobian(step: Array) -> Array:
-    """``Exp(d + e) = Exp(d) Exp(J e)`` to first order in e; Sola et al. 2018, eq. (163).
-
-    Parameters
-    ----------
-    step : tangent vector (3,)
-    """
-    vx, vy, w = step
-    a, q = np.sinc(w / np.pi), 0.5 * np.sinc(0.5 * w / np.pi) ** 2  # sin(w) / w and (1 - cos(w)) / w^2, exact at 0
-    b = w * q
-    p = (w - np.sin(w)) / w**2 if abs(w) > 1e-3 else w / 6.0 - w**3 / 120.0
-    return np.array([[a, b, p * vx - q * vy], [-b, a, q * vx + p * vy], [0.0, 0.0, 1.0]])
-
-
 def step_covariance(step: Array, per_tick: Array) -> Array:
     """Covariance (3, 3) of ``Exp(step)`` in its tangent space, from that of the step's components."""
-    jacobian = right_jacobian(step)
-    return jacobian @ per_tick @ jacobian.T
+    return se2.noise_during(se2.exp(tuple(step.tolist())), per_tick)
 
 
 def accumulated(steps: Array, per_tick: Array) -> Array:

@@ -155,6 +155,9 @@ class SolveConfig:
     closure_gap_s: float = _setting(
         30.0, "and when a landmark returns that was not seen for this long", "s", low=0.0
     )
+    closure_keyframes: int = _setting(
+        5, "but a return does not solve again within this many keyframes of the last solve", "keyframes", low=0
+    )
     method: str = _setting("gn", "gn (damped only where it fails to converge) or lm", choices=("gn", "lm"))
     max_iterations: int = _setting(50, "of each stage of the losses", "", low=1, high=10_000)
     step_tolerance: float = _setting(1e-5, "converged when no step is larger", "m, rad", low=0.0)
@@ -215,7 +218,7 @@ class Config:
         """
         sections: dict[str, dict[str, Any]] = {}
         known = {p.name: p for p in parameters()}
-        for name, value in _flatten(values):
+        for name, value in flatten(values):
             if name not in known:
                 near = difflib.get_close_matches(name, known, 1, 0.0)
                 raise ConfigError(f"unknown parameter {name!r}; did you mean {near[0]!r}?")
@@ -245,10 +248,11 @@ def parameters() -> Iterator[Parameter]:
             yield Parameter(name, type(key.default), key.default, meaning, unit, low, high, choices)
 
 
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names and values of nested mappings."""
     for key, value in values.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):
-            yield from _flatten(value, f"{name}.")
+            yield from flatten(value, f"{name}.")
         else:
             yield name, value

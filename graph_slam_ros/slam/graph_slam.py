@@ -207,8 +207,7 @@ class GraphSlam:
         self._covariance = se2.propagate(self._covariance, motion.T_keyframe_base, motion.covariance)
         motion.restart()
         self._unsolved_keyframes += 1
-        if self._unsolved_keyframes >= self.config.solve.every_keyframes:
-            self._solve()
+        self._solve_if_due()
 
     # -- landmarks -----------------------------------------------------------------------------------------------
 
@@ -241,8 +240,7 @@ class GraphSlam:
         self.sighting_poses.append(SightingPose(m.stamp_ns, len(self.keyframes) - 1, T_keyframe_base))
         for sighting in m.sightings:
             self._add_sighting(sighting, m.stamp_ns, T_keyframe_base, covariance)
-        if self._closure:
-            self._solve()
+        self._solve_if_due()
 
     def _add_sighting(
         self, sighting: Sighting, stamp_ns: int, T_keyframe_base: se2.Pose, motion_covariance: Array  # noqa: N803
@@ -275,6 +273,11 @@ class GraphSlam:
         landmark.last_seen_ns = stamp_ns
 
     # -- solving -------------------------------------------------------------------------------------------------
+
+    def _solve_if_due(self) -> None:
+        due = self.config.solve
+        if self._unsolved_keyframes >= (due.closure_keyframes if self._closure else due.every_keyframes):
+            self._solve()
 
     def _solve(self, settings: Settings | None = None) -> None:
         self._unsolved_keyframes, self._closure = 0, False

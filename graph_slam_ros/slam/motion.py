@@ -55,5 +55,7 @@ class Motion:
             return np.zeros((3, 3))
         self.moving_s += dt
         if c.noise == "twist" and source.twist_covariance is not None:
-            return np.array(source.twist_covariance).reshape(3, 3) * (dt * max(dt, c.twist_correlation_s))
-        return self._density * dt
+            of_twist = np.array(source.twist_covariance).reshape(3, 3) * (dt * max(dt, c.twist_correlation_s))
+        else:
+            of_twist = self._density * dt
+        return se2.noise_during(step, of_twist)

@@ -53,7 +53,7 @@ def _whiten(
             r[a] = 0.0
             for c in range(width):
                 j[a, c] = 0.0
-            for b in range(a, m):
+            for b in range(m):
                 root = sqrt_information[e, a, b]
                 r[a] += root * residual[e, b]
                 for c in range(width):

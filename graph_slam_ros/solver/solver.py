@@ -41,13 +41,13 @@ class Solver:
         new_edges = np.asarray(edges, dtype=np.int64).ravel()
         if self._edges[new_edges].any():
             raise GraphSlamError(f"edge {int(new_edges[self._edges[new_edges]][0])} was added before")
-        self._edges[new_edges] = True
-        for table in self.graph.tables.values():
-            ends = table.vertices.values[self._edges[table.id.values]]
+        tables = self.graph.table_of_edge.values[new_edges]
+        for code, table in enumerate(self.graph.tables.values()):
+            ends = table.vertices.values[self.graph.row_of_edge.values[new_edges[tables == code]]]
             if not self._inside[ends].all():
-                self._edges[new_edges] = False
                 self._inside[new] = False
                 raise GraphSlamError(f"an edge needs vertex {int(ends[~self._inside[ends]][0])}, which was not added")
+        self._edges[new_edges] = True
         self._structure_changed()
 
     def set_weight(self, edge: int, weight: float) -> None:

@@ -1,0 +1,60 @@
+"""Recorded message definitions: a bag is decoded by what it says of itself, if that has what we need."""
+
+from typing import Any
+
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from graph_slam_ros.ros.bag import BagError, Topic
+from graph_slam_ros.ros.from_msg import Decoder, decoder
+from graph_slam_ros.ros.interfaces import typestore
+
+_NEEDED: dict[str, tuple[str, ...]] = {
+    "nav_msgs/msg/Odometry": ("header", "child_frame_id", "pose", "twist"),
+    "vision_msgs/msg/Detection3DArray": ("header", "detections"),
+    "vision_msgs/msg/Detection3D": ("header", "results", "bbox", "id"),
+    "vision_msgs/msg/ObjectHypothesisWithPose": ("hypothesis", "pose"),
+    "vision_msgs/msg/ObjectHypothesis": ("class_id",),
+    "vision_msgs/msg/BoundingBox3D": ("center",),
+    "tf2_msgs/msg/TFMessage": ("transforms",),
+    "std_msgs/msg/Header": ("stamp", "frame_id"),
+    "geometry_msgs/msg/PoseWithCovariance": ("pose", "covariance"),
+    "geometry_msgs/msg/TwistWithCovariance": ("covariance",),
+}
+
+
+def recorded_decoder(topic: Topic) -> Decoder:
+    """From CDR bytes of a topic to message objects, by the definition recorded with it.
+
+    Raises
+    ------
+    BagError
+        Another encoding than CDR, a definition that cannot be parsed, or one that lacks a field we read.
+    """
+    if topic.encoding != "cdr":
+        raise BagError(f"topic {topic.name}: messages are encoded as {topic.encoding!r}, not cdr")
+    if not topic.definition:
+        if topic.type not in typestore().types:
+            raise BagError(f"topic {topic.name}: no definition of {topic.type} in the recording")
+        return decoder(topic.type)
+    try:
+        recorded = get_types_from_msg(topic.definition, topic.type)
+    except Exception as error:  # rosbags' parser raises errors of its own grammar library
+        raise BagError(f"topic {topic.name}: the recorded definition of {topic.type} is not valid") from error
+    ours = typestore().fielddefs
+    if all(ours.get(name) == definition for name, definition in recorded.items()):
+        return decoder(topic.type)
+    for name, (_, fields) in recorded.items():
+        there = {field for field, _ in fields}
+        for field in _NEEDED.get(name, ()):
+            if field not in there:
+                raise BagError(f"topic {topic.name}: {name} of this recording has no field {field!r}")
+    store = _store(recorded)
+    return lambda cdr: store.deserialize_cdr(cdr, topic.type)
+
+
+def _store(recorded: Any) -> Typestore:
+    store = get_typestore(Stores.EMPTY)
+    basic = {name: fields for name, fields in typestore().fielddefs.items() if name not in recorded}
+    store.register({**basic, **recorded})
+    return store

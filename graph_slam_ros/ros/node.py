@@ -1,0 +1,190 @@
+"""The ROS node: subscribes, hands every message to the pipeline, publishes what changed."""
+
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import UInt64
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
+from vision_msgs.msg import Detection3DArray
+from visualization_msgs.msg import MarkerArray
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.ros import results
+from graph_slam_ros.ros.from_msg import Border
+from graph_slam_ros.ros.params import declare_parameters
+from graph_slam_ros.run import RunRecorder
+from graph_slam_ros.slam import Control, GraphSlam, Measurement
+from graph_slam_ros.warmup import warmup
+
+_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+class GraphSlamNode(Node):
+    """Online pose-graph SLAM of odometry and landmark sightings.
+
+    Subscribes ``odom``, ``landmarks`` and ``/tf_static``; publishes ``~/path``, ``~/pose``, ``~/landmarks``,
+    ``~/received`` and the transform map -> odom; serves ``~/save``.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("graph_slam", **options)
+        config = declare_parameters(self)
+        self.get_logger().info("compiling kernels (once per installation)")
+        self.get_logger().info(f"kernels ready after {warmup():.1f} s")
+        self._recorder = RunRecorder(config.output.folder, config) if config.output.folder else None
+        self._slam = GraphSlam(config, self._recorder.sink if self._recorder else None)
+        self._border = Border(config, self._slam.counters)
+        self._received = 0
+        self._acknowledged = -1
+        self._has_player = False
+        self._sent_tf_ns = 0
+        self._saved = True
+        self._advertise()
+        self._listen()
+
+    def _advertise(self) -> None:
+        self._path = self.create_publisher(Path, "~/path", _LATCHED)
+        self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/pose", _LATCHED)
+        self._landmarks = self.create_publisher(MarkerArray, "~/landmarks", _LATCHED)
+        self._acknowledge = self.create_publisher(UInt64, "~/received", _LATCHED)
+        self._tf = self.create_publisher(TFMessage, "/tf", 100)
+        self.create_service(Trigger, "~/save", self._on_save)
+
+    def _listen(self) -> None:
+        config = self._slam.config
+        kind = ReliabilityPolicy.RELIABLE if config.inputs.reliable else ReliabilityPolicy.BEST_EFFORT
+        qos = QoSProfile(depth=config.inputs.depth, reliability=kind)
+        static = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.create_subscription(TFMessage, "/tf_static", self._guarded(self._on_tf_static), static, raw=True)
+        self.create_subscription(Odometry, "odom", self._guarded(self._on_odometry), qos, raw=True)
+        seen = self.create_subscription(Detection3DArray, "landmarks", self._guarded(self._on_landmarks), qos, raw=True)
+        self._landmark_topic = seen.topic_name
+        if config.tf.publish:
+            self.create_timer(config.tf.period_s, self._publish_tf)
+        # a player with /clock waits for this one, so it must not wait for /clock
+        self.create_timer(0.1, self._look_for_player, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    # -- messages in -------------------------------------------------------------------------------------------------
+
+    def _on_odometry(self, cdr: bytes) -> None:
+        self._take(self._border.odometry(cdr))
+
+    def _on_landmarks(self, cdr: bytes) -> None:
+        self._take(self._border.sightings(self._landmark_topic, cdr))
+
+    def _on_tf_static(self, cdr: bytes) -> None:
+        self._border.static_transforms(cdr)
+
+    def _take(self, measurement: Measurement | None) -> None:
+        if measurement is None:
+            return
+        self._saved = False
+        update = self._slam.process(measurement)
+        if self._recorder:
+            self._recorder.record(self._slam, update)
+        if update.keyframes:
+            self._pose.publish(results.pose(self._slam))
+        if update:
+            self._path.publish(results.path(self._slam))
+        if update.report:
+            self._landmarks.publish(results.landmarks(self._slam))
+
+    def _guarded(self, callback: Callable[[bytes], None]) -> Callable[[bytes], None]:
+        """No message ends the node: what a callback raises is counted and told."""
+
+        def guarded(cdr: bytes) -> None:
+            try:
+                callback(cdr)
+            except Exception as error:
+                self._slam.counters.count("node", type(error).__name__)
+                self.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=5.0)
+            self._received += 1
+            if self._has_player:
+                self._publish_received()
+
+        return guarded
+
+    # -- results out -------------------------------------------------------------------------------------------------
+
+    def _publish_tf(self) -> None:
+        """The correction, at most once per odometry stamp and never before the first."""
+        stamp_ns = self._slam.newest_odometry_ns
+        if stamp_ns is None or stamp_ns <= self._sent_tf_ns:
+            return
+        self._sent_tf_ns = stamp_ns
+        ahead_ns = round(self._slam.config.tf.tolerance_s * 1e9)
+        self._tf.publish(results.map_to_odom(self._slam, stamp_ns + ahead_ns))
+
+    def _look_for_player(self) -> None:
+        self._has_player = self._acknowledge.get_subscription_count() > 0
+        self._publish_received()
+
+    def _publish_received(self) -> None:
+        if self._received != self._acknowledged:
+            self._acknowledged = self._received
+            self._acknowledge.publish(UInt64(data=self._received))
+
+    def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.message = self.save()
+            response.success = True
+        except GraphSlamError as error:
+            response.message = str(error)
+        return response
+
+    def save(self) -> str:
+        """Release what waits, solve, and write the run folder; returns its name."""
+        if self._recorder is None:
+            raise GraphSlamError("output.folder is empty: nowhere to save")
+        if not self._saved:
+            for event in ("flush", "optimize"):
+                self._recorder.record(self._slam, self._slam.process(Control(event)))
+        self._saved = True
+        return str(self._recorder.save(self._slam))
+
+    def finish(self) -> None:
+        """Save what was not saved yet, and end the recording."""
+        if self._recorder is None:
+            return
+        if not self._saved:
+            self.get_logger().info(f"saved {self.save()}")
+        self._recorder.close()
+
+
+def main() -> int:
+    """Run the node until it is told to stop; returns the exit code."""
+    rclpy.init()
+    try:
+        node = GraphSlamNode()
+    except GraphSlamError as error:
+        rclpy.logging.get_logger("graph_slam").fatal(str(error))
+        rclpy.try_shutdown()
+        return 2
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # ros2 launch sends it twice
+        try:
+            node.finish()
+            code = 0
+        except GraphSlamError as error:
+            node.get_logger().error(str(error))
+            code = 2
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,48 @@
+"""ROS parameters from the one configuration tree: declared with description, unit and range, and read back as it."""
+
+import sys
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterException, InvalidParameterTypeException, InvalidParameterValueException
+
+from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.slam.config import Config, Parameter, parameters
+
+_OTHERS = {"use_sim_time", "start_type_description_service"}  # rclpy's own
+
+
+def declare_parameters(node: Any) -> Config:
+    """Declare every parameter on a node and return the configuration it was started with.
+
+    Raises
+    ------
+    ConfigError
+        An unknown name (the nearest known one is suggested), a wrong type or a value out of range.
+    """
+    given = {name for name in node._parameter_overrides if name not in _OTHERS and not name.startswith("qos_overrides")}
+    values = {}
+    for p in parameters():
+        try:
+            values[p.name] = node.declare_parameter(p.name, p.default, _descriptor(p)).value
+        except InvalidParameterTypeException:
+            p.check(node._parameter_overrides[p.name].value)  # says it in our words
+            raise ConfigError(f"{p.name}: expected {p.type.__name__}") from None
+        except (InvalidParameterValueException, InvalidParameterException) as error:
+            raise ConfigError(f"{p.name}: {error}") from None
+    unknown = {name: node._parameter_overrides[name].value for name in sorted(given - values.keys())}
+    return Config.from_mapping({**values, **unknown})
+
+
+def _descriptor(p: Parameter) -> ParameterDescriptor:
+    unit = f" [{p.unit}]" if p.unit else ""
+    choices = f" One of: {', '.join(p.choices)}." if p.choices else ""
+    descriptor = ParameterDescriptor(description=f"{p.meaning}{unit}.{choices}", read_only=True)
+    if p.type is float and (p.low is not None or p.high is not None):
+        largest = sys.float_info.max
+        low, high = (-largest if p.low is None else p.low), (largest if p.high is None else p.high)
+        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    if p.type is int and (p.low is not None or p.high is not None):
+        low, high = int(p.low or 0), int(2**31 - 1 if p.high is None else p.high)
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+    return descriptor
