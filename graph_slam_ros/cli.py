@@ -42,7 +42,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get("GRAPH_SLAM_TRACEBACK"):
             traceback.print_exc()
         what = " ".join(str(error).split())
-        print(f"graph_slam: a fault of ours, {type(error).__name__}: {what} (GRAPH_SLAM_TRACEBACK=1 shows where)", file=sys.stderr)
+        print(
+            f"graph_slam: a fault of ours, {type(error).__name__}: {what} (GRAPH_SLAM_TRACEBACK=1 shows where)",
+            file=sys.stderr,
+        )
         return FAULT
 
 
@@ -139,7 +142,10 @@ def _optimize(args: argparse.Namespace) -> int:
         _plot_graph(args.plot, file.graph, solver)
     tags = sorted({line.split()[0] for line in file.unknown})
     if tags:
-        print(f"graph_slam: {len(file.unknown)} lines with unknown tags kept as they are: {', '.join(tags)}", file=sys.stderr)
+        print(
+            f"graph_slam: {len(file.unknown)} lines with unknown tags kept as they are: {', '.join(tags)}",
+            file=sys.stderr,
+        )
     return _told(file.skipped)
 
 
@@ -220,7 +226,9 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("graph", type=Path, metavar="GRAPH.g2o")
     sub.add_argument("--method", choices=("gn", "lm"), default="gn", help="gn is damped only if it fails to converge")
     sub.add_argument("--max-iterations", type=_count, default=100, metavar="N")
-    sub.add_argument("--tolerance", type=_positive, default=1e-6, metavar="X", help="relative decrease of chi2 at the end")
+    sub.add_argument(
+        "--tolerance", type=_positive, default=1e-6, metavar="X", help="relative decrease of chi2 at the end"
+    )
     sub.add_argument("--error-map", choices=("relative", "seed"), default="relative", help="seed: of the inverse")
     sub.add_argument("--lenient", action="store_true", help="leave out bad lines, list them, exit with 3")
     sub.add_argument("--json", action="store_true")
@@ -305,7 +313,7 @@ def _plot_graph(out: Path, graph: Any, solver: Any) -> None:
         if len(table.type.accepts) == 2:
             for code, label in enumerate(graph.labels):
                 edges.setdefault(label, []).extend(table.vertices.values[table.label.values == code].tolist())
-    points = np.flatnonzero([graph.kind_of(v).dof == 2 for v in ids])
+    points: Any = np.flatnonzero([graph.kind_of(v).dof == 2 for v in ids])
     draw_graph(out, initial, final, {k: np.array(v) for k, v in edges.items() if v}, points if len(points) else None)
 
 

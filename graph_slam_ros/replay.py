@@ -186,5 +186,3 @@ def _suggestion(bag: Bag, path: Path) -> str:
         return f"not ready for replay: {error}"
     options = f" --odom {inputs.odometry}" + (f" --landmarks {inputs.landmarks}" if inputs.landmarks else "")
     return f"graph_slam replay {path}{options} --out run"
-
-

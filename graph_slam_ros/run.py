@@ -171,7 +171,7 @@ def _make_room(folder: Path) -> None:
         if present and not is_run(folder):
             raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
         for file in present:
-            if file.name == SUMMARY or file.suffix == ".mcap" and file.stem.split("_")[0] in ("ingest", "run"):
+            if file.name == SUMMARY or (file.suffix == ".mcap" and file.stem.split("_")[0] in ("ingest", "run")):
                 file.unlink()
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None

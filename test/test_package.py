@@ -25,9 +25,11 @@ WITHIN = {
     "slam": {"lie", "graph", "solver"},
     "formats": {"lie", "graph"},
     "ros/from_msg.py": {"lie", "slam", "ros"},
-    "ros/bag.py": {"lie", "slam", "ros"},
+    "ros/bag.py": {"lie", "slam", "ros", "formats"},
     "ros/params.py": {"lie", "slam", "ros"},
     "ros/to_msg.py": {"lie", "slam", "ros"},
+    "ros/node.py": {"slam", "ros", "run", "warmup"},
+    "ros/player.py": {"slam", "formats", "ros", "replay"},
     "ros": {"lie", "graph", "solver", "slam", "formats"},
     "simulation": {"lie", "graph", "solver", "slam", "formats", "ros"},
 }
@@ -38,7 +40,7 @@ THIRD_PARTY = {
     "graph": {"numpy", "numba"},
     "solver": {"numpy", "numba", "scipy"},
     "slam": {"numpy"},
-    "formats": {"numpy"},
+    "formats": {"numpy", "mcap", "yaml"},
     "ros/from_msg.py": {"numpy", "rosbags", "mcap"},
     "ros/bag.py": {"numpy", "rosbags", "mcap"},
 }
@@ -53,7 +55,7 @@ NEVER = {
     "replay.py": {"matplotlib"},
     "ros": {"matplotlib"},
 }
-SPEAK_RCLPY = {"ros/node.py", "ros/player.py"}
+SPEAK_RCLPY = {"ros/node.py", "ros/params.py", "ros/player.py"}
 SPEAK_MESSAGES = SPEAK_RCLPY | {"ros/to_msg.py"}
 OUTSIDE_THE_SOLVER = {"cli.py", "report.py"}
 

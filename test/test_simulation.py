@@ -12,7 +12,7 @@ from graph_slam_ros.ros.bag import open_bag
 from graph_slam_ros.ros.from_msg import Border
 from graph_slam_ros.ros.interfaces import typestore
 from graph_slam_ros.simulation import WORLDS, city_graph, landmark_graph, measurements, simulate, warehouse, write_bag
-from graph_slam_ros.simulation.motion import VelocityNoise, accumulated, integrate, right_jacobian
+from graph_slam_ros.simulation.motion import VelocityNoise, accumulated, integrate
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry
 
 SMALL = {"pythonrobotics": {}, "manhattan": {"poses": 60, "blocks": 6}, "warehouse": {"aisles": 2, "laps": 1}}
@@ -72,7 +72,7 @@ def test_the_right_jacobian_of_a_step_is_its_numeric_derivative(turn):
         return np.array(se2.local(se2.exp(tuple(step + d)), se2.exp(tuple(step))))
 
     numeric = np.stack([(moved(d) - moved(-d)) / (2 * h) for d in h * np.eye(3)], axis=1)
-    assert np.abs(right_jacobian(step) - numeric).max() < 1e-9
+    assert np.abs(se2.right_jacobian(step) - numeric).max() < 1e-9
 
 
 def test_accumulated_covariance_is_that_of_the_dead_reckoned_pose():

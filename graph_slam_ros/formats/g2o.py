@@ -3,6 +3,7 @@
 Information matrices are taken as they are. Unknown tags are kept, word for word, and written back.
 """
 
+import itertools
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -125,7 +126,7 @@ class _Reader:
         for file_id, (tag, value) in self.vertices.items():
             at[file_id] = graph.add_vertex(_VERTEX_TAGS[tag], value)
         poses = sorted(file_id for file_id, (tag, _) in self.vertices.items() if tag == "VERTEX_SE2")
-        follows = dict(zip(poses, poses[1:], strict=False))
+        follows = dict(itertools.pairwise(poses))
         for tag, edges in self.edges.items():
             edge_type = relative_pose if tag == "EDGE_SE2" else _EDGE_TAGS[tag]
             for label, members in _by_label(tag, list(self._known(tag, edges)), follows):
@@ -172,7 +173,11 @@ class _Reader:
                 return
             noise = Gaussian.from_information(information[good])
         graph.add_edges(
-            edge_type, [[at[v] for v in edges[k].vertices] for k in good], [edges[k].measured for k in good], noise, label
+            edge_type,
+            [[at[v] for v in edges[k].vertices] for k in good],
+            [edges[k].measured for k in good],
+            noise,
+            label,
         )
 
 

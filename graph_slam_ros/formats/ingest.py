@@ -16,7 +16,7 @@ from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.mcap_records import records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
-_SCHEMA = {"type": "object", "properties": {"type": {"type": "string"}}, "required": ["type"]}
+_SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}}, "required": ["type"]}).encode()
 
 
 class IngestWriter:
@@ -26,7 +26,9 @@ class IngestWriter:
         self._stream = path.open("wb")
         self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library="graph_slam_ros")
-        self._schema = self._writer.register_schema("graph_slam_ros.Measurement", "jsonschema", _ENCODE(_SCHEMA).encode())
+        self._schema = self._writer.register_schema(
+            "graph_slam_ros.Measurement", "jsonschema", _ENCODE(_SCHEMA).encode()
+        )
         self._channels: dict[str, int] = {}
         self._sequence = 0
         self._stamp_ns = 0
@@ -43,7 +45,7 @@ class IngestWriter:
 
     def close(self) -> None:
         """Write the index and close the file."""
-        self._writer.finish()
+        self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
 
 

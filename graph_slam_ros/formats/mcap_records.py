@@ -66,7 +66,9 @@ def records(path: Path, losses: list[str]) -> Iterator[McapRecord]:
                 return
             except Exception as error:  # see contents
                 at, size = stream.tell(), path.stat().st_size
-                losses.append(f"{path.name}: cut off after {read} messages ({type(error).__name__} at {at} of {size} bytes)")
+                losses.append(
+                    f"{path.name}: cut off after {read} messages ({type(error).__name__} at {at} of {size} bytes)"
+                )
                 return
             if isinstance(record, Chunk):
                 for inner in _unpacked(path, record, losses):

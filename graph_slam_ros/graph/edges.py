@@ -6,8 +6,8 @@ An edge type's ``linearize(x, at, measured)`` gets
 * ``at`` : (n, k) where each edge's k vertices begin in ``x``,
 * ``measured`` : (n, p),
 
-and returns the residuals (n, m) and their Jacobians (n, m, D) with respect to the right perturbations of the k vertices,
-side by side (D is the sum of their degrees of freedom). Nothing here is whitened or weighted.
+and returns the residuals (n, m) and their Jacobians (n, m, D) with respect to the right perturbations of the k
+vertices, side by side (D is the sum of their degrees of freedom). Nothing here is whitened or weighted.
 
 Derivatives used throughout, with J = [[0, -1], [1, 0]]:  R(theta) Exp([w]) = R(theta) (I + w J).
 """

@@ -1,7 +1,7 @@
 """The graph: append-only records of vertices and edges, kept as arrays."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,14 +21,15 @@ class Column:
     __slots__ = ("_buffer", "_length")
 
     def __init__(self, dtype: type, *shape: int) -> None:
-        self._buffer = np.empty((16, *shape), dtype=dtype)
+        self._buffer: NDArray[Any] = np.empty((16, *shape), dtype=dtype)
         self._length = 0
 
     def __len__(self) -> int:
         return self._length
 
     @property
-    def values(self) -> NDArray:
+    def values(self) -> NDArray[Any]:
+        """The rows so far, a view."""
         return self._buffer[: self._length]
 
     def extend(self, rows: ArrayLike, count: int) -> None:
@@ -97,10 +98,12 @@ class Graph:
 
     @property
     def vertex_count(self) -> int:
+        """Number of vertices; their ids are below it."""
         return len(self.kind)
 
     @property
     def edge_count(self) -> int:
+        """Number of edges; their ids are below it."""
         return len(self.row_of_edge)
 
     def add_vertices(self, kind: VertexKind, values: ArrayLike) -> Index:
@@ -146,9 +149,7 @@ class Graph:
         table.weight.extend(1.0, count)
         return ids
 
-    def add_edge(
-        self, edge: EdgeType, vertices: Sequence[int], measured: ArrayLike, noise: Gaussian, label: str
-    ) -> int:
+    def add_edge(self, edge: EdgeType, vertices: ArrayLike, measured: ArrayLike, noise: Gaussian, label: str) -> int:
         """Add one edge; returns its id."""
         return int(self.add_edges(edge, vertices, measured, noise, label)[0])
 
@@ -168,9 +169,9 @@ class Graph:
     def _check(self, edge: EdgeType, at: Index, measured: Array, noise: Gaussian) -> None:
         if len(at) != len(measured):
             raise GraphSlamError(f"{edge.name}: {len(at)} edges but {len(measured)} measurements")
-        if noise.sqrt_information.shape[-1] != edge.residual_size or len(noise.sqrt_information.shape) == 3 and len(
-            noise.sqrt_information
-        ) != len(at):
+        if noise.sqrt_information.shape[-1] != edge.residual_size or (
+            len(noise.sqrt_information.shape) == 3 and len(noise.sqrt_information) != len(at)
+        ):
             raise GraphSlamError(f"{edge.name}: noise of shape {noise.sqrt_information.shape} does not fit")
         if not np.isfinite(measured).all():
             raise GraphSlamError(f"{edge.name}: a measurement is not finite")
@@ -181,4 +182,6 @@ class Graph:
             fits = np.array([kind in kinds for kind in self.kinds])[self.kind.values[at[:, slot]]]
             if not fits.all():
                 vertex = int(at[~fits, slot][0])
-                raise GraphSlamError(f"{edge.name}: vertex {vertex} is {self.kind_of(vertex).name}, not {kinds[0].name}")
+                raise GraphSlamError(
+                    f"{edge.name}: vertex {vertex} is {self.kind_of(vertex).name}, not {kinds[0].name}"
+                )

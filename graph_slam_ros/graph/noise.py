@@ -31,7 +31,7 @@ class Gaussian:
     @classmethod
     def from_covariance(cls, covariance: ArrayLike) -> "Gaussian":
         """From Sigma, (m, m) or (n, m, m). Raises NoiseError naming the first matrix that is not SPD."""
-        return cls(np.linalg.inv(_cholesky(covariance, "covariance")))
+        return cls(np.asarray(np.linalg.inv(_cholesky(covariance, "covariance")), dtype=np.float64))
 
     @classmethod
     def from_sigmas(cls, *sigmas: float) -> "Gaussian":

@@ -150,12 +150,12 @@ class _RosbagsBag:
         self._name = files[0].name
         self._reader = AnyReader(files, default_typestore=typestore())
         self.losses: list[str] = []
+        self.topics: dict[str, Topic] = {}
         try:
             self._reader.open()
         except Exception as error:  # rosbags raises asserts and parser errors on damaged files
             what = str(error) or type(error).__name__
             raise BagError(f"{files[0]}: not a readable recording ({what.splitlines()[0]})") from None
-        self.topics = {}
         for connection in self._reader.connections:
             old = self.topics.get(connection.topic)
             count = connection.msgcount + (old.count if old else 0)
@@ -186,7 +186,7 @@ class BagWriter:
     """Writes CDR messages into one mcap file that Foxglove and ``ros2 bag`` open; every chunk carries its CRC."""
 
     def __init__(self, path: Path | str) -> None:
-        self._stream = Path(path).open("wb")
+        self._stream = Path(path).open("wb")  # noqa: SIM115 - closed by close()
         self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
         self._writer.start(profile="ros2", library="graph_slam_ros")
         self._schemas: dict[str, int] = {}

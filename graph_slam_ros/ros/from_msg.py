@@ -58,7 +58,8 @@ class Border:
         self._counters = counters
         self._decode = {name: decoder(name) for name in (ODOMETRY, DETECTIONS, TRANSFORMS)} | dict(decoders or {})
         self._transforms = StaticTransforms()
-        self._twist_bytes, self._twist = b"", ((), None)  # drivers repeat the same covariance
+        self._twist_bytes = b""  # drivers repeat the same covariance
+        self._twist: tuple[tuple[str, ...], Array | None] = ((), None)
 
     # -- one message each --------------------------------------------------------------------------------------------
 
@@ -297,7 +298,7 @@ def _yaw(q: Any) -> float:
     return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
 
 
-def _planar(T: Array) -> se2.Pose:  # noqa: N803
+def _planar(T: Array) -> se2.Pose:
     return float(T[0, 3]), float(T[1, 3]), math.atan2(T[1, 0], T[0, 0])
 
 
@@ -308,7 +309,7 @@ def _merge(a: Sighting, b: Sighting) -> Sighting | None:
     m = len(a.measured)
     difference = np.subtract(b.measured, a.measured)
     if m == 3:
-        difference = np.array(se2.local(b.measured, a.measured))  # type: ignore[arg-type]
+        difference = np.array(se2.local(b.measured, a.measured))
     cov_a, cov_b = np.array(a.covariance).reshape(m, m), np.array(b.covariance).reshape(m, m)
     gain = cov_a @ np.linalg.inv(cov_a + cov_b)
     if difference @ np.linalg.solve(cov_a + cov_b, difference) > _AGREE_SIGMA**2 * m:
@@ -316,6 +317,6 @@ def _merge(a: Sighting, b: Sighting) -> Sighting | None:
     if a == b:
         return a
     step = gain @ difference
-    at = np.add(a.measured, step).tolist() if m == 2 else se2.retract(a.measured, tuple(step.tolist()))  # type: ignore[arg-type]
+    at = np.add(a.measured, step).tolist() if m == 2 else se2.retract(a.measured, tuple(step.tolist()))
     merged = cov_a - gain @ cov_a
     return Sighting(a.id, tuple(map(float, at)), tuple((0.5 * (merged + merged.T)).ravel().tolist()))

@@ -28,6 +28,7 @@ from graph_slam_ros.warmup import warmup
 
 _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
+
 class GraphSlamNode(Node):
     """Online pose-graph SLAM of odometry and landmark sightings.
 
@@ -63,7 +64,9 @@ class GraphSlamNode(Node):
         config = self._slam.config
         kind = ReliabilityPolicy.RELIABLE if config.inputs.reliable else ReliabilityPolicy.BEST_EFFORT
         qos = QoSProfile(depth=config.inputs.depth, reliability=kind)
-        static = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        static = QoSProfile(
+            depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+        )
         self.create_subscription(TFMessage, "/tf_static", self._guarded(self._on_tf_static), static, raw=True)
         self.create_subscription(Odometry, "odom", self._guarded(self._on_odometry), qos, raw=True)
         seen = self.create_subscription(Detection3DArray, "landmarks", self._guarded(self._on_landmarks), qos, raw=True)

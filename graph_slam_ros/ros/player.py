@@ -13,11 +13,12 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Iterator
+from typing import Any
 
 import rclpy
 from rclpy.node import Node
@@ -76,7 +77,7 @@ class Player:
         """
         self._wait(lambda: self._before is not None, f"no {self._name}/received: is the node running?")
         for topic, publisher in self._publishers.items():
-            self._wait(lambda p=publisher: p.get_subscription_count() > 0, f"nobody subscribes to {topic}")
+            self._wait(partial(_has_subscriber, publisher), f"nobody subscribes to {topic}")
         for message in self._bag.messages({self._inputs.tf_static} - {""}):
             self._send(message)
         self._settle()
@@ -100,7 +101,9 @@ class Player:
         package, _, name = self._bag.topics[topic].type.split("/")
         kind = getattr(importlib.import_module(f"{package}.msg"), name)
         latched = topic == self._inputs.tf_static
-        return self._node.create_publisher(kind, topic, QoSProfile(depth=100, durability=_LATCHED.durability) if latched else 4 * _AHEAD)
+        return self._node.create_publisher(
+            kind, topic, QoSProfile(depth=100, durability=_LATCHED.durability) if latched else 4 * _AHEAD
+        )
 
     def _on_received(self, message: UInt64) -> None:
         if self._before is None:
@@ -203,6 +206,10 @@ def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[None]:
         except subprocess.TimeoutExpired:
             process.kill()
         parameters.unlink(missing_ok=True)
+
+
+def _has_subscriber(publisher: Any) -> bool:
+    return bool(publisher.get_subscription_count())
 
 
 def _stamp_ns(cdr: bytes) -> int:

@@ -55,9 +55,7 @@ def landmarks(slam: GraphSlam) -> bytes:
     found = landmark_estimates(slam)
     positions = np.array([pose[:2] for _, pose, _ in found]).reshape(-1, 2)
     names, covariances = [name for name, _, _ in found], [covariance for _, _, covariance in found]
-    return to_msg.landmark_markers(
-        slam.keyframes[-1].stamp_ns, slam.config.frames.map, names, positions, covariances
-    )
+    return to_msg.landmark_markers(slam.keyframes[-1].stamp_ns, slam.config.frames.map, names, positions, covariances)
 
 
 def landmark_estimates(slam: GraphSlam) -> list[tuple[str, tuple[float, ...], Array]]:

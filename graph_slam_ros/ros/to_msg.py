@@ -86,7 +86,7 @@ def pose_with_covariance(stamp_ns: int, frame: str, p: se2.Pose, covariance: Arr
     return encode(make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(stamp_ns, frame), pose=inner))
 
 
-def transform(stamp_ns: int, parent: str, child: str, T_parent_child: se2.Pose) -> bytes:  # noqa: N803
+def transform(stamp_ns: int, parent: str, child: str, T_parent_child: se2.Pose) -> bytes:
     """tf2_msgs/TFMessage with one transform."""
     x, y, theta = T_parent_child
     moved = make("geometry_msgs/msg/Transform", translation=vector(x, y), rotation=heading(theta))

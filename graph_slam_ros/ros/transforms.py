@@ -34,7 +34,7 @@ class StaticTransforms:
     def __init__(self) -> None:
         self._parent: dict[str, tuple[str, Array]] = {}
 
-    def add(self, parent: str, child: str, T_parent_child: Array) -> None:  # noqa: N803
+    def add(self, parent: str, child: str, T_parent_child: Array) -> None:
         """Take one transform; a later one for the same child replaces it."""
         self._parent[child] = (parent, T_parent_child)
 

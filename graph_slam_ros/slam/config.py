@@ -37,10 +37,10 @@ class Parameter:
             raise ConfigError(f"{self.name}: {value!r} is not {_ARTICLE[self.type]}")
         if self.choices and value not in self.choices:
             raise ConfigError(f"{self.name}: {value!r} is not one of {', '.join(self.choices)}")
-        if self.type in (int, float):
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
             if not math.isfinite(value):
                 raise ConfigError(f"{self.name}: {value!r} is not finite")
-            if self.low is not None and value < self.low or self.high is not None and value > self.high:
+            if (self.low is not None and value < self.low) or (self.high is not None and value > self.high):
                 raise ConfigError(f"{self.name}: {value!r} is not in {self.range_text()}")
         return value
 
@@ -87,13 +87,22 @@ class OdometryConfig:
         0.02, "random walk of the position along x of the base", "m/sqrt(s)", low=1e-6, high=10.0
     )
     lateral_density: float = _setting(
-        0.005, "random walk across; small for wheels, raise it for what can slide or hover", "m/sqrt(s)", low=1e-6, high=10.0
+        0.005,
+        "random walk across; small for wheels, raise it for what can slide or hover",
+        "m/sqrt(s)",
+        low=1e-6,
+        high=10.0,
     )
     rotation_density: float = _setting(0.05, "random walk of the heading", "rad/sqrt(s)", low=1e-6, high=10.0)
     twist_correlation_s: float = _setting(
-        0.25, "how long the error of a velocity lasts: the noise of a step is covariance * dt * max(dt, this)", "s", low=0.0
+        0.25,
+        "how long the error of a velocity lasts: the noise of a step is covariance * dt * max(dt, this)",
+        "s",
+        low=0.0,
     )
-    still_m_s: float = _setting(1e-3, "slower than this and the next, the robot stands: no noise is added", "m/s", low=0.0)
+    still_m_s: float = _setting(
+        1e-3, "slower than this and the next, the robot stands: no noise is added", "m/s", low=0.0
+    )
     still_rad_s: float = _setting(1e-3, "see still_m_s", "rad/s", low=0.0)
 
 
@@ -104,7 +113,9 @@ class KeyframesConfig:
     min_distance_m: float = _setting(0.25, "a keyframe after this distance", "m", low=1e-3)
     min_angle_rad: float = _setting(0.25, "or after this change of heading", "rad", low=1e-3, high=math.pi)
     max_interval_s: float = _setting(
-        1.0, "or after this much time in motion: odometry's noise grows with time, and sightings in between share it", "s",
+        1.0,
+        "or after this much time in motion: odometry's noise grows with time, and sightings in between share it",
+        "s",
         low=1e-3,
     )
 
@@ -113,9 +124,7 @@ class KeyframesConfig:
 class LandmarksConfig:
     """Landmark sightings."""
 
-    id_from: str = _setting(
-        "id", "which field of a detection is the landmark's identity", choices=("id", "class_id")
-    )
+    id_from: str = _setting("id", "which field of a detection is the landmark's identity", choices=("id", "class_id"))
     sigma_m: float = _setting(0.1, "position noise where a message's covariance is all zero (unknown)", "m", low=1e-4)
     added_sigma_m: float = _setting(
         0.05, "position noise added to every sighting for what messages leave out: clocks, mounting, size", "m", low=0.0
@@ -128,7 +137,9 @@ class LandmarksConfig:
         "robust loss; huber_then_cauchy converges with the first, then with the second",
         choices=("none", "huber", "cauchy", "huber_then_cauchy"),
     )
-    loss_scale: float = _setting(3.0, "residuals well below this many standard deviations count fully", "sigma", low=0.1)
+    loss_scale: float = _setting(
+        3.0, "residuals well below this many standard deviations count fully", "sigma", low=0.1
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +154,9 @@ class AnchorConfig:
 class OrderingConfig:
     """The window in which messages are put in order of stamp."""
 
-    window_s: float = _setting(0.05, "how much later than newer odometry a message may come, in stamp time", "s", low=0.0)
+    window_s: float = _setting(
+        0.05, "how much later than newer odometry a message may come, in stamp time", "s", low=0.0
+    )
     max_waiting: int = _setting(1000, "landmark messages that may wait for odometry", "messages", low=1)
 
 
@@ -152,9 +165,7 @@ class SolveConfig:
     """When and how the graph is solved."""
 
     every_keyframes: int = _setting(20, "solve after this many keyframes", "keyframes", low=1)
-    closure_gap_s: float = _setting(
-        30.0, "and when a landmark returns that was not seen for this long", "s", low=0.0
-    )
+    closure_gap_s: float = _setting(30.0, "and when a landmark returns that was not seen for this long", "s", low=0.0)
     closure_keyframes: int = _setting(
         5, "but a return does not solve again within this many keyframes of the last solve", "keyframes", low=0
     )
@@ -224,7 +235,8 @@ class Config:
                 raise ConfigError(f"unknown parameter {name!r}; did you mean {near[0]!r}?")
             section, key = name.split(".")
             sections.setdefault(section, {})[key] = known[name].check(value)
-        return cls(**{s.name: type(s.default)(**sections.get(s.name, {})) for s in dataclasses.fields(cls)})  # type: ignore[operator]
+        trees = {s.name: _section_type(s)(**sections.get(s.name, {})) for s in dataclasses.fields(cls)}
+        return cls(**trees)
 
     def as_mapping(self) -> dict[str, dict[str, Any]]:
         """Nested plain values, every parameter named."""
@@ -239,10 +251,14 @@ class Config:
         return Settings(s.method, s.max_iterations, s.step_tolerance, tolerance, {"landmarks": stages})
 
 
+def _section_type(section: "dataclasses.Field[Any]") -> type:
+    return type(section.default)
+
+
 def parameters() -> Iterator[Parameter]:
     """Every parameter, in the order of the tree, named ``section.key``."""
     for section in dataclasses.fields(Config):
-        for key in dataclasses.fields(section.default):  # type: ignore[arg-type]
+        for key in dataclasses.fields(_section_type(section)):
             meaning, unit, low, high, choices = key.metadata["about"]
             name = f"{section.name}.{key.name}"
             yield Parameter(name, type(key.default), key.default, meaning, unit, low, high, choices)

@@ -139,7 +139,7 @@ class GraphSlam:
         return np.stack(se2.compose(tuple(keyframes.T), tuple(since.T)), axis=-1)
 
     @property
-    def T_map_odom(self) -> se2.Pose:  # noqa: N802
+    def T_map_odom(self) -> se2.Pose:
         """The correction: odometry's drift at the newest keyframe."""
         if not self.keyframes:
             return se2.IDENTITY
@@ -235,7 +235,7 @@ class GraphSlam:
             self.counters.count(m.topic, "after_odometry", len(m.sightings))
         self._waiting.clear()
 
-    def _see(self, m: Sightings, T_keyframe_base: se2.Pose, covariance: Array) -> None:  # noqa: N803
+    def _see(self, m: Sightings, T_keyframe_base: se2.Pose, covariance: Array) -> None:
         """Carry sightings to the newest keyframe by the odometry since, whose noise adds to theirs."""
         self.sighting_poses.append(SightingPose(m.stamp_ns, len(self.keyframes) - 1, T_keyframe_base))
         for sighting in m.sightings:
@@ -243,13 +243,11 @@ class GraphSlam:
         self._solve_if_due()
 
     def _add_sighting(
-        self, sighting: Sighting, stamp_ns: int, T_keyframe_base: se2.Pose, motion_covariance: Array  # noqa: N803
+        self, sighting: Sighting, stamp_ns: int, T_keyframe_base: se2.Pose, motion_covariance: Array
     ) -> None:
         keyframe = self.keyframes[-1]
         landmark = self.landmarks.get(sighting.id)
-        is_point = len(sighting.measured) == 2 or (
-            landmark is not None and self.graph.kind_of(landmark.vertex) is R2
-        )
+        is_point = len(sighting.measured) == 2 or (landmark is not None and self.graph.kind_of(landmark.vertex) is R2)
         carry = _carry_point if is_point else _carry_pose
         measured, covariance = carry(sighting, T_keyframe_base, motion_covariance)
         new_vertices = []
@@ -291,7 +289,7 @@ class GraphSlam:
         return x, y, theta
 
 
-def _carry_point(s: Sighting, T_a_b: se2.Pose, motion_covariance: Array) -> tuple[tuple[float, ...], Array]:  # noqa: N803
+def _carry_point(s: Sighting, T_a_b: se2.Pose, motion_covariance: Array) -> tuple[tuple[float, ...], Array]:
     """A point seen from b, seen from a: ``p_a = T_a_b p_b`` and the noise of both."""
     x, y = s.measured[:2]
     c, n = np.cos(T_a_b[2]), np.sin(T_a_b[2])
@@ -307,7 +305,7 @@ def _carry_point(s: Sighting, T_a_b: se2.Pose, motion_covariance: Array) -> tupl
     return se2.act(T_a_b, (x, y)), covariance
 
 
-def _carry_pose(s: Sighting, T_a_b: se2.Pose, motion_covariance: Array) -> tuple[tuple[float, ...], Array]:  # noqa: N803
+def _carry_pose(s: Sighting, T_a_b: se2.Pose, motion_covariance: Array) -> tuple[tuple[float, ...], Array]:
     """A pose seen from b, seen from a: ``T_a_c = T_a_b T_b_c`` and the noise of both."""
     own = np.array(s.covariance).reshape(3, 3)
     measured: se2.Pose = (s.measured[0], s.measured[1], s.measured[2])

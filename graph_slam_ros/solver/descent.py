@@ -110,7 +110,8 @@ def minimise(problem: Problem, x: Array, settings: Settings) -> tuple[Array, Rep
 def _gauss_newton(problem: Problem, x: Array, losses: Mapping[str, Loss], settings: Settings) -> _Descent:
     blocks = problem.linearize(x, losses)
     _, cost = total(blocks)
-    cost_start, iterations = cost, []
+    cost_start = cost
+    iterations: list[Iteration] = []
     for _ in range(settings.max_iterations):
         problem.normal.assemble(blocks)
         step = problem.normal.factor().solve(-problem.normal.gradient)
@@ -131,7 +132,8 @@ def _levenberg_marquardt(problem: Problem, x: Array, losses: Mapping[str, Loss],
     """Marquardt 1963: the diagonal is enlarged until the cost falls."""
     blocks = problem.linearize(x, losses)
     _, cost = total(blocks)
-    damping, iterations = _DAMPING_FIRST, []
+    damping = _DAMPING_FIRST
+    iterations: list[Iteration] = []
     while len(iterations) < settings.max_iterations:
         problem.normal.assemble(blocks)
         while True:

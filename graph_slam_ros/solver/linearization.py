@@ -70,9 +70,7 @@ def _whiten(
     return chi2, cost
 
 
-def linearize(
-    graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Mapping[str, Loss]
-) -> list[Block]:
+def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Mapping[str, Loss]) -> list[Block]:
     """Linearise the given rows of each table at the stored values x, with the loss of each edge's label."""
     by_code = [losses.get(label, Loss()) for label in graph.labels]
     kinds = np.array([loss.kind for loss in by_code], dtype=np.int64)
