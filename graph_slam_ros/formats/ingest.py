@@ -26,9 +26,7 @@ class IngestWriter:
         self._stream = path.open("wb")
         self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library="graph_slam_ros")
-        self._schema = self._writer.register_schema(
-            "graph_slam_ros.Measurement", "jsonschema", _ENCODE(_SCHEMA).encode()
-        )
+        self._schema = self._writer.register_schema("graph_slam_ros.Measurement", "jsonschema", _SCHEMA)
         self._channels: dict[str, int] = {}
         self._sequence = 0
         self._stamp_ns = 0

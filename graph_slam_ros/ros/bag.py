@@ -20,6 +20,9 @@ from graph_slam_ros.formats.mcap_records import contents, is_mcap, records
 from graph_slam_ros.ros.interfaces import typestore
 
 
+_ROS1_AS_CDR = "cdr"
+
+
 class BagError(GraphSlamError):
     """A recording that cannot be read, or does not hold what was asked for."""
 
@@ -159,7 +162,7 @@ class _RosbagsBag:
         for connection in self._reader.connections:
             old = self.topics.get(connection.topic)
             count = connection.msgcount + (old.count if old else 0)
-            self.topics[connection.topic] = Topic(connection.topic, connection.msgtype, count, _text(connection))
+            self.topics[connection.topic] = self._topic(connection, count)
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         connections = [c for c in self._reader.connections if c.topic in topics]
@@ -169,17 +172,30 @@ class _RosbagsBag:
         while True:
             try:
                 connection, log_ns, raw = next(records)
-                cdr = raw if self._reader.is2 else self._reader.typestore.ros1_to_cdr(raw, connection.msgtype)
+                if self.topics[connection.topic].encoding == _ROS1_AS_CDR:
+                    raw = typestore().ros1_to_cdr(raw, connection.msgtype)
             except StopIteration:
                 return
             except Exception as error:
                 self.losses.append(f"{self._name}: cut off ({type(error).__name__}: {error})")
                 return
-            yield BagMessage(connection.topic, log_ns, bytes(cdr))
+            yield BagMessage(connection.topic, log_ns, bytes(raw))
 
+    def _topic(self, connection: Any, count: int) -> Topic:
+        name, type_name = connection.topic, connection.msgtype
+        if self._reader.is2:
+            definition = connection.msgdef.data if connection.msgdef.format.name == "MSG" else ""
+            return Topic(name, type_name, count, definition)
+        return Topic(name, type_name, count, encoding=_ROS1_AS_CDR if self._is_ours(type_name) else "ros1")
 
-def _text(connection: Any) -> str:
-    return connection.msgdef.data if connection.msgdef.format.name == "MSG" else ""
+    def _is_ours(self, type_name: str) -> bool:
+        """Whether a recorded ROS 1 type, and all it is made of, has our fields (a header's ``seq`` aside)."""
+        recorded, ours = self._reader.typestore.fielddefs, typestore().fielddefs
+        if type_name not in recorded or type_name not in ours:
+            return False
+        theirs = [field for field in recorded[type_name][1] if field[0] != "seq"]
+        inner = {name for name in re.findall(r"\w+/msg/\w+", repr(theirs)) if not name.startswith("builtin_")}
+        return theirs == list(ours[type_name][1]) and all(map(self._is_ours, inner))
 
 
 class BagWriter:
