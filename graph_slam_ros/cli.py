@@ -74,6 +74,8 @@ def _replay(args: argparse.Namespace) -> int:
     own = config if args.config or args.set or not is_run(args.bag) else None
     done = replay(args.bag, args.out, own, odometry=args.odom, landmarks=args.landmarks, progress=_progress("replay"))
     _say(_run_text(done.summary), f"results in {args.out}")
+    if not done.summary["keyframes"]:
+        raise GraphSlamError(f"{args.bag}: no odometry of it could be used, see what was counted and graph_slam info")
     return _told(done.losses)
 
 

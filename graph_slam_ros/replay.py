@@ -15,6 +15,7 @@ from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measuremen
 from graph_slam_ros.slam.measurements import from_record
 
 TF_STATIC = "/tf_static"
+_ARROW = " -> "
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
@@ -166,7 +167,7 @@ def describe(bag: Bag, path: Path) -> list[str]:
     if span:
         first, last = min(a for a, _ in span.values()), max(b for _, b in span.values())
         lines.append(f"span {(last - first) * 1e-9:.3f} s, from {first * 1e-9:.3f}")
-    lines.append(_suggestion(bag, path))
+    lines.append(_suggestion(bag, path, frames))
     return lines
 
 
@@ -176,13 +177,21 @@ def _frames(decode: Callable[[bytes], Any], cdr: bytes) -> str:
     except Exception:  # damaged bytes: replay counts them
         return "(undecodable)"
     child = getattr(message, "child_frame_id", "")
-    return f"{message.header.frame_id}{' -> ' + child if child else ''}"
+    return f"{message.header.frame_id}{_ARROW + child if child else ''}"
 
 
-def _suggestion(bag: Bag, path: Path) -> str:
+def _suggestion(bag: Bag, path: Path, frames: dict[str, str]) -> str:
     try:
         inputs = choose_inputs(bag, None, None)
     except BagError as error:
         return f"not ready for replay: {error}"
-    options = f" --odom {inputs.odometry}" + (f" --landmarks {inputs.landmarks}" if inputs.landmarks else "")
-    return f"graph_slam replay {path}{options} --out run"
+    words = ["graph_slam replay", str(path), "--odom", inputs.odometry]
+    if inputs.landmarks:
+        words += ["--landmarks", inputs.landmarks]
+    parent, _, child = frames.get(inputs.odometry, "").partition(_ARROW)
+    usual = Config().frames
+    if parent not in ("", usual.odom):
+        words += ["--set", f"frames.odom={parent}"]
+    if child not in ("", usual.base):
+        words += ["--set", f"frames.base={child}"]
+    return " ".join([*words, "--out run"])

@@ -20,9 +20,6 @@ from graph_slam_ros.formats.mcap_records import contents, is_mcap, records
 from graph_slam_ros.ros.interfaces import typestore
 
 
-_ROS1_AS_CDR = "cdr"
-
-
 class BagError(GraphSlamError):
     """A recording that cannot be read, or does not hold what was asked for."""
 
@@ -147,7 +144,7 @@ class _McapBag:
 
 
 class _RosbagsBag:
-    """sqlite3 and ROS 1 recordings; messages of ROS 1 are turned into CDR."""
+    """sqlite3 and ROS 1 recordings; messages of ROS 1 are turned into CDR where their type is ours."""
 
     def __init__(self, files: list[Path]) -> None:
         self._name = files[0].name
@@ -172,7 +169,7 @@ class _RosbagsBag:
         while True:
             try:
                 connection, log_ns, raw = next(records)
-                if self.topics[connection.topic].encoding == _ROS1_AS_CDR:
+                if not self._reader.is2 and self.topics[connection.topic].encoding == "cdr":
                     raw = typestore().ros1_to_cdr(raw, connection.msgtype)
             except StopIteration:
                 return
@@ -186,7 +183,7 @@ class _RosbagsBag:
         if self._reader.is2:
             definition = connection.msgdef.data if connection.msgdef.format.name == "MSG" else ""
             return Topic(name, type_name, count, definition)
-        return Topic(name, type_name, count, encoding=_ROS1_AS_CDR if self._is_ours(type_name) else "ros1")
+        return Topic(name, type_name, count, encoding="cdr" if self._is_ours(type_name) else "ros1")
 
     def _is_ours(self, type_name: str) -> bool:
         """Whether a recorded ROS 1 type, and all it is made of, has our fields (a header's ``seq`` aside)."""
