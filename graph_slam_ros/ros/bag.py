@@ -169,14 +169,15 @@ class _RosbagsBag:
         while True:
             try:
                 connection, log_ns, raw = next(records)
+                cdr = bytes(raw)
                 if not self._reader.is2 and self.topics[connection.topic].encoding == "cdr":
-                    raw = typestore().ros1_to_cdr(raw, connection.msgtype)
+                    cdr = bytes(typestore().ros1_to_cdr(raw, connection.msgtype))
             except StopIteration:
                 return
             except Exception as error:
                 self.losses.append(f"{self._name}: cut off ({type(error).__name__}: {error})")
                 return
-            yield BagMessage(connection.topic, log_ns, bytes(raw))
+            yield BagMessage(connection.topic, log_ns, cdr)
 
     def _topic(self, connection: Any, count: int) -> Topic:
         name, type_name = connection.topic, connection.msgtype
