@@ -1,5 +1,6 @@
 """Parameter files: YAML as ROS reads it, strictly. One file serves ``ros2 launch`` and ``graph_slam replay``."""
 
+import json
 from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ class _StrictLoader(yaml.SafeLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen = set()
         for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=deep)
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, Hashable):
+                raise ConfigError(f"line {key_node.start_mark.line + 1}: a key is not a name")
             if key in seen:
                 raise ConfigError(f"line {key_node.start_mark.line + 1}: {key!r} is given twice")
             seen.add(key)
@@ -41,7 +44,7 @@ def read_parameters(path: Path | str) -> dict[str, Any]:
         raise ConfigError(f"{path}: {error.strerror}") from None
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: not UTF-8, or a date like 2001-99-99
         raise ConfigError(f"{path}: not valid YAML ({' '.join(str(error).split())[:200]})") from None
     if values is None:
         return {}
@@ -70,7 +73,7 @@ def parse_setting(text: str) -> tuple[str, Any]:
         raise ConfigError(f"{text!r} is not key=value")
     try:
         return key, yaml.load(value, Loader=_StrictLoader)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError, RecursionError):
         raise ConfigError(f"{key}: {value!r} is not a valid value") from None
 
 
@@ -93,4 +96,4 @@ def _scalar(value: Any) -> str:
         return text if "." in text or "e" not in text else text.replace("e", ".0e")
     if isinstance(value, bool):
         return "true" if value else "false"
-    return f'"{value}"' if isinstance(value, str) else str(value)
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value)

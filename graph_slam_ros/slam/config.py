@@ -31,7 +31,7 @@ class Parameter:
 
     def check(self, value: Any) -> Any:
         """The value in its type. Raises ConfigError naming parameter, value and what is allowed."""
-        if self.type is float and type(value) is int:
+        if self.type is float and type(value) is int and abs(value) < 2**1000:
             value = float(value)
         if type(value) is not self.type:
             raise ConfigError(f"{self.name}: {value!r} is not {_ARTICLE[self.type]}")
@@ -157,7 +157,7 @@ class OrderingConfig:
     window_s: float = _setting(
         0.05, "how much later than newer odometry a message may come, in stamp time", "s", low=0.0
     )
-    max_waiting: int = _setting(1000, "landmark messages that may wait for odometry", "messages", low=1)
+    max_waiting: int = _setting(1000, "messages that may wait for their turn, or for odometry", "messages", low=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +167,7 @@ class SolveConfig:
     every_keyframes: int = _setting(20, "solve after this many keyframes", "keyframes", low=1)
     closure_gap_s: float = _setting(30.0, "and when a landmark returns that was not seen for this long", "s", low=0.0)
     closure_keyframes: int = _setting(
-        5, "but a return does not solve again within this many keyframes of the last solve", "keyframes", low=0
+        10, "but a return does not solve again within this many keyframes of the last solve", "keyframes", low=0
     )
     method: str = _setting("gn", "gn (damped only where it fails to converge) or lm", choices=("gn", "lm"))
     max_iterations: int = _setting(50, "of each stage of the losses", "", low=1, high=10_000)
@@ -262,6 +262,16 @@ def parameters() -> Iterator[Parameter]:
             meaning, unit, low, high, choices = key.metadata["about"]
             name = f"{section.name}.{key.name}"
             yield Parameter(name, type(key.default), key.default, meaning, unit, low, high, choices)
+
+
+def notes() -> dict[str, str]:
+    """Meaning, unit and choices of every parameter by name, as a parameter file says them."""
+    out = {}
+    for p in parameters():
+        unit = f" [{p.unit}]" if p.unit else ""
+        choices = f"; one of {', '.join(p.choices)}" if p.choices else ""
+        out[p.name] = p.meaning + unit + choices
+    return out
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

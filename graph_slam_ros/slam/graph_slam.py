@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.errors import GraphSlamError, NoiseError
 from graph_slam_ros.graph import (
     LANDMARK_POSITION,
     POSE_PRIOR,
@@ -29,7 +30,8 @@ from graph_slam_ros.solver import Report, Settings, Solver
 
 Array = NDArray[np.float64]
 
-_LEAST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-10])  # 0.1 mm, 0.01 mrad: a motion is never certain
+_LEAST_VARIANCE = np.array([1e-8, 1e-8, 1e-10])  # 0.1 mm, 0.01 mrad: nothing is ever certain
+_LEAST_EIGENVALUE = 1e-9  # of the largest, where rounding has left a covariance indefinite
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,9 @@ class Update:
         return bool(self.keyframes) or self.report is not None
 
 
+_NOTHING = Update()
+
+
 class GraphSlam:
     """Online pose-graph SLAM in the plane, from odometry and sightings of landmarks with known identity.
 
@@ -102,20 +107,22 @@ class GraphSlam:
     def process(self, measurement: Measurement) -> Update:
         """Take one measurement or control event; returns what it changed."""
         if not isinstance(measurement, Control) and not self._order.accepts(measurement):
-            return Update()
+            return _NOTHING
         if self._sink is not None:
             self._sink(measurement)
         first_new, solves = len(self.keyframes), len(self.reports)
         match measurement:
+            case Odometry() | Sightings():
+                self._use(self._order.push(measurement))
             case Control("flush"):
                 self._use(self._order.flush())
                 self._drop_unreached()
             case Control("optimize"):
                 self._solve(self.config.solver_settings(final=True))
-            case Control():
-                self.counters.count("control", f"unknown event {measurement.event}")
             case _:
-                self._use(self._order.push(measurement))
+                self.counters.count("control", f"unknown event {measurement.event}")
+        if len(self.keyframes) == first_new and len(self.reports) == solves:
+            return _NOTHING
         report = self.reports[-1] if len(self.reports) > solves else None
         return Update(tuple(range(first_new, len(self.keyframes))), report)
 
@@ -199,8 +206,8 @@ class GraphSlam:
 
     def _next_keyframe(self, m: Odometry) -> None:
         motion, last = self._motion, self.keyframes[-1]
+        noise = self._noise("odometry", motion.covariance)
         vertex = self.graph.add_vertex(SE2, se2.compose(self._pose(last), motion.T_keyframe_base))
-        noise = Gaussian.from_covariance(motion.covariance + _LEAST_COVARIANCE)
         edge = self.graph.add_edge(RELATIVE_POSE, [last.vertex, vertex], motion.T_keyframe_base, noise, "odometry")
         self.solver.add([vertex], [edge])
         self.keyframes.append(Keyframe(vertex, m.stamp_ns, m.T_odom_base))
@@ -219,6 +226,8 @@ class GraphSlam:
             self.counters.count(m.topic, "late", len(m.sightings))
         elif m.stamp_ns == self._odometry.stamp_ns:
             self._see(m, self._motion.T_keyframe_base, self._motion.covariance)
+        elif len(self._waiting) >= self.config.ordering.max_waiting:
+            self.counters.count(m.topic, "overflow", len(m.sightings))
         else:
             self._waiting.append(m)
 
@@ -239,17 +248,19 @@ class GraphSlam:
         """Carry sightings to the newest keyframe by the odometry since, whose noise adds to theirs."""
         self.sighting_poses.append(SightingPose(m.stamp_ns, len(self.keyframes) - 1, T_keyframe_base))
         for sighting in m.sightings:
-            self._add_sighting(sighting, m.stamp_ns, T_keyframe_base, covariance)
+            self._add_sighting(m.topic, sighting, m.stamp_ns, T_keyframe_base, covariance)
         self._solve_if_due()
 
     def _add_sighting(
-        self, sighting: Sighting, stamp_ns: int, T_keyframe_base: se2.Pose, motion_covariance: Array
+        self, topic: str, sighting: Sighting, stamp_ns: int, T_keyframe_base: se2.Pose, motion_covariance: Array
     ) -> None:
         keyframe = self.keyframes[-1]
         landmark = self.landmarks.get(sighting.id)
         is_point = len(sighting.measured) == 2 or (landmark is not None and self.graph.kind_of(landmark.vertex) is R2)
         carry = _carry_point if is_point else _carry_pose
         measured, covariance = carry(sighting, T_keyframe_base, motion_covariance)
+        covariance[:2, :2] += self.config.landmarks.added_sigma_m**2 * np.eye(2)
+        noise = self._noise(topic, covariance)
         new_vertices = []
         if landmark is None:
             act = se2.act if is_point else se2.compose
@@ -261,8 +272,6 @@ class GraphSlam:
             edge_type = RELATIVE_POSE
         else:
             edge_type = LANDMARK_POSITION if self.graph.kind_of(landmark.vertex) is R2 else TAG_POSITION
-        covariance[:2, :2] += self.config.landmarks.added_sigma_m**2 * np.eye(2)
-        noise = Gaussian.from_covariance(covariance)
         edge = self.graph.add_edge(edge_type, [keyframe.vertex, landmark.vertex], measured, noise, "landmarks")
         self.solver.add(new_vertices, [edge])
         if stamp_ns - landmark.last_seen_ns > self.config.solve.closure_gap_s * NS:
@@ -278,11 +287,27 @@ class GraphSlam:
             self._solve()
 
     def _solve(self, settings: Settings | None = None) -> None:
+        """Solve; where that fails the last estimate stays, and the failure is counted."""
         self._unsolved_keyframes, self._closure = 0, False
         if not self.keyframes:
             return
-        self.reports.append(self.solver.update(settings))
-        (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
+        try:
+            self.reports.append(self.solver.update(settings))
+            (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
+        except GraphSlamError as error:
+            self.counters.count("solver", type(error).__name__)
+
+    def _noise(self, source: str, covariance: Array) -> Gaussian:
+        """Noise of an edge, made before anything is added to the graph: it must not fail half-way."""
+        size = len(covariance)
+        least = covariance + np.diag(_LEAST_VARIANCE[:size])
+        try:
+            return Gaussian.from_covariance(least)
+        except NoiseError:  # of extreme numbers: a kilometre's lever arm, an hour's motion in one step
+            self.counters.count(source, "covariance_floored")
+            values, vectors = np.linalg.eigh(0.5 * (least + least.T))
+            floored = np.maximum(values, _LEAST_EIGENVALUE * values[-1])
+            return Gaussian.from_covariance((vectors * floored) @ vectors.T)
 
     def _pose(self, keyframe: Keyframe) -> se2.Pose:
         x, y, theta = self.solver.estimate([keyframe.vertex])[0].tolist()

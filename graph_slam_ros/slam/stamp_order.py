@@ -26,13 +26,20 @@ class StampOrder:
         self._released_ns: int | None = None
 
     def accepts(self, m: Odometry | Sightings) -> bool:
-        """Whether there is room, and an odometry message is not older than what was released; else it is counted."""
-        source = m.topic if isinstance(m, Sightings) else "odometry"
-        if len(self._heap) >= self._max_waiting and isinstance(m, Sightings):
-            self._counters.count(source, "overflow")
+        """Whether there is room, and an odometry message is not older than what was released; else it is counted.
+
+        Odometry newer than all before always has room: it is what makes others leave.
+        """
+        full = len(self._heap) >= self._max_waiting
+        if isinstance(m, Sightings):
+            if full:
+                self._counters.count(m.topic, "overflow", len(m.sightings))
+            return not full
+        if self._released_ns is not None and m.stamp_ns < self._released_ns:
+            self._counters.count("odometry", "late")
             return False
-        if isinstance(m, Odometry) and self._released_ns is not None and m.stamp_ns < self._released_ns:
-            self._counters.count(source, "late")
+        if full and self._newest_odometry_ns is not None and m.stamp_ns <= self._newest_odometry_ns:
+            self._counters.count("odometry", "overflow")
             return False
         return True
 
