@@ -42,5 +42,6 @@ def warmup() -> float:
     solver.update()
     solver.marginal([0])
     se2.noise_during((1.0, 0.0, 0.1), np.eye(3))
+    se2.propagate_during(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))
     se2.propagate(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))
     return time.perf_counter() - start

@@ -147,3 +147,11 @@ def propagate(covariance: NDArray[np.float64], step: Pose, added: NDArray[np.flo
                     total += a[i, k] * covariance[k, m] * a[j, m]
             out[i, j] += total
     return out
+
+
+@kernel
+def propagate_during(
+    covariance: NDArray[np.float64], step: Pose, of_twist: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """As ``propagate``, for noise that acted all through the step (``noise_during``)."""
+    return propagate(covariance, step, noise_during(step, of_twist))

@@ -59,7 +59,7 @@ class Border:
         self._decode = {name: decoder(name) for name in (ODOMETRY, DETECTIONS, TRANSFORMS)} | dict(decoders or {})
         self._transforms = StaticTransforms()
         self._twist_bytes = b""  # drivers repeat the same covariance
-        self._twist: tuple[tuple[str, ...], Array | None] = ((), None)
+        self._twist: tuple[tuple[str, ...], tuple[float, ...] | None] = ((), None)
 
     # -- one message each --------------------------------------------------------------------------------------------
 
@@ -124,17 +124,19 @@ class Border:
         return Odometry(stamp_ns, at, self._twist_covariance(m.twist.covariance, child))
 
     def _twist_covariance(self, flat: Array, child: str) -> tuple[float, ...] | None:
-        if child != self._config.frames.base:
-            return None  # it belongs to another point of the robot
+        if self._config.odometry.noise != "twist" or child != self._config.frames.base:
+            return None  # not used, or it belongs to another point of the robot
         raw = flat.tobytes()
         if raw != self._twist_bytes:
-            self._twist_bytes, self._twist = raw, self._checked(flat.reshape(6, 6)[_PLANAR])
+            repairs, checked = self._checked(flat.reshape(6, 6)[_PLANAR])
+            self._twist_bytes = raw
+            self._twist = repairs, None if checked is None else tuple(checked.ravel().tolist())
         repairs, covariance = self._twist
         for repair in repairs:
             self._counters.count("odometry", repair)
         if covariance is None and "covariance_unknown" not in repairs:
             raise MessageError(_refusal(flat.reshape(6, 6)[_PLANAR]))
-        return None if covariance is None else tuple(covariance.ravel().tolist())
+        return covariance
 
     # -- landmarks ---------------------------------------------------------------------------------------------------
 

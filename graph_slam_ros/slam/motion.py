@@ -17,13 +17,15 @@ class Motion:
     since errors of velocity last for about tau. A robot that stands gathers none.
     """
 
-    __slots__ = ("T_keyframe_base", "_config", "_density", "covariance", "moving_s")
+    __slots__ = ("T_keyframe_base", "_config", "_density", "_flat", "_square", "covariance", "moving_s")
 
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config
         self._density = np.diag(
             np.square([config.translation_density, config.lateral_density, config.rotation_density])
         )
+        self._flat: tuple[float, ...] = ()
+        self._square: Array = self._density
         self.restart()
 
     def restart(self) -> None:
@@ -47,7 +49,7 @@ class Motion:
 
     def _append(self, step: se2.Pose, dt: float, source: Odometry) -> None:
         self.T_keyframe_base = se2.compose(self.T_keyframe_base, step)
-        self.covariance = se2.propagate(self.covariance, step, self._noise(step, dt, source))
+        self.covariance = se2.propagate_during(self.covariance, step, self._noise(step, dt, source))
 
     def _noise(self, step: se2.Pose, dt: float, source: Odometry) -> Array:
         c = self._config
@@ -55,7 +57,10 @@ class Motion:
             return np.zeros((3, 3))
         self.moving_s += dt
         if c.noise == "twist" and source.twist_covariance is not None:
-            of_twist = np.array(source.twist_covariance).reshape(3, 3) * (dt * max(dt, c.twist_correlation_s))
-        else:
-            of_twist = self._density * dt
-        return se2.noise_during(step, of_twist)
+            return self._twist(source.twist_covariance) * (dt * max(dt, c.twist_correlation_s))
+        return self._density * dt
+
+    def _twist(self, flat: tuple[float, ...]) -> Array:
+        if flat is not self._flat:  # drivers repeat the same covariance
+            self._flat, self._square = flat, np.array(flat).reshape(3, 3)
+        return self._square

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.graph import EdgeTable
-from graph_slam_ros.solver.linearization import Block, by_class, linearize, total
+from graph_slam_ros.solver.linearization import Block, by_class, linearize, refuse_nonfinite, total
 from graph_slam_ros.solver.normal import NormalEquations
 from graph_slam_ros.solver.report import Iteration, Report
 
@@ -86,10 +86,20 @@ def minimise(problem: Problem, x: Array, settings: Settings) -> tuple[Array, Rep
     """Minimise stage after stage of the losses; returns the last finite iterate and the report.
 
     Gauss-Newton may rise on its way. It has failed when it ends above where it began, or not finite, or without
-    converging; then the stage is done again with damping.
+    converging, or met a singular system; then the stage is done again with damping. Damping hides what the edges
+    leave open, so after it the undamped system is factored once.
+
+    Raises
+    ------
+    SingularError
+        The edges do not determine a vertex.
+    GraphSlamError
+        The cost is not finite where it starts.
     """
     stages = settings.stages()
-    chi2_initial, cost_initial = total(problem.linearize(x, stages[0]))
+    blocks = problem.linearize(x, stages[0])
+    refuse_nonfinite(blocks)
+    chi2_initial, cost_initial = total(blocks)
     iterations: list[Iteration] = []
     used, stop = settings.method, ""
     for losses in stages:
@@ -102,6 +112,9 @@ def minimise(problem: Problem, x: Array, settings: Settings) -> tuple[Array, Rep
         x, stop = descent.x, descent.stop
         iterations += descent.iterations
     blocks = problem.linearize(x, stages[-1])
+    if used == "lm":
+        problem.normal.assemble(blocks)
+        problem.normal.factor()
     chi2, cost = total(blocks)
     classes = by_class(problem.graph, blocks)
     return x, Report(used, stop, chi2_initial, chi2, cost_initial, cost, tuple(iterations), classes)
@@ -114,7 +127,10 @@ def _gauss_newton(problem: Problem, x: Array, losses: Mapping[str, Loss], settin
     iterations: list[Iteration] = []
     for _ in range(settings.max_iterations):
         problem.normal.assemble(blocks)
-        step = problem.normal.factor().solve(-problem.normal.gradient)
+        try:
+            step = problem.normal.factor().solve(-problem.normal.gradient)
+        except SingularError:
+            return _Descent(x, iterations, "singular")
         x = problem.retract(x, step)
         blocks = problem.linearize(x, losses)
         previous, (chi2, cost) = cost, total(blocks)

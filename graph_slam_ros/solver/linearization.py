@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.graph.losses import weight_and_cost
@@ -95,6 +96,18 @@ def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: M
 def total(blocks: list[Block]) -> tuple[float, float]:
     """(chi2, cost) of all edges."""
     return float(sum(b.chi2.sum() for b in blocks)), float(sum(b.cost.sum() for b in blocks))
+
+
+def refuse_nonfinite(blocks: list[Block]) -> None:
+    """Raise where numbers are so large that a cost overflows, naming the first such edge."""
+    for b in blocks:
+        bad = np.flatnonzero(~np.isfinite(b.cost))
+        if len(bad):
+            row = b.rows[bad[0]]
+            raise GraphSlamError(
+                f"edge {int(b.table.id.values[row])} ({b.table.type.name}) between vertices"
+                f" {b.table.vertices.values[row].tolist()}: its chi2 is not finite"
+            )
 
 
 def by_class(graph: Graph, blocks: list[Block]) -> dict[str, ClassCost]:

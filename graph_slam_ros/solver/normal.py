@@ -22,6 +22,8 @@ from graph_slam_ros.solver.linearization import Block
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+_LEAST_PIVOT = 1e-14  # of its diagonal entry: what elimination left of it is rounding
+_SHIFT = 1e-13  # well above rounding, and below what edges of very different strength leave (1e-10 in real graphs)
 _SYMMETRIC = {"diag_pivot_thresh": 0.0, "relax": 1, "options": {"SymmetricMode": True}}
 
 
@@ -158,22 +160,25 @@ class NormalEquations:
         return h
 
     def factor(self, damping: float = 0.0) -> SuperLU:
-        """Sparse LU in the order of elimination, with diagonal pivots. Raises SingularError naming a vertex."""
-        h = self.matrix(damping)
-        try:
-            return splu(h, permc_spec="NATURAL", **_SYMMETRIC)
-        except RuntimeError:  # SuperLU: "Factor is exactly singular"
-            raise SingularError(f"the edges do not determine vertex {self._weakest(h)}") from None
+        """Sparse LU in the order of elimination, with diagonal pivots.
 
-    def _weakest(self, h: csc_array) -> int:
-        """The vertex with the smallest pivot once a little damping makes the factorisation possible."""
-        scale = h.diagonal()
-        shifted = h + 1e-9 * _diagonal(np.where(scale > 0, scale, 1.0))
-        lu = splu(shifted.tocsc(), permc_spec="NATURAL", **_SYMMETRIC)
-        pivot = np.empty(self.size)
-        pivot[np.argsort(lu.perm_c)] = np.abs(lu.U.diagonal())
-        weakest = int(np.argmin(pivot / np.where(scale > 0, scale, 1.0)))
-        return int(self.free[np.searchsorted(self.first_dof, weakest, side="right") - 1])
+        Raises SingularError naming a vertex, also where rounding hides that H is singular.
+        """
+        h = self.matrix(damping)
+        diagonal = h.diagonal()
+        scale = np.where(diagonal > 0.0, diagonal, 1.0)
+        try:
+            lu = splu(h, permc_spec="NATURAL", **_SYMMETRIC)
+            pivot = _pivots(lu) / scale
+            determined = bool((pivot > _LEAST_PIVOT).all())
+        except RuntimeError:  # SuperLU: "Factor is exactly singular"
+            shifted = (h + _SHIFT * _diagonal(scale)).tocsc()
+            pivot = _pivots(splu(shifted, permc_spec="NATURAL", **_SYMMETRIC)) / scale
+            determined = False
+        if determined:
+            return lu
+        vertex = int(self.free[np.searchsorted(self.first_dof, int(np.argmin(pivot)), side="right") - 1])
+        raise SingularError(f"the edges do not determine vertex {vertex}")
 
 
 def _elimination_order(graph: Graph, free: Index, rows: Mapping[EdgeTable, Index]) -> Index:
@@ -193,6 +198,13 @@ def _elimination_order(graph: Graph, free: Index, rows: Mapping[EdgeTable, Index
     pattern = csc_array((np.ones(len(row)), (row, column)), shape=(len(free), len(free)))
     pattern.setdiag(pattern.sum(axis=0) + 1.0)  # any numbers that need no pivoting
     return free[np.argsort(splu(pattern, permc_spec="MMD_AT_PLUS_A", **_SYMMETRIC).perm_c)]
+
+
+def _pivots(lu: SuperLU) -> Array:
+    """Size of the pivot of each column of the factored matrix."""
+    pivot = np.empty(lu.shape[0])
+    pivot[np.argsort(lu.perm_c)] = np.abs(lu.U.diagonal())
+    return pivot
 
 
 def _diagonal(values: Array) -> coo_array:
@@ -220,7 +232,8 @@ def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable,
         part = np.arange(graph.vertex_count)
     loose = free[~np.isin(part[free], part[fixed])]
     if len(loose):
+        more = int((part[loose] == part[loose[0]]).sum()) - 1
         raise GaugeError(
-            f"nothing fixes the gauge of vertex {int(loose[0])} and {len(loose) - 1} more joined to it: add a prior"
+            f"nothing fixes the gauge of vertex {int(loose[0])} and {more} more joined to it: add a prior"
             " (an anchor) or hold a vertex"
         )

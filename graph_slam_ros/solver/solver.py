@@ -33,27 +33,22 @@ class Solver:
 
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Take vertices (at their initial values) and edges of the graph into the problem, by id, each once."""
-        new = np.asarray(vertices, dtype=np.int64).ravel()
         self._grow()
-        if self._inside[new].any():
-            raise GraphSlamError(f"vertex {int(new[self._inside[new]][0])} was added before")
-        self._inside[new] = True
-        new_edges = np.asarray(edges, dtype=np.int64).ravel()
-        if self._edges[new_edges].any():
-            raise GraphSlamError(f"edge {int(new_edges[self._edges[new_edges]][0])} was added before")
-        tables = self.graph.table_of_edge.values[new_edges]
-        for code, table in enumerate(self.graph.tables.values()):
-            ends = table.vertices.values[self.graph.row_of_edge.values[new_edges[tables == code]]]
-            if not self._inside[ends].all():
-                self._inside[new] = False
-                raise GraphSlamError(f"an edge needs vertex {int(ends[~self._inside[ends]][0])}, which was not added")
-        self._edges[new_edges] = True
+        inside = _with(self._inside, vertices, "vertex")
+        taken = _with(self._edges, edges, "edge")
+        for table in self.graph.tables.values():
+            ends = table.vertices.values[taken[table.id.values]]
+            if not inside[ends].all():
+                raise GraphSlamError(f"an edge needs vertex {int(ends[~inside[ends]][0])}, which was not added")
+        self._inside, self._edges = inside, taken
         self._structure_changed()
 
     def set_weight(self, edge: int, weight: float) -> None:
         """Multiply the information of an edge; 0 takes it out of the structure, another value puts it back."""
         if not (np.isfinite(weight) and weight >= 0.0):
             raise GraphSlamError(f"edge {edge}: weight {weight} is not a finite number >= 0")
+        self._grow()
+        _known([edge], len(self._edges), "edge")
         table, row = self.graph.row(edge)
         was = table.weight.values[row]
         table.weight.values[row] = weight
@@ -64,11 +59,12 @@ class Solver:
     def hold(self, vertex: int) -> None:
         """Keep a vertex at its present estimate."""
         self._grow()
+        _known([vertex], len(self._inside), "vertex")
         self._held[vertex] = True
         self._structure_changed()
 
     def update(self, settings: Settings | None = None) -> Report:
-        """Minimise the cost from the present estimate.
+        """Minimise the cost from the present estimate; nothing is left to do where that has converged before.
 
         Raises
         ------
@@ -82,15 +78,15 @@ class Solver:
             blocks = problem.linearize(self._x, settings.stages()[-1])
             chi2, cost = total(blocks)
             return Report("gn", "nothing_to_do", chi2, chi2, cost, cost, (), by_class(self.graph, blocks))
-        check_gauge(self.graph, problem.normal.free, np.flatnonzero(self._inside & self._held), problem.rows)
+        self._check_gauge()
         self._x, report = minimise(problem, self._x, settings)
-        self._solved_with = settings
+        self._solved_with = settings if report.converged else None
         return report
 
     def estimate(self, ids: ArrayLike) -> Array:
         """Values of vertices of one kind, (n, size)."""
-        at = np.asarray(ids, dtype=np.int64).ravel()
         self._grow()
+        at = _known(ids, len(self._inside), "vertex")
         if not len(at):
             return np.empty((0, 0))
         codes = self.graph.kind.values[at]
@@ -103,18 +99,28 @@ class Solver:
         """Covariance (dof, dof) of each vertex in its tangent space; zero for a held one.
 
         Linearised at the present estimate with the last stage's losses.
+
+        Raises
+        ------
+        GaugeError, SingularError
+            A covariance that does not exist is refused.
         """
-        normal = self._linearized()
-        lu = normal.factor()
+        self._grow()
+        wanted = _known(ids, len(self._inside), "vertex")
+        if not self._inside[wanted].all():
+            raise GraphSlamError(f"vertex {int(wanted[~self._inside[wanted]][0])} is not in the problem")
+        free = not self._held[wanted].all()
+        if free:
+            self._check_gauge()
+            normal = self._linearized()
+            lu = normal.factor()
         out = []
-        for vertex in np.asarray(ids, dtype=np.int64).ravel().tolist():
+        for vertex in wanted.tolist():
             dof = self.graph.kind_of(vertex).dof
             if self._held[vertex]:
                 out.append(np.zeros((dof, dof)))
                 continue
             k = int(normal.position[vertex])
-            if k < 0:
-                raise GraphSlamError(f"vertex {vertex} is not in the problem")
             first = int(normal.first_dof[k])
             unit = np.zeros((normal.size, dof))
             unit[first + np.arange(dof), np.arange(dof)] = 1.0
@@ -125,7 +131,9 @@ class Solver:
     def information_matrix(self) -> Array:
         """H as a dense matrix at the present estimate, vertices in order of id: for tests and small examples."""
         normal = self._linearized()
-        by_id = np.concatenate([normal.first_dof[k] + np.arange(normal.dof[k]) for k in np.argsort(normal.free)])
+        by_id = [
+            int(normal.first_dof[k]) + d for k in np.argsort(normal.free).tolist() for d in range(int(normal.dof[k]))
+        ]
         dense: Array = normal.matrix().toarray()[np.ix_(by_id, by_id)]
         return dense
 
@@ -157,8 +165,30 @@ class Solver:
             self._problem = Problem(self.graph, rows, normal)
         return self._problem
 
+    def _check_gauge(self) -> None:
+        problem = self._structure()
+        check_gauge(self.graph, problem.normal.free, np.flatnonzero(self._inside & self._held), problem.rows)
+
     def _linearized(self) -> NormalEquations:
         self._grow()
         problem = self._structure()
         problem.normal.assemble(problem.linearize(self._x, self.settings.stages()[-1]))
         return problem.normal
+
+
+def _known(ids: ArrayLike, count: int, what: str) -> Index:
+    at = np.asarray(ids, dtype=np.int64).ravel()
+    strange = (at < 0) | (at >= count)
+    if strange.any():
+        raise GraphSlamError(f"{what} {int(at[strange][0])} does not exist")
+    return at
+
+
+def _with(taken: NDArray[np.bool_], ids: ArrayLike, what: str) -> NDArray[np.bool_]:
+    """A copy of ``taken`` with more ids in it, each for the first time."""
+    out = taken.copy()
+    for one in _known(ids, len(taken), what).tolist():
+        if out[one]:
+            raise GraphSlamError(f"{what} {one} was added before")
+        out[one] = True
+    return out
