@@ -1,5 +1,6 @@
 """Replay: a recording, or the ingest sequence of an earlier run, through ``GraphSlam`` as fast as the CPU allows."""
 
+import shlex
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from graph_slam_ros.formats.ingest import read_ingest
 from graph_slam_ros.ros.bag import Bag, BagError, open_bag
 from graph_slam_ros.ros.definitions import recorded_decoder
 from graph_slam_ros.ros.from_msg import DETECTIONS, ODOMETRY, TRANSFORMS, Border
-from graph_slam_ros.run import RunRecorder, is_run, run_config, summarize
+from graph_slam_ros.run import RunRecorder, check_room, is_run, run_config, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.measurements import from_record
 
@@ -82,11 +83,19 @@ def measurements(bag: Bag, inputs: Inputs, config: Config, counters: Counters) -
     """What the border makes of each recorded message, in order; None for one it refused.
 
     Static transforms are read first: they hold for the whole recording.
+
+    Raises
+    ------
+    BagError
+        At once, before anything is read: a recorded definition is not what we can use.
     """
     used = {name: bag.topics[name] for name in inputs.names()}
     types = {inputs.odometry: ODOMETRY, inputs.landmarks: DETECTIONS, inputs.tf_static: TRANSFORMS}
     decoders = {types[name]: recorded_decoder(topic) for name, topic in used.items()}
-    border = Border(config, counters, decoders)
+    return _through(Border(config, counters, decoders), bag, inputs)
+
+
+def _through(border: Border, bag: Bag, inputs: Inputs) -> Iterator[Measurement | None]:
     if inputs.tf_static:
         for message in bag.messages({inputs.tf_static}):
             border.static_transforms(message.cdr)
@@ -115,6 +124,7 @@ def replay(
     """
     start, cpu = time.perf_counter(), time.process_time()
     counters = Counters()
+    check_room(out, source)
     if is_run(source):
         config = config or run_config(source)
         losses: list[str] = []
@@ -185,7 +195,7 @@ def _suggestion(bag: Bag, path: Path, frames: dict[str, str]) -> str:
         inputs = choose_inputs(bag, None, None)
     except BagError as error:
         return f"not ready for replay: {error}"
-    words = ["graph_slam replay", str(path), "--odom", inputs.odometry]
+    words = ["graph_slam", "replay", str(path), "--odom", inputs.odometry]
     if inputs.landmarks:
         words += ["--landmarks", inputs.landmarks]
     parent, _, child = frames.get(inputs.odometry, "").partition(_ARROW)
@@ -194,4 +204,4 @@ def _suggestion(bag: Bag, path: Path, frames: dict[str, str]) -> str:
         words += ["--set", f"frames.odom={parent}"]
     if child not in ("", usual.base):
         words += ["--set", f"frames.base={child}"]
-    return " ".join([*words, "--out run"])
+    return shlex.join([*words, "--out", "run"])

@@ -6,6 +6,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from graph_slam_ros.ros.bag import BagWriter
 from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.measurements import to_record
 
-SUMMARY = "run.json"
+SUMMARY, _CONFIG = "run.json", "config.yaml"
+_RECORDED = re.compile(r"(ingest|run)(_\d+)?\.mcap")
 
 _PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
 
@@ -31,12 +33,29 @@ class RunError(GraphSlamError):
 
 def is_run(folder: Path) -> bool:
     """Whether a folder holds a run: an ingest sequence and the configuration it was taken with."""
-    return folder.is_dir() and (folder / "config.yaml").is_file() and bool(ingest_files(folder))
+    return folder.is_dir() and (folder / _CONFIG).is_file() and bool(ingest_files(folder))
 
 
 def run_config(folder: Path) -> Config:
     """The configuration a run was made with."""
-    return Config.from_mapping(read_parameters(folder / "config.yaml"))
+    return Config.from_mapping(read_parameters(folder / _CONFIG))
+
+
+def check_room(folder: Path, source: Path | None = None) -> None:
+    """Refuse a folder that holds anything but an earlier run, or the source that is about to be read.
+
+    Raises
+    ------
+    RunError
+        Nothing was touched.
+    """
+    try:
+        if source is not None and folder.resolve() in (source.resolve(), source.resolve().parent):
+            raise RunError(f"{folder}: cannot be read from and written to at once")
+        if folder.exists() and any(folder.iterdir()) and not is_run(folder):
+            raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
+    except OSError as error:
+        raise RunError(f"{folder}: {error.strerror}") from None
 
 
 class RunRecorder:
@@ -54,7 +73,11 @@ class RunRecorder:
         self._bag: BagWriter | None = None
         self._next_path_at = 1.0
         _make_room(self.folder)
-        _replace(self.folder / "config.yaml", parameters_text(config.as_mapping()))
+        try:
+            self._ingest = IngestWriter(self._part_of("ingest"))  # from the start: it makes the folder a run
+        except OSError as error:
+            raise RunError(f"{self.folder}: {error.strerror}") from None
+        _replace(self.folder / _CONFIG, parameters_text(config.as_mapping()))
 
     def sink(self, measurement: Measurement) -> None:
         """Append to the ingest sequence: the sink of ``GraphSlam``."""
@@ -75,11 +98,20 @@ class RunRecorder:
             self._record_map(slam)
 
     def save(self, slam: GraphSlam, summary: dict[str, Any] | None = None) -> Path:
-        """Write all results; recording may go on, in new parts of ``ingest`` and ``run``. Returns the folder."""
-        if slam.keyframes:
-            self._record_map(slam)
-        self.close()
-        _write_graph(self.folder, slam)
+        """Write all results; recording may go on, in new parts of ``ingest`` and ``run``. Returns the folder.
+
+        Raises
+        ------
+        RunError
+            The folder cannot be written.
+        """
+        try:
+            if slam.keyframes:
+                self._record_map(slam)
+            self.close()
+            _write_graph(self.folder, slam)
+        except OSError as error:
+            raise RunError(f"{self.folder}: {error.strerror}") from None
         stamps = [k.stamp_ns for k in slam.keyframes]
         _replace(self.folder / "path.tum", tum_text(stamps, slam.trajectory()))
         stamps = [s.stamp_ns for s in slam.sighting_poses]
@@ -165,13 +197,11 @@ def _csv(text: str) -> str:
 
 
 def _make_room(folder: Path) -> None:
+    check_room(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        present = list(folder.iterdir())
-        if present and not is_run(folder):
-            raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
-        for file in present:
-            if file.name == SUMMARY or (file.suffix == ".mcap" and file.stem.split("_")[0] in ("ingest", "run")):
+        for file in folder.iterdir():
+            if file.name == SUMMARY or _RECORDED.fullmatch(file.name):
                 file.unlink()
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None

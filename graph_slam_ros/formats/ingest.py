@@ -5,6 +5,7 @@ files, ``ingest.mcap``, ``ingest_1.mcap``, ...
 """
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.mcap_records import records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
+_PART = re.compile(r"ingest(?:_(\d+))?\.mcap")
 _SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}}, "required": ["type"]}).encode()
 
 
@@ -49,8 +51,9 @@ class IngestWriter:
 
 def ingest_files(folder: Path) -> list[Path]:
     """The files of a run's sequence, in order."""
-    numbered = {file: file.stem.removeprefix("ingest").removeprefix("_") for file in folder.glob("ingest*.mcap")}
-    return sorted(numbered, key=lambda file: int(numbered[file] or 0))
+    parts = {file: _PART.fullmatch(file.name) for file in folder.glob("ingest*.mcap")}
+    numbered = {file: int(part[1] or 0) for file, part in parts.items() if part and file.is_file()}
+    return sorted(numbered, key=lambda file: numbered[file])
 
 
 def read_ingest(folder: Path, losses: list[str]) -> Iterator[dict[str, Any]]:

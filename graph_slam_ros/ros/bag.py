@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.mcap_records import contents, is_mcap, records
+from graph_slam_ros.formats.mcap_records import Contents, contents, is_mcap, records
 from graph_slam_ros.ros.interfaces import typestore
 
 
@@ -82,18 +82,22 @@ def open_bag(path: Path | str) -> Bag:
 
 def _files(path: Path) -> list[Path]:
     if path.is_file():
-        if path.stat().st_size == 0:
-            raise BagError(f"{path}: the file is empty")
-        return [path]
+        return [_filled(path)]
     if not path.exists():
         raise BagError(f"{path}: no such file or folder")
     if not path.is_dir():
         raise BagError(f"{path}: neither a file nor a folder")
     for suffix in (".mcap", ".db3", ".bag"):
-        found = sorted(path.glob(f"*{suffix}"), key=_natural)
+        found = sorted((file for file in path.glob(f"*{suffix}") if file.is_file()), key=_natural)
         if found:
-            return found
+            return [_filled(file) for file in found]
     raise BagError(f"{path}: no recording (.mcap, .db3, .bag) in this folder")
+
+
+def _filled(file: Path) -> Path:
+    if file.stat().st_size == 0:
+        raise BagError(f"{file}: the file is empty")
+    return file
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -106,10 +110,9 @@ class _McapBag:
         self._files = files
         self.losses: list[str] = []
         self.topics: dict[str, Topic] = {}
-        self._expected: dict[Path, int] = {}
+        self._contents: dict[Path, Contents] = {}
         for file in files:
-            found = contents(file)
-            self._expected[file] = sum(found.counts.values())
+            found = self._contents[file] = contents(file)
             for channel in found.channels.values():
                 self._add_topic(file, channel, found.schemas.get(channel.schema_id), found.counts.get(channel.id, 0))
         if not self.topics:
@@ -117,9 +120,10 @@ class _McapBag:
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         for file in self._files:
-            names: dict[int, str] = {}
-            read = 0
-            for record in records(file, self.losses):
+            # a channel's own record may sit in a damaged chunk: the summary knows it, too
+            names = {channel.id: channel.topic for channel in self._contents[file].channels.values()}
+            read, losses = 0, list[str]()
+            for record in records(file, losses):
                 if isinstance(record, Message):
                     read += 1
                     name = names.get(record.channel_id, "")
@@ -127,8 +131,10 @@ class _McapBag:
                         yield BagMessage(name, record.log_time, record.data)
                 elif isinstance(record, Channel):
                     names[record.id] = record.topic
-            if read < self._expected[file]:
-                self.losses.append(f"{file.name}: {self._expected[file] - read} of its messages could not be read")
+            missing = sum(self._contents[file].counts.values()) - read
+            if missing > 0:
+                losses.append(f"{file.name}: {missing} of its messages could not be read")
+            self.losses += [loss for loss in losses if loss not in self.losses]  # a file may be read more than once
 
     def _add_topic(self, file: Path, channel: Channel, schema: Schema | None, count: int) -> None:
         encoding, type_name = channel.message_encoding, schema.name if schema else ""
@@ -148,10 +154,10 @@ class _RosbagsBag:
 
     def __init__(self, files: list[Path]) -> None:
         self._name = files[0].name
-        self._reader = AnyReader(files, default_typestore=typestore())
         self.losses: list[str] = []
         self.topics: dict[str, Topic] = {}
         try:
+            self._reader = AnyReader(files, default_typestore=typestore())
             self._reader.open()
         except Exception as error:  # rosbags raises asserts and parser errors on damaged files
             what = str(error) or type(error).__name__

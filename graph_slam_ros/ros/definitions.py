@@ -18,8 +18,15 @@ _NEEDED: dict[str, tuple[str, ...]] = {
     "vision_msgs/msg/BoundingBox3D": ("center",),
     "tf2_msgs/msg/TFMessage": ("transforms",),
     "std_msgs/msg/Header": ("stamp", "frame_id"),
+    "builtin_interfaces/msg/Time": ("sec", "nanosec"),
     "geometry_msgs/msg/PoseWithCovariance": ("pose", "covariance"),
     "geometry_msgs/msg/TwistWithCovariance": ("covariance",),
+    "geometry_msgs/msg/Pose": ("position", "orientation"),
+    "geometry_msgs/msg/Point": ("x", "y", "z"),
+    "geometry_msgs/msg/Quaternion": ("x", "y", "z", "w"),
+    "geometry_msgs/msg/TransformStamped": ("header", "child_frame_id", "transform"),
+    "geometry_msgs/msg/Transform": ("translation", "rotation"),
+    "geometry_msgs/msg/Vector3": ("x", "y", "z"),
 }
 
 
@@ -45,10 +52,13 @@ def recorded_decoder(topic: Topic) -> Decoder:
     if all(ours.get(name) == definition for name, definition in recorded.items()):
         return decoder(topic.type)
     for name, (_, fields) in recorded.items():
-        there = {field for field, _ in fields}
+        there = dict(fields)
+        known = dict(ours[name][1]) if name in ours else {}
         for field in _NEEDED.get(name, ()):
             if field not in there:
                 raise BagError(f"topic {topic.name}: {name} of this recording has no field {field!r}")
+            if there[field] != known[field]:
+                raise BagError(f"topic {topic.name}: field {field!r} of {name} has another type in this recording")
     store = _store(recorded)
     return lambda cdr: store.deserialize_cdr(cdr, topic.type)
 
