@@ -169,15 +169,15 @@ class NormalEquations:
         scale = np.where(diagonal > 0.0, diagonal, 1.0)
         try:
             lu = splu(h, permc_spec="NATURAL", **_SYMMETRIC)
-            pivot = _pivots(lu) / scale
-            determined = bool((pivot > _LEAST_PIVOT).all())
+            lost = _pivots(lu) <= _LEAST_PIVOT * scale
         except RuntimeError:  # SuperLU: "Factor is exactly singular"
             shifted = (h + _SHIFT * _diagonal(scale)).tocsc()
             pivot = _pivots(splu(shifted, permc_spec="NATURAL", **_SYMMETRIC)) / scale
-            determined = False
-        if determined:
+            lost = pivot <= max(10.0 * _SHIFT, float(pivot.min()))
+        if not lost.any():
             return lu
-        vertex = int(self.free[np.searchsorted(self.first_dof, int(np.argmin(pivot)), side="right") - 1])
+        first = int(np.flatnonzero(lost)[0])  # those after it are spoiled by it
+        vertex = int(self.free[np.searchsorted(self.first_dof, first, side="right") - 1])
         raise SingularError(f"the edges do not determine vertex {vertex}")
 
 

@@ -34,13 +34,16 @@ class Solver:
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Take vertices (at their initial values) and edges of the graph into the problem, by id, each once."""
         self._grow()
-        inside = _with(self._inside, vertices, "vertex")
-        taken = _with(self._edges, edges, "edge")
-        for table in self.graph.tables.values():
-            ends = table.vertices.values[taken[table.id.values]]
-            if not inside[ends].all():
-                raise GraphSlamError(f"an edge needs vertex {int(ends[~inside[ends]][0])}, which was not added")
-        self._inside, self._edges = inside, taken
+        new = _fresh(vertices, self._inside, "vertex")
+        new_edges = _fresh(edges, self._edges, "edge")
+        tables, rows = self.graph.table_of_edge.values[new_edges], self.graph.row_of_edge.values[new_edges]
+        for code, table in enumerate(self.graph.tables.values()):
+            ends = table.vertices.values[rows[tables == code]].ravel()
+            outside = ends[~(self._inside[ends] | np.isin(ends, new))]
+            if len(outside):
+                raise GraphSlamError(f"an edge needs vertex {int(outside[0])}, which was not added")
+        self._inside[new] = True
+        self._edges[new_edges] = True
         self._structure_changed()
 
     def set_weight(self, edge: int, weight: float) -> None:
@@ -184,11 +187,11 @@ def _known(ids: ArrayLike, count: int, what: str) -> Index:
     return at
 
 
-def _with(taken: NDArray[np.bool_], ids: ArrayLike, what: str) -> NDArray[np.bool_]:
-    """A copy of ``taken`` with more ids in it, each for the first time."""
-    out = taken.copy()
-    for one in _known(ids, len(taken), what).tolist():
-        if out[one]:
-            raise GraphSlamError(f"{what} {one} was added before")
-        out[one] = True
-    return out
+def _fresh(ids: ArrayLike, taken: NDArray[np.bool_], what: str) -> Index:
+    """Ids that are there and not yet taken, each once."""
+    at = _known(ids, len(taken), what)
+    ordered = np.sort(at)
+    again = np.concatenate([at[taken[at]], ordered[1:][ordered[1:] == ordered[:-1]]])
+    if len(again):
+        raise GraphSlamError(f"{what} {int(again[0])} was added before")
+    return at
