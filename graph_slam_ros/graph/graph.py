@@ -110,7 +110,9 @@ class Graph:
         """Add n vertices with initial values (n, size); returns their ids."""
         rows = np.asarray(values, dtype=float).reshape(-1, kind.size)
         if not np.isfinite(rows).all():
-            raise GraphSlamError(f"an initial value of a vertex {kind.name} is not finite")
+            row = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
+            vertex = self.vertex_count + row
+            raise GraphSlamError(f"initial value {rows[row].tolist()} of vertex {vertex} is not finite")
         count, start = len(rows), len(self.initial)
         ids = np.arange(self.vertex_count, self.vertex_count + count)
         if kind not in self.kinds:
@@ -174,10 +176,17 @@ class Graph:
         ):
             raise GraphSlamError(f"{edge.name}: noise of shape {noise.sqrt_information.shape} does not fit")
         if not np.isfinite(measured).all():
-            raise GraphSlamError(f"{edge.name}: a measurement is not finite")
+            row = int(np.flatnonzero(~np.isfinite(measured).all(axis=1))[0])
+            raise GraphSlamError(
+                f"{edge.name}: measurement {measured[row].tolist()} at vertices {at[row].tolist()} is not finite"
+            )
         if len(at) and (at.min() < 0 or at.max() >= self.vertex_count):
             missing = int(at.max() if at.max() >= self.vertex_count else at.min())
             raise GraphSlamError(f"{edge.name}: vertex {missing} does not exist")
+        for slot in range(1, at.shape[1]):
+            itself = at[:, slot] == at[:, slot - 1]
+            if itself.any():
+                raise GraphSlamError(f"{edge.name}: edge from vertex {int(at[itself, slot][0])} to itself")
         for slot, kinds in enumerate(edge.accepts):
             fits = np.array([kind in kinds for kind in self.kinds])[self.kind.values[at[:, slot]]]
             if not fits.all():

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie.jit import jitable
 
 NONE, HUBER, CAUCHY = 0, 1, 2
@@ -20,9 +21,15 @@ class Loss:
     kind: int = NONE
     scale: float = 1.0
 
+    def __post_init__(self) -> None:
+        if self.kind not in NAMES.values() or not 0.0 < self.scale < np.inf:
+            raise GraphSlamError(f"loss {self.kind} of scale {self.scale}: no such loss, or not a positive scale")
+
     @classmethod
     def named(cls, name: str, scale: float = 1.0) -> "Loss":
         """From ``none``, ``huber`` or ``cauchy``."""
+        if name not in NAMES:
+            raise GraphSlamError(f"loss {name!r}: choose {', '.join(NAMES)}")
         return cls(NAMES[name], scale)
 
 

@@ -10,6 +10,7 @@ from graph_slam_ros.errors import NoiseError
 Array = NDArray[np.float64]
 
 _ASYMMETRY = 1e-6  # of the largest entry; text files carry 6 digits
+_RANK = 16.0 * float(np.finfo(float).eps)  # what Cholesky leaves of a diagonal entry of a singular matrix is below this
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +54,9 @@ def _cholesky(matrices: ArrayLike, what: str) -> Array:
         asymmetry = np.abs(a - transposed).max(axis=(-1, -2), initial=0.0)
         symmetric = asymmetry <= _ASYMMETRY * np.abs(a).max(axis=(-1, -2), initial=0.0)
     if symmetric.all():  # false for what is not finite, too
-        try:
-            return np.linalg.cholesky(0.5 * (a + transposed))
-        except np.linalg.LinAlgError:
-            pass
+        root = _definite_root(0.5 * (a + transposed))
+        if root is not None:
+            return root
     raise NoiseError(_fault(a.reshape(-1, *a.shape[-2:]), what))
 
 
@@ -67,7 +67,7 @@ def _fault(stack: Array, what: str) -> str:
             why = "not finite"
         elif np.abs(matrix - matrix.T).max() > _ASYMMETRY * np.abs(matrix).max():
             why = "not symmetric"
-        elif not _is_definite(matrix):
+        elif _definite_root(0.5 * (matrix + matrix.T)) is None:
             why = "not positive definite"
         else:
             continue
@@ -76,9 +76,11 @@ def _fault(stack: Array, what: str) -> str:
     return f"{what}: not symmetric positive definite"
 
 
-def _is_definite(matrix: Array) -> bool:
+def _definite_root(matrices: Array) -> Array | None:
+    """Cholesky factors; None where one is singular up to rounding or not definite."""
     try:
-        np.linalg.cholesky(matrix)
+        root = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)
     except np.linalg.LinAlgError:
-        return False
-    return True
+        return None
+    pivots = np.diagonal(root, axis1=-2, axis2=-1) ** 2
+    return root if (pivots > _RANK * np.diagonal(matrices, axis1=-2, axis2=-1)).all() else None
