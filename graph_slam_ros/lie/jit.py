@@ -1,7 +1,7 @@
 """How kernels are compiled: Numba with a cache that cannot serve stale code.
 
-Numba keys its cache by the file of the compiled function and does not see a change in a file imported by it. So the
-cache lives in one folder per digest of all kernel sources.
+Numba keys its cache by the file of the compiled function and sees neither a change in a file imported by it nor another
+setting of the compiler (bounds checks). So the cache lives in one folder per digest of all kernel sources and settings.
 """
 
 import hashlib
@@ -18,10 +18,12 @@ __all__ = ["CACHE_DIR", "jitable", "kernel"]
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _KERNEL_FOLDERS = ("lie", "graph", "solver")
+_SETTINGS = ("BOUNDSCHECK", "OPT")
 
 
 def _digest() -> str:
-    sha = hashlib.sha256(numba.__version__.encode())
+    settings = [getattr(numba.config, name, None) for name in _SETTINGS]
+    sha = hashlib.sha256(f"{numba.__version__} {settings}".encode())
     for folder in _KERNEL_FOLDERS:
         for path in sorted((_PACKAGE / folder).glob("*.py")):
             sha.update(path.name.encode())
@@ -39,6 +41,8 @@ def _cache_dir() -> Path:
     except OSError:  # a read-only home: compile into a folder of this user and this source
         fallback = Path(tempfile.gettempdir()) / f"graph_slam_ros-{os.getuid()}-{_digest()}"
         fallback.mkdir(mode=0o700, exist_ok=True)
+        if fallback.is_symlink() or fallback.stat().st_uid != os.getuid():  # another user's: what it caches is code
+            return Path(tempfile.mkdtemp(prefix="graph_slam_ros-"))
         return fallback
 
 
