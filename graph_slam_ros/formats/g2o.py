@@ -98,6 +98,8 @@ class _Reader:
             elif tag in _EDGE_TAGS:
                 self.edges[tag].append(self._edge(line, tag, words))
             elif tag == "FIX":
+                if len(words) < 2:
+                    raise FormatError("FIX names no vertex")
                 self.fixed += [(line, _integer(word)) for word in words[1:]]
             else:
                 self.unknown.append(text.strip())
@@ -238,13 +240,16 @@ def write_g2o(path: Path | str, file: G2oFile, values: Callable[[Sequence[int]],
             edges.append((int(table.id.values[row]), f"{tag_of_edge[edge_type]} {ends} {numbers}"))
     out += [row for _, row in sorted(edges)]
     out += file.unknown
-    Path(path).write_text("\n".join(out) + "\n")
+    try:
+        Path(path).write_text("\n".join(out) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise FormatError(f"{path}: {error.strerror}") from None
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    if not path.is_file():
-        raise FormatError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
     try:
+        if not path.is_file():
+            raise FormatError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
         with path.open(encoding="utf-8") as stream:
             yield from enumerate(stream, start=1)
     except UnicodeDecodeError:
