@@ -10,6 +10,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small dense blocks: thread
 import argparse
 import importlib.util
 import json
+import signal
 import sys
 import traceback
 from collections.abc import Iterable, Sequence
@@ -51,6 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def node_main() -> int:
     """Run the ROS node; without ROS, say so."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing to tell or save while modules are imported
     if not _has_ros():
         print("graph_slam_node: ROS 2 is not installed here (no rclpy); replay works without it", file=sys.stderr)
         return REFUSED
@@ -113,14 +115,14 @@ def _optimize(args: argparse.Namespace) -> int:
     from graph_slam_ros.formats.g2o import read_g2o, write_g2o
     from graph_slam_ros.solver import Settings, Solver
 
-    file = read_g2o(args.graph, error_map=args.error_map, lenient=args.lenient)
+    file = read_g2o(args.graph, error_map=args.error_map, lenient=args.lenient, raw=args.information == "raw")
     settings = Settings(method=args.method, max_iterations=args.max_iterations, cost_tolerance=args.tolerance)
     solver = Solver(file.graph, settings)
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
     for vertex in file.fixed:
         solver.hold(vertex)
     if not file.fixed and "priors" not in file.graph.labels:
-        first = min(range(file.graph.vertex_count), key=lambda v: (file.graph.kind_of(v).dof != 3, file.ids[v]))
+        first = min(range(file.graph.vertex_count), key=lambda v: (file.graph.kind_of(v).name[:2] != "SE", file.ids[v]))
         solver.hold(first)
     report = solver.update()
     if args.json:
@@ -232,6 +234,7 @@ def _parser() -> argparse.ArgumentParser:
         "--tolerance", type=_positive, default=1e-6, metavar="X", help="relative decrease of chi2 at the end"
     )
     sub.add_argument("--error-map", choices=("relative", "seed"), default="relative", help="seed: of the inverse")
+    sub.add_argument("--information", choices=("g2o", "raw"), default="g2o", help="of rotations in space: see README")
     sub.add_argument("--lenient", action="store_true", help="leave out bad lines, list them, exit with 3")
     sub.add_argument("--json", action="store_true")
     sub.add_argument("--out", type=Path, metavar="FILE.g2o")
@@ -315,7 +318,7 @@ def _plot_graph(out: Path, graph: Any, solver: Any) -> None:
         if len(table.type.accepts) == 2:
             for code, label in enumerate(graph.labels):
                 edges.setdefault(label, []).extend(table.vertices.values[table.label.values == code].tolist())
-    points: Any = np.flatnonzero([graph.kind_of(v).dof == 2 for v in ids])
+    points: Any = np.flatnonzero([graph.kind_of(v).name[0] == "R" for v in ids])
     draw_graph(out, initial, final, {k: np.array(v) for k, v in edges.items() if v}, points if len(points) else None)
 
 

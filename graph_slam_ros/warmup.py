@@ -9,11 +9,16 @@ from graph_slam_ros.graph import (
     HUBER,
     INVERSE_RELATIVE_POSE,
     LANDMARK_POSITION,
+    LANDMARK_POSITION_3D,
     POINT_PRIOR,
     POSE_PRIOR,
+    POSE_PRIOR_3D,
     R2,
+    R3,
     RELATIVE_POSE,
+    RELATIVE_POSE_3D,
     SE2,
+    SE3,
     TAG_POSITION,
     Gaussian,
     Graph,
@@ -37,6 +42,11 @@ def warmup() -> float:
     graph.add_edge(LANDMARK_POSITION, [poses[0], points[0]], [1, 1], flat, "landmarks")
     graph.add_edge(TAG_POSITION, poses, [1, 0], flat, "landmarks")
     graph.add_edge(DIFFERENCE[R2], points, [1, 0], flat, "landmarks")
+    space, far = graph.add_vertices(SE3, [[0, 0, 0, 0, 0, 0, 1.0]] * 2), graph.add_vertex(R3, [1, 0, 0])
+    six, three = Gaussian.from_sigmas(*[1.0] * 6), Gaussian.from_sigmas(1.0, 1.0, 1.0)
+    graph.add_edge(POSE_PRIOR_3D, [space[0]], [0, 0, 0, 0, 0, 0, 1], six, "anchor")
+    graph.add_edge(RELATIVE_POSE_3D, space, [1, 0, 0, 0, 0, 0, 1], six, "odometry")
+    graph.add_edge(LANDMARK_POSITION_3D, [space[0], far], [1, 1, 0], three, "landmarks")
     solver = Solver(graph, Settings(losses={"landmarks": [Loss(HUBER)]}))
     solver.add(range(graph.vertex_count), range(graph.edge_count))
     solver.update()

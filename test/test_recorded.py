@@ -13,7 +13,7 @@ import pytest
 from graph_slam_ros.replay import replay
 
 pytest.importorskip("evo")
-from graph_slam_ros.evaluation import evaluate  # noqa: E402 - needs evo
+from graph_slam_ros.evaluation import evaluate
 
 DATASETS = Path(os.environ.get("GRAPH_SLAM_DATASETS", Path(__file__).resolve().parents[1] / "../shared/datasets"))
 CONVERTER = DATASETS.parent / "tools" / "mrclam_to_mcap.py"

@@ -1,6 +1,8 @@
-"""g2o text files: SE(2) poses, planar point landmarks, relative poses, priors, FIX.
+"""g2o text files: poses and point landmarks in the plane and in space, relative poses, priors, FIX.
 
-Information matrices are taken as they are. Unknown tags are kept, word for word, and written back.
+Information matrices are taken as they are, but for one thing: g2o measures a rotation in space by the vector part of
+its quaternion, which is half the rotation vector, so a rotation's information counts a quarter in our residual.
+Unknown tags are kept, word for word, and written back.
 """
 
 import itertools
@@ -18,8 +20,11 @@ from graph_slam_ros.graph import (
     LANDMARK_POSITION,
     POSE_PRIOR,
     R2,
+    R3,
     RELATIVE_POSE,
+    RELATIVE_POSE_3D,
     SE2,
+    SE3,
     TAG_POSITION,
     EdgeType,
     Gaussian,
@@ -33,13 +38,22 @@ Array = NDArray[np.float64]
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _ID = re.compile(r"[+-]?\d{1,18}", re.ASCII)
 
-_VERTEX_TAGS: dict[str, VertexKind] = {"VERTEX_SE2": SE2, "VERTEX_XY": R2}
+_VERTEX_TAGS: dict[str, VertexKind] = {
+    "VERTEX_SE2": SE2,
+    "VERTEX_XY": R2,
+    "VERTEX_SE3:QUAT": SE3,
+    "VERTEX_TRACKXYZ": R3,
+}
 _EDGE_TAGS: dict[str, EdgeType] = {
     "EDGE_SE2": RELATIVE_POSE,
     "EDGE_SE2_XY": LANDMARK_POSITION,
     "EDGE_PRIOR_SE2": POSE_PRIOR,
+    "EDGE_SE3:QUAT": RELATIVE_POSE_3D,
     "EDGE_SE2_POSITION": TAG_POSITION,  # ours: of a landmark that is a pose, only the position was seen
 }
+_RELATIVE = ("EDGE_SE2", "EDGE_SE3:QUAT")
+_HALVED = {RELATIVE_POSE_3D: np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])}  # of our residual, in g2o's
+_UNIT = 1e-12  # a squared quaternion norm this near to 1 is left as it was written
 ERROR_MAPS = {"relative": RELATIVE_POSE, "seed": INVERSE_RELATIVE_POSE}
 
 
@@ -53,6 +67,7 @@ class G2oFile:
     fixed : vertices (ids of the graph) that FIX lines hold
     unknown : lines with tags that are not understood, in order
     skipped : in lenient reading, what was wrong with each line left out
+    raw : whether the information of rotations in space was, and is to be written, unscaled
     """
 
     graph: Graph
@@ -60,6 +75,7 @@ class G2oFile:
     fixed: list[int] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
+    raw: bool = False
 
 
 @dataclass(slots=True)
@@ -73,8 +89,8 @@ class _Edge:
 class _Reader:
     """State of one reading: what each line declared, before it becomes arrays."""
 
-    def __init__(self, name: str, lenient: bool) -> None:
-        self.name, self.lenient = name, lenient
+    def __init__(self, name: str, lenient: bool, raw: bool) -> None:
+        self.name, self.lenient, self.raw = name, lenient, raw
         self.vertices: dict[int, tuple[str, list[float]]] = {}
         self.edges: dict[str, list[_Edge]] = {tag: [] for tag in _EDGE_TAGS}
         self.fixed: list[tuple[int, int]] = []
@@ -109,7 +125,7 @@ class _Reader:
     def _vertex(self, tag: str, words: list[str]) -> None:
         kind = _VERTEX_TAGS[tag]
         _expect(words, 1 + kind.size)
-        vertex, value = _integer(words[1]), _numbers(words[2:])
+        vertex, value = _integer(words[1]), _with_unit_quaternion(_numbers(words[2:]), kind.size)
         if vertex in self.vertices and self.vertices[vertex] != (tag, value):
             raise FormatError(f"vertex {vertex} was declared before, with other values")
         self.vertices[vertex] = (tag, value)
@@ -120,14 +136,15 @@ class _Reader:
         _expect(words, slots + edge.measured_size + m * (m + 1) // 2)
         vertices = tuple(_integer(word) for word in words[1 : 1 + slots])
         numbers = _numbers(words[1 + slots :])
-        return _Edge(line, vertices, numbers[: edge.measured_size], numbers[edge.measured_size :])
+        measured = _with_unit_quaternion(numbers[: edge.measured_size], edge.measured_size)
+        return _Edge(line, vertices, measured, numbers[edge.measured_size :])
 
     def graph(self, relative_pose: EdgeType) -> G2oFile:
         graph = Graph()
         at: dict[int, int] = {}
         for file_id, (tag, value) in self.vertices.items():
             at[file_id] = graph.add_vertex(_VERTEX_TAGS[tag], value)
-        poses = sorted(file_id for file_id, (tag, _) in self.vertices.items() if tag == "VERTEX_SE2")
+        poses = sorted(file_id for file_id, (tag, _) in self.vertices.items() if _VERTEX_TAGS[tag] in (SE2, SE3))
         follows = dict(itertools.pairwise(poses))
         for tag, edges in self.edges.items():
             edge_type = relative_pose if tag == "EDGE_SE2" else _EDGE_TAGS[tag]
@@ -139,7 +156,7 @@ class _Reader:
                 fixed.append(at[file_id])
             else:
                 self.refuse(line, f"FIX names vertex {file_id}, which is not declared")
-        return G2oFile(graph, list(at), fixed, self.unknown, self.skipped)
+        return G2oFile(graph, list(at), fixed, self.unknown, self.skipped, self.raw)
 
     def _known(self, tag: str, edges: Sequence[_Edge]) -> Iterator[_Edge]:
         """Edges whose vertices exist and are of the right kind, and whose information is positive definite."""
@@ -160,6 +177,8 @@ class _Reader:
 
     def _add(self, graph: Graph, edge_type: EdgeType, label: str, edges: list[_Edge], at: dict[int, int]) -> None:
         information = _symmetric(np.array([e.information for e in edges]), edge_type.residual_size)
+        if edge_type in _HALVED and not self.raw:
+            information *= np.outer(_HALVED[edge_type], _HALVED[edge_type])
         good = list(range(len(edges)))
         try:
             noise = Gaussian.from_information(information)
@@ -183,7 +202,7 @@ class _Reader:
         )
 
 
-def read_g2o(path: Path | str, *, error_map: str = "relative", lenient: bool = False) -> G2oFile:
+def read_g2o(path: Path | str, *, error_map: str = "relative", lenient: bool = False, raw: bool = False) -> G2oFile:
     """Read a g2o file.
 
     Relative poses between one pose and the next (in order of id) are labelled ``odometry``, others ``closures``,
@@ -193,6 +212,7 @@ def read_g2o(path: Path | str, *, error_map: str = "relative", lenient: bool = F
     ----------
     error_map : ``relative`` (g2o's, ours) or ``seed`` (residual of the inverse, python-graphslam's)
     lenient : leave out bad lines and list them in ``skipped`` instead of refusing the file
+    raw : take the information of rotations in space as belonging to the rotation vector, unscaled
 
     Raises
     ------
@@ -202,7 +222,7 @@ def read_g2o(path: Path | str, *, error_map: str = "relative", lenient: bool = F
     path = Path(path)
     if error_map not in ERROR_MAPS:
         raise FormatError(f"error map {error_map!r}: choose {' or '.join(ERROR_MAPS)}")
-    reader = _Reader(path.name, lenient)
+    reader = _Reader(path.name, lenient, raw)
     for number, text in _lines(path):
         reader.take(number, text)
     if not reader.vertices:
@@ -233,7 +253,10 @@ def write_g2o(path: Path | str, file: G2oFile, values: Callable[[Sequence[int]],
             raise FormatError(f"g2o has no tag for an edge {edge_type.name}")
         root = table.sqrt_information.values
         upper = np.triu_indices(edge_type.residual_size)
-        information = (np.swapaxes(root, 1, 2) @ root)[:, upper[0], upper[1]]
+        full = np.swapaxes(root, 1, 2) @ root
+        if edge_type in _HALVED and not file.raw:
+            full /= np.outer(_HALVED[edge_type], _HALVED[edge_type])
+        information = full[:, upper[0], upper[1]]
         for row in range(len(table)):
             ends = " ".join(str(file.ids[v]) for v in table.vertices.values[row].tolist())
             numbers = _text([*table.measured.values[row].tolist(), *information[row].tolist()])
@@ -276,8 +299,20 @@ def _numbers(words: list[str]) -> list[float]:
     return [float(word) for word in words]
 
 
+def _with_unit_quaternion(numbers: list[float], size: int) -> list[float]:
+    """The last four of a pose in space, (x, y, z, w), brought to unit length."""
+    if size != SE3.size:
+        return numbers
+    square = sum(q * q for q in numbers[3:])
+    if square == 0.0:
+        raise FormatError("the quaternion is zero")
+    if abs(square - 1.0) <= _UNIT:
+        return numbers
+    return numbers[:3] + [q / square**0.5 for q in numbers[3:]]
+
+
 def _by_label(tag: str, edges: list[_Edge], follows: dict[int, int]) -> list[tuple[str, list[_Edge]]]:
-    if tag == "EDGE_SE2":
+    if tag in _RELATIVE:
         odometry = [e for e in edges if follows.get(e.vertices[0]) == e.vertices[1]]
         closures = [e for e in edges if follows.get(e.vertices[0]) != e.vertices[1]]
         groups = [("odometry", odometry), ("closures", closures)]

@@ -1,5 +1,6 @@
 """What the problem is: vertices, edges, their noise and loss. Nothing here knows how it is solved."""
 
+from graph_slam_ros.graph.edge_type import EdgeType, numeric_jacobian
 from graph_slam_ros.graph.edges import (
     DIFFERENCE,
     INVERSE_RELATIVE_POSE,
@@ -8,13 +9,12 @@ from graph_slam_ros.graph.edges import (
     POSE_PRIOR,
     RELATIVE_POSE,
     TAG_POSITION,
-    EdgeType,
-    numeric_jacobian,
 )
+from graph_slam_ros.graph.edges_3d import LANDMARK_POSITION_3D, POSE_PRIOR_3D, RELATIVE_POSE_3D
 from graph_slam_ros.graph.graph import Graph
 from graph_slam_ros.graph.losses import CAUCHY, HUBER, NONE, Loss
 from graph_slam_ros.graph.noise import Gaussian
-from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, VertexKind
+from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, SE3, VertexKind
 
 __all__ = [
     "CAUCHY",
@@ -22,14 +22,18 @@ __all__ = [
     "HUBER",
     "INVERSE_RELATIVE_POSE",
     "LANDMARK_POSITION",
+    "LANDMARK_POSITION_3D",
     "NONE",
     "POINT_PRIOR",
     "POSE_PRIOR",
+    "POSE_PRIOR_3D",
     "R1",
     "R2",
     "R3",
     "RELATIVE_POSE",
+    "RELATIVE_POSE_3D",
     "SE2",
+    "SE3",
     "TAG_POSITION",
     "EdgeType",
     "Gaussian",

@@ -1,50 +1,18 @@
-"""Edge types: residual and Jacobian of each kind of measurement, a whole array of edges at a time.
-
-An edge type's ``linearize(x, at, measured)`` gets
-
-* ``x`` : the stored numbers of all vertices in one flat array,
-* ``at`` : (n, k) where each edge's k vertices begin in ``x``,
-* ``measured`` : (n, p),
-
-and returns the residuals (n, m) and their Jacobians (n, m, D) with respect to the right perturbations of the k
-vertices, side by side (D is the sum of their degrees of freedom). Nothing here is whitened or weighted.
+"""Edge types in the plane and between vectors; the arguments of their kernels are explained in ``edge_type``.
 
 Derivatives used throughout, with J = [[0, -1], [1, 0]]:  R(theta) Exp([w]) = R(theta) (I + w J).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, VertexKind
+from graph_slam_ros.graph.edge_type import EdgeType
+from graph_slam_ros.graph.vertices import R1, R2, R3, SE2
 from graph_slam_ros.lie import se2
 from graph_slam_ros.lie.jit import kernel
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EdgeType:
-    """What was measured, between which vertices, and how it is linearised.
-
-    Attributes
-    ----------
-    accepts : for each slot the vertex kinds it takes, all of the same dof
-    """
-
-    name: str
-    accepts: tuple[tuple[VertexKind, ...], ...]
-    measured_size: int
-    residual_size: int
-    linearize: Callable[[Array, Index, Array], tuple[Array, Array]]
-
-    @property
-    def dofs(self) -> tuple[int, ...]:
-        """Degrees of freedom of each slot."""
-        return tuple(kinds[0].dof for kinds in self.accepts)
 
 
 @kernel
@@ -172,26 +140,3 @@ LANDMARK_POSITION = EdgeType("landmark position", (_POSE, _POINT), 2, 2, _landma
 TAG_POSITION = EdgeType("tag position", (_POSE, _POSE), 2, 2, _tag_position)
 DIFFERENCE = {k: EdgeType(f"difference {k.name}", ((k,), (k,)), k.dof, k.dof, _difference) for k in (R1, R2, R3)}
 POINT_PRIOR = {k: EdgeType(f"prior {k.name}", ((k,),), k.dof, k.dof, _point_prior) for k in (R1, R2, R3)}
-
-
-def numeric_jacobian(edge: EdgeType, values: tuple[Array, ...], measured: Array, step: float = 1e-6) -> Array:
-    """Jacobian (m, D) of one edge by central differences through ``retract``: the check of every analytic one.
-
-    Parameters
-    ----------
-    values : the stored numbers of each of the edge's vertices, of the kinds ``edge.accepts`` names first
-    measured : (p,)
-    """
-    kinds = [accepted[0] for accepted in edge.accepts]
-    at = np.cumsum([0, *(k.size for k in kinds[:-1])]).astype(np.int64)[None, :]
-
-    def residual(slot: int, d: Array) -> Array:
-        moved = [np.asarray(v, dtype=float) for v in values]
-        moved[slot] = kinds[slot].retract(moved[slot][None, :], d[None, :])[0]
-        return edge.linearize(np.concatenate(moved), at, np.asarray(measured, dtype=float)[None, :])[0][0]
-
-    columns = []
-    for slot, kind in enumerate(kinds):
-        for d in step * np.eye(kind.dof):
-            columns.append((residual(slot, d) - residual(slot, -d)) / (2.0 * step))
-    return np.stack(columns, axis=1)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph.edges import EdgeType
+from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.noise import Gaussian
 from graph_slam_ros.graph.vertices import VertexKind
 

@@ -10,7 +10,7 @@ from graph_slam_ros.errors import NoiseError
 Array = NDArray[np.float64]
 
 _ASYMMETRY = 1e-6  # of the largest entry; text files carry 6 digits
-_RANK = 16.0 * float(np.finfo(float).eps)  # what Cholesky leaves of a diagonal entry of a singular matrix is below this
+_LEAST_EIGENVALUE = 16.0 * float(np.finfo(float).eps)  # of the correlations; that of a singular matrix is rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,5 +82,6 @@ def _definite_root(matrices: Array) -> Array | None:
         root = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)
     except np.linalg.LinAlgError:
         return None
-    pivots = np.diagonal(root, axis1=-2, axis2=-1) ** 2
-    return root if (pivots > _RANK * np.diagonal(matrices, axis1=-2, axis2=-1)).all() else None
+    sigmas = np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1))
+    least = np.linalg.eigvalsh(matrices / sigmas[..., :, None] / sigmas[..., None, :])[..., 0]
+    return root if (least > _LEAST_EIGENVALUE).all() else None

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.lie import se2
+from graph_slam_ros.lie import se2, se3
 
 Array = NDArray[np.float64]
 
@@ -36,9 +36,18 @@ def _local_se2(a: Array, b: Array) -> Array:
     return np.stack(se2.local(tuple(a.T), tuple(b.T)), axis=-1)
 
 
+def _retract_se3(values: Array, steps: Array) -> Array:
+    return np.stack(se3.retract(tuple(values.T), tuple(steps.T)), axis=-1)
+
+
+def _local_se3(a: Array, b: Array) -> Array:
+    return np.stack(se3.local(tuple(a.T), tuple(b.T)), axis=-1)
+
+
 def _vector_kind(dof: int) -> VertexKind:
     return VertexKind(f"R{dof}", dof, dof, np.add, np.subtract)
 
 
 SE2 = VertexKind("SE2", 3, 3, _retract_se2, _local_se2)
+SE3 = VertexKind("SE3", 7, 6, _retract_se3, _local_se3)
 R1, R2, R3 = _vector_kind(1), _vector_kind(2), _vector_kind(3)

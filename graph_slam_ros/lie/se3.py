@@ -1,0 +1,127 @@
+"""SE(3): rigid motions of space.
+
+A pose is a tuple (x, y, z, qx, qy, qz, qw), metres and a unit quaternion; a component may be a float or an array, as in
+``se2``. Formulas follow J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics", 2018.
+"""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from graph_slam_ros.lie import so3
+from graph_slam_ros.lie.jit import jitable
+
+Pose: TypeAlias = tuple[Any, Any, Any, Any, Any, Any, Any]
+Tangent: TypeAlias = tuple[Any, Any, Any, Any, Any, Any]
+
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@jitable
+def position(a: Pose) -> so3.Vector:
+    """The translation."""
+    return a[0], a[1], a[2]
+
+
+@jitable
+def rotation(a: Pose) -> so3.Quaternion:
+    """The quaternion."""
+    return a[3], a[4], a[5], a[6]
+
+
+@jitable
+def act(a: Pose, p: so3.Vector) -> so3.Vector:
+    """Point p of frame b in frame a."""
+    r = so3.act(rotation(a), p)
+    return a[0] + r[0], a[1] + r[1], a[2] + r[2]
+
+
+@jitable
+def compose(a: Pose, b: Pose) -> Pose:
+    """``T_a_c = T_a_b T_b_c``."""
+    t = act(a, position(b))
+    q = so3.compose(rotation(a), rotation(b))
+    return t[0], t[1], t[2], q[0], q[1], q[2], q[3]
+
+
+@jitable
+def inverse(a: Pose) -> Pose:
+    """``T_b_a`` from ``T_a_b``."""
+    q = so3.inverse(rotation(a))
+    t = so3.act(q, position(a))
+    return -t[0], -t[1], -t[2], q[0], q[1], q[2], q[3]
+
+
+@jitable
+def between(a: Pose, b: Pose) -> Pose:
+    """``inverse(a) b``: pose b seen from pose a."""
+    back = so3.inverse(rotation(a))
+    t = so3.act(back, (b[0] - a[0], b[1] - a[1], b[2] - a[2]))
+    q = so3.compose(back, rotation(b))
+    return t[0], t[1], t[2], q[0], q[1], q[2], q[3]
+
+
+@jitable
+def exp(d: Tangent) -> Pose:
+    """Tangent vector (v, omega) to pose, eq. (172): ``t = v + a (w x v) + b (w x (w x v))``."""
+    w = (d[3], d[4], d[5])
+    v = (d[0], d[1], d[2])
+    angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    a = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2  # (1 - cos) / angle^2
+    b = _cubic(angle)
+    wv = so3.cross(w, v)
+    wwv = so3.cross(w, wv)
+    q = so3.exp(w)
+    return (
+        v[0] + a * wv[0] + b * wwv[0],
+        v[1] + a * wv[1] + b * wwv[1],
+        v[2] + a * wv[2] + b * wwv[2],
+        q[0],
+        q[1],
+        q[2],
+        q[3],
+    )
+
+
+@jitable
+def log(a: Pose) -> Tangent:
+    """Pose to tangent vector, eq. (173): ``v = t - w x t / 2 + k (w x (w x t))``."""
+    w = so3.log(rotation(a))
+    t = position(a)
+    square = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    half = 0.5 * np.sqrt(square)
+    exact = (1.0 - np.cos(half) / np.sinc(half / np.pi)) / np.where(square < 1e-8, 1.0, square)
+    k = np.where(square < 1e-8, 1.0 / 12.0 + square / 720.0, exact)
+    wt = so3.cross(w, t)
+    wwt = so3.cross(w, wt)
+    return (
+        t[0] - 0.5 * wt[0] + k * wwt[0],
+        t[1] - 0.5 * wt[1] + k * wwt[1],
+        t[2] - 0.5 * wt[2] + k * wwt[2],
+        w[0],
+        w[1],
+        w[2],
+    )
+
+
+@jitable
+def retract(a: Pose, d: Tangent) -> Pose:
+    """``a [+] d = a Exp(d)``, the quaternion brought to unit length."""
+    p = compose(a, exp(d))
+    q = so3.normalize(rotation(p))
+    return p[0], p[1], p[2], q[0], q[1], q[2], q[3]
+
+
+@jitable
+def local(a: Pose, b: Pose) -> Tangent:
+    """``a [-] b = Log(b^-1 a)``."""
+    return log(between(b, a))
+
+
+@jitable
+def _cubic(angle: Any) -> Any:
+    """(angle - sin(angle)) / angle^3, by its series where the difference cancels."""
+    square = angle * angle
+    series = 1.0 / 6.0 - square / 120.0 + square * square / 5040.0
+    exact = (angle - np.sin(angle)) / np.where(square < 1e-2, 1.0, angle * square)
+    return np.where(square < 1e-2, series - square**3 / 362880.0, exact)
