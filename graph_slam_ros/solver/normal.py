@@ -137,7 +137,7 @@ class NormalEquations:
         for (table, chosen), shape in zip(rows.items(), shapes, strict=True):
             mine = block[taken : taken + int(np.prod(shape))].reshape(shape)
             at = position[table.vertices.values[chosen]]
-            first = np.where(at >= 0, self.first_dof[at], -1)
+            first = np.append(self.first_dof, -1)[at]
             column = np.concatenate([[0], np.cumsum(table.type.dofs)])
             self._places.append((column, start[mine], stride[mine], first))
             taken += int(np.prod(shape))
