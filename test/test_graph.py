@@ -1,0 +1,249 @@
+"""Edge types against numeric derivatives and a hand-computed example; the graph's records and refusals."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.linalg import expm, logm
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph import (
+    DIFFERENCE,
+    INVERSE_RELATIVE_POSE,
+    LANDMARK_POSITION,
+    POINT_PRIOR,
+    POSE_PRIOR,
+    R1,
+    R2,
+    R3,
+    RELATIVE_POSE,
+    SE2,
+    TAG_POSITION,
+    Gaussian,
+    Graph,
+    numeric_jacobian,
+)
+from graph_slam_ros.graph.graph import Column
+from graph_slam_ros.solver import Solver
+
+EDGES = [
+    RELATIVE_POSE,
+    INVERSE_RELATIVE_POSE,
+    POSE_PRIOR,
+    LANDMARK_POSITION,
+    TAG_POSITION,
+    *DIFFERENCE.values(),
+    *POINT_PRIOR.values(),
+]
+UNIT = Gaussian.from_sigmas(1.0, 1.0, 1.0)
+
+
+def random_value(kind, rng):
+    return (
+        np.array([*rng.uniform(-20, 20, 2), rng.uniform(-np.pi, np.pi)]) if kind is SE2 else rng.normal(0, 9, kind.size)
+    )
+
+
+def linearized(edge, values, measured):
+    at = np.cumsum([0, *(len(v) for v in values[:-1])])[None, :]
+    residual, jacobian = edge.linearize(np.concatenate(values), at, np.asarray(measured, dtype=float)[None, :])
+    return residual[0], jacobian[0]
+
+
+@pytest.mark.parametrize("edge", EDGES, ids=lambda e: e.name)
+def test_the_analytic_jacobian_is_the_numeric_one(edge):
+    rng = np.random.default_rng(11)
+    checked = 0
+    for _ in range(60):
+        values = tuple(random_value(kinds[0], rng) for kinds in edge.accepts)
+        measured = random_value(SE2, rng) if edge.measured_size == 3 else rng.normal(0, 5, edge.measured_size)
+        residual, jacobian = linearized(edge, values, measured)
+        if edge.residual_size == 3 and abs(abs(residual[2]) - np.pi) < 1e-4:
+            continue  # the numeric derivative would step across the cut
+        checked += 1
+        assert jacobian.shape == (edge.residual_size, sum(edge.dofs))
+        # central differences of step 1e-6: rounding of numbers up to 60 over the step
+        assert jacobian == pytest.approx(numeric_jacobian(edge, values, measured), abs=5e-8)
+    assert checked > 50
+
+
+@pytest.mark.parametrize("edge", EDGES, ids=lambda e: e.name)
+def test_edges_are_linearised_each_at_its_own_vertices(edge):
+    rng = np.random.default_rng(12)
+    each = [tuple(random_value(kinds[0], rng) for kinds in edge.accepts) for _ in range(4)]
+    measured = rng.normal(size=(4, edge.measured_size))
+    sizes = [len(v) for values in each for v in values]
+    starts = np.cumsum([0, *sizes[:-1]]).reshape(4, -1)
+    shuffled = np.array([2, 0, 3, 1])
+    residual, jacobian = edge.linearize(
+        np.concatenate([v for e in each for v in e]), starts[shuffled], measured[shuffled]
+    )
+    for row, k in enumerate(shuffled):
+        alone = linearized(edge, each[k], measured[k])
+        assert np.array_equal(residual[row], alone[0])
+        assert np.array_equal(jacobian[row], alone[1])
+
+
+@pytest.mark.parametrize("turn", [np.pi, -np.pi, 3 * np.pi, np.pi - 1e-9])
+def test_the_residual_is_small_across_half_a_turn(turn):
+    a, z = np.array([1.0, 2.0, 0.5]), np.array([0.0, 0.0, turn])
+    for edge in (RELATIVE_POSE, INVERSE_RELATIVE_POSE):
+        residual, _ = linearized(edge, (a, np.array([1.0, 2.0, 0.5 + np.pi + 1e-3])), z)
+        assert abs(residual[2]) == pytest.approx(1e-3, abs=1e-8)
+
+
+def pose(x, y, theta):
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([[c, -s, x], [s, c, y], [0.0, 0.0, 1.0]])
+
+
+def vector(t):
+    return np.array([t[0, 2], t[1, 2], np.arctan2(t[1, 0], t[0, 0])])
+
+
+def tangent(t):
+    v = logm(t).real
+    return np.array([v[0, 2], v[1, 2], v[1, 0]])
+
+
+# Two poses, one reading, and an information matrix that is neither isotropic nor diagonal.
+FROM, TO, READING = (1.0, 2.0, np.pi / 2), (2.0, 5.0, np.pi / 2 + 0.5), (2.5, -0.5, 0.3)
+INFORMATION = np.array([[4.0, 1.0, -2.0], [1.0, 9.0, 3.0], [-2.0, 3.0, 16.0]])
+
+
+def test_the_residual_of_a_relative_pose_is_that_computed_by_hand():
+    # From (1, 2) facing north, (2, 5) lies 3 ahead and 1 to the right, and turned left by 0.5: X = (3, -1, 0.5).
+    # Z^-1 X: (3 - 2.5, -1 + 0.5) = (0.5, -0.5), turned back by 0.3, and 0.2 are left of the angle.
+    c, s = 0.955336489125606, 0.29552020666133955
+    r = np.array([0.5 * c - 0.5 * s, -0.5 * c - 0.5 * s, 0.2])
+    residual, _ = linearized(RELATIVE_POSE, (np.array(FROM), np.array(TO)), READING)
+    assert residual == pytest.approx(r, abs=1e-14)
+    assert chi2_of(RELATIVE_POSE) == pytest.approx(r @ INFORMATION @ r, rel=1e-13)
+
+
+def chi2_of(edge):
+    graph = Graph()
+    ends = graph.add_vertices(SE2, [FROM, TO])
+    graph.add_edge(edge, ends, READING, Gaussian.from_information(INFORMATION), "odometry")
+    solver = Solver(graph)
+    solver.add(ends, [0])
+    solver.hold(0)
+    solver.hold(1)
+    return solver.update().chi2_initial
+
+
+def test_no_other_convention_gives_the_same_chi2():
+    a, b, z = pose(*FROM), pose(*TO), pose(*READING)
+    x = np.linalg.inv(a) @ b
+    inverse = np.linalg.inv(z)
+    conventions = {
+        "[t, angle] of Z^-1 X": vector(inverse @ x),
+        "[t, angle] of its inverse": vector(np.linalg.inv(inverse @ x)),
+        "Log(Z^-1 X)": tangent(inverse @ x),
+        "[t, angle] of X Z^-1": vector(x @ inverse),
+        "Log(X Z^-1)": tangent(x @ inverse),
+        "X - Z": vector(x) - np.array(READING),
+        "the reading from the other end": vector(inverse @ np.linalg.inv(x)),
+        "rotation first": np.roll(vector(inverse @ x), 1),
+    }
+    chi2 = {name: r @ INFORMATION @ r for name, r in conventions.items()}
+    chi2["information taken as covariance"] = vector(inverse @ x) @ np.linalg.inv(INFORMATION) @ vector(inverse @ x)
+    for one, other in itertools.combinations(chi2.values(), 2):
+        assert abs(one - other) > 0.01 * min(one, other)
+    assert chi2_of(RELATIVE_POSE) == pytest.approx(chi2["[t, angle] of Z^-1 X"], rel=1e-12)
+    assert chi2_of(INVERSE_RELATIVE_POSE) == pytest.approx(chi2["[t, angle] of its inverse"], rel=1e-12)
+
+
+def test_a_landmark_reading_is_x_ahead_and_y_to_the_left_of_the_pose():
+    # From (1, 2) facing north, (-1, 5) lies 3 ahead and 2 to the left.
+    for edge, end in ((LANDMARK_POSITION, [-1.0, 5.0]), (TAG_POSITION, [-1.0, 5.0, 2.2])):
+        residual, _ = linearized(edge, (np.array(FROM), np.array(end)), (2.9, 2.2))
+        assert residual == pytest.approx([0.1, -0.2], abs=1e-14)
+
+
+def test_a_prior_is_measured_in_the_frame_of_the_reading():
+    residual, _ = linearized(POSE_PRIOR, (np.array([1.0, 3.0, np.pi / 2 + 0.1]),), FROM)
+    assert residual == pytest.approx([1.0, 0.0, 0.1], abs=1e-14)
+
+
+@pytest.mark.parametrize("kind", [SE2, R1, R2, R3], ids=lambda k: k.name)
+def test_a_step_between_two_values_leads_from_one_to_the_other(kind):
+    rng = np.random.default_rng(3)
+    a, b = (np.array([random_value(kind, rng) for _ in range(9)]) for _ in range(2))
+    assert kind.retract(b, kind.local(a, b)) == pytest.approx(a, abs=1e-12)
+    assert np.array_equal(kind.retract(a, np.zeros((9, kind.dof))), a)
+    if kind is SE2:
+        step = np.array([[0.3, -0.2, 0.4]])
+        hat = np.array([[0, -0.4, 0.3], [0.4, 0, -0.2], [0, 0, 0.0]])
+        assert kind.retract(a[:1], step)[0] == pytest.approx(vector(pose(*a[0]) @ expm(hat)), abs=1e-13)
+
+
+def test_a_column_keeps_its_rows_while_it_grows():
+    column, rows = Column(np.float64, 2), np.arange(2000.0).reshape(-1, 2)
+    for start, end in itertools.pairwise([0, 1, 3, 16, 17, 40, 700, 1000]):
+        column.extend(rows[start:end], end - start)
+        assert len(column) == end
+        assert np.array_equal(column.values, rows[:end])
+    column.extend(-1.0, 2)
+    assert np.array_equal(column.values[-3:], [rows[-1], [-1, -1], [-1, -1]])
+
+
+def test_ids_are_dense_and_records_stay_where_they_were_put():
+    graph = Graph()
+    assert graph.add_vertices(SE2, np.zeros((2, 3))).tolist() == [0, 1]
+    assert graph.add_vertex(R2, [5.0, 6.0]) == 2
+    assert graph.add_vertex(SE2, [7.0, 8.0, 9.0]) == 3
+    assert graph.offset.values.tolist() == [0, 3, 6, 8]
+    assert graph.initial.values[6:].tolist() == [5, 6, 7, 8, 9]
+    assert [graph.kind_of(v).name for v in range(4)] == ["SE2", "SE2", "R2", "SE2"]
+    first = graph.add_edges(RELATIVE_POSE, [[0, 1], [1, 3]], [[1, 0, 0], [2, 0, 0]], UNIT, "odometry")
+    flat = Gaussian.from_sigmas(0.5, 0.1)
+    second = graph.add_edge(LANDMARK_POSITION, [0, 2], [3, 4], flat, "landmarks")
+    third = graph.add_edge(RELATIVE_POSE, [0, 3], [4, 0, 0], UNIT, "closures")
+    assert [*first, second, third] == [0, 1, 2, 3]
+    table, row = graph.row(third)
+    assert (table.type, row, table.vertices.values[row].tolist()) == (RELATIVE_POSE, 2, [0, 3])
+    assert graph.labels[table.label.values[row]] == "closures"
+    table, row = graph.row(second)
+    assert table.measured.values[row].tolist() == [3, 4]
+    assert table.sqrt_information.values[row] == pytest.approx(np.diag([2.0, 10.0]))
+
+
+def two_poses_and_a_point():
+    graph = Graph()
+    graph.add_vertices(SE2, np.zeros((2, 3)))
+    graph.add_vertex(R2, [0.0, 0.0])
+    graph.add_edge(RELATIVE_POSE, [0, 1], [1, 0, 0], UNIT, "odometry")
+    return graph
+
+
+@pytest.mark.parametrize(
+    "edge, ends, measured, noise, culprit",
+    [
+        (RELATIVE_POSE, [[0, 1], [0, 7]], [[1, 0, 0]] * 2, UNIT, "vertex 7 does not exist"),
+        (RELATIVE_POSE, [-1, 0], [1, 0, 0], UNIT, "vertex -1 does not exist"),
+        (RELATIVE_POSE, [0, 2], [1, 0, 0], UNIT, "vertex 2 is R2, not SE2"),
+        (LANDMARK_POSITION, [0, 1], [1, 0], Gaussian.from_sigmas(1, 1), "vertex 1 is SE2, not R2"),
+        (DIFFERENCE[R2], [1, 2], [1, 0], Gaussian.from_sigmas(1, 1), "vertex 1 is SE2, not R2"),
+        (RELATIVE_POSE, [1, 1], [1, 0, 0], UNIT, "vertex 1 to itself"),
+        (RELATIVE_POSE, [0, 1], [1, np.nan, 0], UNIT, r"\[1.0, nan, 0.0\] at vertices \[0, 1\]"),
+        (POSE_PRIOR, [1], [np.inf, 0, 0], UNIT, r"\[inf, 0.0, 0.0\] at vertices \[1\]"),
+        (RELATIVE_POSE, [0, 1], [1, 0, 0], Gaussian.from_sigmas(1, 1), r"noise of shape \(2, 2\)"),
+        (RELATIVE_POSE, [0, 1], [1, 0, 0], Gaussian.from_information([np.eye(3)] * 2), r"noise of shape \(2, 3, 3\)"),
+        (RELATIVE_POSE, [[0, 1], [1, 0]], [1, 0, 0], UNIT, "2 edges but 1 measurements"),
+    ],
+)
+def test_an_edge_that_is_refused_is_named_and_leaves_no_trace(edge, ends, measured, noise, culprit):
+    graph = two_poses_and_a_point()
+    with pytest.raises(GraphSlamError, match=culprit):
+        graph.add_edges(edge, ends, measured, noise, "closures")
+    assert graph.edge_count == 1
+    assert (list(graph.tables), graph.labels) == ([RELATIVE_POSE], ["odometry"])
+    assert graph.add_edge(RELATIVE_POSE, [1, 0], [1, 0, 0], UNIT, "closures") == 1
+
+
+def test_a_vertex_that_is_not_finite_is_named_and_leaves_no_trace():
+    graph = two_poses_and_a_point()
+    with pytest.raises(GraphSlamError, match=r"\[0.0, nan, 0.0\] of vertex 4"):
+        graph.add_vertices(SE2, [[0, 0, 0], [0, np.nan, 0]])
+    assert (graph.vertex_count, len(graph.initial)) == (3, 8)
