@@ -9,9 +9,10 @@ import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
@@ -39,9 +40,9 @@ class GraphSlamNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__("graph_slam", **options)
         config = declare_parameters(self)
+        self._recorder = RunRecorder(config.output.folder, config) if config.output.folder else None
         self.get_logger().info("compiling kernels (once per installation)")
         self.get_logger().info(f"kernels ready after {warmup():.1f} s")
-        self._recorder = RunRecorder(config.output.folder, config) if config.output.folder else None
         self._slam = GraphSlam(config, self._recorder.sink if self._recorder else None)
         self._border = Border(config, self._slam.counters)
         self._received = 0
@@ -67,14 +68,16 @@ class GraphSlamNode(Node):
         static = QoSProfile(
             depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
         )
-        self.create_subscription(TFMessage, "/tf_static", self._guarded(self._on_tf_static), static, raw=True)
-        self.create_subscription(Odometry, "odom", self._guarded(self._on_odometry), qos, raw=True)
-        seen = self.create_subscription(Detection3DArray, "landmarks", self._guarded(self._on_landmarks), qos, raw=True)
+        self.create_subscription(TFMessage, "/tf_static", self._received_by(self._on_tf_static), static, raw=True)
+        self.create_subscription(Odometry, "odom", self._received_by(self._on_odometry), qos, raw=True)
+        seen = self.create_subscription(
+            Detection3DArray, "landmarks", self._received_by(self._on_landmarks), qos, raw=True
+        )
         self._landmark_topic = seen.topic_name
         if config.tf.publish:
-            self.create_timer(config.tf.period_s, self._publish_tf)
+            self.create_timer(config.tf.period_s, self._guarded(self._publish_tf))
         # a player with /clock waits for this one, so it must not wait for /clock
-        self.create_timer(0.1, self._look_for_player, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(0.1, self._guarded(self._look_for_player), clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     # -- messages in -------------------------------------------------------------------------------------------------
 
@@ -91,6 +94,9 @@ class GraphSlamNode(Node):
         if measurement is None:
             return
         self._saved = False
+        self._process(measurement)
+
+    def _process(self, measurement: Measurement) -> None:
         update = self._slam.process(measurement)
         if self._recorder:
             self._recorder.record(self._slam, update)
@@ -101,18 +107,27 @@ class GraphSlamNode(Node):
         if update.report:
             self._landmarks.publish(results.landmarks(self._slam))
 
-    def _guarded(self, callback: Callable[[bytes], None]) -> Callable[[bytes], None]:
-        """No message ends the node: what a callback raises is counted and told."""
+    def _received_by(self, callback: Callable[[bytes], None]) -> Callable[[bytes], None]:
+        """A callback whose messages are acknowledged, whatever becomes of them."""
+        guarded = self._guarded(callback)
 
-        def guarded(cdr: bytes) -> None:
-            try:
-                callback(cdr)
-            except Exception as error:
-                self._slam.counters.count("node", type(error).__name__)
-                self.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=5.0)
+        def received(cdr: bytes) -> None:
+            guarded(cdr)
             self._received += 1
             if self._has_player:
                 self._publish_received()
+
+        return received
+
+    def _guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
+        """Nothing ends the node: what a callback raises is counted and told."""
+
+        def guarded(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except Exception as error:
+                self._slam.counters.count("node", type(error).__name__)
+                self.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=5.0)
 
         return guarded
 
@@ -140,8 +155,8 @@ class GraphSlamNode(Node):
         try:
             response.message = self.save()
             response.success = True
-        except GraphSlamError as error:
-            response.message = str(error)
+        except Exception as error:
+            response.message = str(error) if isinstance(error, GraphSlamError) else f"{type(error).__name__}: {error}"
         return response
 
     def save(self) -> str:
@@ -150,7 +165,7 @@ class GraphSlamNode(Node):
             raise GraphSlamError("output.folder is empty: nowhere to save")
         if not self._saved:
             for event in ("flush", "optimize"):
-                self._recorder.record(self._slam, self._slam.process(Control(event)))
+                self._process(Control(event))
         self._saved = True
         return str(self._recorder.save(self._slam))
 
@@ -163,30 +178,44 @@ class GraphSlamNode(Node):
         self._recorder.close()
 
 
+class _Told:
+    """Whether Ctrl-C or SIGTERM came: noted, never raised, so that no message is left half-way."""
+
+    def __init__(self) -> None:
+        self.to_stop = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._note)
+
+    def _note(self, number: int, frame: Any) -> None:
+        self.to_stop = True
+
+
 def main() -> int:
-    """Run the node until it is told to stop; returns the exit code."""
-    rclpy.init()
+    """Run the node until it is told to stop; returns the exit code: 0, or 2 where it was refused to start or save."""
+    told = _Told()
     try:
+        _init()
         node = GraphSlamNode()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not told.to_stop and rclpy.ok():
+            executor.spin_once(timeout_sec=0.1)
+        node.finish()
+        executor.shutdown()
+        node.destroy_node()
     except GraphSlamError as error:
         rclpy.logging.get_logger("graph_slam").fatal(str(error))
-        rclpy.try_shutdown()
         return 2
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # ros2 launch sends it twice
-        try:
-            node.finish()
-            code = 0
-        except GraphSlamError as error:
-            node.get_logger().error(str(error))
-            code = 2
-        node.destroy_node()
         rclpy.try_shutdown()
-    return code
+    return 0
+
+
+def _init() -> None:
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy has several for arguments and files it cannot read
+        raise GraphSlamError(" ".join(str(error).split())) from None
 
 
 if __name__ == "__main__":

@@ -4,10 +4,8 @@ import sys
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.exceptions import InvalidParameterException, InvalidParameterTypeException, InvalidParameterValueException
 
-from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.slam.config import Config, Parameter, parameters
+from graph_slam_ros.slam.config import Config, Parameter, flatten, parameters
 
 _OTHERS = {"use_sim_time", "start_type_description_service"}  # rclpy's own
 
@@ -20,18 +18,17 @@ def declare_parameters(node: Any) -> Config:
     ConfigError
         An unknown name (the nearest known one is suggested), a wrong type or a value out of range.
     """
-    given = {name for name in node._parameter_overrides if name not in _OTHERS and not name.startswith("qos_overrides")}
-    values = {}
+    config = Config.from_mapping(
+        {
+            name: override.value
+            for name, override in sorted(node._parameter_overrides.items())
+            if name not in _OTHERS and not name.startswith("qos_overrides")
+        }
+    )
+    used = dict(flatten(config.as_mapping()))
     for p in parameters():
-        try:
-            values[p.name] = node.declare_parameter(p.name, p.default, _descriptor(p)).value
-        except InvalidParameterTypeException:
-            p.check(node._parameter_overrides[p.name].value)  # says it in our words
-            raise ConfigError(f"{p.name}: expected {p.type.__name__}") from None
-        except (InvalidParameterValueException, InvalidParameterException) as error:
-            raise ConfigError(f"{p.name}: {error}") from None
-    unknown = {name: node._parameter_overrides[name].value for name in sorted(given - values.keys())}
-    return Config.from_mapping({**values, **unknown})
+        node.declare_parameter(p.name, used[p.name], _descriptor(p), ignore_override=True)
+    return config
 
 
 def _descriptor(p: Parameter) -> ParameterDescriptor:
