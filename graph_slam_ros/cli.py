@@ -15,7 +15,7 @@ import sys
 import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from graph_slam_ros import __version__
 from graph_slam_ros.errors import GraphSlamError
@@ -90,13 +90,15 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
     bag = open_bag(args.bag)
     inputs = choose_inputs(bag, args.odom, args.landmarks)
     from graph_slam_ros.ros.player import own_node, play
+    from graph_slam_ros.run import check_room
 
     options: dict[str, Any] = {"rate": args.rate, "progress": _progress("play")}
     if args.out is None:
         played = play(bag, inputs, node_name=args.node, **options)
     else:
-        with own_node(args.out, inputs, config):
-            played = play(bag, inputs, **options)
+        check_room(args.out, args.bag)
+        with own_node(args.out, inputs, config) as own:
+            played = play(bag, inputs, own=own, **options)
         _say(_run_text(json.loads((args.out / "run.json").read_text())))
     _say(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
     return _told(bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else []))
@@ -201,12 +203,20 @@ def _demo(args: argparse.Namespace) -> int:
 # -- options and output ----------------------------------------------------------------------------------------------
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse the command line."""
+        self.exit(REFUSED, f"{self.prog}: {message} (--help shows what there is)\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="graph_slam", description="Online pose-graph SLAM: replay recordings, optimise graphs, simulate, evaluate."
     )
     parser.add_argument("--version", action="version", version=f"graph_slam_ros {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
 
     def command(name: str, run: Any, about: str) -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=about, description=about)

@@ -53,8 +53,8 @@ def _live(recording: Path, out: Path, progress: Callable[[str], Any]) -> int:
 
     bag = open_bag(recording)
     inputs = choose_inputs(bag, None, None)
-    with own_node(out, inputs, Config()):
-        return play(bag, inputs, progress=progress("play")).lost
+    with own_node(out, inputs, Config()) as own:
+        return play(bag, inputs, own=own, progress=progress("play")).lost
 
 
 def _offline(recording: Path, out: Path, progress: Callable[[str], Any]) -> int:

@@ -12,10 +12,11 @@ import signal
 import struct
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ _AHEAD = 256  # messages on their way
 _OVERTAKE_NS = 20_000_000  # well inside the node's ordering window
 _CLOCK_NS = 5_000_000
 _PATIENCE_S = 10.0
+_START_S = 300.0  # the first start of an installation compiles
 _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -57,12 +59,12 @@ class Played:
 class Player:
     """A publisher of recorded messages that waits for a graph_slam node."""
 
-    def __init__(self, bag: Bag, inputs: Inputs, node_name: str) -> None:
-        self._bag, self._inputs, self._name = bag, inputs, node_name
+    def __init__(self, bag: Bag, inputs: Inputs, node_name: str, own: subprocess.Popen[bytes] | None) -> None:
+        self._bag, self._inputs, self._name, self._own = bag, inputs, node_name, own
         self._node = Node("graph_slam_player")
         self._sent = self._received = self._lost = 0
         self._before: int | None = None
-        self._on_the_way: dict[str, int] = {}
+        self._on_the_way: dict[str, tuple[int, int]] = {}  # oldest and newest stamp by topic
         self._clock_ns = 0
         self._clock = self._node.create_publisher(Clock, "/clock", 10)
         self._publishers = {topic: self._publisher(topic) for topic in inputs.names()}
@@ -75,7 +77,8 @@ class Player:
         ----------
         rate : times real time, or None for as fast as the node keeps up
         """
-        self._wait(lambda: self._before is not None, f"no {self._name}/received: is the node running?")
+        patience_s = _START_S if self._own else _PATIENCE_S
+        self._wait(lambda: self._before is not None, f"no {self._name}/received: is the node running?", patience_s)
         for topic, publisher in self._publishers.items():
             self._wait(partial(_has_subscriber, publisher), f"nobody subscribes to {topic}")
         for message in self._bag.messages({self._inputs.tf_static} - {""}):
@@ -118,12 +121,15 @@ class Player:
             self._clock.publish(to_msg.clock(message.log_ns))
         self._publishers[message.topic].publish(message.cdr)
         self._sent += 1
-        self._on_the_way.setdefault(message.topic, _stamp_ns(message.cdr))
+        stamp_ns = _stamp_ns(message.cdr)
+        oldest, newest = self._on_the_way.get(message.topic, (stamp_ns, stamp_ns))
+        self._on_the_way[message.topic] = min(oldest, stamp_ns), max(newest, stamp_ns)
 
     def _keep_order(self, message: BagMessage) -> None:
-        """Wait where the queues are full, or where this message would overtake older ones of another topic."""
-        until = _stamp_ns(message.cdr) - _OVERTAKE_NS
-        if any(stamp <= until for topic, stamp in self._on_the_way.items() if topic != message.topic):
+        """Wait where the queues are full, or where it would matter which of two topics' messages arrives first."""
+        stamp_ns = _stamp_ns(message.cdr)
+        others = [stamps for topic, stamps in self._on_the_way.items() if topic != message.topic]
+        if any(stamp_ns - oldest >= _OVERTAKE_NS or newest - stamp_ns >= _OVERTAKE_NS for oldest, newest in others):
             self._settle()
         elif self._sent - self._received - self._lost >= _AHEAD:
             self._until_received(self._sent - self._lost - _AHEAD // 2)
@@ -136,6 +142,7 @@ class Player:
         last, deadline = self._received, time.monotonic() + _PATIENCE_S
         while self._received < count:
             rclpy.spin_once(self._node, timeout_sec=0.1)
+            self._check_node()
             if self._received != last:
                 last, deadline = self._received, time.monotonic() + _PATIENCE_S
             elif time.monotonic() > deadline:
@@ -147,12 +154,18 @@ class Player:
         while (left := until - time.monotonic()) > 0.0:
             rclpy.spin_once(self._node, timeout_sec=left)
 
-    def _wait(self, condition: Callable[[], bool], complaint: str) -> None:
-        deadline = time.monotonic() + _PATIENCE_S
+    def _wait(self, condition: Callable[[], bool], complaint: str, patience_s: float = _PATIENCE_S) -> None:
+        deadline = time.monotonic() + patience_s
         while not condition():
+            self._check_node()
             if time.monotonic() > deadline:
                 raise PlayError(complaint)
             rclpy.spin_once(self._node, timeout_sec=0.05)
+
+    def _check_node(self) -> None:
+        code = self._own.poll() if self._own else None
+        if code is not None:
+            raise PlayError(f"the node ended with exit code {code}")
 
     def _save(self) -> str:
         client = self._node.create_client(Trigger, f"{self._name}/save")
@@ -169,13 +182,14 @@ def play(
     inputs: Inputs,
     *,
     node_name: str = "/graph_slam",
+    own: subprocess.Popen[bytes] | None = None,
     rate: float | None = None,
     progress: Callable[[Iterable[Any], int], Iterable[Any]] = lambda items, total: items,
 ) -> Played:
-    """Play a recording into the running node of that name."""
+    """Play a recording into the running node of that name, or into one of our own (``own_node``)."""
     rclpy.init(args=[])
     try:
-        player = Player(bag, inputs, node_name)
+        player = Player(bag, inputs, node_name, own)
         try:
             return player.play(rate, progress)
         finally:
@@ -185,27 +199,31 @@ def play(
 
 
 @contextmanager
-def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[None]:
+def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subprocess.Popen[bytes]]:
     """A node of our own, on this machine and a ROS domain of its own, for as long as the context lasts."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(random.randint(1, 100))
-    parameters = folder.with_name(folder.name + ".parameters.yaml")
-    parameters.parent.mkdir(parents=True, exist_ok=True)
-    parameters.write_text(parameters_text(config.as_mapping()), encoding="utf-8")
-    command = [sys.executable, "-m", "graph_slam_ros.ros.node", "--ros-args", "--params-file", str(parameters)]
-    command += ["-p", f"output.folder:={folder}", "-p", "inputs.reliable:=true", "-p", "use_sim_time:=true"]
-    command += ["-r", f"odom:={inputs.odometry}", "-r", f"landmarks:={inputs.landmarks or 'landmarks'}"]
-    command += ["--log-level", "warn"]
-    process = subprocess.Popen(command)
-    try:
-        yield
-    finally:
-        process.send_signal(signal.SIGINT)
+    config = replace(
+        config,
+        inputs=replace(config.inputs, reliable=True),
+        output=replace(config.output, folder=str(folder)),
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        parameters = Path(scratch) / "parameters.yaml"
+        parameters.write_text(parameters_text(config.as_mapping()), encoding="utf-8")
+        command = [sys.executable, "-m", "graph_slam_ros.ros.node", "--ros-args", "--params-file", str(parameters)]
+        command += ["-p", "use_sim_time:=true"]
+        command += ["-r", f"odom:={inputs.odometry}", "-r", f"landmarks:={inputs.landmarks or 'landmarks'}"]
+        command += ["--log-level", "warn"]
+        process = subprocess.Popen(command)
         try:
-            process.wait(timeout=60.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-        parameters.unlink(missing_ok=True)
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(timeout=60.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
 
 def _has_subscriber(publisher: Any) -> bool:
@@ -213,6 +231,8 @@ def _has_subscriber(publisher: Any) -> bool:
 
 
 def _stamp_ns(cdr: bytes) -> int:
-    """Stamp of a message that begins with a header, without decoding the rest."""
+    """Stamp of a message that begins with a header, without decoding the rest; 0 where it is too short for one."""
+    if len(cdr) < 12:
+        return 0
     sec, nanosec = struct.unpack_from("<iI" if cdr[1] & 1 else ">iI", cdr, 4)
     return int(sec) * 1_000_000_000 + int(nanosec)
