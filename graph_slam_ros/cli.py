@@ -115,17 +115,17 @@ def _info(args: argparse.Namespace) -> int:
 
 def _optimize(args: argparse.Namespace) -> int:
     from graph_slam_ros.formats.g2o import read_g2o, write_g2o
-    from graph_slam_ros.solver import Settings, Solver
+    from graph_slam_ros.solver import Settings, Solver, initial_values
 
     file = read_g2o(args.graph, error_map=args.error_map, lenient=args.lenient, raw=args.information == "raw")
     settings = Settings(method=args.method, max_iterations=args.max_iterations, cost_tolerance=args.tolerance)
     solver = Solver(file.graph, settings)
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
-    for vertex in file.fixed:
+    first = min(range(file.graph.vertex_count), key=lambda v: (file.graph.kind_of(v).name[:2] != "SE", file.ids[v]))
+    root = file.fixed[0] if file.fixed else first
+    solver.start_at(initial_values(file.graph, args.init, root))
+    for vertex in file.fixed if file.fixed or "priors" in file.graph.labels else [root]:
         solver.hold(vertex)
-    if not file.fixed and "priors" not in file.graph.labels:
-        first = min(range(file.graph.vertex_count), key=lambda v: (file.graph.kind_of(v).name[:2] != "SE", file.ids[v]))
-        solver.hold(first)
     report = solver.update()
     if args.json:
         classes = {name: {"edges": c.edges, "chi2": c.chi2} for name, c in report.classes.items()}
@@ -239,6 +239,7 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("optimize", _optimize, "solve a g2o graph")
     sub.add_argument("graph", type=Path, metavar="GRAPH.g2o")
     sub.add_argument("--method", choices=("gn", "lm"), default="gn", help="gn is damped only if it fails to converge")
+    sub.add_argument("--init", choices=("file", "tree", "chordal"), default="file", help="where to start")
     sub.add_argument("--max-iterations", type=_count, default=100, metavar="N")
     sub.add_argument(
         "--tolerance", type=_positive, default=1e-6, metavar="X", help="relative decrease of chi2 at the end"

@@ -46,6 +46,14 @@ class Solver:
         self._edges[new_edges] = True
         self._structure_changed()
 
+    def start_at(self, values: Array) -> None:
+        """Begin from other values than the graph's initial ones: the stored numbers of all vertices, end to end."""
+        self._grow()
+        if values.shape != self._x.shape or not np.isfinite(values).all():
+            raise GraphSlamError(f"start: expected {len(self._x)} finite numbers, got an array {values.shape}")
+        self._x = values.copy()
+        self._solved_with = None
+
     def set_weight(self, edge: int, weight: float) -> None:
         """Multiply the information of an edge; 0 takes it out of the structure, another value puts it back."""
         if not (np.isfinite(weight) and weight >= 0.0):

@@ -1,0 +1,195 @@
+"""Where to start: initial values from the edges alone, for graphs without values or with a bad start.
+
+* ``tree``: poses composed along a breadth-first spanning tree of the relative poses.
+* ``chordal``: rotations from a linear least-squares problem in their matrices, brought back to rotations, then
+  positions from a second one. L. Carlone, R. Tron, K. Daniilidis, F. Dellaert, "Initialization techniques for 3D SLAM:
+  a survey on rotation estimation and its use in pose graph optimization", ICRA 2015.
+
+Point landmarks are placed by their first sighting.
+"""
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph import (
+    INVERSE_RELATIVE_POSE,
+    LANDMARK_POSITION,
+    LANDMARK_POSITION_3D,
+    RELATIVE_POSE,
+    RELATIVE_POSE_3D,
+    SE2,
+    SE3,
+    EdgeType,
+    Graph,
+    VertexKind,
+)
+from graph_slam_ros.lie import se2, se3, so3
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+INITS = ("file", "tree", "chordal")
+
+_RELATIVE: dict[VertexKind, tuple[EdgeType, ...]] = {
+    SE2: (RELATIVE_POSE, INVERSE_RELATIVE_POSE),
+    SE3: (RELATIVE_POSE_3D,),
+}
+_SIGHTING = {SE2: LANDMARK_POSITION, SE3: LANDMARK_POSITION_3D}
+_GROUP = {SE2: se2, SE3: se3}
+
+
+def initial_values(graph: Graph, method: str, root: int) -> Array:
+    """Stored numbers of all vertices, as ``Graph.initial``.
+
+    Parameters
+    ----------
+    method : ``file`` (as they are), ``tree`` or ``chordal``
+    root : the pose that keeps its value
+
+    Raises
+    ------
+    GraphSlamError
+        The relative poses do not join all poses to the root.
+    """
+    if method not in INITS:
+        raise GraphSlamError(f"init {method!r}: choose {', '.join(INITS)}")
+    values = graph.initial.values.copy()
+    if method == "file":
+        return values
+    kind = graph.kind_of(root)
+    if kind not in _GROUP:
+        raise GraphSlamError(f"init {method}: vertex {root} is {kind.name}, not a pose")
+    poses = np.flatnonzero(graph.kind.values == graph.kinds.index(kind))
+    ends, measured = _relative_edges(graph, kind)
+    _along_tree(graph, values, kind, root, poses, ends, measured)
+    if method == "chordal":
+        _chordal(graph, values, kind, root, poses, ends, measured)
+    _place_landmarks(graph, values, kind)
+    return values
+
+
+def _relative_edges(graph: Graph, kind: VertexKind) -> tuple[Index, Array]:
+    tables = [graph.tables[edge] for edge in _RELATIVE[kind] if edge in graph.tables]
+    if not tables:
+        return np.empty((0, 2), dtype=np.int64), np.empty((0, kind.size))
+    ends, measured = (np.concatenate([getattr(t, name).values for t in tables]) for name in ("vertices", "measured"))
+    order = np.argsort(np.concatenate([t.id.values for t in tables]))
+    return ends[order], measured[order]
+
+
+def _slots(graph: Graph, vertices: Index, size: int) -> Index:
+    return graph.offset.values[vertices][:, None] + np.arange(size)
+
+
+def _along_tree(
+    graph: Graph, values: Array, kind: VertexKind, root: int, poses: Index, ends: Index, measured: Array
+) -> None:
+    """Breadth first: each pose is as few relative poses from the root as can be."""
+    group = _GROUP[kind]
+    neighbours: dict[int, list[tuple[int, int, bool]]] = {}
+    for row, (i, j) in enumerate(ends.tolist()):
+        neighbours.setdefault(i, []).append((j, row, True))
+        neighbours.setdefault(j, []).append((i, row, False))
+    placed = {root: tuple(values[_slots(graph, np.array([root]), kind.size)[0]].tolist())}
+    queue = deque([root])
+    while queue:
+        at = queue.popleft()
+        for other, row, forward in neighbours.get(at, ()):
+            if other not in placed:
+                step = tuple(measured[row].tolist())
+                placed[other] = group.compose(placed[at], step if forward else group.inverse(step))
+                queue.append(other)
+    missing = [v for v in poses.tolist() if v not in placed]
+    if missing:
+        raise GraphSlamError(
+            f"no relative poses lead from vertex {root} to vertex {missing[0]} and {len(missing) - 1} more"
+        )
+    ids = np.array(list(placed))
+    values[_slots(graph, ids, kind.size)] = np.array([placed[v] for v in ids.tolist()])
+
+
+def _chordal(
+    graph: Graph, values: Array, kind: VertexKind, root: int, poses: Index, ends: Index, measured: Array
+) -> None:
+    position = np.full(graph.vertex_count, -1, dtype=np.int64)
+    position[poses] = np.arange(len(poses))
+    i, j = position[ends].T
+    fixed = int(position[root])
+    to_matrix, from_matrix, axes = _ROTATIONS[kind]
+    measured_rotations = to_matrix(measured)
+    held = to_matrix(values[_slots(graph, np.array([root]), kind.size)])[0]
+    # R_j = R_i Z, transposed: the rows of R_j' are Z' times those of R_i'
+    relaxed = _linear(
+        i, j, np.swapaxes(measured_rotations, 1, 2), np.zeros((len(i), axes, axes)), fixed, held.T, len(poses)
+    )
+    u, _, vt = np.linalg.svd(np.swapaxes(relaxed, 1, 2))
+    sign = np.ones((len(poses), axes))
+    sign[:, -1] = np.linalg.det(u @ vt)
+    rotations = (u * sign[:, None, :]) @ vt
+    offset = rotations[i] @ measured[:, :axes, None]
+    here = values[_slots(graph, np.array([root]), axes)].T
+    one = np.broadcast_to(np.eye(axes), (len(i), axes, axes))
+    positions = _linear(i, j, one, offset, fixed, here, len(poses))[:, :, 0]
+    values[_slots(graph, poses, kind.size)] = np.hstack([positions, from_matrix(rotations)])
+
+
+def _linear(i: Index, j: Index, a: Array, b: Array, fixed: int, value: Array, count: int) -> Array:
+    """Unknown matrices X of least ``sum |X_j - A X_i - B|^2`` with ``X_fixed = value``; (count, d, columns)."""
+    d = a.shape[1]
+    free = np.full(count, -1, dtype=np.int64)
+    free[np.arange(count) != fixed] = np.arange(count - 1)
+    rows = d * np.arange(len(i))[:, None] + np.arange(d)
+    right = b.reshape(len(i) * d, -1).copy()
+    entries: list[tuple[Array, Index, Index]] = []
+    for ends, block in ((j, np.broadcast_to(np.eye(d), a.shape)), (i, -a)):
+        known = ends == fixed
+        right[rows[known].ravel()] -= (block[known] @ value).reshape(-1, right.shape[1])
+        r, c = np.broadcast_arrays(rows[~known][:, :, None], d * free[ends[~known]][:, None, None] + np.arange(d))
+        entries.append((block[~known].ravel(), r.ravel(), c.ravel()))
+    data, r, c = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+    system = coo_array((data, (r, c)), shape=(len(i) * d, (count - 1) * d)).tocsc()
+    solved = splu((system.T @ system).tocsc(), permc_spec="MMD_AT_PLUS_A").solve(system.T @ right)
+    out = np.empty((count, d, right.shape[1]))
+    out[fixed] = value
+    out[free >= 0] = solved.reshape(count - 1, d, -1)
+    return out
+
+
+def _place_landmarks(graph: Graph, values: Array, kind: VertexKind) -> None:
+    table = graph.tables.get(_SIGHTING[kind])
+    if table is None:
+        return
+    vertices, first = np.unique(table.vertices.values[:, 1], return_index=True)
+    poses = values[_slots(graph, table.vertices.values[first, 0], kind.size)]
+    points = _GROUP[kind].act(tuple(poses.T), tuple(table.measured.values[first].T))
+    values[_slots(graph, vertices, len(points))] = np.stack(points, axis=-1)
+
+
+def _planar_matrices(values: Array) -> Array:
+    c, s = np.cos(values[:, 2]), np.sin(values[:, 2])
+    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=1)
+
+
+def _planar_angles(rotations: Array) -> Array:
+    return np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])[:, None]
+
+
+def _matrices(values: Array) -> Array:
+    return np.moveaxis(np.asarray(so3.matrix(tuple(values[:, 3:].T))), -1, 0)
+
+
+def _quaternions(rotations: Array) -> Array:
+    return np.asarray(Rotation.from_matrix(rotations).as_quat())
+
+
+_ROTATIONS: dict[VertexKind, tuple[Callable[[Array], Array], Callable[[Array], Array], int]] = {
+    SE2: (_planar_matrices, _planar_angles, 2),
+    SE3: (_matrices, _quaternions, 3),
+}
