@@ -1,0 +1,647 @@
+"""The batch solver against independent optimisers and dense algebra, and what it must refuse."""
+
+import functools
+import itertools
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+from scipy.optimize import least_squares
+
+from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
+from graph_slam_ros.graph import (
+    CAUCHY,
+    DIFFERENCE,
+    HUBER,
+    LANDMARK_POSITION,
+    NONE,
+    POINT_PRIOR,
+    POSE_PRIOR,
+    R1,
+    R2,
+    RELATIVE_POSE,
+    SE2,
+    TAG_POSITION,
+    Gaussian,
+    Graph,
+    Loss,
+)
+from graph_slam_ros.lie import se2
+from graph_slam_ros.solver import Settings, Solver
+
+POSES, POINTS = 12, 3
+TIGHT = {"step_tolerance": 1e-11, "cost_tolerance": 1e-15, "max_iterations": 100}
+EPS = np.finfo(float).eps
+
+
+def covariance(rng, size, sigma):
+    a = rng.standard_normal((size, size))
+    return sigma**2 * (a @ a.T / size + 0.3 * np.eye(size))
+
+
+class World:
+    """A loop of poses with landmarks: the graph, and the same problem as plain arrays for the oracle."""
+
+    def __init__(self, seed=0, *, origin=(0.0, 0.0), outliers=False):
+        rng = np.random.default_rng(seed)
+        self.graph, self.edges = Graph(), []
+        turn = 2 * np.pi / POSES
+        truth = [(*origin, 0.3)]
+        for _ in range(POSES - 1):
+            truth.append(se2.compose(truth[-1], (2.0, 0.1, turn)))
+        points = np.array(origin) + rng.uniform(-4, 4, (POINTS, 2)) + [0.0, 3.0]
+        estimate = [truth[0]]
+        steps = []
+        for i in range(POSES - 1):
+            sigma = covariance(rng, 3, 0.05)
+            step = se2.retract(se2.between(truth[i], truth[i + 1]), rng.multivariate_normal(np.zeros(3), sigma))
+            steps.append((RELATIVE_POSE, (i, i + 1), step, sigma, "odometry"))
+            estimate.append(se2.compose(estimate[-1], step))
+        self.graph.add_vertices(SE2, estimate)
+        self.graph.add_vertices(R2, points + 0.3 * rng.standard_normal((POINTS, 2)))
+        self.anchor = covariance(rng, 3, 0.2)
+        self.add(POSE_PRIOR, (0,), truth[0], self.anchor, "anchor")
+        for step in steps:
+            self.add(*step)
+        for i, j in ((0, 11), (2, 9), (5, 1)):
+            sigma = covariance(rng, 3, 0.05)
+            z = se2.retract(se2.between(truth[i], truth[j]), rng.multivariate_normal(np.zeros(3), sigma))
+            self.add(RELATIVE_POSE, (i, j), z, sigma, "closures")
+        for i in range(POSES):
+            for k in range(POINTS):
+                sigma = covariance(rng, 2, 0.1)
+                seen = se2.act(se2.inverse(truth[i]), points[k]) + rng.multivariate_normal(np.zeros(2), sigma)
+                if outliers and (i, k) in ((1, 1), (7, 0), (9, 2)):
+                    seen = np.add(seen, [1.5, -2.0])
+                self.add(LANDMARK_POSITION, (i, POSES + k), seen, sigma, "landmarks")
+
+    def add(self, kind, ends, measured, sigma, label):
+        self.graph.add_edge(kind, ends, measured, Gaussian.from_covariance(sigma), label)
+        self.edges.append((kind, ends, np.array(measured), np.linalg.inv(np.linalg.cholesky(sigma)), label))
+
+    def solver(self, **settings):
+        solver = Solver(self.graph, Settings(**settings))
+        solver.add(range(self.graph.vertex_count), range(self.graph.edge_count))
+        return solver
+
+
+def homogeneous(v):
+    c, s = np.cos(v[2]), np.sin(v[2])
+    return np.array([[c, -s, v[0]], [s, c, v[1]], [0.0, 0.0, 1.0]])
+
+
+def whitened(world, x, losses):
+    """Residuals whose squares sum up to the cost, with matrices and nothing of the package."""
+    poses, points = x[: 3 * POSES].reshape(-1, 3), x[3 * POSES :].reshape(-1, 2)
+    out = []
+    for kind, ends, z, root, label in world.edges:
+        if kind is LANDMARK_POSITION:
+            r = (np.linalg.inv(homogeneous(poses[ends[0]])) @ [*points[ends[1] - POSES], 1.0])[:2] - z
+        else:
+            first = homogeneous(poses[ends[0]])
+            t = first if len(ends) == 1 else np.linalg.inv(first) @ homogeneous(poses[ends[1]])
+            t = np.linalg.inv(homogeneous(z)) @ t
+            r = np.array([t[0, 2], t[1, 2], np.arctan2(t[1, 0], t[0, 0])])
+        r = root @ r
+        s = r @ r
+        name, scale = losses.get(label, ("none", 1.0))
+        if name == "huber" and s > scale**2:
+            r = r * np.sqrt((2 * scale * np.sqrt(s) - scale**2) / s)
+        if name == "cauchy":
+            r = r * np.sqrt(scale**2 * np.log1p(s / scale**2) / s)
+        out.append(r)
+    return np.concatenate(out)
+
+
+@functools.cache
+def oracle(seed, loss):
+    world = World(seed, outliers=loss != "none")
+    losses = {} if loss == "none" else {"landmarks": (loss, SCALES[loss])}
+    start = world.graph.initial.values.copy()
+    ends = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-12}
+    stages = [dict.fromkeys(losses, ("huber", 1.0)), losses] if losses else [{}]
+    for stage in stages:  # a redescending loss from dead reckoning may end elsewhere, so Huber first
+        found = least_squares(lambda x, s=stage: whitened(world, x, s), start, jac="3-point", **ends)
+        start = found.x
+    start[2 : 3 * POSES : 3] = se2.wrap(start[2 : 3 * POSES : 3])
+    return found.x, 2.0 * found.cost
+
+
+STAGES = {"none": [Loss(NONE)], "huber": [Loss(HUBER, 1.0)], "cauchy": [Loss(HUBER, 1.0), Loss(CAUCHY, 2.0)]}
+SCALES = {"huber": 1.0, "cauchy": 2.0}
+
+
+@pytest.mark.parametrize("method", ["gn", "lm"])
+@pytest.mark.parametrize("loss", ["none", "huber", "cauchy"])
+def test_the_optimum_is_that_of_an_independent_optimiser(loss, method):
+    best, cost = oracle(1, loss)
+    solver = World(1, outliers=loss != "none").solver(method=method, losses={"landmarks": STAGES[loss]}, **TIGHT)
+    report = solver.update()
+    assert (report.converged, report.method) == (True, method)
+    # the cost is quadratic at its minimum: 1e-9 of it are 1e-4 of a sigma (0.05) and more where it is flat
+    assert report.cost_final == pytest.approx(cost, rel=1e-9)
+    assert report.cost_final <= cost * (1.0 + 1e-12)
+    assert solver.estimate(range(POSES)) == pytest.approx(best[: 3 * POSES].reshape(-1, 3), abs=5e-5)
+    assert solver.estimate(range(POSES, POSES + POINTS)).ravel() == pytest.approx(best[3 * POSES :], abs=5e-5)
+    if loss == "none":
+        assert report.chi2_final == report.cost_final
+    else:
+        assert report.chi2_final > 1.5 * report.cost_final  # the outliers are there, and are not in the cost
+
+
+def test_a_report_adds_up():
+    world = World(2, outliers=True)
+    solver = world.solver(losses={"landmarks": [Loss(HUBER, 1.5)]})
+    start = world.graph.initial.values.copy()
+    report = solver.update()
+    assert report.stop in ("step", "cost")
+    plain, huber = (whitened(world, start, losses) for losses in ({}, {"landmarks": ("huber", 1.5)}))
+    assert report.chi2_initial == pytest.approx(plain @ plain, rel=1e-12)
+    assert report.cost_initial == pytest.approx(huber @ huber, rel=1e-12)
+    assert {name: c.edges for name, c in report.classes.items()} == {
+        "anchor": 1,
+        "odometry": 11,
+        "closures": 3,
+        "landmarks": 36,
+    }
+    assert sum(c.chi2 for c in report.classes.values()) == pytest.approx(report.chi2_final, rel=1e-12)
+    x = np.concatenate([solver.estimate(range(POSES)).ravel(), solver.estimate(range(POSES, POSES + POINTS)).ravel()])
+    r = whitened(world, x, {})
+    labels = np.concatenate([[label] * len(z) for _, _, z, _, label in world.edges])
+    for name, part in report.classes.items():
+        assert part.chi2 == pytest.approx((r[labels == name] ** 2).sum(), rel=1e-12)
+    last = report.iterations[-1]
+    assert (last.chi2, last.cost, last.damping) == (report.chi2_final, report.cost_final, 0.0)
+
+
+def test_why_it_stopped_is_told():
+    loose = World(0).solver(cost_tolerance=1e-3, step_tolerance=1e-15).update()
+    assert (loose.stop, loose.converged) == ("cost", True)
+    step = World(0).solver(cost_tolerance=0.0, step_tolerance=1e-4).update()
+    assert (step.stop, step.converged) == ("step", True)
+    assert step.iterations[-1].step <= 1e-4 < step.iterations[-2].step
+    short = World(0).solver(max_iterations=1, cost_tolerance=0.0, step_tolerance=0.0).update()
+    assert (short.stop, short.converged) == ("max_iterations", False)
+
+
+def test_stages_end_where_the_last_loss_has_its_minimum():
+    staged = World(3, outliers=True).solver(losses={"landmarks": STAGES["cauchy"]}, **TIGHT)
+    report = staged.update()
+    alone = World(3, outliers=True).solver(losses={"landmarks": STAGES["huber"]}, **TIGHT)
+    first = alone.update()
+    assert report.iterations[: len(first.iterations)] == first.iterations
+    assert len(report.iterations) > len(first.iterations)
+    alone.settings = Settings(losses={"landmarks": [Loss(CAUCHY, 2.0)]}, **TIGHT)
+    assert alone.update().cost_final == pytest.approx(report.cost_final, rel=1e-12)
+
+
+def test_a_second_update_changes_nothing():
+    world = World(0)
+    solver = world.solver()
+    first = solver.update()
+    before = solver.estimate(range(POSES))
+    again = solver.update()
+    assert (again.stop, again.iterations, again.converged) == ("nothing_to_do", (), True)
+    assert np.array_equal(solver.estimate(range(POSES)), before)
+    assert again.chi2_initial == again.chi2_final == first.chi2_final
+    assert again.classes == first.classes
+    assert solver.update(Settings(**TIGHT)).stop != "nothing_to_do"  # another question
+
+
+def test_an_update_that_ran_out_of_iterations_goes_on_with_the_next():
+    world = World(0)
+    solver = world.solver(max_iterations=3, step_tolerance=1e-6, cost_tolerance=0.0)
+    reports = [solver.update()]
+    while not reports[-1].converged and len(reports) < 20:
+        reports.append(solver.update())
+    assert reports[0].stop == "max_iterations"
+    assert reports[-1].stop == "step"
+    assert reports[-1].chi2_final == pytest.approx(World(0).solver(**TIGHT).update().chi2_final, rel=1e-9)
+
+
+def test_pieces_added_between_updates_end_where_the_whole_does():
+    world = World(4)
+    solver = Solver(world.graph, Settings(**TIGHT))
+    inside = np.zeros(world.graph.vertex_count, dtype=bool)
+    for edge, (_, ends, *_) in enumerate(world.edges):
+        new = [v for v in ends if not inside[v]]
+        inside[list(ends)] = True
+        solver.add(new, [edge])
+        if (
+            all(len(e[1]) == 1 or e[0] is RELATIVE_POSE for e in world.edges[: edge + 1])
+            or edge == len(world.edges) - 1
+        ):
+            report = solver.update()
+            batch = Solver(world.graph, Settings(**TIGHT))
+            batch.add(np.flatnonzero(inside), range(edge + 1))
+            assert report.chi2_final == pytest.approx(batch.update().chi2_final, rel=1e-9, abs=1e-12)
+            poses = np.flatnonzero(inside[:POSES])
+            assert solver.estimate(poses) == pytest.approx(batch.estimate(poses), abs=1e-8)
+
+
+def test_the_graph_may_grow_under_the_solver():
+    world = World(0)
+    solver = world.solver()
+    solver.update()
+    new = world.graph.add_vertex(SE2, [9.0, 9.0, 0.0])
+    edge = world.graph.add_edge(RELATIVE_POSE, [0, new], [1.0, 2.0, 0.5], Gaussian.from_sigmas(1, 1, 1), "odometry")
+    assert solver.update().stop == "nothing_to_do"  # not added yet
+    solver.add([new], [edge])
+    solver.update()
+    assert solver.estimate([new])[0] == pytest.approx(se2.compose(solver.estimate([0])[0], (1.0, 2.0, 0.5)), abs=1e-6)
+
+
+def dense_of(world, solver):
+    """Ids in order, the dense H, its inverse, and where each vertex begins."""
+    h = solver.information_matrix()
+    dofs = [world.graph.kind_of(v).dof for v in range(world.graph.vertex_count)]
+    return h, np.linalg.inv(h), np.concatenate([[0], np.cumsum(dofs)])
+
+
+@pytest.mark.parametrize("loss", ["none", "huber"])
+def test_marginals_are_the_blocks_of_the_dense_inverse(loss):
+    world = World(5, outliers=True)
+    solver = world.solver(losses={"landmarks": STAGES[loss]})
+    solver.update()
+    h, inverse, first = dense_of(world, solver)
+    bound = max(1e-9, 100 * EPS * np.linalg.cond(h))
+    for vertex, found in enumerate(solver.marginal(range(world.graph.vertex_count))):
+        block = inverse[first[vertex] : first[vertex + 1], first[vertex] : first[vertex + 1]]
+        assert np.abs(found - block).max() <= bound * np.diag(block).max()
+        assert np.array_equal(found, found.T)
+
+
+def test_the_information_matrix_is_that_of_numeric_derivatives():
+    world = World(5)
+    solver = world.solver()
+    solver.update()
+    poses, points = solver.estimate(range(POSES)), solver.estimate(range(POSES, POSES + POINTS))
+
+    def residuals(step):
+        moved = SE2.retract(poses, step[: 3 * POSES].reshape(-1, 3))
+        return whitened(world, np.concatenate([moved.ravel(), points.ravel() + step[3 * POSES :]]), {})
+
+    width = 3 * POSES + 2 * POINTS
+    j = np.stack([(residuals(e) - residuals(-e)) / 2e-6 for e in 1e-6 * np.eye(width)], axis=1)
+    h = solver.information_matrix()
+    scale = np.sqrt(np.outer(np.diag(h), np.diag(h)))
+    assert np.abs((h - j.T @ j) / scale).max() < 1e-7  # central differences of residuals up to 100
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_loops_do_not_make_the_anchored_pose_more_certain_than_its_anchor(seed):
+    world = World(seed)
+    solver = world.solver()
+    solver.update()
+    anchor = np.linalg.inv(world.graph.row(0)[0].sqrt_information.values[0])
+    cond = np.linalg.cond(solver.information_matrix())
+    (found,) = solver.marginal([0])
+    bound = 1e-12 if cond < 1e4 else 100 * EPS * cond
+    assert np.abs(found - anchor @ anchor.T).max() <= bound * np.abs(anchor @ anchor.T).max()
+
+
+def test_a_well_conditioned_loop_leaves_the_anchor_its_covariance_to_1e_12():
+    graph, sigma = Graph(), covariance(np.random.default_rng(3), 3, 1.0)
+    graph.add_vertices(SE2, [[0.1, 0.2, 0.0], [1.0, 0.0, 1.5], [1.0, 1.0, 3.0], [0.0, 1.0, -1.5]])
+    graph.add_edge(POSE_PRIOR, [0], [0.1, 0.2, 0.0], Gaussian.from_covariance(sigma), "anchor")
+    step = Gaussian.from_covariance(covariance(np.random.default_rng(4), 3, 1.0))
+    for i in range(4):
+        graph.add_edge(RELATIVE_POSE, [i, (i + 1) % 4], [1.0, 0.0, 1.6], step, "odometry")
+    graph.add_edge(RELATIVE_POSE, [0, 2], [1.0, 1.0, 3.0], step, "closures")
+    solver = Solver(graph, Settings(**TIGHT))
+    solver.add(range(4), range(6))
+    solver.update()
+    assert np.linalg.cond(solver.information_matrix()) < 1e4
+    assert np.abs(solver.marginal([0])[0] - sigma).max() <= 1e-12 * np.abs(sigma).max()
+
+
+def test_a_weight_of_zero_is_as_if_the_edge_were_not_there_and_one_brings_it_back():
+    world, closure = World(6), 13
+    solver = world.solver(**TIGHT)
+    whole = solver.update()
+    with_it = solver.estimate(range(POSES))
+    solver.set_weight(closure, 0.0)
+    without = solver.update()
+    assert without.classes["closures"].edges == 2
+    fresh = Solver(world.graph, Settings(**TIGHT))
+    fresh.add(range(world.graph.vertex_count), [e for e in range(world.graph.edge_count) if e != closure])
+    assert without.chi2_final == pytest.approx(fresh.update().chi2_final, rel=1e-12)
+    assert without.chi2_final < whole.chi2_final - 0.1
+    solver.set_weight(closure, 1.0)
+    assert solver.update().chi2_final == pytest.approx(whole.chi2_final, rel=1e-12)
+    assert solver.estimate(range(POSES)) == pytest.approx(with_it, abs=1e-9)
+
+
+def test_a_weight_multiplies_the_information():
+    double, twice = World(7), World(7)
+    kind, ends, z, root, label = twice.edges[13]
+    twice.graph.add_edge(kind, ends, z, Gaussian(root), label)
+    one, other = double.solver(**TIGHT), twice.solver(**TIGHT)
+    one.set_weight(13, 2.0)
+    assert one.update().chi2_final == pytest.approx(other.update().chi2_final, rel=1e-12)
+    assert one.information_matrix() == pytest.approx(other.information_matrix(), rel=1e-9, abs=1e-6)
+
+
+def test_a_held_vertex_stays_and_is_certain():
+    world = World(8)
+    solver = world.solver(**TIGHT)
+    before = solver.estimate([4])
+    solver.hold(4)
+    solver.update()
+    assert np.array_equal(solver.estimate([4]), before)
+    assert not solver.marginal([4])[0].any()
+    assert not np.array_equal(solver.estimate([5]), world.graph.initial.values[15:18])
+    held_by_a_prior = World(8)
+    held_by_a_prior.add(POSE_PRIOR, (4,), before[0], 1e-12 * np.eye(3), "anchor")
+    tied = held_by_a_prior.solver(**TIGHT)
+    tied.update()
+    # a millionth of a metre instead of none
+    assert solver.estimate(range(POSES)) == pytest.approx(tied.estimate(range(POSES)), abs=1e-6)
+    assert solver.marginal([9])[0] == pytest.approx(tied.marginal([9])[0], rel=1e-6, abs=1e-9)
+
+
+def small(*values, kind=SE2):
+    graph = Graph()
+    graph.add_vertices(kind, list(values))
+    return graph
+
+
+PLANAR, FLAT = Gaussian.from_sigmas(0.1, 0.2, 0.05), Gaussian.from_sigmas(0.1, 0.2)
+
+
+def solve(graph, held=(), **settings):
+    solver = Solver(graph, Settings(**settings))
+    solver.add(range(graph.vertex_count), range(graph.edge_count))
+    for vertex in held:
+        solver.hold(vertex)
+    return solver, solver.update()
+
+
+def test_a_single_pose_goes_where_its_anchor_is():
+    graph = small([5.0, 5.0, 1.0])
+    graph.add_edge(POSE_PRIOR, [0], [1.0, 2.0, 3.0], PLANAR, "anchor")
+    solver, report = solve(graph)
+    assert report.converged
+    assert solver.estimate([0])[0] == pytest.approx([1.0, 2.0, 3.0], abs=1e-9)
+    assert solver.marginal([0])[0] == pytest.approx(np.diag([0.01, 0.04, 0.0025]), rel=1e-9)
+
+
+def test_where_all_is_held_nothing_is_to_do():
+    graph = small([0.0, 0.0, 0.0], [2.0, 0.0, 0.0])
+    graph.add_edge(RELATIVE_POSE, [0, 1], [1.0, 0.0, 0.0], PLANAR, "odometry")
+    solver, report = solve(graph, held=[0, 1])
+    assert (report.stop, report.chi2_final) == ("nothing_to_do", pytest.approx(100.0))
+    assert not np.array(solver.marginal([0, 1])).any()
+    assert solver.information_matrix().shape == (0, 0)
+
+
+def test_nothing_at_all_is_solved():
+    solver = Solver(Graph())
+    report = solver.update()
+    assert (report.stop, report.chi2_final, report.classes) == ("nothing_to_do", 0.0, {})
+    assert solver.marginal([]) == []
+    assert len(solver.estimate([])) == 0
+
+
+def test_parts_without_a_link_are_solved_as_if_alone():
+    a, b, both = World(1), World(2), World(1)
+    shift = both.graph.vertex_count
+    other = World(2)
+    values = other.graph.initial.values
+    both.graph.add_vertices(SE2, values[: 3 * POSES].reshape(-1, 3))
+    both.graph.add_vertices(R2, values[3 * POSES :].reshape(-1, 2))
+    for kind, ends, z, root, label in other.edges:
+        both.graph.add_edge(kind, [v + shift for v in ends], z, Gaussian(root), label)
+    solver = both.solver(**TIGHT)
+    report = solver.update()
+    alone = [w.solver(**TIGHT) for w in (a, b)]
+    assert report.chi2_final == pytest.approx(sum(s.update().chi2_final for s in alone), rel=1e-12)
+    assert solver.estimate(range(POSES)) == pytest.approx(alone[0].estimate(range(POSES)), abs=1e-9)
+    second = solver.estimate(range(shift, shift + POSES))
+    assert second == pytest.approx(alone[1].estimate(range(POSES)), abs=1e-9)
+
+
+def test_a_part_that_nothing_fixes_is_named_and_the_estimate_stays():
+    graph = small([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0], [6.5, 0.0, 0.0], [8.0, 0.0, 0.0])
+    for i, j in ((0, 1), (2, 3), (3, 4)):
+        graph.add_edge(RELATIVE_POSE, [i, j], [1.0, 0.0, 0.0], PLANAR, "odometry")
+    solver = Solver(graph)
+    solver.add(range(5), range(3))
+    with pytest.raises(GaugeError, match="vertex 0 and 1 more"):
+        solver.update()
+    solver.hold(0)
+    with pytest.raises(GaugeError, match="vertex 2 and 2 more"):
+        solver.update()
+    with pytest.raises(GaugeError, match="vertex 2"):
+        solver.marginal([1])
+    assert np.array_equal(solver.estimate(range(5)).ravel(), graph.initial.values)
+    solver.hold(3)
+    assert solver.update().chi2_final == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_landmark_without_an_edge_is_named():
+    world = World(0)
+    lonely = world.graph.add_vertex(R2, [1.0, 1.0])
+    with pytest.raises(GaugeError, match=f"vertex {lonely} and 0 more"):
+        world.solver().update()
+
+
+def test_an_edge_taken_out_can_leave_a_part_without_gauge():
+    graph = small([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
+    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
+    graph.add_edge(RELATIVE_POSE, [0, 1], [1.0, 0.0, 0.0], PLANAR, "odometry")
+    solver, _ = solve(graph)
+    solver.set_weight(1, 0.0)
+    with pytest.raises(GaugeError, match="vertex 1"):
+        solver.update()
+    solver.set_weight(1, 1.0)
+    assert solver.update().converged
+
+
+@pytest.mark.parametrize("method", ["gn", "lm"])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_pose_that_may_turn_around_its_only_landmark_is_named(method, seed):
+    rng = np.random.default_rng(seed)
+    graph = small(*rng.standard_normal((2, 3)))
+    graph.add_vertex(R2, rng.standard_normal(2))
+    noise = Gaussian.from_covariance(covariance(rng, 2, 0.1))
+    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], Gaussian.from_covariance(covariance(rng, 3, 0.1)), "anchor")
+    for pose in (0, 1):
+        graph.add_edge(LANDMARK_POSITION, [pose, 2], rng.standard_normal(2), noise, "landmarks")
+    solver = Solver(graph, Settings(method=method))
+    solver.add(range(3), range(3))
+    with pytest.raises(SingularError, match=r"vertex 1$"):
+        solver.update()
+    assert np.array_equal(solver.estimate([0, 1]).ravel(), graph.initial.values[:6])
+    with pytest.raises(SingularError, match=r"vertex 1$"):
+        solver.marginal([0])
+
+
+@pytest.mark.parametrize("method", ["gn", "lm"])
+def test_a_tag_seen_without_its_orientation_is_named(method):
+    graph = small([0.0, 0.0, 0.0], [1.0, 1.0, 0.4])
+    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
+    graph.add_edge(TAG_POSITION, [0, 1], [1.1, 1.2], FLAT, "landmarks")
+    with pytest.raises(SingularError, match=r"vertex 1$"):
+        solve(graph, method=method)
+
+
+def test_a_point_alone_does_not_fix_the_direction_of_what_it_is_seen_from():
+    graph = small([0.3, 0.1, 0.2], [1.0, 0.1, 0.3])
+    graph.add_vertex(R2, [2.0, 3.0])
+    graph.add_edge(RELATIVE_POSE, [0, 1], [1.0, 0.0, 0.1], PLANAR, "odometry")
+    for pose in (0, 1):
+        graph.add_edge(LANDMARK_POSITION, [pose, 2], [2.0 - pose, 2.9], FLAT, "landmarks")
+    graph.add_edge(POINT_PRIOR[R2], [2], [2.0, 3.0], FLAT, "anchor")
+    with pytest.raises(SingularError, match=r"vertex [01]$"):
+        solve(graph)
+
+
+def test_edges_of_very_different_strength_are_not_called_singular():
+    graph = small([0.0, 0.0, 0.0], [1.0, 0.0, 0.1], [2.0, 0.0, 0.0])
+    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], Gaussian.from_sigmas(100.0, 100.0, 1.0), "anchor")
+    for i in (0, 1):
+        graph.add_edge(RELATIVE_POSE, [i, i + 1], [1.0, 0.0, 0.0], Gaussian.from_sigmas(1e-3, 1e-3, 1e-4), "odometry")
+    solver, report = solve(graph)
+    assert report.converged
+    assert solver.estimate([2])[0] == pytest.approx([2.0, 0.0, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_gauss_newton_that_fails_is_done_again_with_damping(seed):
+    rng = np.random.default_rng(seed)  # readings that contradict each other by far: undamped steps jump about
+    graph = small(*np.column_stack([rng.uniform(-5, 5, (6, 2)), rng.uniform(-3, 3, 6)]))
+    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
+    for i, j in itertools.combinations(range(6), 2):
+        noise = Gaussian.from_sigmas(0.01, 0.01, 3.0)
+        graph.add_edge(RELATIVE_POSE, [i, j], rng.uniform(-3, 3, 3), noise, "closures")
+    solver, report = solve(graph, max_iterations=60)
+    assert (report.method, report.converged) == ("lm", True)
+    damped = [report.cost_initial, *(i.cost for i in report.iterations)]
+    assert all(i.damping > 0.0 for i in report.iterations)
+    assert (np.diff(damped) <= 0).all()
+    gradient = 1e-4 * np.eye(18)
+    poses = solver.estimate(range(6))
+    values = []
+    for step in (np.zeros(18), *gradient, *-gradient):
+        graph_at = small(*SE2.retract(poses, step.reshape(6, 3)))
+        for table in graph.tables.values():
+            information = Gaussian(table.sqrt_information.values)
+            graph_at.add_edges(table.type, table.vertices.values, table.measured.values, information, "all")
+        values.append(solve(graph_at, held=range(6))[1].chi2_final)
+    assert values[0] == pytest.approx(report.chi2_final, rel=1e-12)
+    assert min(values) > values[0] * (1.0 - 2e-6)  # a minimum along each axis, up to the tolerance of the cost
+
+
+@pytest.mark.parametrize("method", ["gn", "lm"])
+def test_a_start_that_leaves_something_open_is_recovered_from(method):
+    graph = small([0.0, 0.0, 0.0], [0.5, 0.5, 0.1])
+    graph.add_vertices(R2, [[2.0, 2.0], [2.0, 2.0]])  # two landmarks in one place do not fix a direction
+    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
+    for k, seen in enumerate(([3.0, 1.0], [1.0, 3.0])):
+        graph.add_edge(LANDMARK_POSITION, [0, 2 + k], seen, FLAT, "landmarks")
+        graph.add_edge(LANDMARK_POSITION, [1, 2 + k], np.subtract(seen, 1.0), FLAT, "landmarks")
+    solver, report = solve(graph, method=method)
+    assert report.converged
+    assert solver.estimate([1])[0] == pytest.approx([1.0, 1.0, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("origin", [(5e5, 4e6), (-4e6, 5e5)])
+def test_far_from_the_origin_the_answer_is_the_same(origin):
+    near, far = World(9), World(9, origin=origin)
+    one, other = near.solver(), far.solver()
+    at_home, abroad = one.update(), other.update()
+    assert abroad.converged
+    # a coordinate of 4e6 is stored to 5e-10 m, sigmas are 0.05 m
+    assert abroad.chi2_final == pytest.approx(at_home.chi2_final, rel=1e-6)
+    moved = other.estimate(range(POSES)) - [*origin, 0.0]
+    assert moved == pytest.approx(one.estimate(range(POSES)), abs=1e-6)
+    assert other.marginal([7])[0] == pytest.approx(one.marginal([7])[0], rel=1e-5, abs=1e-9)
+
+
+@pytest.mark.parametrize("method", ["gn", "lm"])
+def test_numbers_that_overflow_are_refused_and_name_the_edge(method):
+    graph = small([0.0, 0.0, 0.0], [1e200, 0.0, 0.0])
+    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
+    graph.add_edge(RELATIVE_POSE, [0, 1], [1.0, 0.0, 0.0], PLANAR, "odometry")
+    with pytest.raises(GraphSlamError, match=r"edge 1 .*\[0, 1\].*not finite"):
+        solve(graph, method=method)
+
+
+@pytest.mark.parametrize("method", ["gn", "lm"])
+@pytest.mark.parametrize("far", [1e6, 1e9, 1e14, 1e140])
+def test_what_is_huge_but_finite_ends_finite_or_is_refused(method, far):
+    graph = small([0.0, 0.0, 0.0], [far, -far, 2.0])
+    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
+    graph.add_edge(RELATIVE_POSE, [0, 1], [1.0, 0.0, 0.0], PLANAR, "odometry")
+    solver = Solver(graph, Settings(method=method))
+    solver.add([0, 1], [0, 1])
+    try:
+        report = solver.update()
+    except SingularError:  # seen from that far, the direction of the first pose is all there is
+        assert far > 1e6
+        assert np.array_equal(solver.estimate([0, 1]).ravel(), graph.initial.values)
+    else:
+        assert np.isfinite(solver.estimate([0, 1])).all()
+        assert report.chi2_final < report.chi2_initial
+        assert far > 1e9 or report.chi2_final < 1e-9
+
+
+def test_a_refused_add_leaves_nothing_behind():
+    world = World(0)
+    solver = Solver(world.graph)
+    solver.add([0, 1], [0, 1])
+    for vertices, edges, culprit in (
+        ([2, 1], [], "vertex 1 was added before"),
+        ([2, 2], [], "vertex 2 was added before"),
+        ([2], [1, 2], "edge 1 was added before"),
+        ([2], [2, 2], "edge 2 was added before"),
+        ([2], [3], "needs vertex 3"),
+        ([99], [], "vertex 99 does not exist"),
+        ([-1], [], "vertex -1 does not exist"),
+        ([2], [999], "edge 999 does not exist"),
+    ):
+        with pytest.raises(GraphSlamError, match=culprit):
+            solver.add(vertices, edges)
+    solver.add([2], [2])
+    assert {name: c.edges for name, c in solver.update().classes.items()} == {"anchor": 1, "odometry": 2}
+
+
+@pytest.mark.parametrize("wrong", [-1, 15, 1000])
+def test_ids_that_do_not_exist_are_refused_wherever_they_are_asked_for(wrong):
+    solver = World(0).solver()
+    for ask in (solver.estimate, solver.marginal, solver.hold):
+        with pytest.raises(GraphSlamError, match=f"vertex {wrong} does not exist"):
+            ask([wrong] if ask != solver.hold else wrong)
+    for weight in (-1.0, np.nan, np.inf):
+        with pytest.raises(GraphSlamError, match="edge 3: weight"):
+            solver.set_weight(3, weight)
+    with pytest.raises(GraphSlamError, match=f"edge {wrong * 10} does not exist"):
+        solver.set_weight(wrong * 10, 1.0)
+    with pytest.raises(GraphSlamError, match="not of one kind"):
+        solver.estimate([0, POSES])
+
+
+def test_a_marginal_of_what_was_not_added_is_refused():
+    world = World(0)
+    solver = Solver(world.graph)
+    solver.add([0], [0])
+    with pytest.raises(GraphSlamError, match="vertex 1 is not in the problem"):
+        solver.marginal([0, 1])
+
+
+def test_an_unknown_method_is_refused_with_the_choices():
+    with pytest.raises(GraphSlamError, match=r"'dogleg'.*gn or lm"):
+        Settings(method="dogleg")
+
+
+def test_vectors_are_solved_in_one_step_to_the_weighted_mean():
+    graph = small([0.0], [7.0], kind=R1)
+    for z, sigma in ((1.0, 1.0), (4.0, 0.5)):
+        graph.add_edge(POINT_PRIOR[R1], [0], [z], Gaussian.from_sigmas(sigma), "anchor")
+    graph.add_edge(DIFFERENCE[R1], [0, 1], [2.0], Gaussian.from_sigmas(2.0), "odometry")
+    solver, report = solve(graph)
+    assert solver.estimate([0, 1]).ravel() == pytest.approx([17 / 5, 27 / 5], abs=1e-12)  # (1 + 4 * 4) / 5
+    assert np.ravel(solver.marginal([0, 1])) == pytest.approx([0.2, 4.2], rel=1e-12)
+    assert block_diag(*solver.marginal([0])).shape == (1, 1)
+    assert report.iterations[1].step < 1e-12
