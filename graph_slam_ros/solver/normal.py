@@ -230,7 +230,7 @@ def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable,
         _, part = connected_components(links, directed=False)
     else:
         part = np.arange(graph.vertex_count)
-    loose = free[~np.isin(part[free], part[fixed])]
+    loose = np.sort(free[~np.isin(part[free], part[fixed])])
     if len(loose):
         more = int((part[loose] == part[loose[0]]).sum()) - 1
         raise GaugeError(
