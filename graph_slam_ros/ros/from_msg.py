@@ -31,6 +31,8 @@ _NORM_EXACT = 1e-6
 _ASYMMETRY_REPAIRED, _ASYMMETRY_EXACT = 1e-2, 1e-6
 _DEFICIT_REPAIRED = 1e-9  # negative eigenvalues down to this fraction of the largest are rounding
 _AGREE_SIGMA = 3.0
+_FARTHEST_M = 1e9
+_MOST_VARIANCE = np.array([1e6, 1e6, 1e3])  # m^2, m^2, rad^2: as good as unknown; drivers send up to 1.8e308
 
 
 class MessageError(Exception):
@@ -99,11 +101,12 @@ class Border:
             try:
                 self._finite(t.transform.translation)
                 self._unit("tf_static", t.transform.rotation)
+                parent = self._frame("tf_static", t.header.frame_id)
+                child = self._frame("tf_static", t.child_frame_id)
             except MessageError as reason:
                 self._counters.count("tf_static", str(reason))
                 continue
-            T_parent_child = matrix(t.transform.translation, t.transform.rotation)
-            self._transforms.add(t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/"), T_parent_child)
+            self._transforms.add(parent, child, matrix(t.transform.translation, t.transform.rotation))
 
     # -- odometry ----------------------------------------------------------------------------------------------------
 
@@ -208,9 +211,10 @@ class Border:
                 if fused is None:
                     self._counters.count(topic, "id_conflict", len(same))
                     break
-                self._counters.count(topic, "id_merged")
                 merged = fused
             else:
+                if len(same) > 1:
+                    self._counters.count(topic, "id_merged", len(same) - 1)
                 out.append(merged)
         return out
 
@@ -240,6 +244,8 @@ class Border:
     def _finite(v: Any) -> None:
         if not (math.isfinite(v.x) and math.isfinite(v.y) and math.isfinite(v.z)):
             raise MessageError("nonfinite")
+        if max(abs(v.x), abs(v.y), abs(v.z)) > _FARTHEST_M:
+            raise MessageError("too_far")
 
     def _unit(self, source: str, q: Any) -> None:
         """Refuse what is no rotation; bring a nearly unit quaternion to unit length, in place."""
@@ -263,12 +269,17 @@ class Border:
         if not np.isfinite(block).all():
             return (), None
         repairs = []
+        variances, most = np.diag(block), _MOST_VARIANCE[: len(block)]
+        if (variances > most).any():
+            repairs.append("covariance_clamped")
+            scale = np.sqrt(most / np.maximum(variances, most))
+            block = scale[:, None] * block * scale
         asymmetry = np.abs(block - block.T).max() / np.abs(block).max()
         if asymmetry > _ASYMMETRY_REPAIRED:
             return (), None
         if asymmetry > _ASYMMETRY_EXACT:
             repairs.append("covariance_symmetrized")
-        symmetric = 0.5 * (block + block.T)
+        symmetric = 0.5 * block + 0.5 * block.T
         values, vectors = np.linalg.eigh(symmetric)
         floor = _DEFICIT_REPAIRED * values[-1]
         if values[0] < -floor or values[-1] <= 0.0:
