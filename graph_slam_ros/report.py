@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros import evaluation
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.evaluation import Trajectory
 from graph_slam_ros.lie import se2
 
@@ -175,4 +176,9 @@ def _legend(axes: Any, *, at: float, side: str) -> None:
 
 
 def _save(figure: Any, out_png: Path) -> None:
-    figure.savefig(out_png, metadata={"Software": "graph_slam_ros"})
+    if Path(out_png).suffix != ".png":
+        raise GraphSlamError(f"{out_png}: a picture is a .png file")
+    try:
+        figure.savefig(out_png, metadata={"Software": "graph_slam_ros"})
+    except OSError as error:
+        raise GraphSlamError(f"{out_png}: {error.strerror or error}") from None
