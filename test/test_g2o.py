@@ -1,0 +1,251 @@
+"""g2o files: what is written is read back, and what is wrong is named with its line."""
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.g2o import read_g2o, write_g2o
+from graph_slam_ros.graph import (
+    LANDMARK_POSITION,
+    POSE_PRIOR,
+    R1,
+    R2,
+    RELATIVE_POSE,
+    SE2,
+    TAG_POSITION,
+    Gaussian,
+    Graph,
+)
+from graph_slam_ros.solver import Solver
+
+GOOD = """\
+# two poses and a landmark
+VERTEX_SE2 10 0 0 0
+VERTEX_SE2 11 1.5 -2e-3 .25
+VERTEX_XY 7 3. +4 # 5
+EDGE_SE2 10 11 1 0 0.1 10 1 -2 20 3 30
+"""
+FINE = GOOD.replace(" # 5", "")
+EDGE = "EDGE_SE2 10 11 1 0 0.1 10 1 -2 20 3 30"
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(text, **options):
+        path = tmp_path / "graph.g2o"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_g2o(path, **options)
+
+    return read
+
+
+def values_of(graph):
+    return lambda ids: graph.initial.values[graph.offset.values[ids][:, None] + np.arange(graph.kind_of(ids[0]).size)]
+
+
+def test_a_file_becomes_vertices_and_edges_in_its_own_words(read):
+    file = read(FINE + "FIX 11\nEDGE_SE2_XY 11 7 1 2 4 1 9\nEDGE_SE2 11 10 0 0 0 1 0 0 1 0 1\n")
+    graph = file.graph
+    assert (file.ids, file.fixed) == ([10, 11, 7], [1])
+    assert [graph.kind_of(v) for v in range(3)] == [SE2, SE2, R2]
+    assert graph.initial.values.tolist() == [0, 0, 0, 1.5, -2e-3, 0.25, 3, 4]
+    assert "landmarks" in graph.labels
+    table = graph.tables[RELATIVE_POSE]
+    assert table.vertices.values.tolist() == [[0, 1], [1, 0]]
+    # the upper triangle, row by row
+    information = Gaussian(table.sqrt_information.values[0]).information
+    assert information == pytest.approx(np.array([[10, 1, -2], [1, 20, 3], [-2, 3, 30.0]]), rel=1e-13)
+    sighting = graph.tables[LANDMARK_POSITION]
+    assert (sighting.vertices.values.tolist(), sighting.measured.values.tolist()) == ([[1, 2]], [[1, 2]])
+
+
+def test_odometry_joins_a_pose_to_the_next_id_even_where_ids_are_missing(read):
+    lines = "".join(f"VERTEX_SE2 {k} {k} 0 0\n" for k in (30, 10, 20)) + "VERTEX_XY 15 0 0\n"
+    for i, j in ((10, 20), (20, 30), (10, 30)):
+        lines += f"EDGE_SE2 {i} {j} 1 0 0 1 0 0 1 0 1\n"
+    file = read(lines)
+    table = file.graph.tables[RELATIVE_POSE]
+    named = [
+        (file.ids[i], file.ids[j], file.graph.labels[label])
+        for (i, j), label in zip(table.vertices.values, table.label.values, strict=True)
+    ]
+    assert sorted(named) == [
+        (10, 20, "odometry"),
+        (10, 30, "closures"),
+        (20, 30, "odometry"),
+    ]
+
+
+def random_graph():
+    rng, graph = np.random.default_rng(8), Graph()
+    graph.add_vertices(SE2, rng.standard_normal((5, 3)) * [1e6, 1e-6, 1.0])
+    graph.add_vertices(R2, rng.standard_normal((2, 2)) / 3)
+    graph.add_vertex(SE2, [0.1, 1 / 3, -np.pi])
+
+    def noise(count, size):
+        a = rng.standard_normal((count, size, size)) * 10.0 ** rng.uniform(-4, 4, (count, size, 1))
+        return Gaussian.from_information(a @ np.swapaxes(a, 1, 2))
+
+    graph.add_edges(RELATIVE_POSE, [[i, i + 1] for i in range(4)], rng.standard_normal((4, 3)), noise(4, 3), "odometry")
+    graph.add_edges(RELATIVE_POSE, [[0, 4], [3, 1]], rng.standard_normal((2, 3)), noise(2, 3), "closures")
+    graph.add_edges(LANDMARK_POSITION, [[0, 5], [3, 6]], rng.standard_normal((2, 2)), noise(2, 2), "landmarks")
+    graph.add_edges(TAG_POSITION, [[2, 7]], rng.standard_normal((1, 2)), noise(1, 2), "landmarks")
+    graph.add_edges(POSE_PRIOR, [[0]], rng.standard_normal((1, 3)), noise(1, 3), "priors")
+    return graph
+
+
+def test_what_is_written_is_read_back_to_the_bit(tmp_path, read):
+    file = read(FINE)
+    file.graph, file.ids, file.fixed = random_graph(), [100, 4, 8, 15, 16, 1, 2, 1000], [3, 5]
+    file.unknown = ["PARAMS_SE2OFFSET 0   0 0 0", "VERTEX_TAG 5 it's \u00fcnknown"]
+    write_g2o(tmp_path / "a.g2o", file, values_of(file.graph))
+    again = read_g2o(tmp_path / "a.g2o")
+    assert (again.ids, again.fixed, again.unknown) == (file.ids, file.fixed, file.unknown)
+    assert again.graph.initial.values.tobytes() == file.graph.initial.values.tobytes()
+    assert list(again.graph.tables) != [] and set(again.graph.tables) == set(file.graph.tables)
+    for kind, table in file.graph.tables.items():
+        other = again.graph.tables[kind]
+        order, order_again = (np.lexsort(t.measured.values.T) for t in (table, other))
+        assert np.array_equal(table.vertices.values[order], other.vertices.values[order_again])
+        assert table.measured.values[order].tobytes() == other.measured.values[order_again].tobytes()
+        one, two = (
+            Gaussian(t.sqrt_information.values[o]).information for t, o in ((table, order), (other, order_again))
+        )
+        sigma = np.sqrt(np.diagonal(one, axis1=1, axis2=2))
+        assert np.abs((one - two) / sigma[:, :, None] / sigma[:, None, :]).max() < 1e-12
+    write_g2o(tmp_path / "b.g2o", again, values_of(again.graph))
+    lines, lines_again = ((tmp_path / f"{n}.g2o").read_text().splitlines() for n in "ab")
+    vertices = [line for line in lines if not line.startswith("EDGE")]
+    assert vertices == [line for line in lines_again if not line.startswith("EDGE")]
+
+
+def test_the_estimate_is_what_is_written(tmp_path, read):
+    file = read(FINE.replace("VERTEX_XY 7 3. +4\n", "") + "FIX 10\n")
+    solver = Solver(file.graph)
+    solver.add([0, 1], [0])
+    solver.hold(0)
+    solver.update()
+    write_g2o(tmp_path / "out.g2o", file, solver.estimate)
+    assert read_g2o(tmp_path / "out.g2o").graph.initial.values.tobytes() == solver.estimate([0, 1]).tobytes()
+
+
+def test_unknown_lines_are_kept_word_for_word(read):
+    odd = ["EDGE_BEARING_SE2_XY 10 7  0.5 1e3", "WHAT nan inf 1_0 \u0663"]
+    assert read(odd[0] + "\n" + FINE + odd[1] + "\r\n").unknown == odd
+
+
+def test_line_ends_of_windows_blank_lines_and_comments_change_nothing(read):
+    plain, other = read(FINE), read(FINE.replace("\n", "\r\n\r\n").replace("EDGE", "\t # c\r\n  EDGE"))
+    assert plain.graph.initial.values.tolist() == other.graph.initial.values.tolist()
+    assert other.graph.edge_count == 1
+    assert read(FINE.rstrip("\n")).graph.edge_count == 1
+
+
+def test_a_vertex_twice_is_fine_where_it_says_the_same(read):
+    assert read(FINE + "VERTEX_SE2 11 1.5 -0.002 0.250\n").ids == [10, 11, 7]
+
+
+@pytest.mark.parametrize(
+    "line, why",
+    [
+        ("VERTEX_SE2 11 1.5 -2e-3 .26", "vertex 11 was declared before, with other values"),
+        ("VERTEX_XY 11 1.5 -2e-3", "vertex 11 was declared before"),
+        ("VERTEX_SE2 12 1 2", "VERTEX_SE2 needs 4 fields after the tag, found 3"),
+        ("VERTEX_XY 12 1 2 3", "VERTEX_XY needs 3 fields after the tag, found 4"),
+        ("VERTEX_SE2", "needs 4 fields after the tag, found 0"),
+        ("VERTEX_SE2 12 1 2 nan", "'nan' is not a finite number"),
+        ("VERTEX_SE2 12 inf 2 3", "'inf' is not a finite number"),
+        ("VERTEX_SE2 12 1 -Infinity 3", "'-Infinity' is not a finite number"),
+        ("VERTEX_SE2 12 1e999 2 3", "'1e999' is not a finite number"),
+        ("VERTEX_SE2 12 1_0 2 3", "'1_0' is not a finite number"),
+        ("VERTEX_SE2 12 \u0661 2 3", "'\u0661' is not a finite number"),
+        ("VERTEX_SE2 12 0x10 2 3", "'0x10' is not a finite number"),
+        ("VERTEX_SE2 12 1,5 2 3", "'1,5' is not a finite number"),
+        ("VERTEX_SE2 12 . 2 3", "'.' is not a finite number"),
+        ("VERTEX_SE2 1.0 1 2 3", "'1.0' is not an id"),
+        ("VERTEX_SE2 \u0661 1 2 3", "'\u0661' is not an id"),
+        ("VERTEX_SE2 1_0 1 2 3", "'1_0' is not an id"),
+        ("VERTEX_SE2 99999999999999999999 1 2 3", "is not an id"),
+        ("EDGE_SE2 10 11 1 0 0.1 10 1 -2 20 3", "EDGE_SE2 needs 11 fields after the tag, found 10"),
+        ("EDGE_SE2 10 11 1 0 0.1 10 1 -2 20 3 nan", "'nan' is not a finite number"),
+        ("EDGE_SE2 10 12 1 0 0.1 10 1 -2 20 3 30", "edge to vertex 12, which is not declared"),
+        ("EDGE_SE2 10 7 1 0 0.1 10 1 -2 20 3 30", "EDGE_SE2 to vertex 7, which is a VERTEX_XY"),
+        ("EDGE_SE2_XY 10 11 1 2 1 0 1", "EDGE_SE2_XY to vertex 11, which is a VERTEX_SE2"),
+        ("EDGE_SE2 11 11 1 0 0.1 10 1 -2 20 3 30", "edge from vertex 11 to itself"),
+        ("EDGE_SE2 10 11 1 0 0.1 0 0 0 0 0 0", "information is not positive definite"),
+        ("EDGE_SE2 10 11 1 0 0.1 1 1 1 1 1 1", "information is not positive definite"),
+        ("EDGE_SE2 10 11 1 0 0.1 1 2 0 1 0 1", "information is not positive definite"),
+        ("EDGE_PRIOR_SE2 11 0 0 0 -1 0 0 1 0 1", "information is not positive definite"),
+        ("FIX 12", "FIX names vertex 12, which is not declared"),
+        ("FIX", "FIX names no vertex"),
+        ("FIX x", "'x' is not an id"),
+    ],
+)
+def test_a_bad_line_is_named_and_in_lenient_reading_left_out(read, line, why):
+    text = FINE + line + "\n" + "FIX 11\n"
+    with pytest.raises(FormatError) as refusal:
+        read(text)
+    number = len(FINE.splitlines()) + 1
+    assert str(refusal.value).startswith(f"graph.g2o:{number}: ")
+    assert why in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+    file = read(text, lenient=True)
+    assert (file.ids, file.graph.edge_count, file.fixed) == ([10, 11, 7], 1, [1])
+    assert file.graph.initial.values[3:6].tolist() == [1.5, -2e-3, 0.25]
+    assert file.skipped == [str(refusal.value)]
+
+
+def test_lenient_reading_lists_every_bad_line(read):
+    text = FINE + "EDGE_SE2 1\nVERTEX_SE2 1 x 0 0\n" + EDGE + "\nEDGE_SE2 10 11 1 0 0.1 -1 0 0 1 0 1\nEDGE_SE2 10 1 1\n"
+    file = read(text, lenient=True)
+    assert [s.split(":")[1] for s in file.skipped] == ["6", "7", "10", "9"]
+    assert file.graph.edge_count == 2
+
+
+def test_a_comment_behind_a_line_is_not_guessed_at(read):
+    with pytest.raises(FormatError, match=r"graph.g2o:4: VERTEX_XY needs 3 fields after the tag, found 5"):
+        read(GOOD)
+
+
+@pytest.mark.parametrize(
+    "content, why",
+    [
+        ("", "no vertex|neither vertex"),
+        ("# nothing\n\n", "no vertex|neither vertex"),
+        (b"\x89PNG\r\n\x1a\n\x00\x00\xff\xfe", "not a text file"),
+        (bytes(range(1, 128)) * 20, "no vertex|neither vertex"),
+        ("some other text\n", "no vertex|neither vertex"),
+        ("VERTEX_SE2 x 0 0 0\n", r"graph.g2o:1: 'x' is not an id"),
+    ],
+)
+def test_what_is_no_g2o_file_is_refused(read, content, why):
+    with pytest.raises(FormatError, match=why):
+        read(content)
+
+
+def test_what_cannot_be_opened_is_named(tmp_path):
+    for path, why in (
+        (tmp_path, "not a file"),
+        (tmp_path / "missing.g2o", "no such file"),
+        (tmp_path / ("x" * 4096), "too long"),
+    ):
+        with pytest.raises(FormatError, match=why) as refusal:
+            read_g2o(path)
+        assert str(path) in str(refusal.value)
+
+
+def test_what_cannot_be_written_is_named(tmp_path, read):
+    file = read(FINE)
+    for path, why in ((tmp_path / "no" / "where.g2o", "No such file"), (tmp_path, "directory")):
+        with pytest.raises(FormatError, match=why):
+            write_g2o(path, file, values_of(file.graph))
+    file.graph.add_vertex(R1, [0.0])
+    file.ids.append(12)
+    with pytest.raises(FormatError, match="no tag for a vertex R1"):
+        write_g2o(tmp_path / "out.g2o", file, values_of(file.graph))
+    assert not (tmp_path / "out.g2o").exists()
+
+
+def test_an_unknown_error_map_is_refused_with_the_choices(read):
+    with pytest.raises(FormatError, match="'other': choose relative or seed"):
+        read(FINE, error_map="other")

@@ -1,0 +1,83 @@
+"""Compiled loops: with bounds checked, without compilation, and all compiled by the warm-up."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TEST = Path(__file__).resolve().parent
+# Small, and between them they call every kernel.
+SMALL = [
+    "test_lie.py",
+    "test_graph.py",
+    "test_solver.py::test_a_report_adds_up",
+    "test_solver.py::test_a_held_vertex_stays_and_is_certain",
+    "test_solver.py::test_where_all_is_held_nothing_is_to_do",
+    "test_solver.py::test_marginals_are_the_blocks_of_the_dense_inverse",
+    "test_solver.py::test_vectors_are_solved_in_one_step_to_the_weighted_mean",
+    "test_solver.py::test_parts_without_a_link_are_solved_as_if_alone",
+]
+
+
+def python(*words, **environment):
+    return subprocess.run(
+        [sys.executable, *words], capture_output=True, text=True, cwd=TEST, env=os.environ | environment, timeout=300
+    )
+
+
+@pytest.mark.parametrize("setting", ["NUMBA_BOUNDSCHECK", "NUMBA_DISABLE_JIT"])
+def test_the_small_tests_pass_with(setting):
+    done = python("-m", "pytest", "-q", "-p", "no:cacheprovider", *SMALL, **{setting: "1"})
+    assert done.returncode == 0, done.stdout[-3000:]
+    assert " passed" in done.stdout
+
+
+BEYOND = """
+import numpy as np
+from graph_slam_ros.graph.edges import _pose_prior
+from graph_slam_ros.lie.jit import CACHE_DIR
+print(CACHE_DIR)
+_pose_prior(np.zeros(3), np.array([[{at}]]), np.zeros((1, 3)))
+"""
+
+
+def test_code_compiled_without_bounds_checks_is_not_served_where_they_are_asked_for(tmp_path):
+    cache = {"GRAPH_SLAM_CACHE": str(tmp_path)}
+    plain = python("-c", BEYOND.format(at=0), NUMBA_BOUNDSCHECK="0", **cache)
+    assert plain.returncode == 0, plain.stderr
+    checked = python("-c", BEYOND.format(at=1), NUMBA_BOUNDSCHECK="1", **cache)
+    assert "IndexError" in checked.stderr
+    assert checked.stdout != plain.stdout
+
+
+COMPILED_LATER = """
+import sys
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.solver import Settings, Solver
+from graph_slam_ros.warmup import warmup
+
+def signatures():
+    modules = [m for name, m in list(sys.modules.items()) if name.startswith("graph_slam_ros")]
+    kernels = {f"{f.__module__}.{f.__name__}": f for m in modules for f in vars(m).values() if hasattr(f, "signatures")}
+    return {name: len(f.signatures) for name, f in kernels.items()}
+
+warmup()
+before = signatures()
+for path in sys.argv[1:]:
+    file = read_g2o(path)
+    solver = Solver(file.graph)
+    solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
+    solver.hold(0)
+    solver.update()
+    solver.marginal([1])
+print([name for name, count in before.items() if count == 0])
+print([name for name, count in signatures().items() if count != before.get(name, 0)])
+"""
+
+
+def test_the_warm_up_compiles_all_that_solving_a_graph_needs():
+    graphs = [str(TEST.parent / "data" / name) for name in ("city.g2o", "landmarks.g2o")]
+    done = python("-c", COMPILED_LATER, *graphs)
+    assert done.stdout.splitlines() == ["[]", "[]"], done.stdout + done.stderr

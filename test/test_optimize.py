@@ -1,0 +1,211 @@
+"""The command ``graph_slam optimize``: answers, files, exit codes, and one line where it refuses."""
+
+import json
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from graph_slam_ros.cli import main
+
+DATA = Path(__file__).resolve().parents[1] / "data"
+CITY = DATA / "city.g2o"
+SMALL = """\
+VERTEX_SE2 3 0.5 0 0
+VERTEX_SE2 4 1.2 0.3 0.1
+VERTEX_SE2 5 2.5 0 0
+VERTEX_XY 9 2 2
+EDGE_SE2 3 4 1 0 0 4 0 0 4 0 4
+EDGE_SE2 4 5 1 0 0 4 0 0 4 0 4
+EDGE_SE2 3 5 2.1 0 0 4 0 0 4 0 4
+EDGE_SE2_XY 3 9 1.5 2 9 0 9
+EDGE_SE2_XY 5 9 -.5 2 9 0 9
+"""
+KEYS = {"chi2_initial", "chi2_final", "iterations", "converged", "stop", "error_map", "classes"}
+
+
+@pytest.fixture
+def graph(tmp_path):
+    path = tmp_path / "small.g2o"
+    path.write_text(SMALL)
+    return path
+
+
+@pytest.fixture
+def run(capsys):
+    def run(*words):
+        code = main(["optimize", *map(str, words)])
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+def answer_of(run, *words):
+    code, out, err = run(*words, "--json")
+    assert (code, err) == (0, "")
+    assert len(out.splitlines()) == 1
+    return json.loads(out)
+
+
+def test_the_answer_has_the_promised_keys_and_adds_up(run, graph):
+    answer = answer_of(run, graph)
+    assert set(answer) >= KEYS
+    assert {name: set(part) for name, part in answer["classes"].items()} == {
+        "odometry": {"edges", "chi2"},
+        "closures": {"edges", "chi2"},
+        "landmarks": {"edges", "chi2"},
+    }
+    assert [answer["classes"][k]["edges"] for k in ("odometry", "closures", "landmarks")] == [2, 1, 2]
+    assert sum(part["chi2"] for part in answer["classes"].values()) == pytest.approx(answer["chi2_final"], rel=1e-12)
+    assert (answer["converged"], answer["error_map"], type(answer["iterations"])) == (True, "relative", int)
+    assert 0 < answer["chi2_final"] < answer["chi2_initial"]
+
+
+@pytest.mark.parametrize("method", ["gn", "lm"])
+@pytest.mark.parametrize("error_map", ["relative", "seed"])
+def test_the_city_comes_to_the_value_that_its_readme_states(run, method, error_map):
+    answer = answer_of(run, CITY, "--method", method, "--error-map", error_map)
+    assert answer["chi2_final"] == pytest.approx(465.969818, rel=1e-6)  # the tolerance of convergence
+    assert (answer["method"], answer["error_map"]) == (method, error_map)
+
+
+def test_what_is_written_is_the_optimum_again(run, tmp_path, graph):
+    for source in (graph, CITY):
+        out = tmp_path / "out.g2o"
+        first = answer_of(run, source, "--out", out)
+        again = answer_of(run, out)
+        assert again["chi2_initial"] == pytest.approx(first["chi2_final"], rel=1e-9)
+        assert again["classes"].keys() == first["classes"].keys()
+        assert answer_of(run, source)["chi2_initial"] == first["chi2_initial"]  # the source is as it was
+
+
+def test_the_first_pose_is_held_where_nothing_else_fixes_the_graph(run, tmp_path, graph):
+    out = tmp_path / "out.g2o"
+    run(graph, "--out", out)
+    assert out.read_text().splitlines()[0].split() == ["VERTEX_SE2", "3", "0.5", "0.0", "0.0"]
+    graph.write_text(SMALL + "FIX 5\n")
+    run(graph, "--out", out)
+    lines = [line.split() for line in out.read_text().splitlines()]
+    assert ["VERTEX_SE2", "5", "2.5", "0.0", "0.0"] in lines
+    assert ["FIX", "5"] in lines
+    assert lines[0] != ["VERTEX_SE2", "3", "0.5", "0.0", "0.0"]
+    graph.write_text(SMALL + "EDGE_PRIOR_SE2 4 7 8 0.5 1 0 0 1 0 1\n")
+    run(graph, "--out", out)
+    moved = [float(x) for x in out.read_text().splitlines()[1].split()[2:]]
+    assert moved == pytest.approx([7.0, 8.0, 0.5], abs=1e-3)
+
+
+def test_the_text_shows_every_step_and_the_classes(run, graph):
+    code, out, err = run(graph)
+    answer = answer_of(run, graph)
+    assert (code, err) == (0, "")
+    steps = [line for line in out.splitlines() if "largest step" in line]
+    assert len(steps) == answer["iterations"]
+    assert f"{answer['chi2_final']:.6f}" in steps[-1]
+    assert f"converged ({answer['stop']}), method gn" in out
+    for name, part in answer["classes"].items():
+        assert any(name in line and f"{part['chi2']:.6f}" in line for line in out.splitlines())
+
+
+def test_few_iterations_are_told_as_not_converged(run):
+    code, out, _ = run(CITY, "--max-iterations", 1)
+    assert code == 0
+    assert "NOT converged (max_iterations)" in out
+
+
+def test_a_picture_is_drawn(run, tmp_path, graph):
+    picture = tmp_path / "graph.png"
+    assert run(graph, "--plot", picture)[0] == 0
+    head = picture.read_bytes()[:24]
+    assert head[:8] == b"\x89PNG\r\n\x1a\n"
+    assert min(struct.unpack(">II", head[16:24])) > 300
+
+
+def test_unknown_tags_are_told_and_kept(run, tmp_path, graph):
+    graph.write_text(SMALL + "EDGE_ODD 3 4  x\nEDGE_ODD 4 5 y\n")
+    out = tmp_path / "out.g2o"
+    code, _, err = run(graph, "--out", out)
+    assert code == 0
+    assert err == "graph_slam: 2 lines with unknown tags kept as they are: EDGE_ODD\n"
+    assert out.read_text().endswith("EDGE_ODD 3 4  x\nEDGE_ODD 4 5 y\n")
+
+
+def test_lenient_reading_ends_with_3_and_lists_what_was_lost(run, graph):
+    graph.write_text(SMALL + "VERTEX_SE2 6 nan 0 0\nEDGE_SE2 5 6 1 0 0 4 0 0 4 0 4\n")
+    assert run(graph)[0] == 2
+    code, out, err = run(graph, "--lenient", "--json")
+    assert code == 3
+    assert [line.split(": ")[:3] for line in err.splitlines()] == [
+        ["graph_slam", "lost", "small.g2o:10"],
+        ["graph_slam", "lost", "small.g2o:11"],
+    ]
+    graph.write_text(SMALL)
+    assert json.loads(out) == answer_of(run, graph)
+
+
+BROKEN = {
+    "malformed": ("VERTEX_SE2 1 2\n", "small.g2o:10"),
+    "missing vertex": ("EDGE_SE2 3 77 1 0 0 4 0 0 4 0 4\n", "vertex 77"),
+    "no gauge": ("VERTEX_SE2 6 0 0 0\n", "gauge of vertex 4"),
+    "undetermined": ("VERTEX_SE2 6 0 0 0\nEDGE_SE2_XY 6 9 1 1 1 0 1\n", "do not determine vertex"),
+    "overflow": ("VERTEX_SE2 6 1e200 0 0\nEDGE_SE2 5 6 1 0 0 4 0 0 4 0 4\n", r"not finite"),
+}
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_a_refusal_is_one_line_that_names_the_culprit_and_exit_code_2(run, graph, fault):
+    more, culprit = BROKEN[fault]
+    graph.write_text(SMALL + more)
+    out = graph.with_name("out.g2o")
+    code, stdout, err = run(graph, "--out", out)
+    assert (code, stdout) == (2, "")
+    assert err.startswith("graph_slam: ")
+    assert (err.count("\n"), culprit in err) == (1, True)
+    assert not out.exists()
+
+
+def test_files_that_cannot_be_read_or_written_are_refusals(run, tmp_path, graph):
+    nowhere = tmp_path / "no" / "where"
+    for words in (
+        [nowhere],
+        [tmp_path],
+        [tmp_path / ("x" * 4096)],
+        [graph, "--out", nowhere],
+        [graph, "--out", tmp_path],
+        [graph, "--plot", nowhere / "a.png"],
+        [graph, "--plot", tmp_path / "a.nonsense"],
+    ):
+        code, _, err = run(*words)
+        assert code == 2, err
+        assert err.startswith("graph_slam: ")
+        assert err.count("\n") == 1
+        assert str(words[-1])[:60] in err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--method", "newton"], ["--max-iterations", "0"], ["--tolerance", "nan"], ["--tolerance", "-1"], ["--what"]],
+)
+def test_options_that_cannot_be_are_refused(graph, words, capsys):
+    with pytest.raises(SystemExit) as refusal:
+        main(["optimize", str(graph), *words])
+    assert refusal.value.code == 2
+    assert words[0] in capsys.readouterr().err
+
+
+def test_the_installed_command_never_shows_a_traceback(tmp_path):
+    noise = tmp_path / "noise.g2o"
+    noise.write_bytes(bytes(range(256)) * 40)
+    done = subprocess.run(
+        [sys.executable, "-m", "graph_slam_ros.cli", "optimize", str(noise)],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"GRAPH_SLAM_TRACEBACK": ""},
+        timeout=60,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "graph_slam: noise.g2o: not a text file\n"
