@@ -123,7 +123,8 @@ def _optimize(args: argparse.Namespace) -> int:
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
     first = min(range(file.graph.vertex_count), key=lambda v: (file.graph.kind_of(v).name[:2] != "SE", file.ids[v]))
     root = file.fixed[0] if file.fixed else first
-    solver.start_at(initial_values(file.graph, args.init, root))
+    init = args.init if file.has_values or args.init != "file" else "tree"  # edges alone: there is no other start
+    solver.start_at(initial_values(file.graph, init, root))
     for vertex in file.fixed if file.fixed or "priors" in file.graph.labels else [root]:
         solver.hold(vertex)
     report = solver.update()
@@ -236,8 +237,8 @@ def _parser() -> argparse.ArgumentParser:
     sub = command("info", _info, "topics, types, rates, frames and span of a recording, and how to replay it")
     sub.add_argument("bag", type=Path, metavar="BAG")
 
-    sub = command("optimize", _optimize, "solve a g2o graph")
-    sub.add_argument("graph", type=Path, metavar="GRAPH.g2o")
+    sub = command("optimize", _optimize, "solve a graph: g2o, TORO, iSAM or GTSAM text")
+    sub.add_argument("graph", type=Path, metavar="GRAPH")
     sub.add_argument("--method", choices=("gn", "lm"), default="gn", help="gn is damped only if it fails to converge")
     sub.add_argument("--init", choices=("file", "tree", "chordal"), default="file", help="where to start")
     sub.add_argument("--max-iterations", type=_count, default=100, metavar="N")

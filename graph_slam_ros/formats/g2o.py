@@ -2,11 +2,11 @@
 
 Information matrices are taken as they are, but for one thing: g2o measures a rotation in space by the vector part of
 its quaternion, which is half the rotation vector, so a rotation's information counts a quarter in our residual.
-Unknown tags are kept, word for word, and written back.
+Unknown tags are kept, word for word, and written back. TORO's, iSAM's and GTSAM's texts are read as well
+(``dialects``), and files without vertex lines.
 """
 
 import itertools
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError, NoiseError
+from graph_slam_ros.formats.dialects import in_g2o_words
+from graph_slam_ros.formats.strict import expect, integer, lines, numbers
 from graph_slam_ros.graph import (
     INVERSE_RELATIVE_POSE,
     LANDMARK_POSITION,
@@ -33,10 +35,6 @@ from graph_slam_ros.graph import (
 )
 
 Array = NDArray[np.float64]
-
-# float() also accepts 1_0, inf, nan and digits of other scripts
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-_ID = re.compile(r"[+-]?\d{1,18}", re.ASCII)
 
 _VERTEX_TAGS: dict[str, VertexKind] = {
     "VERTEX_SE2": SE2,
@@ -68,6 +66,7 @@ class G2oFile:
     unknown : lines with tags that are not understood, in order
     skipped : in lenient reading, what was wrong with each line left out
     raw : whether the information of rotations in space was, and is to be written, unscaled
+    has_values : whether the file gave initial values; without, all are at the origin
     """
 
     graph: Graph
@@ -76,6 +75,7 @@ class G2oFile:
     unknown: list[str] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
     raw: bool = False
+    has_values: bool = True
 
 
 @dataclass(slots=True)
@@ -96,6 +96,7 @@ class _Reader:
         self.fixed: list[tuple[int, int]] = []
         self.unknown: list[str] = []
         self.skipped: list[str] = []
+        self.has_values = True
 
     def refuse(self, line: int, why: str) -> None:
         message = f"{self.name}:{line}: {why}"
@@ -107,8 +108,9 @@ class _Reader:
         words = text.split()
         if not words or words[0].startswith("#"):
             return
-        tag = words[0]
         try:
+            words = in_g2o_words(words)
+            tag = words[0]
             if tag in _VERTEX_TAGS:
                 self._vertex(tag, words)
             elif tag in _EDGE_TAGS:
@@ -116,7 +118,7 @@ class _Reader:
             elif tag == "FIX":
                 if len(words) < 2:
                     raise FormatError("FIX names no vertex")
-                self.fixed += [(line, _integer(word)) for word in words[1:]]
+                self.fixed += [(line, integer(word)) for word in words[1:]]
             else:
                 self.unknown.append(text.strip())
         except FormatError as error:
@@ -124,8 +126,8 @@ class _Reader:
 
     def _vertex(self, tag: str, words: list[str]) -> None:
         kind = _VERTEX_TAGS[tag]
-        _expect(words, 1 + kind.size)
-        vertex, value = _integer(words[1]), _with_unit_quaternion(_numbers(words[2:]), kind.size)
+        expect(words, 1 + kind.size)
+        vertex, value = integer(words[1]), _with_unit_quaternion(numbers(words[2:]), kind.size)
         if vertex in self.vertices and self.vertices[vertex] != (tag, value):
             raise FormatError(f"vertex {vertex} was declared before, with other values")
         self.vertices[vertex] = (tag, value)
@@ -133,11 +135,25 @@ class _Reader:
     def _edge(self, line: int, tag: str, words: list[str]) -> _Edge:
         edge = _EDGE_TAGS[tag]
         slots, m = len(edge.accepts), edge.residual_size
-        _expect(words, slots + edge.measured_size + m * (m + 1) // 2)
-        vertices = tuple(_integer(word) for word in words[1 : 1 + slots])
-        numbers = _numbers(words[1 + slots :])
-        measured = _with_unit_quaternion(numbers[: edge.measured_size], edge.measured_size)
-        return _Edge(line, vertices, measured, numbers[edge.measured_size :])
+        expect(words, slots + edge.measured_size + m * (m + 1) // 2)
+        vertices = tuple(integer(word) for word in words[1 : 1 + slots])
+        values = numbers(words[1 + slots :])
+        measured = _with_unit_quaternion(values[: edge.measured_size], edge.measured_size)
+        return _Edge(line, vertices, measured, values[edge.measured_size :])
+
+    def declare_all(self) -> None:
+        """A file of edges alone: its vertices are those the edges name, in order of id and without values."""
+        self.has_values = False
+        kinds: dict[int, str] = {}
+        tags = {kind: tag for tag, kind in _VERTEX_TAGS.items()}
+        for tag, edges in self.edges.items():
+            for edge in edges:
+                for vertex, accepted in zip(edge.vertices, _EDGE_TAGS[tag].accepts, strict=True):
+                    kinds.setdefault(vertex, tags[accepted[0]])
+        nowhere = {"VERTEX_SE3:QUAT": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
+        for vertex in sorted(kinds):
+            tag = kinds[vertex]
+            self.vertices[vertex] = (tag, nowhere.get(tag, [0.0] * _VERTEX_TAGS[tag].size))
 
     def graph(self, relative_pose: EdgeType) -> G2oFile:
         graph = Graph()
@@ -156,7 +172,7 @@ class _Reader:
                 fixed.append(at[file_id])
             else:
                 self.refuse(line, f"FIX names vertex {file_id}, which is not declared")
-        return G2oFile(graph, list(at), fixed, self.unknown, self.skipped, self.raw)
+        return G2oFile(graph, list(at), fixed, self.unknown, self.skipped, self.raw, self.has_values)
 
     def _known(self, tag: str, edges: Sequence[_Edge]) -> Iterator[_Edge]:
         """Edges whose vertices exist and are of the right kind, and whose information is positive definite."""
@@ -223,10 +239,12 @@ def read_g2o(path: Path | str, *, error_map: str = "relative", lenient: bool = F
     if error_map not in ERROR_MAPS:
         raise FormatError(f"error map {error_map!r}: choose {' or '.join(ERROR_MAPS)}")
     reader = _Reader(path.name, lenient, raw)
-    for number, text in _lines(path):
+    for number, text in lines(path):
         reader.take(number, text)
     if not reader.vertices:
-        raise FormatError(f"{path.name}: no vertex in it; is it a g2o file?")
+        reader.declare_all()
+    if not reader.vertices:
+        raise FormatError(f"{path.name}: no vertex in it; is it a graph?")
     return reader.graph(ERROR_MAPS[error_map])
 
 
@@ -269,36 +287,6 @@ def write_g2o(path: Path | str, file: G2oFile, values: Callable[[Sequence[int]],
         raise FormatError(f"{path}: {error.strerror}") from None
 
 
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    try:
-        if not path.is_file():
-            raise FormatError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
-        with path.open(encoding="utf-8") as stream:
-            yield from enumerate(stream, start=1)
-    except UnicodeDecodeError:
-        raise FormatError(f"{path.name}: not a text file") from None
-    except OSError as error:
-        raise FormatError(f"{path}: {error.strerror}") from None
-
-
-def _expect(words: list[str], count: int) -> None:
-    if len(words) - 1 != count:
-        raise FormatError(f"{words[0]} needs {count} fields after the tag, found {len(words) - 1}")
-
-
-def _integer(word: str) -> int:
-    if not _ID.fullmatch(word):
-        raise FormatError(f"{word!r} is not an id")
-    return int(word)
-
-
-def _numbers(words: list[str]) -> list[float]:
-    for word in words:
-        if not _NUMBER.fullmatch(word) or float(word) in (np.inf, -np.inf):
-            raise FormatError(f"{word!r} is not a finite number")
-    return [float(word) for word in words]
-
-
 def _with_unit_quaternion(numbers: list[float], size: int) -> list[float]:
     """The last four of a pose in space, (x, y, z, w), brought to unit length."""
     if size != SE3.size:
@@ -313,8 +301,9 @@ def _with_unit_quaternion(numbers: list[float], size: int) -> list[float]:
 
 def _by_label(tag: str, edges: list[_Edge], follows: dict[int, int]) -> list[tuple[str, list[_Edge]]]:
     if tag in _RELATIVE:
-        odometry = [e for e in edges if follows.get(e.vertices[0]) == e.vertices[1]]
-        closures = [e for e in edges if follows.get(e.vertices[0]) != e.vertices[1]]
+        steps = [follows.get(min(e.vertices)) == max(e.vertices) for e in edges]
+        odometry = [e for e, step in zip(edges, steps, strict=True) if step]
+        closures = [e for e, step in zip(edges, steps, strict=True) if not step]
         groups = [("odometry", odometry), ("closures", closures)]
     else:
         groups = [("priors" if tag == "EDGE_PRIOR_SE2" else "landmarks", edges)]
