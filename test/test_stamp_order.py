@@ -83,6 +83,24 @@ def test_odometry_older_than_what_was_released_is_late_and_counted():
     assert queue._counters.as_dict() == {"odometry": {"late": 1}}
 
 
+def test_odometry_older_than_a_landmark_message_that_was_released_is_late():
+    queue = order()
+    assert through(queue, [odometry(0)]) == [odometry(0)]
+    queue = order()
+    for m in (odometry(0), seen(40), odometry(100)):
+        queue.push(m)
+    assert not queue.accepts(odometry(39)), "it would come out after what was seen at 40"
+    queue.push(seen(10))  # late itself; what was released stays released
+    assert not queue.accepts(odometry(39))
+    assert queue.accepts(odometry(40))
+
+
+def test_a_landmark_message_of_the_future_makes_no_odometry_late():
+    queue = order()
+    assert through(queue, [odometry(0), seen(3_600_000), odometry(10)]) == [odometry(0), odometry(10), seen(3_600_000)]
+    assert queue.accepts(odometry(20))
+
+
 def test_a_full_queue_refuses_landmarks_and_counts_their_sightings():
     queue = order(max_waiting=3)
     for m in (seen(k, "/tags") for k in range(5)):

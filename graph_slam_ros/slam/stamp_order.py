@@ -61,8 +61,8 @@ class StampOrder:
     def _release(self, until_ns: int) -> list[Odometry | Sightings]:
         out = []
         while self._heap and self._heap[0][0] <= until_ns:
-            stamp_ns, rank, _, _, m = heapq.heappop(self._heap)
-            if rank == 0:
-                self._released_ns = stamp_ns
+            stamp_ns, _, _, _, m = heapq.heappop(self._heap)
+            if self._newest_odometry_ns is not None:  # a landmark message of the future is not what others are late for
+                self._released_ns = max(self._released_ns or 0, min(stamp_ns, self._newest_odometry_ns))
             out.append(m)
         return out

@@ -1,0 +1,470 @@
+"""The pipeline: measurements in, a graph and an estimate out; each rule against a computation of its own."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.errors import SingularError
+from graph_slam_ros.formats.g2o import G2oFile, write_g2o
+from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, SE2, TAG_POSITION
+from graph_slam_ros.lie import se2
+from graph_slam_ros.run import summarize
+from graph_slam_ros.simulation import measurements, simulate
+from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.measurements import from_record, to_record
+
+S = 1_000_000_000
+T0 = 1_700_000_000 * S
+POINT = (0.01, 0.002, 0.002, 0.04)
+POSE = (0.01, 0.001, 0.0, 0.001, 0.02, 0.002, 0.0, 0.002, 0.005)
+
+
+def odometry(t_s, pose, twist=None):
+    return Odometry(T0 + round(t_s * S), pose, twist)
+
+
+def seen(t_s, *sightings, topic="/landmarks"):
+    return Sightings(T0 + round(t_s * S), topic, tuple(sightings))
+
+
+def point(name="a", at=(2.0, 1.0), covariance=POINT):
+    return Sighting(name, at, covariance)
+
+
+def tag(name="a", at=(2.0, 1.0, 0.5), covariance=POSE):
+    return Sighting(name, at, covariance)
+
+
+def slam(sink=None, **sections):
+    """A pipeline with no window and exact sightings, unless told otherwise."""
+    base = {"ordering.window_s": 0.0, "landmarks.added_sigma_m": 0.0, "odometry.noise": "density"}
+    dotted = {f"{section}.{key}": value for section, keys in sections.items() for key, value in keys.items()}
+    return GraphSlam(Config.from_mapping(base | dotted), sink)
+
+
+def run(pipeline, *items):
+    for item in items:
+        pipeline.process(item)
+    return pipeline
+
+
+def table(pipeline, edge_type):
+    return pipeline.graph.tables[edge_type]
+
+
+def covariance_of(pipeline, edge_type, row=-1):
+    root = table(pipeline, edge_type).sqrt_information.values[row]
+    return np.linalg.inv(root.T @ root)
+
+
+def g2o(pipeline, tmp_path):
+    file = tmp_path / "graph.g2o"
+    write_g2o(file, G2oFile(pipeline.graph, list(range(pipeline.graph.vertex_count))), pipeline.solver.estimate)
+    return file.read_bytes()
+
+
+def straight(seconds, speed=1.0, hz=10):
+    return [odometry(k / hz, (speed * k / hz, 0.0, 0.0)) for k in range(int(seconds * hz) + 1)]
+
+
+END = (Control("flush"), Control("optimize"))
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return list(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=6.0)))
+
+
+# -- order ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def in_order(recorded):
+    return run(GraphSlam(), *recorded, *END)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_B1_messages_out_of_order_within_the_window_give_exactly_the_same_graph(recorded, in_order, tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    # the first odometry decides where the map begins: nothing of it may be overtaken by 50 ms of stamp time
+    delay = rng.uniform(0.0, 0.0499 * S, len(recorded))
+    arrival = sorted(range(len(recorded)), key=lambda k: (recorded[k].stamp_ns + delay[k], k))
+    assert arrival != sorted(arrival)
+    shuffled = run(GraphSlam(), *(recorded[k] for k in arrival), *END)
+    assert shuffled.counters.as_dict() == in_order.counters.as_dict() == {}
+    assert g2o(shuffled, tmp_path) == g2o(in_order, tmp_path)
+    assert shuffled.sighting_trajectory().tobytes() == in_order.sighting_trajectory().tobytes()
+
+
+def test_the_graph_is_a_function_of_the_ingest_sequence(recorded, in_order, tmp_path):
+    accepted = []
+    rng = np.random.default_rng(1)
+    late = sorted(range(len(recorded)), key=lambda k: (recorded[k].stamp_ns + rng.uniform(0.0, 0.2 * S), k))
+    messy = run(GraphSlam(sink=accepted.append), *(recorded[k] for k in late), recorded[5], *END)
+    assert messy.counters["odometry", "late"] > 100
+    again = run(GraphSlam(), *(from_record(to_record(m)) for m in accepted))
+    assert g2o(again, tmp_path) == g2o(messy, tmp_path)
+    refused = len(recorded) + 1 + len(END) - len(accepted)
+    assert refused == messy.counters["odometry", "late"], "what is not accepted is counted"
+    assert g2o(in_order, tmp_path) != g2o(messy, tmp_path)
+
+
+def test_B3_odometry_of_one_stamp_is_used_once_and_counted_by_whether_it_differs():
+    p = run(slam(), odometry(0, (0, 0, 0)), odometry(1, (1, 0, 0)), odometry(1, (1, 0, 0)), odometry(1, (9, 0, 0)))
+    p.process(odometry(2, (2, 0, 0)))
+    assert p.counters.as_dict() == {"odometry": {"duplicate": 1, "duplicate_stamp": 1}}
+    assert [k.T_odom_base[0] for k in p.keyframes] == [0, 1, 2]
+
+
+def test_late_sightings_are_dropped_and_counted_each():
+    p = run(slam(), *straight(1), seen(0.05, point("a"), point("b")), seen(1.0, point("c")))
+    assert p.counters.as_dict() == {"/landmarks": {"late": 2}}
+    assert set(p.landmarks) == {"c"}
+
+
+def test_sightings_from_before_the_first_odometry_are_counted_whenever_they_come():
+    p = run(slam(), seen(-1, point("a")), *straight(1), seen(-0.5, point("a")), *END)
+    assert p.counters.as_dict() == {"/landmarks": {"before_odometry": 2}}
+    assert not p.landmarks
+
+
+def test_sightings_from_after_the_last_odometry_are_counted_at_the_end():
+    p = run(slam(), *straight(1), seen(1.5, point("a"), point("b")))
+    assert p.counters.as_dict() == {}
+    run(p, *END)
+    assert p.counters.as_dict() == {"/landmarks": {"after_odometry": 2}}
+
+
+def test_sightings_that_wait_for_odometry_are_bounded():
+    p = slam(ordering={"max_waiting": 3})
+    run(p, odometry(0, (0, 0, 0)), odometry(100, (0.1, 0, 0)))
+    run(p, *(seen(100 + k, point("a")) for k in range(1, 6)))
+    assert p.counters["/landmarks", "overflow"] == 2
+    p = slam(ordering={"max_waiting": 3, "window_s": 10.0})
+    run(p, odometry(0, (0, 0, 0)), odometry(20, (0, 0, 0)), odometry(100, (0.1, 0, 0)))
+    run(p, *(seen(50 + k, point("a")) for k in range(5)))  # released at once, and waiting for odometry at 100 s
+    assert p.counters["/landmarks", "overflow"] == 2
+    run(p, odometry(200, (0.2, 0, 0)))
+    assert p.landmarks["a"].sightings == 3
+
+
+def test_an_unknown_control_event_is_counted():
+    assert run(slam(), Control("dance")).counters.as_dict() == {"control": {"unknown event dance": 1}}
+
+
+# -- keyframes and motion -------------------------------------------------------------------------------------------
+
+
+def test_keyframes_come_by_distance_by_angle_and_by_time_in_motion():
+    distance = run(slam(), *straight(2, speed=1.0))
+    assert [k.T_odom_base[0] for k in distance.keyframes] == pytest.approx([0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8])
+    turning = run(slam(), *(odometry(k / 10, (0.0, 0.0, 0.1 * k)) for k in range(10)))
+    assert [k.T_odom_base[2] for k in turning.keyframes] == pytest.approx([0, 0.3, 0.6, 0.9])
+    slow = run(slam(), *straight(3.1, speed=0.01, hz=8))
+    assert [(k.stamp_ns - T0) / S for k in slow.keyframes] == pytest.approx([0, 1.0, 2.0, 3.0])
+
+
+def test_a_standing_robot_makes_no_keyframes_and_gathers_no_noise():
+    wiggle = [odometry(k / 10, (1e-6 * (k % 2), 0.0, 0.0)) for k in range(1, 6001)]
+    p = run(slam(), odometry(0, (0, 0, 0)), *wiggle, seen(600.0, point()))
+    assert len(p.keyframes) == 1
+    assert p.graph.edge_count == 2
+    assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(np.reshape(POINT, (2, 2)), rel=1e-5)
+
+
+def test_odometry_edges_are_the_relative_motion_and_not_the_absolute_pose():
+    p = run(slam(), odometry(0, (5, 5, math.pi / 2)), odometry(1, (5, 6, math.pi / 2 + 0.2)), odometry(2, (5, 7, 1.0)))
+    assert table(p, RELATIVE_POSE).measured.values[0] == pytest.approx([1, 0, 0.2])
+    assert p.trajectory() == pytest.approx(np.array([k.T_odom_base for k in p.keyframes])), "map begins where odom does"
+    assert p.T_map_odom == pytest.approx((0, 0, 0), abs=1e-12)
+
+
+def monte_carlo(steps, covariance_of_step, samples=20_000, seed=3):
+    """Covariance at the end of noisy steps, in the tangent space there."""
+    rng = np.random.default_rng(seed)
+    end, noisy = se2.IDENTITY, tuple(np.zeros((3, samples)))
+    for step, covariance in zip(steps, covariance_of_step, strict=True):
+        end = se2.compose(end, step)
+        noise = rng.multivariate_normal(np.zeros(3), covariance, samples)
+        twist = np.array(se2.log(step))[:, None] + noise.T
+        noisy = se2.compose(noisy, se2.exp(tuple(twist)))
+    return np.cov(np.stack(se2.local(noisy, end)))
+
+
+CURVE = [(0.1 * k, 0.004 * k * k, 0.05 * k) for k in range(4)]
+
+
+@pytest.mark.parametrize("noise", ["density", "twist"])
+def test_the_noise_of_a_step_is_what_random_steps_have(noise):
+    twist = np.array([[2e-3, 1e-4, 0], [1e-4, 1e-3, 0], [0, 0, 4e-3]])
+    p = slam(odometry={"noise": noise, "lateral_density": 0.01}, keyframes={"min_distance_m": 0.29})
+    run(p, *(odometry(0.1 * k, pose, tuple(twist.ravel())) for k, pose in enumerate(CURVE)))
+    assert len(p.keyframes) == 2
+    of_step = np.diag([0.02**2, 0.01**2, 0.05**2]) * 0.1 if noise == "density" else twist * 0.1 * 0.25
+    steps = [se2.between(a, b) for a, b in itertools.pairwise(CURVE)]
+    expected, got = monte_carlo(steps, [of_step] * 3), covariance_of(p, RELATIVE_POSE)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert (got / scale) == pytest.approx(expected / scale, abs=0.04)  # 20,000 samples: 1 % each, 4 sigma
+
+
+def test_a_twist_covariance_that_a_message_lacks_is_replaced_by_the_densities():
+    with_twist = slam(odometry={"noise": "twist"})
+    densities = slam(odometry={"noise": "density"})
+    for p in (with_twist, densities):
+        run(p, *straight(1))
+    assert covariance_of(with_twist, RELATIVE_POSE) == pytest.approx(covariance_of(densities, RELATIVE_POSE))
+
+
+def test_density_is_used_where_it_is_asked_for_whatever_the_messages_say():
+    plain, told = slam(), slam()
+    run(plain, *straight(1))
+    run(told, *(replace(m, twist_covariance=tuple(np.eye(3).ravel())) for m in straight(1)))
+    assert covariance_of(plain, RELATIVE_POSE) == pytest.approx(covariance_of(told, RELATIVE_POSE))
+
+
+# -- sightings ------------------------------------------------------------------------------------------------------
+
+
+def between_keyframes(*sightings):
+    """Odometry at 0, 1 and 2 s; a sighting at 1.4 s, with keyframes at 0 and 2 s only."""
+    p = slam(keyframes={"min_distance_m": 0.9, "min_angle_rad": 3.0, "max_interval_s": 100.0})
+    at_1, at_2 = (0.6, 0.1, 0.5), (1.2, 0.5, 0.8)
+    run(p, odometry(0, (0, 0, 0)), odometry(1, at_1), seen(1.4, *sightings), odometry(2, at_2))
+    return p, at_1, se2.interpolate(at_1, at_2, 0.4)
+
+
+def carried_noise(at_1, at_see):
+    """Of the motion from the keyframe to the sighting, by random steps."""
+    density = np.diag([0.02**2, 0.005**2, 0.05**2])
+    return [at_1, se2.between(at_1, at_see)], [density * 1.0, density * 0.4]
+
+
+def test_a_point_is_carried_to_the_last_keyframe_by_the_odometry_since():
+    p, at_1, at_see = between_keyframes(point())
+    assert len(p.keyframes) == 2
+    edges = table(p, LANDMARK_POSITION)
+    assert edges.vertices.values[0].tolist() == [p.keyframes[0].vertex, p.landmarks["a"].vertex]
+    assert edges.measured.values[0] == pytest.approx(se2.act(at_see, (2.0, 1.0)))
+    rng = np.random.default_rng(5)
+    steps, noise = carried_noise(at_1, at_see)
+    n = 40_000
+    moved = tuple(np.zeros((3, n)))
+    for step, covariance in zip(steps, noise, strict=True):
+        twist = np.array(se2.log(step))[:, None] + rng.multivariate_normal(np.zeros(3), covariance, n).T
+        moved = se2.compose(moved, se2.exp(tuple(twist)))
+    local = np.array([2.0, 1.0])[:, None] + rng.multivariate_normal([0, 0], np.reshape(POINT, (2, 2)), n).T
+    expected = np.cov(np.stack(se2.act(moved, tuple(local))))
+    assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(expected, abs=0.03 * np.trace(expected))
+
+
+def test_a_tag_is_carried_to_the_last_keyframe_by_the_odometry_since():
+    p, at_1, at_see = between_keyframes(tag())
+    edges = table(p, RELATIVE_POSE)
+    row = int(np.flatnonzero(edges.vertices.values[:, 1] == p.landmarks["a"].vertex)[0])
+    assert edges.measured.values[row] == pytest.approx(se2.compose(at_see, (2.0, 1.0, 0.5)))
+    steps, noise = carried_noise(at_1, at_see)
+    expected = monte_carlo([*steps, (2.0, 1.0, 0.5)], [*noise, np.zeros((3, 3))], 40_000)
+    expected += np.reshape(POSE, (3, 3))
+    assert covariance_of(p, RELATIVE_POSE, row) == pytest.approx(expected, abs=0.03 * np.trace(expected))
+
+
+def test_a_sighting_splits_no_odometry_edge_and_makes_no_pose():
+    quiet, looking = slam(), slam()
+    run(quiet, *straight(3))
+    run(looking, *(m for o in straight(3) for m in (o, seen((o.stamp_ns - T0) / S + 0.04, point()))))
+    assert [k.stamp_ns for k in quiet.keyframes] == [k.stamp_ns for k in looking.keyframes]
+    one, other = table(quiet, RELATIVE_POSE), table(looking, RELATIVE_POSE)
+    assert one.measured.values.tobytes() == other.measured.values.tobytes()
+    assert one.sqrt_information.values.tobytes() == other.sqrt_information.values.tobytes()
+    assert looking.graph.vertex_count == len(looking.keyframes) + 1
+    assert looking.landmarks["a"].sightings == 30
+
+
+def test_a_sighting_at_a_keyframes_stamp_belongs_to_that_keyframe():
+    p = run(slam(), odometry(0, (0, 0, 0)), odometry(1, (1, 0, 0)), seen(1, point()))
+    assert table(p, LANDMARK_POSITION).vertices.values[0, 0] == p.keyframes[1].vertex
+    assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(np.reshape(POINT, (2, 2)), rel=1e-4)
+
+
+def test_configured_noise_is_added_to_every_sighting():
+    p = slam(landmarks={"added_sigma_m": 0.3})
+    run(p, odometry(0, (0, 0, 0)), seen(0, point("a"), tag("b")))
+    assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(np.reshape(POINT, (2, 2)) + 0.09 * np.eye(2))
+    assert covariance_of(p, RELATIVE_POSE) == pytest.approx(np.reshape(POSE, (3, 3)) + 0.09 * np.diag([1, 1, 0]))
+
+
+def test_where_the_robot_was_at_each_sighting_is_kept():
+    p, _, at_see = between_keyframes(point(), point("b"))
+    assert p.sighting_odometry() == pytest.approx(np.array([at_see]))
+    assert p.sighting_trajectory() == pytest.approx(np.array([at_see]))
+
+
+def test_a_landmark_seen_as_a_pose_first_takes_points_later():
+    p = run(slam(), odometry(0, (0, 0, 0)), seen(0, tag()), odometry(1, (1, 0, 0)), seen(1, point(at=(1.0, 1.0))), *END)
+    assert p.graph.kind_of(p.landmarks["a"].vertex) is SE2
+    assert len(table(p, TAG_POSITION)) == 1
+    assert LANDMARK_POSITION not in p.graph.tables
+    assert p.solver.estimate([p.landmarks["a"].vertex])[0] == pytest.approx([2.0, 1.0, 0.5], abs=1e-6)
+    assert p.counters.as_dict() == {}
+
+
+def test_a_landmark_seen_as_a_point_first_takes_the_positions_of_poses_later():
+    p = run(slam(), odometry(0, (0, 0, 0)), seen(0, point()), odometry(1, (1, 0, 0)), seen(1, tag(at=(1.0, 1.0, 0.5))))
+    edges = table(p, LANDMARK_POSITION)
+    assert len(edges) == 2
+    assert edges.measured.values[1] == pytest.approx([1.0, 1.0])
+    c, s = math.cos(0.5), math.sin(0.5)
+    turn = np.array([[c, -s], [s, c]])
+    assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(
+        turn @ np.reshape(POSE, (3, 3))[:2, :2] @ turn.T, rel=1e-4
+    )
+    run(p, *END)
+    assert p.solver.estimate([p.landmarks["a"].vertex])[0] == pytest.approx([2.0, 1.0], abs=1e-6)
+
+
+# -- solving --------------------------------------------------------------------------------------------------------
+
+
+def solves(p, items):
+    """Stamps in seconds at which a solve happened."""
+    return [(m.stamp_ns - T0) / S for m in items if p.process(m).report is not None]
+
+
+def test_a_solve_comes_every_so_many_keyframes():
+    p = slam(solve={"every_keyframes": 4}, keyframes={"min_distance_m": 0.95})
+    assert solves(p, straight(13)) == pytest.approx([4, 8, 12])
+
+
+def looks(drive, *times_names):
+    """A drive with points seen at some odometry stamps."""
+    by_time = dict(times_names)
+    for m in drive:
+        yield m
+        t = (m.stamp_ns - T0) / S
+        if t in by_time:
+            yield seen(t, point(by_time[t]))
+
+
+POLICY = {"every_keyframes": 1000, "closure_gap_s": 5.0, "closure_keyframes": 3}
+
+
+def test_a_landmark_that_returns_is_solved_for_at_once():
+    p = slam(solve=POLICY, keyframes={"min_distance_m": 0.95})
+    assert solves(p, list(looks(straight(12), (1, "a"), (5, "a"), (10.5, "a")))) == [10.5]
+
+
+def test_a_return_soon_after_a_solve_waits_for_enough_keyframes():
+    p = slam(solve=POLICY, keyframes={"min_distance_m": 0.95})
+    times = ((1, "a"), (2, "b"), (10.5, "a"), (11.5, "b"))
+    assert solves(p, list(looks(straight(16), *times))) == [10.5, 13.0]
+
+
+def test_a_landmark_that_never_left_and_one_seen_first_are_no_closure():
+    p = slam(solve=POLICY, keyframes={"min_distance_m": 0.95})
+    assert solves(p, list(looks(straight(16), *((float(t), "a") for t in range(0, 15, 4)), (15.0, "b")))) == []
+
+
+def loop(p):
+    """A square drive with a drift, whose first landmark returns at its end."""
+    x, heading, t = (0.0, 0.0), 0.0, 0
+    run(p, odometry(0, (0, 0, 0)), seen(0, point("home", (2.0, 0.0))))
+    for _ in range(4):
+        for _ in range(5):
+            t += 1
+            x = (x[0] + math.cos(heading), x[1] + math.sin(heading))
+            run(p, odometry(t, (*x, heading)), seen(t, point(f"at {t}", (1.0, 1.0))))
+        heading += math.pi / 2 + 0.02
+    t += 1
+    return run(p, odometry(t, (*x, heading)), seen(t, point("home", (2.0, 0.0))))
+
+
+def test_after_a_solve_the_pose_covariance_is_the_marginal_and_then_grows_with_the_odometry():
+    p = loop(slam())
+    run(p, *END)
+    h = p.solver.information_matrix()
+    newest = p.keyframes[-1].vertex
+    dofs = [p.graph.kind_of(v).dof for v in range(p.graph.vertex_count)]
+    first = sum(dofs[:newest])
+    dense = np.linalg.inv(h)[first : first + 3, first : first + 3]
+    assert p.pose_covariance == pytest.approx(dense, rel=1e-8, abs=1e-10 * np.trace(dense))
+    step = (0.5, 0.0, 0.3)
+    at = p.keyframes[-1]
+    p.process(Odometry(at.stamp_ns + S, se2.compose(at.T_odom_base, step), None))
+    ad = se2.adjoint(se2.inverse(step))
+    grown = ad @ dense @ ad.T + covariance_of(p, RELATIVE_POSE)
+    assert p.pose_covariance == pytest.approx(grown, rel=1e-6, abs=1e-7)
+
+
+def test_the_first_pose_is_as_uncertain_as_its_anchor():
+    p = run(slam(anchor={"sigma_m": 0.1, "sigma_rad": 0.2}), odometry(0, (1, 2, 3)))
+    assert p.pose_covariance == pytest.approx(np.diag([0.01, 0.01, 0.04]))
+    run(p, *END)
+    assert p.pose_covariance == pytest.approx(np.diag([0.01, 0.01, 0.04]))
+
+
+def test_a_closed_loop_moves_the_map_under_the_odometry_and_halves_its_error():
+    p = loop(slam())
+    drift = np.hypot(*p.keyframes[-1].T_odom_base[:2])
+    run(p, *END)
+    newest = se2.compose(p.T_map_odom, p.keyframes[-1].T_odom_base)
+    assert se2.local(newest, tuple(p.trajectory()[-1])) == pytest.approx((0, 0, 0), abs=1e-9)
+    assert np.hypot(*newest[:2]) < 0.5 * drift
+
+
+class Failing:
+    """A solver's update that fails while it is told to."""
+
+    def __init__(self, pipeline, monkeypatch):
+        self.works, update = False, pipeline.solver.update
+        monkeypatch.setattr(pipeline.solver, "update", lambda *a: update(*a) if self.works else self.fail())
+
+    def fail(self):
+        raise SingularError("the edges do not determine vertex 7")
+
+
+def test_a_solve_that_fails_is_counted_and_the_last_estimate_stays(monkeypatch):
+    p = slam(solve={"every_keyframes": 2})
+    failing = Failing(p, monkeypatch)
+    items = [m for o in straight(2) for m in (o, seen((o.stamp_ns - T0) / S, point(at=(3.0 - o.T_odom_base[0], 0.1))))]
+    updates = [p.process(m) for m in items]
+    assert not any(u.report for u in updates)
+    assert p.counters["solver", "SingularError"] == 3
+    assert p.trajectory() == pytest.approx(np.array([k.T_odom_base for k in p.keyframes]), abs=1e-12)
+    assert np.isfinite(p.pose_covariance).all()
+    assert summarize(p)["solves"] == 0
+    failing.works = True
+    assert p.process(Control("optimize")).report.converged
+    assert p.counters["solver", "SingularError"] == 3
+
+
+@pytest.mark.parametrize("far", [1e8, 1e9])
+def test_numbers_at_the_borders_limits_leave_no_vertex_without_its_edge(far):
+    p = slam(landmarks={"loss": "none"})
+    huge, tiny = tuple(np.diag([1e6, 1e6, 1e3]).ravel()), tuple(1e-30 * np.eye(3).ravel())
+    run(p, odometry(0, (0, 0, 0), huge), seen(0, tag(at=(far, -far, 1.0)), point("b", (far, far), (1e6, 0, 0, 1e6))))
+    run(p, odometry(1e9, (far, far, 2.0), huge), seen(1e9, tag(), tag("c", covariance=tiny)))
+    run(p, odometry(1e9 + 1, (0, 0, 0)), *END)
+    inside = set(np.concatenate([t.vertices.values.ravel() for t in p.graph.tables.values()]).tolist())
+    assert inside == set(range(p.graph.vertex_count))
+    assert np.isfinite(p.trajectory()).all()
+
+
+def test_nothing_comes_of_nothing():
+    p = run(slam(), *END)
+    assert p.trajectory().shape == p.sighting_trajectory().shape == (0, 3)
+    assert p.T_map_odom == (0.0, 0.0, 0.0)
+    assert p.newest_odometry_ns is None
+    assert summarize(p)["stop"] == "nothing_to_do"
+
+
+def test_an_update_says_what_it_changed():
+    p = slam(solve={"every_keyframes": 2})
+    assert p.process(odometry(0, (0, 0, 0))).keyframes == (0,)
+    assert not p.process(odometry(0.1, (0.01, 0, 0)))
+    assert p.process(odometry(1, (1, 0, 0))).keyframes == (1,)
+    last = p.process(odometry(2, (2, 0, 0)))
+    assert last.keyframes == (2,)
+    assert last.report is p.reports[-1]
