@@ -533,6 +533,17 @@ def test_gauss_newton_that_fails_is_done_again_with_damping(seed):
     assert min(values) > values[0] * (1.0 - 2e-6)  # a minimum along each axis, up to the tolerance of the cost
 
 
+def test_a_step_that_ends_above_the_start_is_not_taken_for_an_answer():
+    # two turns of a hundred degrees make Gauss-Newton overshoot; a loose tolerance would let it end there
+    graph = small([0.0, 0.0, 0.0], [0.0, 1.0, 1.8], [1.0, 1.0, -1.8])
+    graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
+    for i, j in ((0, 1), (1, 2), (2, 0), (1, 0)):
+        graph.add_edge(RELATIVE_POSE, [i, j], [10.0, 0.0, 0.0], Gaussian.from_sigmas(0.01, 0.01, 1.0), "odometry")
+    first = solve(graph, max_iterations=1, step_tolerance=1e3)[1]
+    assert (first.method, first.stop) == ("lm", "step")
+    assert first.cost_final < first.cost_initial
+
+
 @pytest.mark.parametrize("method", ["gn", "lm"])
 def test_a_start_that_leaves_something_open_is_recovered_from(method):
     graph = small([0.0, 0.0, 0.0], [0.5, 0.5, 0.1])
