@@ -1,0 +1,140 @@
+"""Messages out: their bytes are those of rosbags' serialiser, their numbers those of ROS's conventions."""
+
+import math
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.ros import results, to_msg
+from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+
+STAMP_NS = 1_700_000_000_987_654_321
+
+
+def decode(cdr, name):
+    return typestore().deserialize_cdr(cdr, name)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 5])
+@pytest.mark.parametrize("length", range(1, 17))
+def test_a_path_has_the_bytes_of_the_serialiser_for_every_length_of_the_frames_name(length, n):
+    frame = "abcdefghijklmnop"[:length]
+    rng = np.random.default_rng(length)
+    poses = rng.uniform(-9.0, 9.0, (n, 3))
+    stamps = [STAMP_NS + 1_100_000_000 * k for k in range(n)]
+    stamped = [
+        to_msg.make("geometry_msgs/msg/PoseStamped", header=to_msg.header(stamp, frame), pose=to_msg.pose(tuple(p)))
+        for stamp, p in zip(stamps, poses, strict=True)
+    ]
+    head = to_msg.header(stamps[-1] if n else 0, frame)
+    assert to_msg.path(frame, stamps, poses) == to_msg.encode(
+        to_msg.make("nav_msgs/msg/Path", header=head, poses=stamped)
+    )
+
+
+def test_a_path_keeps_the_stamp_of_each_pose_and_carries_the_newest():
+    stamps = [STAMP_NS, STAMP_NS + 1, STAMP_NS + 20_000_000_000]
+    path = decode(
+        to_msg.path("map", stamps, np.array([[1, 2, 0], [3, 4, math.pi / 2], [5, 6, -1.0]])), "nav_msgs/msg/Path"
+    )
+    times = [p.header.stamp for p in path.poses]
+    assert [t.sec * 10**9 + t.nanosec for t in times] == stamps
+    assert (path.header.stamp.sec, path.header.stamp.nanosec) == divmod(stamps[-1], 10**9)
+    assert {p.header.frame_id for p in path.poses} | {path.header.frame_id} == {"map"}
+    q = path.poses[1].pose.orientation
+    assert (q.x, q.y, q.z, q.w) == pytest.approx((0, 0, math.sqrt(0.5), math.sqrt(0.5)))
+
+
+def test_a_covariance_is_published_in_the_axes_of_the_parent_frame():
+    # at 90 degrees the robot's x (variance 1) is the map's y, its y (4) the map's -x
+    tangent = np.array([[1.0, 0.5, 0.1], [0.5, 4.0, 0.2], [0.1, 0.2, 9.0]])
+    cdr = to_msg.pose_with_covariance(STAMP_NS, "map", (3.0, -2.0, math.pi / 2), tangent, 1e6)
+    message = decode(cdr, "geometry_msgs/msg/PoseWithCovarianceStamped")
+    full = message.pose.covariance.reshape(6, 6)
+    expected = np.diag([4.0, 1.0, 1e6, 1e6, 1e6, 9.0])
+    expected[0, 1] = expected[1, 0] = -0.5
+    expected[0, 5] = expected[5, 0] = -0.2
+    expected[1, 5] = expected[5, 1] = 0.1
+    assert full == pytest.approx(expected, abs=1e-12)
+    at = message.pose.pose
+    assert (at.position.x, at.position.y, at.position.z) == (3.0, -2.0, 0.0)
+    assert at.orientation.z == pytest.approx(math.sqrt(0.5))
+    assert message.header.frame_id == "map"
+
+
+def test_a_transform_names_its_frames_and_its_stamp():
+    (t,) = decode(to_msg.transform(STAMP_NS, "map", "odom", (1.0, 2.0, math.pi)), "tf2_msgs/msg/TFMessage").transforms
+    assert (t.header.frame_id, t.child_frame_id) == ("map", "odom")
+    assert (t.header.stamp.sec, t.header.stamp.nanosec) == (1_700_000_000, 987_654_321)
+    assert (t.transform.translation.x, t.transform.translation.y) == (1.0, 2.0)
+    assert (t.transform.rotation.z, t.transform.rotation.w) == pytest.approx((1.0, 0.0))
+
+
+def test_the_clock_is_the_stamp():
+    clock = decode(to_msg.clock(STAMP_NS), "rosgraph_msgs/msg/Clock").clock
+    assert (clock.sec, clock.nanosec) == (1_700_000_000, 987_654_321)
+
+
+def test_markers_replace_the_former_ones_and_draw_each_landmark_as_its_two_sigma_ellipse():
+    c, s = math.cos(0.3), math.sin(0.3)
+    turn = np.array([[c, -s], [s, c]])
+    covariances = [turn @ np.diag([0.01, 0.09]) @ turn.T, np.zeros((2, 2))]
+    cdr = to_msg.landmark_markers(STAMP_NS, "map", ["a", "b"], np.array([[1.0, 2.0], [3.0, 4.0]]), covariances)
+    clear, *drawn = decode(cdr, "visualization_msgs/msg/MarkerArray").markers
+    assert clear.action == 3
+    assert [(m.ns, m.id, m.action) for m in drawn] == [(ns, k, 0) for k in (0, 1) for ns in ("landmarks", "names")]
+    ellipse, name, exact, _ = drawn
+    assert (ellipse.type, name.type) == (3, 9)
+    assert sorted((ellipse.scale.x, ellipse.scale.y)) == pytest.approx([0.4, 1.2])
+    tilt = 2 * math.atan2(ellipse.pose.orientation.z, ellipse.pose.orientation.w)
+    long_axis = tilt if ellipse.scale.x > ellipse.scale.y else tilt + math.pi / 2
+    assert math.sin(long_axis - (0.3 + math.pi / 2)) == pytest.approx(0.0, abs=1e-9)
+    assert name.text == "a"
+    assert (exact.scale.x, exact.scale.y) == (0.05, 0.05), "never too small to see"
+    assert {m.header.frame_id for m in drawn} == {"map"}
+
+
+def test_no_landmarks_are_drawn_as_none():
+    cdr = to_msg.landmark_markers(STAMP_NS, "map", [], np.zeros((0, 2)), [])
+    assert [m.action for m in decode(cdr, "visualization_msgs/msg/MarkerArray").markers] == [3]
+
+
+@pytest.fixture(scope="module")
+def solved():
+    slam = GraphSlam(Config.from_mapping({"frames": {"map": "world", "odom": "start", "base": "body"}}))
+    for k in range(8):
+        stamp = STAMP_NS + k * 10**9
+        slam.process(Odometry(stamp, (0.5 * k, 0.0, 0.1 * k)))
+        tag = Sighting("tag", (1.0, 0.2, 0.3), tuple(0.01 * np.eye(3).ravel()))
+        point = Sighting("point", (2.0, -0.1 * k), (0.01, 0.0, 0.0, 0.01))
+        slam.process(Sightings(stamp, "/landmarks", (tag, point)))
+    for event in ("flush", "optimize"):
+        slam.process(Control(event))
+    return slam
+
+
+def test_the_published_pose_is_the_paths_last_and_the_correction_leads_there(solved):
+    path = decode(results.path(solved), results.PATH)
+    pose = decode(results.pose(solved), results.POSE)
+    last = path.poses[-1]
+    assert path.header.frame_id == pose.header.frame_id == "world"
+    assert pose.header.stamp == last.header.stamp
+    assert pose.pose.pose.position.x == pytest.approx(last.pose.position.x, abs=1e-9)
+    assert pose.pose.pose.position.y == pytest.approx(last.pose.position.y, abs=1e-9)
+    (correction,) = decode(results.map_to_odom(solved, STAMP_NS), results.TF).transforms
+    assert (correction.header.frame_id, correction.child_frame_id) == ("world", "start")
+    (odometry,) = decode(results.odom_to_base(solved), results.TF).transforms
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("start", "body")
+    assert odometry.transform.translation.x == 3.5
+
+
+def test_a_landmarks_covariance_is_that_of_its_position_in_the_map(solved):
+    by_name = {name: (value, covariance) for name, value, covariance in results.landmark_estimates(solved)}
+    value, covariance = by_name["tag"]
+    (marginal,) = solved.solver.marginal([solved.landmarks["tag"].vertex])
+    c, s = math.cos(value[2]), math.sin(value[2])
+    turn = np.array([[c, -s], [s, c]])
+    assert covariance == pytest.approx(turn @ marginal[:2, :2] @ turn.T)
+    assert len(by_name["point"][0]) == 2
+    assert by_name["point"][1] == pytest.approx(solved.solver.marginal([solved.landmarks["point"].vertex])[0])
