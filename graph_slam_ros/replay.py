@@ -59,11 +59,13 @@ def choose_inputs(bag: Bag, odometry: str | None, landmarks: str | None) -> Inpu
 
 
 def _choose(bag: Bag, type_name: str, named: str | None, usual: str, option: str, *, required: bool) -> str:
-    there = ", ".join(f"{t.name} ({t.type})" for t in bag.topics.values())
+    there = ", ".join(f"{t.name} ({t.type or 'no type'})" for t in bag.topics.values())
     if named is not None:
         topic = bag.topics.get(named)
         if topic is None:
             raise BagError(f"no topic {named} in the recording; there are {there}")
+        if not topic.type:
+            raise BagError(f"topic {named} has no type: the recording lacks its schema")
         if topic.type != type_name:
             raise BagError(f"topic {named} is {topic.type}, not {type_name}")
         return named
