@@ -78,14 +78,15 @@ def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: M
     scales = np.array([loss.scale for loss in by_code])
     blocks = []
     for table, chosen in rows.items():
-        at = graph.offset.values[table.vertices.values[chosen]]
-        residual, jacobian = table.type.linearize(x, at, table.measured.values[chosen])
-        label = table.label.values[chosen]
+        take = slice(None) if len(chosen) == len(table) else chosen  # a view where all are in, not a copy
+        at = graph.offset.values[table.vertices.values[take]]
+        residual, jacobian = table.type.linearize(x, at, table.measured.values[take])
+        label = table.label.values[take]
         chi2, cost = _whiten(
             residual,
             jacobian,
-            table.sqrt_information.values[chosen],
-            table.weight.values[chosen],
+            table.sqrt_information.values[take],
+            table.weight.values[take],
             kinds[label],
             scales[label],
         )

@@ -24,7 +24,8 @@ Index = NDArray[np.int64]
 
 _LEAST_PIVOT = 1e-14  # of its diagonal entry: what elimination left of it is rounding
 _SHIFT = 1e-13  # well above rounding, and below what edges of very different strength leave (1e-10 in real graphs)
-_SYMMETRIC = {"diag_pivot_thresh": 0.0, "relax": 1, "options": {"SymmetricMode": True}}
+# small panels and no relaxed supernodes: fronts of pose graphs are small
+_SYMMETRIC = {"diag_pivot_thresh": 0.0, "relax": 1, "panel_size": 1, "options": {"SymmetricMode": True}}
 
 
 @kernel
