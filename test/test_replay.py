@@ -1,0 +1,350 @@
+"""Replay and the run folder: the same sequence gives the same bytes, and nothing is overwritten that is not a run."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.evaluation import read_tum
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.formats.ingest import IngestWriter, ingest_files, read_ingest
+from graph_slam_ros.replay import replay
+from graph_slam_ros.ros.bag import BagWriter, open_bag
+from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.run import RunError, RunRecorder, is_run, run_config
+from graph_slam_ros.simulation import measurements, simulate, write_bag
+from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
+from graph_slam_ros.slam.measurements import from_record, to_record
+
+RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv")
+ALL = {*RESULTS, "graph_vertices.csv", "odometry.tum", "run.mcap", "ingest.mcap", "config.yaml", "run.json"}
+
+
+@pytest.fixture(scope="module")
+def world():
+    return simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory, world):
+    file = tmp_path_factory.mktemp("bag") / "drive.mcap"
+    write_bag(world, file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, bag):
+    out = tmp_path_factory.mktemp("runs") / "first"
+    return replay(bag, out)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, bag):
+    out = tmp_path_factory.mktemp("runs") / "kept"
+    replay(bag, out)
+    return out
+
+
+def contents(folder, names=RESULTS):
+    return {name: (folder / name).read_bytes() for name in names}
+
+
+def test_a_run_folder_holds_what_it_says(folder, run):
+    assert {file.name for file in folder.iterdir()} == ALL
+    summary = json.loads((folder / "run.json").read_text())
+    assert summary["keyframes"] == len(run.slam.keyframes) > 50
+    assert summary["landmarks"] == len(run.slam.landmarks) > 10
+    assert summary["edges"] == run.slam.graph.edge_count == summary["keyframes"] + summary["sightings"]
+    assert sum(c["edges"] for c in summary["classes"].values()) == summary["edges"]
+    assert sum(c["chi2"] for c in summary["classes"].values()) == pytest.approx(summary["chi2"])
+    assert summary["converged"]
+    assert summary["counters"] == {}
+    assert summary["losses"] == []
+
+
+def test_the_same_recording_gives_the_same_bytes_and_another_configuration_others(tmp_path, bag, folder):
+    replay(bag, tmp_path / "again")
+    assert contents(tmp_path / "again") == contents(folder)
+    replay(bag, tmp_path / "other", Config.from_mapping({"keyframes.min_distance_m": 0.5}))
+    assert contents(tmp_path / "other") != contents(folder)
+
+
+def test_replay_of_a_runs_own_sequence_gives_its_bytes_again(tmp_path, folder):
+    replay(folder, tmp_path / "again")
+    assert contents(tmp_path / "again") == contents(folder)
+
+
+def test_replay_of_a_run_takes_the_configuration_it_was_made_with(tmp_path, bag):
+    config = Config.from_mapping({"keyframes.min_distance_m": 0.6, "solve.every_keyframes": 3, "frames.map": 'a"b\\'})
+    replay(bag, tmp_path / "run", config)
+    assert run_config(tmp_path / "run") == config
+    replay(tmp_path / "run", tmp_path / "again")
+    assert contents(tmp_path / "again") == contents(tmp_path / "run")
+    assert run_config(tmp_path / "again") == config
+
+
+def test_a_run_in_several_parts_is_replayed_as_one(tmp_path, world):
+    config = Config()
+    recorder = RunRecorder(tmp_path / "run", config)
+    slam = GraphSlam(config, recorder.sink)
+    items = list(measurements(world))
+    for k, m in enumerate(items):
+        recorder.record(slam, slam.process(m))
+        if k % (len(items) // 11) == 50:
+            recorder.record(slam, slam.process(Control("flush")))
+            recorder.record(slam, slam.process(Control("optimize")))
+            recorder.save(slam)
+    for event in ("flush", "optimize"):
+        slam.process(Control(event))
+    recorder.save(slam)
+    assert len(ingest_files(tmp_path / "run")) > 10
+    replay(tmp_path / "run", tmp_path / "again")
+    assert contents(tmp_path / "again") == contents(tmp_path / "run")
+
+
+def test_every_measurement_survives_its_record_exactly(world):
+    for m in measurements(world):
+        assert from_record(json.loads(json.dumps(to_record(m)))) == m
+    assert from_record(to_record(Control("flush"))) == Control("flush")
+
+
+@pytest.mark.parametrize(
+    "record, complaint",
+    [
+        ({"type": "sonar", "stamp_ns": 1}, "unknown kind of measurement 'sonar'"),
+        ({"stamp_ns": 1}, "unknown kind of measurement None"),
+        ({"type": "odometry", "stamp_ns": 1}, "odometry: .*T_odom_base"),
+        ({"type": "odometry", "stamp_ns": 1, "T_odom_base": [0, 0, 0], "more": 1}, "odometry: .*more"),
+        ({"type": "sightings", "stamp_ns": 1, "topic": "/a"}, "sightings: 'sightings'"),
+        ({"type": "sightings", "stamp_ns": 1, "topic": "/a", "sightings": [{"id": "a"}]}, "sightings: .*measured"),
+    ],
+)
+def test_a_record_of_another_shape_is_refused_by_field(record, complaint):
+    with pytest.raises(FormatError, match=complaint):
+        from_record(record)
+
+
+def test_a_sequence_cut_off_is_replayed_as_far_as_it_goes_and_the_loss_told(tmp_path, folder):
+    shutil.copytree(folder, tmp_path / "cut")
+    file = tmp_path / "cut" / "ingest.mcap"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    done = replay(tmp_path / "cut", tmp_path / "again")
+    assert len(done.losses) == 1
+    assert "ingest.mcap: cut off after" in done.losses[0]
+
+
+def test_a_sequence_with_a_record_that_is_no_json_is_refused(tmp_path):
+    writer = IngestWriter(tmp_path / "ingest.mcap")
+    writer._channels["odometry"] = writer._writer.register_channel("odometry", "json", writer._schema)
+    writer._writer.add_message(writer._channels["odometry"], 0, b"{no", 0, 0)
+    writer.close()
+    with pytest.raises(FormatError, match=r"ingest\.mcap: record 0 is not JSON"):
+        list(read_ingest(tmp_path, []))
+
+
+# -- files ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_graph_file_reads_back_with_poses_first_and_stamps_beside_it(folder, run):
+    file = read_g2o(folder / "graph.g2o")
+    table = [line.split(",") for line in (folder / "graph_vertices.csv").read_text().splitlines()]
+    assert table[0] == ["id", "vertex", "stamp_ns", "name"]
+    keyframes = [row for row in table[1:] if row[1] == "keyframe"]
+    assert [int(row[2]) for row in keyframes] == [k.stamp_ns for k in run.slam.keyframes]
+    assert [int(row[0]) for row in table[1:]] == list(range(run.slam.graph.vertex_count))
+    assert [row[3] for row in table[1 + len(keyframes) :]] == list(run.slam.landmarks)
+    by_id = dict(zip(file.ids, range(len(file.ids)), strict=True))
+    offset = file.graph.offset.values[[by_id[k] for k in range(len(keyframes))]]
+    read = file.graph.initial.values[offset[:, None] + np.arange(3)]
+    assert read == pytest.approx(run.slam.trajectory(), abs=1e-12)
+
+
+def test_trajectories_have_a_line_for_each_keyframe_and_each_sighting(folder, run):
+    path = read_tum(folder / "path.tum")
+    assert path.poses[:, :2] == pytest.approx(run.slam.trajectory()[:, :2])
+    stamps = [
+        int(a) * 10**9 + int(b) for a, b in re.findall(r"^(\d+)\.(\d{9}) ", (folder / "path.tum").read_text(), re.M)
+    ]
+    assert stamps == [k.stamp_ns for k in run.slam.keyframes]
+    for name, poses in (
+        ("sightings.tum", run.slam.sighting_trajectory()),
+        ("odometry.tum", run.slam.sighting_odometry()),
+    ):
+        assert read_tum(folder / name).poses[:, :2] == pytest.approx(poses[:, :2])
+
+
+def test_the_table_of_landmarks_has_estimate_and_covariance(folder, run):
+    rows = [line.split(",") for line in (folder / "landmarks.csv").read_text().splitlines()]
+    assert rows[0] == ["id", "kind", "x", "y", "theta", "sightings", "cov_xx", "cov_xy", "cov_yy"]
+    assert [row[0] for row in rows[1:]] == list(run.slam.landmarks)
+    for row in rows[1:]:
+        landmark = run.slam.landmarks[row[0]]
+        assert [float(v) for v in row[2:5]] == run.slam.solver.estimate([landmark.vertex])[0].tolist()
+        assert int(row[5]) == landmark.sightings
+        xx, xy, yy = map(float, row[6:])
+        assert xx * yy > xy * xy
+
+
+def test_a_landmarks_name_may_hold_anything(tmp_path, folder):
+    shutil.copytree(folder, tmp_path / "run")
+    name = 'a,"b"\nc'
+    config = run_config(folder)
+    recorder = RunRecorder(tmp_path / "named", config)
+    slam = GraphSlam(config, recorder.sink)
+    for record in read_ingest(tmp_path / "run", []):
+        m = from_record(record)
+        if hasattr(m, "sightings"):
+            m = type(m)(m.stamp_ns, m.topic, tuple(type(s)(name + s.id, s.measured, s.covariance) for s in m.sightings))
+        slam.process(m)
+    recorder.save(slam)
+    import csv
+
+    with (tmp_path / "named" / "landmarks.csv").open(newline="") as stream:
+        assert [row[0] for row in csv.reader(stream)][1:] == list(slam.landmarks)
+    replay(tmp_path / "named", tmp_path / "again")
+    assert contents(tmp_path / "again") == contents(tmp_path / "named")
+
+
+def test_the_recording_of_a_run_is_read_by_mcap_and_by_rosbags(folder):
+    types = {
+        "/path": "nav_msgs/msg/Path",
+        "/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "/tf": "tf2_msgs/msg/TFMessage",
+        "/landmarks": "visualization_msgs/msg/MarkerArray",
+    }
+    with (folder / "run.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert {c.topic for c in reader.get_summary().channels.values()} == set(types)
+        by_mcap = [(channel.topic, m.log_time, m.data) for _, channel, m in reader.iter_messages(log_time_order=False)]
+    with AnyReader([folder / "run.mcap"]) as reader:
+        by_rosbags = [(c.topic, t, bytes(raw)) for c, t, raw in reader.messages()]
+        for c, _, raw in reader.messages():
+            assert c.msgtype == types[c.topic]
+            reader.deserialize(raw, c.msgtype)
+    assert sorted(by_mcap) == sorted(by_rosbags)
+    assert [t for _, t, _ in by_mcap] == sorted(t for _, t, _ in by_mcap)
+
+
+def test_the_recorded_path_is_the_saved_one(folder):
+    *_, last = open_bag(folder / "run.mcap").messages({"/path"})
+    path = typestore().deserialize_cdr(last.cdr, "nav_msgs/msg/Path")
+    recorded = [
+        f"{p.header.stamp.sec}.{p.header.stamp.nanosec:09d} {p.pose.position.x!r} {p.pose.position.y!r} 0 0 0"
+        f" {p.pose.orientation.z!r} {p.pose.orientation.w!r}"
+        for p in path.poses
+    ]
+    assert recorded == (folder / "path.tum").read_text().splitlines()
+
+
+def test_the_recorded_transforms_lead_from_map_over_odom_to_the_recorded_pose(folder):
+    store, poses, links = typestore(), {}, {}
+    for m in open_bag(folder / "run.mcap").messages({"/pose", "/tf"}):
+        if m.topic == "/pose":
+            p = store.deserialize_cdr(m.cdr, "geometry_msgs/msg/PoseWithCovarianceStamped").pose.pose.position
+            poses[m.log_ns] = np.array([p.x, p.y])
+        else:
+            (t,) = store.deserialize_cdr(m.cdr, "tf2_msgs/msg/TFMessage").transforms
+            links[m.log_ns, t.header.frame_id, t.child_frame_id] = t.transform
+    assert len(poses) > 50
+    for stamp, at in poses.items():
+        correction, odometry = links[stamp, "map", "odom"], links[stamp, "odom", "base_link"]
+        angle = 2 * np.arctan2(correction.rotation.z, correction.rotation.w)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        there = turn @ [odometry.translation.x, odometry.translation.y]
+        origin = np.array([correction.translation.x, correction.translation.y])
+        assert origin + there == pytest.approx(at, abs=1e-9)
+
+
+def test_the_recorded_path_stays_linear_in_the_length_of_the_run(folder, run):
+    sizes = [len(m.cdr) for m in open_bag(folder / "run.mcap").messages({"/path"})]
+    assert sum(sizes) < 15 * sizes[-1]
+    assert len(sizes) > 20
+
+
+# -- folders --------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_with_other_things_in_it_is_refused_and_not_touched(tmp_path, bag):
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / "config.yaml").write_text("mine")
+    (out / "run_of_last_year.mcap").write_bytes(b"mine")
+    with pytest.raises(RunError, match="mine: not empty and not an earlier run; nothing was written"):
+        replay(bag, out)
+    assert {f.name: f.read_bytes() for f in out.iterdir()} == {"config.yaml": b"mine", "run_of_last_year.mcap": b"mine"}
+
+
+def test_an_earlier_run_is_replaced_but_what_else_is_in_its_folder_stays(tmp_path, bag, folder):
+    out = tmp_path / "run"
+    shutil.copytree(folder, out)
+    for name in ("ingest_3.mcap", "run_3.mcap"):
+        (out / name).write_bytes(b"of a longer run")
+    for name in ("notes.txt", "run_of_last_year.mcap", "ingest_copy.mcap"):
+        (out / name).write_bytes(b"mine")
+    replay(bag, out)
+    assert {f.name for f in out.iterdir()} == ALL | {"notes.txt", "run_of_last_year.mcap", "ingest_copy.mcap"}
+    assert contents(out) == contents(folder)
+    replay(out, tmp_path / "again")
+    assert contents(tmp_path / "again") == contents(folder)
+
+
+def test_a_folder_is_not_read_and_written_at_once(tmp_path, bag, folder):
+    out = tmp_path / "run"
+    shutil.copytree(folder, out)
+    (tmp_path / "link").symlink_to(out)
+    shutil.copy(bag, out / "run_5.mcap")
+    before = contents(out, ALL)
+    for source, target in ((out, out), (out, tmp_path / "link"), (out / "run_5.mcap", out)):
+        with pytest.raises(RunError, match="cannot be read from and written to at once"):
+            replay(source, target)
+    assert contents(out, ALL) == before
+    assert (out / "run_5.mcap").exists()
+
+
+def test_a_refused_recording_leaves_an_earlier_run_as_it_was(tmp_path, folder):
+    out = tmp_path / "run"
+    shutil.copytree(folder, out)
+    bad = tmp_path / "bad.mcap"
+    with BagWriter(bad) as writer:
+        writer.write("/pose", "geometry_msgs/msg/PoseStamped", 1, b"")
+    before = contents(out, ALL)
+    with pytest.raises(GraphSlamError, match="no topic of type nav_msgs/msg/Odometry"):
+        replay(bad, out)
+    assert contents(out, ALL) == before
+
+
+def test_a_run_that_ended_without_data_is_a_run_that_may_be_replaced(tmp_path):
+    for _ in range(2):
+        recorder = RunRecorder(tmp_path / "run", Config())
+        recorder.close()
+        assert is_run(tmp_path / "run")
+    done = replay(tmp_path / "run", tmp_path / "again")
+    assert done.summary["keyframes"] == 0
+
+
+def test_a_run_that_was_never_closed_is_a_run(tmp_path):
+    recorder = RunRecorder(tmp_path / "run", Config())
+    recorder.sink(Odometry(1, (0.0, 0.0, 0.0)))
+    recorder._ingest._stream.flush()
+    assert is_run(tmp_path / "run")
+    assert replay(tmp_path / "run", tmp_path / "again").losses
+    recorder.close()
+
+
+def test_a_folder_that_cannot_be_made_or_goes_away_is_refused_by_name(tmp_path, world):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(RunError, match="file"):
+            RunRecorder(path, Config())
+    recorder = RunRecorder(tmp_path / "run", Config())
+    slam = GraphSlam(Config(), recorder.sink)
+    for m in list(measurements(world))[:200]:
+        recorder.record(slam, slam.process(m))
+    shutil.rmtree(tmp_path / "run")
+    with pytest.raises(GraphSlamError, match="run"):
+        recorder.save(slam)
