@@ -128,7 +128,9 @@ def _gauss_newton(problem: Problem, x: Array, losses: Mapping[str, Loss], settin
     for _ in range(settings.max_iterations):
         problem.normal.assemble(blocks)
         try:
-            step = problem.normal.factor().solve(-problem.normal.gradient)
+            # what the edges leave open they leave open from the first step on
+            lu = problem.normal.factor(check=not iterations)
+            step = lu.solve(-problem.normal.gradient)
         except SingularError:
             return _Descent(x, iterations, "singular")
         x = problem.retract(x, step)

@@ -160,16 +160,18 @@ class NormalEquations:
             h.setdiag(h.diagonal() * (1.0 + damping))
         return h
 
-    def factor(self, damping: float = 0.0) -> SuperLU:
+    def factor(self, damping: float = 0.0, *, check: bool = True) -> SuperLU:
         """Sparse LU in the order of elimination, with diagonal pivots.
 
-        Raises SingularError naming a vertex, also where rounding hides that H is singular.
+        Raises SingularError naming a vertex; with ``check``, also where rounding hides that H is singular.
         """
         h = self.matrix(damping)
         diagonal = h.diagonal()
         scale = np.where(diagonal > 0.0, diagonal, 1.0)
         try:
             lu = splu(h, permc_spec="NATURAL", **_SYMMETRIC)
+            if not check:
+                return lu
             lost = _pivots(lu) <= _LEAST_PIVOT * scale
         except RuntimeError:  # SuperLU: "Factor is exactly singular"
             shifted = (h + _SHIFT * _diagonal(scale)).tocsc()
