@@ -61,7 +61,7 @@ def landmarks(slam: GraphSlam) -> bytes:
 def landmark_estimates(slam: GraphSlam) -> list[tuple[str, tuple[float, ...], Array]]:
     """(id, (x, y) or (x, y, theta), covariance (2, 2) of the position), all in the map frame."""
     vertices = [landmark.vertex for landmark in slam.landmarks.values()]
-    marginals = slam.solver.marginal(vertices) if vertices else []
+    marginals = slam.landmark_covariances() if vertices else []
     out = []
     for name, vertex, marginal in zip(slam.landmarks, vertices, marginals, strict=True):
         value = tuple(slam.solver.estimate([vertex])[0].tolist())

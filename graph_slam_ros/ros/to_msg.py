@@ -152,7 +152,8 @@ def landmark_markers(
     """
     markers = [_marker(stamp_ns, frame, "", 0, action=3)]
     for k, (name, position, covariance) in enumerate(zip(names, positions.tolist(), covariances, strict=True)):
-        variances, axes = np.linalg.eigh(covariance)
+        known = np.isfinite(covariance).all()
+        variances, axes = np.linalg.eigh(covariance if known else np.zeros((2, 2)))
         size = np.maximum(4.0 * np.sqrt(np.maximum(variances, 0.0)), 0.05)
         tilt = float(np.arctan2(axes[1, 0], axes[0, 0]))
         at = (position[0], position[1], tilt)

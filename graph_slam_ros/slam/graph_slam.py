@@ -99,6 +99,7 @@ class GraphSlam:
         self._motion = Motion(self.config.odometry)
         self._waiting: list[Sightings] = []
         self._covariance = np.zeros((3, 3))
+        self._handed_over = 0, 0  # vertices and edges the solver has
         self._unsolved_keyframes = 0
         self._closure = False
 
@@ -161,6 +162,17 @@ class GraphSlam:
         """
         return self._covariance.copy()
 
+    def landmark_covariances(self) -> list[Array]:
+        """Marginal of each landmark, (2, 2) in the map's axes or (3, 3) in its tangent space; NaN where unknown."""
+        self._hand_over()
+        vertices = [landmark.vertex for landmark in self.landmarks.values()]
+        try:
+            return self.solver.marginal(vertices)
+        except GraphSlamError as error:
+            self.counters.count("solver", type(error).__name__)
+            dofs = [self.graph.kind_of(vertex).dof for vertex in vertices]
+            return [np.full((dof, dof), np.nan) for dof in dofs]
+
     @property
     def newest_odometry_ns(self) -> int | None:
         """Stamp of the last odometry that was used."""
@@ -200,16 +212,14 @@ class GraphSlam:
         anchor = self.config.anchor
         noise = Gaussian.from_sigmas(anchor.sigma_m, anchor.sigma_m, anchor.sigma_rad)
         self._covariance = np.diag([anchor.sigma_m**2, anchor.sigma_m**2, anchor.sigma_rad**2])
-        edge = self.graph.add_edge(POSE_PRIOR, [vertex], m.T_odom_base, noise, "anchor")
-        self.solver.add([vertex], [edge])
+        self.graph.add_edge(POSE_PRIOR, [vertex], m.T_odom_base, noise, "anchor")
         self.keyframes.append(Keyframe(vertex, m.stamp_ns, m.T_odom_base))
 
     def _next_keyframe(self, m: Odometry) -> None:
         motion, last = self._motion, self.keyframes[-1]
         noise = self._noise("odometry", motion.covariance)
         vertex = self.graph.add_vertex(SE2, se2.compose(self._pose(last), motion.T_keyframe_base))
-        edge = self.graph.add_edge(RELATIVE_POSE, [last.vertex, vertex], motion.T_keyframe_base, noise, "odometry")
-        self.solver.add([vertex], [edge])
+        self.graph.add_edge(RELATIVE_POSE, [last.vertex, vertex], motion.T_keyframe_base, noise, "odometry")
         self.keyframes.append(Keyframe(vertex, m.stamp_ns, m.T_odom_base))
         self._covariance = se2.propagate(self._covariance, motion.T_keyframe_base, motion.covariance)
         motion.restart()
@@ -261,19 +271,16 @@ class GraphSlam:
         measured, covariance = carry(sighting, T_keyframe_base, motion_covariance)
         covariance[:2, :2] += self.config.landmarks.added_sigma_m**2 * np.eye(2)
         noise = self._noise(topic, covariance)
-        new_vertices = []
         if landmark is None:
             act = se2.act if is_point else se2.compose
             kind = R2 if is_point else SE2
             vertex = self.graph.add_vertex(kind, act(self._pose(keyframe), measured))
             landmark = self.landmarks[sighting.id] = Landmark(vertex, 0, stamp_ns)
-            new_vertices = [vertex]
         if not is_point:
             edge_type = RELATIVE_POSE
         else:
             edge_type = LANDMARK_POSITION if self.graph.kind_of(landmark.vertex) is R2 else TAG_POSITION
-        edge = self.graph.add_edge(edge_type, [keyframe.vertex, landmark.vertex], measured, noise, "landmarks")
-        self.solver.add(new_vertices, [edge])
+        self.graph.add_edge(edge_type, [keyframe.vertex, landmark.vertex], measured, noise, "landmarks")
         if stamp_ns - landmark.last_seen_ns > self.config.solve.closure_gap_s * NS:
             self._closure = True
         landmark.sightings += 1
@@ -291,11 +298,18 @@ class GraphSlam:
         self._unsolved_keyframes, self._closure = 0, False
         if not self.keyframes:
             return
+        self._hand_over()
         try:
             self.reports.append(self.solver.update(settings))
             (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
         except GraphSlamError as error:
             self.counters.count("solver", type(error).__name__)
+
+    def _hand_over(self) -> None:
+        """Give the solver what is new in the graph."""
+        vertices, edges = self._handed_over
+        self._handed_over = self.graph.vertex_count, self.graph.edge_count
+        self.solver.add(range(vertices, self.graph.vertex_count), range(edges, self.graph.edge_count))
 
     def _noise(self, source: str, covariance: Array) -> Gaussian:
         """Noise of an edge, made before anything is added to the graph: it must not fail half-way."""
