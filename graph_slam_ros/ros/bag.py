@@ -116,7 +116,10 @@ class _McapBag:
             for channel in found.channels.values():
                 self._add_topic(file, channel, found.schemas.get(channel.schema_id), found.counts.get(channel.id, 0))
         if not self.topics:
-            raise BagError(f"{files[0]}: no topic in it")
+            lost: list[str] = []
+            for _ in records(files[0], lost):
+                pass
+            raise BagError(f"{files[0]}: no topic in it{' that is whole; ' + lost[0] if lost else ''}")
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         for file in self._files:

@@ -1,0 +1,308 @@
+"""The command line: every exit code, one line for what is refused, never a traceback."""
+
+import importlib.util
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from graph_slam_ros import __version__, cli
+from graph_slam_ros.ros.bag import BagWriter, open_bag
+
+RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv")
+COMMAND = Path(sys.executable).parent / "graph_slam"
+WITH_EVO = pytest.mark.skipif(importlib.util.find_spec("evo") is None, reason="evo is not installed")
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    file = tmp_path_factory.mktemp("a folder") / "drive it.mcap"
+    assert (
+        cli.main(["simulate", "manhattan", "--out", str(file), "--seed", "4", "--poses", "80", "--set", "blocks=4"])
+        == 0
+    )
+    return file
+
+
+@pytest.fixture(scope="module")
+def long_bag(tmp_path_factory):
+    """Of several chunks."""
+    file = tmp_path_factory.mktemp("long") / "long.mcap"
+    assert cli.main(["simulate", "manhattan", "--out", str(file), "--poses", "1500"]) == 0
+    return file
+
+
+@pytest.fixture(scope="module")
+def run(bag, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    assert cli.main(["replay", str(bag), "--out", str(folder)]) == 0
+    return folder
+
+
+def told(capsys, *words):
+    """(exit code, standard output, lines on standard error)."""
+    try:
+        code = cli.main([str(w) for w in words])
+    except SystemExit as end:  # argparse
+        code = end.code
+    out, err = capsys.readouterr()
+    assert "Traceback" not in err
+    return code, out, err.splitlines()
+
+
+def results(folder):
+    return {name: (folder / name).read_bytes() for name in RESULTS}
+
+
+# -- 0 --------------------------------------------------------------------------------------------------------------
+
+
+def test_replay_says_what_happened_and_ends_with_0(bag, run, tmp_path, capsys):
+    code, out, err = told(capsys, "replay", bag, "--out", tmp_path / "run")
+    assert (code, err) == (0, [])
+    summary = json.loads((tmp_path / "run" / "run.json").read_text())
+    for number in (summary["keyframes"], summary["landmarks"], summary["edges"], f"{summary['chi2']:.3f}"):
+        assert f" {number}" in out
+    assert f"results in {tmp_path / 'run'}" in out
+    assert results(tmp_path / "run") == results(run)
+
+
+def test_replay_of_a_run_repeats_it_and_a_setting_changes_it(run, tmp_path, capsys):
+    assert told(capsys, "replay", run, "--out", tmp_path / "same")[0] == 0
+    assert results(tmp_path / "same") == results(run)
+    assert told(capsys, "replay", run, "--out", tmp_path / "other", "--set", "landmarks.loss=none")[0] == 0
+    assert results(tmp_path / "other") != results(run)
+
+
+def test_settings_go_before_the_file_and_the_file_before_the_defaults(bag, tmp_path, capsys):
+    (tmp_path / "mine.yaml").write_text("keyframes:\n  min_distance_m: 0.7\nsolve:\n  every_keyframes: 7\n")
+    options = ("--config", tmp_path / "mine.yaml", "--set", "solve.every_keyframes=9")
+    assert told(capsys, "replay", bag, "--out", tmp_path / "run", *options)[0] == 0
+    used = (tmp_path / "run" / "config.yaml").read_text()
+    assert "min_distance_m: 0.7" in used
+    assert "every_keyframes: 9" in used
+
+
+def test_the_command_that_info_prints_works_as_it_is(bag, run, tmp_path, capsys, monkeypatch):
+    code, out, err = told(capsys, "info", bag)
+    assert (code, err) == (0, [])
+    lines = out.splitlines()
+    topics = {line.split()[0]: line for line in lines if line.startswith("/")}
+    assert set(topics) == set(open_bag(bag).topics)
+    assert "nav_msgs/msg/Odometry" in topics["/odom"]
+    assert "odom -> base_link" in topics["/odom"]
+    assert " Hz" in topics["/odom"]
+    assert any(line.startswith("span ") for line in lines)
+    monkeypatch.chdir(tmp_path)
+    program, *words = shlex.split(lines[-1])
+    assert program == "graph_slam"
+    assert told(capsys, *words)[0] == 0
+    assert results(tmp_path / "run") == results(run)
+
+
+@WITH_EVO
+def test_simulate_replay_evaluate_end_to_end(bag, run, capsys):
+    code, out, err = told(capsys, "evaluate", run, "--truth", bag, "--json")
+    assert (code, err) == (0, [])
+    scores = json.loads(out)
+    assert set(scores) == {"position_m", "heading_rad", "map_m", "n", "odometry"}
+    assert set(scores["position_m"]) == set(scores["heading_rad"]) == {"rmse", "median", "max"}
+    assert set(scores["map_m"]) == {"rmse"}
+    assert scores["n"] > 50
+    assert scores["position_m"]["rmse"] < 0.5 * scores["odometry"]["position_m"]["rmse"]
+    assert (run / "path.png").stat().st_size > 10_000
+    code, out, _ = told(capsys, "evaluate", run, "--truth", f"{bag}:/ground_truth", "--plot", run / "b.png")
+    assert code == 0
+    assert f"{scores['position_m']['rmse']:.3f}" in out
+
+
+def test_help_and_version_end_with_0(capsys):
+    assert told(capsys, "--version") == (0, f"graph_slam_ros {__version__}\n", [])
+    for command in ("replay", "info", "optimize", "simulate", "evaluate", "demo", "warmup"):
+        code, out, _ = told(capsys, command, "--help")
+        assert code == 0
+        assert out.startswith(f"usage: graph_slam {command}")
+
+
+# -- 2 --------------------------------------------------------------------------------------------------------------
+
+REFUSED = {
+    "no command": ([], "graph_slam: the following arguments are required: COMMAND"),
+    "unknown command": (["fly"], "invalid choice: 'fly'"),
+    "unknown option": (["info", "{bag}", "--fast"], "unrecognized arguments: --fast"),
+    "no bag": (["replay"], "graph_slam replay: the following arguments are required: BAG"),
+    "no out": (["replay", "{bag}"], "replay needs --out DIR"),
+    "missing bag": (["replay", "none.mcap", "--out", "{out}"], "none.mcap: no such file or folder"),
+    "empty bag": (["replay", "{empty}", "--out", "{out}"], "empty.mcap: the file is empty"),
+    "bag cut off too early": (["info", "{cut}"], "cut.mcap: no topic in it that is whole; cut.mcap: cut off after 0"),
+    "no recording": (["info", "{text}"], "text.mcap: not a readable recording"),
+    "unknown topic": (
+        ["replay", "{bag}", "--out", "{out}", "--odom", "/wheel"],
+        "no topic /wheel in the recording; there",
+    ),
+    "wrong topic": (
+        ["replay", "{bag}", "--out", "{out}", "--landmarks", "/odom"],
+        "topic /odom is nav_msgs/msg/Odometry",
+    ),
+    "unknown parameter": (
+        ["replay", "{bag}", "--out", "{out}", "--set", "a.b=1"],
+        "unknown parameter 'a.b'; did you mean",
+    ),
+    "no setting": (["replay", "{bag}", "--out", "{out}", "--set", "a.b"], "'a.b' is not key=value"),
+    "missing config": (["replay", "{bag}", "--out", "{out}", "--config", "no.yaml"], "no.yaml: No such file"),
+    "foreign folder": (
+        ["replay", "{bag}", "--out", "{foreign}"],
+        "not empty and not an earlier run; nothing was written",
+    ),
+    "out is a file": (["replay", "{bag}", "--out", "{text}"], "text.mcap: Not a directory"),
+    "own source": (["replay", "{run}", "--out", "{run}"], "cannot be read from and written to at once"),
+    "rate": (["replay", "{bag}", "--ros", "--rate", "-1"], "argument --rate: -1 is not a positive number"),
+    "unknown world": (["simulate", "mars", "--out", "{out}"], "no world 'mars'; there are pythonrobotics"),
+    "negative seed": (["simulate", "manhattan", "--out", "{out}", "--seed", "-1"], "seed -1 is negative"),
+    "simulate nowhere": (["simulate", "manhattan", "--out", "/nowhere/a.mcap"], "/nowhere/a.mcap: No such file"),
+    "missing graph": (["optimize", "none.g2o"], "none.g2o: no such file"),
+    "evaluate no run": (["evaluate", "none", "--truth", "{bag}"], "none"),
+    "no odometry that fits": (
+        ["replay", "{bag}", "--out", "{out}", "--set", "frames.odom=world"],
+        "no odometry of it could be used",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_refused_is_told_in_one_line_with_code_2_and_nothing_is_touched(case, bag, run, tmp_path, capsys):
+    words, complaint = REFUSED[case]
+    names = {"bag": bag, "run": run, "out": tmp_path / "out"}
+    for name, file, content in (
+        ("empty", "empty.mcap", ""),
+        ("text", "text.mcap", "hello"),
+        ("foreign", "f/notes", "mine"),
+    ):
+        names[name] = tmp_path / file
+        names[name].parent.mkdir(exist_ok=True)
+        names[name].write_text(content)
+    names["foreign"], names["cut"] = tmp_path / "f", tmp_path / "cut.mcap"
+    names["cut"].write_bytes(bag.read_bytes()[:5000])
+    before = results(run)
+    code, _, err = told(capsys, *(word.format(**names) for word in words))
+    assert code == 2
+    assert len(err) == 1, err
+    assert err[0].startswith("graph_slam")
+    assert complaint in err[0]
+    assert results(run) == before
+    assert [f.read_text() for f in (tmp_path / "f").iterdir()] == ["mine"]
+
+
+# -- 3 and 1 --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["replay", "info"])
+def test_a_loss_is_told_and_ends_with_3_and_the_rest_is_done(long_bag, tmp_path, capsys, command):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(long_bag.read_bytes()[: int(long_bag.stat().st_size * 0.7)])
+    words = [cut, "--out", tmp_path / "run"] if command == "replay" else [cut]
+    code, _, err = told(capsys, command, *words)
+    assert code == 3
+    assert len(err) == 1
+    assert err[0].startswith("graph_slam: lost: cut.mcap: cut off after ")
+    if command == "replay":
+        summary = json.loads((tmp_path / "run" / "run.json").read_text())
+        assert [f"graph_slam: lost: {loss}" for loss in summary["losses"]] == err
+
+
+def test_refused_messages_are_counted_and_shown_but_are_no_loss(bag, tmp_path, capsys):
+    file = tmp_path / "a.mcap"
+    with BagWriter(file) as writer:
+        for k, m in enumerate(open_bag(bag).messages({"/odom"})):
+            writer.write("/odom", "nav_msgs/msg/Odometry", m.log_ns, m.cdr[:50] if k % 10 == 3 else m.cdr)
+    code, out, err = told(capsys, "replay", file, "--out", tmp_path / "run")
+    assert (code, err) == (0, [])
+    refused = json.loads((tmp_path / "run" / "run.json").read_text())["counters"]["odometry"]["undecodable"]
+    assert refused > 5
+    assert f"counted    odometry: undecodable {refused}" in out
+
+
+def test_a_fault_of_ours_is_one_line_with_code_1(bag, tmp_path, capsys, monkeypatch):
+    def broken(*arguments, **options):
+        raise ZeroDivisionError("division\nby zero")
+
+    monkeypatch.setattr("graph_slam_ros.replay.replay", broken)
+    code, _, err = told(capsys, "replay", bag, "--out", tmp_path / "run")
+    assert code == 1
+    assert err == [
+        "graph_slam: a fault of ours, ZeroDivisionError: division by zero (GRAPH_SLAM_TRACEBACK=1 shows where)"
+    ]
+
+
+# -- as a process ---------------------------------------------------------------------------------------------------
+
+
+def process(*words, **options):
+    return subprocess.Popen(
+        [COMMAND, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options
+    )
+
+
+def test_the_installed_command_passes_its_exit_code_on(tmp_path):
+    p = process("info", tmp_path / "none.mcap")
+    out, err = p.communicate(timeout=60)
+    assert (p.returncode, out) == (2, "")
+    assert err == f"graph_slam: {tmp_path}/none.mcap: no such file or folder\n"
+
+
+def test_a_fifo_is_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.mcap")
+    p = process("info", tmp_path / "a.mcap")
+    _, err = p.communicate(timeout=30)
+    assert p.returncode == 2
+    assert "neither a file nor a folder" in err
+
+
+def test_ctrl_c_during_a_replay_shows_no_traceback_and_leaves_a_run_that_may_be_replaced(
+    bag, long_bag, tmp_path, capsys
+):
+    p = process("replay", long_bag, "--out", tmp_path / "run")
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "run" / "config.yaml").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    p.send_signal(signal.SIGINT)
+    _, err = p.communicate(timeout=30)
+    assert p.returncode == 2
+    assert "Traceback" not in err
+    assert told(capsys, "replay", bag, "--out", tmp_path / "run")[0] == 0
+
+
+def test_without_ros_the_live_commands_say_so(bag, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "_has_ros", lambda: False)
+    code, _, err = told(capsys, "replay", bag, "--ros", "--out", tmp_path / "run")
+    assert (code, len(err)) == (2, 1)
+    assert "--ros needs ROS 2" in err[0]
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        assert cli.node_main() == 2
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert capsys.readouterr().err == (
+        "graph_slam_node: ROS 2 is not installed here (no rclpy); replay works without it\n"
+    )
+
+
+def test_a_reader_that_stops_reading_is_no_fault(bag):
+    done = subprocess.run(
+        f"{shlex.quote(str(COMMAND))} info {shlex.quote(str(bag))} | head -n 1; exit ${{PIPESTATUS[0]}}",
+        shell=True,
+        executable=shutil.which("bash"),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0
+    assert done.stderr == ""
