@@ -39,6 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return DONE
+    except OSError as error:
+        print(f"graph_slam: {error.filename or 'writing'}: {error.strerror}", file=sys.stderr)
+        return REFUSED
     except Exception as error:
         if os.environ.get("GRAPH_SLAM_TRACEBACK"):
             traceback.print_exc()
@@ -68,6 +71,7 @@ def _replay(args: argparse.Namespace) -> int:
     from graph_slam_ros.replay import replay
     from graph_slam_ros.run import is_run
 
+    _refuse_idle_options(args, is_run(args.bag))
     config = _config(args)
     if args.ros:
         return _replay_live(args, config)
@@ -75,9 +79,8 @@ def _replay(args: argparse.Namespace) -> int:
         raise GraphSlamError("replay needs --out DIR, the folder for the results")
     own = config if args.config or args.set or not is_run(args.bag) else None
     done = replay(args.bag, args.out, own, odometry=args.odom, landmarks=args.landmarks, progress=_progress("replay"))
-    _say(_run_text(done.summary), f"results in {args.out}")
-    if not done.summary["keyframes"]:
-        raise GraphSlamError(f"{args.bag}: no odometry of it could be used, see what was counted and graph_slam info")
+    _say_run(args.bag, done.summary)
+    _say(f"results in {args.out}")
     return _told(done.losses)
 
 
@@ -94,20 +97,40 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
 
     options: dict[str, Any] = {"rate": args.rate, "progress": _progress("play")}
     if args.out is None:
-        played = play(bag, inputs, node_name=args.node, **options)
+        played = play(bag, inputs, node_name=args.node or "/graph_slam", **options)
     else:
         check_room(args.out, args.bag)
         with own_node(args.out, inputs, config) as own:
-            played = play(bag, inputs, own=own, **options)
-        _say(_run_text(json.loads((args.out / "run.json").read_text())))
+            played = play(bag, inputs, own=own, window_s=config.ordering.window_s, **options)
+        _say_run(args.bag, json.loads((args.out / "run.json").read_text()))
     _say(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
     return _told(bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else []))
+
+
+def _refuse_idle_options(args: argparse.Namespace, of_run: bool) -> None:
+    """An option that would have no effect is a mistake of the caller's: say so."""
+    idle = {
+        "--odom or --landmarks: a run knows its own inputs": of_run and (args.odom or args.landmarks),
+        "--ros: the events of a run cannot be played, only its recording": of_run and args.ros,
+        "--rate without --ros": args.rate and not args.ros,
+        "--node without --ros, or with --out": args.node and (args.out or not args.ros),
+        "--config or --set with --ros and no --out: the running node has its own": args.ros
+        and not args.out
+        and (args.config or args.set),
+    }
+    for what, given in idle.items():
+        if given:
+            raise GraphSlamError(f"replay: no use for {what}")
 
 
 def _info(args: argparse.Namespace) -> int:
     from graph_slam_ros.replay import describe
     from graph_slam_ros.ros.bag import open_bag
+    from graph_slam_ros.run import is_run
 
+    if is_run(args.bag):
+        _say(f"an earlier run: graph_slam replay {args.bag} --out again")
+        return DONE
     bag = open_bag(args.bag)
     _say(*describe(bag, args.bag))
     return _told(bag.losses)
@@ -122,10 +145,11 @@ def _optimize(args: argparse.Namespace) -> int:
     solver = Solver(file.graph, settings)
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
     first = min(range(file.graph.vertex_count), key=lambda v: (file.graph.kind_of(v).name[:2] != "SE", file.ids[v]))
+    has_prior = any(len(edge.accepts) == 1 for edge in file.graph.tables)
     root = file.fixed[0] if file.fixed else first
     init = args.init if file.has_values or args.init != "file" else "tree"  # edges alone: there is no other start
     solver.start_at(initial_values(file.graph, init, root))
-    for vertex in file.fixed if file.fixed or "priors" in file.graph.labels else [root]:
+    for vertex in file.fixed if file.fixed or has_prior else [root]:
         solver.hold(vertex)
     report = solver.update()
     if args.json:
@@ -232,7 +256,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_config(sub)
     sub.add_argument("--ros", action="store_true", help="publish into a live ROS graph: a node of its own with --out")
     sub.add_argument("--rate", type=_positive, metavar="X", help="with --ros: times real time (default: all it takes)")
-    sub.add_argument("--node", default="/graph_slam", metavar="NAME", help="with --ros and no --out: the running node")
+    sub.add_argument("--node", metavar="NAME", help="with --ros and no --out: the running node")
 
     sub = command("info", _info, "topics, types, rates, frames and span of a recording, and how to replay it")
     sub.add_argument("bag", type=Path, metavar="BAG")
@@ -246,7 +270,9 @@ def _parser() -> argparse.ArgumentParser:
         "--tolerance", type=_positive, default=1e-6, metavar="X", help="relative decrease of chi2 at the end"
     )
     sub.add_argument("--error-map", choices=("relative", "seed"), default="relative", help="seed: of the inverse")
-    sub.add_argument("--information", choices=("g2o", "raw"), default="g2o", help="of rotations in space: see README")
+    sub.add_argument(
+        "--information", choices=("g2o", "raw"), default="g2o", help="of rotations in space; raw: unscaled"
+    )
     sub.add_argument("--lenient", action="store_true", help="leave out bad lines, list them, exit with 3")
     sub.add_argument("--json", action="store_true")
     sub.add_argument("--out", type=Path, metavar="FILE.g2o")
@@ -343,6 +369,12 @@ def _optimize_text(report: Any) -> Iterable[str]:
     yield f"{state} ({report.stop}), method {report.method}"
     for name, part in report.classes.items():
         yield f"  {name:12s}{part.edges:7d} edges   chi2 {part.chi2:14.6f}"
+
+
+def _say_run(source: Path, summary: dict[str, Any]) -> None:
+    _say(_run_text(summary))
+    if not summary["keyframes"]:
+        raise GraphSlamError(f"{source}: no odometry of it could be used, see what was counted and graph_slam info")
 
 
 def _run_text(summary: dict[str, Any]) -> str:

@@ -157,7 +157,7 @@ def replay(
 def _with_end(items: Iterable[Measurement | None]) -> Iterator[Measurement | None]:
     """A recording ends: what waits is released, and the whole is solved."""
     yield from items
-    yield Control("flush")
+    yield Control("end")
     yield Control("optimize")
 
 

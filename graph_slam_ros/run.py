@@ -87,7 +87,7 @@ class RunRecorder:
 
     def record(self, slam: GraphSlam, update: Update) -> None:
         """Append what an update changed: pose and TF, and the path and the landmarks when they have grown."""
-        if not update.keyframes:
+        if not update or not slam.keyframes:
             return
         stamp = slam.keyframes[-1].stamp_ns
         self._write("/tf", results.TF, stamp, results.map_to_odom(slam, stamp))

@@ -70,7 +70,7 @@ def straight(seconds, speed=1.0, hz=10):
     return [odometry(k / hz, (speed * k / hz, 0.0, 0.0)) for k in range(int(seconds * hz) + 1)]
 
 
-END = (Control("flush"), Control("optimize"))
+END = (Control("end"), Control("optimize"))
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ Unknown tags are kept, word for word, and written back. TORO's, iSAM's and GTSAM
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -51,6 +51,7 @@ _EDGE_TAGS: dict[str, EdgeType] = {
 }
 _RELATIVE = ("EDGE_SE2", "EDGE_SE3:QUAT")
 _HALVED = {RELATIVE_POSE_3D: np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])}  # of our residual, in g2o's
+_CLASS = ["#", "class"]  # our comment: the label of the edges that follow it
 _UNIT = 1e-12  # a squared quaternion norm this near to 1 is left as it was written
 ERROR_MAPS = {"relative": RELATIVE_POSE, "seed": INVERSE_RELATIVE_POSE}
 
@@ -84,6 +85,7 @@ class _Edge:
     vertices: tuple[int, ...]
     measured: list[float]
     information: list[float]
+    label: str
 
 
 class _Reader:
@@ -97,6 +99,7 @@ class _Reader:
         self.unknown: list[str] = []
         self.skipped: list[str] = []
         self.has_values = True
+        self.label = ""
 
     def refuse(self, line: int, why: str) -> None:
         message = f"{self.name}:{line}: {why}"
@@ -107,6 +110,7 @@ class _Reader:
     def take(self, line: int, text: str) -> None:
         words = text.split()
         if not words or words[0].startswith("#"):
+            self.label = words[2] if words[:2] == _CLASS and len(words) == 3 else self.label
             return
         try:
             words = in_g2o_words(words)
@@ -139,7 +143,7 @@ class _Reader:
         vertices = tuple(integer(word) for word in words[1 : 1 + slots])
         values = numbers(words[1 + slots :])
         measured = _with_unit_quaternion(values[: edge.measured_size], edge.measured_size)
-        return _Edge(line, vertices, measured, values[edge.measured_size :])
+        return _Edge(line, vertices, measured, values[edge.measured_size :], self.label)
 
     def declare_all(self) -> None:
         """A file of edges alone: its vertices are those the edges name, in order of id and without values."""
@@ -164,7 +168,7 @@ class _Reader:
         follows = dict(itertools.pairwise(poses))
         for tag, edges in self.edges.items():
             edge_type = relative_pose if tag == "EDGE_SE2" else _EDGE_TAGS[tag]
-            for label, members in _by_label(tag, list(self._known(tag, edges)), follows):
+            for label, members in _by_label(tag, self._known(tag, edges), follows).items():
                 self._add(graph, edge_type, label, members, at)
         fixed = []
         for line, file_id in self.fixed:
@@ -221,8 +225,9 @@ class _Reader:
 def read_g2o(path: Path | str, *, error_map: str = "relative", lenient: bool = False, raw: bool = False) -> G2oFile:
     """Read a g2o file.
 
-    Relative poses between one pose and the next (in order of id) are labelled ``odometry``, others ``closures``,
-    sightings ``landmarks``, priors ``priors``.
+    Edges are labelled as the comments ``# class LABEL`` of our own files say. In other files relative poses between
+    one pose and the next (in order of id) are labelled ``odometry``, others ``closures``, sightings ``landmarks``,
+    priors ``priors``.
 
     Parameters
     ----------
@@ -265,7 +270,7 @@ def write_g2o(path: Path | str, file: G2oFile, values: Callable[[Sequence[int]],
     out += [row for _, row in sorted(rows)]
     out += [f"FIX {file.ids[vertex]}" for vertex in file.fixed]
     tag_of_edge = {edge: tag for tag, edge in _EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
-    edges: list[tuple[int, str]] = []
+    edges: list[tuple[int, int, str]] = []
     for edge_type, table in graph.tables.items():
         if edge_type not in tag_of_edge:
             raise FormatError(f"g2o has no tag for an edge {edge_type.name}")
@@ -278,8 +283,11 @@ def write_g2o(path: Path | str, file: G2oFile, values: Callable[[Sequence[int]],
         for row in range(len(table)):
             ends = " ".join(str(file.ids[v]) for v in table.vertices.values[row].tolist())
             numbers = _text([*table.measured.values[row].tolist(), *information[row].tolist()])
-            edges.append((int(table.id.values[row]), f"{tag_of_edge[edge_type]} {ends} {numbers}"))
-    out += [row for _, row in sorted(edges)]
+            label, edge = int(table.label.values[row]), int(table.id.values[row])
+            edges.append((label, edge, f"{tag_of_edge[edge_type]} {ends} {numbers}"))
+    for label, group in itertools.groupby(sorted(edges), key=lambda edge: edge[0]):
+        out.append(" ".join([*_CLASS, graph.labels[label]]))
+        out += [text for _, _, text in group]
     out += file.unknown
     try:
         Path(path).write_text("\n".join(out) + "\n", encoding="utf-8")
@@ -299,15 +307,17 @@ def _with_unit_quaternion(numbers: list[float], size: int) -> list[float]:
     return numbers[:3] + [q / square**0.5 for q in numbers[3:]]
 
 
-def _by_label(tag: str, edges: list[_Edge], follows: dict[int, int]) -> list[tuple[str, list[_Edge]]]:
+def _by_label(tag: str, edges: Iterable[_Edge], follows: dict[int, int]) -> dict[str, list[_Edge]]:
+    groups: dict[str, list[_Edge]] = {}
+    for edge in edges:
+        groups.setdefault(edge.label or _usual_label(tag, edge, follows), []).append(edge)
+    return groups
+
+
+def _usual_label(tag: str, edge: _Edge, follows: dict[int, int]) -> str:
     if tag in _RELATIVE:
-        steps = [follows.get(min(e.vertices)) == max(e.vertices) for e in edges]
-        odometry = [e for e, step in zip(edges, steps, strict=True) if step]
-        closures = [e for e, step in zip(edges, steps, strict=True) if not step]
-        groups = [("odometry", odometry), ("closures", closures)]
-    else:
-        groups = [("priors" if tag == "EDGE_PRIOR_SE2" else "landmarks", edges)]
-    return [(label, members) for label, members in groups if members]
+        return "odometry" if follows.get(min(edge.vertices)) == max(edge.vertices) else "closures"
+    return "priors" if tag == "EDGE_PRIOR_SE2" else "landmarks"
 
 
 def _symmetric(upper: Array, size: int) -> Array:

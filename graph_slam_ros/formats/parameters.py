@@ -1,6 +1,7 @@
 """Parameter files: YAML as ROS reads it, strictly. One file serves ``ros2 launch`` and ``graph_slam replay``."""
 
 import json
+import re
 from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,12 @@ class _StrictLoader(yaml.SafeLoader):
                 raise ConfigError(f"line {key_node.start_mark.line + 1}: {key!r} is given twice")
             seen.add(key)
         return super().construct_mapping(node, deep)
+
+
+# YAML 1.1 reads 1e-3 as a text; ROS and people read a number
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(?:\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
 
 
 def read_parameters(path: Path | str) -> dict[str, Any]:

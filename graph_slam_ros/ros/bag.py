@@ -4,6 +4,7 @@ mcap files are read through the stream reader, one path for whole and damaged on
 is told. sqlite3 and ROS 1 bags are read by rosbags.
 """
 
+import heapq
 import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -122,22 +123,25 @@ class _McapBag:
             raise BagError(f"{files[0]}: no topic in it{' that is whole; ' + lost[0] if lost else ''}")
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        for file in self._files:
-            # a channel's own record may sit in a damaged chunk: the summary knows it, too
-            names = {channel.id: channel.topic for channel in self._contents[file].channels.values()}
-            read, losses = 0, list[str]()
-            for record in records(file, losses):
-                if isinstance(record, Message):
-                    read += 1
-                    name = names.get(record.channel_id, "")
-                    if name in topics:
-                        yield BagMessage(name, record.log_time, record.data)
-                elif isinstance(record, Channel):
-                    names[record.id] = record.topic
-            missing = sum(self._contents[file].counts.values()) - read
-            if missing > 0:
-                losses.append(f"{file.name}: {missing} of its messages could not be read")
-            self.losses += [loss for loss in losses if loss not in self.losses]  # a file may be read more than once
+        """Of several files in order of time: they may be parts of one recording split by time or by topic."""
+        return heapq.merge(*(self._of(file, topics) for file in self._files), key=lambda message: message.log_ns)
+
+    def _of(self, file: Path, topics: Collection[str]) -> Iterator[BagMessage]:
+        # a channel's own record may sit in a damaged chunk: the summary knows it, too
+        names = {channel.id: channel.topic for channel in self._contents[file].channels.values()}
+        read, losses = 0, list[str]()
+        for record in records(file, losses):
+            if isinstance(record, Message):
+                read += 1
+                name = names.get(record.channel_id, "")
+                if name in topics:
+                    yield BagMessage(name, record.log_time, record.data)
+            elif isinstance(record, Channel):
+                names[record.id] = record.topic
+        missing = sum(self._contents[file].counts.values()) - read
+        if missing > 0:
+            losses.append(f"{file.name}: {missing} of its messages could not be read")
+        self.losses += [loss for loss in losses if loss not in self.losses]  # a file may be read more than once
 
     def _add_topic(self, file: Path, channel: Channel, schema: Schema | None, count: int) -> None:
         encoding, type_name = channel.message_encoding, schema.name if schema else ""

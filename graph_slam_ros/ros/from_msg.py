@@ -190,6 +190,9 @@ class Border:
 
     def _landmark_covariance(self, topic: str, block: Array) -> Array:
         repairs, covariance = self._checked(block)
+        if len(block) == 3 and not block[:2, :2].any():  # only the heading's variance is given
+            sigma_m = self._config.landmarks.sigma_m
+            repairs, covariance = ("covariance_unknown",), np.diag([sigma_m**2, sigma_m**2, block[2, 2]])
         for repair in repairs:
             self._counters.count(topic, repair)
         if covariance is not None:
@@ -325,7 +328,7 @@ def _merge(a: Sighting, b: Sighting) -> Sighting | None:
         difference = np.array(se2.local(b.measured, a.measured))
     cov_a, cov_b = np.array(a.covariance).reshape(m, m), np.array(b.covariance).reshape(m, m)
     gain = cov_a @ np.linalg.inv(cov_a + cov_b)
-    if difference @ np.linalg.solve(cov_a + cov_b, difference) > _AGREE_SIGMA**2 * m:
+    if difference @ np.linalg.solve(cov_a + cov_b, difference) > _AGREE_SIGMA**2:
         return None
     if a == b:
         return a

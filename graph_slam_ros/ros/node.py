@@ -44,6 +44,7 @@ class GraphSlamNode(Node):
         self.get_logger().info("compiling kernels (once per installation)")
         self.get_logger().info(f"kernels ready after {warmup():.1f} s")
         self._slam = GraphSlam(config, self._recorder.sink if self._recorder else None)
+        self._slam.counters.on_first = self._tell
         self._border = Border(config, self._slam.counters)
         self._received = 0
         self._acknowledged = -1
@@ -100,12 +101,14 @@ class GraphSlamNode(Node):
         update = self._slam.process(measurement)
         if self._recorder:
             self._recorder.record(self._slam, update)
-        if update.keyframes:
-            self._pose.publish(results.pose(self._slam))
         if update:
+            self._pose.publish(results.pose(self._slam))
             self._path.publish(results.path(self._slam))
         if update.report:
             self._landmarks.publish(results.landmarks(self._slam))
+
+    def _tell(self, source: str, reason: str) -> None:
+        self.get_logger().warn(f"{source}: {reason} (told once, counted from now on)")
 
     def _received_by(self, callback: Callable[[bytes], None]) -> Callable[[bytes], None]:
         """A callback whose messages are acknowledged, whatever becomes of them."""
@@ -159,22 +162,23 @@ class GraphSlamNode(Node):
             response.message = str(error) if isinstance(error, GraphSlamError) else f"{type(error).__name__}: {error}"
         return response
 
-    def save(self) -> str:
+    def save(self, release: str = "flush") -> str:
         """Release what waits, solve, and write the run folder; returns its name."""
         if self._recorder is None:
             raise GraphSlamError("output.folder is empty: nowhere to save")
         if not self._saved:
-            for event in ("flush", "optimize"):
+            for event in (release, "optimize"):
                 self._process(Control(event))
+        folder = str(self._recorder.save(self._slam))
         self._saved = True
-        return str(self._recorder.save(self._slam))
+        return folder
 
     def finish(self) -> None:
         """Save what was not saved yet, and end the recording."""
         if self._recorder is None:
             return
         if not self._saved:
-            self.get_logger().info(f"saved {self.save()}")
+            self.get_logger().info(f"saved {self.save('end')}")
         self._recorder.close()
 
 
@@ -191,7 +195,7 @@ class _Told:
 
 
 def main() -> int:
-    """Run the node until it is told to stop; returns the exit code: 0, or 2 where it was refused to start or save."""
+    """Run the node until it is told to stop; returns the exit code: 0, 1 our fault, 2 refused to start or save."""
     told = _Told()
     try:
         _init()
@@ -206,6 +210,9 @@ def main() -> int:
     except GraphSlamError as error:
         rclpy.logging.get_logger("graph_slam").fatal(str(error))
         return 2
+    except Exception as error:
+        rclpy.logging.get_logger("graph_slam").fatal(f"a fault of ours, {type(error).__name__}: {error}")
+        return 1
     finally:
         rclpy.try_shutdown()
     return 0

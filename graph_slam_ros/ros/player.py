@@ -34,9 +34,10 @@ from graph_slam_ros.replay import Inputs
 from graph_slam_ros.ros import to_msg
 from graph_slam_ros.ros.bag import Bag, BagMessage
 from graph_slam_ros.slam import Config
+from graph_slam_ros.slam.config import OrderingConfig
 
 _AHEAD = 256  # messages on their way
-_OVERTAKE_NS = 20_000_000  # well inside the node's ordering window
+_OVERTAKE_NS = 20_000_000  # at most, and well inside the node's ordering window
 _CLOCK_NS = 5_000_000
 _PATIENCE_S = 10.0
 _START_S = 300.0  # the first start of an installation compiles
@@ -49,7 +50,7 @@ class PlayError(GraphSlamError):
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """What was sent and what did not arrive; the folder the node saved, or why it did not."""
+    """What was sent and what did not arrive, and the folder the node saved."""
 
     sent: int
     lost: int
@@ -59,8 +60,11 @@ class Played:
 class Player:
     """A publisher of recorded messages that waits for a graph_slam node."""
 
-    def __init__(self, bag: Bag, inputs: Inputs, node_name: str, own: subprocess.Popen[bytes] | None) -> None:
+    def __init__(
+        self, bag: Bag, inputs: Inputs, node_name: str, window_s: float, own: subprocess.Popen[bytes] | None
+    ) -> None:
         self._bag, self._inputs, self._name, self._own = bag, inputs, node_name, own
+        self._overtake_ns = min(_OVERTAKE_NS, round(0.5e9 * window_s))
         self._node = Node("graph_slam_player")
         self._sent = self._received = self._lost = 0
         self._before: int | None = None
@@ -129,7 +133,8 @@ class Player:
         """Wait where the queues are full, or where it would matter which of two topics' messages arrives first."""
         stamp_ns = _stamp_ns(message.cdr)
         others = [stamps for topic, stamps in self._on_the_way.items() if topic != message.topic]
-        if any(stamp_ns - oldest >= _OVERTAKE_NS or newest - stamp_ns >= _OVERTAKE_NS for oldest, newest in others):
+        apart = self._overtake_ns
+        if any(stamp_ns - oldest >= apart or newest - stamp_ns >= apart for oldest, newest in others):
             self._settle()
         elif self._sent - self._received - self._lost >= _AHEAD:
             self._until_received(self._sent - self._lost - _AHEAD // 2)
@@ -170,11 +175,13 @@ class Player:
     def _save(self) -> str:
         client = self._node.create_client(Trigger, f"{self._name}/save")
         if not client.wait_for_service(timeout_sec=_PATIENCE_S):
-            return f"no service {self._name}/save"
+            raise PlayError(f"no service {self._name}/save")
         future = client.call_async(Trigger.Request())
         rclpy.spin_until_future_complete(self._node, future, timeout_sec=300.0)
         answer = future.result()
-        return "no answer" if answer is None else answer.message
+        if answer is None or not answer.success:
+            raise PlayError(f"{self._name}/save: {answer.message if answer else 'no answer'}")
+        return str(answer.message)
 
 
 def play(
@@ -182,6 +189,7 @@ def play(
     inputs: Inputs,
     *,
     node_name: str = "/graph_slam",
+    window_s: float = OrderingConfig().window_s,
     own: subprocess.Popen[bytes] | None = None,
     rate: float | None = None,
     progress: Callable[[Iterable[Any], int], Iterable[Any]] = lambda items, total: items,
@@ -189,7 +197,7 @@ def play(
     """Play a recording into the running node of that name, or into one of our own (``own_node``)."""
     rclpy.init(args=[])
     try:
-        player = Player(bag, inputs, node_name, own)
+        player = Player(bag, inputs, node_name, window_s, own)
         try:
             return player.play(rate, progress)
         finally:

@@ -157,17 +157,19 @@ class OrderingConfig:
     window_s: float = _setting(
         0.05, "how much later than newer odometry a message may come, in stamp time", "s", low=0.0
     )
-    max_waiting: int = _setting(1000, "messages that may wait for their turn, or for odometry", "messages", low=1)
+    max_waiting: int = _setting(
+        1000, "messages that may wait for their turn, or for odometry", "messages", low=1, high=1_000_000
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class SolveConfig:
     """When and how the graph is solved."""
 
-    every_keyframes: int = _setting(20, "solve after this many keyframes", "keyframes", low=1)
+    every_keyframes: int = _setting(20, "solve after this many keyframes", "keyframes", low=1, high=1_000_000)
     closure_gap_s: float = _setting(30.0, "and when a landmark returns that was not seen for this long", "s", low=0.0)
     closure_keyframes: int = _setting(
-        10, "but a return does not solve again within this many keyframes of the last solve", "keyframes", low=0
+        10, "but a return does not solve again within this many keyframes", "keyframes", low=0, high=1_000_000
     )
     method: str = _setting("gn", "gn (damped only where it fails to converge) or lm", choices=("gn", "lm"))
     max_iterations: int = _setting(50, "of each stage of the losses", "", low=1, high=10_000)
@@ -190,7 +192,7 @@ class InputsConfig:
     """Subscriptions of the node."""
 
     reliable: bool = _setting(False, "ask for reliable delivery (a best-effort publisher then does not connect)")
-    depth: int = _setting(1000, "messages the middleware may hold for a subscription", "messages", low=1)
+    depth: int = _setting(1000, "messages the middleware may hold for a subscription", "messages", low=1, high=100_000)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,16 +1,25 @@
 """Nothing is dropped or repaired silently: each case adds to a counter by (source, reason)."""
 
 from collections import Counter
+from collections.abc import Callable
 
 
 class Counters:
-    """Counts by (source, reason); a source is a topic or an input's name."""
+    """Counts by (source, reason); a source is a topic or an input's name.
+
+    Attributes
+    ----------
+    on_first : called with source and reason the first time each is counted
+    """
 
     def __init__(self) -> None:
         self._counts: Counter[tuple[str, str]] = Counter()
+        self.on_first: Callable[[str, str], None] = lambda source, reason: None
 
     def count(self, source: str, reason: str, times: int = 1) -> None:
         """Add to one counter."""
+        if (source, reason) not in self._counts:
+            self.on_first(source, reason)
         self._counts[source, reason] += times
 
     def __getitem__(self, key: tuple[str, str]) -> int:

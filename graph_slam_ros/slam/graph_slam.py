@@ -3,6 +3,7 @@
 Its state is a function of the configuration and the sequence of accepted measurements, nothing else.
 """
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -24,7 +25,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.measurements import Control, Measurement, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.motion import Motion
+from graph_slam_ros.slam.motion import Motion, Moved
 from graph_slam_ros.slam.stamp_order import NS, StampOrder
 from graph_slam_ros.solver import Report, Settings, Solver
 
@@ -96,7 +97,7 @@ class GraphSlam:
         self._sink = sink
         self._order = StampOrder(self.config.ordering, self.counters)
         self._odometry: Odometry | None = None
-        self._motion = Motion(self.config.odometry)
+        self._motions: deque[Motion] = deque(maxlen=2)  # since the newest keyframe, and since the one before
         self._waiting: list[Sightings] = []
         self._covariance = np.zeros((3, 3))
         self._handed_over = 0, 0  # vertices and edges the solver has
@@ -116,6 +117,8 @@ class GraphSlam:
             case Odometry() | Sightings():
                 self._use(self._order.push(measurement))
             case Control("flush"):
+                self._use(self._order.flush())
+            case Control("end"):
                 self._use(self._order.flush())
                 self._drop_unreached()
             case Control("optimize"):
@@ -195,16 +198,17 @@ class GraphSlam:
         if m.stamp_ns == self._odometry.stamp_ns:
             self.counters.count("odometry", "duplicate" if m == self._odometry else "duplicate_stamp")
             return
-        self._see_waiting(m)
-        self._motion.step(self._odometry, m)
+        self._motions[-1].step(m)
         self._odometry = m
+        self._see_waiting()
         if self._keyframe_due():
             self._next_keyframe(m)
 
     def _keyframe_due(self) -> bool:
-        due, (x, y, theta) = self.config.keyframes, self._motion.T_keyframe_base
+        due, motion = self.config.keyframes, self._motions[-1]
+        x, y, theta = motion.now.T_keyframe_base
         far = x * x + y * y >= due.min_distance_m**2 or abs(theta) >= due.min_angle_rad
-        return far or self._motion.moving_s >= due.max_interval_s
+        return far or motion.moving_s >= due.max_interval_s
 
     def _first_keyframe(self, m: Odometry) -> None:
         """Map begins where odom begins: the first pose is anchored at its odometry pose."""
@@ -214,61 +218,60 @@ class GraphSlam:
         self._covariance = np.diag([anchor.sigma_m**2, anchor.sigma_m**2, anchor.sigma_rad**2])
         self.graph.add_edge(POSE_PRIOR, [vertex], m.T_odom_base, noise, "anchor")
         self.keyframes.append(Keyframe(vertex, m.stamp_ns, m.T_odom_base))
+        self._motions.append(Motion(self.config.odometry, 0, m))
 
     def _next_keyframe(self, m: Odometry) -> None:
-        motion, last = self._motion, self.keyframes[-1]
+        motion, last = self._motions[-1].now, self.keyframes[-1]
         noise = self._noise("odometry", motion.covariance)
         vertex = self.graph.add_vertex(SE2, se2.compose(self._pose(last), motion.T_keyframe_base))
         self.graph.add_edge(RELATIVE_POSE, [last.vertex, vertex], motion.T_keyframe_base, noise, "odometry")
         self.keyframes.append(Keyframe(vertex, m.stamp_ns, m.T_odom_base))
         self._covariance = se2.propagate(self._covariance, motion.T_keyframe_base, motion.covariance)
-        motion.restart()
+        self._motions.append(Motion(self.config.odometry, len(self.keyframes) - 1, m))
         self._unsolved_keyframes += 1
         self._solve_if_due()
 
     # -- landmarks -----------------------------------------------------------------------------------------------
 
     def _on_sightings(self, m: Sightings) -> None:
-        """Use what was seen at the newest odometry; what is newer waits for the odometry on its other side."""
+        """Use what was seen since the keyframe before last; what is newer than all odometry waits for the next."""
         if self._odometry is None or m.stamp_ns < self.keyframes[0].stamp_ns:
             self.counters.count(m.topic, "before_odometry", len(m.sightings))
-        elif m.stamp_ns < self._odometry.stamp_ns:
+        elif m.stamp_ns < self._motions[0].start_ns:
             self.counters.count(m.topic, "late", len(m.sightings))
-        elif m.stamp_ns == self._odometry.stamp_ns:
-            self._see(m, self._motion.T_keyframe_base, self._motion.covariance)
+        elif m.stamp_ns <= self._odometry.stamp_ns:
+            self._see(m)
         elif len(self._waiting) >= self.config.ordering.max_waiting:
             self.counters.count(m.topic, "overflow", len(m.sightings))
         else:
             self._waiting.append(m)
 
-    def _see_waiting(self, ahead: Odometry) -> None:
-        """Use what was seen between the last odometry and the one ahead, by interpolation."""
-        assert self._odometry is not None
-        for m in self._waiting:
-            between = self._motion.between(self._odometry, ahead, m.stamp_ns)
-            self._see(m, between.T_keyframe_base, between.covariance)
-        self._waiting.clear()
+    def _see_waiting(self) -> None:
+        """Use what waited for the odometry that has come."""
+        if self._waiting:
+            waiting, self._waiting = self._waiting, []
+            for m in waiting:
+                self._on_sightings(m)
 
     def _drop_unreached(self) -> None:
         for m in self._waiting:
             self.counters.count(m.topic, "after_odometry", len(m.sightings))
         self._waiting.clear()
 
-    def _see(self, m: Sightings, T_keyframe_base: se2.Pose, covariance: Array) -> None:
-        """Carry sightings to the newest keyframe by the odometry since, whose noise adds to theirs."""
-        self.sighting_poses.append(SightingPose(m.stamp_ns, len(self.keyframes) - 1, T_keyframe_base))
+    def _see(self, m: Sightings) -> None:
+        """Carry sightings to the keyframe before them by the odometry in between, whose noise adds to theirs."""
+        motion = next(motion for motion in reversed(self._motions) if motion.start_ns <= m.stamp_ns)
+        moved, keyframe = motion.at(m.stamp_ns), self.keyframes[motion.keyframe]
+        self.sighting_poses.append(SightingPose(m.stamp_ns, motion.keyframe, moved.T_keyframe_base))
         for sighting in m.sightings:
-            self._add_sighting(m.topic, sighting, m.stamp_ns, T_keyframe_base, covariance)
+            self._add_sighting(m.topic, sighting, m.stamp_ns, keyframe, moved)
         self._solve_if_due()
 
-    def _add_sighting(
-        self, topic: str, sighting: Sighting, stamp_ns: int, T_keyframe_base: se2.Pose, motion_covariance: Array
-    ) -> None:
-        keyframe = self.keyframes[-1]
+    def _add_sighting(self, topic: str, sighting: Sighting, stamp_ns: int, keyframe: Keyframe, moved: Moved) -> None:
         landmark = self.landmarks.get(sighting.id)
         is_point = len(sighting.measured) == 2 or (landmark is not None and self.graph.kind_of(landmark.vertex) is R2)
         carry = _carry_point if is_point else _carry_pose
-        measured, covariance = carry(sighting, T_keyframe_base, motion_covariance)
+        measured, covariance = carry(sighting, moved.T_keyframe_base, moved.covariance)
         covariance[:2, :2] += self.config.landmarks.added_sigma_m**2 * np.eye(2)
         noise = self._noise(topic, covariance)
         if landmark is None:
@@ -308,6 +311,8 @@ class GraphSlam:
     def _hand_over(self) -> None:
         """Give the solver what is new in the graph."""
         vertices, edges = self._handed_over
+        if (vertices, edges) == (self.graph.vertex_count, self.graph.edge_count):
+            return
         self._handed_over = self.graph.vertex_count, self.graph.edge_count
         self.solver.add(range(vertices, self.graph.vertex_count), range(edges, self.graph.edge_count))
 

@@ -50,7 +50,10 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True)
 class Control:
-    """An event that is not a measurement: ``flush`` releases what waits for its turn, ``optimize`` solves now."""
+    """An event that is not a measurement.
+
+    ``flush`` releases what waits for its turn, ``end`` also gives up what no odometry reached, ``optimize`` solves now.
+    """
 
     event: str
 

@@ -55,7 +55,7 @@ class StampOrder:
         return self._release(self._newest_odometry_ns - self._window_ns)
 
     def flush(self) -> list[Odometry | Sightings]:
-        """Release everything that waits."""
+        """Release everything that waits for its turn."""
         return self._release(max((entry[0] for entry in self._heap), default=0))
 
     def _release(self, until_ns: int) -> list[Odometry | Sightings]:
