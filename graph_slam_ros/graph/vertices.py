@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.lie.jit import kernel
 
 Array = NDArray[np.float64]
 
@@ -28,8 +29,13 @@ class VertexKind:
     local: Callable[[Array, Array], Array]
 
 
+@kernel
 def _retract_se2(values: Array, steps: Array) -> Array:
-    return np.stack(se2.retract(tuple(values.T), tuple(steps.T)), axis=-1)
+    """Compiled: the last digit of NumPy's sine of an array may depend on where in memory the array is."""
+    out = np.empty((len(values), 3))
+    for i in range(len(values)):
+        out[i] = se2.retract((values[i, 0], values[i, 1], values[i, 2]), (steps[i, 0], steps[i, 1], steps[i, 2]))
+    return out
 
 
 def _local_se2(a: Array, b: Array) -> Array:
