@@ -60,10 +60,10 @@ setup(
     zip_safe=False,
     # Each lower bound is what `make test-oldest` runs with (constraints-oldest.txt).
     install_requires=[
-        "numpy>=1.23.5",
-        "scipy>=1.9.3",
-        "numba>=0.57.1",
-        "rosbags>=0.10.9",
+        "numpy>=1.26.4",
+        "scipy>=1.11.4",
+        "numba>=0.59.1",
+        "rosbags>=0.11.0",
         "mcap>=1.3.0",
         "PyYAML>=6.0",
         "matplotlib>=3.6.3",

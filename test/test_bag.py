@@ -14,6 +14,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.replay import choose_inputs, replay
 from graph_slam_ros.ros.bag import BagError, BagWriter, open_bag
 from graph_slam_ros.ros.definitions import recorded_decoder
@@ -500,3 +501,29 @@ def test_reading_writes_nothing_beside_the_recording(tmp_path, recorded):
     shutil.copy(recorded, tmp_path / "b.mcap")
     read(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["b.mcap"]
+
+
+def test_a_recording_split_by_topic_is_read_in_order_of_time(tmp_path):
+    whole = tmp_path / "whole.mcap"
+    write_bag(simulate("warehouse", 3, aisles=2, laps=1, aisle_m=6.0), whole)
+    bag, parts = open_bag(whole), tmp_path / "parts"
+    parts.mkdir()
+    for name, topic in (("a", "/landmarks"), ("b", "/odom")):
+        with BagWriter(parts / f"{name}.mcap") as part:
+            for message in bag.messages({topic}):
+                part.write(topic, bag.topics[topic].type, message.log_ns, message.cdr)
+    together, apart = (replay(source, tmp_path / f"{source.stem}_run") for source in (whole, parts))
+    assert apart.slam.graph.edge_count == together.slam.graph.edge_count
+    assert apart.summary["counters"] == together.summary["counters"]
+
+
+def test_a_run_s_graph_keeps_the_classes_of_its_edges(tmp_path):
+    write_bag(simulate("warehouse", 3, aisles=2, laps=1, aisle_m=6.0), tmp_path / "bag.mcap")
+    done = replay(tmp_path / "bag.mcap", tmp_path / "run")
+    graph = read_g2o(tmp_path / "run" / "graph.g2o").graph
+    assert set(graph.labels) == {"anchor", "odometry", "landmarks"}
+    count: dict[str, int] = {}
+    for table in graph.tables.values():
+        for code, label in enumerate(graph.labels):
+            count[label] = count.get(label, 0) + int((table.label.values == code).sum())
+    assert count == {name: part["edges"] for name, part in done.summary["classes"].items()}

@@ -112,6 +112,22 @@ def test_the_graph_is_a_function_of_the_ingest_sequence(recorded, in_order, tmp_
     assert g2o(in_order, tmp_path) != g2o(messy, tmp_path)
 
 
+def test_saving_on_the_way_costs_no_measurement():
+    seen_ahead = [
+        m for k in range(40) for m in (odometry(k, (0.3 * k, 0, 0)), seen(k + 0.02, point()), Control("flush"))
+    ]
+    p = run(slam(), *seen_ahead, odometry(40, (12.0, 0, 0)), *END)
+    assert p.landmarks["a"].sightings == 40
+    assert p.counters.as_dict() == {}
+
+
+def test_a_sighting_that_comes_late_is_carried_to_the_keyframe_before_it():
+    in_time = run(slam(), *straight(1), seen(0.75, point()), *END)
+    late = run(slam(), *straight(1), Control("flush"), seen(0.75, point()), *END)
+    assert late.sighting_poses == in_time.sighting_poses
+    assert late.counters.as_dict() == {}
+
+
 def test_B3_odometry_of_one_stamp_is_used_once_and_counted_by_whether_it_differs():
     p = run(slam(), odometry(0, (0, 0, 0)), odometry(1, (1, 0, 0)), odometry(1, (1, 0, 0)), odometry(1, (9, 0, 0)))
     p.process(odometry(2, (2, 0, 0)))
