@@ -208,7 +208,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     draw_run(args.run_folder, args.truth, picture)
     if not args.json:
         _say(f"picture in {picture}")
-    return DONE
+    return _told(scores.losses)
 
 
 def _warmup(args: argparse.Namespace) -> int:

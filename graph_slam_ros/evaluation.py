@@ -5,6 +5,7 @@ where both have a stamp within 0.05 s.
 """
 
 import csv
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se2
 from graph_slam_ros.ros.bag import Bag, open_bag
-from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.ros.definitions import recorded_decoder
 
 Array = NDArray[np.float64]
 
@@ -54,10 +55,17 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What is known to be true; ``landmarks`` holds positions (x, y) in metres by id, where they are known."""
+    """What is known to be true.
+
+    Attributes
+    ----------
+    landmarks : positions (x, y) in metres by id, where they are known
+    losses : what of the recording could not be read
+    """
 
     trajectory: Trajectory
     landmarks: dict[str, tuple[float, float]]
+    losses: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,11 +85,13 @@ class Scores:
     ----------
     odometry : the same for dead reckoning, or None where the run has none
     map_rmse_m : of landmarks with the same id, aligned by themselves; None with fewer than two or without truth
+    losses : what of the truth could not be read
     """
 
     estimate: PathError
     odometry: PathError | None
     map_rmse_m: float | None
+    losses: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; ``map_m`` and ``odometry`` are None where there are none."""
@@ -129,6 +139,7 @@ def evaluate(run: Path, truth: str | Path, estimate: str = "sightings.tum") -> S
         path_error(read_tum(run / estimate), known.trajectory),
         path_error(read_tum(odometry), known.trajectory) if odometry.exists() else None,
         _map_rmse(read_landmarks(run / "landmarks.csv"), known.landmarks),
+        known.losses,
     )
 
 
@@ -283,7 +294,8 @@ def read_truth(truth: str | Path) -> Truth:
     if path.suffix in (".tum", ".txt"):
         return Truth(read_tum(path), {})
     bag = open_bag(path)
-    return Truth(_recorded_poses(bag, topic or _truth_topic(bag, path), path), _recorded_landmarks(bag))
+    poses, landmarks = _recorded_poses(bag, topic or _truth_topic(bag, path), path), _recorded_landmarks(bag)
+    return Truth(poses, landmarks, tuple(bag.losses))
 
 
 def _truth_topic(bag: Bag, path: Path) -> str:
@@ -305,10 +317,8 @@ def _listed(bag: Bag) -> str:
 def _recorded_poses(bag: Bag, topic: str, path: Path) -> Trajectory:
     if topic not in bag.topics or bag.topics[topic].type not in _POSE_TYPES:
         raise GraphSlamError(f"{path}: no topic {topic} of poses; {_listed(bag)}")
-    kind = bag.topics[topic].type
     stamps, rows = [], []
-    for record in bag.messages([topic]):
-        message: Any = typestore().deserialize_cdr(record.cdr, kind)
+    for message in _decoded(bag, topic):
         p, q = _position_and_orientation(message)
         # One rounding, as of the decimal text in a TUM file: equal stamps stay equal.
         stamps.append((message.header.stamp.sec * 10**9 + message.header.stamp.nanosec) / 10**9)
@@ -317,6 +327,18 @@ def _recorded_poses(bag: Bag, topic: str, path: Path) -> Trajectory:
         raise GraphSlamError(f"{path}: no message on {topic}")
     table = np.array(rows)
     return _trajectory(np.array(stamps), table[:, :2], table[:, 2:])
+
+
+def _decoded(bag: Bag, topic: str) -> Iterator[Any]:
+    decode = recorded_decoder(bag.topics[topic])
+    for record in bag.messages([topic]):
+        try:
+            message = decode(record.cdr)
+        except Exception:  # of damaged bytes rosbags raises almost anything
+            loss = f"a message on {topic} cannot be decoded"
+            bag.losses += [loss] if loss not in bag.losses else []
+            continue
+        yield message
 
 
 def _position_and_orientation(message: Any) -> tuple[Any, Any]:
@@ -331,8 +353,7 @@ def _recorded_landmarks(bag: Bag) -> dict[str, tuple[float, float]]:
     if TRUE_LANDMARKS_TOPIC not in bag.topics or bag.topics[TRUE_LANDMARKS_TOPIC].type != kind:
         return {}
     out = {}
-    for record in bag.messages([TRUE_LANDMARKS_TOPIC]):
-        message: Any = typestore().deserialize_cdr(record.cdr, kind)
+    for message in _decoded(bag, TRUE_LANDMARKS_TOPIC):
         for detection in message.detections:
             at = detection.bbox.center.position
             out[detection.id] = (float(at.x), float(at.y))

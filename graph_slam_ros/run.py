@@ -4,6 +4,7 @@
 ``odometry.tum``, ``landmarks.csv``, ``run.mcap``, ``ingest.mcap``, ``config.yaml``, ``run.json``.
 """
 
+import itertools
 import json
 import os
 import re
@@ -24,6 +25,16 @@ from graph_slam_ros.slam.measurements import to_record
 SUMMARY, _CONFIG = "run.json", "config.yaml"
 _RECORDED = re.compile(r"(ingest|run)(_\d+)?\.mcap")
 
+_RESULTS = {
+    SUMMARY,
+    "graph.g2o",
+    "graph_vertices.csv",
+    "path.tum",
+    "sightings.tum",
+    "odometry.tum",
+    "landmarks.csv",
+    "path.png",
+}
 _PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
 
 
@@ -54,6 +65,18 @@ def check_room(folder: Path, source: Path | None = None) -> None:
             raise RunError(f"{folder}: cannot be read from and written to at once")
         if folder.exists() and any(folder.iterdir()) and not is_run(folder):
             raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
+    except OSError as error:
+        raise RunError(f"{folder}: {error.strerror}") from None
+
+
+def keep_earlier(folder: Path | str) -> None:
+    """Move an earlier run out of the way: to ``folder-1``, or the first such name that is free."""
+    folder = Path(folder)
+    if not is_run(folder):
+        return
+    free = next(name for k in itertools.count(1) if not (name := folder.with_name(f"{folder.name}-{k}")).exists())
+    try:
+        folder.rename(free)
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None
 
@@ -201,7 +224,7 @@ def _make_room(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for file in folder.iterdir():
-            if file.name == SUMMARY or _RECORDED.fullmatch(file.name):
+            if file.name in _RESULTS or _RECORDED.fullmatch(file.name):
                 file.unlink()
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None

@@ -270,7 +270,7 @@ def test_ctrl_c_during_a_replay_shows_no_traceback_and_leaves_a_run_that_may_be_
 ):
     p = process("replay", long_bag, "--out", tmp_path / "run")
     deadline = time.monotonic() + 60
-    while not (tmp_path / "run" / "config.yaml").exists():
+    while not (tmp_path / "run" / "run.mcap").exists():
         assert time.monotonic() < deadline
         time.sleep(0.01)
     p.send_signal(signal.SIGINT)

@@ -309,6 +309,8 @@ def session(messages, tmp_path_factory):
         with robot(name="late_joiner") as late:
             until(lambda: all(late.heard[t] for t in ("path", "pose", "landmarks")), late.spin, "latched message")
             late_heard = dict(late.heard)
+        for topic in ("path", "pose", "landmarks"):  # on a busy machine the last ones may still be on their way
+            until(lambda t=topic: r.heard[t][-1] == late_heard[t][-1], r.spin, f"last {topic}")
         stopped = n.stop()
     return {
         "heard": r.heard,

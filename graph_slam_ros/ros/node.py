@@ -1,9 +1,12 @@
 """The ROS node: subscribes, hands every message to the pipeline, publishes what changed."""
 
+import os
 import signal
 import sys
 from collections.abc import Callable
 from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy comes in: threads would reorder sums
 
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -23,7 +26,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.from_msg import Border
 from graph_slam_ros.ros.params import declare_parameters
-from graph_slam_ros.run import RunRecorder
+from graph_slam_ros.run import RunRecorder, keep_earlier
 from graph_slam_ros.slam import Control, GraphSlam, Measurement
 from graph_slam_ros.warmup import warmup
 
@@ -40,6 +43,8 @@ class GraphSlamNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__("graph_slam", **options)
         config = declare_parameters(self)
+        if config.output.folder and config.output.keep_earlier:
+            keep_earlier(config.output.folder)
         self._recorder = RunRecorder(config.output.folder, config) if config.output.folder else None
         self.get_logger().info("compiling kernels (once per installation)")
         self.get_logger().info(f"kernels ready after {warmup():.1f} s")

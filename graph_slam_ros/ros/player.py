@@ -214,7 +214,7 @@ def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subproces
     config = replace(
         config,
         inputs=replace(config.inputs, reliable=True),
-        output=replace(config.output, folder=str(folder)),
+        output=replace(config.output, folder=str(folder), keep_earlier=False),
     )
     with tempfile.TemporaryDirectory() as scratch:
         parameters = Path(scratch) / "parameters.yaml"

@@ -200,6 +200,7 @@ class OutputConfig:
     """What the node leaves behind."""
 
     folder: str = _setting("graph_slam_run", "run folder written by ~/save and at shutdown; empty: none at shutdown")
+    keep_earlier: bool = _setting(True, "an earlier run in the folder is renamed (folder-1, ...), not replaced")
     pose_covariance_max: float = _setting(
         1e6, "variance published for what a planar robot does not estimate (z, roll, pitch)", "m^2, rad^2", low=0.0
     )
