@@ -369,7 +369,8 @@ def test_transforms_are_dated_ahead_of_the_odometry_by_the_tolerance(session, me
 def test_poses_come_for_every_keyframe_with_a_covariance_that_is_one(session):
     heard = session["heard"]["pose"]
     stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in heard]
-    assert stamps == sorted(set(stamps))
+    assert stamps == sorted(stamps)  # a solve between two keyframes sends the newest again, corrected
+    assert len(set(stamps)) > 10
     for m in heard:
         full = np.reshape(m.pose.covariance, (6, 6))
         assert np.linalg.eigvalsh(full)[0] > 0.0
