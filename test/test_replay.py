@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -211,7 +210,6 @@ def test_a_landmarks_name_may_hold_anything(tmp_path, folder):
     assert contents(tmp_path / "again") == contents(tmp_path / "named")
 
 
-@pytest.mark.skipif(version("rosbags").startswith("0.10."), reason="this rosbags reads folders only")
 def test_the_recording_of_a_run_is_read_by_mcap_and_by_rosbags(folder):
     types = {
         "/path": "nav_msgs/msg/Path",
