@@ -63,7 +63,7 @@ def check_room(folder: Path, source: Path | None = None) -> None:
     try:
         if source is not None and folder.resolve() in (source.resolve(), source.resolve().parent):
             raise RunError(f"{folder}: cannot be read from and written to at once")
-        if folder.exists() and any(folder.iterdir()) and not is_run(folder):
+        if folder.exists() and not is_run(folder) and not all(map(_is_of_a_start, folder.iterdir())):
             raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None
@@ -219,12 +219,17 @@ def _csv(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\n\r') else text
 
 
+def _is_of_a_start(file: Path) -> bool:
+    """What a run that was stopped as it began may have left, before its folder can be told for a run."""
+    return file.name.removesuffix(".new") == _CONFIG or _RECORDED.fullmatch(file.name) is not None
+
+
 def _make_room(folder: Path) -> None:
     check_room(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for file in folder.iterdir():
-            if file.name in _RESULTS or _RECORDED.fullmatch(file.name):
+            if file.name in _RESULTS or _is_of_a_start(file):
                 file.unlink()
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None
