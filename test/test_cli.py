@@ -245,9 +245,14 @@ def test_a_fault_of_ours_is_one_line_with_code_1(bag, tmp_path, capsys, monkeypa
 
 
 def process(*words, **options):
-    return subprocess.Popen(
-        [COMMAND, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options
-    )
+    # a shell starts what it runs in the background with Ctrl-C ignored, and that is inherited
+    heard = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(
+            [COMMAND, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options
+        )
+    finally:
+        signal.signal(signal.SIGINT, heard)
 
 
 def test_the_installed_command_passes_its_exit_code_on(tmp_path):
