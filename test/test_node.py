@@ -429,7 +429,7 @@ def test_a_signal_saves_the_run_and_ends_the_node_with_0_within_3_seconds(messag
 
 
 def test_a_node_without_output_folder_runs_and_refuses_to_save(messages, tmp_path):
-    with node("output.folder:=''", cwd=tmp_path) as n, robot() as r:
+    with node("output.folder:=''", "inputs.reliable:=true", cwd=tmp_path) as n, robot() as r:
         r.wait_for_node()
         r.drive(messages[:200])
         until(lambda: r.heard["path"], r.spin, "path")
