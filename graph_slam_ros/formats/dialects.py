@@ -1,87 +1,201 @@
-"""Other texts for graphs, said in g2o's words: TORO and iSAM (VERTEX2, EDGE2, ...), GTSAM (ODOMETRY, LANDMARK).
+"""Other texts for graphs, said in g2o's words and back: TORO, iSAM (VERTEX2, EDGE2), GTSAM (ODOMETRY, LANDMARK).
 
-Each line is turned into the g2o line of the same meaning, so there is one reader, one set of checks and one graph.
+Each line is turned into the g2o line of the same meaning, so there is one reader, one set of checks and one graph; and
+a g2o line into the line of the same meaning, so there is one writer.
+
+* TORO: the information of EDGE2 as I11 I12 I22 I33 I13 I23, that of EDGE3 in rows of the upper triangle; angles in
+  radians, roll, pitch and yaw about fixed axes. It has poses and what is between them, nothing else.
+* GTSAM: covariances, in rows of the upper triangle, in the plane. Landmarks have numbers of their own.
 """
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.strict import expect, integer, numbers
-from graph_slam_ros.lie import so3
+from graph_slam_ros.lie import se2, so3
 
 Array = NDArray[np.float64]
+Words: TypeAlias = list[str]
 
 LANDMARK_IDS_FROM = 1_000_000_000  # GTSAM's text numbers landmarks apart from poses
 
-_TORO = [0, 1, 4, 2, 5, 3]  # TORO writes I11 I12 I22 I33 I13 I23, g2o the rows of the upper triangle
+_TORO = [0, 1, 4, 2, 5, 3]  # where g2o's rows of the upper triangle stand in TORO's order
+_TO_TORO = [0, 1, 3, 5, 2, 4]
 _HALVED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
+_UPPER_3D = np.triu_indices(6)
 
 
-def in_g2o_words(words: list[str]) -> list[str]:
+@dataclass(frozen=True, slots=True)
+class Text:
+    """How the lines of a text are meant.
+
+    Attributes
+    ----------
+    dialect : ``g2o``, ``toro`` or ``gtsam``; None: each line is known by its tag
+    raw : whether g2o's information of rotations in space belongs to the rotation vector, as TORO's does
+    landmarks_from : what the text's number of a VERTEX_XY lacks to its id
+    """
+
+    dialect: str | None = None
+    raw: bool = False
+    landmarks_from: int = 0
+
+
+def in_g2o_words(words: Words, text: Text) -> Words:
     """The same line in g2o's words; a line that is of no dialect is returned as it is.
 
     Raises
     ------
     FormatError
-        Wrong number of fields, or fields that are not numbers.
+        Wrong number of fields, or fields that are not numbers; a line of another dialect than the text's.
     """
-    translate = _LINES.get(words[0])
-    return words if translate is None else translate(words)
+    tag = words[0]
+    if text.dialect and tag not in _TAGS[text.dialect] and any(tag in tags for tags in _TAGS.values()):
+        raise FormatError(f"{tag} is no line of a {text.dialect} file")
+    translate = _READ.get(tag)
+    return words if translate is None else translate(words, text)
 
 
-def _vertex2(words: list[str]) -> list[str]:
+def from_g2o_words(words: Words, text: Text) -> Words | None:
+    """The g2o line in the words of the text's dialect; None where that has no line for it."""
+    translate = _WRITTEN[text.dialect or "g2o"].get(words[0])
+    return None if translate is None else translate(words, text)
+
+
+# -- reading ---------------------------------------------------------------------------------------------------------
+
+
+def _vertex2(words: Words, _: Text) -> Words:
     expect(words, 4)
     return ["VERTEX_SE2", *words[1:]]
 
 
-def _edge2(words: list[str]) -> list[str]:
+def _edge2(words: Words, text: Text) -> Words:
+    """Files of other programs have the rows of the upper triangle: where only that is definite, it is meant."""
     expect(words, 11)
-    upper = numbers(words[6:])
-    toro = [upper[k] for k in _TORO]
-    return ["EDGE_SE2", *words[1:6], *_written(toro if _is_definite(toro) else upper)]
+    rows = numbers(words[6:])
+    toro = [rows[k] for k in _TORO]
+    is_rows = text.dialect is None and not _is_definite(toro) and _is_definite(rows)
+    return ["EDGE_SE2", *words[1:6], *_written(rows if is_rows else toro)]
 
 
-def _vertex3(words: list[str]) -> list[str]:
+def _vertex3(words: Words, _: Text) -> Words:
     expect(words, 7)
     return ["VERTEX_SE3:QUAT", words[1], *_written(_pose(numbers(words[2:])))]
 
 
-def _edge3(words: list[str]) -> list[str]:
+def _edge3(words: Words, text: Text) -> Words:
     """Without an information matrix it is the identity; its rotations are taken as rotation vectors."""
     if len(words) != 9:
         expect(words, 29)
     values = numbers(words[3:])
-    upper = np.triu_indices(6)
-    information = np.zeros((6, 6))
-    information[upper] = values[6:] if len(values) > 6 else np.eye(6)[upper]
-    scaled = information / np.outer(_HALVED, _HALVED)
-    return ["EDGE_SE3:QUAT", *words[1:3], *_written(_pose(values[:6])), *_written(scaled[upper].tolist())]
+    information = np.array(values[6:]) if len(values) > 6 else np.eye(6)[_UPPER_3D]
+    if not text.raw:
+        information = information / np.outer(_HALVED, _HALVED)[_UPPER_3D]
+    return ["EDGE_SE3:QUAT", *words[1:3], *_written(_pose(values[:6])), *_written(information.tolist())]
 
 
-def _odometry(words: list[str]) -> list[str]:
+def _odometry(words: Words, _: Text) -> Words:
     expect(words, 11)
-    xx, xy, xt, yy, yt, tt = numbers(words[6:])
-    covariance = np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
-    return ["EDGE_SE2", *words[1:6], *_written(_inverse_upper(covariance))]
+    return ["EDGE_SE2", *words[1:6], *_written(_inverse(numbers(words[6:]), "covariance"))]
 
 
-def _landmark(words: list[str]) -> list[str]:
+def _landmark(words: Words, _: Text) -> Words:
     expect(words, 7)
-    xx, xy, yy = numbers(words[5:])
     landmark = str(LANDMARK_IDS_FROM + integer(words[2]))
-    information = _inverse_upper(np.array([[xx, xy], [xy, yy]]))
-    return ["EDGE_SE2_XY", words[1], landmark, *words[3:5], *_written(information)]
+    return ["EDGE_SE2_XY", words[1], landmark, *words[3:5], *_written(_inverse(numbers(words[5:]), "covariance"))]
 
 
-_LINES = {
+def _point(words: Words, text: Text) -> Words:
+    if len(words) < 2 or not text.landmarks_from:
+        return words
+    return ["VERTEX_XY", str(text.landmarks_from + integer(words[1])), *words[2:]]
+
+
+Translation: TypeAlias = Callable[[Words, Text], Words]
+
+_READ: dict[str, Translation] = {
     "VERTEX2": _vertex2,
     "EDGE2": _edge2,
     "VERTEX3": _vertex3,
     "EDGE3": _edge3,
     "ODOMETRY": _odometry,
     "LANDMARK": _landmark,
+    "VERTEX_XY": _point,
 }
+
+
+# -- writing ---------------------------------------------------------------------------------------------------------
+
+
+def _as_it_is(words: Words, _: Text) -> Words:
+    return words
+
+
+def _to_vertex2(words: Words, _: Text) -> Words:
+    return ["VERTEX2", *words[1:]]
+
+
+def _to_edge2(words: Words, _: Text) -> Words:
+    return ["EDGE2", *words[1:6], *(words[6 + k] for k in _TO_TORO)]
+
+
+def _to_vertex3(words: Words, _: Text) -> Words:
+    return ["VERTEX3", words[1], *_written(_xyz_rpy(numbers(words[2:])))]
+
+
+def _to_edge3(words: Words, text: Text) -> Words:
+    information = np.array(numbers(words[10:]))
+    if not text.raw:
+        information = information * np.outer(_HALVED, _HALVED)[_UPPER_3D]
+    return ["EDGE3", *words[1:3], *_written(_xyz_rpy(numbers(words[3:10]))), *_written(information.tolist())]
+
+
+def _to_odometry(words: Words, _: Text) -> Words:
+    return ["ODOMETRY", *words[1:6], *_written(_inverse(numbers(words[6:]), "information"))]
+
+
+def _to_landmark(words: Words, text: Text) -> Words:
+    landmark = str(integer(words[2]) - text.landmarks_from)
+    return ["LANDMARK", words[1], landmark, *words[3:5], *_written(_inverse(numbers(words[5:]), "information"))]
+
+
+def _to_point(words: Words, text: Text) -> Words:
+    return ["VERTEX_XY", str(integer(words[1]) - text.landmarks_from), *words[2:]]
+
+
+_G2O = ("VERTEX_SE2", "VERTEX_XY", "EDGE_SE2", "EDGE_SE2_XY", "EDGE_PRIOR_SE2", "EDGE_SE2_POSITION")
+_G2O_3D = ("VERTEX_SE3:QUAT", "VERTEX_TRACKXYZ", "EDGE_SE3:QUAT")
+
+_WRITTEN: dict[str, dict[str, Translation]] = {
+    "g2o": dict.fromkeys([*_G2O, *_G2O_3D, "FIX"], _as_it_is),
+    "toro": {
+        "VERTEX_SE2": _to_vertex2,
+        "EDGE_SE2": _to_edge2,
+        "VERTEX_SE3:QUAT": _to_vertex3,
+        "EDGE_SE3:QUAT": _to_edge3,
+    },
+    "gtsam": {
+        "VERTEX_SE2": _as_it_is,
+        "VERTEX_XY": _to_point,
+        "EDGE_SE2": _to_odometry,
+        "EDGE_SE2_XY": _to_landmark,
+    },
+}
+_TAGS = {
+    "g2o": frozenset(_WRITTEN["g2o"]),
+    "toro": frozenset({"VERTEX2", "EDGE2", "VERTEX3", "EDGE3"}),
+    "gtsam": frozenset({"VERTEX_SE2", "VERTEX2", "VERTEX_XY", "ODOMETRY", "LANDMARK"}),
+}
+DIALECTS = tuple(_TAGS)
+
+
+# -- numbers ---------------------------------------------------------------------------------------------------------
 
 
 def _pose(xyz_rpy: list[float]) -> list[float]:
@@ -91,17 +205,44 @@ def _pose(xyz_rpy: list[float]) -> list[float]:
     return [*xyz_rpy[:3], *(float(q) for q in so3.compose(so3.compose(about_z, about_y), about_x))]
 
 
+def _xyz_rpy(pose: list[float]) -> list[float]:
+    """Back from ``_pose``; exact to rounding also where the pitch is 90 degrees, since no arcsine is taken.
+
+    With half the sum and half the difference of roll and yaw, ``x + z`` and ``w - y`` are the sine and cosine of the
+    one times ``sqrt(2) sin(pi/4 - pitch/2)``, ``x - z`` and ``w + y`` those of the other times the cosine.
+    """
+    x, y, z, w = pose[3:7]
+    half_sum, half_difference = np.arctan2(x + z, w - y), np.arctan2(x - z, w + y)
+    pitch = 0.5 * np.pi - 2.0 * np.arctan2(np.hypot(x + z, w - y), np.hypot(x - z, w + y))
+    roll, yaw = se2.wrap(half_sum + half_difference), se2.wrap(half_sum - half_difference)
+    return [*pose[:3], float(roll), float(pitch), float(yaw)]
+
+
 def _is_definite(upper: list[float]) -> bool:
+    """Of the correlations, so that units do not matter."""
     a, b, c, d, e, f = upper
-    return a > 0 and a * d > b * b and a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d) > 0
+    if not (a > 0.0 and d > 0.0 and f > 0.0):
+        return False
+    b, c, e = b / (a * d) ** 0.5, c / (a * f) ** 0.5, e / (d * f) ** 0.5
+    return b * b < 1.0 and 1.0 + 2.0 * b * c * e > b * b + c * c + e * e
 
 
-def _inverse_upper(covariance: Array) -> list[float]:
-    if not np.isfinite(covariance).all() or np.linalg.det(covariance) <= 0.0:
-        raise FormatError("the covariance is not positive definite")
-    values: list[float] = np.linalg.inv(covariance)[np.triu_indices(len(covariance))].tolist()
-    return values
+def _inverse(upper: list[float], what: str) -> list[float]:
+    """Of a symmetric matrix by its upper triangle, through the correlations: units may differ by many orders."""
+    size = 3 if len(upper) == 6 else 2
+    matrix = np.zeros((size, size))
+    at = np.triu_indices(size)
+    matrix[at] = upper
+    matrix.T[at] = upper
+    if not (np.diagonal(matrix) > 0.0).all():
+        raise FormatError(f"the {what} is not positive definite")
+    scale = 1.0 / np.sqrt(np.diagonal(matrix))
+    correlation = matrix * scale[:, None] * scale
+    if np.linalg.det(correlation) <= 0.0:
+        raise FormatError(f"the {what} is not positive definite")
+    inverse: list[float] = (np.linalg.inv(correlation) * scale[:, None] * scale)[at].tolist()
+    return inverse
 
 
-def _written(values: list[float]) -> list[str]:
+def _written(values: list[float]) -> Words:
     return [repr(float(value)) for value in values]

@@ -3,19 +3,20 @@
 Information matrices are taken as they are, but for one thing: g2o measures a rotation in space by the vector part of
 its quaternion, which is half the rotation vector, so a rotation's information counts a quarter in our residual.
 Unknown tags are kept, word for word, and written back. TORO's, iSAM's and GTSAM's texts are read as well
-(``dialects``), and files without vertex lines.
+(``dialects``, and ``convert`` to write them), and files without vertex lines.
 """
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError, NoiseError
-from graph_slam_ros.formats.dialects import in_g2o_words
+from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, in_g2o_words
 from graph_slam_ros.formats.strict import expect, integer, lines, numbers
 from graph_slam_ros.graph import (
     INVERSE_RELATIVE_POSE,
@@ -35,14 +36,15 @@ from graph_slam_ros.graph import (
 )
 
 Array = NDArray[np.float64]
+Values: TypeAlias = Callable[[Sequence[int]], Array]
 
-_VERTEX_TAGS: dict[str, VertexKind] = {
+VERTEX_TAGS: dict[str, VertexKind] = {
     "VERTEX_SE2": SE2,
     "VERTEX_XY": R2,
     "VERTEX_SE3:QUAT": SE3,
     "VERTEX_TRACKXYZ": R3,
 }
-_EDGE_TAGS: dict[str, EdgeType] = {
+EDGE_TAGS: dict[str, EdgeType] = {
     "EDGE_SE2": RELATIVE_POSE,
     "EDGE_SE2_XY": LANDMARK_POSITION,
     "EDGE_PRIOR_SE2": POSE_PRIOR,
@@ -91,10 +93,10 @@ class _Edge:
 class _Reader:
     """State of one reading: what each line declared, before it becomes arrays."""
 
-    def __init__(self, name: str, lenient: bool, raw: bool) -> None:
-        self.name, self.lenient, self.raw = name, lenient, raw
+    def __init__(self, name: str, lenient: bool, text: Text) -> None:
+        self.name, self.lenient, self.text = name, lenient, text
         self.vertices: dict[int, tuple[str, list[float]]] = {}
-        self.edges: dict[str, list[_Edge]] = {tag: [] for tag in _EDGE_TAGS}
+        self.edges: dict[str, list[_Edge]] = {tag: [] for tag in EDGE_TAGS}
         self.fixed: list[tuple[int, int]] = []
         self.unknown: list[str] = []
         self.skipped: list[str] = []
@@ -113,11 +115,11 @@ class _Reader:
             self.label = words[2] if words[:2] == _CLASS and len(words) == 3 else self.label
             return
         try:
-            words = in_g2o_words(words)
+            words = in_g2o_words(words, self.text)
             tag = words[0]
-            if tag in _VERTEX_TAGS:
+            if tag in VERTEX_TAGS:
                 self._vertex(tag, words)
-            elif tag in _EDGE_TAGS:
+            elif tag in EDGE_TAGS:
                 self.edges[tag].append(self._edge(line, tag, words))
             elif tag == "FIX":
                 if len(words) < 2:
@@ -129,7 +131,7 @@ class _Reader:
             self.refuse(line, str(error))
 
     def _vertex(self, tag: str, words: list[str]) -> None:
-        kind = _VERTEX_TAGS[tag]
+        kind = VERTEX_TAGS[tag]
         expect(words, 1 + kind.size)
         vertex, value = integer(words[1]), _with_unit_quaternion(numbers(words[2:]), kind.size)
         if vertex in self.vertices and self.vertices[vertex] != (tag, value):
@@ -137,7 +139,7 @@ class _Reader:
         self.vertices[vertex] = (tag, value)
 
     def _edge(self, line: int, tag: str, words: list[str]) -> _Edge:
-        edge = _EDGE_TAGS[tag]
+        edge = EDGE_TAGS[tag]
         slots, m = len(edge.accepts), edge.residual_size
         expect(words, slots + edge.measured_size + m * (m + 1) // 2)
         vertices = tuple(integer(word) for word in words[1 : 1 + slots])
@@ -149,25 +151,25 @@ class _Reader:
         """A file of edges alone: its vertices are those the edges name, in order of id and without values."""
         self.has_values = False
         kinds: dict[int, str] = {}
-        tags = {kind: tag for tag, kind in _VERTEX_TAGS.items()}
+        tags = {kind: tag for tag, kind in VERTEX_TAGS.items()}
         for tag, edges in self.edges.items():
             for edge in edges:
-                for vertex, accepted in zip(edge.vertices, _EDGE_TAGS[tag].accepts, strict=True):
+                for vertex, accepted in zip(edge.vertices, EDGE_TAGS[tag].accepts, strict=True):
                     kinds.setdefault(vertex, tags[accepted[0]])
         nowhere = {"VERTEX_SE3:QUAT": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
         for vertex in sorted(kinds):
             tag = kinds[vertex]
-            self.vertices[vertex] = (tag, nowhere.get(tag, [0.0] * _VERTEX_TAGS[tag].size))
+            self.vertices[vertex] = (tag, nowhere.get(tag, [0.0] * VERTEX_TAGS[tag].size))
 
     def graph(self, relative_pose: EdgeType) -> G2oFile:
         graph = Graph()
         at: dict[int, int] = {}
         for file_id, (tag, value) in self.vertices.items():
-            at[file_id] = graph.add_vertex(_VERTEX_TAGS[tag], value)
-        poses = sorted(file_id for file_id, (tag, _) in self.vertices.items() if _VERTEX_TAGS[tag] in (SE2, SE3))
+            at[file_id] = graph.add_vertex(VERTEX_TAGS[tag], value)
+        poses = sorted(file_id for file_id, (tag, _) in self.vertices.items() if VERTEX_TAGS[tag] in (SE2, SE3))
         follows = dict(itertools.pairwise(poses))
         for tag, edges in self.edges.items():
-            edge_type = relative_pose if tag == "EDGE_SE2" else _EDGE_TAGS[tag]
+            edge_type = relative_pose if tag == "EDGE_SE2" else EDGE_TAGS[tag]
             for label, members in _by_label(tag, self._known(tag, edges), follows).items():
                 self._add(graph, edge_type, label, members, at)
         fixed = []
@@ -176,17 +178,17 @@ class _Reader:
                 fixed.append(at[file_id])
             else:
                 self.refuse(line, f"FIX names vertex {file_id}, which is not declared")
-        return G2oFile(graph, list(at), fixed, self.unknown, self.skipped, self.raw, self.has_values)
+        return G2oFile(graph, list(at), fixed, self.unknown, self.skipped, self.text.raw, self.has_values)
 
     def _known(self, tag: str, edges: Sequence[_Edge]) -> Iterator[_Edge]:
         """Edges whose vertices exist and are of the right kind, and whose information is positive definite."""
         for edge in edges:
-            for file_id, kinds in zip(edge.vertices, _EDGE_TAGS[tag].accepts, strict=True):
+            for file_id, kinds in zip(edge.vertices, EDGE_TAGS[tag].accepts, strict=True):
                 declared = self.vertices.get(file_id)
                 if declared is None:
                     self.refuse(edge.line, f"edge to vertex {file_id}, which is not declared")
                     break
-                if _VERTEX_TAGS[declared[0]] not in kinds:
+                if VERTEX_TAGS[declared[0]] not in kinds:
                     self.refuse(edge.line, f"{tag} to vertex {file_id}, which is a {declared[0]}")
                     break
             else:
@@ -197,7 +199,7 @@ class _Reader:
 
     def _add(self, graph: Graph, edge_type: EdgeType, label: str, edges: list[_Edge], at: dict[int, int]) -> None:
         information = _symmetric(np.array([e.information for e in edges]), edge_type.residual_size)
-        if edge_type in _HALVED and not self.raw:
+        if edge_type in _HALVED and not self.text.raw:
             information *= np.outer(_HALVED[edge_type], _HALVED[edge_type])
         good = list(range(len(edges)))
         try:
@@ -222,8 +224,15 @@ class _Reader:
         )
 
 
-def read_g2o(path: Path | str, *, error_map: str = "relative", lenient: bool = False, raw: bool = False) -> G2oFile:
-    """Read a g2o file.
+def read_g2o(
+    path: Path | str,
+    *,
+    error_map: str = "relative",
+    lenient: bool = False,
+    raw: bool = False,
+    dialect: str | None = None,
+) -> G2oFile:
+    """Read a g2o file, or a text of one of its dialects.
 
     Edges are labelled as the comments ``# class LABEL`` of our own files say. In other files relative poses between
     one pose and the next (in order of id) are labelled ``odometry``, others ``closures``, sightings ``landmarks``,
@@ -234,6 +243,8 @@ def read_g2o(path: Path | str, *, error_map: str = "relative", lenient: bool = F
     error_map : ``relative`` (g2o's, ours) or ``seed`` (residual of the inverse, python-graphslam's)
     lenient : leave out bad lines and list them in ``skipped`` instead of refusing the file
     raw : take the information of rotations in space as belonging to the rotation vector, unscaled
+    dialect : ``g2o``, ``toro`` or ``gtsam``: refuse lines of the others, and guess at nothing; by default each line is
+        known by its tag
 
     Raises
     ------
@@ -243,8 +254,12 @@ def read_g2o(path: Path | str, *, error_map: str = "relative", lenient: bool = F
     path = Path(path)
     if error_map not in ERROR_MAPS:
         raise FormatError(f"error map {error_map!r}: choose {' or '.join(ERROR_MAPS)}")
-    reader = _Reader(path.name, lenient, raw)
-    for number, text in lines(path):
+    if dialect not in (None, *DIALECTS):
+        raise FormatError(f"dialect {dialect!r}: choose {', '.join(DIALECTS)}")
+    numbered = list(lines(path))
+    own_numbers = dialect == "gtsam" or any(text.split(None, 1)[:1] == ["LANDMARK"] for _, text in numbered)
+    reader = _Reader(path.name, lenient, Text(dialect, raw, LANDMARK_IDS_FROM if own_numbers else 0))
+    for number, text in numbered:
         reader.take(number, text)
     if not reader.vertices:
         reader.declare_all()
@@ -253,13 +268,43 @@ def read_g2o(path: Path | str, *, error_map: str = "relative", lenient: bool = F
     return reader.graph(ERROR_MAPS[error_map])
 
 
-def write_g2o(path: Path | str, file: G2oFile, values: Callable[[Sequence[int]], Array]) -> None:
+def write_g2o(path: Path | str, file: G2oFile, values: Values) -> int:
     """Write a graph; ``values(ids)`` gives the numbers of vertices of one kind, e.g. ``Solver.estimate``.
 
-    17 significant digits: what is read back is what was written.
+    17 significant digits: what is read back is what was written. The information of an edge is multiplied by its
+    weight; one of weight 0 is out of the problem, and left out. Returns how many were.
     """
-    graph, out = file.graph, []
-    tag_of_kind = {kind: tag for tag, kind in _VERTEX_TAGS.items()}
+    write_text(path, "\n".join(graph_lines(file, values)) + "\n")
+    return weightless(file.graph)
+
+
+def weightless(graph: Graph) -> int:
+    """How many edges are of weight 0."""
+    return sum(int((table.weight.values == 0.0).sum()) for table in graph.tables.values())
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write a file. Raises FormatError."""
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise FormatError(f"{path}: {error.strerror}") from None
+
+
+def graph_lines(file: G2oFile, values: Values | None) -> list[str]:
+    """The lines of a g2o file; without values, those of the edges alone."""
+    out = [] if values is None else _vertex_lines(file, values)
+    out += [f"FIX {file.ids[vertex]}" for vertex in file.fixed]
+    edges = sorted(_edge_lines(file), key=lambda edge: edge[:2])
+    for label, group in itertools.groupby(edges, key=lambda edge: edge[0]):
+        out.append(" ".join([*_CLASS, file.graph.labels[label]]))
+        out += [text for _, _, text in group]
+    return out + file.unknown
+
+
+def _vertex_lines(file: G2oFile, values: Values) -> list[str]:
+    graph = file.graph
+    tag_of_kind = {kind: tag for tag, kind in VERTEX_TAGS.items()}
     rows: list[tuple[int, str]] = []
     for code, kind in enumerate(graph.kinds):
         members = np.flatnonzero(graph.kind.values == code).tolist()
@@ -267,32 +312,26 @@ def write_g2o(path: Path | str, file: G2oFile, values: Callable[[Sequence[int]],
             raise FormatError(f"g2o has no tag for a vertex {kind.name}")
         for vertex, value in zip(members, values(members).tolist(), strict=True):
             rows.append((vertex, f"{tag_of_kind[kind]} {file.ids[vertex]} {_text(value)}"))
-    out += [row for _, row in sorted(rows)]
-    out += [f"FIX {file.ids[vertex]}" for vertex in file.fixed]
-    tag_of_edge = {edge: tag for tag, edge in _EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
-    edges: list[tuple[int, int, str]] = []
-    for edge_type, table in graph.tables.items():
+    return [row for _, row in sorted(rows)]
+
+
+def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
+    """Code of the label, id and line of each edge in the problem."""
+    tag_of_edge = {edge: tag for tag, edge in EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
+    for edge_type, table in file.graph.tables.items():
         if edge_type not in tag_of_edge:
             raise FormatError(f"g2o has no tag for an edge {edge_type.name}")
         root = table.sqrt_information.values
         upper = np.triu_indices(edge_type.residual_size)
-        full = np.swapaxes(root, 1, 2) @ root
+        full = np.swapaxes(root, 1, 2) @ root * table.weight.values[:, None, None]
         if edge_type in _HALVED and not file.raw:
             full /= np.outer(_HALVED[edge_type], _HALVED[edge_type])
         information = full[:, upper[0], upper[1]]
-        for row in range(len(table)):
+        for row in np.flatnonzero(table.weight.values != 0.0).tolist():
             ends = " ".join(str(file.ids[v]) for v in table.vertices.values[row].tolist())
             numbers = _text([*table.measured.values[row].tolist(), *information[row].tolist()])
             label, edge = int(table.label.values[row]), int(table.id.values[row])
-            edges.append((label, edge, f"{tag_of_edge[edge_type]} {ends} {numbers}"))
-    for label, group in itertools.groupby(sorted(edges), key=lambda edge: edge[0]):
-        out.append(" ".join([*_CLASS, graph.labels[label]]))
-        out += [text for _, _, text in group]
-    out += file.unknown
-    try:
-        Path(path).write_text("\n".join(out) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise FormatError(f"{path}: {error.strerror}") from None
+            yield label, edge, f"{tag_of_edge[edge_type]} {ends} {numbers}"
 
 
 def _with_unit_quaternion(numbers: list[float], size: int) -> list[float]:
