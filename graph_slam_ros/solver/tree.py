@@ -1,0 +1,116 @@
+"""The clique tree (Bayes tree): what is known of each vertex, edge, clique and region, in flat arrays.
+
+Eliminating the information matrix H vertex after vertex leaves cliques: *frontal* vertices that were eliminated
+together, given a *separator* of later ones, which the parent clique contains. Each clique keeps one dense front::
+
+    [ L11  .  ]   L11 L11' + ... : the factor of the frontal variables, its diagonal inverted
+    [ L21  C  ]   L21            : how they depend on the separator
+                  C              : what the whole subtree says of the separator, the contribution to the parent
+
+and a vector likewise (y above, the contribution to the gradient below). Because contributions are kept, an update
+touches only the cliques of changed edges and their ancestors (Kaess et al., "iSAM2", IJRR 2012).
+
+Records are columns of integer arrays, so that compiled code reaches everything through one tuple.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+NOTHING = -1
+
+# vertex: degrees of freedom; begin in ``step`` and in ``value``; kind (below); key: the order of elimination;
+# the clique it is frontal in; first link to its edges; its region and the next vertex there; 1 where it is an unknown;
+# scratch, NOTHING between uses
+DOF, STEP, VALUE, KIND, KEY, CLIQUE, LINK, REGION, NEXT, FREE, LOCAL, VERTEX_COLUMNS = range(12)
+
+# edge: vertices (at most 3); rows of its whitened block; where that begins; 1 where it is in the structure; scratch
+COUNT, END, ROWS, BLOCK, ACTIVE, TAKEN, EDGE_COLUMNS = 0, 1, 4, 5, 6, 7, 8
+
+# link: an edge of a vertex, and the vertex's next link
+LINK_EDGE, LINK_NEXT, LINK_COLUMNS = range(3)
+
+# clique: its place in the tree; where its members begin, how many are frontal, how many there are; the same in
+# degrees of freedom; where its front begins; its size class; 1 where an update has marked it
+PARENT, CHILD, SIBLING, MEMBERS, FRONTALS, SIZE, FRONT_DOF, FULL_DOF, FRONT, CLASS, MARK, CLIQUE_COLUMNS = range(12)
+
+# region of the nested dissection: its place in the binary tree; vertices in its subtree, now and when it was made;
+# the first vertex of its own
+R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = range(8)
+
+# tops of the pools, and what an update counts
+(
+    LINKS,
+    CLIQUES,
+    MEMBERS_TOP,
+    FRONTS_TOP,
+    REGIONS,
+    FREE_REGION,
+    BLOCKS_TOP,
+    TAIL_FIRST,
+    TAIL_END,
+    AFFECTED,
+    FLOPS,
+    STATE_COLUMNS,
+) = range(12)
+
+VECTOR, SE2_KIND, SE3_KIND = range(3)
+
+_STEPS = np.array([4, 5, 6, 7])
+CAPACITIES = np.concatenate([[1, 2, 3], *(_STEPS * 2**k for k in range(13))]).astype(np.int64)
+
+
+class Tree(NamedTuple):
+    """All of it; every pool may be longer than what is used.
+
+    Attributes
+    ----------
+    members : vertices of the cliques, frontal ones first in order of elimination; fronts : their fronts
+    blocks : of each edge the whitened Jacobian (rows, D) and residual (rows,)
+    step : of each unknown, from its linearisation point ``value``; ``estimate`` is ``value [+] step``
+    tail : the newest vertices, eliminated last and in order of time
+    vacant : by size class, the first of the cliques that may be used again
+    """
+
+    vertex: Index
+    edge: Index
+    link: Index
+    clique: Index
+    region: Index
+    members: Index
+    tail: Index
+    vacant: Index
+    state: Index
+    fronts: Array
+    blocks: Array
+    step: Array
+    value: Array
+    estimate: Array
+
+
+def empty_tree() -> Tree:
+    """A tree without a vertex."""
+    region = np.full((16, REGION_COLUMNS), NOTHING, dtype=np.int64)
+    region[0] = [NOTHING, 0, NOTHING, NOTHING, 0, 0, NOTHING]
+    state = np.zeros(STATE_COLUMNS, dtype=np.int64)
+    state[REGIONS], state[FREE_REGION] = 1, NOTHING
+    return Tree(
+        vertex=np.zeros((0, VERTEX_COLUMNS), dtype=np.int64),
+        edge=np.zeros((0, EDGE_COLUMNS), dtype=np.int64),
+        link=np.zeros((0, LINK_COLUMNS), dtype=np.int64),
+        clique=np.zeros((0, CLIQUE_COLUMNS), dtype=np.int64),
+        region=region,
+        members=np.zeros(0, dtype=np.int64),
+        tail=np.zeros(0, dtype=np.int64),
+        vacant=np.full(len(CAPACITIES), NOTHING, dtype=np.int64),
+        state=state,
+        fronts=np.zeros(0),
+        blocks=np.zeros(0),
+        step=np.zeros(0),
+        value=np.zeros(0),
+        estimate=np.zeros(0),
+    )
