@@ -21,9 +21,14 @@ from graph_slam_ros import __version__
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
+    from graph_slam_ros.formats.g2o import G2oFile
+    from graph_slam_ros.graph import Loss
     from graph_slam_ros.slam import Config
+    from graph_slam_ros.solver import Report, Solver
 
 DONE, FAULT, REFUSED, LOSSES = 0, 1, 2, 3
+_CODES = "Exit codes: 0 done, 1 a fault of ours, 2 refused, 3 done but something was lost."
+_LOSS_SCALE = 3.0  # [standard deviations], as for landmarks of a robot
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -137,47 +142,106 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _optimize(args: argparse.Namespace) -> int:
-    from graph_slam_ros.formats.g2o import read_g2o, write_g2o
-    from graph_slam_ros.solver import Settings, Solver, initial_values
+    from graph_slam_ros.formats.g2o import write_g2o
+    from graph_slam_ros.solver import Settings
 
-    file = read_g2o(args.graph, error_map=args.error_map, lenient=args.lenient, raw=args.information == "raw")
-    settings = Settings(method=args.method, max_iterations=args.max_iterations, cost_tolerance=args.tolerance)
-    solver = Solver(file.graph, settings)
-    solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
-    first = min(range(file.graph.vertex_count), key=lambda v: (file.graph.kind_of(v).name[:2] != "SE", file.ids[v]))
-    has_prior = any(len(edge.accepts) == 1 for edge in file.graph.tables)
-    root = file.fixed[0] if file.fixed else first
-    init = args.init if file.has_values or args.init != "file" else "tree"  # edges alone: there is no other start
-    solver.start_at(initial_values(file.graph, init, root))
-    for vertex in file.fixed if file.fixed or has_prior else [root]:
+    file = _read_graph(args, error_map=args.error_map)
+    graph = file.graph
+    solver, start = _started(file, args.init)
+    solver.settings = Settings(
+        method=args.method,
+        max_iterations=args.max_iterations,
+        cost_tolerance=args.tolerance,
+        losses={label: [args.loss] for label in graph.labels if label != "odometry"},
+    )
+    solver.add(range(graph.vertex_count), range(graph.edge_count))
+    has_prior = any(len(edge.accepts) == 1 for edge in graph.tables)
+    for vertex in file.fixed if file.fixed or has_prior else [_root(file)]:
         solver.hold(vertex)
     report = solver.update()
     if args.json:
-        classes = {name: {"edges": c.edges, "chi2": c.chi2} for name, c in report.classes.items()}
         answer = {
             "chi2_initial": report.chi2_initial,
             "chi2_final": report.chi2_final,
+            "cost_initial": report.cost_initial,
+            "cost_final": report.cost_final,
             "iterations": len(report.iterations),
             "converged": report.converged,
             "stop": report.stop,
             "method": report.method,
+            "loss": _loss_text(args.loss),
+            "start": start,
             "error_map": args.error_map,
-            "classes": classes,
+            "classes": {name: {"edges": c.edges, "chi2": c.chi2} for name, c in report.classes.items()},
         }
         _say(json.dumps(answer))
     else:
-        _say(*_optimize_text(report))
+        _say(*_optimize_text(report, _START[start] if file.has_values else f"{_START[start]}: {_NO_VALUES}", args.loss))
     if args.out:
         write_g2o(args.out, file, solver.estimate)
     if args.plot:
-        _plot_graph(args.plot, file.graph, solver)
+        _plot_graph(args.plot, graph, solver)
+    _tell_unknown(file)
+    return _told(file.skipped)
+
+
+def _convert(args: argparse.Namespace) -> int:
+    from graph_slam_ros.formats.convert import NAMES, format_of, write_graph
+
+    target = args.to or format_of(args.out)
+    if args.graph.suffix == ".tum" and not args.source:
+        raise GraphSlamError(f"{args.graph}: a trajectory has no edges, and so is no graph: TUM is only written")
+    if args.out.exists() and args.graph.exists() and args.out.samefile(args.graph):
+        raise GraphSlamError(f"{args.out}: cannot be read from and written to at once")
+    file = _read_graph(args, dialect=args.source)
+    if file.has_values or target != "gtsam":  # which alone needs no vertex lines
+        solver, start = _started(file, "file")
+        written = write_graph(args.out, file, solver.estimate, target)
+        if not file.has_values:
+            _say(f"{_NO_VALUES}: those of {_START[start]} are written")
+    else:
+        written = write_graph(args.out, file, None, target)
+    vertices = f"{written.vertices} of {file.graph.vertex_count} vertices"
+    _say(f"wrote {args.out} as {NAMES[target]}: {vertices}, {written.edges} of {file.graph.edge_count} edges")
+    if target == "g2o":
+        _tell_unknown(file)
+    return _told(file.skipped + written.lost)
+
+
+_START = {"file": "the file", "tree": "the spanning tree", "chordal": "the chordal relaxation"}
+_NO_VALUES = "the file has no vertex lines"
+
+
+def _read_graph(args: argparse.Namespace, **options: Any) -> "G2oFile":
+    from graph_slam_ros.formats.g2o import read_g2o
+
+    return read_g2o(args.graph, lenient=args.lenient, raw=args.information == "raw", **options)
+
+
+def _root(file: "G2oFile") -> int:
+    """The first pose of a FIX line, or that of the least id."""
+    of_no_pose = [not file.graph.kind_of(v).name.startswith("SE") for v in range(file.graph.vertex_count)]
+    fixed = [v for v in file.fixed if not of_no_pose[v]]
+    return fixed[0] if fixed else min(range(file.graph.vertex_count), key=lambda v: (of_no_pose[v], file.ids[v]))
+
+
+def _started(file: "G2oFile", init: str) -> tuple["Solver", str]:
+    """A solver with initial values, and where they are from: edges alone leave nothing but their tree."""
+    from graph_slam_ros.solver import Solver, initial_values
+
+    start = init if file.has_values or init != "file" else "tree"
+    solver = Solver(file.graph)
+    solver.start_at(initial_values(file.graph, start, _root(file)))
+    return solver, start
+
+
+def _tell_unknown(file: "G2oFile") -> None:
     tags = sorted({line.split()[0] for line in file.unknown})
     if tags:
         print(
             f"graph_slam: {len(file.unknown)} lines with unknown tags kept as they are: {', '.join(tags)}",
             file=sys.stderr,
         )
-    return _told(file.skipped)
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -238,7 +302,9 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
-        prog="graph_slam", description="Online pose-graph SLAM: replay recordings, optimise graphs, simulate, evaluate."
+        prog="graph_slam",
+        description="Online pose-graph SLAM: replay recordings, optimise and convert graphs, simulate, evaluate.",
+        epilog=_CODES,
     )
     parser.add_argument("--version", action="version", version=f"graph_slam_ros {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
@@ -263,20 +329,47 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = command("optimize", _optimize, "solve a graph: g2o, TORO, iSAM or GTSAM text")
     sub.add_argument("graph", type=Path, metavar="GRAPH")
-    sub.add_argument("--method", choices=("gn", "lm"), default="gn", help="gn is damped only if it fails to converge")
-    sub.add_argument("--init", choices=("file", "tree", "chordal"), default="file", help="where to start")
-    sub.add_argument("--max-iterations", type=_count, default=100, metavar="N")
     sub.add_argument(
-        "--tolerance", type=_positive, default=1e-6, metavar="X", help="relative decrease of chi2 at the end"
+        "--method",
+        type=_method,
+        default="gn",
+        metavar="gn|lm",
+        help="gn (default) is damped only if it does not converge",
+    )
+    sub.add_argument("--max-iterations", type=_count, default=100, metavar="N", help="default: 100")
+    sub.add_argument(
+        "--tolerance", type=_positive, default=1e-6, metavar="X", help="relative decrease of cost at the end (1e-6)"
+    )
+    sub.add_argument(
+        "--loss",
+        type=_loss,
+        default="none",
+        metavar="none|huber|cauchy[:SCALE]",
+        help=f"robust loss of all edges but odometry; scale in standard deviations of an edge ({_LOSS_SCALE:g})",
+    )
+    sub.add_argument(
+        "--init",
+        choices=("file", "tree", "chordal"),
+        default="file",
+        help="where to start (file; tree without vertices)",
     )
     sub.add_argument("--error-map", choices=("relative", "seed"), default="relative", help="seed: of the inverse")
+    _add_reading(sub)
+    sub.add_argument("--json", action="store_true", help="the answer as one line")
+    sub.add_argument("--out", type=Path, metavar="FILE.g2o", help="the solved graph")
+    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="start and result")
+
+    sub = command("convert", _convert, "write a graph in another format: g2o, TORO, GTSAM text; its poses as TUM")
+    sub.epilog = f"What the format of B cannot say is left out, told in a line, and ends with 3. {_CODES}"
+    sub.add_argument("graph", type=Path, metavar="A", help="g2o, TORO, iSAM or GTSAM text")
     sub.add_argument(
-        "--information", choices=("g2o", "raw"), default="g2o", help="of rotations in space; raw: unscaled"
+        "out", type=Path, metavar="B", help="by its ending: .g2o; .toro, .graph; .gtsam; .tum (poses, id as stamp)"
     )
-    sub.add_argument("--lenient", action="store_true", help="leave out bad lines, list them, exit with 3")
-    sub.add_argument("--json", action="store_true")
-    sub.add_argument("--out", type=Path, metavar="FILE.g2o")
-    sub.add_argument("--plot", type=Path, metavar="FILE.png")
+    sub.add_argument(
+        "--from", dest="source", choices=("g2o", "toro", "gtsam"), help="refuse other lines (default: each by its tag)"
+    )
+    sub.add_argument("--to", choices=("g2o", "toro", "gtsam", "tum"), help="whatever the ending of B")
+    _add_reading(sub)
 
     sub = command("simulate", _simulate, "record a synthetic world with truth: pythonrobotics, manhattan, warehouse")
     sub.add_argument("scenario", metavar="SCENARIO")
@@ -304,18 +397,55 @@ def _add_config(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one parameter")
 
 
+def _add_reading(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--information", choices=("g2o", "raw"), default="g2o", help="of rotations in space in g2o; raw: unscaled"
+    )
+    sub.add_argument("--lenient", action="store_true", help="leave out bad lines, list them, exit with 3")
+
+
 def _positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value
 
 
 def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
+    if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive integer")
-    return value
+    return int(text)
+
+
+def _method(text: str) -> str:
+    """Of those that the solver has."""
+    from graph_slam_ros.solver import Settings
+
+    try:
+        return Settings(method=text).method
+    except GraphSlamError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _loss(text: str) -> "Loss":
+    from graph_slam_ros.graph import Loss
+
+    name, separator, scale = text.partition(":")
+    if separator and name == "none":
+        raise argparse.ArgumentTypeError("none has no scale")
+    try:
+        return Loss.named(name, _positive(scale) if separator else _LOSS_SCALE)
+    except GraphSlamError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _loss_text(loss: "Loss") -> str:
+    from graph_slam_ros.graph import CAUCHY, HUBER
+
+    return {HUBER: f"huber:{loss.scale:g}", CAUCHY: f"cauchy:{loss.scale:g}"}.get(loss.kind, "none")
 
 
 def _config(args: argparse.Namespace) -> "Config":
@@ -360,13 +490,19 @@ def _plot_graph(out: Path, graph: Any, solver: Any) -> None:
     draw_graph(out, initial, final, {k: np.array(v) for k, v in edges.items() if v}, points if len(points) else None)
 
 
-def _optimize_text(report: Any) -> Iterable[str]:
-    yield f"start    chi2 {report.chi2_initial:16.6f}"
+def _optimize_text(report: "Report", start: str, loss: "Loss") -> Iterable[str]:
+    """The cost stands beside chi2 where a loss makes it another number."""
+    robust = _loss_text(loss)
+
+    def both(chi2: float, cost: float) -> str:
+        return f"chi2 {chi2:16.6f}" + (f"   cost {cost:16.6f}" if robust != "none" else "")
+
+    yield f"start    {both(report.chi2_initial, report.cost_initial)}   from {start}"
     for k, step in enumerate(report.iterations, start=1):
         damping = f"   damping {step.damping:.0e}" if step.damping else ""
-        yield f"{k:5d}    chi2 {step.chi2:16.6f}   largest step {step.step:.2e}{damping}"
+        yield f"{k:5d}    {both(step.chi2, step.cost)}   largest step {step.step:.2e}{damping}"
     state = "converged" if report.converged else "NOT converged"
-    yield f"{state} ({report.stop}), method {report.method}"
+    yield f"{state} ({report.stop}), method {report.method}" + (f", loss {robust}" if robust != "none" else "")
     for name, part in report.classes.items():
         yield f"  {name:12s}{part.edges:7d} edges   chi2 {part.chi2:14.6f}"
 
