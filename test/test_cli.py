@@ -125,7 +125,7 @@ def test_simulate_replay_evaluate_end_to_end(bag, run, capsys):
 
 def test_help_and_version_end_with_0(capsys):
     assert told(capsys, "--version") == (0, f"graph_slam_ros {__version__}\n", [])
-    for command in ("replay", "info", "optimize", "simulate", "evaluate", "demo", "warmup"):
+    for command in ("replay", "info", "optimize", "convert", "simulate", "evaluate", "demo", "warmup"):
         code, out, _ = told(capsys, command, "--help")
         assert code == 0
         assert out.startswith(f"usage: graph_slam {command}")
@@ -168,6 +168,9 @@ REFUSED = {
     "negative seed": (["simulate", "manhattan", "--out", "{out}", "--seed", "-1"], "seed -1 is negative"),
     "simulate nowhere": (["simulate", "manhattan", "--out", "/nowhere/a.mcap"], "/nowhere/a.mcap: No such file"),
     "missing graph": (["optimize", "none.g2o"], "none.g2o: no such file"),
+    "unknown loss": (["optimize", "{text}", "--loss", "hubr"], "loss 'hubr': choose none, huber, cauchy"),
+    "unknown format": (["convert", "{text}", "{out}"], "its ending is none of .g2o, .toro, .graph, .gtsam, .tum"),
+    "no graph": (["convert", "{text}", "{out}", "--to", "g2o"], "no vertex in it; is it a graph?"),
     "evaluate no run": (["evaluate", "none", "--truth", "{bag}"], "none"),
     "no odometry that fits": (
         ["replay", "{bag}", "--out", "{out}", "--set", "frames.odom=world"],

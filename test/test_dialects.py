@@ -55,12 +55,31 @@ def test_edge3_turns_roll_pitch_and_yaw_into_a_quaternion_and_needs_no_informati
     assert np.allclose(information(file, RELATIVE_POSE_3D)[0], np.eye(6))
 
 
+def test_the_information_of_edge3_is_never_scaled(tmp_path):
+    text = "VERTEX3 0 0 0 0 0 0 0\nVERTEX3 1 1 2 3 0.1 -0.2 0.3\nEDGE3 0 1 1 2 3 0.1 -0.2 0.3 " + " ".join(
+        f"{value:g}" for value in np.diag([1.0, 2, 3, 4, 5, 6])[np.triu_indices(6)]
+    )
+    for raw in (False, True):
+        file = read(tmp_path, text + "\n", raw=raw)
+        assert np.allclose(information(file, RELATIVE_POSE_3D)[0], np.diag([1.0, 2, 3, 4, 5, 6]), rtol=1e-14)
+
+
 def test_a_graph_of_edges_alone_starts_from_its_tree(tmp_path):
     file = read(tmp_path, "EDGE_SE2 0 1 1 0 1.5707963267948966 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n")
     assert np.allclose(initial_values(file.graph, "tree", 0).reshape(-1, 3)[:, :2], [[0, 0], [1, 0], [1, 1]])
 
 
-@pytest.mark.parametrize("line", ["EDGE2 0 1 1 0", "ODOMETRY 0 1 1 0 0 0 0 0 0 0", "VERTEX2 0 nan 0 0", "EDGE3 0 1 1"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "EDGE2 0 1 1 0",
+        "ODOMETRY 0 1 1 0 0 0 0 0 0 0",
+        "ODOMETRY 0 1 1 0 0 -1 0 0 1 0 1",
+        "LANDMARK 0 1 1 0 1 2 1",
+        "VERTEX2 0 nan 0 0",
+        "EDGE3 0 1 1",
+    ],
+)
 def test_a_bad_line_is_named(tmp_path, line):
     with pytest.raises(FormatError, match=r"graph\.txt:1: "):
         read(tmp_path, line + "\n")

@@ -24,7 +24,8 @@ EDGE_SE2 3 5 2.1 0 0 4 0 0 4 0 4
 EDGE_SE2_XY 3 9 1.5 2 9 0 9
 EDGE_SE2_XY 5 9 -.5 2 9 0 9
 """
-KEYS = {"chi2_initial", "chi2_final", "iterations", "converged", "stop", "error_map", "classes"}
+KEYS = {"chi2_initial", "chi2_final", "cost_initial", "cost_final", "iterations", "converged", "stop", "method", "loss"}
+KEYS |= {"start", "error_map", "classes"}
 
 
 @pytest.fixture
@@ -53,7 +54,7 @@ def answer_of(run, *words):
 
 def test_the_answer_has_the_promised_keys_and_adds_up(run, graph):
     answer = answer_of(run, graph)
-    assert set(answer) >= KEYS
+    assert set(answer) == KEYS
     assert {name: set(part) for name, part in answer["classes"].items()} == {
         "odometry": {"edges", "chi2"},
         "closures": {"edges", "chi2"},
@@ -115,6 +116,80 @@ def test_few_iterations_are_told_as_not_converged(run):
     code, out, _ = run(CITY, "--max-iterations", 1)
     assert code == 0
     assert "NOT converged (max_iterations)" in out
+
+
+def test_the_number_of_iterations_may_be_bounded(run):
+    answer = answer_of(run, CITY, "--max-iterations", 2)
+    assert (answer["stop"], answer["converged"]) == ("max_iterations", False)
+    assert answer["iterations"] == 2
+
+
+@pytest.fixture
+def city_with_false_closures(tmp_path):
+    path = tmp_path / "false.g2o"
+    false = [f"EDGE_SE2 {i} {i + 200} 1 2 0.5 44 0 0 44 0 44\n" for i in range(10, 60, 10)]
+    path.write_text(CITY.read_text() + "# class closures\n" + "".join(false))
+    return path
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "huber:0.5", "cauchy:2.5"])
+def test_a_robust_loss_lets_false_closures_pull_less(run, city_with_false_closures, loss):
+    plain = answer_of(run, city_with_false_closures, "--init", "tree")
+    robust = answer_of(run, city_with_false_closures, "--init", "tree", "--loss", loss)
+    assert (plain["loss"], robust["loss"]) == ("none", loss if ":" in loss else f"{loss}:3")
+    assert plain["classes"]["odometry"]["chi2"] > 2000.0
+    assert robust["classes"]["odometry"]["chi2"] < 0.5 * plain["classes"]["odometry"]["chi2"]
+    assert plain["cost_final"] == plain["chi2_final"]
+    assert robust["cost_final"] < robust["chi2_final"]
+    if loss.startswith("cauchy"):  # which forgets what is far away
+        truth = answer_of(run, CITY)["classes"]["odometry"]["chi2"]
+        assert robust["classes"]["odometry"]["chi2"] == pytest.approx(truth, rel=0.05)
+
+
+def test_the_loss_is_of_every_class_but_odometry(run, graph):
+    graph.write_text(SMALL.replace("3 5 2.1", "3 5 9.1").replace("9 1.5 2", "9 7.5 2"))
+    answer = answer_of(run, graph, "--loss", "huber:1e-9")  # of such a scale, next to nothing is left of them
+    assert answer["classes"]["odometry"]["chi2"] == pytest.approx(0.0, abs=1e-6)
+    assert answer["classes"]["closures"]["chi2"] > 100.0
+    assert answer["classes"]["landmarks"]["chi2"] > 100.0
+    graph.write_text("\n".join(SMALL.splitlines()[:3] + SMALL.splitlines()[4:6]) + "\n")  # odometry alone
+    answer = answer_of(run, graph, "--loss", "huber:1e-9")
+    assert answer["cost_initial"] == answer["chi2_initial"] > 1.0
+
+
+def test_the_text_shows_cost_and_chi2_side_by_side_where_a_loss_makes_them_two(run, graph):
+    assert "cost" not in run(graph)[1].replace("converged (cost)", "")
+    _, out, _ = run(graph, "--loss", "huber:0.1")
+    answer = answer_of(run, graph, "--loss", "huber:0.1")
+    last = [line for line in out.splitlines() if "largest step" in line][-1]
+    assert f"{answer['chi2_final']:.6f}" in last
+    assert f"{answer['cost_final']:.6f}" in last
+    assert "method gn, loss huber:0.1\n" in out
+
+
+def test_the_start_is_told(run, graph):
+    for init, words in (("file", "the file"), ("tree", "the spanning tree"), ("chordal", "the chordal relaxation")):
+        assert run(graph, "--init", init)[1].splitlines()[0].endswith(f"   from {words}")
+        assert answer_of(run, graph, "--init", init)["start"] == init
+
+
+def test_a_graph_of_edges_alone_is_solved_from_its_tree_and_says_so(run, tmp_path, graph):
+    whole = answer_of(run, graph)
+    graph.write_text("".join(line + "\n" for line in SMALL.splitlines() if line.startswith("EDGE")))
+    out = tmp_path / "out.g2o"
+    code, text, err = run(graph, "--out", out)
+    assert (code, err) == (0, "")
+    assert text.splitlines()[0].endswith("   from the spanning tree: the file has no vertex lines")
+    answer = answer_of(run, graph)
+    assert answer["start"] == "tree"
+    assert answer["chi2_final"] == pytest.approx(whole["chi2_final"], rel=1e-6)
+    assert answer_of(run, out)["start"] == "file"
+    assert answer_of(run, graph, "--init", "chordal")["start"] == "chordal"
+
+
+def test_a_tree_grows_from_the_pose_of_a_fix_line_even_where_a_landmark_is_fixed_first(run, graph):
+    graph.write_text(SMALL + "FIX 9 5\n")
+    assert answer_of(run, graph, "--init", "tree")["start"] == "tree"
 
 
 def test_a_picture_is_drawn(run, tmp_path, graph):
@@ -188,13 +263,35 @@ def test_files_that_cannot_be_read_or_written_are_refusals(run, tmp_path, graph)
 
 @pytest.mark.parametrize(
     "words",
-    [["--method", "newton"], ["--max-iterations", "0"], ["--tolerance", "nan"], ["--tolerance", "-1"], ["--what"]],
+    [
+        ["--method", "newton"],
+        ["--max-iterations", "0"],
+        ["--max-iterations", "many"],
+        ["--max-iterations", "1.5"],
+        ["--max-iterations", "\u00b2"],
+        ["--tolerance", "nan"],
+        ["--tolerance", "-1"],
+        ["--tolerance", "small"],
+        ["--loss", "tukey"],
+        ["--loss", ""],
+        ["--loss", "none:1"],
+        ["--loss", "huber:"],
+        ["--loss", "huber:0"],
+        ["--loss", "cauchy:-1"],
+        ["--loss", "cauchy:inf"],
+        ["--loss", "cauchy:x"],
+        ["--loss", "huber:1:2"],
+        ["--what"],
+    ],
 )
-def test_options_that_cannot_be_are_refused(graph, words, capsys):
+def test_options_that_cannot_be_are_refused_in_one_line(graph, words, capsys):
     with pytest.raises(SystemExit) as refusal:
         main(["optimize", str(graph), *words])
     assert refusal.value.code == 2
-    assert words[0] in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert words[0] in err
+    assert " _" not in err  # no name of a function
 
 
 def test_the_installed_command_never_shows_a_traceback(tmp_path):
