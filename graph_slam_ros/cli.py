@@ -22,7 +22,7 @@ from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
     from graph_slam_ros.formats.g2o import G2oFile
-    from graph_slam_ros.graph import Loss
+    from graph_slam_ros.graph import Graph, Loss
     from graph_slam_ros.slam import Config
     from graph_slam_ros.solver import Report, Solver
 
@@ -148,7 +148,7 @@ def _optimize(args: argparse.Namespace) -> int:
     file = _read_graph(args, error_map=args.error_map)
     graph = file.graph
     solver, start = _started(file, args.init)
-    solver.settings = Settings(
+    settings = Settings(
         method=args.method,
         max_iterations=args.max_iterations,
         cost_tolerance=args.tolerance,
@@ -158,7 +158,8 @@ def _optimize(args: argparse.Namespace) -> int:
     has_prior = any(len(edge.accepts) == 1 for edge in graph.tables)
     for vertex in file.fixed if file.fixed or has_prior else [_root(file)]:
         solver.hold(vertex)
-    report = solver.update()
+    before = _positions(graph, solver) if args.plot else None
+    report = solver.update(settings)
     if args.json:
         answer = {
             "chi2_initial": report.chi2_initial,
@@ -176,11 +177,11 @@ def _optimize(args: argparse.Namespace) -> int:
         }
         _say(json.dumps(answer))
     else:
-        _say(*_optimize_text(report, _START[start] if file.has_values else f"{_START[start]}: {_NO_VALUES}", args.loss))
+        _say(*_optimize_text(report, _START[start] + ("" if file.has_values else f": {_NO_VALUES}"), args.loss))
     if args.out:
         write_g2o(args.out, file, solver.estimate)
     if args.plot:
-        _plot_graph(args.plot, graph, solver)
+        _plot_graph(args.plot, graph, before, _positions(graph, solver))
     _tell_unknown(file)
     return _told(file.skipped)
 
@@ -206,42 +207,6 @@ def _convert(args: argparse.Namespace) -> int:
     if target == "g2o":
         _tell_unknown(file)
     return _told(file.skipped + written.lost)
-
-
-_START = {"file": "the file", "tree": "the spanning tree", "chordal": "the chordal relaxation"}
-_NO_VALUES = "the file has no vertex lines"
-
-
-def _read_graph(args: argparse.Namespace, **options: Any) -> "G2oFile":
-    from graph_slam_ros.formats.g2o import read_g2o
-
-    return read_g2o(args.graph, lenient=args.lenient, raw=args.information == "raw", **options)
-
-
-def _root(file: "G2oFile") -> int:
-    """The first pose of a FIX line, or that of the least id."""
-    of_no_pose = [not file.graph.kind_of(v).name.startswith("SE") for v in range(file.graph.vertex_count)]
-    fixed = [v for v in file.fixed if not of_no_pose[v]]
-    return fixed[0] if fixed else min(range(file.graph.vertex_count), key=lambda v: (of_no_pose[v], file.ids[v]))
-
-
-def _started(file: "G2oFile", init: str) -> tuple["Solver", str]:
-    """A solver with initial values, and where they are from: edges alone leave nothing but their tree."""
-    from graph_slam_ros.solver import Solver, initial_values
-
-    start = init if file.has_values or init != "file" else "tree"
-    solver = Solver(file.graph)
-    solver.start_at(initial_values(file.graph, start, _root(file)))
-    return solver, start
-
-
-def _tell_unknown(file: "G2oFile") -> None:
-    tags = sorted({line.split()[0] for line in file.unknown})
-    if tags:
-        print(
-            f"graph_slam: {len(file.unknown)} lines with unknown tags kept as they are: {', '.join(tags)}",
-            file=sys.stderr,
-        )
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -287,6 +252,87 @@ def _demo(args: argparse.Namespace) -> int:
     from graph_slam_ros.demo import demo
 
     return demo(args.out, live=_has_ros(), progress=_progress, say=_say)
+
+
+# -- graphs ----------------------------------------------------------------------------------------------------------
+
+_START = {"file": "the file", "tree": "the spanning tree", "chordal": "the chordal relaxation"}
+_NO_VALUES = "the file has no vertex lines"
+
+
+def _read_graph(args: argparse.Namespace, **options: Any) -> "G2oFile":
+    from graph_slam_ros.formats.g2o import read_g2o
+
+    return read_g2o(args.graph, lenient=args.lenient, raw=args.information == "raw", **options)
+
+
+def _root(file: "G2oFile") -> int:
+    """The first pose of a FIX line, or that of the least id."""
+    of_no_pose = [not file.graph.kind_of(v).name.startswith("SE") for v in range(file.graph.vertex_count)]
+    fixed = [v for v in file.fixed if not of_no_pose[v]]
+    return fixed[0] if fixed else min(range(file.graph.vertex_count), key=lambda v: (of_no_pose[v], file.ids[v]))
+
+
+def _started(file: "G2oFile", init: str) -> tuple["Solver", str]:
+    """A solver with initial values, and where they are from: edges alone leave nothing but their tree."""
+    from graph_slam_ros.solver import Solver, initial_values
+
+    start = init if file.has_values or init != "file" else "tree"
+    solver = Solver(file.graph)
+    solver.start_at(initial_values(file.graph, start, _root(file)))
+    return solver, start
+
+
+def _tell_unknown(file: "G2oFile") -> None:
+    tags = sorted({line.split()[0] for line in file.unknown})
+    if tags:
+        print(
+            f"graph_slam: {len(file.unknown)} lines with unknown tags kept as they are: {', '.join(tags)}",
+            file=sys.stderr,
+        )
+
+
+def _optimize_text(report: "Report", start: str, loss: "Loss") -> Iterable[str]:
+    """The cost stands beside chi2 where a loss makes it another number."""
+    robust = _loss_text(loss)
+
+    def both(chi2: float, cost: float) -> str:
+        return f"chi2 {chi2:16.6f}" + (f"   cost {cost:16.6f}" if robust != "none" else "")
+
+    yield f"start    {both(report.chi2_initial, report.cost_initial)}   from {start}"
+    for k, step in enumerate(report.iterations, start=1):
+        damping = f"   damping {step.damping:.0e}" if step.damping else ""
+        yield f"{k:5d}    {both(step.chi2, step.cost)}   largest step {step.step:.2e}{damping}"
+    state = "converged" if report.converged else "NOT converged"
+    yield f"{state} ({report.stop}), method {report.method}" + (f", loss {robust}" if robust != "none" else "")
+    for name, part in report.classes.items():
+        yield f"  {name:12s}{part.edges:7d} edges   chi2 {part.chi2:14.6f}"
+
+
+def _loss_text(loss: "Loss") -> str:
+    from graph_slam_ros.graph import CAUCHY, HUBER
+
+    return {HUBER: f"huber:{loss.scale:g}", CAUCHY: f"cauchy:{loss.scale:g}"}.get(loss.kind, "none")
+
+
+def _positions(graph: "Graph", solver: "Solver") -> Any:
+    import numpy as np
+
+    return np.array([solver.estimate([v])[0][:2] for v in range(graph.vertex_count)])
+
+
+def _plot_graph(out: Path, graph: "Graph", initial: Any, final: Any) -> None:
+    import numpy as np
+
+    from graph_slam_ros.report import draw_graph
+
+    edges: dict[str, list[Any]] = {}
+    for table in graph.tables.values():
+        if len(table.type.accepts) == 2:
+            for code, label in enumerate(graph.labels):
+                edges.setdefault(label, []).extend(table.vertices.values[table.label.values == code].tolist())
+    points: Any = np.flatnonzero([graph.kind_of(v).name[0] == "R" for v in range(graph.vertex_count)])
+    draw_graph(out, initial, final, {k: np.array(v) for k, v in edges.items() if v}, points if len(points) else None)
 
 
 # -- options and output ----------------------------------------------------------------------------------------------
@@ -383,7 +429,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("run_folder", type=Path, metavar="RUN")
     sub.add_argument("--truth", required=True, metavar="BAG[:TOPIC]|FILE.tum")
     sub.add_argument("--estimate", default="sightings.tum", metavar="FILE", help="which trajectory of the run")
-    sub.add_argument("--json", action="store_true")
+    sub.add_argument("--json", action="store_true", help="the numbers as one line")
     sub.add_argument("--plot", type=Path, metavar="FILE.png", help="default: path.png in the run folder")
 
     command("warmup", _warmup, "compile the kernels")
@@ -442,12 +488,6 @@ def _loss(text: str) -> "Loss":
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def _loss_text(loss: "Loss") -> str:
-    from graph_slam_ros.graph import CAUCHY, HUBER
-
-    return {HUBER: f"huber:{loss.scale:g}", CAUCHY: f"cauchy:{loss.scale:g}"}.get(loss.kind, "none")
-
-
 def _config(args: argparse.Namespace) -> "Config":
     """Defaults, then the run's own or the given file, then single settings."""
     from graph_slam_ros.formats.parameters import parse_setting, read_parameters
@@ -471,40 +511,6 @@ def _progress(label: str) -> Any:
         return tqdm(items, desc=label, total=total or None, unit="msg", leave=False, disable=quiet, file=sys.stderr)
 
     return bar
-
-
-def _plot_graph(out: Path, graph: Any, solver: Any) -> None:
-    import numpy as np
-
-    from graph_slam_ros.report import draw_graph
-
-    ids = np.arange(graph.vertex_count)
-    initial = graph.initial.values[graph.offset.values[:, None] + np.arange(2)]
-    final = np.array([solver.estimate([v])[0][:2] for v in ids])
-    edges: dict[str, list[Any]] = {}
-    for table in graph.tables.values():
-        if len(table.type.accepts) == 2:
-            for code, label in enumerate(graph.labels):
-                edges.setdefault(label, []).extend(table.vertices.values[table.label.values == code].tolist())
-    points: Any = np.flatnonzero([graph.kind_of(v).name[0] == "R" for v in ids])
-    draw_graph(out, initial, final, {k: np.array(v) for k, v in edges.items() if v}, points if len(points) else None)
-
-
-def _optimize_text(report: "Report", start: str, loss: "Loss") -> Iterable[str]:
-    """The cost stands beside chi2 where a loss makes it another number."""
-    robust = _loss_text(loss)
-
-    def both(chi2: float, cost: float) -> str:
-        return f"chi2 {chi2:16.6f}" + (f"   cost {cost:16.6f}" if robust != "none" else "")
-
-    yield f"start    {both(report.chi2_initial, report.cost_initial)}   from {start}"
-    for k, step in enumerate(report.iterations, start=1):
-        damping = f"   damping {step.damping:.0e}" if step.damping else ""
-        yield f"{k:5d}    {both(step.chi2, step.cost)}   largest step {step.step:.2e}{damping}"
-    state = "converged" if report.converged else "NOT converged"
-    yield f"{state} ({report.stop}), method {report.method}" + (f", loss {robust}" if robust != "none" else "")
-    for name, part in report.classes.items():
-        yield f"  {name:12s}{part.edges:7d} edges   chi2 {part.chi2:14.6f}"
 
 
 def _say_run(source: Path, summary: dict[str, Any]) -> None:

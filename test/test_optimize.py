@@ -200,6 +200,18 @@ def test_a_picture_is_drawn(run, tmp_path, graph):
     assert min(struct.unpack(">II", head[16:24])) > 300
 
 
+def test_the_picture_shows_the_start_that_was_used(run, tmp_path, graph, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        "graph_slam_ros.report.draw_graph", lambda out, initial, final, *_: drawn.append((initial, final))
+    )
+    graph.write_text("".join(line + "\n" for line in SMALL.splitlines() if line.startswith("EDGE")))
+    assert run(graph, "--plot", tmp_path / "graph.png")[0] == 0
+    ((initial, final),) = drawn
+    assert initial.tolist() == [[0, 0], [1, 0], [2.1, 0], [1.5, 2]]  # along the tree, not where no line puts them
+    assert abs(final - initial).max() > 1e-3
+
+
 def test_unknown_tags_are_told_and_kept(run, tmp_path, graph):
     graph.write_text(SMALL + "EDGE_ODD 3 4  x\nEDGE_ODD 4 5 y\n")
     out = tmp_path / "out.g2o"
