@@ -6,6 +6,7 @@
 # test-oldest   the tests without ROS, in .venv-oldest with the lowest versions that setup.py allows
 # lint, format  style and types: tell, mend
 # lock          write requirements.txt and constraints-oldest.txt from setup.py; LOCK=--upgrade takes newer versions
+# bench         measure ours against GTSAM, g2o and python-graphslam into docs/benchmarks.md; hours
 # clean         remove what these made
 
 PYTHON ?= python3
@@ -24,7 +25,7 @@ ifeq ($(SYSTEM_ROS),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: install demo test test-oldest lint format lock clean
+.PHONY: install demo test test-oldest lint format lock bench clean
 .DELETE_ON_ERROR:
 
 install: $(VENV)/interfaces.stamp $(VENV)/kernels.stamp
@@ -90,6 +91,19 @@ $(VENV)-oldest/stamp: constraints-oldest.txt setup.py setup.cfg pyproject.toml
 
 test-oldest: $(VENV)-oldest/stamp
 	$(VENV)-oldest/bin/python -m pytest -q
+
+$(VENV)-bench/stamp: benchmarks/requirements.txt setup.py setup.cfg pyproject.toml
+	$(PYTHON) -m venv $(VENV)-bench
+	$(VENV)-bench/bin/pip install --quiet -r benchmarks/requirements.txt -e .
+	@touch $@
+
+$(VENV)-bench-g2o/stamp: benchmarks/requirements-g2o.txt
+	$(PYTHON) -m venv $(VENV)-bench-g2o
+	$(VENV)-bench-g2o/bin/pip install --quiet -r benchmarks/requirements-g2o.txt
+	@touch $@
+
+bench: $(VENV)-bench/stamp $(VENV)-bench-g2o/stamp
+	$(VENV)-bench/bin/python -m benchmarks
 
 lock:
 	$(PYTHON) -m venv $(VENV)-lock

@@ -1,0 +1,76 @@
+"""Graphs in GTSAM's words, for its incremental and its batch solvers alike.
+
+Poses are keys 0, 1, ...; a landmark is the symbol ``l`` with its index. GTSAM has the rotation before the position in
+the tangent space of a pose in space, we after it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from benchmarks.problem import Array, Edges, Problem, polar, triangular
+
+_ANCHOR_M, _ANCHOR_RAD = 1e-3, 1e-4  # the prior on the first pose in GTSAM's own examples
+_ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
+
+
+def landmark(index: int) -> int:
+    """The key of a landmark."""
+    return gtsam.symbol("l", index)
+
+
+def pose(values: Sequence[float] | Array) -> gtsam.Pose2 | gtsam.Pose3:
+    """From (3,) or (7,) numbers."""
+    if len(values) == 3:
+        return gtsam.Pose2(*values)
+    x, y, z, w = values[3:]
+    return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), np.asarray(values[:3]))
+
+
+def numbers(of: gtsam.Pose2 | gtsam.Pose3) -> Array:
+    """The (3,) or (7,) numbers of a pose."""
+    if isinstance(of, gtsam.Pose2):
+        return np.array([of.x(), of.y(), of.theta()])
+    q = of.rotation().toQuaternion()
+    return np.array([*of.translation(), q.x(), q.y(), q.z(), q.w()])
+
+
+def prepared(problem: Problem) -> Problem:
+    """Landmarks by bearing and range, and the noise of poses in space in GTSAM's order, triangular again."""
+    relative = problem.relative
+    if not problem.planar:
+        relative = replace(relative, root=triangular(relative.root[:, :, _ROTATION_FIRST]))
+    return replace(problem, relative=relative, sightings=polar(problem.sightings))
+
+
+def add_anchor(graph: gtsam.NonlinearFactorGraph, at: Array) -> None:
+    """A strong prior on the first pose."""
+    if len(at) == 3:
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([_ANCHOR_M, _ANCHOR_M, _ANCHOR_RAD]))
+        graph.add(gtsam.PriorFactorPose2(0, pose(at), noise))
+    else:
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([_ANCHOR_RAD, _ANCHOR_M], 3))
+        graph.add(gtsam.PriorFactorPose3(0, pose(at), noise))
+
+
+def add_relative(graph: gtsam.NonlinearFactorGraph, relative: Edges) -> None:
+    """Relative poses of a prepared problem."""
+    between = gtsam.BetweenFactorPose2 if relative.measured.shape[1] == 3 else gtsam.BetweenFactorPose3
+    for (i, j), measured, root in zip(relative.ends.tolist(), relative.measured.tolist(), relative.root, strict=True):
+        graph.add(between(i, j, pose(measured), gtsam.noiseModel.Gaussian.SqrtInformation(root)))
+
+
+def add_sightings(graph: gtsam.NonlinearFactorGraph, seen: Edges) -> None:
+    """Sightings of a prepared problem."""
+    for (i, j), (bearing, distance), root in zip(seen.ends.tolist(), seen.measured.tolist(), seen.root, strict=True):
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(root)
+        graph.add(gtsam.BearingRangeFactor2D(i, landmark(j), gtsam.Rot2(bearing), distance, noise))
+
+
+def estimate(values: gtsam.Values, poses: int, landmarks: int, planar: bool) -> tuple[Array, Array]:
+    """Poses and landmarks as our arrays."""
+    at = values.atPose2 if planar else values.atPose3
+    points = [values.atPoint2(landmark(j)) for j in range(landmarks)]
+    return np.array([numbers(at(k)) for k in range(poses)]), np.array(points).reshape(-1, 2)

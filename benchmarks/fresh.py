@@ -1,0 +1,53 @@
+"""Calls in a fresh process on one core: nobody profits from, or pays for, what another left behind."""
+
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+_ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+class Crashed(Exception):
+    """The process ended without an answer."""
+
+
+def call(function: Callable[..., Any], *arguments: Any, python: str = sys.executable) -> Any:
+    """``function(*arguments)`` in a fresh process of the given interpreter.
+
+    Raises
+    ------
+    Crashed
+        With the last line of what the process wrote to its standard error.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        asked, answered = Path(folder) / "asked", Path(folder) / "answered"
+        asked.write_bytes(pickle.dumps((function, arguments)))
+        done = subprocess.run(
+            [python, "-m", "benchmarks.fresh", str(asked), str(answered)],
+            cwd=ROOT,
+            env=os.environ | _ONE_THREAD,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+        if not answered.exists():
+            last = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
+            raise Crashed(last[0])
+        return pickle.loads(answered.read_bytes())
+
+
+def _answer(asked: Path, answered: Path) -> None:
+    function, arguments = pickle.loads(asked.read_bytes())
+    answer = pickle.dumps(function(*arguments))
+    answered.write_bytes(answer)
+
+
+if __name__ == "__main__":
+    _answer(*map(Path, sys.argv[1:]))

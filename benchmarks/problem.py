@@ -1,0 +1,218 @@
+"""A pose graph as plain arrays in time order: what every contender is given.
+
+Only reading and simulating need more than NumPy, since some contenders live in an environment of their own.
+"""
+
+import gzip
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from graph_slam_ros.formats.g2o import G2oFile
+    from graph_slam_ros.graph import EdgeType, Graph
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Measurements between two things each.
+
+    Attributes
+    ----------
+    ends : (n, 2), of relative poses the two poses, of sightings the pose and the landmark
+    measured : (n, p)
+    root : (n, m, m) upper triangular R with ``R'R`` the information matrix
+    """
+
+    ends: Index
+    measured: Array
+    root: Array
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    def __getitem__(self, rows: slice | NDArray[Any]) -> "Edges":
+        return Edges(self.ends[rows], self.measured[rows], self.root[rows])
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What arrives with one pose.
+
+    Attributes
+    ----------
+    pose : its index
+    landmarks : indices of the landmarks seen for the first time
+    first : (n,) the sighting of each of them, a row of ``sightings``
+    parent : the latest earlier pose that an edge joins it to (-1: it is the first)
+    motion, forward : the measurement of that edge, and whether it leads from the parent to the pose
+    """
+
+    pose: int
+    relative: Edges
+    sightings: Edges
+    landmarks: range
+    first: Index
+    parent: int
+    motion: Array
+    forward: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A graph: poses in order of time, landmarks in order of their first sighting.
+
+    Attributes
+    ----------
+    poses : (n, 3) x, y, theta or (n, 7) x, y, z, quaternion (x, y, z, w): where a batch solver starts
+    landmarks : (n, 2)
+    relative : relative poses, in order of their later pose
+    sightings : of landmarks, x and y in the pose's frame, in order of the pose
+    left_out : lines of the file that were not used
+    whole : it is no prefix of a longer one
+    """
+
+    name: str
+    poses: Array
+    landmarks: Array
+    relative: Edges
+    sightings: Edges
+    left_out: int = 0
+    whole: bool = True
+
+    @property
+    def planar(self) -> bool:
+        """Whether it is in the plane."""
+        return self.poses.shape[1] == 3
+
+    def prefix(self, poses: int) -> "Problem":
+        """The graph when it had that many poses."""
+        sightings = self.sightings[self.sightings.ends[:, 0] < poses]
+        return replace(
+            self,
+            poses=self.poses[:poses],
+            landmarks=self.landmarks[: sightings.ends[:, 1].max(initial=-1) + 1],
+            relative=self.relative[self.relative.ends.max(axis=1) < poses],
+            sightings=sightings,
+            whole=self.whole and poses >= len(self.poses),
+        )
+
+    def steps(self) -> Iterator[Step]:
+        """Pose after pose, each with the edges whose other ends are there already."""
+        counted = np.arange(len(self.poses) + 1)
+        relative_at = np.searchsorted(self.relative.ends.max(axis=1), counted)
+        sighting_at = np.searchsorted(self.sightings.ends[:, 0], counted)
+        known = 0
+        for pose in range(len(self.poses)):
+            relative = self.relative[slice(*relative_at[pose : pose + 2])]
+            sightings = self.sightings[slice(*sighting_at[pose : pose + 2])]
+            seen, first = np.unique(sightings.ends[:, 1], return_index=True)
+            new = range(known, max(known, int(seen.max(initial=-1)) + 1))
+            known = new.stop
+            parent, motion, forward = -1, np.empty(0), True
+            if pose:
+                earlier = relative.ends.min(axis=1)
+                row = int(np.argmax(earlier))
+                parent, motion = int(earlier[row]), relative.measured[row]
+                forward = bool(relative.ends[row, 1] == pose)
+            yield Step(pose, relative, sightings, new, first[seen >= new.start], parent, motion, forward)
+
+
+def triangular(root: Array) -> Array:
+    """Upper triangular square roots (n, m, m), of positive diagonal, of the same information matrices."""
+    upper = np.asarray(np.linalg.qr(root, mode="r"))
+    return upper * np.where(np.diagonal(upper, axis1=1, axis2=2) < 0.0, -1.0, 1.0)[:, :, None]
+
+
+def polar(sightings: Edges) -> Edges:
+    """The same sightings as bearing and range, their information carried over to first order."""
+    x, y = sightings.measured.T
+    distance = np.hypot(x, y)
+    cartesian_by_polar = np.stack([np.stack([-y, x / distance], -1), np.stack([x, y / distance], -1)], axis=1)
+    root = triangular(sightings.root @ cartesian_by_polar)
+    return Edges(sightings.ends, np.stack([np.arctan2(y, x), distance], axis=1), root)
+
+
+def read_problem(path: Path) -> Problem:
+    """Read any text the package reads, gzipped or not; lines it does not understand are left out and counted.
+
+    Information matrices are taken as they are in the file. Without initial values the start is composed along a tree.
+
+    Raises
+    ------
+    GraphSlamError
+        The file cannot be read, has other kinds of edges, or a pose that is joined to no earlier one.
+    """
+    from graph_slam_ros.formats.g2o import read_g2o
+
+    name = path.name.split(".")[0]
+    if path.suffix != ".gz":
+        return _in_time_order(name, read_g2o(path, lenient=True, raw=True))
+    with tempfile.TemporaryDirectory() as folder:
+        text = Path(folder) / path.stem
+        text.write_bytes(gzip.decompress(path.read_bytes()))
+        return _in_time_order(name, read_g2o(text, lenient=True, raw=True))
+
+
+def city_problem(poses: int, seed: int = 1) -> Problem:
+    """Our simulator's Manhattan: 60 by 60 blocks, a closure per three poses once streets are revisited."""
+    from graph_slam_ros.formats.g2o import G2oFile
+    from graph_slam_ros.simulation.pose_graph import city_graph
+
+    graph, _ = city_graph(seed, poses=poses)
+    return _in_time_order(f"city{poses}", G2oFile(graph, list(range(graph.vertex_count))))
+
+
+def _in_time_order(name: str, file: "G2oFile") -> Problem:
+    from graph_slam_ros.errors import FormatError
+    from graph_slam_ros.graph import LANDMARK_POSITION, R2, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3
+    from graph_slam_ros.solver import initial_values
+
+    graph, ids = file.graph, np.asarray(file.ids)
+    edge_type, kind = (RELATIVE_POSE, SE2) if RELATIVE_POSE in graph.tables else (RELATIVE_POSE_3D, SE3)
+    strange = set(graph.tables) - {edge_type, LANDMARK_POSITION}
+    if strange or kind not in graph.kinds:
+        raise FormatError(f"{name}: only relative poses and, in the plane, positions of landmarks can be raced")
+    poses = np.flatnonzero(graph.kind.values == graph.kinds.index(kind))
+    poses = poses[np.argsort(ids[poses])]
+    values = initial_values(graph, "file" if file.has_values else "tree", int(poses[0]))
+    index = np.full(graph.vertex_count, -1)
+    index[poses] = np.arange(len(poses))
+
+    relative = _edges(graph, edge_type, index)
+    relative = relative[np.argsort(relative.ends.max(axis=1), kind="stable")]
+    joined = np.isin(np.arange(1, len(poses)), relative.ends.max(axis=1))
+    if not joined.all():
+        raise FormatError(f"{name}: pose {ids[poses[1:][~joined][0]]} is joined to no earlier pose")
+
+    points = np.empty(0, dtype=np.int64)
+    sightings = Edges(np.empty((0, 2), dtype=np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
+    if LANDMARK_POSITION in graph.tables:
+        index[graph.kind.values == graph.kinds.index(R2)] = np.flatnonzero(graph.kind.values == graph.kinds.index(R2))
+        sightings = _edges(graph, LANDMARK_POSITION, index)
+        sightings = sightings[np.lexsort((sightings.ends[:, 1], sightings.ends[:, 0]))]
+        seen, first, which = np.unique(sightings.ends[:, 1], return_index=True, return_inverse=True)
+        in_time = np.argsort(first)
+        points = seen[in_time]
+        sightings = replace(sightings, ends=np.column_stack([sightings.ends[:, 0], np.argsort(in_time)[which]]))
+
+    def stored(vertices: Index, size: int) -> Array:
+        return values[graph.offset.values[vertices][:, None] + np.arange(size)]
+
+    left_out = len(file.unknown) + len(file.skipped)
+    return Problem(name, stored(poses, kind.size), stored(points, 2), relative, sightings, left_out)
+
+
+def _edges(graph: "Graph", edge_type: "EdgeType", index: Index) -> Edges:
+    table = graph.tables[edge_type]
+    columns = (table.vertices, table.measured, table.sqrt_information)
+    ends, measured, root = (column.values.copy() for column in columns)
+    return Edges(index[ends], measured, root)

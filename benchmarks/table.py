@@ -1,0 +1,216 @@
+"""Results as JSON and as Markdown tables; a table has its place in docs/benchmarks.md between two markers.
+
+``python -m benchmarks.table RESULTS.json ...`` puts earlier results into the document.
+"""
+
+import datetime
+import json
+import platform
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from benchmarks.contenders import OURS, OURS_AS_G2O
+from benchmarks.fresh import ROOT
+
+Row = dict[str, Any]
+
+DOCUMENT = ROOT / "docs/benchmarks.md"
+_LIBRARIES = ("graph_slam_ros", "numpy", "scipy", "numba", "gtsam", "graphslam")
+
+# The lowest cost that anybody has found, in our error map with the information matrices of the file.
+_BEST_KNOWN = {
+    "input_INTEL": 215.83,
+    "intel_943": 546.461,
+    "M3500": 137.913,
+    "manhattanOlson3500": 146.077,
+    "sphere2500": 1351.36,
+    "parking-garage": 1.26838,
+    "torus3D": 24237.98,
+    "smallGrid3D": 1033.894,
+    "ring": 11.1631,
+    "victoria_park": 6184.12,
+    "w10000": 289.7259,
+}
+
+
+def results(programme: str, rows: Sequence[Row], about: str = "") -> Row:
+    """Rows with what they were measured by, on, and when."""
+    return {
+        "programme": programme,
+        "about": about,
+        "date": datetime.date.today().isoformat(),
+        "machine": f"{_cpu()}, Python {platform.python_version()}, {_versions()}",
+        "rows": list(rows),
+    }
+
+
+def finish(measured: Row, path: Path | None) -> None:
+    """Print a table, and keep the results where that was asked for."""
+    print(markdown(measured))
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+
+
+def markdown(measured: Row) -> str:
+    """The results of a programme, and below them how and on what they were measured."""
+    about = "".join(f"{text}; " for text in (measured["about"], _repeated(measured["rows"])) if text)
+    return f"{_TABLES[measured['programme']](measured['rows'])}\n\n{about}{measured['date']}, {measured['machine']}."
+
+
+def into_document(measured: Row, document: Path = DOCUMENT) -> None:
+    """Put a table between its markers, in the place of an earlier one."""
+    begin, end = (mark.format(measured["programme"]) for mark in ("<!-- {}: begin -->", "<!-- {}: end -->"))
+    text = document.read_text(encoding="utf-8")
+    head, rest = text.split(begin)
+    _, tail = rest.split(end)
+    document.write_text(f"{head}{begin}\n{markdown(measured)}\n{end}{tail}", encoding="utf-8")
+
+
+def _online(rows: Sequence[Row]) -> str:
+    names = (
+        "graph",
+        "poses, edges",
+        "who",
+        "CPU s",
+        "median ms",
+        "p99 ms",
+        "worst ms",
+        "chi2 (of best)",
+        "in its own map",
+    )
+    lines = []
+    for row in rows:
+        ours = _of_ours(row, rows)
+        times = [
+            _with_ratio(row, ours, "total_s", 1.0, 2),
+            _with_ratio(row, ours, "median_s", 1e3, 3),
+            _with_ratio(row, ours, "p99_s", 1e3, 2),
+            _with_ratio(row, ours, "worst_s", 1e3, 1),
+        ]
+        lines.append([*_heading(row, rows), *times, *_costs(row, rows)])
+    return _table(names, lines)
+
+
+def _batch(rows: Sequence[Row]) -> str:
+    names = (
+        "graph",
+        "poses, edges",
+        "who",
+        "CPU s",
+        "of it building",
+        "iterations",
+        "chi2 (of best)",
+        "in its own map",
+    )
+    lines = []
+    for row in rows:
+        seconds = _with_ratio(row, _of_ours(row, rows), "total_s", 1.0, 3)
+        about = [seconds, f"{row['build_s']:.3f}", str(row["iterations"])]
+        lines.append([*_heading(row, rows), *about, *_costs(row, rows)])
+    return _table(names, lines)
+
+
+def _growth(rows: Sequence[Row]) -> str:
+    names = ("poses", "who", "odometry alone, µs", "with a closure, µs")
+    lines = [
+        [f"{row['from']} to {row['to']}", row["who"], _microseconds(row["odometry_s"]), _microseconds(row["closure_s"])]
+        for row in sorted(rows, key=lambda row: (row["from"], row["who"] != OURS, row["who"]))
+    ]
+    return "![time per update over the size of the graph](growth.png)\n\n" + _table(names, lines)
+
+
+def _memory(rows: Sequence[Row]) -> str:
+    names = ("poses, edges", "who", "peak MB", "bytes per pose")
+    lines = []
+    for row in rows:
+        peak = _with_ratio(row, _of_ours(row, rows), "peak_bytes", 1e-6, 1)
+        who = row["who"] + (f" ({row['fault']})" if row["fault"] else "")
+        lines.append([f"{row['poses']}, {row['edges']}", who, peak, f"{row['peak_bytes'] / row['poses']:.0f}"])
+    return _table(names, lines)
+
+
+_TABLES: dict[str, Callable[[Sequence[Row]], str]] = {
+    "online": _online,
+    "batch": _batch,
+    "growth": _growth,
+    "memory": _memory,
+}
+
+
+def _heading(row: Row, rows: Sequence[Row]) -> list[str]:
+    """Graph, size and who; the graph is named in the first of its lines."""
+    first = next(other for other in rows if other["graph"] == row["graph"]) is row
+    size = f"{row['poses']}, {row['edges']}"
+    return [row["graph"] if first else "", size if first else "", row["who"]]
+
+
+def _of_ours(row: Row, rows: Sequence[Row]) -> Row | None:
+    """What a peer is compared with: ours on the same graph, in space against g2o with its weights."""
+    name = OURS_AS_G2O if row["who"].startswith("g2o") and len(row["chi2"] or ()) > 2 else OURS
+    same = (other for other in rows if other.get("graph") == row.get("graph") and other["who"] == name)
+    return next((other for other in same if not other["fault"]), None)
+
+
+def _with_ratio(row: Row, ours: Row | None, key: str, scale: float, digits: int) -> str:
+    """A number, and for a peer in brackets what part of it ours is."""
+    text = f"{scale * row[key]:.{digits}f}"
+    if ours is None or row["fault"] or row["who"].startswith(OURS) or not row[key]:
+        return text
+    return f"{text} ({ours[key] / row[key]:.2f}x)"
+
+
+def _costs(row: Row, rows: Sequence[Row]) -> list[str]:
+    """The cost in our error map and in the contender's own, or instead why there is none."""
+    if row["chi2"] is None:
+        return [row["fault"], ""]
+    ours, own = _cost(row, rows, "relative"), _cost(row, rows, row["error_map"])
+    return [f"{ours}, {row['fault']}" if row["fault"] else ours, own]
+
+
+def _cost(row: Row, rows: Sequence[Row], error_map: str) -> str:
+    """A cost, and in brackets how many times the lowest known it is."""
+    found = [other["chi2"][error_map] for other in rows if other["graph"] == row["graph"] and other["chi2"]]
+    if row["whole"] and error_map == "relative" and row["graph"] in _BEST_KNOWN:
+        found.append(_BEST_KNOWN[row["graph"]])
+    return f"{row['chi2'][error_map]:.4f} ({row['chi2'][error_map] / min(found):.4f})"
+
+
+def _repeated(rows: Sequence[Row]) -> str:
+    times = max((row.get("reps", 1) for row in rows), default=1)
+    return f"medians of {times} repetitions" if times > 1 else ""
+
+
+def _microseconds(seconds: float | None) -> str:
+    return "" if seconds is None else f"{1e6 * seconds:.0f}"
+
+
+def _table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    rule = ["---"] * len(names)
+    return "\n".join(f"| {' | '.join(line)} |" for line in (names, rule, *lines))
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _versions() -> str:
+    found = []
+    for name in _LIBRARIES:
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    return ", ".join(found)
+
+
+if __name__ == "__main__":
+    for source in sys.argv[1:]:
+        into_document(json.loads(Path(source).read_text(encoding="utf-8")))
