@@ -54,6 +54,7 @@ def _row(problem: Problem, name: str, solved: Sequence[Solved]) -> table.Row:
         "chi2": judge.all_costs(problem, last.poses, last.landmarks),
         "error_map": contenders.error_map(name, problem.planar),
         "fault": last.fault,
+        "reached": len(problem.poses),
         "whole": problem.whole,
     }
 

@@ -51,6 +51,7 @@ def _through(name: str, problem: Problem, read_path: bool, patience_s: float) ->
     steps = list(zip(problem.steps(), contender.prepared(problem).steps(), strict=True))
     step_s = np.zeros(len(steps))
     gc.collect()
+    gc.freeze()  # what is there already would be searched for garbage again and again
     before = _memory(peak=False)
     spent, fault = 0.0, ""
     for k, (step, given) in enumerate(steps):

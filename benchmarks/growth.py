@@ -38,8 +38,10 @@ def measure(poses: int, peer_poses: int, peers: Sequence[str], patience_s: float
 
 def _windows(problem: Problem, name: str, done: Drive) -> Iterator[table.Row]:
     """Mean CPU time of steps without and with a closure, over sizes of the graph evenly spaced on a log axis."""
+    if len(done.step_s) <= _SMALLEST:
+        return
     edges = np.bincount(problem.relative.ends.max(axis=1), minlength=len(problem.poses))[: len(done.step_s)]
-    decades = np.log10(max(len(done.step_s), _SMALLEST) / _SMALLEST)
+    decades = np.log10(len(done.step_s) / _SMALLEST)
     bounds = np.geomspace(_SMALLEST, len(done.step_s), max(2, round(_WINDOWS_PER_DECADE * decades) + 1)).astype(int)
     for start, stop in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
         seconds, closes = done.step_s[start:stop], edges[start:stop] > 1

@@ -53,6 +53,7 @@ def _row(problem: Problem, name: str, drives: Sequence[Drive]) -> table.Row:
         "chi2": judge.all_costs(reached, last.poses, last.landmarks),
         "error_map": contenders.error_map(name, problem.planar),
         "fault": last.fault,
+        "reached": len(reached.poses),
         "whole": reached.whole,
     }
 
@@ -67,8 +68,8 @@ def main() -> None:
     rows = []
     for problem in options.problems(args):
         rows += race(problem, args.peers, args.reps, not args.no_path, args.patience)
-    about = f"{'the newest pose' if args.no_path else 'the whole path'} is read after each step"
-    table.finish(table.results("online", rows, about), args.json)
+    programme, read = ("update", "the newest pose") if args.no_path else ("online", "the whole path")
+    table.finish(table.results(programme, rows, f"{read} is read after each step"), args.json)
 
 
 if __name__ == "__main__":

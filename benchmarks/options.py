@@ -21,13 +21,21 @@ def parser(about: str | None, peers: Sequence[str], usual: Sequence[str]) -> arg
     options = argparse.ArgumentParser(description=(about or "").splitlines()[0])
     options.add_argument(
         "--peers",
-        type=lambda text: [name for name in text.split(",") if name],
+        type=lambda text: _names(text, peers),
         default=list(usual),
         metavar="NAME,...",
         help=f"of {', '.join(peers)} (default: {','.join(usual)})",
     )
     options.add_argument("--json", type=Path, metavar="OUT", help="write the results there as well")
     return options
+
+
+def _names(text: str, known: Sequence[str]) -> list[str]:
+    names = [name for name in text.split(",") if name]
+    for name in names:
+        if name not in known:
+            raise argparse.ArgumentTypeError(f"{name} is none of {', '.join(known)}")
+    return names
 
 
 def add_files(options: argparse.ArgumentParser) -> None:

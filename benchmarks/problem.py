@@ -173,7 +173,7 @@ def city_problem(poses: int, seed: int = 1) -> Problem:
 
 def _in_time_order(name: str, file: "G2oFile") -> Problem:
     from graph_slam_ros.errors import FormatError
-    from graph_slam_ros.graph import LANDMARK_POSITION, R2, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3
+    from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3
     from graph_slam_ros.solver import initial_values
 
     graph, ids = file.graph, np.asarray(file.ids)
@@ -184,7 +184,7 @@ def _in_time_order(name: str, file: "G2oFile") -> Problem:
     poses = np.flatnonzero(graph.kind.values == graph.kinds.index(kind))
     poses = poses[np.argsort(ids[poses])]
     values = initial_values(graph, "file" if file.has_values else "tree", int(poses[0]))
-    index = np.full(graph.vertex_count, -1)
+    index = np.arange(graph.vertex_count)
     index[poses] = np.arange(len(poses))
 
     relative = _edges(graph, edge_type, index)
@@ -196,7 +196,6 @@ def _in_time_order(name: str, file: "G2oFile") -> Problem:
     points = np.empty(0, dtype=np.int64)
     sightings = Edges(np.empty((0, 2), dtype=np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
     if LANDMARK_POSITION in graph.tables:
-        index[graph.kind.values == graph.kinds.index(R2)] = np.flatnonzero(graph.kind.values == graph.kinds.index(R2))
         sightings = _edges(graph, LANDMARK_POSITION, index)
         sightings = sightings[np.lexsort((sightings.ends[:, 1], sightings.ends[:, 0]))]
         seen, first, which = np.unique(sightings.ends[:, 1], return_index=True, return_inverse=True)

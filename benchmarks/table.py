@@ -3,11 +3,13 @@
 ``python -m benchmarks.table RESULTS.json ...`` puts earlier results into the document.
 """
 
+import contextlib
 import datetime
 import json
 import platform
+import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from benchmarks.fresh import ROOT
 Row = dict[str, Any]
 
 DOCUMENT = ROOT / "docs/benchmarks.md"
-_LIBRARIES = ("graph_slam_ros", "numpy", "scipy", "numba", "gtsam", "graphslam")
+_LIBRARIES = ("numpy", "scipy", "numba", "gtsam", "graphslam")
 
 # The lowest cost that anybody has found, in our error map with the information matrices of the file.
 _BEST_KNOWN = {
@@ -42,7 +44,7 @@ def results(programme: str, rows: Sequence[Row], about: str = "") -> Row:
         "programme": programme,
         "about": about,
         "date": datetime.date.today().isoformat(),
-        "machine": f"{_cpu()}, Python {platform.python_version()}, {_versions()}",
+        "machine": f"{_cpu()}, Python {platform.python_version()}, {', '.join([*_versions(), *_pinned()])}",
         "rows": list(rows),
     }
 
@@ -135,6 +137,7 @@ def _memory(rows: Sequence[Row]) -> str:
 
 _TABLES: dict[str, Callable[[Sequence[Row]], str]] = {
     "online": _online,
+    "update": _online,
     "batch": _batch,
     "growth": _growth,
     "memory": _memory,
@@ -173,7 +176,8 @@ def _costs(row: Row, rows: Sequence[Row]) -> list[str]:
 
 def _cost(row: Row, rows: Sequence[Row], error_map: str) -> str:
     """A cost, and in brackets how many times the lowest known it is."""
-    found = [other["chi2"][error_map] for other in rows if other["graph"] == row["graph"] and other["chi2"]]
+    same = (other for other in rows if all(other[key] == row[key] for key in ("graph", "reached")))
+    found = [other["chi2"][error_map] for other in same if other["chi2"]]
     if row["whole"] and error_map == "relative" and row["graph"] in _BEST_KNOWN:
         found.append(_BEST_KNOWN[row["graph"]])
     return f"{row['chi2'][error_map]:.4f} ({row['chi2'][error_map] / min(found):.4f})"
@@ -201,14 +205,21 @@ def _cpu() -> str:
         return platform.processor() or platform.machine()
 
 
-def _versions() -> str:
-    found = []
+def _versions() -> Iterator[str]:
+    """Of ours the revision."""
+    described = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    yield f"graph_slam_ros {described.stdout.strip() or version('graph_slam_ros')}"
     for name in _LIBRARIES:
-        try:
-            found.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            continue
-    return ", ".join(found)
+        with contextlib.suppress(PackageNotFoundError):
+            yield f"{name} {version(name)}"
+
+
+def _pinned() -> Iterator[str]:
+    """The versions in g2o's environment, which is not this one."""
+    text = (ROOT / "benchmarks/requirements-g2o.txt").read_text(encoding="utf-8")
+    return (line.replace("==", " ") for line in text.splitlines() if line.startswith("g2o"))
 
 
 if __name__ == "__main__":
