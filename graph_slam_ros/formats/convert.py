@@ -37,8 +37,8 @@ def write_graph(path: Path, file: G2oFile, values: Values | None, target: str) -
     """Write a graph in a format of ``ENDINGS``; without values, its edges alone.
 
     In TUM a vertex's id is its stamp, in seconds, since a graph has no stamps; edges and landmarks are no part of a
-    trajectory, and not counted as lost. Edges of weight 0 are out of the problem: they are left
-    out, and counted.
+    trajectory, and not counted as lost. The labels of edges are in g2o alone, as comments; in the others a reader gives
+    the usual ones. Edges of weight 0 are out of the problem: they are left out, and counted.
 
     Raises
     ------
@@ -65,18 +65,15 @@ def _translated(lines: list[str], text: Text) -> tuple[list[str], Counter[str]]:
     """The lines in another text's words, and how many lines of each tag it has no words for."""
     out: list[str] = []
     missing: Counter[str] = Counter()
-    heading: list[str] = []
     for line in lines:
         words = line.split()
-        if words[0] == "#":
-            heading = [line]  # of a class: written before the first of its edges, if one is
+        if words[0] == "#":  # there are readers that give up at a comment, and say nothing
             continue
         translated = from_g2o_words(words, text)
         if translated is None:
             missing[words[0]] += 1
         else:
-            out += [*heading, " ".join(translated)]
-            heading = []
+            out.append(" ".join(translated))
     return out, missing
 
 
