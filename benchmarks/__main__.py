@@ -1,4 +1,7 @@
-"""Everything, into docs/benchmarks.md: ``make bench``."""
+"""Everything, into docs/benchmarks.md: ``make bench``.
+
+What follows on the command line goes to each programme, e.g. ``python -m benchmarks --poses 400`` for a short look.
+"""
 
 import json
 import subprocess
@@ -14,7 +17,11 @@ def main() -> None:
     """One programme after the other; what is done is in the document even if the next is stopped."""
     for name, *more in (["batch"], ["online"], ["online", "--no-path"], ["memory"], ["growth"]):
         path = _RESULTS / f"{name}{''.join(more)}.json"
-        subprocess.run([sys.executable, "-m", f"benchmarks.{name}", *more, "--json", str(path)], cwd=ROOT, check=True)
+        subprocess.run(
+            [sys.executable, "-m", f"benchmarks.{name}", *more, *sys.argv[1:], "--json", str(path)],
+            cwd=ROOT,
+            check=True,
+        )
         table.into_document(json.loads(path.read_text(encoding="utf-8")))
 
 

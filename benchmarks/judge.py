@@ -2,6 +2,7 @@
 
 * ``relative`` : position and rotation vector of ``Z^-1 Ti^-1 Tj``; ours, and in the plane g2o's.
 * ``logarithm`` : the full logarithm of it, and landmarks by bearing and range; GTSAM's.
+* ``inverse`` : as ``relative``, of the inverse of it; python-graphslam's, in the plane.
 * ``quaternion`` : position and the vector part of the quaternion, half the rotation vector; g2o's in space.
 
 The information matrices are those of the file in all of them. No one-half, no loss.
@@ -14,10 +15,10 @@ from graph_slam_ros.lie import se2, se3, so3
 
 
 def all_costs(problem: Problem, poses: Array, landmarks: Array) -> dict[str, float] | None:
-    """The cost in each error map that is another one than ours; ``None`` where there is no finite estimate."""
+    """The cost in each error map; ``None`` where there is no finite estimate."""
     if len(poses) != len(problem.poses) or not np.isfinite(poses).all():
         return None
-    maps = ("relative", "logarithm") if problem.planar else ("relative", "logarithm", "quaternion")
+    maps = ("relative", "logarithm", "inverse") if problem.planar else ("relative", "logarithm", "quaternion")
     return {error_map: chi2(problem, poses, landmarks, error_map) for error_map in maps}
 
 
@@ -28,6 +29,8 @@ def chi2(problem: Problem, poses: Array, landmarks: Array, error_map: str) -> fl
     error = group.between(tuple(problem.relative.measured.T), group.between(i, j))
     if error_map == "logarithm":
         error = group.log(error)
+    elif error_map == "inverse":
+        error = group.inverse(error)
     elif not problem.planar:
         sign = np.where(error[6] < 0.0, -1.0, 1.0)
         turned = sign * np.stack(error[3:6]) if error_map == "quaternion" else so3.log(se3.rotation(error))

@@ -30,7 +30,7 @@ _BEST_KNOWN = {
     "manhattanOlson3500": 146.077,
     "sphere2500": 1351.36,
     "parking-garage": 1.26838,
-    "torus3D": 24237.98,
+    "torus3D": 24234.71,
     "smallGrid3D": 1033.894,
     "ring": 11.1631,
     "victoria_park": 6184.12,
@@ -153,9 +153,9 @@ def _heading(row: Row, rows: Sequence[Row]) -> list[str]:
 
 def _of_ours(row: Row, rows: Sequence[Row]) -> Row | None:
     """What a peer is compared with: ours on the same graph, in space against g2o with its weights."""
-    name = OURS_AS_G2O if row["who"].startswith("g2o") and len(row["chi2"] or ()) > 2 else OURS
-    same = (other for other in rows if other.get("graph") == row.get("graph") and other["who"] == name)
-    return next((other for other in same if not other["fault"]), None)
+    same = {other["who"]: other for other in rows if other.get("graph") == row.get("graph")}
+    ours = same.get(OURS_AS_G2O, same[OURS]) if row["who"].startswith("g2o") else same[OURS]
+    return None if ours["fault"] else ours
 
 
 def _with_ratio(row: Row, ours: Row | None, key: str, scale: float, digits: int) -> str:

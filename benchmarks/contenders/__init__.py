@@ -88,6 +88,8 @@ def error_map(name: str, planar: bool) -> str:
     """What a contender minimises, see ``judge``."""
     if name.startswith(("isam2", "gtsam")):
         return "logarithm"
+    if name == "graphslam":
+        return "inverse"
     return "quaternion" if not planar and name in ("g2o-gn", "g2o-lm", OURS_AS_G2O) else "relative"
 
 
