@@ -12,8 +12,7 @@ import numpy as np
 
 from benchmarks.problem import Array, Edges, Problem, polar, triangular
 
-# Any prior on the first pose fixes the gauge and is met exactly; a strong one makes iSAM2 throw on sphere2500.
-_ANCHOR = 0.1  # [m, rad]
+_ANCHOR = 1e-3  # sigma [m, rad] of the prior on the first pose, which fixes the gauge and is met exactly
 _ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
