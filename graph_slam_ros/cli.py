@@ -159,7 +159,7 @@ def _optimize(args: argparse.Namespace) -> int:
     for vertex in file.fixed if file.fixed or has_prior else [_root(file)]:
         solver.hold(vertex)
     before = _positions(graph, solver) if args.plot else None
-    report = solver.update(settings)
+    report = solver.optimize(settings)
     if args.json:
         answer = {
             "chi2_initial": report.chi2_initial,

@@ -169,14 +169,14 @@ class RunRecorder:
 
 def summarize(slam: GraphSlam) -> dict[str, Any]:
     """What happened, in numbers."""
-    last = slam.reports[-1] if slam.reports else None
+    last = slam.report
     return {
         "version": __version__,
         "keyframes": len(slam.keyframes),
         "landmarks": len(slam.landmarks),
         "sightings": sum(landmark.sightings for landmark in slam.landmarks.values()),
         "edges": slam.graph.edge_count,
-        "solves": len(slam.reports),
+        "solves": slam.solves,
         "chi2": last.chi2_final if last else 0.0,
         "cost": last.cost_final if last else 0.0,
         "converged": last.converged if last else True,

@@ -49,7 +49,7 @@ def warmup() -> float:
     graph.add_edge(LANDMARK_POSITION_3D, [space[0], far], [1, 1, 0], three, "landmarks")
     solver = Solver(graph, Settings(losses={"landmarks": [Loss(HUBER)]}))
     solver.add(range(graph.vertex_count), range(graph.edge_count))
-    solver.update()
+    solver.optimize()
     solver.marginal([0])
     se2.noise_during((1.0, 0.0, 0.1), np.eye(3))
     se2.propagate_during(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))

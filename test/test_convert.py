@@ -82,7 +82,7 @@ def solved(path):
     solver.start_at(initial_values(file.graph, "file" if file.has_values else "tree", 0))
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
     solver.hold(int(np.argmin(file.ids)))
-    return solver.update()
+    return solver.optimize()
 
 
 # -- what each format says -------------------------------------------------------------------------------------------

@@ -91,7 +91,7 @@ def test_each_graph_has_the_optimum_that_the_readme_states(name, error_map, star
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
     for vertex in file.fixed:
         solver.hold(vertex)
-    report = solver.update()
+    report = solver.optimize()
     assert report.converged
     classes = [c.chi2 for _, c in sorted(report.classes.items(), key=lambda item: item[0] != "odometry")]
     assert f"{report.chi2_initial:.3f}" == start
@@ -126,7 +126,7 @@ def test_a_general_optimiser_finds_the_chi2_that_the_readme_states():
     solver = Solver(file.graph)
     solver.add(range(106), range(file.graph.edge_count))
     solver.hold(0)
-    solver.update()
+    solver.optimize()
     found = np.concatenate([solver.estimate(range(1, 101)).ravel(), solver.estimate(range(101, 106)).ravel()])
     start = found + 0.01 * np.random.default_rng(0).standard_normal(len(found))
     best = least_squares(residuals, start, args=(*edges, solver.estimate([0])[0]), x_scale="jac", max_nfev=15)

@@ -93,4 +93,4 @@ def test_victoria_park_starts_where_its_reference_says():
     solver.start_at(initial_values(file.graph, "tree", 0))
     solver.hold(0)
     assert file.graph.vertex_count == 6969 + 151
-    assert solver.update(type(solver.settings)(max_iterations=1)).chi2_initial == pytest.approx(1.33018e8, rel=1e-5)
+    assert solver.optimize(type(solver.settings)(max_iterations=1)).chi2_initial == pytest.approx(1.33018e8, rel=1e-5)

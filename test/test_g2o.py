@@ -124,7 +124,7 @@ def test_the_estimate_is_what_is_written(tmp_path, read):
     solver = Solver(file.graph)
     solver.add([0, 1], [0])
     solver.hold(0)
-    solver.update()
+    solver.optimize()
     write_g2o(tmp_path / "out.g2o", file, solver.estimate)
     assert read_g2o(tmp_path / "out.g2o").graph.initial.values.tobytes() == solver.estimate([0, 1]).tobytes()
 

@@ -129,7 +129,7 @@ def chi2_of(edge):
     solver.add(ends, [0])
     solver.hold(0)
     solver.hold(1)
-    return solver.update().chi2_initial
+    return solver.optimize().chi2_initial
 
 
 def test_no_other_convention_gives_the_same_chi2():

@@ -22,7 +22,7 @@ def solved(graph, method):
     solver.add(range(graph.vertex_count), range(graph.edge_count))
     solver.start_at(initial_values(graph, method, 0))
     solver.hold(0)
-    return solver.update()
+    return solver.optimize()
 
 
 def exact_graph(seed, kind, edge, group, dof):

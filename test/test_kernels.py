@@ -71,7 +71,7 @@ for path in sys.argv[1:]:
     solver = Solver(file.graph)
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
     solver.hold(0)
-    solver.update()
+    solver.optimize()
     solver.marginal([1])
 print([name for name, count in before.items() if count == 0])
 print([name for name, count in signatures().items() if count != before.get(name, 0)])

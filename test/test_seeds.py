@@ -51,13 +51,13 @@ def test_on_a_line_nothing_is_determined_without_an_anchor():
     assert solver.information_matrix() == pytest.approx(2.5 * np.array([[2, -1, -1], [-1, 2, -1], [-1, -1, 2]]))
     assert np.linalg.det(solver.information_matrix()) == pytest.approx(0.0, abs=1e-12)
     with pytest.raises(GaugeError, match="vertex 0"):
-        solver.update()
+        solver.optimize()
 
 
 def test_on_a_line_the_poses_come_to_where_the_sightings_put_them():
     solver = poses_on_a_line(anchored=True)
     assert np.linalg.det(solver.information_matrix()) == pytest.approx(18.75, rel=1e-12)
-    report = solver.update()
+    report = solver.optimize()
     assert report.converged
     assert solver.estimate(range(3)).ravel() == pytest.approx([0.0, 0.9, 1.9], abs=1e-12)
     assert report.chi2_final == pytest.approx(0.0, abs=1e-12)  # three edges from three sightings never disagree
@@ -74,7 +74,7 @@ def test_on_a_line_the_landmark_as_a_vertex_uses_odometry_too_and_counts_each_si
     for i in range(3):
         graph.add_edge(DIFFERENCE[R1], [i, landmark], [AHEAD[i]], noise, "sightings")
     solver = with_all(graph)
-    report = solver.update()
+    report = solver.optimize()
     rows = np.array([[-1, 1, 0, 0], [0, -1, 1, 0], [-1, 0, 0, 1], [0, -1, 0, 1], [0, 0, -1, 1.0]]) / np.sqrt(VARIANCE)
     readings = np.array([1.5, 0.9, *AHEAD]) / np.sqrt(VARIANCE)
     rows, readings = np.vstack([[1, 0, 0, 0], rows]), np.append(0.0, readings)
@@ -110,7 +110,7 @@ def test_in_the_plane_the_determinant_is_that_of_the_information_whatever_the_re
     anchor = graph.add_edge(POSE_PRIOR, [0], (0.0, 0.0, 0.0), Gaussian.from_information(np.eye(3)), "anchor")
     solver.add([], [anchor])
     assert np.linalg.det(solver.information_matrix()) == pytest.approx(716.197, abs=5e-4)
-    solver.update()
+    solver.optimize()
     assert se2.between(*solver.estimate([0, 1])) == pytest.approx((*z[:2], se2.wrap(z[2])), abs=1e-6)
     assert np.linalg.det(solver.information_matrix()) == pytest.approx(716.197, abs=5e-4)
 
@@ -127,7 +127,7 @@ def solved(path, error_map="relative", **settings):
     solver = Solver(file.graph, Settings(**settings))
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
     solver.hold(0)
-    return solver.update()
+    return solver.optimize()
 
 
 @pytest.mark.parametrize(

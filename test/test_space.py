@@ -121,7 +121,7 @@ def solved(file):
     solver = Solver(file.graph)
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
     solver.hold(0)
-    return solver.update()
+    return solver.optimize()
 
 
 def initial(graph, ids):

@@ -13,7 +13,7 @@ from typing import Any
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import Loss
-from graph_slam_ros.solver import Settings
+from graph_slam_ros.solver import METHODS, Settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,18 +164,28 @@ class OrderingConfig:
 
 @dataclass(frozen=True, slots=True)
 class SolveConfig:
-    """When and how the graph is solved."""
+    """When and how the graph is solved: a little at each keyframe, and everything at the end."""
 
-    every_keyframes: int = _setting(20, "solve after this many keyframes", "keyframes", low=1, high=1_000_000)
-    closure_gap_s: float = _setting(30.0, "and when a landmark returns that was not seen for this long", "s", low=0.0)
-    closure_keyframes: int = _setting(
-        10, "but a return does not solve again within this many keyframes", "keyframes", low=0, high=1_000_000
+    every_keyframes: int = _setting(
+        1, "update the estimate after this many keyframes", "keyframes", low=1, high=1_000_000
     )
-    method: str = _setting("gn", "gn (damped only where it fails to converge) or lm", choices=("gn", "lm"))
-    max_iterations: int = _setting(50, "of each stage of the losses", "", low=1, high=10_000)
-    step_tolerance: float = _setting(1e-5, "converged when no step is larger", "m, rad", low=0.0)
-    cost_tolerance: float = _setting(1e-3, "converged when the cost changes by a smaller fraction", "", low=0.0)
-    final_cost_tolerance: float = _setting(1e-9, "the same, for the solve at the end of a run", "", low=0.0)
+    relinearize_above: float = _setting(
+        0.05, "linearise a pose or landmark anew when it has moved by more since", "m, rad", low=0.0
+    )
+    relinearize_every: int = _setting(
+        10,
+        "look for those at every so many updates (at each for five times that far)",
+        "updates",
+        low=1,
+        high=1_000_000,
+    )
+    tolerance: float = _setting(1e-5, "changes up to this are not followed through the graph", "m, rad", low=0.0)
+    method: str = _setting(
+        "gn", "of the solve at the end: gn (damped only where it fails to converge), lm or dogleg", choices=METHODS
+    )
+    max_iterations: int = _setting(50, "of the solve at the end, of each stage of the losses", "", low=1, high=10_000)
+    step_tolerance: float = _setting(1e-5, "it has converged when no step is larger", "m, rad", low=0.0)
+    cost_tolerance: float = _setting(1e-9, "or when the cost changes by a smaller fraction", "", low=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,13 +255,21 @@ class Config:
         """Nested plain values, every parameter named."""
         return dataclasses.asdict(self)
 
-    def solver_settings(self, final: bool = False) -> Settings:
-        """How the solver is to be run, online or at the end."""
+    def solver_settings(self) -> Settings:
+        """How the solver is to be run, online and at the end."""
         scale = self.landmarks.loss_scale
         stages = [Loss.named(name, scale) for name in self.landmarks.loss.split("_then_")]
         s = self.solve
-        tolerance = s.final_cost_tolerance if final else s.cost_tolerance
-        return Settings(s.method, s.max_iterations, s.step_tolerance, tolerance, {"landmarks": stages})
+        return Settings(
+            s.method,
+            s.max_iterations,
+            s.step_tolerance,
+            s.cost_tolerance,
+            {"landmarks": stages},
+            s.relinearize_above,
+            s.relinearize_every,
+            tolerance=s.tolerance,
+        )
 
 
 def _section_type(section: "dataclasses.Field[Any]") -> type:

@@ -26,7 +26,7 @@ from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.measurements import Control, Measurement, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.motion import Motion, Moved
-from graph_slam_ros.slam.stamp_order import NS, StampOrder
+from graph_slam_ros.slam.stamp_order import StampOrder
 from graph_slam_ros.solver import Report, Settings, Solver
 
 Array = NDArray[np.float64]
@@ -64,13 +64,14 @@ class SightingPose:
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """What ``process`` changed: indices of new keyframes, and the report of the last solve, if there was one."""
+    """What ``process`` changed: indices of new keyframes; whether it solved; the report of a solve of everything."""
 
     keyframes: tuple[int, ...] = ()
+    solved: bool = False
     report: Report | None = None
 
     def __bool__(self) -> bool:
-        return bool(self.keyframes) or self.report is not None
+        return bool(self.keyframes) or self.solved
 
 
 _NOTHING = Update()
@@ -93,7 +94,8 @@ class GraphSlam:
         self.keyframes: list[Keyframe] = []
         self.landmarks: dict[str, Landmark] = {}
         self.sighting_poses: list[SightingPose] = []
-        self.reports: list[Report] = []
+        self.solves = 0
+        self.report: Report | None = None  # of the last solve of everything
         self._sink = sink
         self._order = StampOrder(self.config.ordering, self.counters)
         self._odometry: Odometry | None = None
@@ -102,7 +104,6 @@ class GraphSlam:
         self._covariance = np.zeros((3, 3))
         self._handed_over = 0, 0  # vertices and edges the solver has
         self._unsolved_keyframes = 0
-        self._closure = False
 
     # -- the door ------------------------------------------------------------------------------------------------
 
@@ -112,7 +113,7 @@ class GraphSlam:
             return _NOTHING
         if self._sink is not None:
             self._sink(measurement)
-        first_new, solves = len(self.keyframes), len(self.reports)
+        first_new, solves, report = len(self.keyframes), self.solves, self.report
         match measurement:
             case Odometry() | Sightings():
                 self._use(self._order.push(measurement))
@@ -122,13 +123,13 @@ class GraphSlam:
                 self._use(self._order.flush())
                 self._drop_unreached()
             case Control("optimize"):
-                self._solve(self.config.solver_settings(final=True))
+                self._solve(self.config.solver_settings())
             case _:
                 self.counters.count("control", f"unknown event {measurement.event}")
-        if len(self.keyframes) == first_new and len(self.reports) == solves:
+        if len(self.keyframes) == first_new and self.solves == solves:
             return _NOTHING
-        report = self.reports[-1] if len(self.reports) > solves else None
-        return Update(tuple(range(first_new, len(self.keyframes))), report)
+        new = self.report if self.report is not report else None
+        return Update(tuple(range(first_new, len(self.keyframes))), self.solves > solves, new)
 
     # -- what is known now ---------------------------------------------------------------------------------------
 
@@ -284,27 +285,28 @@ class GraphSlam:
         else:
             edge_type = LANDMARK_POSITION if self.graph.kind_of(landmark.vertex) is R2 else TAG_POSITION
         self.graph.add_edge(edge_type, [keyframe.vertex, landmark.vertex], measured, noise, "landmarks")
-        if stamp_ns - landmark.last_seen_ns > self.config.solve.closure_gap_s * NS:
-            self._closure = True
         landmark.sightings += 1
         landmark.last_seen_ns = stamp_ns
 
     # -- solving -------------------------------------------------------------------------------------------------
 
     def _solve_if_due(self) -> None:
-        due = self.config.solve
-        if self._unsolved_keyframes >= (due.closure_keyframes if self._closure else due.every_keyframes):
+        if self._unsolved_keyframes >= self.config.solve.every_keyframes:
             self._solve()
 
-    def _solve(self, settings: Settings | None = None) -> None:
-        """Solve; where that fails the last estimate stays, and the failure is counted."""
-        self._unsolved_keyframes, self._closure = 0, False
+    def _solve(self, everything: Settings | None = None) -> None:
+        """Take in what is new, or solve everything; where that fails the last estimate stays, and it is counted."""
+        self._unsolved_keyframes = 0
         if not self.keyframes:
             return
         self._hand_over()
         try:
-            self.reports.append(self.solver.update(settings))
+            if everything is None:
+                self.solver.update()
+            else:
+                self.report = self.solver.optimize(everything)
             (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
+            self.solves += 1
         except GraphSlamError as error:
             self.counters.count("solver", type(error).__name__)
 

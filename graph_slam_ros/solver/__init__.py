@@ -1,8 +1,8 @@
-"""How the problem is solved: linearisation, normal equations, Gauss-Newton and Levenberg-Marquardt, marginals."""
+"""How the problem is solved: linearisation, ordering, the clique tree, online updates and batch optimisation."""
 
-from graph_slam_ros.solver.descent import Settings
+from graph_slam_ros.solver.descent import METHODS, Settings
 from graph_slam_ros.solver.initialization import initial_values
-from graph_slam_ros.solver.report import ClassCost, Iteration, Report
+from graph_slam_ros.solver.report import Change, ClassCost, Iteration, Report
 from graph_slam_ros.solver.solver import Solver
 
-__all__ = ["ClassCost", "Iteration", "Report", "Settings", "Solver", "initial_values"]
+__all__ = ["METHODS", "Change", "ClassCost", "Iteration", "Report", "Settings", "Solver", "initial_values"]

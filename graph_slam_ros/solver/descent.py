@@ -1,6 +1,6 @@
-"""Gauss-Newton and Levenberg-Marquardt on the normal equations, with losses minimised in stages."""
+"""Batch optimisation on the clique tree: Gauss-Newton, Levenberg-Marquardt, dogleg, with losses in stages."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,15 +9,18 @@ from numpy.typing import NDArray
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.graph import EdgeTable
-from graph_slam_ros.solver.linearization import Block, by_class, linearize, refuse_nonfinite, total
-from graph_slam_ros.solver.normal import NormalEquations
+from graph_slam_ros.solver.linearization import by_class, linearize, refuse_nonfinite, store, total
+from graph_slam_ros.solver.numeric import back_substitute, curvature, eliminate, gradient, settle, step_by
 from graph_slam_ros.solver.report import Iteration, Report
+from graph_slam_ros.solver.symbolic import mark
+from graph_slam_ros.solver.tree import NOTHING, Tree
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _TINY = 1e-12  # a cost of zero up to rounding has converged
 _DAMPING_FIRST, _DAMPING_LEAST, _DAMPING_MOST, _DAMPING_FACTOR = 1e-4, 1e-12, 1e12, 10.0
+_RADIUS_FIRST, _RADIUS_LEAST = 1.0, 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +29,16 @@ class Settings:
 
     Attributes
     ----------
-    method : ``gn`` (damped only after it fails to converge) or ``lm``
+    method : of ``optimize``: ``gn`` (damped only after it fails to converge), ``lm`` or ``dogleg``
     max_iterations : of each stage
     step_tolerance : converged when no component of a step is larger [m, rad]
     cost_tolerance : converged when the cost changes by a smaller fraction
     losses : by label, the stages of its loss: each is minimised until converged, then the next; a label with fewer
-        stages keeps its last
+        stages keeps its last. Online an edge has the first at its first update and the last from then on
+    relinearize_above : online, a vertex is linearised anew when a component of its step is larger [m, rad]
+    relinearize_every : that is looked for at every so many updates; steps five times as large are at any
+    relinearize_passes : how often at most within one update
+    tolerance : online, changes of a step up to this are not followed [m, rad]
     """
 
     method: str = "gn"
@@ -39,10 +46,14 @@ class Settings:
     step_tolerance: float = 1e-6
     cost_tolerance: float = 1e-6
     losses: Mapping[str, Sequence[Loss]] = field(default_factory=dict)
+    relinearize_above: float = 0.05
+    relinearize_every: int = 10
+    relinearize_passes: int = 3
+    tolerance: float = 1e-5
 
     def __post_init__(self) -> None:
-        if self.method not in ("gn", "lm"):
-            raise GraphSlamError(f"method {self.method!r}: choose gn or lm")
+        if self.method not in METHODS:
+            raise GraphSlamError(f"method {self.method!r}: choose {', '.join(METHODS[:-1])} or {METHODS[-1]}")
 
     def stages(self) -> list[dict[str, Loss]]:
         """One loss per label for each stage."""
@@ -50,40 +61,74 @@ class Settings:
         return [{name: s[min(k, len(s) - 1)] for name, s in self.losses.items()} for k in range(count)]
 
 
-@dataclass(frozen=True, slots=True)
 class Problem:
-    """What is minimised: edges (rows of each table) over the free vertices of ``normal``."""
+    """What is minimised: the edges of a clique tree over its unknowns, from where the estimate is.
 
-    graph: Graph
-    rows: Mapping[EdgeTable, Index]
-    normal: NormalEquations
+    Attributes
+    ----------
+    chi2, cost : of what was last linearised
+    """
 
-    def linearize(self, x: Array, losses: Mapping[str, Loss]) -> list[Block]:
-        """Whitened blocks of all edges at the stored values x."""
-        return linearize(self.graph, x, self.rows, losses)
+    def __init__(self, graph: Graph, tree: Tree, rows: Mapping[EdgeTable, Index], unknowns: Index) -> None:
+        self.graph, self.tree, self.rows, self.unknowns = graph, tree, rows, unknowns
+        self._cliques = mark(tree, unknowns)
+        self.edges = np.concatenate([t.id.values[r] for t, r in rows.items()] or [np.empty(0, dtype=np.int64)])
+        self._size = len(graph.initial)
+        self.chi2 = self.cost = 0.0
+        settle(tree, unknowns)
 
-    def retract(self, x: Array, step: Array) -> Array:
-        """``x [+] step`` over the free vertices."""
-        out = x.copy()
-        codes = self.graph.kind.values[self.normal.free]
-        for code, kind in enumerate(self.graph.kinds):
-            mine = codes == code
-            at = self.graph.offset.values[self.normal.free[mine]][:, None] + np.arange(kind.size)
-            out[at] = kind.retract(x[at], step[self.normal.first_dof[mine][:, None] + np.arange(kind.dof)])
-        return out
+    def linearize(self, losses: Mapping[str, Loss]) -> None:
+        """Put the blocks of all edges at the linearisation points into the tree."""
+        blocks = linearize(self.graph, self.tree.value, self.rows, losses)
+        for b in blocks:
+            store(self.tree, b.table.id.values[b.rows], b.residual, b.jacobian)
+        self.chi2, self.cost = total(blocks)
+
+    def solve(self, damping: float = 0.0) -> float:
+        """Find the step of all unknowns; returns its largest component.
+
+        Raises
+        ------
+        SingularError
+            The edges do not determine a vertex.
+        """
+        vertex = eliminate(self.tree, self._cliques, damping)
+        if vertex != NOTHING:
+            raise SingularError(f"the edges do not determine vertex {vertex}")
+        back_substitute(self.tree, self._cliques, -1.0)
+        return self.largest_step()
+
+    def largest_step(self) -> float:
+        """Largest component of the present step [m or rad]."""
+        return float(np.abs(self.tree.step).max(initial=0.0))
+
+    def move(self) -> None:
+        """Take the step: the estimate becomes the linearisation point."""
+        settle(self.tree, self.unknowns)
+
+    def saved(self) -> tuple[Array, ...]:
+        """Linearisation points and blocks, to come back to."""
+        tree = self.tree
+        return tree.value[: self._size].copy(), tree.blocks.copy(), tree.diagonal.copy()
+
+    def restore(self, saved: tuple[Array, ...]) -> None:
+        """Come back to what was saved."""
+        value, blocks, diagonal = saved
+        self.tree.value[: self._size] = self.tree.estimate[: self._size] = value
+        self.tree.blocks[:], self.tree.diagonal[:] = blocks, diagonal
+        self.tree.step[:] = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class _Descent:
     """How one method went, from where it began."""
 
-    x: Array
     iterations: list[Iteration]
     stop: str
 
 
-def minimise(problem: Problem, x: Array, settings: Settings) -> tuple[Array, Report]:
-    """Minimise stage after stage of the losses; returns the last finite iterate and the report.
+def minimise(problem: Problem, settings: Settings) -> Report:
+    """Minimise stage after stage of the losses; the tree is left at the last finite iterate.
 
     Gauss-Newton may rise on its way. It has failed when it ends above where it began, or not finite, or without
     converging, or met a singular system; then the stage is done again with damping. Damping hides what the edges
@@ -97,80 +142,128 @@ def minimise(problem: Problem, x: Array, settings: Settings) -> tuple[Array, Rep
         The cost is not finite where it starts.
     """
     stages = settings.stages()
-    blocks = problem.linearize(x, stages[0])
-    refuse_nonfinite(blocks)
-    chi2_initial, cost_initial = total(blocks)
+    refuse_nonfinite(linearize(problem.graph, problem.tree.value, problem.rows, stages[0]))
+    problem.linearize(stages[0])
+    chi2_initial, cost_initial = problem.chi2, problem.cost
     iterations: list[Iteration] = []
     used, stop = settings.method, ""
     for losses in stages:
-        descent = None
-        if settings.method == "gn":
-            descent = _gauss_newton(problem, x, losses, settings)
-        if descent is None or descent.stop not in ("step", "cost"):
-            descent = _levenberg_marquardt(problem, x, losses, settings)
+        begin = problem.saved()
+        descent = _DESCENTS[settings.method](problem, losses, settings)
+        if settings.method == "gn" and descent.stop not in ("step", "cost"):
+            problem.restore(begin)
+            descent = _levenberg_marquardt(problem, losses, settings)
             used = "lm"
-        x, stop = descent.x, descent.stop
+        stop = descent.stop
         iterations += descent.iterations
-    blocks = problem.linearize(x, stages[-1])
-    if used == "lm":
-        problem.normal.assemble(blocks)
-        problem.normal.factor()
+    if used != "gn":
+        problem.solve()
+        problem.tree.step[:] = 0.0
+        problem.restore(problem.saved())
+    blocks = linearize(problem.graph, problem.tree.value, problem.rows, stages[-1])
     chi2, cost = total(blocks)
     classes = by_class(problem.graph, blocks)
-    return x, Report(used, stop, chi2_initial, chi2, cost_initial, cost, tuple(iterations), classes)
+    return Report(used, stop, chi2_initial, chi2, cost_initial, cost, tuple(iterations), classes)
 
 
-def _gauss_newton(problem: Problem, x: Array, losses: Mapping[str, Loss], settings: Settings) -> _Descent:
-    blocks = problem.linearize(x, losses)
-    _, cost = total(blocks)
-    cost_start = cost
+def _gauss_newton(problem: Problem, losses: Mapping[str, Loss], settings: Settings) -> _Descent:
+    problem.linearize(losses)
+    start = problem.cost
     iterations: list[Iteration] = []
     for _ in range(settings.max_iterations):
-        problem.normal.assemble(blocks)
         try:
-            # what the edges leave open they leave open from the first step on
-            lu = problem.normal.factor(check=not iterations)
-            step = lu.solve(-problem.normal.gradient)
+            step = problem.solve()
         except SingularError:
-            return _Descent(x, iterations, "singular")
-        x = problem.retract(x, step)
-        blocks = problem.linearize(x, losses)
-        previous, (chi2, cost) = cost, total(blocks)
-        iterations.append(Iteration(chi2, cost, float(np.abs(step).max(initial=0.0)), 0.0))
-        if not np.isfinite(cost):
-            break
+            return _Descent(iterations, "singular")
+        previous = problem.cost
+        problem.move()
+        problem.linearize(losses)
+        iterations.append(Iteration(problem.chi2, problem.cost, step, 0.0))
+        if not np.isfinite(problem.cost):
+            return _Descent(iterations, "diverged")
         stop = _converged(previous, iterations[-1], settings)
         if stop:
-            risen = cost > cost_start * (1.0 + settings.cost_tolerance) + _TINY
-            return _Descent(x, iterations, "diverged" if risen else stop)
-    return _Descent(x, iterations, "max_iterations" if np.isfinite(cost) else "diverged")
+            risen = problem.cost > start * (1.0 + settings.cost_tolerance) + _TINY
+            return _Descent(iterations, "diverged" if risen else stop)
+    return _Descent(iterations, "max_iterations")
 
 
-def _levenberg_marquardt(problem: Problem, x: Array, losses: Mapping[str, Loss], settings: Settings) -> _Descent:
+def _levenberg_marquardt(problem: Problem, losses: Mapping[str, Loss], settings: Settings) -> _Descent:
     """Marquardt 1963: the diagonal is enlarged until the cost falls."""
-    blocks = problem.linearize(x, losses)
-    _, cost = total(blocks)
+    problem.linearize(losses)
     damping = _DAMPING_FIRST
     iterations: list[Iteration] = []
     while len(iterations) < settings.max_iterations:
-        problem.normal.assemble(blocks)
+        previous, here = problem.cost, problem.saved()
         while True:
-            step = problem.normal.factor(damping).solve(-problem.normal.gradient)
-            trial = problem.retract(x, step)
-            trial_blocks = problem.linearize(trial, losses)
-            trial_chi2, trial_cost = total(trial_blocks)
-            if trial_cost <= cost:
+            step = problem.solve(damping)
+            problem.move()
+            problem.linearize(losses)
+            if problem.cost <= previous:
                 break
-            if damping >= _DAMPING_MOST or np.abs(step).max(initial=0.0) < settings.step_tolerance:
-                return _Descent(x, iterations, "step" if damping < _DAMPING_MOST else "no_decrease")
+            problem.restore(here)
+            problem.cost = previous
+            if damping >= _DAMPING_MOST or step < settings.step_tolerance:
+                return _Descent(iterations, "step" if damping < _DAMPING_MOST else "no_decrease")
             damping *= _DAMPING_FACTOR
-        previous, x, blocks, cost = cost, trial, trial_blocks, trial_cost
-        iterations.append(Iteration(trial_chi2, cost, float(np.abs(step).max(initial=0.0)), damping))
+        iterations.append(Iteration(problem.chi2, problem.cost, step, damping))
         stop = _converged(previous, iterations[-1], settings)
         if stop:
-            return _Descent(x, iterations, stop)
+            return _Descent(iterations, stop)
         damping = max(damping / _DAMPING_FACTOR, _DAMPING_LEAST)
-    return _Descent(x, iterations, "max_iterations")
+    return _Descent(iterations, "max_iterations")
+
+
+def _dogleg(problem: Problem, losses: Mapping[str, Loss], settings: Settings) -> _Descent:
+    """Powell 1970: within a radius, from steepest descent's minimum towards the Gauss-Newton step."""
+    problem.linearize(losses)
+    radius = _RADIUS_FIRST
+    iterations: list[Iteration] = []
+    while len(iterations) < settings.max_iterations:
+        slope = gradient(problem.tree, problem.edges)
+        steepest = -slope * (slope @ slope) / max(curvature(problem.tree, problem.edges, slope), _TINY)
+        try:
+            problem.solve()
+            newton = problem.tree.step.copy()
+        except SingularError:  # as where it starts: another point may tell more
+            newton = steepest
+        previous, here = problem.cost, problem.saved()
+        while True:
+            step = _within(radius, newton, steepest)
+            length = float(np.abs(step).max(initial=0.0))
+            promised = -2.0 * slope @ step - curvature(problem.tree, problem.edges, step)
+            step_by(problem.tree, problem.unknowns, step)
+            problem.move()
+            problem.linearize(losses)
+            kept = (previous - problem.cost) / promised if promised > 0.0 else 0.0
+            if problem.cost <= previous:
+                break
+            problem.restore(here)
+            problem.cost = previous
+            if length < settings.step_tolerance or radius < _RADIUS_LEAST:
+                return _Descent(iterations, "step")
+            radius = 0.25 * min(radius, float(np.linalg.norm(step)))
+        if kept > 0.75:
+            radius = max(radius, 3.0 * float(np.linalg.norm(step)))
+        elif kept < 0.25:
+            radius *= 0.5
+        iterations.append(Iteration(problem.chi2, problem.cost, length, 0.0))
+        stop = _converged(previous, iterations[-1], settings)
+        if stop:
+            return _Descent(iterations, stop)
+    return _Descent(iterations, "max_iterations")
+
+
+def _within(radius: float, newton: Array, steepest: Array) -> Array:
+    """The point of the dogleg at a distance of at most the radius."""
+    if np.linalg.norm(newton) <= radius:
+        return newton
+    length = float(np.linalg.norm(steepest))
+    if length >= radius:
+        return steepest * (radius / length)
+    leg = newton - steepest
+    a, b, c = float(leg @ leg), float(steepest @ leg), length**2 - radius**2
+    return steepest + leg * ((-b + np.sqrt(b * b - a * c)) / a)
 
 
 def _converged(previous: float, last: Iteration, settings: Settings) -> str:
@@ -180,3 +273,11 @@ def _converged(previous: float, last: Iteration, settings: Settings) -> str:
     if abs(previous - last.cost) <= settings.cost_tolerance * last.cost + _TINY:
         return "cost"
     return ""
+
+
+_DESCENTS: dict[str, Callable[[Problem, Mapping[str, Loss], Settings], _Descent]] = {
+    "gn": _gauss_newton,
+    "lm": _levenberg_marquardt,
+    "dogleg": _dogleg,
+}
+METHODS = tuple(_DESCENTS)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.numeric import back_substitute, eliminate
-from graph_slam_ros.solver.ordering import key_of, move_tail
+from graph_slam_ros.solver.numeric import back_substitute, eliminate, settle
+from graph_slam_ros.solver.ordering import key_of, move_tail, neighbourhood
 from graph_slam_ros.solver.symbolic import build, cliques_of, collect, mark, release, room_for, structure
 from graph_slam_ros.solver.tree import (
     ACTIVE,
@@ -13,13 +13,16 @@ from graph_slam_ros.solver.tree import (
     BLOCKS_TOP,
     CLIQUE,
     CLIQUES,
+    CLIQUES_WANTED,
     COUNT,
     DOF,
     END,
     FLOPS,
     FREE,
+    FREE_REGION,
     FRONT_DOF,
     FRONTS_TOP,
+    FRONTS_WANTED,
     FULL_DOF,
     KEY,
     KIND,
@@ -29,168 +32,256 @@ from graph_slam_ros.solver.tree import (
     LINKS,
     LOCAL,
     MEMBERS_TOP,
+    MEMBERS_WANTED,
     NEXT,
     NOTHING,
+    OWNER,
+    R_COUNT,
+    R_DEPTH,
+    R_MADE,
     REGION,
-    ROWS,
+    REGIONS,
     STEP,
     TAIL_END,
+    TAIL_FIRST,
     TAKEN,
     VALUE,
+    WIDTH,
     Array,
     Index,
     Tree,
 )
 
-DONE, NO_ROOM, SINGULAR = range(3)
+DONE, NO_ROOM = range(2)
 
 
 @kernel
-def append_vertices(t: Tree, first: int, offset: Index, initial: Array, dof: Index, size: Index, kind: Index) -> None:
+def append_vertices(t: Tree, first: int, offset: Index, initial: Array, shapes: Index) -> None:
     """Write the records of new vertices, not yet unknowns, with their initial values."""
-    step = 0 if first == 0 else t.vertex[first - 1, STEP] + t.vertex[first - 1, DOF]
+    vertex, t_step, value, estimate = t.vertex, t.step, t.value, t.estimate
+    step = 0 if first == 0 else vertex[first - 1, STEP] + vertex[first - 1, DOF]
     for k in range(len(offset)):
         v = first + k
-        t.vertex[v, :] = NOTHING
-        t.vertex[v, FREE] = 0
-        t.vertex[v, DOF], t.vertex[v, KIND] = dof[k], kind[k]
-        t.vertex[v, STEP], t.vertex[v, VALUE] = step, offset[k]
-        for i in range(dof[k]):
-            t.step[step + i] = 0.0
-        for i in range(size[k]):
+        vertex[v, :] = NOTHING
+        vertex[v, FREE] = 0
+        dof, size, kind = shapes[k]
+        vertex[v, DOF], vertex[v, KIND] = dof, kind
+        vertex[v, STEP], vertex[v, VALUE] = step, offset[k]
+        for i in range(dof):
+            t_step[step + i] = 0.0
+        for i in range(size):
             x = initial[offset[k] + i]
-            t.value[offset[k] + i] = x
-            t.estimate[offset[k] + i] = x
-        step += dof[k]
+            value[offset[k] + i] = x
+            estimate[offset[k] + i] = x
+        step += dof
 
 
 @kernel
-def append_edges(t: Tree, ids: Index, ends: Index, rows: int) -> None:
-    """Write the records of edges, in the structure, and link them to their vertices."""
+def append_edges(t: Tree, ids: Index, ends: Index) -> None:
+    """Write the records of edges, not yet in the structure, and link them to their vertices."""
+    vertex, edge, t_link, state, blocks = t.vertex, t.edge, t.link, t.state, t.blocks
     for k in range(len(ids)):
         e = ids[k]
         width = 0
-        t.edge[e, COUNT], t.edge[e, ROWS] = ends.shape[1], rows
+        edge[e, COUNT] = ends.shape[1]
         for s in range(ends.shape[1]):
             v = ends[k, s]
-            t.edge[e, END + s] = v
-            width += t.vertex[v, DOF]
-            link = t.state[LINKS]
-            t.state[LINKS] += 1
-            t.link[link, LINK_EDGE], t.link[link, LINK_NEXT] = e, t.vertex[v, LINK]
-            t.vertex[v, LINK] = link
-        t.edge[e, BLOCK] = t.state[BLOCKS_TOP]
-        t.state[BLOCKS_TOP] += rows * (width + 1)
-        t.edge[e, ACTIVE] = 1
-        t.edge[e, TAKEN] = 0
+            edge[e, END + s] = v
+            width += vertex[v, DOF]
+            link = state[LINKS]
+            state[LINKS] += 1
+            t_link[link, LINK_EDGE], t_link[link, LINK_NEXT] = e, vertex[v, LINK]
+            vertex[v, LINK] = link
+        edge[e, BLOCK] = state[BLOCKS_TOP]
+        state[BLOCKS_TOP] += width * (width + 1)
+        edge[e, WIDTH], edge[e, ACTIVE], edge[e, OWNER], edge[e, TAKEN] = width, 0, NOTHING, 0
+        blocks[edge[e, BLOCK] : state[BLOCKS_TOP]] = 0.0
 
 
 @kernel
-def enter_tail(t: Tree, vertices: Index) -> None:
-    """Make vertices unknowns, the newest."""
+def enter(t: Tree, vertices: Index, edges: Index) -> None:
+    """Make vertices unknowns, the newest, and put edges, whose blocks are still to be made, into the structure."""
+    vertex, tail, state = t.vertex, t.tail, t.state
     for v in vertices:
-        t.vertex[v, FREE] = 1
-        t.vertex[v, REGION] = t.vertex[v, NEXT] = NOTHING
-        t.vertex[v, KEY] = key_of(-1, 0, v)
-        t.tail[t.state[TAIL_END]] = v
-        t.state[TAIL_END] += 1
+        vertex[v, FREE] = 1
+        vertex[v, REGION] = vertex[v, NEXT] = vertex[v, CLIQUE] = NOTHING
+        vertex[v, KEY] = key_of(-1, 0, v)
+        if state[TAIL_END] == len(tail):  # what is before the first is not needed any more
+            keep = tail[state[TAIL_FIRST] :].copy()
+            tail[: len(keep)] = keep
+            state[TAIL_FIRST], state[TAIL_END] = 0, len(keep)
+        tail[state[TAIL_END]] = v
+        state[TAIL_END] += 1
+    for e in edges:
+        t.edge[e, ACTIVE] = 1
+
+
+@kernel
+def leave(t: Tree, vertices: Index, edges: Index) -> Index:
+    """Take vertices and edges out again; returns the vertices whose cliques must be made anew."""
+    deactivate(t, edges)
+    touched = neighbourhood(t, vertices)
+    for v in vertices:
+        t.vertex[v, FREE] = 0
+    return touched
+
+
+@kernel
+def deactivate(t: Tree, edges: Index) -> None:
+    """Take edges, and what they add to the diagonal of H, out of the structure."""
+    vertex, edge, blocks, diagonal = t.vertex, t.edge, t.blocks, t.diagonal
+    for e in edges:
+        width = edge[e, WIDTH]
+        edge[e, ACTIVE], edge[e, OWNER] = 0, NOTHING
+        block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
+        p = 0
+        for s in range(edge[e, COUNT]):
+            v = edge[e, END + s]
+            for i in range(vertex[v, DOF]):
+                diagonal[vertex[v, STEP] + i] -= block[p, p]
+                p += 1
+        block[:] = 0.0
+
+
+@kernel
+def reset(t: Tree, unknowns: Index) -> None:
+    """Forget order and cliques: all unknowns are new."""
+    vertex, region, state = t.vertex, t.region, t.state
+    state[CLIQUES] = state[MEMBERS_TOP] = state[FRONTS_TOP] = 0
+    state[REGIONS], state[FREE_REGION] = 1, NOTHING
+    region[0, :] = NOTHING
+    region[0, R_DEPTH] = region[0, R_COUNT] = region[0, R_MADE] = 0
+    t.vacant[:] = NOTHING
+    state[TAIL_FIRST] = state[TAIL_END] = 0
+    vertex[:, CLIQUE] = NOTHING
+    vertex[:, REGION] = NOTHING
+    enter(t, unknowns, unknowns[:0])
+
+
+@kernel
+def anchored(t: Tree, new: Index) -> bool:
+    """Whether a chain of edges joins each new vertex to an older one or to an edge on one vertex alone."""
+    vertex, edge, link = t.vertex, t.edge, t.link
+    for v in new:
+        vertex[v, LOCAL] = 0
+    count, gained = 0, True
+    while gained and count < len(new):
+        gained = False
+        for v in new:
+            a = vertex[v, LINK]
+            while a != NOTHING and vertex[v, LOCAL] == 0:
+                e = link[a, LINK_EDGE]
+                a = link[a, LINK_NEXT]
+                if edge[e, ACTIVE] == 0:
+                    continue
+                fixed = edge[e, COUNT] == 1
+                for s in range(edge[e, COUNT]):
+                    fixed = fixed or vertex[edge[e, END + s], LOCAL] != 0
+                if fixed:
+                    vertex[v, LOCAL] = 1
+                    count += 1
+                    gained = True
+    for v in new:
+        vertex[v, LOCAL] = NOTHING
+    return count == len(new)
 
 
 @kernel
 def ends_of(t: Tree, edges: Index) -> Index:
     """The vertices of edges; some more than once."""
+    edge = t.edge
     out = np.empty(3 * len(edges), np.int64)
     count = 0
     for e in edges:
-        for s in range(t.edge[e, COUNT]):
-            out[count] = t.edge[e, END + s]
+        for s in range(edge[e, COUNT]):
+            out[count] = edge[e, END + s]
             count += 1
     return out[:count]
 
 
 @kernel
-def restructure(
-    t: Tree, touched: Index, new: Index, tail: int, damping: float, tolerance: float
-) -> tuple[int, int, Index]:
-    """Put changes of the structure into the tree and solve.
+def restructure(t: Tree, touched: Index, new: Index, tail: int) -> tuple[int, Index]:
+    """Put changes of the structure into the tree: order again what they touch, and group it into cliques.
 
     Parameters
     ----------
-    touched : vertices whose edges changed; new : vertices that are not in it yet
+    touched : vertices whose surroundings changed; new : vertices that are not in it yet
     tail : how many of the newest vertices stay last in the order
 
     Returns
     -------
-    what became of it; with SINGULAR the vertex without a pivot; the vertices that moved. With NO_ROOM nothing has
-    changed, ``state`` says how long the pools must be, and the vertices are those to touch when it is tried again.
+    DONE and the new cliques, children before parents, whose numbers are to be made; or NO_ROOM and the vertices to
+    touch when it is tried again: nothing was changed but the order, and ``state`` says how long pools must be.
     """
+    clique, state = t.clique, t.state
     touched = move_tail(t, tail, touched)
     marked = mark(t, touched)
     order, orphans = collect(t, marked, new)
     start, later = structure(t, order, orphans)
     group, last, size = cliques_of(t, order, start, later)
     cliques, members, numbers = room_for(t, size)
+    state[CLIQUES_WANTED] = state[CLIQUES] + cliques
+    state[MEMBERS_WANTED] = state[MEMBERS_TOP] + members
+    state[FRONTS_WANTED] = state[FRONTS_TOP] + numbers
     if (
-        t.state[CLIQUES] + cliques > len(t.clique)
-        or t.state[MEMBERS_TOP] + members > len(t.members)
-        or t.state[FRONTS_TOP] + numbers > len(t.fronts)
+        state[CLIQUES_WANTED] > len(clique)
+        or state[MEMBERS_WANTED] > len(t.members)
+        or state[FRONTS_WANTED] > len(t.fronts)
     ):
-        return NO_ROOM, NOTHING, touched
+        return NO_ROOM, touched
     created = build(t, order, start, later, group, last, size, orphans)
     release(t, marked)
-    t.state[AFFECTED] += len(order)
-    return _renumber(t, created, damping, tolerance)
+    state[AFFECTED] += len(order)
+    return DONE, created
 
 
 @kernel
-def renumber(t: Tree, touched: Index, damping: float, tolerance: float) -> tuple[int, int, Index]:
-    """Put changes of numbers alone into the tree and solve; returns as ``restructure``."""
-    return _renumber(t, mark(t, touched), damping, tolerance)
+def solve(t: Tree, cliques: Index, tolerance: float) -> tuple[int, Index]:
+    """Make the numbers of cliques, children before parents, and step.
 
-
-@kernel
-def _renumber(t: Tree, cliques: Index, damping: float, tolerance: float) -> tuple[int, int, Index]:
+    Returns a vertex that has no pivot, or NOTHING, and the vertices that moved.
+    """
+    clique, state = t.clique, t.state
     for c in cliques:
-        t.state[FLOPS] += t.clique[c, FULL_DOF] ** 2 * t.clique[c, FRONT_DOF]
-    failed = eliminate(t, cliques, damping)
+        state[FLOPS] += clique[c, FULL_DOF] ** 2 * clique[c, FRONT_DOF]
+    failed = eliminate(t, cliques, 0.0)
     if failed != NOTHING:
-        return SINGULAR, failed, cliques[:0]
-    return DONE, NOTHING, back_substitute(t, cliques, tolerance)
+        return failed, cliques[:0].copy()
+    return failed, back_substitute(t, cliques, tolerance)
+
+
+@kernel
+def renumber(t: Tree, touched: Index, tolerance: float) -> tuple[int, Index]:
+    """``solve`` where only numbers have changed, at these vertices."""
+    return solve(t, mark(t, touched), tolerance)
 
 
 @kernel
 def relinearize(t: Tree, moved: Index, threshold: float) -> Index:
     """Move the linearisation points of vertices whose step is above the threshold; returns all edges on them."""
-    edges = np.empty(64, np.int64)
-    count = 0
+    vertex, edge, link, t_step = t.vertex, t.edge, t.link, t.step
+    edges, moving = np.empty(64, np.int64), np.empty(len(moved), np.int64)
+    count = many = 0
     for v in moved:
-        step = t.step[t.vertex[v, STEP] : t.vertex[v, STEP] + t.vertex[v, DOF]]
+        step = t_step[vertex[v, STEP] : vertex[v, STEP] + vertex[v, DOF]]
         largest = 0.0
         for d in step:
             largest = max(largest, abs(d))
         if largest <= threshold:
             continue
-        settle(t, v)
-        a = t.vertex[v, LINK]
+        moving[many] = v
+        many += 1
+        a = vertex[v, LINK]
         while a != NOTHING:
-            e = t.link[a, LINK_EDGE]
-            a = t.link[a, LINK_NEXT]
-            if t.edge[e, ACTIVE] == 1 and t.edge[e, TAKEN] == 0:
-                t.edge[e, TAKEN] = 1
+            e = link[a, LINK_EDGE]
+            a = link[a, LINK_NEXT]
+            if edge[e, ACTIVE] == 1 and edge[e, TAKEN] == 0:
+                edge[e, TAKEN] = 1
                 if count == len(edges):
                     edges = np.concatenate((edges, np.empty(count, np.int64)))
                 edges[count] = e
                 count += 1
     for e in edges[:count]:
-        t.edge[e, TAKEN] = 0
+        edge[e, TAKEN] = 0
+    settle(t, moving[:many])
     return np.sort(edges[:count])
-
-
-@kernel
-def settle(t: Tree, v: int) -> None:
-    """The estimate becomes the linearisation point."""
-    x, d = t.vertex[v, VALUE], t.vertex[v, STEP]
-    for i in range(t.vertex[v, DOF]):
-        t.step[d + i] = 0.0
-    for i in range(t.vertex[v, DOF] + (1 if t.vertex[v, KIND] == 2 else 0)):
-        t.value[x + i] = t.estimate[x + i]

@@ -12,6 +12,7 @@ from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.report import ClassCost
+from graph_slam_ros.solver.tree import BLOCK, COUNT, DOF, END, STEP, Tree
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -92,6 +93,41 @@ def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: M
         )
         blocks.append(Block(table, chosen, residual, jacobian, chi2, cost))
     return blocks
+
+
+@kernel
+def store(t: Tree, ids: Index, residual: Array, jacobian: Array) -> None:
+    """Put the shares of whitened edges into the tree: J'J and J'r, and the diagonal of H."""
+    vertex, edge, blocks, diagonal = t.vertex, t.edge, t.blocks, t.diagonal
+    n, m, width = jacobian.shape
+    for k in range(n):
+        e = ids[k]
+        block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
+        p = 0
+        for s in range(edge[e, COUNT]):
+            v = edge[e, END + s]
+            for i in range(vertex[v, DOF]):
+                before = block[p, p]
+                for c in range(width):
+                    total = 0.0
+                    for a in range(m):
+                        total += jacobian[k, a, p] * jacobian[k, a, c]
+                    block[p, c] = total
+                total = 0.0
+                for a in range(m):
+                    total += jacobian[k, a, p] * residual[k, a]
+                block[p, width] = total
+                diagonal[vertex[v, STEP] + i] += block[p, p] - before
+                p += 1
+
+
+def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:
+    """Edges, by id, as rows of their tables."""
+    rows = graph.row_of_edge.values[edges]
+    if len(graph.tables) == 1:
+        return dict.fromkeys(graph.tables.values(), rows)
+    codes = graph.table_of_edge.values[edges]
+    return {table: rows[codes == code] for code, table in enumerate(graph.tables.values()) if (codes == code).any()}
 
 
 def total(blocks: list[Block]) -> tuple[float, float]:

@@ -1,12 +1,14 @@
-"""The numbers of the clique tree: assembly, partial Cholesky, back-substitution, covariances."""
+"""The numbers of the clique tree: assembly and elimination, back-substitution, covariances.
 
-import numba
+Kernels take the arrays out of the tree once: each access through the tuple would count references.
+"""
+
 import numpy as np
 
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.dense import partial_cholesky, solve_upper
 from graph_slam_ros.solver.tree import (
-    ACTIVE,
     BLOCK,
     CHILD,
     CLIQUE,
@@ -18,7 +20,6 @@ from graph_slam_ros.solver.tree import (
     FRONT_DOF,
     FRONTALS,
     FULL_DOF,
-    KEY,
     KIND,
     LINK,
     LINK_EDGE,
@@ -27,20 +28,21 @@ from graph_slam_ros.solver.tree import (
     MARK,
     MEMBERS,
     NOTHING,
+    OWNER,
     PARENT,
-    ROWS,
     SE2_KIND,
     SE3_KIND,
     SIBLING,
     SIZE,
     STEP,
     VALUE,
+    WIDTH,
     Array,
     Index,
     Tree,
 )
 
-LEAST_PIVOT = 1e-14  # of its diagonal entry: what elimination left of it is rounding
+MOVED = -2  # in LOCAL: its step has changed
 
 
 @kernel
@@ -49,135 +51,101 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
 
     ``damping`` enlarges the diagonal of H by the factor 1 + damping (Marquardt).
     """
-    diagonal = np.empty(0)
+    vertex, clique, members, fronts, diagonal = t.vertex, t.clique, t.members, t.fronts, t.diagonal
+    scale = np.empty(0)
     failed = NOTHING
     for c in cliques:
-        front, gradient = front_of(t, c)
-        full, frontal = t.clique[c, FULL_DOF], t.clique[c, FRONT_DOF]
-        if len(diagonal) < frontal:
-            diagonal = np.empty(2 * frontal)
+        front, frontal = _front(clique, fronts, c), clique[c, FRONT_DOF]
+        if len(scale) < frontal:
+            scale = np.empty(2 * frontal)
         front[:] = 0.0
-        gradient[:] = 0.0
-        _number(t, c)
-        _add_edges(t, c, front, gradient, diagonal)
-        for i in range(frontal):
-            front[i, i] += damping * diagonal[i]
-        child = t.clique[c, CHILD]
+        at = 0
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, SIZE]):
+            v = members[m]
+            vertex[v, LOCAL] = at
+            if at < frontal:
+                for i in range(vertex[v, DOF]):
+                    scale[at + i] = diagonal[vertex[v, STEP] + i]
+                    front[at + i, at + i] = damping * scale[at + i]
+            at += vertex[v, DOF]
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+            _add_edges(vertex, t.edge, t.link, t.blocks, members[m], front)
+        child = clique[c, CHILD]
         while child != NOTHING:
-            _add_contribution(t, child, front, gradient)
-            child = t.clique[child, SIBLING]
-        failed = _factor(front, gradient, frontal, diagonal)
+            _add_contribution(vertex, clique, members, fronts, child, front)
+            child = clique[child, SIBLING]
+        failed = partial_cholesky(front, frontal, scale)
         if failed != NOTHING:
-            failed = _member_at(t, c, failed)
+            failed = _member_at(vertex, clique, members, c, failed)
             break
     for c in cliques:
-        for m in range(t.clique[c, MEMBERS], t.clique[c, MEMBERS] + t.clique[c, FRONTALS]):
-            t.vertex[t.members[m], LOCAL] = NOTHING
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+            vertex[members[m], LOCAL] = NOTHING
     return failed
 
 
 @kernel
-def front_of(t: Tree, c: int) -> tuple[Array, Array]:
-    """The front (full, full), of which the lower triangle counts, and its vector (full,)."""
-    full, base = t.clique[c, FULL_DOF], t.clique[c, FRONT]
-    return t.fronts[base : base + full * full].reshape(full, full), t.fronts[base + full * full : base + full * (full + 1)]
+def _front(clique: Index, fronts: Array, c: int) -> Array:
+    """The front (full, full + 1): an upper triangle, and the right side as its last column."""
+    full, base = clique[c, FULL_DOF], clique[c, FRONT]
+    return fronts[base : base + full * (full + 1)].reshape(full, full + 1)
 
 
 @kernel
-def _number(t: Tree, c: int) -> None:
-    """Where each member begins in the front."""
-    at = 0
-    for m in range(t.clique[c, MEMBERS], t.clique[c, MEMBERS] + t.clique[c, SIZE]):
-        t.vertex[t.members[m], LOCAL] = at
-        at += t.vertex[t.members[m], DOF]
-
-
-@kernel
-def _member_at(t: Tree, c: int, row: int) -> int:
-    at = 0
-    for m in range(t.clique[c, MEMBERS], t.clique[c, MEMBERS] + t.clique[c, SIZE]):
-        at += t.vertex[t.members[m], DOF]
-        if row < at:
-            return t.members[m]
+def _member_at(vertex: Index, clique: Index, members: Index, c: int, row: int) -> int:
+    for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+        if row < vertex[members[m], LOCAL] + vertex[members[m], DOF]:
+            return members[m]
     return NOTHING
 
 
 @kernel
-def _add_edges(t: Tree, c: int, front: Array, gradient: Array, diagonal: Array) -> None:
-    """Add J'J and -J'r of the edges whose first eliminated vertex is frontal here; the diagonal of H of all edges."""
-    at = 0
-    for m in range(t.clique[c, MEMBERS], t.clique[c, MEMBERS] + t.clique[c, FRONTALS]):
-        v = t.members[m]
-        dof = t.vertex[v, DOF]
-        for i in range(at, at + dof):
-            diagonal[i] = 0.0
-        a = t.vertex[v, LINK]
-        while a != NOTHING:
-            e = t.link[a, LINK_EDGE]
-            a = t.link[a, LINK_NEXT]
-            if t.edge[e, ACTIVE] == 0:
-                continue
-            first = True
-            width = before = 0
-            for s in range(t.edge[e, COUNT]):
-                u = t.edge[e, END + s]
-                if u == v:
-                    before = width
-                elif t.vertex[u, FREE] == 1 and t.vertex[u, KEY] < t.vertex[v, KEY]:
-                    first = False
-                width += t.vertex[u, DOF]
-            rows, block = t.edge[e, ROWS], t.edge[e, BLOCK]
-            for i in range(dof):
-                for r in range(rows):
-                    diagonal[at + i] += t.blocks[block + r * width + before + i] ** 2
-            if first:
-                _add_edge(t, e, width, front, gradient)
-        at += dof
+def _add_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, front: Array) -> None:
+    """Add the blocks of the edges of which v is eliminated first."""
+    right = front.shape[0]
+    a = vertex[v, LINK]
+    while a != NOTHING:
+        e = link[a, LINK_EDGE]
+        a = link[a, LINK_NEXT]
+        if edge[e, OWNER] != v:
+            continue
+        width = edge[e, WIDTH]
+        row = edge[e, BLOCK]  # of the block, where the rows of one end begin
+        for s in range(edge[e, COUNT]):
+            u = edge[e, END + s]
+            dof, at = vertex[u, DOF], vertex[u, LOCAL]
+            if vertex[u, FREE] == 1:
+                column = row
+                for z in range(edge[e, COUNT]):
+                    w = edge[e, END + z]
+                    to = vertex[w, LOCAL]
+                    if to >= at and vertex[w, FREE] == 1:
+                        for i in range(dof):
+                            for j in range(vertex[w, DOF]):
+                                front[at + i, to + j] += blocks[column + i * (width + 1) + j]
+                    column += vertex[w, DOF]
+                for i in range(dof):
+                    front[at + i, right] -= blocks[column + i * (width + 1)]
+            row += dof * (width + 1)
 
 
 @kernel
-def _add_edge(t: Tree, e: int, width: int, front: Array, gradient: Array) -> None:
-    rows, block = t.edge[e, ROWS], t.edge[e, BLOCK]
-    residual = block + rows * width
-    p = 0
-    for s in range(t.edge[e, COUNT]):
-        u = t.edge[e, END + s]
-        if t.vertex[u, FREE] == 1:
-            at = t.vertex[u, LOCAL]
-            for i in range(t.vertex[u, DOF]):
-                total = 0.0
-                for r in range(rows):
-                    total += t.blocks[block + r * width + p + i] * t.blocks[residual + r]
-                gradient[at + i] -= total
-            q = 0
-            for z in range(t.edge[e, COUNT]):
-                w = t.edge[e, END + z]
-                if t.vertex[w, FREE] == 1 and t.vertex[w, LOCAL] <= at:
-                    for i in range(t.vertex[u, DOF]):
-                        for j in range(t.vertex[w, DOF]):
-                            total = 0.0
-                            for r in range(rows):
-                                total += t.blocks[block + r * width + p + i] * t.blocks[block + r * width + q + j]
-                            front[at + i, t.vertex[w, LOCAL] + j] += total
-                q += t.vertex[w, DOF]
-        p += t.vertex[u, DOF]
-
-
-@kernel
-def _add_contribution(t: Tree, child: int, front: Array, gradient: Array) -> None:
+def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Array, child: int, front: Array) -> None:
     """Add what a child's subtree says of its separator."""
-    of_child, y = front_of(t, child)
-    low = t.clique[child, MEMBERS] + t.clique[child, FRONTALS]
-    high = t.clique[child, MEMBERS] + t.clique[child, SIZE]
-    row = t.clique[child, FRONT_DOF]
+    of_child = _front(clique, fronts, child)
+    right, of_right = front.shape[0], of_child.shape[0]
+    low, high = clique[child, MEMBERS] + clique[child, FRONTALS], clique[child, MEMBERS] + clique[child, SIZE]
+    row = clique[child, FRONT_DOF]
     for m in range(low, high):
-        at, dof = t.vertex[t.members[m], LOCAL], t.vertex[t.members[m], DOF]
+        at, dof = vertex[members[m], LOCAL], vertex[members[m], DOF]
         for i in range(dof):
-            gradient[at + i] += y[row + i]
-        column = t.clique[child, FRONT_DOF]
-        for k in range(low, m):
-            to, width = t.vertex[t.members[k], LOCAL], t.vertex[t.members[k], DOF]
-            if to < at:
+            front[at + i, right] += of_child[row + i, of_right]
+            for j in range(i, dof):
+                front[at + i, at + j] += of_child[row + i, row + j]
+        column = row + dof
+        for k in range(m + 1, high):
+            to, width = vertex[members[k], LOCAL], vertex[members[k], DOF]
+            if at < to:
                 for i in range(dof):
                     for j in range(width):
                         front[at + i, to + j] += of_child[row + i, column + j]
@@ -186,44 +154,7 @@ def _add_contribution(t: Tree, child: int, front: Array, gradient: Array) -> Non
                     for j in range(width):
                         front[to + j, at + i] += of_child[row + i, column + j]
             column += width
-        for i in range(dof):
-            for j in range(i + 1):
-                front[at + i, at + j] += of_child[row + i, row + j]
         row += dof
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _factor(front, y, frontal, diagonal):  # type: ignore[no-untyped-def]
-    """Partial Cholesky of the first ``frontal`` columns, in place; returns a row without a positive pivot, or NOTHING.
-
-    Rows are built one after the other from dot products of rows, which lie in memory as they are read.
-    """
-    full = front.shape[0]
-    for i in range(full):
-        top = min(i, frontal)
-        for a in range(top):
-            s = front[i, a]
-            for z in range(a):
-                s -= front[i, z] * front[a, z]
-            front[i, a] = s * front[a, a]
-        if i < frontal:
-            s = front[i, i]
-            for z in range(i):
-                s -= front[i, z] * front[i, z]
-            if not s > LEAST_PIVOT * diagonal[i]:
-                return i
-            front[i, i] = 1.0 / np.sqrt(s)
-        s = y[i]
-        for z in range(top):
-            s -= front[i, z] * y[z]
-        y[i] = s * front[i, i] if i < frontal else s
-    for i in range(frontal, full):
-        for k in range(frontal, i + 1):
-            s = front[i, k]
-            for z in range(frontal):
-                s -= front[i, z] * front[k, z]
-            front[i, k] = s
-    return NOTHING
 
 
 @kernel
@@ -233,120 +164,182 @@ def back_substitute(t: Tree, cliques: Index, tolerance: float) -> Index:
     A step that changes by no more than the tolerance is left as it was, and so is what depends on it alone; so errors
     do not add up. Returns the vertices whose step has changed; their estimates follow.
     """
-    moved = np.empty(64, np.int64)
-    count = 0
-    x = np.empty(64)
+    vertex, clique, members, fronts, step = t.vertex, t.clique, t.members, t.fronts, t.step
+    value, estimate = t.value, t.estimate
+    moved, count = np.empty(256, np.int64), 0
+    stack, top = np.empty(256, np.int64), 0
+    x = np.empty(256)
     for c in cliques:
-        t.clique[c, MARK] = 1
-    stack = [int(c) for c in cliques if t.clique[c, PARENT] == NOTHING]
-    while len(stack):
-        c = stack.pop()
-        to_solve = t.clique[c, MARK] == 1
-        t.clique[c, MARK] = 0
-        full, frontal = t.clique[c, FULL_DOF], t.clique[c, FRONT_DOF]
+        clique[c, MARK] = 1
+        if clique[c, PARENT] == NOTHING:
+            if top == len(stack):
+                stack = np.concatenate((stack, np.empty(top, np.int64)))
+            stack[top] = c
+            top += 1
+    while top:
+        top -= 1
+        c = stack[top]
+        to_solve = clique[c, MARK] == 1
+        clique[c, MARK] = 0
+        full, frontal, low = clique[c, FULL_DOF], clique[c, FRONT_DOF], clique[c, MEMBERS]
         if len(x) < full:
             x = np.empty(2 * full)
-        low = t.clique[c, MEMBERS]
         at = frontal
-        for m in range(low + t.clique[c, FRONTALS], low + t.clique[c, SIZE]):
-            v = t.members[m]
-            to_solve = to_solve or t.vertex[v, LOCAL] == MOVED
-            for i in range(t.vertex[v, DOF]):
-                x[at] = t.step[t.vertex[v, STEP] + i]
-                at += 1
+        for m in range(low + clique[c, FRONTALS], low + clique[c, SIZE]):
+            v = members[m]
+            to_solve = to_solve or vertex[v, LOCAL] == MOVED
+            for i in range(vertex[v, DOF]):
+                x[at + i] = step[vertex[v, STEP] + i]
+            at += vertex[v, DOF]
         if not to_solve:
             continue
-        front, y = front_of(t, c)
-        for a in range(frontal - 1, -1, -1):
-            s = y[a]
-            for i in range(a + 1, full):
-                s -= front[i, a] * x[i]
-            x[a] = s * front[a, a]
+        solve_upper(_front(clique, fronts, c), frontal, x)
+        if count + clique[c, FRONTALS] > len(moved):
+            moved = np.concatenate((moved, np.empty(count + clique[c, FRONTALS], np.int64)))
         at = 0
-        for m in range(low, low + t.clique[c, FRONTALS]):
-            v = t.members[m]
-            step = t.step[t.vertex[v, STEP] : t.vertex[v, STEP] + t.vertex[v, DOF]]
+        for m in range(low, low + clique[c, FRONTALS]):
+            v = members[m]
+            first, dof = vertex[v, STEP], vertex[v, DOF]
             change = 0.0
-            for i in range(len(step)):
-                change = max(change, abs(step[i] - x[at + i]))
+            for i in range(dof):
+                change = max(change, abs(step[first + i] - x[at + i]))
             if not change <= tolerance:
-                for i in range(len(step)):
-                    step[i] = x[at + i]
-                t.vertex[v, LOCAL] = MOVED
-                if count == len(moved):
-                    moved = np.concatenate((moved, np.empty(count, np.int64)))
+                for i in range(dof):
+                    step[first + i] = x[at + i]
+                vertex[v, LOCAL] = MOVED
                 moved[count] = v
                 count += 1
-                retract(t, v)
-            at += len(step)
-        k = t.clique[c, CHILD]
+            at += dof
+        k = clique[c, CHILD]
         while k != NOTHING:
-            stack.append(k)
-            k = t.clique[k, SIBLING]
+            if top == len(stack):
+                stack = np.concatenate((stack, np.empty(top, np.int64)))
+            stack[top] = k
+            top += 1
+            k = clique[k, SIBLING]
     for c in cliques:
-        t.clique[c, MARK] = 0
+        clique[c, MARK] = 0
     for v in moved[:count]:
-        t.vertex[v, LOCAL] = NOTHING
+        vertex[v, LOCAL] = NOTHING
+        _retract(vertex, value, step, estimate, v)
     return moved[:count]
 
 
-MOVED = -2
-
-
 @kernel
-def retract(t: Tree, v: int) -> None:
+def _retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -> None:
     """The estimate of a vertex: its linearisation point [+] its step."""
-    kind, x, d = t.vertex[v, KIND], t.vertex[v, VALUE], t.vertex[v, STEP]
-    value, step = t.value, t.step
+    kind, x, d = vertex[v, KIND], vertex[v, VALUE], vertex[v, STEP]
     if kind == SE2_KIND:
         pose = se2.retract((value[x], value[x + 1], value[x + 2]), (step[d], step[d + 1], step[d + 2]))
         for i in range(3):
-            t.estimate[x + i] = pose[i]
+            estimate[x + i] = pose[i]
     elif kind == SE3_KIND:
         p = (value[x], value[x + 1], value[x + 2], value[x + 3], value[x + 4], value[x + 5], value[x + 6])
         q = se3.retract(p, (step[d], step[d + 1], step[d + 2], step[d + 3], step[d + 4], step[d + 5]))
         for i in range(7):
-            t.estimate[x + i] = q[i]
+            estimate[x + i] = q[i]
     else:
-        for i in range(t.vertex[v, DOF]):
-            t.estimate[x + i] = value[x + i] + step[d + i]
+        for i in range(vertex[v, DOF]):
+            estimate[x + i] = value[x + i] + step[d + i]
 
 
 @kernel
 def marginal(t: Tree, v: int) -> Array:
     """Covariance (dof, dof) of a vertex: from the root down to its clique, each clique's own given its parent's."""
-    path = [t.vertex[v, CLIQUE]]
-    while t.clique[path[len(path) - 1], PARENT] != NOTHING:
-        path.append(t.clique[path[len(path) - 1], PARENT])
+    vertex, clique, members = t.vertex, t.clique, t.members
+    path = [vertex[v, CLIQUE]]
+    while clique[path[-1], PARENT] != NOTHING:
+        path.append(clique[path[-1], PARENT])
     above = np.zeros((0, 0))
-    for p in range(len(path) - 1, -1, -1):
-        c = path[p]
-        full, frontal = t.clique[c, FULL_DOF], t.clique[c, FRONT_DOF]
-        front, _ = front_of(t, c)
+    for c in path[::-1]:
+        full, frontal = clique[c, FULL_DOF], clique[c, FRONT_DOF]
+        front = _front(clique, t.fronts, c)
+        low = clique[c, MEMBERS]
+        middle, high = low + clique[c, FRONTALS], low + clique[c, SIZE]
         covariance = np.zeros((full, full))
-        # the separator's, picked from the parent's
-        row = frontal
-        low, high = t.clique[c, MEMBERS] + t.clique[c, FRONTALS], t.clique[c, MEMBERS] + t.clique[c, SIZE]
-        for m in range(low, high):
-            column = frontal
-            for k in range(low, high):
-                for i in range(t.vertex[t.members[m], DOF]):
-                    for j in range(t.vertex[t.members[k], DOF]):
-                        a, b = t.vertex[t.members[m], LOCAL] + i, t.vertex[t.members[k], LOCAL] + j
-                        covariance[row + i, column + j] = above[a, b]
-                column += t.vertex[t.members[k], DOF]
-            row += t.vertex[t.members[m], DOF]
-        # L11' X = [I / L11, 0] - L21' Sigma, column after column from the last
+        place = np.empty(full - frontal, np.int64)  # of the separator, in the parent's front
+        at = 0
+        for m in range(middle, high):
+            for i in range(vertex[members[m], DOF]):
+                place[at] = vertex[members[m], LOCAL] + i
+                at += 1
+        for i in range(at):
+            for j in range(at):
+                covariance[frontal + i, frontal + j] = above[place[i], place[j]]
+        # U11 X = [1 / U11', 0] - U12 Sigma, column after column from the last
         for j in range(full - 1, -1, -1):
             for a in range(min(frontal - 1, j), -1, -1):
                 s = front[a, a] if a == j else 0.0
                 for i in range(a + 1, full):
-                    s -= front[i, a] * covariance[i, j]
+                    s -= front[a, i] * covariance[i, j]
                 covariance[a, j] = covariance[j, a] = s * front[a, a]
-        _number(t, c)
+        at = 0
+        for m in range(low, high):
+            vertex[members[m], LOCAL] = at
+            at += vertex[members[m], DOF]
         above = covariance
-    at = t.vertex[v, LOCAL]
+    at, dof = vertex[v, LOCAL], vertex[v, DOF]
     for c in path:
-        for m in range(t.clique[c, MEMBERS], t.clique[c, MEMBERS] + t.clique[c, SIZE]):
-            t.vertex[t.members[m], LOCAL] = NOTHING
-    return above[at : at + t.vertex[v, DOF], at : at + t.vertex[v, DOF]].copy()
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, SIZE]):
+            vertex[members[m], LOCAL] = NOTHING
+    return above[at : at + dof, at : at + dof].copy()
+
+
+@kernel
+def settle(t: Tree, vertices: Index) -> None:
+    """The estimate becomes the linearisation point."""
+    vertex, step, value, estimate = t.vertex, t.step, t.value, t.estimate
+    for v in vertices:
+        x, d, dof = vertex[v, VALUE], vertex[v, STEP], vertex[v, DOF]
+        for i in range(dof):
+            step[d + i] = 0.0
+        for i in range(7 if vertex[v, KIND] == SE3_KIND else dof):
+            value[x + i] = estimate[x + i]
+
+
+@kernel
+def step_by(t: Tree, vertices: Index, step: Array) -> None:
+    """Set the steps of vertices, and their estimates."""
+    for v in vertices:
+        for i in range(t.vertex[v, STEP], t.vertex[v, STEP] + t.vertex[v, DOF]):
+            t.step[i] = step[i]
+        _retract(t.vertex, t.value, t.step, t.estimate, v)
+
+
+@kernel
+def gradient(t: Tree, edges: Index) -> Array:
+    """J'r over the unknowns, numbered as ``step``."""
+    vertex, edge, blocks = t.vertex, t.edge, t.blocks
+    out = np.zeros(len(t.step))
+    for e in edges:
+        width = edge[e, WIDTH]
+        at = edge[e, BLOCK] + width
+        for s in range(edge[e, COUNT]):
+            v = edge[e, END + s]
+            for i in range(vertex[v, DOF]):
+                if vertex[v, FREE] == 1:
+                    out[vertex[v, STEP] + i] += blocks[at]
+                at += width + 1
+    return out
+
+
+@kernel
+def curvature(t: Tree, edges: Index, d: Array) -> float:
+    """``d' J'J d`` for a direction over the unknowns, numbered as ``step``."""
+    vertex, edge, blocks = t.vertex, t.edge, t.blocks
+    mine = np.empty(64)
+    out = 0.0
+    for e in edges:
+        width = edge[e, WIDTH]
+        if width > len(mine):
+            mine = np.empty(width)
+        k = 0
+        for s in range(edge[e, COUNT]):
+            v = edge[e, END + s]
+            for i in range(vertex[v, DOF]):
+                mine[k] = d[vertex[v, STEP] + i] if vertex[v, FREE] == 1 else 0.0
+                k += 1
+        for i in range(width):
+            for j in range(width):
+                out += mine[i] * blocks[edge[e, BLOCK] + i * (width + 1) + j] * mine[j]
+    return out

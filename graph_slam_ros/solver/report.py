@@ -1,4 +1,4 @@
-"""What an update did and why it stopped."""
+"""What an update or a batch optimisation did, and why it stopped."""
 
 from dataclasses import dataclass
 
@@ -22,8 +22,24 @@ class ClassCost:
 
 
 @dataclass(frozen=True, slots=True)
+class Change:
+    """Result of ``Solver.update``: what one increment cost.
+
+    Attributes
+    ----------
+    eliminated : vertices that were eliminated again, the new ones included
+    linearized : edges that were linearised, the new ones included
+    moved : vertices whose estimate changed
+    """
+
+    eliminated: int = 0
+    linearized: int = 0
+    moved: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Report:
-    """Result of ``Solver.update``.
+    """Result of ``Solver.optimize``.
 
     ``chi2`` is the sum of r' Omega r without any loss; ``cost`` is what was minimised, losses applied.
 

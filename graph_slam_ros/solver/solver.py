@@ -1,115 +1,221 @@
-"""The seam between the problem and its solution: add, set_weight, hold, update, estimate, marginal."""
+"""The seam between the problem and its solution: what it is made of, its estimate, its covariances."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import Graph
+from graph_slam_ros.errors import GraphSlamError, SingularError
+from graph_slam_ros.graph import SE2, SE3, Graph
 from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
-from graph_slam_ros.solver.linearization import by_class, total
-from graph_slam_ros.solver.normal import NormalEquations, check_gauge
-from graph_slam_ros.solver.report import Report
+from graph_slam_ros.solver.gauge import check_gauge
+from graph_slam_ros.solver.linearization import by_class, linearize, refuse_nonfinite, rows_of, store, total
+from graph_slam_ros.solver.numeric import marginal
+from graph_slam_ros.solver.report import Change, Report
+from graph_slam_ros.solver.tree import (
+    ACTIVE,
+    AFFECTED,
+    BLOCKS_TOP,
+    CLIQUES_WANTED,
+    FREE,
+    FRONTS_WANTED,
+    LINKS,
+    MEMBERS_WANTED,
+    NOTHING,
+    SE2_KIND,
+    SE3_KIND,
+    VECTOR,
+    empty_tree,
+)
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+_TAIL = 8  # newest vertices that stay last in the order of elimination
+_BY_FAR = 5.0  # times the threshold: steps that are linearised anew at once
+_FEW = 64  # new vertices whose anchorage is looked for one by one
+_NONE = np.empty(0, dtype=np.int64)
+_KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
+
 
 class Solver:
-    """Batch maximum-likelihood estimate of the vertices it was given; it owns their estimates.
+    """Maximum-likelihood estimate of the vertices it was given, online and in batch; it owns their estimates.
 
-    Vertices and edges are records of a ``Graph``; the solver minimises over those that were added to it.
+    Vertices and edges are records of a ``Graph``; the solver minimises over those that were added to it. ``update``
+    costs what has changed, ``optimize`` what there is; both work on one clique tree.
     """
 
     def __init__(self, graph: Graph, settings: Settings | None = None) -> None:
         self.graph = graph
         self.settings = settings or Settings()
-        self._x = np.empty(0)
-        self._inside = np.zeros(0, dtype=bool)
+        self._tree = empty_tree()
+        self._vertices = 0  # of the graph, that have a record in the tree
+        self._inside = np.zeros(0, dtype=bool)  # vertices of the problem
         self._held = np.zeros(0, dtype=bool)
-        self._edges = np.zeros(0, dtype=bool)
-        self._problem: Problem | None = None
+        self._taken = np.zeros(0, dtype=bool)  # edges of the problem
+        self._new_vertices, self._new_edges = _NONE, _NONE  # since the last update
+        self._touched = _NONE  # vertices that lost an edge or a neighbour since
+        self._young = _NONE  # edges that have had but one update, with the first stage of their loss
+        self._broken = False  # the tree must be made anew
+        self._settled = True  # its numbers are those at its linearisation points
+        self._loose = False  # something that held parts together may be gone
+        self._updates = 0
         self._solved_with: Settings | None = None
+
+    # -- what the problem is -----------------------------------------------------------------------------------------
 
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Take vertices (at their initial values) and edges of the graph into the problem, by id, each once."""
         self._grow()
-        new = _fresh(vertices, self._inside, "vertex")
-        new_edges = _fresh(edges, self._edges, "edge")
-        tables, rows = self.graph.table_of_edge.values[new_edges], self.graph.row_of_edge.values[new_edges]
-        for code, table in enumerate(self.graph.tables.values()):
-            ends = table.vertices.values[rows[tables == code]].ravel()
-            outside = ends[~(self._inside[ends] | np.isin(ends, new))]
-            if len(outside):
-                raise GraphSlamError(f"an edge needs vertex {int(outside[0])}, which was not added")
+        new = _fresh(vertices, self._inside[: self._vertices], "vertex")
+        new_edges = _fresh(edges, self._taken[: self.graph.edge_count], "edge")
+        rows = rows_of(self.graph, new_edges)
         self._inside[new] = True
-        self._edges[new_edges] = True
-        self._structure_changed()
+        for table, chosen in rows.items():
+            ends = table.vertices.values[chosen]
+            outside = ends[~self._inside[ends]]
+            if len(outside):
+                self._inside[new] = False
+                raise GraphSlamError(f"an edge needs vertex {int(outside[0])}, which was not added")
+        self._taken[new_edges] = True
+        for table, chosen in rows.items():
+            self._record(table, chosen)
+        self._new_vertices = np.concatenate((self._new_vertices, new))
+        self._new_edges = np.concatenate((self._new_edges, new_edges))
 
     def start_at(self, values: Array) -> None:
         """Begin from other values than the graph's initial ones: the stored numbers of all vertices, end to end."""
         self._grow()
-        if values.shape != self._x.shape or not np.isfinite(values).all():
-            raise GraphSlamError(f"start: expected {len(self._x)} finite numbers, got an array {values.shape}")
-        self._x = values.copy()
-        self._solved_with = None
+        size = len(self.graph.initial)
+        if values.shape != (size,) or not np.isfinite(values).all():
+            raise GraphSlamError(f"start: expected {size} finite numbers, got an array {values.shape}")
+        self._set_estimate(values)
+        self._broken = True
 
     def set_weight(self, edge: int, weight: float) -> None:
         """Multiply the information of an edge; 0 takes it out of the structure, another value puts it back."""
         if not (np.isfinite(weight) and weight >= 0.0):
             raise GraphSlamError(f"edge {edge}: weight {weight} is not a finite number >= 0")
         self._grow()
-        _known([edge], len(self._edges), "edge")
+        one = _known([edge], self.graph.edge_count, "edge")
         table, row = self.graph.row(edge)
-        was = table.weight.values[row]
         table.weight.values[row] = weight
-        self._solved_with = None
-        if (was == 0.0) != (weight == 0.0):
-            self._structure_changed()
+        if not self._taken[edge]:
+            return
+        if weight:
+            self._new_edges = np.union1d(self._new_edges, one)
+        elif self._tree.edge[edge, ACTIVE]:
+            incremental.deactivate(self._tree, one)
+            self._touched = np.concatenate((self._touched, table.vertices.values[row]))
+            self._loose = True
 
     def hold(self, vertex: int) -> None:
         """Keep a vertex at its present estimate."""
         self._grow()
-        _known([vertex], len(self._inside), "vertex")
+        one = _known([vertex], self._vertices, "vertex")
         self._held[vertex] = True
-        self._structure_changed()
+        self._take_out(one)
 
-    def update(self, settings: Settings | None = None) -> Report:
-        """Minimise the cost from the present estimate; nothing is left to do where that has converged before.
+    def remove(self, vertex: int) -> None:
+        """Take a vertex out of the problem again; all its edges must be out (weight 0) before."""
+        self._grow()
+        one = _known([vertex], self._vertices, "vertex")
+        if not self._inside[vertex]:
+            raise GraphSlamError(f"vertex {vertex} is not in the problem")
+        for table in self.graph.tables.values():
+            there = (table.weight.values != 0.0) & self._taken[table.id.values]
+            there &= (table.vertices.values == vertex).any(axis=1)
+            if there.any():
+                raise GraphSlamError(f"vertex {vertex} is needed by edge {int(table.id.values[there][0])}")
+        self._inside[vertex] = False
+        self._take_out(one)
+
+    # -- its solution ------------------------------------------------------------------------------------------------
+
+    def update(self) -> Change:
+        """Take in what was added and changed, and bring the estimate to the optimum of all of it.
+
+        It costs what the change costs. Vertices whose step has become large are linearised anew (``Settings``).
 
         Raises
         ------
         GaugeError, SingularError
-            The estimate is left as it was.
+            The estimate stays; what was added since the last update is not in it, and waits for the next.
+        """
+        settings, eliminated = self.settings, int(self._tree.state[AFFECTED])
+        moved, linearized = self._take_in()
+        count = len(moved)
+        self._updates += 1
+        due = self._updates % settings.relinearize_every == 0
+        if due and settings.relinearize_every > 1:
+            moved = self._unknowns()
+        for _ in range(settings.relinearize_passes):
+            threshold = settings.relinearize_above * (1.0 if due else _BY_FAR)
+            edges = incremental.relinearize(self._tree, moved, threshold)
+            if not len(edges):
+                break
+            self._linearize(edges)
+            failed, moved = incremental.renumber(self._tree, incremental.ends_of(self._tree, edges), settings.tolerance)
+            if failed != NOTHING:
+                self._broken = True
+                raise _singular(failed)
+            linearized += len(edges)
+            count += len(moved)
+            due = True
+        return Change(int(self._tree.state[AFFECTED]) - eliminated, linearized, count)
+
+    def optimize(self, settings: Settings | None = None) -> Report:
+        """Minimise the cost over everything, from the present estimate, until converged.
+
+        Raises
+        ------
+        GaugeError, SingularError
+            As for ``update``.
         """
         settings = settings or self.settings
         self._grow()
-        problem = self._structure()
-        if self._solved_with == settings or not len(problem.normal.free):
-            blocks = problem.linearize(self._x, settings.stages()[-1])
-            chi2, cost = total(blocks)
-            return Report("gn", "nothing_to_do", chi2, chi2, cost, cost, (), by_class(self.graph, blocks))
-        self._check_gauge()
-        self._x, report = minimise(problem, self._x, settings)
+        if self._solved_with == settings and not self._waiting():
+            return self.evaluate(settings)
+        before = self._tree.estimate[: len(self.graph.initial)].copy()
+        vertices, edges = self._activate()
+        try:
+            if not len(self._unknowns()):
+                return self.evaluate(settings)
+            self._refuse_loose()
+            self._restructure(vertices, edges)
+            report = minimise(Problem(self.graph, self._tree, self._active_rows(), self._unknowns()), settings)
+        except GraphSlamError:
+            self._set_estimate(before)
+            self._put_off(vertices, edges)
+            raise
+        self._settled, self._young = False, _NONE
         self._solved_with = settings if report.converged else None
         return report
+
+    def evaluate(self, settings: Settings | None = None) -> Report:
+        """Chi2 and cost of the present estimate, with the last stage of the losses."""
+        self._grow()
+        losses = (settings or self.settings).stages()[-1]
+        blocks = linearize(self.graph, self._tree.estimate, self._active_rows(), losses)
+        chi2, cost = total(blocks)
+        return Report("gn", "nothing_to_do", chi2, chi2, cost, cost, (), by_class(self.graph, blocks))
 
     def estimate(self, ids: ArrayLike) -> Array:
         """Values of vertices of one kind, (n, size)."""
         self._grow()
-        at = _known(ids, len(self._inside), "vertex")
+        at = _known(ids, self._vertices, "vertex")
         if not len(at):
             return np.empty((0, 0))
         codes = self.graph.kind.values[at]
         if (codes != codes[0]).any():
             raise GraphSlamError("estimate: the vertices are not of one kind")
         size = self.graph.kinds[codes[0]].size
-        return self._x[self.graph.offset.values[at][:, None] + np.arange(size)]
+        return self._tree.estimate[self.graph.offset.values[at][:, None] + np.arange(size)]
 
     def marginal(self, ids: ArrayLike) -> list[Array]:
         """Covariance (dof, dof) of each vertex in its tangent space; zero for a held one.
 
-        Linearised at the present estimate with the last stage's losses.
+        What waits for an update is taken in first.
 
         Raises
         ------
@@ -117,74 +223,182 @@ class Solver:
             A covariance that does not exist is refused.
         """
         self._grow()
-        wanted = _known(ids, len(self._inside), "vertex")
+        wanted = _known(ids, self._vertices, "vertex")
         if not self._inside[wanted].all():
             raise GraphSlamError(f"vertex {int(wanted[~self._inside[wanted]][0])} is not in the problem")
-        free = not self._held[wanted].all()
-        if free:
-            self._check_gauge()
-            normal = self._linearized()
-            lu = normal.factor()
+        if not self._held[wanted].all():
+            self._take_in()
         out = []
         for vertex in wanted.tolist():
             dof = self.graph.kind_of(vertex).dof
-            if self._held[vertex]:
-                out.append(np.zeros((dof, dof)))
-                continue
-            k = int(normal.position[vertex])
-            first = int(normal.first_dof[k])
-            unit = np.zeros((normal.size, dof))
-            unit[first + np.arange(dof), np.arange(dof)] = 1.0
-            block = lu.solve(unit)[first : first + dof]
-            out.append(0.5 * (block + block.T))
+            out.append(np.zeros((dof, dof)) if self._held[vertex] else marginal(self._tree, vertex))
         return out
 
     def information_matrix(self) -> Array:
         """H as a dense matrix at the present estimate, vertices in order of id: for tests and small examples."""
-        normal = self._linearized()
-        by_id = [
-            int(normal.first_dof[k]) + d for k in np.argsort(normal.free).tolist() for d in range(int(normal.dof[k]))
-        ]
-        dense: Array = normal.matrix().toarray()[np.ix_(by_id, by_id)]
-        return dense
+        self._grow()
+        free = np.flatnonzero(self._inside & ~self._held)
+        dof = np.array([self.graph.kind_of(v).dof for v in free.tolist()], dtype=np.int64)
+        first = dict(zip(free.tolist(), (np.cumsum(dof) - dof).tolist(), strict=True))
+        out = np.zeros((int(dof.sum()), int(dof.sum())))
+        rows = rows_of(self.graph, np.union1d(self._active(), self._new_edges))
+        for b in linearize(self.graph, self._tree.estimate, rows, self.settings.stages()[-1]):
+            slots = np.repeat(np.arange(len(b.table.type.dofs)), b.table.type.dofs)
+            within = np.concatenate([np.arange(d) for d in b.table.type.dofs])
+            for jacobian, ends in zip(b.jacobian, b.table.vertices.values[b.rows], strict=True):
+                mine = np.isin(ends[slots], free)
+                at = [first[v] + d for v, d in zip(ends[slots][mine].tolist(), within[mine].tolist(), strict=True)]
+                out[np.ix_(at, at)] += jacobian[:, mine].T @ jacobian[:, mine]
+        return out
+
+    # -- inside ------------------------------------------------------------------------------------------------------
 
     def _grow(self) -> None:
         """Follow the graph's growth: new vertices start at their initial values."""
-        known = len(self._inside)
-        more = self.graph.vertex_count - known
-        if more:
-            start = len(self._x)
-            self._x = np.concatenate([self._x, self.graph.initial.values[start:]])
-            self._inside = np.concatenate([self._inside, np.zeros(more, dtype=bool)])
-            self._held = np.concatenate([self._held, np.zeros(more, dtype=bool)])
-        more = self.graph.edge_count - len(self._edges)
-        if more:
-            self._edges = np.concatenate([self._edges, np.zeros(more, dtype=bool)])
+        graph, known = self.graph, self._vertices
+        if graph.vertex_count > known:
+            self._reserve(vertex=graph.vertex_count, region=2 * graph.vertex_count, tail=2 * graph.vertex_count)
+            self._reserve(**dict.fromkeys(("diagonal", "step", "value", "estimate"), len(graph.initial)))
+            self._inside = _longer(self._inside, len(self._tree.vertex))
+            self._held = _longer(self._held, len(self._tree.vertex))
+            shapes = np.array([(k.dof, k.size, _KINDS.get(k, VECTOR)) for k in graph.kinds])
+            incremental.append_vertices(
+                self._tree, known, graph.offset.values[known:], graph.initial.values, shapes[graph.kind.values[known:]]
+            )
+            self._vertices = graph.vertex_count
+        if graph.edge_count > len(self._taken):
+            self._reserve(edge=graph.edge_count)
+            self._taken = _longer(self._taken, len(self._tree.edge))
 
-    def _structure_changed(self) -> None:
-        self._problem = None
-        self._solved_with = None
+    def _reserve(self, **lengths: int) -> None:
+        """Make arrays of the tree at least so long."""
+        short = {name: n for name, n in lengths.items() if len(getattr(self._tree, name)) < n}
+        if short:
+            self._tree = self._tree._replace(
+                **{name: _longer(getattr(self._tree, name), n) for name, n in short.items()}
+            )
 
-    def _structure(self) -> Problem:
-        if self._problem is None:
-            rows: dict[EdgeTable, Index] = {}
-            for table in self.graph.tables.values():
-                mine = self._edges[table.id.values] & (table.weight.values != 0.0)
-                if mine.any():
-                    rows[table] = np.flatnonzero(mine)
-            normal = NormalEquations(self.graph, np.flatnonzero(self._inside & ~self._held), rows)
-            self._problem = Problem(self.graph, rows, normal)
-        return self._problem
+    def _record(self, table: EdgeTable, rows: Index) -> None:
+        """Link edges to their vertices; they are not in the structure yet."""
+        state, width = self._tree.state, sum(table.type.dofs)
+        links = int(state[LINKS]) + len(rows) * len(table.type.accepts)
+        self._reserve(link=links, blocks=int(state[BLOCKS_TOP]) + len(rows) * width * (width + 1))
+        incremental.append_edges(self._tree, table.id.values[rows], table.vertices.values[rows])
 
-    def _check_gauge(self) -> None:
-        problem = self._structure()
-        check_gauge(self.graph, problem.normal.free, np.flatnonzero(self._inside & self._held), problem.rows)
+    def _waiting(self) -> bool:
+        return bool(len(self._new_vertices) or len(self._new_edges) or len(self._touched) or self._broken)
 
-    def _linearized(self) -> NormalEquations:
+    def _unknowns(self) -> Index:
+        return np.flatnonzero(self._tree.vertex[: self._vertices, FREE])
+
+    def _active(self) -> Index:
+        return np.flatnonzero(self._tree.edge[:, ACTIVE])
+
+    def _active_rows(self) -> dict[EdgeTable, Index]:
+        return rows_of(self.graph, self._active())
+
+    def _take_in(self) -> tuple[Index, int]:
+        """Put what waits into the tree and solve; the vertices that moved, and how many edges were linearised."""
         self._grow()
-        problem = self._structure()
-        problem.normal.assemble(problem.linearize(self._x, self.settings.stages()[-1]))
-        return problem.normal
+        if not self._settled:
+            self._settle()
+        if not self._waiting() and not len(self._young):
+            return _NONE, 0
+        grown_up = self._young
+        vertices, edges = self._activate()
+        try:
+            if self._loose or self._broken or not self._is_anchored(vertices):
+                self._refuse_loose()
+            fresh = self._active() if self._broken else np.union1d(edges, grown_up) if len(grown_up) else edges
+            self._young = edges if len(self.settings.stages()) > 1 else _NONE
+            self._linearize(fresh)
+            cliques = self._restructure(vertices, fresh)
+            failed, moved = incremental.solve(self._tree, cliques, self.settings.tolerance)
+            if failed != NOTHING:
+                self._refuse_loose()
+                raise _singular(failed)
+        except GraphSlamError:
+            self._put_off(vertices, edges)
+            raise
+        self._solved_with = None
+        return moved, len(fresh)
+
+    def _settle(self) -> None:
+        """After a batch: make the numbers of the tree at its result, which stays."""
+        self._linearize(self._active())
+        failed, _ = incremental.renumber(self._tree, self._unknowns(), np.inf)
+        if failed != NOTHING:
+            self._broken = True
+        self._settled = True
+
+    def _activate(self) -> tuple[Index, Index]:
+        """Make what was added part of the problem; returns the new unknowns, and the edges that have a weight."""
+        vertices = self._new_vertices[self._inside[self._new_vertices] & ~self._held[self._new_vertices]]
+        edges = _NONE
+        if len(self._new_edges):
+            rows = rows_of(self.graph, self._new_edges)
+            weighty = [table.id.values[r[table.weight.values[r] != 0.0]] for table, r in rows.items()]
+            edges = np.sort(np.concatenate(weighty))
+        self._new_vertices = self._new_edges = _NONE
+        incremental.enter(self._tree, vertices, edges)
+        return vertices, edges
+
+    def _linearize(self, edges: Index) -> None:
+        """Put the blocks of edges at the linearisation points into the tree."""
+        stages = self.settings.stages()
+        parts = [(edges, stages[-1])]
+        if len(self._young):
+            young = np.isin(edges, self._young)
+            parts = [(edges[young], stages[0]), (edges[~young], stages[-1])]
+        for ids, losses in parts:
+            blocks = linearize(self.graph, self._tree.value, rows_of(self.graph, ids), losses)
+            refuse_nonfinite(blocks)
+            for b in blocks:
+                store(self._tree, b.table.id.values[b.rows], b.residual, b.jacobian)
+
+    def _restructure(self, vertices: Index, edges: Index) -> Index:
+        """Order what new vertices and edges touch; returns the cliques to make numbers of, children before parents."""
+        touched = np.concatenate((incremental.ends_of(self._tree, edges), self._touched))
+        if self._broken:
+            vertices = self._unknowns()
+            incremental.reset(self._tree, vertices)
+        self._touched, self._broken, self._loose = _NONE, False, False
+        while True:
+            status, cliques = incremental.restructure(self._tree, touched, vertices, _TAIL)
+            if status == incremental.DONE:
+                return cliques
+            touched, state = cliques, self._tree.state
+            self._reserve(
+                clique=int(state[CLIQUES_WANTED]), members=int(state[MEMBERS_WANTED]), fronts=int(state[FRONTS_WANTED])
+            )
+
+    def _put_off(self, vertices: Index, edges: Index) -> None:
+        """Take back an update that failed: what it added waits again, and the tree is made anew without it."""
+        incremental.leave(self._tree, vertices, edges)
+        self._new_vertices = np.concatenate((vertices, self._new_vertices))
+        self._new_edges = np.union1d(edges, self._new_edges)
+        self._young, self._broken, self._settled = _NONE, True, True
+
+    def _take_out(self, one: Index) -> None:
+        """Make a vertex no unknown any more."""
+        if self._tree.vertex[one[0], FREE]:
+            self._touched = np.concatenate((self._touched, incremental.leave(self._tree, one, _NONE)))
+        self._loose = True
+
+    def _set_estimate(self, values: Array) -> None:
+        self._tree.value[: len(values)] = self._tree.estimate[: len(values)] = values
+        self._tree.step[:] = 0.0
+
+    def _is_anchored(self, vertices: Index) -> bool:
+        return len(vertices) <= _FEW and incremental.anchored(self._tree, vertices)
+
+    def _refuse_loose(self) -> None:
+        held = np.flatnonzero(self._inside & self._held)
+        check_gauge(self.graph, self._unknowns(), held, self._active_rows())
+
+
+def _singular(vertex: int) -> SingularError:
+    return SingularError(f"the edges do not determine vertex {vertex}")
 
 
 def _known(ids: ArrayLike, count: int, what: str) -> Index:
@@ -203,3 +417,12 @@ def _fresh(ids: ArrayLike, taken: NDArray[np.bool_], what: str) -> Index:
     if len(again):
         raise GraphSlamError(f"{what} {int(again[0])} was added before")
     return at
+
+
+def _longer(array: NDArray, count: int) -> NDArray:
+    """The array with room for so many rows, and more to come."""
+    if count <= len(array):
+        return array
+    grown = np.zeros((max(count, 2 * len(array), 64), *array.shape[1:]), dtype=array.dtype)
+    grown[: len(array)] = array
+    return grown

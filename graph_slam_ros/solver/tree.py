@@ -3,12 +3,11 @@
 Eliminating the information matrix H vertex after vertex leaves cliques: *frontal* vertices that were eliminated
 together, given a *separator* of later ones, which the parent clique contains. Each clique keeps one dense front::
 
-    [ L11  .  ]   L11 L11' + ... : the factor of the frontal variables, its diagonal inverted
-    [ L21  C  ]   L21            : how they depend on the separator
-                  C              : what the whole subtree says of the separator, the contribution to the parent
+    [ U11  U12 | y ]   U11: the factor of the frontal variables, its diagonal inverted; U12: on the separator
+    [  .    C  | d ]   C, d: what the whole subtree says of the separator, the contribution to the parent
 
-and a vector likewise (y above, the contribution to the gradient below). Because contributions are kept, an update
-touches only the cliques of changed edges and their ancestors (Kaess et al., "iSAM2", IJRR 2012).
+Because contributions are kept, an update touches only the cliques of changed edges and their ancestors (Kaess et al.,
+"iSAM2: incremental smoothing and mapping using the Bayes tree", IJRR 2012).
 
 Records are columns of integer arrays, so that compiled code reaches everything through one tuple.
 """
@@ -28,8 +27,9 @@ NOTHING = -1
 # scratch, NOTHING between uses
 DOF, STEP, VALUE, KIND, KEY, CLIQUE, LINK, REGION, NEXT, FREE, LOCAL, VERTEX_COLUMNS = range(12)
 
-# edge: vertices (at most 3); rows of its whitened block; where that begins; 1 where it is in the structure; scratch
-COUNT, END, ROWS, BLOCK, ACTIVE, TAKEN, EDGE_COLUMNS = 0, 1, 4, 5, 6, 7, 8
+# edge: vertices (at most 3); their degrees of freedom; where its block begins; 1 where it is in the structure; which of
+# its vertices is eliminated first; scratch
+COUNT, END, WIDTH, BLOCK, ACTIVE, OWNER, TAKEN, EDGE_COLUMNS = 0, 1, 4, 5, 6, 7, 8, 9
 
 # link: an edge of a vertex, and the vertex's next link
 LINK_EDGE, LINK_NEXT, LINK_COLUMNS = range(3)
@@ -55,8 +55,11 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
     TAIL_END,
     AFFECTED,
     FLOPS,
+    CLIQUES_WANTED,
+    MEMBERS_WANTED,
+    FRONTS_WANTED,
     STATE_COLUMNS,
-) = range(12)
+) = range(15)
 
 VECTOR, SE2_KIND, SE3_KIND = range(3)
 
@@ -70,7 +73,8 @@ class Tree(NamedTuple):
     Attributes
     ----------
     members : vertices of the cliques, frontal ones first in order of elimination; fronts : their fronts
-    blocks : of each edge the whitened Jacobian (rows, D) and residual (rows,)
+    blocks : of each edge (D, D + 1): its share of the information matrix, J'J, and of the gradient, J'r
+    diagonal : of the information matrix, all edges together
     step : of each unknown, from its linearisation point ``value``; ``estimate`` is ``value [+] step``
     tail : the newest vertices, eliminated last and in order of time
     vacant : by size class, the first of the cliques that may be used again
@@ -87,6 +91,7 @@ class Tree(NamedTuple):
     state: Index
     fronts: Array
     blocks: Array
+    diagonal: Array
     step: Array
     value: Array
     estimate: Array
@@ -110,6 +115,7 @@ def empty_tree() -> Tree:
         state=state,
         fronts=np.zeros(0),
         blocks=np.zeros(0),
+        diagonal=np.zeros(0),
         step=np.zeros(0),
         value=np.zeros(0),
         estimate=np.zeros(0),
