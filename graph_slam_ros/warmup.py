@@ -25,7 +25,7 @@ from graph_slam_ros.graph import (
     Loss,
 )
 from graph_slam_ros.lie import se2
-from graph_slam_ros.solver import Settings, Solver
+from graph_slam_ros.solver import METHODS, Settings, Solver
 
 
 def warmup() -> float:
@@ -49,8 +49,15 @@ def warmup() -> float:
     graph.add_edge(LANDMARK_POSITION_3D, [space[0], far], [1, 1, 0], three, "landmarks")
     solver = Solver(graph, Settings(losses={"landmarks": [Loss(HUBER)]}))
     solver.add(range(graph.vertex_count), range(graph.edge_count))
-    solver.optimize()
+    solver.update()
+    for method in METHODS:
+        solver.optimize(Settings(method, max_iterations=1))
+    solver.set_weight(0, 0.5)
     solver.marginal([0])
+    solver.set_weight(graph.edge_count - 2, 0.0)
+    solver.set_weight(graph.edge_count - 2, 1.0)
+    solver.hold(0)
+    solver.update()
     se2.noise_during((1.0, 0.0, 0.1), np.eye(3))
     se2.propagate_during(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))
     se2.propagate(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))

@@ -1,214 +1,143 @@
-"""The normal equations H dx = -b, H = J' Omega J, b = J' Omega r, in compressed columns.
+"""The tests' independent reference: dense or sparse normal equations of all edges, made anew for every step.
 
-The pattern is found once per structure, by blocks (a block is a pair of vertices that share an edge); each
-linearisation then only adds numbers into their places.
+Nothing of the package's solver is used, only what edges and vertices are: ``EdgeType.linearize`` and
+``VertexKind.retract``. Losses are applied by their formulas in the literature.
 """
 
-import itertools
-from collections.abc import Mapping
-
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import splu
 
-from graph_slam_ros.errors import SingularError
-from graph_slam_ros.graph import Graph
-from graph_slam_ros.graph.graph import EdgeTable
-from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.linearization import Block
+from graph_slam_ros.graph import CAUCHY, HUBER, Loss
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
-_LEAST_PIVOT = 1e-14  # of its diagonal entry: what elimination left of it is rounding
-_SHIFT = 1e-13  # well above rounding, and below what edges of very different strength leave (1e-10 in real graphs)
-# small panels and no relaxed supernodes: fronts of pose graphs are small
-_SYMMETRIC = {"diag_pivot_thresh": 0.0, "relax": 1, "panel_size": 1, "options": {"SymmetricMode": True}}
+_SYMMETRIC = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 
 
-@kernel
-def _accumulate(
-    residual: Array,
-    jacobian: Array,
-    column: Index,
-    start: Index,
-    stride: Index,
-    first_dof: Index,
-    data: Array,
-    gradient: Array,
-) -> None:
-    """Add J'J of each edge into the data of the compressed columns, and J'r into the gradient.
-
-    column (k + 1): where each slot's columns begin in the Jacobian; start, stride (n, k, k): where the block
-    (row slot, column slot) begins in ``data`` and how far its columns lie apart, start -1 where a vertex is held.
-    """
-    n, m, _ = jacobian.shape
-    slots = len(column) - 1
-    for e in range(n):
-        for q in range(slots):
-            if first_dof[e, q] >= 0:
-                for c in range(column[q], column[q + 1]):
-                    total = 0.0
-                    for k in range(m):
-                        total += jacobian[e, k, c] * residual[e, k]
-                    gradient[first_dof[e, q] + c - column[q]] += total
-            for p in range(slots):
-                if start[e, p, q] < 0:
-                    continue
-                for c in range(column[q], column[q + 1]):
-                    place = start[e, p, q] + (c - column[q]) * stride[e, p, q]
-                    for r in range(column[p], column[p + 1]):
-                        total = 0.0
-                        for k in range(m):
-                            total += jacobian[e, k, r] * jacobian[e, k, c]
-                        data[place] += total
-                        place += 1
+def _slope(loss, s):
+    """``rho'(s)`` of Huber 1964 and Cauchy."""
+    if loss.kind == HUBER:
+        return np.minimum(1.0, loss.scale / np.sqrt(np.maximum(s, 1e-300)))
+    if loss.kind == CAUCHY:
+        return 1.0 / (1.0 + s / loss.scale**2)
+    return np.ones_like(s)
 
 
-@kernel
-def _fill_indices(
-    block_row: Index, block_column: Index, dof: Index, first_dof: Index, indptr: Index, indices: NDArray[np.int32]
-) -> tuple[Index, Index]:
-    """Row indices of all columns, blocks sorted by column; returns start and stride of each block in the data."""
-    count = len(block_row)
-    start, stride = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
-    b = 0
-    while b < count:
-        column = block_column[b]
-        end, height = b, 0
-        while end < count and block_column[end] == column:
-            height += dof[block_row[end]]
-            end += 1
-        base, above = indptr[first_dof[column]], 0
-        for k in range(b, end):
-            row = block_row[k]
-            start[k], stride[k] = base + above, height
-            for c in range(dof[column]):
-                for r in range(dof[row]):
-                    indices[base + above + c * height + r] = first_dof[row] + r
-            above += dof[row]
-        b = end
-    return start, stride
+class Reference:
+    """Some vertices and edges of a graph; those of a weight of zero do not count, held vertices are known."""
+
+    def __init__(self, graph, vertices, edges, held=(), losses=None):
+        self.graph, self.losses = graph, losses or {}
+        self.free = np.setdiff1d(np.asarray(list(vertices), dtype=np.int64), list(held))
+        dof = np.array([k.dof for k in graph.kinds], dtype=np.int64)[graph.kind.values]
+        self.first = np.full(graph.vertex_count, -1, dtype=np.int64)
+        self.first[self.free] = np.cumsum(dof[self.free]) - dof[self.free]
+        self.size = int(dof[self.free].sum())
+        chosen = np.zeros(graph.edge_count, dtype=bool)
+        chosen[list(edges)] = True
+        self.parts = []
+        for table in graph.tables.values():
+            rows = np.flatnonzero(chosen[table.id.values] & (table.weight.values != 0.0))
+            if not len(rows):
+                continue
+            at = table.vertices.values[rows]
+            slots = np.concatenate([np.full(d, s) for s, d in enumerate(table.type.dofs)])
+            within = np.concatenate([np.arange(d) for d in table.type.dofs])
+            columns = np.where(self.first[at] >= 0, self.first[at], -self.size - 9)[:, slots] + within
+            self.parts.append((table, rows, at, columns))
+
+    def linearized(self, x):
+        """Whitened residuals (n, m), Jacobians (n, m, D) and their columns (n, D; negative: held), by edge type."""
+        for table, rows, at, columns in self.parts:
+            r, j = table.type.linearize(x, self.graph.offset.values[at], table.measured.values[rows])
+            root = table.sqrt_information.values[rows] * np.sqrt(table.weight.values[rows])[:, None, None]
+            r, j = (root @ r[:, :, None])[:, :, 0], root @ j
+            label = table.label.values[rows]
+            for code in np.unique(label):
+                loss = self.losses.get(self.graph.labels[code], Loss())
+                mine = label == code
+                factor = np.sqrt(_slope(loss, (r[mine] ** 2).sum(axis=1)))
+                r[mine], j[mine] = r[mine] * factor[:, None], j[mine] * factor[:, None, None]
+            yield r, j, columns
+
+    def chi2(self, x):
+        """Sum of the squared whitened residuals."""
+        return sum(float((r**2).sum()) for r, _, _ in self.linearized(x))
+
+    def system(self, x):
+        """H, sparse, and the gradient."""
+        data, row, column, gradient = [], [], [], np.zeros(self.size)
+        for r, j, columns in self.linearized(x):
+            known = columns < 0
+            j = np.where(known[:, None, :], 0.0, j)
+            to = np.where(known, 0, columns)
+            transposed = np.swapaxes(j, 1, 2)
+            np.add.at(gradient, to, (transposed @ r[:, :, None])[:, :, 0])
+            h = transposed @ j
+            p, q = np.broadcast_arrays(to[:, :, None], to[:, None, :])
+            data.append(h.ravel())
+            row.append(p.ravel())
+            column.append(q.ravel())
+        entries = [np.concatenate(a) if a else np.empty(0) for a in (data, row, column)]
+        h = coo_array((entries[0], (entries[1].astype(int), entries[2].astype(int))), shape=(self.size, self.size))
+        return h.tocsc(), gradient
+
+    def dense(self, x):
+        """H as a dense matrix, free vertices in order of id."""
+        return self.system(x)[0].toarray()
+
+    def covariance(self, x, vertex):
+        """Block of the inverse of the dense H; zero for a held vertex."""
+        dof, first = self.graph.kind_of(vertex).dof, self.first[vertex]
+        if first < 0:
+            return np.zeros((dof, dof))
+        return np.linalg.inv(self.dense(x))[first : first + dof, first : first + dof]
+
+    def moved(self, x, step):
+        """All vertices after a step."""
+        out = x.copy()
+        graph = self.graph
+        for code, kind in enumerate(graph.kinds):
+            ids = self.free[graph.kind.values[self.free] == code]
+            if len(ids):
+                slots = graph.offset.values[ids][:, None] + np.arange(kind.size)
+                out[slots] = kind.retract(x[slots], step[self.first[ids][:, None] + np.arange(kind.dof)])
+        return out
+
+    def optimum(self, start, *, least=1e-10, most=100):
+        """Gauss-Newton until no component of a step is larger than ``least``, or until rounding stops it."""
+        x, previous = np.array(start, dtype=float), np.inf
+        for _ in range(most if self.size else 0):
+            h, gradient = self.system(x)
+            step = splu(h, **_SYMMETRIC).solve(-gradient)
+            x = self.moved(x, step)
+            largest = np.abs(step).max()
+            if largest <= least or (largest < 1e-8 and largest >= previous):
+                return x
+            previous = largest
+        assert not self.size, f"the reference does not converge: steps of {largest:.1e}"
+        return x
+
+    def apart(self, x, y):
+        """Largest difference of the free vertices in their tangent spaces [m or rad]."""
+        graph, largest = self.graph, 0.0
+        for code, kind in enumerate(graph.kinds):
+            ids = self.free[graph.kind.values[self.free] == code]
+            if len(ids):
+                slots = graph.offset.values[ids][:, None] + np.arange(kind.size)
+                largest = max(largest, float(np.abs(kind.local(x[slots], y[slots])).max()))
+        return largest
 
 
-class NormalEquations:
-    """Pattern of H for a set of vertices and edges, and the numbers last put into it.
-
-    Parameters
-    ----------
-    free : ids of the vertices to solve for
-    rows : the edges, as rows of each table
-
-    Attributes
-    ----------
-    free : the same ids in order of elimination
-    position : of each vertex of the graph in ``free``, or -1
-    first_dof : where each free vertex begins in the step and the gradient
-    """
-
-    def __init__(self, graph: Graph, free: Index, rows: Mapping[EdgeTable, Index]) -> None:
-        self.free = free = _elimination_order(graph, free, rows)
-        self.dof = np.array([kind.dof for kind in graph.kinds], dtype=np.int64)[graph.kind.values[free]]
-        ends = np.cumsum(self.dof)
-        self.size = int(ends[-1]) if len(ends) else 0
-        self.first_dof = ends - self.dof
-        self.position = position = np.full(graph.vertex_count, -1, dtype=np.int64)
-        position[free] = np.arange(len(free))
-
-        pairs, shapes = [], []
-        for table, chosen in rows.items():
-            at = position[table.vertices.values[chosen]]
-            row, column = np.broadcast_arrays(at[:, :, None], at[:, None, :])
-            pairs.append(np.where((row >= 0) & (column >= 0), column * len(free) + row, -1).ravel())
-            shapes.append(row.shape)
-        diagonal = np.arange(len(free)) * (len(free) + 1)
-        keys, block = np.unique(np.concatenate([*pairs, diagonal]), return_inverse=True)
-        held_blocks = int(len(keys) > 0 and keys[0] < 0)
-        block_column, block_row = np.divmod(keys[held_blocks:], max(len(free), 1))
-
-        heights = np.zeros(len(free), dtype=np.int64)
-        np.add.at(heights, block_column, self.dof[block_row])
-        self._indptr = np.concatenate([[0], np.cumsum(np.repeat(heights, self.dof))])
-        self._indices = np.empty(self._indptr[-1], dtype=np.int32)
-        start, stride = _fill_indices(block_row, block_column, self.dof, self.first_dof, self._indptr, self._indices)
-        start, stride = (np.concatenate([np.full(held_blocks, -1), a]) for a in (start, stride))
-        self._places, taken = [], 0
-        for (table, chosen), shape in zip(rows.items(), shapes, strict=True):
-            mine = block[taken : taken + int(np.prod(shape))].reshape(shape)
-            at = position[table.vertices.values[chosen]]
-            first = np.append(self.first_dof, -1)[at]
-            column = np.concatenate([[0], np.cumsum(table.type.dofs)])
-            self._places.append((column, start[mine], stride[mine], first))
-            taken += int(np.prod(shape))
-        self.data = np.zeros(len(self._indices))
-        self.gradient = np.zeros(self.size)
-
-    def assemble(self, blocks: list[Block]) -> None:
-        """Put in the numbers of linearised edges, the same tables in the same order as given at construction."""
-        self.data[:] = 0.0
-        self.gradient[:] = 0.0
-        for block, (column, start, stride, first) in zip(blocks, self._places, strict=True):
-            _accumulate(block.residual, block.jacobian, column, start, stride, first, self.data, self.gradient)
-
-    def matrix(self, damping: float = 0.0) -> csc_array:
-        """H, its diagonal enlarged by the factor 1 + damping (Marquardt)."""
-        h = csc_array((self.data, self._indices, self._indptr), shape=(self.size, self.size))
-        if damping:
-            h = h.copy()
-            h.setdiag(h.diagonal() * (1.0 + damping))
-        return h
-
-    def factor(self, damping: float = 0.0, *, check: bool = True) -> SuperLU:
-        """Sparse LU in the order of elimination, with diagonal pivots.
-
-        Raises SingularError naming a vertex; with ``check``, also where rounding hides that H is singular.
-        """
-        h = self.matrix(damping)
-        diagonal = h.diagonal()
-        scale = np.where(diagonal > 0.0, diagonal, 1.0)
-        try:
-            lu = splu(h, permc_spec="NATURAL", **_SYMMETRIC)
-            if not check:
-                return lu
-            lost = _pivots(lu) <= _LEAST_PIVOT * scale
-        except RuntimeError:  # SuperLU: "Factor is exactly singular"
-            shifted = (h + _SHIFT * _diagonal(scale)).tocsc()
-            pivot = _pivots(splu(shifted, permc_spec="NATURAL", **_SYMMETRIC)) / scale
-            lost = pivot <= max(10.0 * _SHIFT, float(pivot.min()))
-        if not lost.any():
-            return lu
-        first = int(np.flatnonzero(lost)[0])  # those after it are spoiled by it
-        vertex = int(self.free[np.searchsorted(self.first_dof, first, side="right") - 1])
-        raise SingularError(f"the edges do not determine vertex {vertex}")
+def all_values(solver):
+    """The estimate of every vertex of the solver's graph, end to end as ``Graph.initial``."""
+    graph = solver.graph
+    out = graph.initial.values.copy()
+    for code, kind in enumerate(graph.kinds):
+        ids = np.flatnonzero(graph.kind.values == code)
+        out[graph.offset.values[ids][:, None] + np.arange(kind.size)] = solver.estimate(ids)
+    return out
 
 
-def _elimination_order(graph: Graph, free: Index, rows: Mapping[EdgeTable, Index]) -> Index:
-    """Order by minimum degree, found once on the vertices and not on their degrees of freedom at each step."""
-    position = np.full(graph.vertex_count, -1, dtype=np.int64)
-    position[free] = np.arange(len(free))
-    i, j = [np.arange(len(free))], [np.arange(len(free))]
-    for table, chosen in rows.items():
-        at = position[table.vertices.values[chosen]]
-        for p, q in itertools.permutations(range(at.shape[1]), 2):
-            both = (at[:, p] >= 0) & (at[:, q] >= 0)
-            i.append(at[both, p])
-            j.append(at[both, q])
-    if not len(free):
-        return free
-    row, column = np.concatenate(i), np.concatenate(j)
-    pattern = csc_array((np.ones(len(row)), (row, column)), shape=(len(free), len(free)))
-    pattern.setdiag(pattern.sum(axis=0) + 1.0)  # any numbers that need no pivoting
-    return free[np.argsort(splu(pattern, permc_spec="MMD_AT_PLUS_A", **_SYMMETRIC).perm_c)]
-
-
-def _pivots(lu: SuperLU) -> Array:
-    """Size of the pivot of each column of the factored matrix."""
-    pivot = np.empty(lu.shape[0])
-    pivot[np.argsort(lu.perm_c)] = np.abs(lu.U.diagonal())
-    return pivot
-
-
-def _diagonal(values: Array) -> coo_array:
-    k = np.arange(len(values))
-    return coo_array((values, (k, k)), shape=(len(values), len(values)))
+def reference_optimum(graph, vertices, edges, held, start):
+    """Where batch Gauss-Newton from the start converges to: the values of all vertices."""
+    return Reference(graph, vertices, edges, held).optimum(start)

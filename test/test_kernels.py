@@ -71,9 +71,12 @@ for path in sys.argv[1:]:
     solver = Solver(file.graph)
     solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
     solver.hold(0)
-    solver.optimize()
+    solver.update()
+    for method in ("gn", "lm", "dogleg"):
+        solver.optimize(Settings(method=method, max_iterations=2))
     solver.marginal([1])
-print([name for name, count in before.items() if count == 0])
+    solver.set_weight(file.graph.edge_count - 1, 0.0)
+    solver.update()
 print([name for name, count in signatures().items() if count != before.get(name, 0)])
 """
 
@@ -81,4 +84,4 @@ print([name for name, count in signatures().items() if count != before.get(name,
 def test_the_warm_up_compiles_all_that_solving_a_graph_needs():
     graphs = [str(TEST.parent / "data" / name) for name in ("city.g2o", "landmarks.g2o")]
     done = python("-c", COMPILED_LATER, *graphs)
-    assert done.stdout.splitlines() == ["[]", "[]"], done.stdout + done.stderr
+    assert done.stdout.splitlines() == ["[]"], done.stdout + done.stderr

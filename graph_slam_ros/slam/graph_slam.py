@@ -167,15 +167,19 @@ class GraphSlam:
         return self._covariance.copy()
 
     def landmark_covariances(self) -> list[Array]:
-        """Marginal of each landmark, (2, 2) in the map's axes or (3, 3) in its tangent space; NaN where unknown."""
-        self._hand_over()
+        """Marginal of each landmark, (2, 2) in the map's axes or (3, 3) in its tangent space; NaN where unknown.
+
+        Looking changes nothing: a landmark that was first seen after the last solve is unknown until the next.
+        """
         vertices = [landmark.vertex for landmark in self.landmarks.values()]
+        out = [np.full((dof, dof), np.nan) for dof in (self.graph.kind_of(vertex).dof for vertex in vertices)]
+        known = [k for k, vertex in enumerate(vertices) if vertex < self._handed_over[0]]
         try:
-            return self.solver.marginal(vertices)
+            for k, marginal in zip(known, self.solver.marginal([vertices[k] for k in known]), strict=True):
+                out[k] = marginal
         except GraphSlamError as error:
             self.counters.count("solver", type(error).__name__)
-            dofs = [self.graph.kind_of(vertex).dof for vertex in vertices]
-            return [np.full((dof, dof), np.nan) for dof in dofs]
+        return out
 
     @property
     def newest_odometry_ns(self) -> int | None:
