@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.graph import EdgeTable
-from graph_slam_ros.solver.linearization import by_class, linearize, refuse_nonfinite, store, total
+from graph_slam_ros.solver.linearization import Losses, by_class, linearize, refuse_nonfinite, store, total
 from graph_slam_ros.solver.numeric import back_substitute, curvature, eliminate, gradient, settle, step_by
 from graph_slam_ros.solver.report import Iteration, Report
 from graph_slam_ros.solver.symbolic import mark
@@ -77,11 +77,11 @@ class Problem:
         self.chi2 = self.cost = 0.0
         settle(tree, unknowns)
 
-    def linearize(self, losses: Mapping[str, Loss]) -> None:
+    def linearize(self, losses: Losses) -> None:
         """Put the blocks of all edges at the linearisation points into the tree."""
         blocks = linearize(self.graph, self.tree.value, self.rows, losses)
         for b in blocks:
-            store(self.tree, b.table.id.values[b.rows], b.residual, b.jacobian)
+            store(self.tree, b.rows, b.table.id.values, b.residual, b.jacobian)
         self.chi2, self.cost = total(blocks)
 
     def solve(self, damping: float = 0.0) -> float:
@@ -141,7 +141,7 @@ def minimise(problem: Problem, settings: Settings) -> Report:
     GraphSlamError
         The cost is not finite where it starts.
     """
-    stages = settings.stages()
+    stages = [Losses(problem.graph, by_label) for by_label in settings.stages()]
     refuse_nonfinite(linearize(problem.graph, problem.tree.value, problem.rows, stages[0]))
     problem.linearize(stages[0])
     chi2_initial, cost_initial = problem.chi2, problem.cost
@@ -166,7 +166,7 @@ def minimise(problem: Problem, settings: Settings) -> Report:
     return Report(used, stop, chi2_initial, chi2, cost_initial, cost, tuple(iterations), classes)
 
 
-def _gauss_newton(problem: Problem, losses: Mapping[str, Loss], settings: Settings) -> _Descent:
+def _gauss_newton(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
     problem.linearize(losses)
     start = problem.cost
     iterations: list[Iteration] = []
@@ -188,7 +188,7 @@ def _gauss_newton(problem: Problem, losses: Mapping[str, Loss], settings: Settin
     return _Descent(iterations, "max_iterations")
 
 
-def _levenberg_marquardt(problem: Problem, losses: Mapping[str, Loss], settings: Settings) -> _Descent:
+def _levenberg_marquardt(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
     """Marquardt 1963: the diagonal is enlarged until the cost falls."""
     problem.linearize(losses)
     damping = _DAMPING_FIRST
@@ -214,7 +214,7 @@ def _levenberg_marquardt(problem: Problem, losses: Mapping[str, Loss], settings:
     return _Descent(iterations, "max_iterations")
 
 
-def _dogleg(problem: Problem, losses: Mapping[str, Loss], settings: Settings) -> _Descent:
+def _dogleg(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
     """Powell 1970: within a radius, from steepest descent's minimum towards the Gauss-Newton step."""
     problem.linearize(losses)
     radius = _RADIUS_FIRST
@@ -275,7 +275,7 @@ def _converged(previous: float, last: Iteration, settings: Settings) -> str:
     return ""
 
 
-_DESCENTS: dict[str, Callable[[Problem, Mapping[str, Loss], Settings], _Descent]] = {
+_DESCENTS: dict[str, Callable[[Problem, Losses, Settings], _Descent]] = {
     "gn": _gauss_newton,
     "lm": _levenberg_marquardt,
     "dogleg": _dogleg,

@@ -1,6 +1,7 @@
 """One update of the clique tree: what changed goes in, the steps of what it moves come out."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.numeric import back_substitute, eliminate, settle
@@ -53,6 +54,7 @@ from graph_slam_ros.solver.tree import (
 )
 
 DONE, NO_ROOM = range(2)
+FEW = 64  # new vertices whose anchorage is looked for; more are said to be loose, which is then looked into
 
 
 @kernel
@@ -77,15 +79,50 @@ def append_vertices(t: Tree, first: int, offset: Index, initial: Array, shapes: 
 
 
 @kernel
-def append_edges(t: Tree, ids: Index, ends: Index) -> None:
-    """Write the records of edges, not yet in the structure, and link them to their vertices."""
-    vertex, edge, t_link, state, blocks = t.vertex, t.edge, t.link, t.state, t.blocks
+def admit(ids: Index, inside: NDArray[np.bool_], count: int) -> int:
+    """Note ids below ``count`` as inside, each once; or nothing, and which is not fit (its place in ``ids``)."""
     for k in range(len(ids)):
-        e = ids[k]
-        width = 0
-        edge[e, COUNT] = ends.shape[1]
+        if ids[k] < 0 or ids[k] >= count or inside[ids[k]]:
+            for j in range(k):
+                inside[ids[j]] = False
+            return k
+        inside[ids[k]] = True
+    return NOTHING
+
+
+@kernel
+def outside(rows: Index, ends: Index, inside: NDArray[np.bool_]) -> int:
+    """A vertex that edges, rows of a table, need and that is not inside, or NOTHING."""
+    for row in rows:
         for s in range(ends.shape[1]):
-            v = ends[k, s]
+            if not inside[ends[row, s]]:
+                return ends[row, s]
+    return NOTHING
+
+
+@kernel
+def gather(estimate: Array, kind: Index, offset: Index, ids: Index, size: int) -> tuple[int, Array]:
+    """Stored numbers (n, size) of vertices of the first one's kind; a place in ``ids`` that is unfit, or NOTHING."""
+    out = np.empty((len(ids), size))
+    for k in range(len(ids)):
+        if ids[k] < 0 or ids[k] >= len(kind) or kind[ids[k]] != kind[ids[0]]:
+            return k, out
+        at = offset[ids[k]]
+        for i in range(size):
+            out[k, i] = estimate[at + i]
+    return NOTHING, out
+
+
+@kernel
+def append_edges(t: Tree, rows: Index, all_ids: Index, all_ends: Index) -> None:
+    """Write the records of edges, rows of a table, not yet in the structure, and link them to their vertices."""
+    vertex, edge, t_link, state, blocks = t.vertex, t.edge, t.link, t.state, t.blocks
+    for row in rows:
+        e = all_ids[row]
+        width = 0
+        edge[e, COUNT] = all_ends.shape[1]
+        for s in range(all_ends.shape[1]):
+            v = all_ends[row, s]
             edge[e, END + s] = v
             width += vertex[v, DOF]
             link = state[LINKS]
@@ -99,8 +136,11 @@ def append_edges(t: Tree, ids: Index, ends: Index) -> None:
 
 
 @kernel
-def enter(t: Tree, vertices: Index, edges: Index) -> None:
-    """Make vertices unknowns, the newest, and put edges, whose blocks are still to be made, into the structure."""
+def enter(t: Tree, vertices: Index, edges: Index) -> bool:
+    """Make vertices unknowns, the newest, and put edges, whose blocks are still to be made, into the structure.
+
+    Returns whether a chain of edges joins each of them to an older vertex or to an edge on one vertex alone.
+    """
     vertex, tail, state = t.vertex, t.tail, t.state
     for v in vertices:
         vertex[v, FREE] = 1
@@ -114,6 +154,7 @@ def enter(t: Tree, vertices: Index, edges: Index) -> None:
         state[TAIL_END] += 1
     for e in edges:
         t.edge[e, ACTIVE] = 1
+    return _anchored(t, vertices)
 
 
 @kernel
@@ -159,12 +200,11 @@ def reset(t: Tree, unknowns: Index) -> None:
 
 
 @kernel
-def anchored(t: Tree, new: Index) -> bool:
-    """Whether a chain of edges joins each new vertex to an older one or to an edge on one vertex alone."""
+def _anchored(t: Tree, new: Index) -> bool:
     vertex, edge, link = t.vertex, t.edge, t.link
     for v in new:
         vertex[v, LOCAL] = 0
-    count, gained = 0, True
+    count, gained = 0, len(new) <= FEW
     while gained and count < len(new):
         gained = False
         for v in new:
@@ -251,9 +291,21 @@ def solve(t: Tree, cliques: Index, tolerance: float) -> tuple[int, Index]:
 
 
 @kernel
-def renumber(t: Tree, touched: Index, tolerance: float) -> tuple[int, Index]:
-    """``solve`` where only numbers have changed, at these vertices."""
-    return solve(t, mark(t, touched), tolerance)
+def advance(
+    t: Tree, edges: Index, touched: Index, new: Index, tail: int, tolerance: float
+) -> tuple[int, Index, int, Index]:
+    """``restructure`` for changed edges and ``solve`` in one."""
+    status, cliques = restructure(t, np.concatenate((ends_of(t, edges), touched)), new, tail)
+    if status == NO_ROOM:
+        return status, cliques, NOTHING, cliques
+    failed, moved = solve(t, cliques, tolerance)
+    return status, cliques, failed, moved
+
+
+@kernel
+def renumber(t: Tree, edges: Index, tolerance: float) -> tuple[int, Index]:
+    """``solve`` where only the numbers of edges have changed."""
+    return solve(t, mark(t, ends_of(t, edges)), tolerance)
 
 
 @kernel

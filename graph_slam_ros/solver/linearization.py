@@ -36,35 +36,60 @@ class Block:
     cost: Array
 
 
+class Losses:
+    """The loss of each label of a graph, by its code, as arrays for the kernels."""
+
+    def __init__(self, graph: Graph, by_label: Mapping[str, Loss]) -> None:
+        losses = [by_label.get(label, Loss()) for label in graph.labels]
+        self.kind = np.array([loss.kind for loss in losses], dtype=np.int64)
+        self.scale = np.array([loss.scale for loss in losses])
+
+
+@kernel
+def _take(rows: Index, vertices: Index, offset: Index, measured: Array) -> tuple[Index, Array]:
+    """Where the vertices of some edges begin, and what was measured."""
+    n, ends = len(rows), vertices.shape[1]
+    at, z = np.empty((n, ends), np.int64), np.empty((n, measured.shape[1]))
+    for k in range(n):
+        for s in range(ends):
+            at[k, s] = offset[vertices[rows[k], s]]
+        for c in range(measured.shape[1]):
+            z[k, c] = measured[rows[k], c]
+    return at, z
+
+
 @kernel
 def _whiten(
+    rows: Index,
     residual: Array,
     jacobian: Array,
     sqrt_information: Array,
     weight: Array,
+    label: Index,
     loss_kind: Index,
     loss_scale: Array,
 ) -> tuple[Array, Array]:
-    """Multiply rows by sqrt(weight * rho') R in place; returns chi2 and cost of each edge."""
+    """Multiply residuals and Jacobians by sqrt(weight * rho') R in place; returns chi2 and cost of each edge."""
     n, m, width = jacobian.shape
     chi2, cost = np.zeros(n), np.zeros(n)
     r, j = np.zeros(m), np.zeros((m, width))
     for e in range(n):
+        row = rows[e]
         s = 0.0
         for a in range(m):
             r[a] = 0.0
             for c in range(width):
                 j[a, c] = 0.0
             for b in range(m):
-                root = sqrt_information[e, a, b]
+                root = sqrt_information[row, a, b]
                 r[a] += root * residual[e, b]
                 for c in range(width):
                     j[a, c] += root * jacobian[e, b, c]
             s += r[a] * r[a]
-        s *= weight[e]
-        slope, rho = weight_and_cost(loss_kind[e], loss_scale[e], s)
+        s *= weight[row]
+        slope, rho = weight_and_cost(loss_kind[label[row]], loss_scale[label[row]], s)
         chi2[e], cost[e] = s, rho
-        factor = np.sqrt(weight[e] * slope)
+        factor = np.sqrt(weight[row] * slope)
         for a in range(m):
             residual[e, a] = factor * r[a]
             for c in range(width):
@@ -72,36 +97,34 @@ def _whiten(
     return chi2, cost
 
 
-def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Mapping[str, Loss]) -> list[Block]:
+def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Losses) -> list[Block]:
     """Linearise the given rows of each table at the stored values x, with the loss of each edge's label."""
-    by_code = [losses.get(label, Loss()) for label in graph.labels]
-    kinds = np.array([loss.kind for loss in by_code], dtype=np.int64)
-    scales = np.array([loss.scale for loss in by_code])
     blocks = []
+    offset = graph.offset.values
     for table, chosen in rows.items():
-        take = slice(None) if len(chosen) == len(table) else chosen  # a view where all are in, not a copy
-        at = graph.offset.values[table.vertices.values[take]]
-        residual, jacobian = table.type.linearize(x, at, table.measured.values[take])
-        label = table.label.values[take]
+        at, measured = _take(chosen, table.vertices.values, offset, table.measured.values)
+        residual, jacobian = table.type.linearize(x, at, measured)
         chi2, cost = _whiten(
+            chosen,
             residual,
             jacobian,
-            table.sqrt_information.values[take],
-            table.weight.values[take],
-            kinds[label],
-            scales[label],
+            table.sqrt_information.values,
+            table.weight.values,
+            table.label.values,
+            losses.kind,
+            losses.scale,
         )
         blocks.append(Block(table, chosen, residual, jacobian, chi2, cost))
     return blocks
 
 
 @kernel
-def store(t: Tree, ids: Index, residual: Array, jacobian: Array) -> None:
+def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) -> None:
     """Put the shares of whitened edges into the tree: J'J and J'r, and the diagonal of H."""
     vertex, edge, blocks, diagonal = t.vertex, t.edge, t.blocks, t.diagonal
     n, m, width = jacobian.shape
     for k in range(n):
-        e = ids[k]
+        e = ids[rows[k]]
         block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
         p = 0
         for s in range(edge[e, COUNT]):

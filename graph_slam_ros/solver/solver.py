@@ -9,7 +9,7 @@ from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
 from graph_slam_ros.solver.gauge import check_gauge
-from graph_slam_ros.solver.linearization import by_class, linearize, refuse_nonfinite, rows_of, store, total
+from graph_slam_ros.solver.linearization import Losses, by_class, linearize, refuse_nonfinite, rows_of, store, total
 from graph_slam_ros.solver.numeric import marginal
 from graph_slam_ros.solver.report import Change, Report
 from graph_slam_ros.solver.tree import (
@@ -33,7 +33,6 @@ Index = NDArray[np.int64]
 
 _TAIL = 8  # newest vertices that stay last in the order of elimination
 _BY_FAR = 5.0  # times the threshold: steps that are linearised anew at once
-_FEW = 64  # new vertices whose anchorage is looked for one by one
 _NONE = np.empty(0, dtype=np.int64)
 _KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
 
@@ -60,6 +59,8 @@ class Solver:
         self._settled = True  # its numbers are those at its linearisation points
         self._loose = False  # something that held parts together may be gone
         self._updates = 0
+        self._stages: list[Losses] = []
+        self._losses_for = NOTHING  # so many labels
         self._solved_with: Settings | None = None
 
     # -- what the problem is -----------------------------------------------------------------------------------------
@@ -67,21 +68,23 @@ class Solver:
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Take vertices (at their initial values) and edges of the graph into the problem, by id, each once."""
         self._grow()
-        new = _fresh(vertices, self._inside[: self._vertices], "vertex")
-        new_edges = _fresh(edges, self._taken[: self.graph.edge_count], "edge")
+        new, new_edges = np.asarray(vertices, dtype=np.int64).ravel(), np.asarray(edges, dtype=np.int64).ravel()
+        _admit(new, self._inside, self._vertices, "vertex")
+        try:
+            _admit(new_edges, self._taken, self.graph.edge_count, "edge")
+        except GraphSlamError:
+            self._inside[new] = False
+            raise
         rows = rows_of(self.graph, new_edges)
-        self._inside[new] = True
         for table, chosen in rows.items():
-            ends = table.vertices.values[chosen]
-            outside = ends[~self._inside[ends]]
-            if len(outside):
-                self._inside[new] = False
-                raise GraphSlamError(f"an edge needs vertex {int(outside[0])}, which was not added")
-        self._taken[new_edges] = True
+            missing = incremental.outside(chosen, table.vertices.values, self._inside)
+            if missing != NOTHING:
+                self._inside[new], self._taken[new_edges] = False, False
+                raise GraphSlamError(f"an edge needs vertex {missing}, which was not added")
         for table, chosen in rows.items():
             self._record(table, chosen)
-        self._new_vertices = np.concatenate((self._new_vertices, new))
-        self._new_edges = np.concatenate((self._new_edges, new_edges))
+        self._new_vertices = np.concatenate((self._new_vertices, new)) if len(self._new_vertices) else new
+        self._new_edges = np.concatenate((self._new_edges, new_edges)) if len(self._new_edges) else new_edges
 
     def start_at(self, values: Array) -> None:
         """Begin from other values than the graph's initial ones: the stored numbers of all vertices, end to end."""
@@ -155,7 +158,7 @@ class Solver:
             if not len(edges):
                 break
             self._linearize(edges)
-            failed, moved = incremental.renumber(self._tree, incremental.ends_of(self._tree, edges), settings.tolerance)
+            failed, moved = incremental.renumber(self._tree, edges, settings.tolerance)
             if failed != NOTHING:
                 self._broken = True
                 raise _singular(failed)
@@ -177,7 +180,7 @@ class Solver:
         if self._solved_with == settings and not self._waiting():
             return self.evaluate(settings)
         before = self._tree.estimate[: len(self.graph.initial)].copy()
-        vertices, edges = self._activate()
+        vertices, edges, _ = self._activate()
         try:
             if not len(self._unknowns()):
                 return self.evaluate(settings)
@@ -195,7 +198,7 @@ class Solver:
     def evaluate(self, settings: Settings | None = None) -> Report:
         """Chi2 and cost of the present estimate, with the last stage of the losses."""
         self._grow()
-        losses = (settings or self.settings).stages()[-1]
+        losses = Losses(self.graph, (settings or self.settings).stages()[-1])
         blocks = linearize(self.graph, self._tree.estimate, self._active_rows(), losses)
         chi2, cost = total(blocks)
         return Report("gn", "nothing_to_do", chi2, chi2, cost, cost, (), by_class(self.graph, blocks))
@@ -203,14 +206,16 @@ class Solver:
     def estimate(self, ids: ArrayLike) -> Array:
         """Values of vertices of one kind, (n, size)."""
         self._grow()
-        at = _known(ids, self._vertices, "vertex")
+        at = np.asarray(ids, dtype=np.int64).ravel()
         if not len(at):
             return np.empty((0, 0))
-        codes = self.graph.kind.values[at]
-        if (codes != codes[0]).any():
+        graph = self.graph
+        size = graph.kind_of(_known(at[:1], self._vertices, "vertex")[0]).size
+        unfit, out = incremental.gather(self._tree.estimate, graph.kind.values, graph.offset.values, at, size)
+        if unfit != NOTHING:
+            _known(at, self._vertices, "vertex")
             raise GraphSlamError("estimate: the vertices are not of one kind")
-        size = self.graph.kinds[codes[0]].size
-        return self._tree.estimate[self.graph.offset.values[at][:, None] + np.arange(size)]
+        return out
 
     def marginal(self, ids: ArrayLike) -> list[Array]:
         """Covariance (dof, dof) of each vertex in its tangent space; zero for a held one.
@@ -242,7 +247,7 @@ class Solver:
         first = dict(zip(free.tolist(), (np.cumsum(dof) - dof).tolist(), strict=True))
         out = np.zeros((int(dof.sum()), int(dof.sum())))
         rows = rows_of(self.graph, np.union1d(self._active(), self._new_edges))
-        for b in linearize(self.graph, self._tree.estimate, rows, self.settings.stages()[-1]):
+        for b in linearize(self.graph, self._tree.estimate, rows, self._losses()[-1]):
             slots = np.repeat(np.arange(len(b.table.type.dofs)), b.table.type.dofs)
             within = np.concatenate([np.arange(d) for d in b.table.type.dofs])
             for jacobian, ends in zip(b.jacobian, b.table.vertices.values[b.rows], strict=True):
@@ -283,7 +288,7 @@ class Solver:
         state, width = self._tree.state, sum(table.type.dofs)
         links = int(state[LINKS]) + len(rows) * len(table.type.accepts)
         self._reserve(link=links, blocks=int(state[BLOCKS_TOP]) + len(rows) * width * (width + 1))
-        incremental.append_edges(self._tree, table.id.values[rows], table.vertices.values[rows])
+        incremental.append_edges(self._tree, rows, table.id.values, table.vertices.values)
 
     def _waiting(self) -> bool:
         return bool(len(self._new_vertices) or len(self._new_edges) or len(self._touched) or self._broken)
@@ -305,15 +310,19 @@ class Solver:
         if not self._waiting() and not len(self._young):
             return _NONE, 0
         grown_up = self._young
-        vertices, edges = self._activate()
+        vertices, edges, anchored = self._activate()
+        self._young = edges if len(self._losses()) > 1 else _NONE
         try:
-            if self._loose or self._broken or not self._is_anchored(vertices):
+            if self._loose or self._broken or not anchored:
                 self._refuse_loose()
-            fresh = self._active() if self._broken else np.union1d(edges, grown_up) if len(grown_up) else edges
-            self._young = edges if len(self.settings.stages()) > 1 else _NONE
+            fresh = np.union1d(edges, grown_up) if len(grown_up) else edges
+            if self._broken:
+                fresh, vertices_now = self._active(), self._unknowns()
+                incremental.reset(self._tree, vertices_now)
+            else:
+                vertices_now = vertices
             self._linearize(fresh)
-            cliques = self._restructure(vertices, fresh)
-            failed, moved = incremental.solve(self._tree, cliques, self.settings.tolerance)
+            failed, moved = self._advance(fresh, vertices_now)
             if failed != NOTHING:
                 self._refuse_loose()
                 raise _singular(failed)
@@ -323,29 +332,48 @@ class Solver:
         self._solved_with = None
         return moved, len(fresh)
 
+    def _advance(self, edges: Index, vertices: Index) -> tuple[int, Index]:
+        touched, self._touched, self._loose, self._broken = self._touched, _NONE, False, False
+        while True:
+            status, cliques, failed, moved = incremental.advance(
+                self._tree, edges, touched, vertices, _TAIL, self.settings.tolerance
+            )
+            if status == incremental.DONE:
+                return failed, moved
+            touched = cliques
+            self._make_room()
+
     def _settle(self) -> None:
         """After a batch: make the numbers of the tree at its result, which stays."""
         self._linearize(self._active())
-        failed, _ = incremental.renumber(self._tree, self._unknowns(), np.inf)
+        failed, _ = incremental.renumber(self._tree, self._active(), np.inf)
         if failed != NOTHING:
             self._broken = True
         self._settled = True
 
-    def _activate(self) -> tuple[Index, Index]:
-        """Make what was added part of the problem; returns the new unknowns, and the edges that have a weight."""
-        vertices = self._new_vertices[self._inside[self._new_vertices] & ~self._held[self._new_vertices]]
-        edges = _NONE
-        if len(self._new_edges):
-            rows = rows_of(self.graph, self._new_edges)
-            weighty = [table.id.values[r[table.weight.values[r] != 0.0]] for table, r in rows.items()]
-            edges = np.sort(np.concatenate(weighty))
+    def _activate(self) -> tuple[Index, Index, bool]:
+        """Make what was added part of the problem: new unknowns, edges with a weight, and the answer of ``enter``."""
+        vertices, edges = self._new_vertices, self._new_edges
+        wanted = self._inside[vertices] & ~self._held[vertices]
+        if not wanted.all():
+            vertices = vertices[wanted]
+        for table, rows in rows_of(self.graph, edges).items():
+            weight = table.weight.values[rows]
+            if not weight.all():
+                edges = np.setdiff1d(edges, table.id.values[rows[weight == 0.0]])
         self._new_vertices = self._new_edges = _NONE
-        incremental.enter(self._tree, vertices, edges)
-        return vertices, edges
+        return vertices, edges, incremental.enter(self._tree, vertices, edges)
+
+    def _losses(self) -> list[Losses]:
+        """Of each stage."""
+        if len(self.graph.labels) != self._losses_for:
+            self._losses_for = len(self.graph.labels)
+            self._stages = [Losses(self.graph, by_label) for by_label in self.settings.stages()]
+        return self._stages
 
     def _linearize(self, edges: Index) -> None:
         """Put the blocks of edges at the linearisation points into the tree."""
-        stages = self.settings.stages()
+        stages = self._losses()
         parts = [(edges, stages[-1])]
         if len(self._young):
             young = np.isin(edges, self._young)
@@ -354,23 +382,26 @@ class Solver:
             blocks = linearize(self.graph, self._tree.value, rows_of(self.graph, ids), losses)
             refuse_nonfinite(blocks)
             for b in blocks:
-                store(self._tree, b.table.id.values[b.rows], b.residual, b.jacobian)
+                store(self._tree, b.rows, b.table.id.values, b.residual, b.jacobian)
 
-    def _restructure(self, vertices: Index, edges: Index) -> Index:
-        """Order what new vertices and edges touch; returns the cliques to make numbers of, children before parents."""
+    def _restructure(self, vertices: Index, edges: Index) -> None:
+        """Order and group what new vertices and edges touch, for a batch to make the numbers."""
         touched = np.concatenate((incremental.ends_of(self._tree, edges), self._touched))
         if self._broken:
             vertices = self._unknowns()
             incremental.reset(self._tree, vertices)
         self._touched, self._broken, self._loose = _NONE, False, False
         while True:
-            status, cliques = incremental.restructure(self._tree, touched, vertices, _TAIL)
+            status, touched = incremental.restructure(self._tree, touched, vertices, _TAIL)
             if status == incremental.DONE:
-                return cliques
-            touched, state = cliques, self._tree.state
-            self._reserve(
-                clique=int(state[CLIQUES_WANTED]), members=int(state[MEMBERS_WANTED]), fronts=int(state[FRONTS_WANTED])
-            )
+                return
+            self._make_room()
+
+    def _make_room(self) -> None:
+        state = self._tree.state
+        self._reserve(
+            clique=int(state[CLIQUES_WANTED]), members=int(state[MEMBERS_WANTED]), fronts=int(state[FRONTS_WANTED])
+        )
 
     def _put_off(self, vertices: Index, edges: Index) -> None:
         """Take back an update that failed: what it added waits again, and the tree is made anew without it."""
@@ -389,9 +420,6 @@ class Solver:
         self._tree.value[: len(values)] = self._tree.estimate[: len(values)] = values
         self._tree.step[:] = 0.0
 
-    def _is_anchored(self, vertices: Index) -> bool:
-        return len(vertices) <= _FEW and incremental.anchored(self._tree, vertices)
-
     def _refuse_loose(self) -> None:
         held = np.flatnonzero(self._inside & self._held)
         check_gauge(self.graph, self._unknowns(), held, self._active_rows())
@@ -409,14 +437,12 @@ def _known(ids: ArrayLike, count: int, what: str) -> Index:
     return at
 
 
-def _fresh(ids: ArrayLike, taken: NDArray[np.bool_], what: str) -> Index:
-    """Ids that are there and not yet taken, each once."""
-    at = _known(ids, len(taken), what)
-    ordered = np.sort(at)
-    again = np.concatenate([at[taken[at]], ordered[1:][ordered[1:] == ordered[:-1]]])
-    if len(again):
-        raise GraphSlamError(f"{what} {int(again[0])} was added before")
-    return at
+def _admit(ids: Index, inside: NDArray[np.bool_], count: int, what: str) -> None:
+    """Note ids as inside, each once; or refuse them all."""
+    unfit = incremental.admit(ids, inside, count)
+    if unfit != NOTHING:
+        _known(ids[unfit], count, what)
+        raise GraphSlamError(f"{what} {int(ids[unfit])} was added before")
 
 
 def _longer(array: NDArray, count: int) -> NDArray:

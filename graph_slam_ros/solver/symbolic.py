@@ -312,7 +312,7 @@ def build(
                 key = vertex[members[m], KEY]
                 parent = vertex[members[m], CLIQUE]
         _hang(t, c, parent)
-    return new[::-1]
+    return new[::-1].copy()
 
 
 @kernel
