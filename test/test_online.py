@@ -337,11 +337,11 @@ def run(machine, examples, steps):
 
 
 def test_after_any_changes_an_update_finds_the_optimum_and_the_marginals():
-    run(Changes, 60, 30)
+    run(Changes, 25, 30)
 
 
 def test_after_any_changes_an_update_with_default_settings_is_as_near_as_they_state():
-    run(ChangesWithDefaults, 25, 30)
+    run(ChangesWithDefaults, 15, 30)
 
 
 def test_the_jacobian_of_the_edge_on_three_vertices_is_the_numeric_one():
