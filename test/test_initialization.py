@@ -1,5 +1,6 @@
 """Starts that do not need the file's values: spanning tree and chordal, in the plane and in space."""
 
+import functools
 import os
 from pathlib import Path
 
@@ -77,6 +78,28 @@ def test_a_city_with_bad_odometry_reaches_one_optimum_from_either_start(factor):
     tree, chordal = solved(graph, "tree"), solved(graph, "chordal")
     assert tree.chi2_final == pytest.approx(chordal.chi2_final, rel=1e-6)
     assert tree.chi2_final < 1.2 * (3 * graph.edge_count - 3 * graph.vertex_count)  # about its degrees of freedom
+
+
+@pytest.mark.parametrize("start", ["tree", "chordal"])
+@pytest.mark.parametrize("factor", [2.0, 5.0, 10.0])
+def test_a_city_with_bad_odometry_comes_to_what_online_updates_come_to(factor, start):
+    graph, _ = city_graph(seed=1, poses=1500, blocks=20, odometry_noise_factor=factor)
+    batch = solved(graph, start)
+    assert batch.chi2_final == pytest.approx(online(factor), rel=1e-4)
+
+
+@functools.cache
+def online(factor):
+    """Chi2 after an update for each pose."""
+    graph, _ = city_graph(seed=1, poses=1500, blocks=20, odometry_noise_factor=factor)
+    newest = next(iter(graph.tables.values())).vertices.values.max(axis=1)
+    solver = Solver(graph, Settings(relinearize_above=1e-3, relinearize_every=1, tolerance=1e-8))
+    for k in range(graph.vertex_count):
+        solver.add([k], np.flatnonzero(newest == k))
+        if k == 0:
+            solver.hold(0)
+        solver.update()
+    return solver.evaluate().chi2_final
 
 
 @pytest.mark.skipif(not GRAPHS.exists(), reason=f"no public graphs under {GRAPHS}")

@@ -27,6 +27,7 @@ from graph_slam_ros.graph import (
     Loss,
 )
 from graph_slam_ros.lie import se2
+from graph_slam_ros.simulation import city_graph
 from graph_slam_ros.solver import Settings, Solver
 
 POSES, POINTS = 12, 3
@@ -507,14 +508,20 @@ def test_edges_of_very_different_strength_are_not_called_singular():
     assert solver.estimate([2])[0] == pytest.approx([2.0, 0.0, 0.0], abs=1e-6)
 
 
-@pytest.mark.parametrize("seed", [3, 8])
-def test_gauss_newton_that_fails_is_done_again_with_damping(seed):
-    rng = np.random.default_rng(seed)  # readings that contradict each other by far: undamped steps jump about
+def contradictions(seed):
+    """Readings that contradict each other by far: undamped steps jump about."""
+    rng = np.random.default_rng(seed)
     graph = small(*np.column_stack([rng.uniform(-5, 5, (6, 2)), rng.uniform(-3, 3, 6)]))
     graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
     for i, j in itertools.combinations(range(6), 2):
         noise = Gaussian.from_sigmas(0.01, 0.01, 3.0)
         graph.add_edge(RELATIVE_POSE, [i, j], rng.uniform(-3, 3, 3), noise, "closures")
+    return graph
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_gauss_newton_that_fails_is_done_again_with_damping(seed):
+    graph = contradictions(seed)
     solver, report = solve(graph, max_iterations=60)
     assert (report.method, report.converged) == ("lm", True)
     damped = [report.cost_initial, *(i.cost for i in report.iterations)]
@@ -555,6 +562,26 @@ def test_a_start_that_leaves_something_open_is_recovered_from(method):
     solver, report = solve(graph, method=method)
     assert report.converged
     assert solver.estimate([1])[0] == pytest.approx([1.0, 1.0, 0.0], abs=1e-6)
+
+
+CITIES = {f"odometry {factor} times as noisy": factor for factor in (1.0, 3.0, 6.0)}
+
+
+@pytest.mark.parametrize("factor", CITIES.values(), ids=CITIES)
+def test_dogleg_converges_from_dead_reckoning_where_levenberg_marquardt_does(factor):
+    graph, _ = city_graph(seed=5, poses=500, blocks=6, odometry_noise_factor=factor)
+    damped, dogleg = (solve(graph, held=[0], method=method, max_iterations=200)[1] for method in ("lm", "dogleg"))
+    assert damped.converged
+    assert (dogleg.converged, dogleg.method) == (True, "dogleg")
+    assert (np.diff([dogleg.cost_initial, *(i.cost for i in dogleg.iterations)]) <= 0.0).all()
+    assert dogleg.cost_final <= damped.cost_final * (1.0 + 1e-4)
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_dogleg_converges_on_contradictions_where_levenberg_marquardt_does(seed):
+    damped, dogleg = (solve(contradictions(seed), method=method, max_iterations=200)[1] for method in ("lm", "dogleg"))
+    assert (damped.converged, dogleg.converged, dogleg.method) == (True, True, "dogleg")
+    assert (np.diff([dogleg.cost_initial, *(i.cost for i in dogleg.iterations)]) <= 0.0).all()
 
 
 @pytest.mark.parametrize("origin", [(5e5, 4e6), (-4e6, 5e5)])
