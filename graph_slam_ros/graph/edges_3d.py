@@ -15,9 +15,18 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
+AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
 @jitable
 def _pose(x: Array, i: int) -> se3.Pose:
     return x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5], x[i + 6]
+
+
+@jitable
+def _put(out: Array, row: int, column: int, v: so3.Vector) -> None:
+    """Write a vector down a column of a Jacobian."""
+    out[row, column], out[row + 1, column], out[row + 2, column] = v
 
 
 @jitable
@@ -38,13 +47,18 @@ def _relative_pose(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
         z = _pose(measured[k], 0)
         d = se3.between(_pose(x, at[k, 0]), _pose(x, at[k, 1]))
         e = se3.between(z, d)
-        by_angle = so3.right_jacobian_inverse(_residual(e, residual[k]))
-        back = so3.matrix(so3.inverse(se3.rotation(z)))
-        jacobian[k, :3, :3] = -back
-        jacobian[k, :3, 3:6] = back @ so3.hat(se3.position(d))
-        jacobian[k, 3:, 3:6] = -by_angle @ so3.matrix(so3.inverse(se3.rotation(d)))
-        jacobian[k, :3, 6:9] = so3.matrix(se3.rotation(e))
-        jacobian[k, 3:, 9:] = by_angle
+        w = _residual(e, residual[k])
+        from_z, from_d = so3.inverse(se3.rotation(z)), so3.inverse(se3.rotation(d))
+        out = jacobian[k]
+        for c in range(3):
+            axis = AXES[c]
+            back = so3.act(from_z, axis)
+            turned = so3.right_jacobian_inverse(w, so3.act(from_d, axis))
+            _put(out, 0, c, (-back[0], -back[1], -back[2]))
+            _put(out, 0, 3 + c, so3.act(from_z, so3.cross(se3.position(d), axis)))
+            _put(out, 3, 3 + c, (-turned[0], -turned[1], -turned[2]))
+            _put(out, 0, 6 + c, so3.act(se3.rotation(e), axis))
+            _put(out, 3, 9 + c, so3.right_jacobian_inverse(w, axis))
     return residual, jacobian
 
 
@@ -55,8 +69,10 @@ def _pose_prior(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
     residual, jacobian = np.zeros((n, 6)), np.zeros((n, 6, 6))
     for k in range(n):
         e = se3.between(_pose(measured[k], 0), _pose(x, at[k, 0]))
-        jacobian[k, 3:, 3:] = so3.right_jacobian_inverse(_residual(e, residual[k]))
-        jacobian[k, :3, :3] = so3.matrix(se3.rotation(e))
+        w = _residual(e, residual[k])
+        for c in range(3):
+            _put(jacobian[k], 0, c, so3.act(se3.rotation(e), AXES[c]))
+            _put(jacobian[k], 3, 3 + c, so3.right_jacobian_inverse(w, AXES[c]))
     return residual, jacobian
 
 
@@ -69,11 +85,11 @@ def _landmark_position(x: Array, at: Index, measured: Array) -> tuple[Array, Arr
         i, j = at[k]
         back = so3.inverse(se3.rotation(_pose(x, i)))
         p = so3.act(back, (x[j] - x[i], x[j + 1] - x[i + 1], x[j + 2] - x[i + 2]))
-        jacobian[k, :, 3:6] = so3.hat(p)
-        jacobian[k, :, 6:] = so3.matrix(back)
-        for a in range(3):
-            residual[k, a] = p[a] - measured[k, a]
-            jacobian[k, a, a] = -1.0
+        for c in range(3):
+            residual[k, c] = p[c] - measured[k, c]
+            jacobian[k, c, c] = -1.0
+            _put(jacobian[k], 0, 3 + c, so3.cross(p, AXES[c]))
+            _put(jacobian[k], 0, 6 + c, so3.act(back, AXES[c]))
     return residual, jacobian
 
 

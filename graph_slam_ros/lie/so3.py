@@ -95,23 +95,14 @@ def hat(v: Vector) -> NDArray[np.float64]:
 
 
 @jitable
-def right_jacobian_inverse(d: Vector) -> NDArray[np.float64]:
-    """``Log(Exp(d) Exp(e)) = d + J e`` to first order in e, eq. (144); (3, 3) of one vector."""
+def right_jacobian_inverse(d: Vector, v: Vector) -> Vector:
+    """``J v`` with ``Log(Exp(d) Exp(e)) = d + J e`` to first order in e, eq. (144): v + d x v / 2 + k d x (d x v)."""
     square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
     if square < _SMALL * _SMALL:
         k = 1.0 / 12.0 + square / 720.0
     else:
         half = 0.5 * np.sqrt(square)
-        k = (1.0 - np.cos(half) / np.sinc(half / np.pi)) / square
-    out = np.empty((3, 3))
-    for r in range(3):
-        for c in range(3):
-            out[r, c] = k * d[r] * d[c]
-        out[r, r] += 1.0 - k * square
-    out[0, 1] -= 0.5 * d[2]
-    out[0, 2] += 0.5 * d[1]
-    out[1, 0] += 0.5 * d[2]
-    out[1, 2] -= 0.5 * d[0]
-    out[2, 0] -= 0.5 * d[1]
-    out[2, 1] += 0.5 * d[0]
-    return out
+        k = (1.0 - half * np.cos(half) / np.sin(half)) / square
+    dv = cross(d, v)
+    ddv = cross(d, dv)
+    return v[0] + 0.5 * dv[0] + k * ddv[0], v[1] + 0.5 * dv[1] + k * ddv[1], v[2] + 0.5 * dv[2] + k * ddv[2]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.graph import EdgeTable
-from graph_slam_ros.solver.linearization import Losses, by_class, linearize, refuse_nonfinite, store, total
+from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, store
 from graph_slam_ros.solver.numeric import back_substitute, curvature, eliminate, gradient, settle, step_by
 from graph_slam_ros.solver.report import Iteration, Report
 from graph_slam_ros.solver.symbolic import mark
@@ -48,7 +48,7 @@ class Settings:
     losses: Mapping[str, Sequence[Loss]] = field(default_factory=dict)
     relinearize_above: float = 0.05
     relinearize_every: int = 10
-    relinearize_passes: int = 3
+    relinearize_passes: int = 1
     tolerance: float = 1e-5
 
     def __post_init__(self) -> None:
@@ -79,10 +79,11 @@ class Problem:
 
     def linearize(self, losses: Losses) -> None:
         """Put the blocks of all edges at the linearisation points into the tree."""
-        blocks = linearize(self.graph, self.tree.value, self.rows, losses)
-        for b in blocks:
+        self.chi2 = self.cost = 0.0
+        for b in linearize(self.graph, self.tree.value, self.rows, losses):
             store(self.tree, b.rows, b.table.id.values, b.residual, b.jacobian)
-        self.chi2, self.cost = total(blocks)
+            self.chi2 += float(b.chi2.sum())
+            self.cost += float(b.cost.sum())
 
     def solve(self, damping: float = 0.0) -> float:
         """Find the step of all unknowns; returns its largest component.
@@ -142,7 +143,8 @@ def minimise(problem: Problem, settings: Settings) -> Report:
         The cost is not finite where it starts.
     """
     stages = [Losses(problem.graph, by_label) for by_label in settings.stages()]
-    refuse_nonfinite(linearize(problem.graph, problem.tree.value, problem.rows, stages[0]))
+    for block in linearize(problem.graph, problem.tree.value, problem.rows, stages[0]):
+        refuse_nonfinite(block)
     problem.linearize(stages[0])
     chi2_initial, cost_initial = problem.chi2, problem.cost
     iterations: list[Iteration] = []
@@ -160,10 +162,8 @@ def minimise(problem: Problem, settings: Settings) -> Report:
         problem.solve()
         problem.tree.step[:] = 0.0
         problem.restore(problem.saved())
-    blocks = linearize(problem.graph, problem.tree.value, problem.rows, stages[-1])
-    chi2, cost = total(blocks)
-    classes = by_class(problem.graph, blocks)
-    return Report(used, stop, chi2_initial, chi2, cost_initial, cost, tuple(iterations), classes)
+    end = costs(problem.graph, linearize(problem.graph, problem.tree.value, problem.rows, stages[-1]))
+    return Report(used, stop, chi2_initial, end.chi2, cost_initial, end.cost, tuple(iterations), end.classes)
 
 
 def _gauss_newton(problem: Problem, losses: Losses, settings: Settings) -> _Descent:

@@ -1,6 +1,6 @@
 """From edges to whitened blocks: the only place of the solver that looks at an edge type, and only to call it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,8 @@ from graph_slam_ros.solver.tree import BLOCK, COUNT, DOF, END, STEP, Tree
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+CHUNK = 512  # edges
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,25 +99,20 @@ def _whiten(
     return chi2, cost
 
 
-def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Losses) -> list[Block]:
-    """Linearise the given rows of each table at the stored values x, with the loss of each edge's label."""
-    blocks = []
+def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Losses) -> Iterator[Block]:
+    """Linearise the given rows of each table at the stored values x, with the loss of each edge's label.
+
+    Blocks come some hundred edges at a time: arrays of that size stay in the cache and in the process.
+    """
     offset = graph.offset.values
     for table, chosen in rows.items():
-        at, measured = _take(chosen, table.vertices.values, offset, table.measured.values)
-        residual, jacobian = table.type.linearize(x, at, measured)
-        chi2, cost = _whiten(
-            chosen,
-            residual,
-            jacobian,
-            table.sqrt_information.values,
-            table.weight.values,
-            table.label.values,
-            losses.kind,
-            losses.scale,
-        )
-        blocks.append(Block(table, chosen, residual, jacobian, chi2, cost))
-    return blocks
+        columns = table.sqrt_information.values, table.weight.values, table.label.values
+        for first in range(0, len(chosen), CHUNK):
+            some = chosen[first : first + CHUNK]
+            at, measured = _take(some, table.vertices.values, offset, table.measured.values)
+            residual, jacobian = table.type.linearize(x, at, measured)
+            chi2, cost = _whiten(some, residual, jacobian, *columns, losses.kind, losses.scale)
+            yield Block(table, some, residual, jacobian, chi2, cost)
 
 
 @kernel
@@ -126,22 +123,25 @@ def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) ->
     for k in range(n):
         e = ids[rows[k]]
         block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
-        p = 0
-        for s in range(edge[e, COUNT]):
-            v = edge[e, END + s]
-            for i in range(vertex[v, DOF]):
-                before = block[p, p]
+        _add_to_diagonal(vertex, edge, e, block, diagonal, -1.0)
+        block[:] = 0.0
+        for a in range(m):
+            for p in range(width):
+                x = jacobian[k, a, p]
                 for c in range(width):
-                    total = 0.0
-                    for a in range(m):
-                        total += jacobian[k, a, p] * jacobian[k, a, c]
-                    block[p, c] = total
-                total = 0.0
-                for a in range(m):
-                    total += jacobian[k, a, p] * residual[k, a]
-                block[p, width] = total
-                diagonal[vertex[v, STEP] + i] += block[p, p] - before
-                p += 1
+                    block[p, c] += x * jacobian[k, a, c]
+                block[p, width] += x * residual[k, a]
+        _add_to_diagonal(vertex, edge, e, block, diagonal, 1.0)
+
+
+@kernel
+def _add_to_diagonal(vertex: Index, edge: Index, e: int, block: Array, diagonal: Array, sign: float) -> None:
+    p = 0
+    for s in range(edge[e, COUNT]):
+        v = edge[e, END + s]
+        for i in range(vertex[v, DOF]):
+            diagonal[vertex[v, STEP] + i] += sign * block[p, p]
+            p += 1
 
 
 def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:
@@ -153,28 +153,35 @@ def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:
     return {table: rows[codes == code] for code, table in enumerate(graph.tables.values()) if (codes == code).any()}
 
 
-def total(blocks: list[Block]) -> tuple[float, float]:
-    """(chi2, cost) of all edges."""
-    return float(sum(b.chi2.sum() for b in blocks)), float(sum(b.cost.sum() for b in blocks))
-
-
-def refuse_nonfinite(blocks: list[Block]) -> None:
+def refuse_nonfinite(block: Block) -> None:
     """Raise where numbers are so large that a cost overflows, naming the first such edge."""
-    for b in blocks:
-        bad = np.flatnonzero(~np.isfinite(b.cost))
-        if len(bad):
-            row = b.rows[bad[0]]
-            raise GraphSlamError(
-                f"edge {int(b.table.id.values[row])} ({b.table.type.name}) between vertices"
-                f" {b.table.vertices.values[row].tolist()}: its chi2 is not finite"
-            )
+    if np.isfinite(block.cost.sum()):
+        return
+    bad = np.flatnonzero(~np.isfinite(block.cost))
+    row = block.rows[bad[0] if len(bad) else int(block.cost.argmax())]
+    table = block.table
+    raise GraphSlamError(
+        f"edge {int(table.id.values[row])} ({table.type.name}) between vertices"
+        f" {table.vertices.values[row].tolist()}: its chi2 is not finite"
+    )
 
 
-def by_class(graph: Graph, blocks: list[Block]) -> dict[str, ClassCost]:
-    """chi2 and number of edges of each label."""
-    count, chi2 = np.zeros(len(graph.labels), dtype=np.int64), np.zeros(len(graph.labels))
+@dataclass(slots=True)
+class Costs:
+    """Sums over edges: chi2 without and cost with their losses, and chi2 and number by label."""
+
+    chi2: float
+    cost: float
+    classes: dict[str, ClassCost]
+
+
+def costs(graph: Graph, blocks: Iterable[Block]) -> Costs:
+    """Add up the costs of linearised edges."""
+    count, chi2, cost = np.zeros(len(graph.labels), dtype=np.int64), np.zeros(len(graph.labels)), 0.0
     for b in blocks:
         label = b.table.label.values[b.rows]
-        np.add.at(count, label, 1)
-        np.add.at(chi2, label, b.chi2)
-    return {name: ClassCost(int(count[k]), float(chi2[k])) for k, name in enumerate(graph.labels) if count[k]}
+        count += np.bincount(label, minlength=len(count))
+        chi2 += np.bincount(label, b.chi2, minlength=len(count))
+        cost += float(b.cost.sum())
+    classes = {name: ClassCost(int(count[k]), float(chi2[k])) for k, name in enumerate(graph.labels) if count[k]}
+    return Costs(float(chi2.sum()), cost, classes)

@@ -218,7 +218,7 @@ def dissect(t: Tree, region: int) -> Index:
         side = np.full(high - low, 2, np.int64)
         if high - low > LEAF and t_region[r, R_DEPTH] < DEEPEST - 1:
             side = separate(*_induced(mine, start, neighbour, strength, weight, place))
-        a, b = np.count_nonzero(side == 0), np.count_nonzero(side == 1)
+        a, b = int(np.count_nonzero(side == 0)), int(np.count_nonzero(side == 1))
         part[low : low + a] = mine[side == 0]
         part[low + a : low + a + b] = mine[side == 1]
         if a > 0 and b > 0:

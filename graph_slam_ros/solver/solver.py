@@ -1,5 +1,7 @@
 """The seam between the problem and its solution: what it is made of, its estimate, its covariances."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -9,7 +11,7 @@ from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
 from graph_slam_ros.solver.gauge import check_gauge
-from graph_slam_ros.solver.linearization import Losses, by_class, linearize, refuse_nonfinite, rows_of, store, total
+from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, rows_of, store
 from graph_slam_ros.solver.numeric import marginal
 from graph_slam_ros.solver.report import Change, Report
 from graph_slam_ros.solver.tree import (
@@ -199,9 +201,8 @@ class Solver:
         """Chi2 and cost of the present estimate, with the last stage of the losses."""
         self._grow()
         losses = Losses(self.graph, (settings or self.settings).stages()[-1])
-        blocks = linearize(self.graph, self._tree.estimate, self._active_rows(), losses)
-        chi2, cost = total(blocks)
-        return Report("gn", "nothing_to_do", chi2, chi2, cost, cost, (), by_class(self.graph, blocks))
+        now = costs(self.graph, linearize(self.graph, self._tree.estimate, self._active_rows(), losses))
+        return Report("gn", "nothing_to_do", now.chi2, now.chi2, now.cost, now.cost, (), now.classes)
 
     def estimate(self, ids: ArrayLike) -> Array:
         """Values of vertices of one kind, (n, size)."""
@@ -379,9 +380,8 @@ class Solver:
             young = np.isin(edges, self._young)
             parts = [(edges[young], stages[0]), (edges[~young], stages[-1])]
         for ids, losses in parts:
-            blocks = linearize(self.graph, self._tree.value, rows_of(self.graph, ids), losses)
-            refuse_nonfinite(blocks)
-            for b in blocks:
+            for b in linearize(self.graph, self._tree.value, rows_of(self.graph, ids), losses):
+                refuse_nonfinite(b)
                 store(self._tree, b.rows, b.table.id.values, b.residual, b.jacobian)
 
     def _restructure(self, vertices: Index, edges: Index) -> None:
@@ -445,7 +445,7 @@ def _admit(ids: Index, inside: NDArray[np.bool_], count: int, what: str) -> None
         raise GraphSlamError(f"{what} {int(ids[unfit])} was added before")
 
 
-def _longer(array: NDArray, count: int) -> NDArray:
+def _longer(array: NDArray[Any], count: int) -> NDArray[Any]:
     """The array with room for so many rows, and more to come."""
     if count <= len(array):
         return array

@@ -37,6 +37,7 @@ from graph_slam_ros.solver.tree import (
 )
 
 RELAXED = 36  # zeros that a vertex may bring along when it joins a clique: fewer, larger fronts
+SHARE = 0.12  # or this share of a large one
 
 
 @kernel
@@ -206,7 +207,7 @@ def cliques_of(t: Tree, order: Index, start: Index, later: Index) -> tuple[Index
         if width > 0:
             parent = later[start[k]]
             c = clique[parent]
-            if head[c] == parent and (size[c] - width) * dof <= RELAXED:
+            if head[c] == parent and ((size[c] - width) * dof <= RELAXED or size[c] - width <= SHARE * size[c]):
                 clique[k], head[c] = c, k
                 size[c] += dof
                 continue
@@ -218,7 +219,7 @@ def cliques_of(t: Tree, order: Index, start: Index, later: Index) -> tuple[Index
 @kernel
 def capacity_class(size: int) -> int:
     """The least size class that has room for so many degrees of freedom."""
-    return np.searchsorted(CAPACITIES, size)
+    return int(np.searchsorted(CAPACITIES, size))
 
 
 @kernel
@@ -243,8 +244,11 @@ def room_for(t: Tree, size: Index) -> tuple[int, int, int]:
 @kernel
 def release(t: Tree, cliques: Index) -> None:
     """Give cliques back: their places are used again by the next ones of the same size class, while still in cache."""
-    clique, vacant = t.clique, t.vacant
+    vertex, clique, vacant, members = t.vertex, t.clique, t.vacant, t.members
     for c in cliques:
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+            if vertex[members[m], CLIQUE] == c:  # it is no unknown any more
+                vertex[members[m], CLIQUE] = NOTHING
         k = clique[c, CLASS]
         clique[c, SIBLING] = vacant[k]
         vacant[k] = c
