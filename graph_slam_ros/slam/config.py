@@ -172,6 +172,12 @@ class SolveConfig:
     relinearize_above: float = _setting(
         0.05, "linearise a pose or landmark anew when it has moved by more since", "m, rad", low=0.0
     )
+    relinearize_error: float = _setting(
+        0.1,
+        "or when the square of that is more of the standard deviation of its strongest measurement",
+        "sigma",
+        low=0.0,
+    )
     relinearize_every: int = _setting(
         10,
         "look for those at every so many updates (at each for five times that far)",
@@ -266,8 +272,9 @@ class Config:
             s.step_tolerance,
             s.cost_tolerance,
             {"landmarks": stages},
-            s.relinearize_above,
-            s.relinearize_every,
+            relinearize_above=s.relinearize_above,
+            relinearize_error=s.relinearize_error,
+            relinearize_every=s.relinearize_every,
             tolerance=s.tolerance,
         )
 

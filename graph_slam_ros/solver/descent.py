@@ -36,6 +36,7 @@ class Settings:
     losses : by label, the stages of its loss: each is minimised until converged, then the next; a label with fewer
         stages keeps its last. Online an edge has the first at its first update and the last from then on
     relinearize_above : online, a vertex is linearised anew when a component of its step is larger [m, rad]
+    relinearize_error : or when its step squared is more than so many standard deviations of its strongest measurement
     relinearize_every : that is looked for at every so many updates; steps five times as large are at any
     relinearize_passes : how often at most within one update
     tolerance : online, changes of a step up to this are not followed [m, rad]
@@ -47,6 +48,7 @@ class Settings:
     cost_tolerance: float = 1e-6
     losses: Mapping[str, Sequence[Loss]] = field(default_factory=dict)
     relinearize_above: float = 0.05
+    relinearize_error: float = 0.1
     relinearize_every: int = 10
     relinearize_passes: int = 1
     tolerance: float = 1e-5

@@ -309,17 +309,22 @@ def renumber(t: Tree, edges: Index, tolerance: float) -> tuple[int, Index]:
 
 
 @kernel
-def relinearize(t: Tree, moved: Index, threshold: float) -> Index:
-    """Move the linearisation points of vertices whose step is above the threshold; returns all edges on them."""
-    vertex, edge, link, t_step = t.vertex, t.edge, t.link, t.step
+def relinearize(t: Tree, moved: Index, threshold: float, error: float) -> Index:
+    """Move the linearisation points of vertices whose step is too large; returns all edges on them.
+
+    It is above the threshold, or what a linearisation neglects (the square of the step) is above ``error`` standard
+    deviations of the strongest measurement.
+    """
+    vertex, edge, link, t_step, t_diagonal = t.vertex, t.edge, t.link, t.step, t.diagonal
     edges, moving = np.empty(64, np.int64), np.empty(len(moved), np.int64)
     count = many = 0
     for v in moved:
         step = t_step[vertex[v, STEP] : vertex[v, STEP] + vertex[v, DOF]]
-        largest = 0.0
-        for d in step:
-            largest = max(largest, abs(d))
-        if largest <= threshold:
+        largest = information = 0.0
+        for i in range(len(step)):
+            largest = max(largest, abs(step[i]))
+            information = max(information, t_diagonal[vertex[v, STEP] + i])
+        if largest <= threshold and largest * largest * np.sqrt(information) <= error:
             continue
         moving[many] = v
         many += 1

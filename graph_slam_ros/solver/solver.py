@@ -155,8 +155,10 @@ class Solver:
         if due and settings.relinearize_every > 1:
             moved = self._unknowns()
         for _ in range(settings.relinearize_passes):
-            threshold = settings.relinearize_above * (1.0 if due else _BY_FAR)
-            edges = incremental.relinearize(self._tree, moved, threshold)
+            far = 1.0 if due else _BY_FAR
+            edges = incremental.relinearize(
+                self._tree, moved, far * settings.relinearize_above, far**2 * settings.relinearize_error
+            )
             if not len(edges):
                 break
             self._linearize(edges)
