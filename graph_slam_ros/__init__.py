@@ -1,3 +1,57 @@
-"""Online pose-graph SLAM for robots that bring their own odometry and landmark sightings."""
+"""Online pose-graph SLAM for robots that bring their own odometry and landmark sightings.
+
+Names are imported when they are first used, so that ``import graph_slam_ros`` costs nothing and none of them needs ROS.
+Kinds of vertices, edge types and losses are in ``graph_slam_ros.graph``.
+"""
 
 __version__ = "0.1.0"
+
+TYPE_CHECKING = False  # type checkers take it for true; typing itself is slow to import
+if TYPE_CHECKING:
+    from graph_slam_ros.batch import Solution, optimize
+    from graph_slam_ros.formats.g2o import read_g2o, write_g2o
+    from graph_slam_ros.graph import Gaussian, Graph
+    from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+    from graph_slam_ros.solver import Settings, Solver
+
+__all__ = [
+    "Config",
+    "Control",
+    "Gaussian",
+    "Graph",
+    "GraphSlam",
+    "Odometry",
+    "Settings",
+    "Sighting",
+    "Sightings",
+    "Solution",
+    "Solver",
+    "optimize",
+    "read_g2o",
+    "write_g2o",
+]
+
+_HOMES = {
+    "batch": ("Solution", "optimize"),
+    "formats.g2o": ("read_g2o", "write_g2o"),
+    "graph": ("Gaussian", "Graph"),
+    "slam": ("Config", "Control", "GraphSlam", "Odometry", "Sighting", "Sightings"),
+    "solver": ("Settings", "Solver"),
+}
+
+if not TYPE_CHECKING:  # or type checkers would believe in every name
+
+    def __getattr__(name: str) -> object:
+        """Import a public name when it is first used (PEP 562)."""
+        for home, names in _HOMES.items():
+            if name in names:
+                from importlib import import_module
+
+                value = globals()[name] = getattr(import_module(f"{__name__}.{home}"), name)
+                return value
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """The public names, imported or not."""
+    return sorted({*globals(), *__all__})

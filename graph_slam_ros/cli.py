@@ -142,22 +142,20 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _optimize(args: argparse.Namespace) -> int:
+    from graph_slam_ros.batch import started, take_whole
     from graph_slam_ros.formats.g2o import write_g2o
     from graph_slam_ros.solver import Settings
 
     file = _read_graph(args, error_map=args.error_map)
     graph = file.graph
-    solver, start = _started(file, args.init)
+    solver, start = started(file, args.init)
     settings = Settings(
         method=args.method,
         max_iterations=args.max_iterations,
         cost_tolerance=args.tolerance,
         losses={label: [args.loss] for label in graph.labels if label != "odometry"},
     )
-    solver.add(range(graph.vertex_count), range(graph.edge_count))
-    has_prior = any(len(edge.accepts) == 1 for edge in graph.tables)
-    for vertex in file.fixed if file.fixed or has_prior else [_root(file)]:
-        solver.hold(vertex)
+    take_whole(solver, file)
     before = _positions(graph, solver) if args.plot else None
     report = solver.optimize(settings)
     if args.json:
@@ -187,6 +185,7 @@ def _optimize(args: argparse.Namespace) -> int:
 
 
 def _convert(args: argparse.Namespace) -> int:
+    from graph_slam_ros.batch import started
     from graph_slam_ros.formats.convert import NAMES, format_of, write_graph
 
     target = args.to or format_of(args.out)
@@ -196,7 +195,7 @@ def _convert(args: argparse.Namespace) -> int:
         raise GraphSlamError(f"{args.out}: cannot be read from and written to at once")
     file = _read_graph(args, dialect=args.source)
     if file.has_values or target != "gtsam":  # which alone needs no vertex lines
-        solver, start = _started(file, "file")
+        solver, start = started(file, "file")
         written = write_graph(args.out, file, solver.estimate, target)
         if not file.has_values:
             _say(f"{_NO_VALUES}: those of {_START[start]} are written")
@@ -264,23 +263,6 @@ def _read_graph(args: argparse.Namespace, **options: Any) -> "G2oFile":
     from graph_slam_ros.formats.g2o import read_g2o
 
     return read_g2o(args.graph, lenient=args.lenient, raw=args.information == "raw", **options)
-
-
-def _root(file: "G2oFile") -> int:
-    """The first pose of a FIX line, or that of the least id."""
-    of_no_pose = [not file.graph.kind_of(v).name.startswith("SE") for v in range(file.graph.vertex_count)]
-    fixed = [v for v in file.fixed if not of_no_pose[v]]
-    return fixed[0] if fixed else min(range(file.graph.vertex_count), key=lambda v: (of_no_pose[v], file.ids[v]))
-
-
-def _started(file: "G2oFile", init: str) -> tuple["Solver", str]:
-    """A solver with initial values, and where they are from: edges alone leave nothing but their tree."""
-    from graph_slam_ros.solver import Solver, initial_values
-
-    start = init if file.has_values or init != "file" else "tree"
-    solver = Solver(file.graph)
-    solver.start_at(initial_values(file.graph, start, _root(file)))
-    return solver, start
 
 
 def _tell_unknown(file: "G2oFile") -> None:
