@@ -108,19 +108,20 @@ def path(frame: str, stamps_ns: Sequence[int], poses: Array) -> bytes:
     """
     stamps = np.asarray(stamps_ns, dtype=np.int64)
     name = frame.encode() + b"\x00"
-    out = bytearray(_stamp(int(stamps[-1]) if len(stamps) else 0) + np.uint32(len(name)).tobytes() + name)
-    out += b"\x00" * (-len(out) % 4) + np.uint32(len(stamps)).tobytes()
-    if len(stamps):
-        out += _pose_rows(name, stamps[:1], poses[:1], len(out)) + _pose_rows(name, stamps[1:], poses[1:], 0)
-    return _HEADER + bytes(out)
+    head = _stamp(int(stamps[-1]) if len(stamps) else 0) + np.uint32(len(name)).tobytes() + name
+    head += b"\x00" * (-len(head) % 4) + np.uint32(len(stamps)).tobytes()
+    if not len(stamps):
+        return _HEADER + head
+    first, others = _pose_rows(name, stamps[:1], poses[:1], len(head)), _pose_rows(name, stamps[1:], poses[1:], 0)
+    return b"".join((_HEADER, head, first.data, others.data))  # a megabyte, copied once
 
 
 def _stamp(stamp_ns: int) -> bytes:
     return np.int32(stamp_ns // _NS).tobytes() + np.uint32(stamp_ns % _NS).tobytes()
 
 
-def _pose_rows(name: bytes, stamps: NDArray[np.int64], poses: Array, start: int) -> bytes:
-    """PoseStamped rows that begin at a multiple of 8 plus ``start`` from the head of the message."""
+def _pose_rows(name: bytes, stamps: NDArray[np.int64], poses: Array, start: int) -> NDArray[np.uint8]:
+    """PoseStamped rows, as bytes, that begin at a multiple of 8 plus ``start`` from the head of the message."""
     text = 12 + len(name)
     row = np.dtype(
         [
@@ -133,12 +134,12 @@ def _pose_rows(name: bytes, stamps: NDArray[np.int64], poses: Array, start: int)
         ]
     )
     rows = np.zeros(len(stamps), dtype=row)
-    rows["sec"], rows["nanosec"] = stamps // _NS, stamps % _NS
+    rows["sec"], rows["nanosec"] = np.divmod(stamps, _NS)
     rows["length"], rows["frame"] = len(name), name
     half = 0.5 * poses[:, 2]
     rows["values"][:, :2] = poses[:, :2]
     rows["values"][:, 5], rows["values"][:, 6] = np.sin(half), np.cos(half)
-    return rows.tobytes()
+    return rows.view(np.uint8)
 
 
 def landmark_markers(
