@@ -93,7 +93,7 @@ def online(factor):
     """Chi2 after an update for each pose."""
     graph, _ = city_graph(seed=1, poses=1500, blocks=20, odometry_noise_factor=factor)
     newest = next(iter(graph.tables.values())).vertices.values.max(axis=1)
-    solver = Solver(graph, Settings(relinearize_above=1e-3, relinearize_every=1, tolerance=1e-8))
+    solver = Solver(graph)
     for k in range(graph.vertex_count):
         solver.add([k], np.flatnonzero(newest == k))
         if k == 0:

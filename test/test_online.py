@@ -510,3 +510,14 @@ def test_an_update_that_turns_singular_on_its_way_leaves_the_estimate():
     solver.add([], [graph.add_edge(POINT_PRIOR[R1], [0], [2.0], Gaussian.from_sigmas(0.1), "all")])
     solver.update()
     assert off_by(solver) < 1e-6
+
+
+def test_what_is_left_when_the_passes_run_out_is_seen_to_by_later_updates():
+    solver = chain(30, **EXACT | {"relinearize_passes": 1})
+    append(solver, 30, 0, 3)
+    solver.update()
+    assert off_by(solver) > 1e-5
+    for k in range(31, 51):
+        append(solver, k)
+        solver.update()
+    assert off_by(solver) < 1e-6
