@@ -361,7 +361,7 @@ def _parser() -> argparse.ArgumentParser:
         "--method",
         type=_method,
         default="gn",
-        metavar="gn|lm",
+        metavar="gn|lm|dogleg",
         help="gn (default) is damped only if it does not converge",
     )
     sub.add_argument("--max-iterations", type=_count, default=100, metavar="N", help="default: 100")
