@@ -43,6 +43,7 @@ from graph_slam_ros.solver.tree import (
 LEAF = 6  # vertices a region need not be dissected for
 GROWTH = 2.0  # a subtree is dissected anew when it has grown by this factor
 DEEPEST = 200
+LONGEST = 8  # times the length that is kept, of the tail
 PASSES = 4  # of refinement
 PATIENCE = 30  # moves without gain before a pass ends
 HEAVIEST = 0.6  # share of one side
@@ -56,10 +57,16 @@ def key_of(depth: int, region: int, vertex: int) -> int:
 
 @kernel
 def move_tail(t: Tree, keep: int, touched: Index) -> Index:
-    """Move the older vertices of a tail of more than twice ``keep`` down; returns all vertices this touches."""
+    """Move the older vertices of a tail of more than twice ``keep`` down; returns all vertices this touches.
+
+    That waits for a change that goes beyond the tail, and so for a while if need be: what odometry alone adds is cheap.
+    """
     vertex, region, tail, state = t.vertex, t.region, t.tail, t.state
     first, end = state[TAIL_FIRST], state[TAIL_END]
-    if end - first <= 2 * keep:
+    beyond = end - first > LONGEST * keep
+    for v in touched:
+        beyond = beyond or vertex[v, REGION] != NOTHING
+    if end - first <= 2 * keep or not beyond:
         return touched
     last = end - keep
     moving = tail[first:last]

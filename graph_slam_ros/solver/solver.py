@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _TAIL = 8  # newest vertices that stay last in the order of elimination
+_MUCH, _PATIENCE = 32, 5  # large steps are looked for when so many vertices move, or after so many times as long
 _BY_FAR = 5.0  # times the threshold: steps that are linearised anew at once
 _NONE = np.empty(0, dtype=np.int64)
 _KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
@@ -60,7 +61,7 @@ class Solver:
         self._broken = False  # the tree must be made anew
         self._settled = True  # its numbers are those at its linearisation points
         self._loose = False  # something that held parts together may be gone
-        self._updates = 0
+        self._moved: list[Index] = []  # at each update since large steps were last looked for
         self._stages: list[Losses] = []
         self._losses_for = NOTHING  # so many labels
         self._solved_with: Settings | None = None
@@ -150,10 +151,12 @@ class Solver:
         settings, eliminated = self.settings, int(self._tree.state[AFFECTED])
         moved, linearized = self._take_in()
         count = len(moved)
-        self._updates += 1
-        due = self._updates % settings.relinearize_every == 0
-        if due and settings.relinearize_every > 1:
-            moved = self._unknowns()
+        self._moved.append(moved)
+        much = len(moved) > _MUCH or len(self._moved) >= _PATIENCE * settings.relinearize_every
+        due = len(self._moved) >= settings.relinearize_every and (much or settings.relinearize_every == 1)
+        if due:
+            moved = np.unique(np.concatenate(self._moved))
+            self._moved = []
         for _ in range(settings.relinearize_passes):
             far = 1.0 if due else _BY_FAR
             edges = incremental.relinearize(
@@ -166,6 +169,7 @@ class Solver:
             if failed != NOTHING:
                 self._broken = True
                 raise _singular(failed)
+            self._moved.append(moved)
             linearized += len(edges)
             count += len(moved)
             due = True
