@@ -12,7 +12,7 @@ from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
 from graph_slam_ros.solver.gauge import check_gauge
 from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, rows_of, store
-from graph_slam_ros.solver.numeric import marginal
+from graph_slam_ros.solver.numeric import marginal, settle
 from graph_slam_ros.solver.report import Change, Report
 from graph_slam_ros.solver.tree import (
     ACTIVE,
@@ -21,11 +21,14 @@ from graph_slam_ros.solver.tree import (
     CLIQUES_WANTED,
     FREE,
     FRONTS_WANTED,
+    KEY,
     LINKS,
     MEMBERS_WANTED,
     NOTHING,
     SE2_KIND,
     SE3_KIND,
+    TAIL_END,
+    TAIL_FIRST,
     VECTOR,
     empty_tree,
 )
@@ -34,7 +37,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _TAIL = 8  # newest vertices that stay last in the order of elimination
-_MUCH, _PATIENCE = 32, 5  # large steps are looked for when so many vertices move, or after so many times as long
+_MANY, _PATIENCE = 32, 5  # large steps are looked for when so many vertices move, or after so many times as long
 _BY_FAR = 5.0  # times the threshold: steps that are linearised anew at once
 _NONE = np.empty(0, dtype=np.int64)
 _KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
@@ -61,7 +64,8 @@ class Solver:
         self._broken = False  # the tree must be made anew
         self._settled = True  # its numbers are those at its linearisation points
         self._loose = False  # something that held parts together may be gone
-        self._moved: list[Index] = []  # at each update since large steps were last looked for
+        self._moved_since: list[Index] = []  # large steps were last looked for
+        self._updates_since = 0
         self._stages: list[Losses] = []
         self._losses_for = NOTHING  # so many labels
         self._solved_with: Settings | None = None
@@ -86,6 +90,7 @@ class Solver:
                 raise GraphSlamError(f"an edge needs vertex {missing}, which was not added")
         for table, chosen in rows.items():
             self._record(table, chosen)
+        self._broken |= bool((self._tree.vertex[new, KEY] != NOTHING).any())  # removed before: it is in the order still
         self._new_vertices = np.concatenate((self._new_vertices, new)) if len(self._new_vertices) else new
         self._new_edges = np.concatenate((self._new_edges, new_edges)) if len(self._new_edges) else new_edges
 
@@ -105,6 +110,9 @@ class Solver:
         self._grow()
         one = _known([edge], self.graph.edge_count, "edge")
         table, row = self.graph.row(edge)
+        ends = table.vertices.values[row]
+        if weight and self._taken[edge] and not self._inside[ends].all():
+            raise GraphSlamError(f"edge {edge} needs vertex {int(ends[~self._inside[ends]][0])}, which was removed")
         table.weight.values[row] = weight
         if not self._taken[edge]:
             return
@@ -112,7 +120,7 @@ class Solver:
             self._new_edges = np.union1d(self._new_edges, one)
         elif self._tree.edge[edge, ACTIVE]:
             incremental.deactivate(self._tree, one)
-            self._touched = np.concatenate((self._touched, table.vertices.values[row]))
+            self._touched = np.concatenate((self._touched, ends))
             self._loose = True
 
     def hold(self, vertex: int) -> None:
@@ -120,6 +128,11 @@ class Solver:
         self._grow()
         one = _known([vertex], self._vertices, "vertex")
         self._held[vertex] = True
+        if self._tree.vertex[vertex, FREE]:
+            settle(self._tree, one)
+            for table, rows in self._active_rows().items():  # they are linearised where it is held
+                on_it = (table.vertices.values[rows] == vertex).any(axis=1)
+                self._new_edges = np.union1d(self._new_edges, table.id.values[rows[on_it]])
         self._take_out(one)
 
     def remove(self, vertex: int) -> None:
@@ -134,6 +147,7 @@ class Solver:
             if there.any():
                 raise GraphSlamError(f"vertex {vertex} is needed by edge {int(table.id.values[there][0])}")
         self._inside[vertex] = False
+        self._new_vertices = self._new_vertices[self._new_vertices != vertex]
         self._take_out(one)
 
     # -- its solution ------------------------------------------------------------------------------------------------
@@ -146,17 +160,20 @@ class Solver:
         Raises
         ------
         GaugeError, SingularError
-            The estimate stays; what was added since the last update is not in it, and waits for the next.
+            The estimate stays; what was added since the last update is not in it, and waits for the next. Where all
+            was taken in, and only linearising anew shows a vertex to be undetermined, the estimate is that of before
+            this.
         """
         settings, eliminated = self.settings, int(self._tree.state[AFFECTED])
         moved, linearized = self._take_in()
         count = len(moved)
-        self._moved.append(moved)
-        much = len(moved) > _MUCH or len(self._moved) >= _PATIENCE * settings.relinearize_every
-        due = len(self._moved) >= settings.relinearize_every and (much or settings.relinearize_every == 1)
+        self._moved_since.append(moved)
+        self._updates_since += 1
+        many = count > _MANY or self._updates_since >= _PATIENCE * settings.relinearize_every
+        due = self._updates_since >= settings.relinearize_every and (many or settings.relinearize_every == 1)
         if due:
-            moved = np.unique(np.concatenate(self._moved))
-            self._moved = []
+            moved = np.unique(np.concatenate(self._moved_since))
+            self._moved_since, self._updates_since = [], 0
         for _ in range(settings.relinearize_passes):
             far = 1.0 if due else _BY_FAR
             edges = incremental.relinearize(
@@ -169,7 +186,7 @@ class Solver:
             if failed != NOTHING:
                 self._broken = True
                 raise _singular(failed)
-            self._moved.append(moved)
+            self._moved_since.append(moved)
             linearized += len(edges)
             count += len(moved)
             due = True
@@ -238,8 +255,8 @@ class Solver:
         wanted = _known(ids, self._vertices, "vertex")
         if not self._inside[wanted].all():
             raise GraphSlamError(f"vertex {int(wanted[~self._inside[wanted]][0])} is not in the problem")
-        if not self._held[wanted].all():
-            self._take_in()
+        if not self._held[wanted].all() and (self._waiting() or not self._settled):
+            self._moved_since.append(self._take_in()[0])
         out = []
         for vertex in wanted.tolist():
             dof = self.graph.kind_of(vertex).dof
@@ -415,6 +432,7 @@ class Solver:
         self._new_vertices = np.concatenate((vertices, self._new_vertices))
         self._new_edges = np.union1d(edges, self._new_edges)
         self._young, self._broken, self._settled = _NONE, True, True
+        self._tree.state[TAIL_FIRST] = self._tree.state[TAIL_END] = 0  # it is filled anew with the tree
 
     def _take_out(self, one: Index) -> None:
         """Make a vertex no unknown any more."""
