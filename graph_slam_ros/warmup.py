@@ -57,6 +57,7 @@ def warmup() -> float:
     solver.marginal([0])
     solver.estimate([0])
     solver.add([], [edges.stop])
+    solver.update()
     solver.set_weight(edges.stop, 0.0)
     solver.hold(0)
     solver.update()

@@ -37,7 +37,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _TAIL = 8  # newest vertices that stay last in the order of elimination
-_MANY, _PATIENCE = 32, 5  # large steps are looked for when so many vertices move, or after so many times as long
 _BY_FAR = 5.0  # times the threshold: steps that are linearised anew at once
 _NONE = np.empty(0, dtype=np.int64)
 _KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
@@ -169,8 +168,7 @@ class Solver:
         count = len(moved)
         self._moved_since.append(moved)
         self._updates_since += 1
-        many = count > _MANY or self._updates_since >= _PATIENCE * settings.relinearize_every
-        due = self._updates_since >= settings.relinearize_every and (many or settings.relinearize_every == 1)
+        due = self._updates_since >= settings.relinearize_every
         if due:
             moved = np.unique(np.concatenate(self._moved_since))
             self._moved_since, self._updates_since = [], 0
