@@ -66,7 +66,7 @@ class Solver:
         self._moved_since: list[Index] = []  # large steps were last looked for
         self._updates_since = 0
         self._stages: list[Losses] = []
-        self._losses_for = NOTHING  # so many labels
+        self._losses_for = NOTHING, self.settings  # so many labels, and their settings
         self._solved_with: Settings | None = None
 
     # -- what the problem is -----------------------------------------------------------------------------------------
@@ -388,8 +388,9 @@ class Solver:
 
     def _losses(self) -> list[Losses]:
         """Of each stage."""
-        if len(self.graph.labels) != self._losses_for:
-            self._losses_for = len(self.graph.labels)
+        count, settings = self._losses_for
+        if count != len(self.graph.labels) or settings is not self.settings:
+            self._losses_for = len(self.graph.labels), self.settings
             self._stages = [Losses(self.graph, by_label) for by_label in self.settings.stages()]
         return self._stages
 
