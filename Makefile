@@ -115,4 +115,4 @@ COMPILE = $(VENV)-lock/bin/uv pip compile --quiet --universal --python-version 3
   --no-emit-index-url --no-annotate --custom-compile-command 'make lock' $(LOCK)
 
 clean:
-	rm -rf $(VENV) $(VENV)-oldest $(VENV)-lock build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-oldest $(VENV)-lock $(VENV)-bench $(VENV)-bench-g2o build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
