@@ -9,7 +9,8 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.parameters import parameters_text, parse_setting, read_parameters
 from graph_slam_ros.slam import Config
-from graph_slam_ros.slam.config import notes, parameters
+from graph_slam_ros.slam.config import SolveConfig, notes, parameters
+from graph_slam_ros.solver import Settings
 
 SHIPPED = Path(__file__).resolve().parents[1] / "config" / "planar.yaml"
 
@@ -33,6 +34,14 @@ def test_every_parameter_says_what_it_means_and_its_default_is_valid():
         assert p.meaning
         assert p.check(p.default) == p.default
         assert p.unit or p.type is not float or p.name.endswith("tolerance"), p.name
+
+
+def test_the_solvers_defaults_are_those_of_its_settings_but_for_when_the_last_solve_has_converged():
+    ours, solvers = SolveConfig(), Settings()
+    shared = set(SolveConfig.__slots__) & set(Settings.__slots__)
+    others = {name for name in shared if getattr(ours, name) != getattr(solvers, name)}
+    assert others == {"step_tolerance", "cost_tolerance"} < shared
+    assert set(SolveConfig.__slots__) - shared == {"every_keyframes"}
 
 
 def test_what_is_written_is_read_back_as_it_was(tmp_path):

@@ -1,4 +1,4 @@
-"""The one tree of parameters: every default, unit, meaning and bound is here and nowhere else.
+"""The one tree of parameters: every default (but the solver's own), unit, meaning and bound is here and nowhere else.
 
 YAML files, command-line settings and ROS parameters are all read through ``Config.from_mapping``; unknown names, wrong
 types and values out of range are refused with the name of the culprit.
@@ -162,6 +162,9 @@ class OrderingConfig:
     )
 
 
+_SOLVER = Settings()  # its defaults are ours, but for when the solve at the end has converged
+
+
 @dataclass(frozen=True, slots=True)
 class SolveConfig:
     """When and how the graph is solved: a little at each keyframe, and everything at the end."""
@@ -170,26 +173,35 @@ class SolveConfig:
         1, "update the estimate after this many keyframes", "keyframes", low=1, high=1_000_000
     )
     relinearize_above: float = _setting(
-        0.05, "linearise a pose or landmark anew when it has moved by more since", "m, rad", low=0.0
+        _SOLVER.relinearize_above,
+        "linearise a pose or landmark anew when it has moved by more since",
+        "m, rad",
+        low=0.0,
     )
     relinearize_error: float = _setting(
-        0.1,
+        _SOLVER.relinearize_error,
         "or when the square of that is more of the standard deviation of its strongest measurement",
         "sigma",
         low=0.0,
     )
     relinearize_every: int = _setting(
-        10,
+        _SOLVER.relinearize_every,
         "look for those at every so many updates (at each for five times that far)",
         "updates",
         low=1,
         high=1_000_000,
     )
-    tolerance: float = _setting(1e-5, "changes up to this are not followed through the graph", "m, rad", low=0.0)
-    method: str = _setting(
-        "gn", "of the solve at the end: gn (damped only where it fails to converge), lm or dogleg", choices=METHODS
+    tolerance: float = _setting(
+        _SOLVER.tolerance, "changes up to this are not followed through the graph", "m, rad", low=0.0
     )
-    max_iterations: int = _setting(50, "of the solve at the end, of each stage of the losses", "", low=1, high=10_000)
+    method: str = _setting(
+        _SOLVER.method,
+        "of the solve at the end: gn (damped only where it fails to converge), lm or dogleg",
+        choices=METHODS,
+    )
+    max_iterations: int = _setting(
+        _SOLVER.max_iterations, "of the solve at the end, of each stage of the losses", "", low=1, high=10_000
+    )
     step_tolerance: float = _setting(1e-5, "it has converged when no step is larger", "m, rad", low=0.0)
     cost_tolerance: float = _setting(1e-9, "or when the cost changes by a smaller fraction", "", low=0.0)
 
