@@ -458,11 +458,14 @@ def test_a_solve_that_fails_is_counted_and_the_last_estimate_stays(monkeypatch):
     updates = [p.process(m) for m in items]
     assert not any(u.solved for u in updates)
     assert p.counters["solver", "SingularError"] == 3
+    assert all(np.isnan(c).all() for c in p.landmark_covariances())
+    assert p.counters["solver", "SingularError"] == 3  # nothing was tried again
     assert p.trajectory() == pytest.approx(np.array([k.T_odom_base for k in p.keyframes]), abs=1e-12)
     assert np.isfinite(p.pose_covariance).all()
     assert summarize(p)["solves"] == 0
     failing.works = True
     assert p.process(Control("optimize")).report.converged
+    assert all(np.isfinite(c).all() for c in p.landmark_covariances())
     assert p.counters["solver", "SingularError"] == 3
 
 

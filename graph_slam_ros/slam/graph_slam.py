@@ -103,6 +103,7 @@ class GraphSlam:
         self._waiting: list[Sightings] = []
         self._covariance = np.zeros((3, 3))
         self._handed_over = 0, 0  # vertices and edges the solver has
+        self._solved_vertices = 0  # of these, what the last solve took in: none where it failed
         self._unsolved_keyframes = 0
 
     # -- the door ------------------------------------------------------------------------------------------------
@@ -169,16 +170,14 @@ class GraphSlam:
     def landmark_covariances(self) -> list[Array]:
         """Marginal of each landmark, (2, 2) in the map's axes or (3, 3) in its tangent space; NaN where unknown.
 
-        Looking changes nothing: a landmark that was first seen after the last solve is unknown until the next.
+        Looking changes nothing: a landmark that was first seen after the last solve is unknown until the next, and so
+        are all where that failed.
         """
         vertices = [landmark.vertex for landmark in self.landmarks.values()]
         out = [np.full((dof, dof), np.nan) for dof in (self.graph.kind_of(vertex).dof for vertex in vertices)]
-        known = [k for k, vertex in enumerate(vertices) if vertex < self._handed_over[0]]
-        try:
-            for k, marginal in zip(known, self.solver.marginal([vertices[k] for k in known]), strict=True):
-                out[k] = marginal
-        except GraphSlamError as error:
-            self.counters.count("solver", type(error).__name__)
+        known = [k for k, vertex in enumerate(vertices) if vertex < self._solved_vertices]
+        for k, marginal in zip(known, self.solver.marginal([vertices[k] for k in known]), strict=True):
+            out[k] = marginal
         return out
 
     @property
@@ -300,7 +299,7 @@ class GraphSlam:
 
     def _solve(self, everything: Settings | None = None) -> None:
         """Take in what is new, or solve everything; where that fails the last estimate stays, and it is counted."""
-        self._unsolved_keyframes = 0
+        self._unsolved_keyframes = self._solved_vertices = 0
         if not self.keyframes:
             return
         self._hand_over()
@@ -311,6 +310,7 @@ class GraphSlam:
                 self.report = self.solver.optimize(everything)
             (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
             self.solves += 1
+            self._solved_vertices = self._handed_over[0]
         except GraphSlamError as error:
             self.counters.count("solver", type(error).__name__)
 
