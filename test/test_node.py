@@ -302,8 +302,9 @@ def session(messages, tmp_path_factory):
             r.spin(0.02)
         before = {topic: len(heard) for topic, heard in r.heard.items()}
         r.drive(messages, every=3)
+        until(lambda: len(r.heard["landmarks"]) > 1 and r.heard["tf"], r.spin, "landmarks and transforms")
+        on_the_way = list(r.heard["landmarks"])
         saved = r.save()
-        until(lambda: r.heard["landmarks"] and r.heard["tf"], r.spin, "landmarks and transforms")
         for _ in range(20):
             r.spin(0.02)
         with robot(name="late_joiner") as late:
@@ -315,6 +316,7 @@ def session(messages, tmp_path_factory):
     return {
         "heard": r.heard,
         "before": before,
+        "on_the_way": on_the_way,
         "late": late_heard,
         "saved": saved,
         "stopped": stopped,
@@ -347,6 +349,17 @@ def test_who_joins_late_gets_the_last_path_pose_and_landmarks(session):
     names = {m.text for m in session["late"]["landmarks"][0].markers if m.text}
     table = (session["folder"] / "landmarks.csv").read_text().splitlines()[1:]
     assert names == {line.split(",")[0] for line in table}
+
+
+def test_landmarks_come_on_the_way_every_20_keyframes(session):
+    saved = [line.split()[0] for line in (session["folder"] / "path.tum").read_text().splitlines()]
+    stamps = [m.markers[0].header.stamp for m in session["on_the_way"]]
+    at = [saved.index(f"{stamp.sec}.{stamp.nanosec:09d}") for stamp in stamps]
+    assert len(at) == len(set(at)) > 1
+    assert {(k - at[0]) % 20 for k in at} == {0}
+    known = [sum(bool(m.text) for m in message.markers) for message in session["on_the_way"]]
+    assert known[0] > 0
+    assert known == sorted(known)
 
 
 def test_transforms_lead_from_map_to_odom_at_stamps_that_strictly_increase(session):

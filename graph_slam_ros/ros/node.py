@@ -27,7 +27,7 @@ from graph_slam_ros.ros import results
 from graph_slam_ros.ros.from_msg import Border
 from graph_slam_ros.ros.params import declare_parameters
 from graph_slam_ros.run import RunRecorder, keep_earlier
-from graph_slam_ros.slam import Control, GraphSlam, Measurement
+from graph_slam_ros.slam import Control, GraphSlam, Measurement, Update
 from graph_slam_ros.warmup import warmup
 
 _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -55,6 +55,7 @@ class GraphSlamNode(Node):
         self._acknowledged = -1
         self._has_player = False
         self._sent_tf_ns = 0
+        self._landmarks_at = 0  # keyframes, or later
         self._saved = True
         self._advertise()
         self._listen()
@@ -109,8 +110,14 @@ class GraphSlamNode(Node):
         if update:
             self._pose.publish(results.pose(self._slam))
             self._path.publish(results.path(self._slam))
-        if update.report:
+        if self._landmarks_due(update):
+            self._landmarks_at = len(self._slam.keyframes) + self._slam.config.output.landmarks_every_keyframes
             self._landmarks.publish(results.landmarks(self._slam))
+
+    def _landmarks_due(self, update: Update) -> bool:
+        """From the first on regularly, whether or not somebody listens: who joins late gets the last that was sent."""
+        regularly = bool(self._slam.landmarks) and len(self._slam.keyframes) >= self._landmarks_at
+        return update.report is not None or (update.solved and regularly)
 
     def _tell(self, source: str, reason: str) -> None:
         self.get_logger().warn(f"{source}: {reason} (told once, counted from now on)")

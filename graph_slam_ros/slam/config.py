@@ -225,10 +225,17 @@ class InputsConfig:
 
 @dataclass(frozen=True, slots=True)
 class OutputConfig:
-    """What the node leaves behind."""
+    """What the node publishes and leaves behind."""
 
     folder: str = _setting("graph_slam_run", "run folder written by ~/save and at shutdown; empty: none at shutdown")
     keep_earlier: bool = _setting(True, "an earlier run in the folder is renamed (folder-1, ...), not replaced")
+    landmarks_every_keyframes: int = _setting(
+        20,
+        "publish ~/landmarks after this many keyframes, and after each solve of everything; each landmark takes time",
+        "keyframes",
+        low=1,
+        high=1_000_000,
+    )
     pose_covariance_max: float = _setting(
         1e6, "variance published for what a planar robot does not estimate (z, roll, pitch)", "m^2, rad^2", low=0.0
     )
