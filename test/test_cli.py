@@ -290,7 +290,7 @@ def test_ctrl_c_during_a_replay_shows_no_traceback_and_leaves_a_run_that_may_be_
 
 
 def test_without_ros_the_live_commands_say_so(bag, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "_has_ros", lambda: False)
+    monkeypatch.setattr(cli.console, "has_ros", lambda: False)
     code, _, err = told(capsys, "replay", bag, "--ros", "--out", tmp_path / "run")
     assert (code, len(err)) == (2, 1)
     assert "--ros needs ROS 2" in err[0]

@@ -1,0 +1,52 @@
+"""The commands ``graph_slam`` and ``graph_slam_node``.
+
+Exit codes: 0 done, 1 a fault of ours, 2 refused (one line names the culprit), 3 done but something was lost.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small dense blocks: threads only cost, and reorder sums
+
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+
+from graph_slam_ros.cli import console
+from graph_slam_ros.cli.parser import parser
+from graph_slam_ros.errors import GraphSlamError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    args = parser().parse_args(arguments)
+    try:
+        return int(args.run(args))
+    except GraphSlamError as error:
+        console.tell(str(error))
+        return console.REFUSED
+    except KeyboardInterrupt:
+        return console.REFUSED
+    except BrokenPipeError:
+        sys.stderr.close()
+        return console.DONE
+    except OSError as error:
+        console.tell(f"{error.filename or 'writing'}: {error.strerror}")
+        return console.REFUSED
+    except Exception as error:
+        if os.environ.get("GRAPH_SLAM_TRACEBACK"):
+            traceback.print_exc()
+        what = " ".join(str(error).split())
+        console.tell(f"a fault of ours, {type(error).__name__}: {what} (GRAPH_SLAM_TRACEBACK=1 shows where)")
+        return console.FAULT
+
+
+def node_main() -> int:
+    """Run the ROS node; without ROS, say so."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing to tell or save while modules are imported
+    if not console.has_ros():
+        console.tell("ROS 2 is not installed here (no rclpy); replay works without it", "graph_slam_node")
+        return console.REFUSED
+    from graph_slam_ros.ros.node import main as run
+
+    return run()

@@ -1,0 +1,146 @@
+"""The commands on graphs: ``optimize`` and ``convert``."""
+
+import argparse
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from graph_slam_ros.cli import console
+from graph_slam_ros.errors import GraphSlamError
+
+if TYPE_CHECKING:
+    from graph_slam_ros.formats.g2o import G2oFile
+    from graph_slam_ros.graph import Graph, Loss
+    from graph_slam_ros.solver import Report, Solver
+
+_START = {"file": "the file", "tree": "the spanning tree", "chordal": "the chordal relaxation"}
+_NO_VALUES = "the file has no vertex lines"
+
+
+def optimize(args: argparse.Namespace) -> int:
+    """Solve a graph, say how it went, write it and draw it."""
+    from graph_slam_ros.batch import started, take_whole
+    from graph_slam_ros.formats.g2o import write_g2o
+    from graph_slam_ros.solver import Settings
+
+    file = _read_graph(args, error_map=args.error_map)
+    graph = file.graph
+    solver, start = started(file, args.init)
+    settings = Settings(
+        method=args.method,
+        max_iterations=args.max_iterations,
+        cost_tolerance=args.tolerance,
+        losses={label: [args.loss] for label in graph.labels if label != "odometry"},
+    )
+    take_whole(solver, file)
+    before = _positions(graph, solver) if args.plot else None
+    report = solver.optimize(settings)
+    if args.json:
+        console.say(json.dumps(_answer(report, start, args)))
+    else:
+        told_start = _START[start] + ("" if file.has_values else f": {_NO_VALUES}")
+        console.say(*_optimize_text(report, told_start, args.loss))
+    if args.out:
+        write_g2o(args.out, file, solver.estimate)
+    if args.plot:
+        _plot_graph(args.plot, graph, before, _positions(graph, solver))
+    _tell_unknown(file)
+    return console.told(file.skipped)
+
+
+def convert(args: argparse.Namespace) -> int:
+    """Write a graph in another format."""
+    from graph_slam_ros.batch import started
+    from graph_slam_ros.formats.convert import NAMES, format_of, write_graph
+
+    target = args.to or format_of(args.out)
+    if args.graph.suffix == ".tum" and not args.source:
+        raise GraphSlamError(f"{args.graph}: a trajectory has no edges, and so is no graph: TUM is only written")
+    if args.out.exists() and args.graph.exists() and args.out.samefile(args.graph):
+        raise GraphSlamError(f"{args.out}: cannot be read from and written to at once")
+    file = _read_graph(args, dialect=args.source)
+    if file.has_values or target != "gtsam":  # which alone needs no vertex lines
+        solver, start = started(file, "file")
+        written = write_graph(args.out, file, solver.estimate, target)
+        if not file.has_values:
+            console.say(f"{_NO_VALUES}: those of {_START[start]} are written")
+    else:
+        written = write_graph(args.out, file, None, target)
+    vertices = f"{written.vertices} of {file.graph.vertex_count} vertices"
+    console.say(f"wrote {args.out} as {NAMES[target]}: {vertices}, {written.edges} of {file.graph.edge_count} edges")
+    if target == "g2o":
+        _tell_unknown(file)
+    return console.told(file.skipped + written.lost)
+
+
+def _read_graph(args: argparse.Namespace, **options: Any) -> "G2oFile":
+    from graph_slam_ros.formats.g2o import read_g2o
+
+    return read_g2o(args.graph, lenient=args.lenient, raw=args.information == "raw", **options)
+
+
+def _tell_unknown(file: "G2oFile") -> None:
+    tags = sorted({line.split()[0] for line in file.unknown})
+    if tags:
+        console.tell(f"{len(file.unknown)} lines with unknown tags kept as they are: {', '.join(tags)}")
+
+
+def _answer(report: "Report", start: str, args: argparse.Namespace) -> dict[str, Any]:
+    return {
+        "chi2_initial": report.chi2_initial,
+        "chi2_final": report.chi2_final,
+        "cost_initial": report.cost_initial,
+        "cost_final": report.cost_final,
+        "iterations": len(report.iterations),
+        "converged": report.converged,
+        "stop": report.stop,
+        "method": report.method,
+        "loss": _loss_text(args.loss),
+        "start": start,
+        "error_map": args.error_map,
+        "classes": {name: {"edges": c.edges, "chi2": c.chi2} for name, c in report.classes.items()},
+    }
+
+
+def _optimize_text(report: "Report", start: str, loss: "Loss") -> Iterable[str]:
+    """The cost stands beside chi2 where a loss makes it another number."""
+    robust = _loss_text(loss)
+
+    def both(chi2: float, cost: float) -> str:
+        return f"chi2 {chi2:16.6f}" + (f"   cost {cost:16.6f}" if robust != "none" else "")
+
+    yield f"start    {both(report.chi2_initial, report.cost_initial)}   from {start}"
+    for k, step in enumerate(report.iterations, start=1):
+        damping = f"   damping {step.damping:.0e}" if step.damping else ""
+        yield f"{k:5d}    {both(step.chi2, step.cost)}   largest step {step.step:.2e}{damping}"
+    state = "converged" if report.converged else "NOT converged"
+    yield f"{state} ({report.stop}), method {report.method}" + (f", loss {robust}" if robust != "none" else "")
+    for name, part in report.classes.items():
+        yield f"  {name:12s}{part.edges:7d} edges   chi2 {part.chi2:14.6f}"
+
+
+def _loss_text(loss: "Loss") -> str:
+    from graph_slam_ros.graph import CAUCHY, HUBER
+
+    return {HUBER: f"huber:{loss.scale:g}", CAUCHY: f"cauchy:{loss.scale:g}"}.get(loss.kind, "none")
+
+
+def _positions(graph: "Graph", solver: "Solver") -> Any:
+    import numpy as np
+
+    return np.array([solver.estimate([v])[0][:2] for v in range(graph.vertex_count)])
+
+
+def _plot_graph(out: Path, graph: "Graph", initial: Any, final: Any) -> None:
+    import numpy as np
+
+    from graph_slam_ros.report import draw_graph
+
+    edges: dict[str, list[Any]] = {}
+    for table in graph.tables.values():
+        if len(table.type.accepts) == 2:
+            for code, label in enumerate(graph.labels):
+                edges.setdefault(label, []).extend(table.vertices.values[table.label.values == code].tolist())
+    points: Any = np.flatnonzero([graph.kind_of(v).name[0] == "R" for v in range(graph.vertex_count)])
+    draw_graph(out, initial, final, {k: np.array(v) for k, v in edges.items() if v}, points if len(points) else None)

@@ -1,0 +1,201 @@
+"""The command line of ``graph_slam``: commands, options, and what their values may be."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from graph_slam_ros import __version__
+from graph_slam_ros.cli import graphs, recordings
+from graph_slam_ros.cli.console import REFUSED
+from graph_slam_ros.errors import GraphSlamError
+
+if TYPE_CHECKING:
+    from graph_slam_ros.graph import Loss
+
+_CODES = "Exit codes: 0 done, 1 a fault of ours, 2 refused, 3 done but something was lost."
+_LOSS_SCALE = 3.0  # [standard deviations], as for landmarks of a robot
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line; the arguments' ``run`` is the command's function."""
+    whole = _Parser(
+        prog="graph_slam",
+        description="Online pose-graph SLAM: replay recordings, optimise and convert graphs, simulate, evaluate.",
+        epilog=_CODES,
+    )
+    whole.add_argument("--version", action="version", version=f"graph_slam_ros {__version__}")
+    commands = whole.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
+
+    def command(name: str, run: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=about, description=about)
+        sub.set_defaults(run=run)
+        return sub
+
+    _replay(
+        command(
+            "replay", recordings.replay, "run a recording (mcap, db3, ROS 1) or an earlier run through the pipeline"
+        )
+    )
+    _info(
+        command("info", recordings.info, "topics, types, rates, frames and span of a recording, and how to replay it")
+    )
+    _optimize(command("optimize", graphs.optimize, "solve a graph: g2o, TORO, iSAM or GTSAM text"))
+    _convert(
+        command("convert", graphs.convert, "write a graph in another format: g2o, TORO, GTSAM text; its poses as TUM")
+    )
+    _simulate(
+        command(
+            "simulate", recordings.simulate, "record a synthetic world with truth: pythonrobotics, manhattan, warehouse"
+        )
+    )
+    _evaluate(command("evaluate", recordings.evaluate, "position, heading and map error of a run, and a picture"))
+    command("warmup", recordings.warmup, "compile the kernels")
+    _demo(command("demo", recordings.demo, "replay the recording that comes with the source through a live ROS graph"))
+    return whole
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse the command line."""
+        self.exit(REFUSED, f"{self.prog}: {message} (--help shows what there is)\n")
+
+
+# -- options of each command -------------------------------------------------------------------------------------------
+
+
+def _replay(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording, or a run folder")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="folder for the results")
+    sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: the only one, or /odom)")
+    sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: the only one, or /landmarks)")
+    _add_config(sub)
+    sub.add_argument("--ros", action="store_true", help="publish into a live ROS graph: a node of its own with --out")
+    sub.add_argument("--rate", type=_positive, metavar="X", help="with --ros: times real time (default: all it takes)")
+    sub.add_argument("--node", metavar="NAME", help="with --ros and no --out: the running node")
+
+
+def _info(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("bag", type=Path, metavar="BAG")
+
+
+def _optimize(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("graph", type=Path, metavar="GRAPH")
+    sub.add_argument(
+        "--method",
+        type=_method,
+        default="gn",
+        metavar="gn|lm|dogleg",
+        help="gn (default) is damped only if it does not converge",
+    )
+    sub.add_argument("--max-iterations", type=_count, default=100, metavar="N", help="default: 100")
+    sub.add_argument(
+        "--tolerance", type=_positive, default=1e-6, metavar="X", help="relative decrease of cost at the end (1e-6)"
+    )
+    sub.add_argument(
+        "--loss",
+        type=_loss,
+        default="none",
+        metavar="none|huber|cauchy[:SCALE]",
+        help=f"robust loss of all edges but odometry; scale in standard deviations of an edge ({_LOSS_SCALE:g})",
+    )
+    sub.add_argument(
+        "--init",
+        choices=("file", "tree", "chordal"),
+        default="file",
+        help="where to start (file; tree without vertices)",
+    )
+    sub.add_argument("--error-map", choices=("relative", "seed"), default="relative", help="seed: of the inverse")
+    _add_reading(sub)
+    sub.add_argument("--json", action="store_true", help="the answer as one line")
+    sub.add_argument("--out", type=Path, metavar="FILE.g2o", help="the solved graph")
+    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="start and result")
+
+
+def _convert(sub: argparse.ArgumentParser) -> None:
+    sub.epilog = f"What the format of B cannot say is left out, told in a line, and ends with 3. {_CODES}"
+    sub.add_argument("graph", type=Path, metavar="A", help="g2o, TORO, iSAM or GTSAM text")
+    sub.add_argument(
+        "out", type=Path, metavar="B", help="by its ending: .g2o; .toro, .graph; .gtsam; .tum (poses, id as stamp)"
+    )
+    sub.add_argument(
+        "--from", dest="source", choices=("g2o", "toro", "gtsam"), help="refuse other lines (default: each by its tag)"
+    )
+    sub.add_argument("--to", choices=("g2o", "toro", "gtsam", "tum"), help="whatever the ending of B")
+    _add_reading(sub)
+
+
+def _simulate(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("scenario", metavar="SCENARIO")
+    sub.add_argument("--out", type=Path, required=True, metavar="BAG.mcap")
+    sub.add_argument("--seed", type=int, default=0, metavar="N")
+    sub.add_argument("--as-original", action="store_true", help="pythonrobotics: its own, squared noise")
+    sub.add_argument("--poses", type=_count, metavar="N", help="length of the drive, where the world has it")
+    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="an option of the world")
+
+
+def _evaluate(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("run_folder", type=Path, metavar="RUN")
+    sub.add_argument("--truth", required=True, metavar="BAG[:TOPIC]|FILE.tum")
+    sub.add_argument("--estimate", default="sightings.tum", metavar="FILE", help="which trajectory of the run")
+    sub.add_argument("--json", action="store_true", help="the numbers as one line")
+    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="default: path.png in the run folder")
+
+
+def _demo(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--out", type=Path, default=Path("runs/demo"), metavar="DIR")
+
+
+# -- what they share ---------------------------------------------------------------------------------------------------
+
+
+def _add_config(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file, as for the node")
+    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one parameter")
+
+
+def _add_reading(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--information", choices=("g2o", "raw"), default="g2o", help="of rotations in space in g2o; raw: unscaled"
+    )
+    sub.add_argument("--lenient", action="store_true", help="leave out bad lines, list them, exit with 3")
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive integer")
+    return int(text)
+
+
+def _method(text: str) -> str:
+    """Of those that the solver has."""
+    from graph_slam_ros.solver import Settings
+
+    try:
+        return Settings(method=text).method
+    except GraphSlamError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _loss(text: str) -> "Loss":
+    from graph_slam_ros.graph import Loss
+
+    name, separator, scale = text.partition(":")
+    if separator and name == "none":
+        raise argparse.ArgumentTypeError("none has no scale")
+    try:
+        return Loss.named(name, _positive(scale) if separator else _LOSS_SCALE)
+    except GraphSlamError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None

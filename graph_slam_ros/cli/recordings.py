@@ -1,0 +1,169 @@
+"""The commands on recordings and runs: ``replay``, ``info``, ``simulate``, ``evaluate``, ``warmup``, ``demo``."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from graph_slam_ros.cli import console
+from graph_slam_ros.errors import GraphSlamError
+
+if TYPE_CHECKING:
+    from graph_slam_ros.slam import Config
+
+
+def replay(args: argparse.Namespace) -> int:
+    """Run a recording, or an earlier run, through the pipeline, or play it into a live ROS graph."""
+    from graph_slam_ros.replay import replay as replayed
+    from graph_slam_ros.run import is_run
+
+    _refuse_idle_options(args, is_run(args.bag))
+    config = _config(args)
+    if args.ros:
+        return _replay_live(args, config)
+    if args.out is None:
+        raise GraphSlamError("replay needs --out DIR, the folder for the results")
+    own = config if args.config or args.set or not is_run(args.bag) else None
+    done = replayed(
+        args.bag, args.out, own, odometry=args.odom, landmarks=args.landmarks, progress=console.progress("replay")
+    )
+    _say_run(args.bag, done.summary)
+    console.say(f"results in {args.out}")
+    return console.told(done.losses)
+
+
+def _replay_live(args: argparse.Namespace, config: "Config") -> int:
+    from graph_slam_ros.replay import choose_inputs
+    from graph_slam_ros.ros.bag import open_bag
+
+    if not console.has_ros():
+        raise GraphSlamError("--ros needs ROS 2 (no rclpy here); without --ros the same replay runs without it")
+    bag = open_bag(args.bag)
+    inputs = choose_inputs(bag, args.odom, args.landmarks)
+    from graph_slam_ros.ros.player import own_node, play
+    from graph_slam_ros.run import check_room
+
+    options: dict[str, Any] = {"rate": args.rate, "progress": console.progress("play")}
+    if args.out is None:
+        played = play(bag, inputs, node_name=args.node or "/graph_slam", **options)
+    else:
+        check_room(args.out, args.bag)
+        with own_node(args.out, inputs, config) as own:
+            played = play(bag, inputs, own=own, window_s=config.ordering.window_s, **options)
+        _say_run(args.bag, json.loads((args.out / "run.json").read_text()))
+    console.say(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
+    return console.told(bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else []))
+
+
+def info(args: argparse.Namespace) -> int:
+    """Say what a recording holds."""
+    from graph_slam_ros.replay import describe
+    from graph_slam_ros.ros.bag import open_bag
+    from graph_slam_ros.run import is_run
+
+    if is_run(args.bag):
+        console.say(f"an earlier run: graph_slam replay {args.bag} --out again")
+        return console.DONE
+    bag = open_bag(args.bag)
+    console.say(*describe(bag, args.bag))
+    return console.told(bag.losses)
+
+
+def simulate(args: argparse.Namespace) -> int:
+    """Record a synthetic world."""
+    from graph_slam_ros.formats.parameters import parse_setting
+    from graph_slam_ros.simulation import simulate as recorded
+    from graph_slam_ros.simulation import write_bag
+
+    options = dict(parse_setting(text) for text in args.set)
+    if args.as_original:
+        options["as_original"] = True
+    if args.poses is not None:
+        options["poses"] = args.poses
+    recording = recorded(args.scenario, args.seed, **options)
+    try:
+        write_bag(recording, args.out)
+    except OSError as error:
+        raise GraphSlamError(f"{args.out}: {error.strerror}") from None
+    console.say(f"wrote {args.out}")
+    return console.DONE
+
+
+def evaluate(args: argparse.Namespace) -> int:
+    """Compare a run with the truth."""
+    from graph_slam_ros.evaluation import evaluate as compared
+    from graph_slam_ros.report import draw_run
+
+    scores = compared(args.run_folder, args.truth, estimate=args.estimate)
+    console.say(json.dumps(scores.as_dict()) if args.json else str(scores))
+    picture = args.plot or args.run_folder / "path.png"
+    draw_run(args.run_folder, args.truth, picture)
+    if not args.json:
+        console.say(f"picture in {picture}")
+    return console.told(scores.losses)
+
+
+def warmup(args: argparse.Namespace) -> int:
+    """Compile the kernels."""
+    console.tell("compiling kernels, once per installation")
+    from graph_slam_ros.warmup import warmup as compiled
+
+    console.tell(f"kernels ready after {compiled():.1f} s")
+    return console.DONE
+
+
+def demo(args: argparse.Namespace) -> int:
+    """Run the demonstration."""
+    from graph_slam_ros.demo import demo as shown
+
+    return shown(args.out, live=console.has_ros(), progress=console.progress, say=console.say)
+
+
+def _refuse_idle_options(args: argparse.Namespace, of_run: bool) -> None:
+    """An option that would have no effect is a mistake of the caller's: say so."""
+    idle = {
+        "--odom or --landmarks: a run knows its own inputs": of_run and (args.odom or args.landmarks),
+        "--ros: the events of a run cannot be played, only its recording": of_run and args.ros,
+        "--rate without --ros": args.rate and not args.ros,
+        "--node without --ros, or with --out": args.node and (args.out or not args.ros),
+        "--config or --set with --ros and no --out: the running node has its own": args.ros
+        and not args.out
+        and (args.config or args.set),
+    }
+    for what, given in idle.items():
+        if given:
+            raise GraphSlamError(f"replay: no use for {what}")
+
+
+def _config(args: argparse.Namespace) -> "Config":
+    """Defaults, then the run's own or the given file, then single settings."""
+    from graph_slam_ros.formats.parameters import parse_setting, read_parameters
+    from graph_slam_ros.run import is_run
+    from graph_slam_ros.slam import Config
+    from graph_slam_ros.slam.config import flatten
+
+    file = args.config or (args.bag / "config.yaml" if is_run(args.bag) else None)
+    values = dict(flatten(read_parameters(file))) if file else {}
+    try:
+        return Config.from_mapping(values | dict(parse_setting(text) for text in args.set))
+    except GraphSlamError as error:
+        raise GraphSlamError(f"{file}: {error}" if file and not args.set else str(error)) from None
+
+
+def _say_run(source: Path, summary: dict[str, Any]) -> None:
+    console.say(_run_text(summary))
+    if not summary["keyframes"]:
+        raise GraphSlamError(f"{source}: no odometry of it could be used, see what was counted and graph_slam info")
+
+
+def _run_text(summary: dict[str, Any]) -> str:
+    counters = [f"{source}: {reason} {n}" for source, by in summary["counters"].items() for reason, n in by.items()]
+    lines = [
+        f"keyframes  {summary['keyframes']:8d}   over {summary['span_s']:.1f} s",
+        f"landmarks  {summary['landmarks']:8d}   from {summary['sightings']} sightings",
+        f"edges      {summary['edges']:8d}",
+        f"chi2       {summary['chi2']:12.3f}   after {summary['solves']} solves",
+    ]
+    if "time_s" in summary:
+        lines.append(f"time       {summary['time_s']:10.1f} s")
+    return "\n".join(lines + [f"counted    {text}" for text in counters])
