@@ -1,5 +1,7 @@
 """g2o files: what is written is read back, and what is wrong is named with its line."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -117,6 +119,40 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path, read):
     lines, lines_again = ((tmp_path / f"{n}.g2o").read_text().splitlines() for n in "ab")
     vertices = [line for line in lines if not line.startswith("EDGE")]
     assert vertices == [line for line in lines_again if not line.startswith("EDGE")]
+
+
+def test_labels_are_read_from_our_comments_with_and_without_numbers(read):
+    edges = [f"{comment}\n{EDGE}\n" for comment in ("# class a", "# 3 1 class b", "#  class c d", "# 1 class e", "# f")]
+    file = read(FINE.replace(EDGE + "\n", "") + "".join(edges))
+    table = file.graph.tables[RELATIVE_POSE]
+    assert [file.graph.labels[code] for code in table.label.values] == ["a", "b", "b", "b", "b"]
+
+
+@pytest.fixture
+def everything(tmp_path, read):
+    """A file with every kind of line that is written of a graph in the plane."""
+    file = read(FINE)
+    file.graph, file.ids, file.fixed = random_graph(), [100, 4, 8, 15, 16, 1, 2, 1000], [3, 5]
+    write_g2o(tmp_path / "every.g2o", file, values_of(file.graph))
+    return tmp_path / "every.g2o"
+
+
+def test_every_line_down_to_the_last_edge_has_the_two_integers_that_gtsam_looks_for(everything):
+    lines = everything.read_text().splitlines()
+    assert [line for line in lines if line[0] == "#"] == [
+        "# 0 4 class odometry",
+        "# 1 2 class closures",
+        "# 2 3 class landmarks",
+        "# 3 1 class priors",
+    ]
+    assert lines[-2:] == ["FIX 15", "FIX 1"]
+    assert [line for line in lines[:-2] if not re.match(r"\S+ -?\d+ -?\d", line)] == []
+
+
+def test_gtsam_reads_every_relative_pose(everything):
+    gtsam = pytest.importorskip("gtsam")
+    factors, values = gtsam.readG2o(str(everything), False)
+    assert (factors.size(), values.size()) == (6, 8)
 
 
 def test_the_estimate_is_what_is_written(tmp_path, read):

@@ -7,6 +7,7 @@ Unknown tags are kept, word for word, and written back. TORO's, iSAM's and GTSAM
 """
 
 import itertools
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,7 +54,9 @@ EDGE_TAGS: dict[str, EdgeType] = {
 }
 _RELATIVE = ("EDGE_SE2", "EDGE_SE3:QUAT")
 _HALVED = {RELATIVE_POSE_3D: np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])}  # of our residual, in g2o's
-_CLASS = ["#", "class"]  # our comment: the label of the edges that follow it
+# Our comment, the label of the edges that follow it. Its code and their number come first since GTSAM looks for two
+# integers behind every tag in the plane: where a line has none (a FIX line as well), it reads no edge after it.
+_CLASS = re.compile(r"#\s+(?:\d+\s+\d+\s+)?class\s+(\S+)\s*", re.ASCII)
 _UNIT = 1e-12  # a squared quaternion norm this near to 1 is left as it was written
 ERROR_MAPS = {"relative": RELATIVE_POSE, "seed": INVERSE_RELATIVE_POSE}
 
@@ -112,7 +115,8 @@ class _Reader:
     def take(self, line: int, text: str) -> None:
         words = text.split()
         if not words or words[0].startswith("#"):
-            self.label = words[2] if words[:2] == _CLASS and len(words) == 3 else self.label
+            labelled = _CLASS.fullmatch(text.strip())
+            self.label = labelled[1] if labelled else self.label
             return
         try:
             words = in_g2o_words(words, self.text)
@@ -234,9 +238,9 @@ def read_g2o(
 ) -> G2oFile:
     """Read a g2o file, or a text of one of its dialects.
 
-    Edges are labelled as the comments ``# class LABEL`` of our own files say. In other files relative poses between
-    one pose and the next (in order of id) are labelled ``odometry``, others ``closures``, sightings ``landmarks``,
-    priors ``priors``.
+    Edges are labelled as the comments ``# CODE COUNT class LABEL`` of our own files say. In other files relative poses
+    between one pose and the next (in order of id) are labelled ``odometry``, others ``closures``, sightings
+    ``landmarks``, priors ``priors``.
 
     Parameters
     ----------
@@ -294,12 +298,11 @@ def write_text(path: Path | str, text: str) -> None:
 def graph_lines(file: G2oFile, values: Values | None) -> list[str]:
     """The lines of a g2o file; without values, those of the edges alone."""
     out = [] if values is None else _vertex_lines(file, values)
-    out += [f"FIX {file.ids[vertex]}" for vertex in file.fixed]
     edges = sorted(_edge_lines(file), key=lambda edge: edge[:2])
     for label, group in itertools.groupby(edges, key=lambda edge: edge[0]):
-        out.append(" ".join([*_CLASS, file.graph.labels[label]]))
-        out += [text for _, _, text in group]
-    return out + file.unknown
+        members = [text for _, _, text in group]
+        out += [f"# {label} {len(members)} class {file.graph.labels[label]}", *members]
+    return out + [f"FIX {file.ids[vertex]}" for vertex in file.fixed] + file.unknown
 
 
 def _vertex_lines(file: G2oFile, values: Values) -> list[str]:
