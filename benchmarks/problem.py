@@ -3,8 +3,6 @@
 Only reading and simulating need more than NumPy, since some contenders live in an environment of their own.
 """
 
-import gzip
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -142,7 +140,7 @@ def polar(sightings: Edges) -> Edges:
 
 
 def read_problem(path: Path) -> Problem:
-    """Read any text the package reads, gzipped or not; lines it does not understand are left out and counted.
+    """Read any text the package reads; lines it does not understand are left out and counted.
 
     Information matrices are taken as they are in the file. Without initial values the start is composed along a tree.
 
@@ -153,13 +151,7 @@ def read_problem(path: Path) -> Problem:
     """
     from graph_slam_ros.formats.g2o import read_g2o
 
-    name = path.name.split(".")[0]
-    if path.suffix != ".gz":
-        return _in_time_order(name, read_g2o(path, lenient=True, raw=True))
-    with tempfile.TemporaryDirectory() as folder:
-        text = Path(folder) / path.stem
-        text.write_bytes(gzip.decompress(path.read_bytes()))
-        return _in_time_order(name, read_g2o(text, lenient=True, raw=True))
+    return _in_time_order(path.name.split(".")[0], read_g2o(path, lenient=True, raw=True))
 
 
 def city_problem(poses: int, seed: int = 1) -> Problem:

@@ -362,6 +362,20 @@ def test_a_trajectory_is_no_graph(convert, tmp_path):
     ]
 
 
+def test_gzipped_files_are_read_and_written_by_the_ending_before(convert, tmp_path):
+    code, out, err, target = convert(PLANE, ".toro.gz", "--lenient")
+    assert (code, err) == (3, ["graph_slam: lost: 1 VERTEX_XY, 1 EDGE_SE2_XY: TORO has no such line"])
+    assert f"wrote {target} as TORO" in out
+    code, _, err, again = convert(target, ".g2o")
+    assert (code, err) == (0, [])
+    assert_same_graph(read_g2o(target), read_g2o(again))
+    target.write_bytes(target.read_bytes()[:-9])
+    code, out, err, _ = convert(target, ".out.g2o")
+    assert (code, out, err) == (2, "", ["graph_slam: b.toro.gz: damaged, or not a gzip file"])
+    assert convert(tmp_path / "a.tum.gz", ".g2o")[0] == 2
+    assert convert(PLANE, ".nonsense.gz")[0] == 2
+
+
 def test_a_file_is_not_written_over_while_it_is_read(convert, tmp_path):
     (tmp_path / "b.g2o").write_text(PLANE)
     code, _, err, target = convert(tmp_path / "b.g2o", ".g2o")

@@ -1,5 +1,6 @@
 """g2o files: what is written is read back, and what is wrong is named with its line."""
 
+import gzip
 import re
 
 import numpy as np
@@ -257,6 +258,37 @@ def test_a_comment_behind_a_line_is_not_guessed_at(read):
 def test_what_is_no_g2o_file_is_refused(read, content, why):
     with pytest.raises(FormatError, match=why):
         read(content)
+
+
+@pytest.mark.parametrize("ending", [".gz", ".GZ"])
+def test_a_gzipped_file_is_read_as_the_text_in_it_and_written_again(tmp_path, read, ending):
+    plain, path = read(FINE), tmp_path / f"graph.g2o{ending}"
+    path.write_bytes(gzip.compress(FINE.replace("\n", "\r\n").encode()))
+    file = read_g2o(path)
+    assert (file.ids, file.graph.edge_count) == (plain.ids, 1)
+    assert file.graph.initial.values.tobytes() == plain.graph.initial.values.tobytes()
+    write_g2o(path, file, values_of(file.graph))
+    write_g2o(tmp_path / "plain.g2o", file, values_of(file.graph))
+    assert gzip.decompress(path.read_bytes()) == (tmp_path / "plain.g2o").read_bytes()
+    first = path.read_bytes()
+    write_g2o(path, file, values_of(file.graph))
+    assert path.read_bytes() == first  # no time of day in it
+
+
+WHOLE = gzip.compress(("# " + "x" * 50_000 + "\n" + FINE).encode(), mtime=0)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [FINE.encode(), WHOLE[:-20], WHOLE[:30], WHOLE[:5], WHOLE[:20] + b"\xff" * 8 + WHOLE[28:], WHOLE[:-8] + bytes(8)],
+    ids=["text", "cut off", "cut off early", "part of a header", "spoiled", "wrong sum"],
+)
+def test_a_damaged_gzip_file_is_refused_by_name(tmp_path, content):
+    path = tmp_path / "graph.g2o.gz"
+    path.write_bytes(content)
+    for lenient in (False, True):
+        with pytest.raises(FormatError, match=r"^graph\.g2o\.gz: damaged, or not a gzip file$"):
+            read_g2o(path, lenient=lenient)
 
 
 def test_what_cannot_be_opened_is_named(tmp_path):

@@ -1,5 +1,6 @@
 """The command ``graph_slam optimize``: answers, files, exit codes, and one line where it refuses."""
 
+import gzip
 import json
 import os
 import struct
@@ -82,6 +83,14 @@ def test_what_is_written_is_the_optimum_again(run, tmp_path, graph):
         assert again["chi2_initial"] == pytest.approx(first["chi2_final"], rel=1e-9)
         assert again["classes"].keys() == first["classes"].keys()
         assert answer_of(run, source)["chi2_initial"] == first["chi2_initial"]  # the source is as it was
+
+
+def test_gzipped_graphs_are_solved_and_written(run, tmp_path, graph):
+    packed, out = tmp_path / "small.g2o.gz", tmp_path / "out.g2o.gz"
+    packed.write_bytes(gzip.compress(graph.read_bytes()))
+    answer = answer_of(run, packed, "--out", out)
+    assert answer == answer_of(run, graph)
+    assert answer_of(run, out)["chi2_initial"] == pytest.approx(answer["chi2_final"], rel=1e-9)
 
 
 def test_the_first_pose_is_held_where_nothing_else_fixes_the_graph(run, tmp_path, graph):

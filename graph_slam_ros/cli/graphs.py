@@ -53,9 +53,10 @@ def convert(args: argparse.Namespace) -> int:
     """Write a graph in another format."""
     from graph_slam_ros.batch import started
     from graph_slam_ros.formats.convert import NAMES, format_of, write_graph
+    from graph_slam_ros.formats.strict import ending
 
     target = args.to or format_of(args.out)
-    if args.graph.suffix == ".tum" and not args.source:
+    if ending(args.graph) == ".tum" and not args.source:
         raise GraphSlamError(f"{args.graph}: a trajectory has no edges, and so is no graph: TUM is only written")
     if args.out.exists() and args.graph.exists() and args.out.samefile(args.graph):
         raise GraphSlamError(f"{args.out}: cannot be read from and written to at once")

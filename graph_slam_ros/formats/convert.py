@@ -9,6 +9,7 @@ import numpy as np
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.dialects import LANDMARK_IDS_FROM, Text, from_g2o_words
 from graph_slam_ros.formats.g2o import EDGE_TAGS, VERTEX_TAGS, G2oFile, Values, graph_lines, weightless, write_text
+from graph_slam_ros.formats.strict import ending
 from graph_slam_ros.formats.tum import NS, tum_text
 from graph_slam_ros.graph import R2, SE2, SE3, Graph, VertexKind
 
@@ -28,7 +29,7 @@ class Written:
 def format_of(path: Path) -> str:
     """By the ending. Raises FormatError."""
     try:
-        return ENDINGS[path.suffix.lower()]
+        return ENDINGS[ending(path)]
     except KeyError:
         raise FormatError(f"{path}: its ending is none of {', '.join(ENDINGS)}; --to names the format") from None
 

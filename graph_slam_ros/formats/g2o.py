@@ -6,6 +6,7 @@ Unknown tags are kept, word for word, and written back. TORO's, iSAM's and GTSAM
 (``dialects``, and ``convert`` to write them), and files without vertex lines.
 """
 
+import gzip
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError, NoiseError
 from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, in_g2o_words
-from graph_slam_ros.formats.strict import expect, integer, lines, numbers
+from graph_slam_ros.formats.strict import expect, integer, is_gzipped, lines, numbers
 from graph_slam_ros.graph import (
     INVERSE_RELATIVE_POSE,
     LANDMARK_POSITION,
@@ -288,9 +289,10 @@ def weightless(graph: Graph) -> int:
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Write a file. Raises FormatError."""
+    """Write a file, gzipped where its name ends so. Raises FormatError."""
+    content = text.encode()
     try:
-        Path(path).write_text(text, encoding="utf-8")
+        Path(path).write_bytes(gzip.compress(content, mtime=0) if is_gzipped(Path(path)) else content)
     except OSError as error:
         raise FormatError(f"{path}: {error.strerror}") from None
 

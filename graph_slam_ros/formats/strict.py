@@ -1,6 +1,8 @@
 """Strict reading of text: what Python's own conversions would let through is refused by name."""
 
+import gzip
 import re
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,16 +16,28 @@ _ID = re.compile(r"[+-]?\d{1,18}", re.ASCII)
 
 
 def lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines of a text file. Raises FormatError."""
+    """Numbered lines of a text file, gzipped where its name ends so. Raises FormatError."""
     try:
         if not path.is_file():
             raise FormatError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
-        with path.open(encoding="utf-8") as stream:
+        with (gzip.open if is_gzipped(path) else open)(path, "rt", encoding="utf-8") as stream:
             yield from enumerate(stream, start=1)
+    except (gzip.BadGzipFile, zlib.error, EOFError):
+        raise FormatError(f"{path.name}: damaged, or not a gzip file") from None
     except UnicodeDecodeError:
         raise FormatError(f"{path.name}: not a text file") from None
     except OSError as error:
         raise FormatError(f"{path}: {error.strerror}") from None
+
+
+def is_gzipped(path: Path) -> bool:
+    """By the ending."""
+    return path.suffix.lower() == ".gz"
+
+
+def ending(path: Path) -> str:
+    """What the file is without its compression: ``.g2o`` of ``a.g2o.gz``."""
+    return (path.with_suffix("") if is_gzipped(path) else path).suffix.lower()
 
 
 def expect(words: list[str], count: int) -> None:
