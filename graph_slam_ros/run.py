@@ -135,9 +135,8 @@ class RunRecorder:
             _write_graph(self.folder, slam)
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
-        stamps = [k.stamp_ns for k in slam.keyframes]
-        _replace(self.folder / "path.tum", tum_text(stamps, slam.trajectory()))
-        stamps = [s.stamp_ns for s in slam.sighting_poses]
+        _replace(self.folder / "path.tum", tum_text(slam.keyframes.stamps_ns.tolist(), slam.trajectory()))
+        stamps = slam.sighting_poses.stamps_ns.tolist()
         _replace(self.folder / "sightings.tum", tum_text(stamps, slam.sighting_trajectory()))
         _replace(self.folder / "odometry.tum", tum_text(stamps, slam.sighting_odometry()))
         _replace(self.folder / "landmarks.csv", _landmark_table(slam))

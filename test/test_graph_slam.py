@@ -124,7 +124,7 @@ def test_saving_on_the_way_costs_no_measurement():
 def test_a_sighting_that_comes_late_is_carried_to_the_keyframe_before_it():
     in_time = run(slam(), *straight(1), seen(0.75, point()), *END)
     late = run(slam(), *straight(1), Control("flush"), seen(0.75, point()), *END)
-    assert late.sighting_poses == in_time.sighting_poses
+    assert list(late.sighting_poses) == list(in_time.sighting_poses) != []
     assert late.counters.as_dict() == {}
 
 
@@ -181,6 +181,22 @@ def test_keyframes_come_by_distance_by_angle_and_by_time_in_motion():
     assert [k.T_odom_base[2] for k in turning.keyframes] == pytest.approx([0, 0.3, 0.6, 0.9])
     slow = run(slam(), *straight(3.1, speed=0.01, hz=8))
     assert [(k.stamp_ns - T0) / S for k in slow.keyframes] == pytest.approx([0, 1.0, 2.0, 3.0])
+
+
+def test_keyframes_and_sightings_are_the_same_one_by_one_and_as_columns():
+    p = run(slam(), *itertools.chain(*zip(straight(9), (seen(k / 10, point()) for k in range(91)), strict=True)))
+    for track, pose in ((p.keyframes, "T_odom_base"), (p.sighting_poses, "T_keyframe_base")):
+        assert len(list(track)) == len(track) == len(track.ids) > 25
+        assert list(track) == [track[k] for k in range(len(track))]
+        assert track[-1] == list(track)[-1]
+        assert track.stamps_ns.tolist() == [instant.stamp_ns for instant in track]
+        assert track.poses.tolist() == [list(getattr(instant, pose)) for instant in track]
+        with pytest.raises(IndexError):
+            track[len(track)]
+    assert p.keyframes.ids.tolist() == [k.vertex for k in p.keyframes]
+    assert p.sighting_poses.ids.tolist() == [s.keyframe for s in p.sighting_poses]
+    assert {type(value) for value in (p.keyframes[0].vertex, p.keyframes[0].stamp_ns)} == {int}
+    assert p.keyframes[-1].stamp_ns == T0 + 9 * S
 
 
 def test_a_standing_robot_makes_no_keyframes_and_gathers_no_noise():

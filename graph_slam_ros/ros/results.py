@@ -25,7 +25,7 @@ def newest_pose(slam: GraphSlam) -> se2.Pose:
 
 def path(slam: GraphSlam) -> bytes:
     """The corrected path: every keyframe at its own stamp."""
-    return to_msg.path(slam.config.frames.map, [k.stamp_ns for k in slam.keyframes], slam.trajectory())
+    return to_msg.path(slam.config.frames.map, slam.keyframes.stamps_ns, slam.trajectory())
 
 
 def pose(slam: GraphSlam) -> bytes:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from graph_slam_ros.lie import se2
 from graph_slam_ros.ros.interfaces import typestore
@@ -101,8 +101,8 @@ def clock(stamp_ns: int) -> bytes:
     return encode(make("rosgraph_msgs/msg/Clock", clock=time(stamp_ns)))
 
 
-def path(frame: str, stamps_ns: Sequence[int], poses: Array) -> bytes:
-    """nav_msgs/Path of poses (n, 3); its header carries the newest stamp.
+def path(frame: str, stamps_ns: ArrayLike, poses: Array) -> bytes:
+    """nav_msgs/Path of poses (n, 3) and their stamps (n,); its header carries the newest stamp.
 
     All poses after the first take the same number of bytes; the first is preceded by its own padding.
     """

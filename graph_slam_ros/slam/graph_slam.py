@@ -27,6 +27,7 @@ from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.measurements import Control, Measurement, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.motion import Motion, Moved
 from graph_slam_ros.slam.stamp_order import StampOrder
+from graph_slam_ros.slam.track import Track
 from graph_slam_ros.solver import Report, Settings, Solver
 
 Array = NDArray[np.float64]
@@ -55,10 +56,10 @@ class Landmark:
 
 @dataclass(frozen=True, slots=True)
 class SightingPose:
-    """Where the robot was when it saw something: a keyframe and the motion since."""
+    """Where the robot was when it saw something: a keyframe, by its index, and the motion since."""
 
-    stamp_ns: int
     keyframe: int
+    stamp_ns: int
     T_keyframe_base: se2.Pose
 
 
@@ -91,9 +92,9 @@ class GraphSlam:
         self.counters = Counters()
         self.graph = Graph()
         self.solver = Solver(self.graph, self.config.solver_settings())
-        self.keyframes: list[Keyframe] = []
+        self.keyframes = Track(Keyframe)
         self.landmarks: dict[str, Landmark] = {}
-        self.sighting_poses: list[SightingPose] = []
+        self.sighting_poses = Track(SightingPose)
         self.solves = 0
         self.report: Report | None = None  # of the last solve of everything
         self._sink = sink
@@ -136,7 +137,7 @@ class GraphSlam:
 
     def trajectory(self) -> Array:
         """Estimated poses ``T_map_base`` of all keyframes, (n, 3)."""
-        return self.solver.estimate([k.vertex for k in self.keyframes]).reshape(-1, 3)
+        return self.solver.estimate(self.keyframes.ids).reshape(-1, 3)
 
     def sighting_trajectory(self) -> Array:
         """Estimated poses ``T_map_base`` at the stamps of the sightings, (n, 3)."""
@@ -144,12 +145,11 @@ class GraphSlam:
 
     def sighting_odometry(self) -> Array:
         """What odometry alone says, ``T_odom_base`` at the stamps of the sightings, (n, 3)."""
-        return self._at_sightings(np.array([k.T_odom_base for k in self.keyframes]).reshape(-1, 3))
+        return self._at_sightings(self.keyframes.poses)
 
     def _at_sightings(self, keyframe_poses: Array) -> Array:
-        keyframes = keyframe_poses[[s.keyframe for s in self.sighting_poses]]
-        since = np.array([s.T_keyframe_base for s in self.sighting_poses]).reshape(-1, 3)
-        return np.stack(se2.compose(tuple(keyframes.T), tuple(since.T)), axis=-1)
+        keyframes = keyframe_poses[self.sighting_poses.ids]
+        return np.stack(se2.compose(tuple(keyframes.T), tuple(self.sighting_poses.poses.T)), axis=-1)
 
     @property
     def T_map_odom(self) -> se2.Pose:
@@ -221,7 +221,7 @@ class GraphSlam:
         noise = Gaussian.from_sigmas(anchor.sigma_m, anchor.sigma_m, anchor.sigma_rad)
         self._covariance = np.diag([anchor.sigma_m**2, anchor.sigma_m**2, anchor.sigma_rad**2])
         self.graph.add_edge(POSE_PRIOR, [vertex], m.T_odom_base, noise, "anchor")
-        self.keyframes.append(Keyframe(vertex, m.stamp_ns, m.T_odom_base))
+        self.keyframes.append(vertex, m.stamp_ns, m.T_odom_base)
         self._motions.append(Motion(self.config.odometry, 0, m))
 
     def _next_keyframe(self, m: Odometry) -> None:
@@ -229,7 +229,7 @@ class GraphSlam:
         noise = self._noise("odometry", motion.covariance)
         vertex = self.graph.add_vertex(SE2, se2.compose(self._pose(last), motion.T_keyframe_base))
         self.graph.add_edge(RELATIVE_POSE, [last.vertex, vertex], motion.T_keyframe_base, noise, "odometry")
-        self.keyframes.append(Keyframe(vertex, m.stamp_ns, m.T_odom_base))
+        self.keyframes.append(vertex, m.stamp_ns, m.T_odom_base)
         self._covariance = se2.propagate(self._covariance, motion.T_keyframe_base, motion.covariance)
         self._motions.append(Motion(self.config.odometry, len(self.keyframes) - 1, m))
         self._unsolved_keyframes += 1
@@ -266,7 +266,7 @@ class GraphSlam:
         """Carry sightings to the keyframe before them by the odometry in between, whose noise adds to theirs."""
         motion = next(motion for motion in reversed(self._motions) if motion.start_ns <= m.stamp_ns)
         moved, keyframe = motion.at(m.stamp_ns), self.keyframes[motion.keyframe]
-        self.sighting_poses.append(SightingPose(m.stamp_ns, motion.keyframe, moved.T_keyframe_base))
+        self.sighting_poses.append(motion.keyframe, m.stamp_ns, moved.T_keyframe_base)
         for sighting in m.sightings:
             self._add_sighting(m.topic, sighting, m.stamp_ns, keyframe, moved)
         self._solve_if_due()
