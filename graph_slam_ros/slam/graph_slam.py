@@ -212,7 +212,7 @@ class GraphSlam:
         due, motion = self.config.keyframes, self._motions[-1]
         x, y, theta = motion.now.T_keyframe_base
         far = x * x + y * y >= due.min_distance_m**2 or abs(theta) >= due.min_angle_rad
-        return far or motion.moving_s >= due.max_interval_s
+        return far or motion.moving_ns / 1e9 >= due.max_interval_s
 
     def _first_keyframe(self, m: Odometry) -> None:
         """Map begins where odom begins: the first pose is anchored at its odometry pose."""

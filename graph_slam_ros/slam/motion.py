@@ -29,11 +29,11 @@ class Motion:
     since errors of velocity last for about tau. A robot that stands gathers none.
     """
 
-    __slots__ = ("_config", "_density", "_flat", "_moved", "_square", "keyframe", "moving_s")
+    __slots__ = ("_config", "_density", "_flat", "_moved", "_square", "keyframe", "moving_ns")
 
     def __init__(self, config: OdometryConfig, keyframe: int, start: Odometry) -> None:
         self.keyframe = keyframe
-        self.moving_s = 0.0
+        self.moving_ns = 0  # whole numbers: a sum of seconds would round
         self._config = config
         self._density = np.diag(
             np.square([config.translation_density, config.lateral_density, config.rotation_density])
@@ -56,9 +56,10 @@ class Motion:
         """Go on to odometry b."""
         last = self._moved[-1]
         step = se2.between(last.odometry.T_odom_base, b.T_odom_base)
-        dt = (b.stamp_ns - last.odometry.stamp_ns) * 1e-9
+        elapsed_ns = b.stamp_ns - last.odometry.stamp_ns
+        dt = elapsed_ns * 1e-9
         moves = not self._stands(step, dt)
-        self.moving_s += dt * moves
+        self.moving_ns += elapsed_ns * moves
         self._moved.append(self._extended(last, step, dt * moves, b))
 
     def at(self, stamp_ns: int) -> Moved:
