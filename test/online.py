@@ -6,7 +6,13 @@ from graph_slam_ros.graph import R1, R2, SE2, EdgeType
 from graph_slam_ros.solver import tree as t
 
 # everything is linearised anew until nothing moves: the optimum of all there is
-EXACT = {"relinearize_above": 0.0, "relinearize_every": 1, "relinearize_passes": 50, "tolerance": 1e-12}
+EXACT = {
+    "relinearize_above": 0.0,
+    "relinearize_every": 1,
+    "relinearize_passes": 50,
+    "tolerance": 1e-12,
+    "tolerance_sigmas": 0.0,
+}
 BATCH = {"max_iterations": 100, "step_tolerance": 1e-10, "cost_tolerance": 0.0}
 
 

@@ -2,13 +2,22 @@
 
 import numba
 import numpy as np
+from numba.core import types
+from numba.np.linalg import _BLAS, ensure_blas
 
 from graph_slam_ros.solver.tree import NOTHING, Array
 
 LEAST_PIVOT = 1e-14  # of its diagonal entry: what elimination left of it is rounding
-WIDE = 48  # pivots that are applied to the rows below by one matrix product
+WIDE = 12  # pivots that are applied to the rows below by matrix products
+FEWEST, SHORTEST = 3, 24  # pivots, and rows below them, for which that pays
+STRIP = 64  # rows of one product: half of what it makes on the diagonal is not needed
 
 dense = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+
+# BLAS as Numba calls it for np.dot, which would copy each panel and its product: here they stay in the front.
+ensure_blas()
+_gemm = _BLAS().numba_xxgemm(types.float64)  # type: ignore[no-untyped-call]
+_DOUBLE, _PLAIN, _TRANSPOSED = (np.int8(ord(letter)) for letter in "dnt")
 
 
 @dense
@@ -17,34 +26,42 @@ def partial_cholesky(front: Array, frontal: int, diagonal: Array) -> int:
 
     ``front`` (n, n + m) holds an upper triangle and m right sides. It becomes [U11 U12 y; . C d]: the factor, its
     diagonal inverted, and what is left for the other rows. NOTHING is returned where all pivots are safely above
-    rounding, which is judged by the ``diagonal`` of the whole problem.
+    rounding, which is judged by the ``diagonal`` of the whole problem. What is below the diagonal is not used.
     """
     n = front.shape[0]
     done = 0
     while done < frontal:
-        wide = frontal - done >= WIDE and n - done >= 3 * WIDE
-        end = done + WIDE if wide else frontal
-        below = end if wide else n
-        for a in range(done, end, 4):
-            last = min(a + 4, end)
-            for p in range(a, last):
-                for q in range(a, p):
-                    _subtract(front, p, p, q)
-                if not front[p, p] > LEAST_PIVOT * diagonal[p]:
-                    return p
-                inverse = 1.0 / np.sqrt(front[p, p])
-                front[p, p] = inverse
-                for j in range(p + 1, front.shape[1]):
-                    front[p, j] *= inverse
-            if last - a == 4:
-                _subtract_four(front, last, below, a)
-            else:
-                for i in range(last, below):
-                    for q in range(a, last):
-                        _subtract(front, i, i, q)
+        end = min(done + WIDE, frontal)
+        wide = end - done >= FEWEST and n - end >= SHORTEST
+        failed = _eliminate_panel(front, done, end, end if wide else n, diagonal)
+        if failed != NOTHING:
+            return failed
         if wide:
             _subtract_panel(front, done, end)
         done = end
+    return NOTHING
+
+
+@dense
+def _eliminate_panel(front: Array, low: int, high: int, below: int, diagonal: Array) -> int:
+    """Eliminate some rows, and take their share out of those before ``below``; returns a row without a pivot."""
+    for a in range(low, high, 4):
+        last = min(a + 4, high)
+        for p in range(a, last):
+            for q in range(a, p):
+                _subtract(front, p, p, q)
+            if not front[p, p] > LEAST_PIVOT * diagonal[p]:
+                return p
+            inverse = 1.0 / np.sqrt(front[p, p])
+            front[p, p] = inverse
+            for j in range(p + 1, front.shape[1]):
+                front[p, j] *= inverse
+        if last - a == 4:
+            _subtract_four(front, last, below, a)
+        else:
+            for i in range(last, below):
+                for q in range(a, last):
+                    _subtract(front, i, i, q)
     return NOTHING
 
 
@@ -69,12 +86,15 @@ def _subtract_four(front: Array, low: int, high: int, pivot: int) -> None:
 
 @dense
 def _subtract_panel(front: Array, low: int, high: int) -> None:
-    """Take many pivot rows' shares out of all rows below, by matrix products."""
-    for first in range(high, front.shape[0], WIDE):
-        last = min(first + WIDE, front.shape[0])
-        panel = front[low:high, first:].copy()
-        own = panel[:, : last - first].copy()
-        front[first:last, first:] -= np.dot(own.T, panel)
+    """Take pivot rows' shares out of all rows below, by matrix products in place."""
+    n, stride = front.shape
+    minus, plus = np.full(1, -1.0), np.full(1, 1.0)
+    for first in range(high, n, STRIP):
+        panel, rows = front[low:, first:].ctypes, front[first:, first:].ctypes
+        _gemm(
+            _DOUBLE, _PLAIN, _TRANSPOSED, stride - first, min(STRIP, n - first), high - low,
+            minus.ctypes, panel, stride, panel, stride, plus.ctypes, rows, stride,
+        )  # fmt: skip
 
 
 @dense

@@ -40,6 +40,7 @@ class Settings:
     relinearize_every : that is looked for at every so many updates; steps five times as large are at any
     relinearize_passes : how often at most within one update
     tolerance : online, changes of a step up to this are not followed [m, rad]
+    tolerance_sigmas : nor are those up to so many standard deviations of the vertex given its neighbours
     """
 
     method: str = "gn"
@@ -52,6 +53,7 @@ class Settings:
     relinearize_every: int = 10
     relinearize_passes: int = 1
     tolerance: float = 1e-5
+    tolerance_sigmas: float = 1e-3
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -98,7 +100,7 @@ class Problem:
         vertex = eliminate(self.tree, self._cliques, damping)
         if vertex != NOTHING:
             raise SingularError(f"the edges do not determine vertex {vertex}")
-        back_substitute(self.tree, self._cliques, -1.0)
+        back_substitute(self.tree, self._cliques, -1.0, -1.0)
         return self.largest_step()
 
     def largest_step(self) -> float:

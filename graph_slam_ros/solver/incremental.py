@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.numeric import back_substitute, eliminate, settle
+from graph_slam_ros.solver.numeric import add_to_diagonal, back_substitute, eliminate, settle
 from graph_slam_ros.solver.ordering import key_of, move_tail, neighbourhood
 from graph_slam_ros.solver.symbolic import build, cliques_of, collect, mark, release, room_for, structure
 from graph_slam_ros.solver.tree import (
@@ -51,9 +51,9 @@ from graph_slam_ros.solver.tree import (
     Array,
     Index,
     Tree,
+    with_room,
 )
 
-DONE, NO_ROOM = range(2)
 FEW = 64  # new vertices whose anchorage is looked for; more are said to be loose, which is then looked into
 
 
@@ -175,12 +175,7 @@ def deactivate(t: Tree, edges: Index) -> None:
         width = edge[e, WIDTH]
         edge[e, ACTIVE], edge[e, OWNER] = 0, NOTHING
         block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
-        p = 0
-        for s in range(edge[e, COUNT]):
-            v = edge[e, END + s]
-            for i in range(vertex[v, DOF]):
-                diagonal[vertex[v, STEP] + i] -= block[p, p]
-                p += 1
+        add_to_diagonal(vertex, edge, e, block, diagonal, -1.0)
         block[:] = 0.0
 
 
@@ -240,26 +235,25 @@ def ends_of(t: Tree, edges: Index) -> Index:
 
 
 @kernel
-def restructure(t: Tree, touched: Index, new: Index, tail: int) -> tuple[int, Index]:
+def _restructure(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
     """Put changes of the structure into the tree: order again what they touch, and group it into cliques.
 
     Parameters
     ----------
     touched : vertices whose surroundings changed; new : vertices that are not in it yet
-    tail : how many of the newest vertices stay last in the order
 
     Returns
     -------
-    DONE and the new cliques, children before parents, whose numbers are to be made; or NO_ROOM and the vertices to
-    touch when it is tried again: nothing was changed but the order, and ``state`` says how long pools must be.
+    Whether there was room, and then the new cliques; otherwise the vertices to touch when it is tried again: nothing
+    was changed but the order, and ``state`` says how long the pools must be.
     """
     clique, state = t.clique, t.state
-    touched = move_tail(t, tail, touched)
+    touched = move_tail(t, touched)
     marked = mark(t, touched)
     order, orphans = collect(t, marked, new)
     start, later = structure(t, order, orphans)
     group, last, size = cliques_of(t, order, start, later)
-    cliques, members, numbers = room_for(t, size)
+    cliques, members, numbers = room_for(t, size, marked)
     state[CLIQUES_WANTED] = state[CLIQUES] + cliques
     state[MEMBERS_WANTED] = state[MEMBERS_TOP] + members
     state[FRONTS_WANTED] = state[FRONTS_TOP] + numbers
@@ -268,15 +262,29 @@ def restructure(t: Tree, touched: Index, new: Index, tail: int) -> tuple[int, In
         or state[MEMBERS_WANTED] > len(t.members)
         or state[FRONTS_WANTED] > len(t.fronts)
     ):
-        return NO_ROOM, touched
-    created = build(t, order, start, later, group, last, size, orphans)
+        return False, touched
     release(t, marked)
     state[AFFECTED] += len(order)
-    return DONE, created
+    return True, build(t, order, start, later, group, last, size, orphans)
+
+
+def restructure(tree: Tree, touched: Index, new: Index) -> tuple[Tree, Index]:
+    """The tree with changes of the structure in it, and its new cliques, whose numbers are to be made.
+
+    Parameters
+    ----------
+    touched : vertices whose surroundings changed; new : vertices that are not in it yet
+    """
+    while True:
+        done, out = _restructure(tree, touched, new)
+        if done:
+            return tree, out
+        touched, state = out, tree.state
+        tree = with_room(tree, clique=state[CLIQUES_WANTED], members=state[MEMBERS_WANTED], fronts=state[FRONTS_WANTED])
 
 
 @kernel
-def solve(t: Tree, cliques: Index, tolerance: float) -> tuple[int, Index]:
+def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float) -> tuple[int, Index]:
     """Make the numbers of cliques, children before parents, and step.
 
     Returns a vertex that has no pivot, or NOTHING, and the vertices that moved.
@@ -287,25 +295,13 @@ def solve(t: Tree, cliques: Index, tolerance: float) -> tuple[int, Index]:
     failed = eliminate(t, cliques, 0.0)
     if failed != NOTHING:
         return failed, cliques[:0].copy()
-    return failed, back_substitute(t, cliques, tolerance)
+    return failed, back_substitute(t, cliques, tolerance, sigmas)
 
 
 @kernel
-def advance(
-    t: Tree, edges: Index, touched: Index, new: Index, tail: int, tolerance: float
-) -> tuple[int, Index, int, Index]:
-    """``restructure`` for changed edges and ``solve`` in one."""
-    status, cliques = restructure(t, np.concatenate((ends_of(t, edges), touched)), new, tail)
-    if status == NO_ROOM:
-        return status, cliques, NOTHING, cliques
-    failed, moved = solve(t, cliques, tolerance)
-    return status, cliques, failed, moved
-
-
-@kernel
-def renumber(t: Tree, edges: Index, tolerance: float) -> tuple[int, Index]:
+def renumber(t: Tree, edges: Index, tolerance: float, sigmas: float) -> tuple[int, Index]:
     """``solve`` where only the numbers of edges have changed."""
-    return solve(t, mark(t, ends_of(t, edges)), tolerance)
+    return solve(t, mark(t, ends_of(t, edges)), tolerance, sigmas)
 
 
 @kernel

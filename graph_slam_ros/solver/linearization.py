@@ -11,8 +11,9 @@ from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.numeric import add_to_diagonal
 from graph_slam_ros.solver.report import ClassCost
-from graph_slam_ros.solver.tree import BLOCK, COUNT, DOF, END, STEP, Tree
+from graph_slam_ros.solver.tree import BLOCK, Tree
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -123,7 +124,7 @@ def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) ->
     for k in range(n):
         e = ids[rows[k]]
         block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
-        _add_to_diagonal(vertex, edge, e, block, diagonal, -1.0)
+        add_to_diagonal(vertex, edge, e, block, diagonal, -1.0)
         block[:] = 0.0
         for a in range(m):
             for p in range(width):
@@ -131,17 +132,7 @@ def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) ->
                 for c in range(width):
                     block[p, c] += x * jacobian[k, a, c]
                 block[p, width] += x * residual[k, a]
-        _add_to_diagonal(vertex, edge, e, block, diagonal, 1.0)
-
-
-@kernel
-def _add_to_diagonal(vertex: Index, edge: Index, e: int, block: Array, diagonal: Array, sign: float) -> None:
-    p = 0
-    for s in range(edge[e, COUNT]):
-        v = edge[e, END + s]
-        for i in range(vertex[v, DOF]):
-            diagonal[vertex[v, STEP] + i] += sign * block[p, p]
-            p += 1
+        add_to_diagonal(vertex, edge, e, block, diagonal, 1.0)
 
 
 def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:

@@ -158,14 +158,16 @@ def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Arra
 
 
 @kernel
-def back_substitute(t: Tree, cliques: Index, tolerance: float) -> Index:
+def back_substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float) -> Index:
     """Steps from the root down, through the given cliques (children before parents) and below where they matter.
 
-    A step that changes by no more than the tolerance is left as it was, and so is what depends on it alone; so errors
-    do not add up. Returns the vertices whose step has changed; their estimates follow.
+    A step that changes by no more than the tolerance [m, rad], or so many standard deviations of the vertex given its
+    neighbours, is left as it was, and so is what depends on it alone; so errors do not add up. Returns the vertices
+    whose step has changed; their estimates follow.
     """
     vertex, clique, members, fronts, step = t.vertex, t.clique, t.members, t.fronts, t.step
-    value, estimate = t.value, t.estimate
+    value, estimate, diagonal = t.value, t.estimate, t.diagonal
+    limit = sigmas * abs(sigmas)
     moved, count = np.empty(256, np.int64), 0
     stack, top = np.empty(256, np.int64), 0
     x = np.empty(256)
@@ -200,10 +202,11 @@ def back_substitute(t: Tree, cliques: Index, tolerance: float) -> Index:
         for m in range(low, low + clique[c, FRONTALS]):
             v = members[m]
             first, dof = vertex[v, STEP], vertex[v, DOF]
-            change = 0.0
+            change = error = 0.0
             for i in range(dof):
-                change = max(change, abs(step[first + i] - x[at + i]))
-            if not change <= tolerance:
+                d = abs(step[first + i] - x[at + i])
+                change, error = max(change, d), max(error, d * d * diagonal[first + i])
+            if not (change <= tolerance or error <= limit):
                 for i in range(dof):
                     step[first + i] = x[at + i]
                 vertex[v, LOCAL] = MOVED
@@ -283,6 +286,17 @@ def marginal(t: Tree, v: int) -> Array:
         for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, SIZE]):
             vertex[members[m], LOCAL] = NOTHING
     return above[at : at + dof, at : at + dof].copy()
+
+
+@kernel
+def add_to_diagonal(vertex: Index, edge: Index, e: int, block: Array, diagonal: Array, sign: float) -> None:
+    """Add the diagonal of an edge's block to that of the information matrix."""
+    p = 0
+    for s in range(edge[e, COUNT]):
+        v = edge[e, END + s]
+        for i in range(vertex[v, DOF]):
+            diagonal[vertex[v, STEP] + i] += sign * block[p, p]
+            p += 1
 
 
 @kernel

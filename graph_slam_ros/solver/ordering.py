@@ -3,7 +3,7 @@
 Regions form a binary tree. The vertices of an inner region separate those of its two subtrees, so they are eliminated
 after both: a path from any vertex to the root is short, and an update touches little. The newest vertices, the
 *tail*, come last of all in order of time, so that the next odometry edge meets the root. When the tail is long its
-older half moves down, each vertex into the deepest region that keeps the separation true. A region whose subtree has
+older part moves down, each vertex into the deepest region that keeps the separation true. A region whose subtree has
 grown too much is dissected anew; that is paid for by what was added to it.
 """
 
@@ -16,6 +16,9 @@ from graph_slam_ros.solver.tree import (
     COUNT,
     DOF,
     END,
+    FLOPS,
+    FLOPS_SEEN,
+    FLOPS_USUAL,
     FREE,
     FREE_REGION,
     KEY,
@@ -32,10 +35,15 @@ from graph_slam_ros.solver.tree import (
     R_MADE,
     R_PARENT,
     R_RIGHT,
+    RECENT,
     REGION,
     REGIONS,
+    RESTRUCTURED,
+    RESTRUCTURED_SEEN,
     TAIL_END,
     TAIL_FIRST,
+    TAIL_KEPT,
+    TAIL_LEAST,
     Index,
     Tree,
 )
@@ -43,10 +51,10 @@ from graph_slam_ros.solver.tree import (
 LEAF = 6  # vertices a region need not be dissected for
 GROWTH = 2.0  # a subtree is dissected anew when it has grown by this factor
 DEEPEST = 200
-LONGEST = 8  # times the length that is kept, of the tail
-PASSES = 4  # of refinement
-PATIENCE = 30  # moves without gain before a pass ends
-HEAVIEST = 0.6  # share of one side
+TAIL_MOST = 128  # vertices that are kept in the tail at most
+SLACK = 8  # vertices beyond these that move down in one go, when a closure comes
+WAITING = 56  # as long as none comes
+INSIDE = 0.9  # share of the recent closures that a longer tail must hold
 
 
 @kernel
@@ -56,22 +64,30 @@ def key_of(depth: int, region: int, vertex: int) -> int:
 
 
 @kernel
-def move_tail(t: Tree, keep: int, touched: Index) -> Index:
-    """Move the older vertices of a tail of more than twice ``keep`` down; returns all vertices this touches.
+def move_tail(t: Tree, touched: Index) -> Index:
+    """Move the older vertices of a long tail down; returns all vertices this touches.
 
-    That waits for a change that goes beyond the tail, and so for a while if need be: what odometry alone adds is cheap.
+    That waits for a change that goes further back, and so for a while if need be: what odometry alone adds is cheap.
     """
     vertex, region, tail, state = t.vertex, t.region, t.tail, t.state
     first, end = state[TAIL_FIRST], state[TAIL_END]
-    beyond = end - first > LONGEST * keep
+    state[RESTRUCTURED] += 1
+    if first == end:
+        return touched
+    back, beyond = 0, False
     for v in touched:
+        back = max(back, tail[end - 1] - v)
         beyond = beyond or vertex[v, REGION] != NOTHING
-    if end - first <= 2 * keep or not beyond:
+    if back > TAIL_LEAST:
+        _decide_length(t, back)
+    keep = state[TAIL_KEPT]
+    beyond = beyond or (keep > TAIL_LEAST and back > TAIL_LEAST)
+    if end - first <= keep + (SLACK if beyond else WAITING):
         return touched
     last = end - keep
     moving = tail[first:last]
     state[TAIL_FIRST] = last
-    if last - first > max(region[0, R_COUNT], 4 * keep):  # as many as there are: all in one go
+    if last - first > max(region[0, R_COUNT], 4 * TAIL_LEAST):  # as many as there are: all in one go
         for v in moving:
             if vertex[v, FREE] == 1:
                 _enter(t, v, 0)
@@ -92,6 +108,30 @@ def move_tail(t: Tree, keep: int, touched: Index) -> Index:
     if overgrown != NOTHING:
         touched = np.concatenate((touched, dissect(t, overgrown)))
     return touched
+
+
+@kernel
+def _decide_length(t: Tree, back: int) -> None:
+    """Decide how many vertices the tail keeps, now that a closure reaches back so far.
+
+    They are in the root, so a closure among them touches nothing else, but every update pays for them. So there are
+    more than a few only where most recent closures reach no further, and where a root of that size costs less than
+    updates cost while there were few. That is so where a robot sweeps row beside row.
+    """
+    state, reach = t.state, t.reach
+    reach[:-1] = reach[1:]
+    reach[-1] = back
+    updates = state[RESTRUCTURED] - state[RESTRUCTURED_SEEN]
+    spent = (state[FLOPS] - state[FLOPS_SEEN]) // updates
+    state[RESTRUCTURED_SEEN], state[FLOPS_SEEN] = state[RESTRUCTURED], state[FLOPS]
+    if state[TAIL_KEPT] == TAIL_LEAST:
+        state[FLOPS_USUAL] += (spent - state[FLOPS_USUAL]) // RECENT
+    enough = np.sort(reach)[int(INSIDE * RECENT)] + 1
+    state[TAIL_KEPT] = TAIL_LEAST
+    if enough <= TAIL_MOST:
+        size = (enough + SLACK) * t.vertex[t.tail[state[TAIL_END] - 1], DOF]
+        if 2 * size**3 <= state[FLOPS_USUAL]:
+            state[TAIL_KEPT] = enough
 
 
 @kernel

@@ -1,7 +1,5 @@
 """The seam between the problem and its solution: what it is made of, its estimate, its covariances."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -18,12 +16,9 @@ from graph_slam_ros.solver.tree import (
     ACTIVE,
     AFFECTED,
     BLOCKS_TOP,
-    CLIQUES_WANTED,
     FREE,
-    FRONTS_WANTED,
     KEY,
     LINKS,
-    MEMBERS_WANTED,
     NOTHING,
     SE2_KIND,
     SE3_KIND,
@@ -31,12 +26,13 @@ from graph_slam_ros.solver.tree import (
     TAIL_FIRST,
     VECTOR,
     empty_tree,
+    longer,
+    with_room,
 )
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_TAIL = 8  # newest vertices that stay last in the order of elimination
 _BY_FAR = 5.0  # times the threshold: steps that are linearised anew at once
 _NONE = np.empty(0, dtype=np.int64)
 _KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
@@ -180,7 +176,7 @@ class Solver:
             if not len(edges):
                 break
             self._linearize(edges)
-            failed, moved = incremental.renumber(self._tree, edges, settings.tolerance)
+            failed, moved = incremental.renumber(self._tree, edges, settings.tolerance, settings.tolerance_sigmas)
             if failed != NOTHING:
                 self._broken = True
                 raise _singular(failed)
@@ -284,32 +280,25 @@ class Solver:
         """Follow the graph's growth: new vertices start at their initial values."""
         graph, known = self.graph, self._vertices
         if graph.vertex_count > known:
-            self._reserve(vertex=graph.vertex_count, region=2 * graph.vertex_count, tail=2 * graph.vertex_count)
-            self._reserve(**dict.fromkeys(("diagonal", "step", "value", "estimate"), len(graph.initial)))
-            self._inside = _longer(self._inside, len(self._tree.vertex))
-            self._held = _longer(self._held, len(self._tree.vertex))
+            count, size = graph.vertex_count, len(graph.initial)
+            self._tree = with_room(self._tree, vertex=count, region=2 * count, tail=2 * count)
+            self._tree = with_room(self._tree, diagonal=size, step=size, value=size, estimate=size)
+            self._inside, self._held = longer(self._inside, count), longer(self._held, count)
             shapes = np.array([(k.dof, k.size, _KINDS.get(k, VECTOR)) for k in graph.kinds])
             incremental.append_vertices(
                 self._tree, known, graph.offset.values[known:], graph.initial.values, shapes[graph.kind.values[known:]]
             )
             self._vertices = graph.vertex_count
         if graph.edge_count > len(self._taken):
-            self._reserve(edge=graph.edge_count)
-            self._taken = _longer(self._taken, len(self._tree.edge))
-
-    def _reserve(self, **lengths: int) -> None:
-        """Make arrays of the tree at least so long."""
-        short = {name: n for name, n in lengths.items() if len(getattr(self._tree, name)) < n}
-        if short:
-            self._tree = self._tree._replace(
-                **{name: _longer(getattr(self._tree, name), n) for name, n in short.items()}
-            )
+            self._tree = with_room(self._tree, edge=graph.edge_count)
+            self._taken = longer(self._taken, graph.edge_count)
 
     def _record(self, table: EdgeTable, rows: Index) -> None:
         """Link edges to their vertices; they are not in the structure yet."""
         state, width = self._tree.state, sum(table.type.dofs)
         links = int(state[LINKS]) + len(rows) * len(table.type.accepts)
-        self._reserve(link=links, blocks=int(state[BLOCKS_TOP]) + len(rows) * width * (width + 1))
+        blocks = int(state[BLOCKS_TOP]) + len(rows) * width * (width + 1)
+        self._tree = with_room(self._tree, link=links, blocks=blocks)
         incremental.append_edges(self._tree, rows, table.id.values, table.vertices.values)
 
     def _waiting(self) -> bool:
@@ -339,12 +328,11 @@ class Solver:
                 self._refuse_loose()
             fresh = np.union1d(edges, grown_up) if len(grown_up) else edges
             if self._broken:
-                fresh, vertices_now = self._active(), self._unknowns()
-                incremental.reset(self._tree, vertices_now)
-            else:
-                vertices_now = vertices
+                fresh = self._active()
             self._linearize(fresh)
-            failed, moved = self._advance(fresh, vertices_now)
+            cliques = self._restructure(vertices, fresh)
+            settings = self.settings
+            failed, moved = incremental.solve(self._tree, cliques, settings.tolerance, settings.tolerance_sigmas)
             if failed != NOTHING:
                 self._refuse_loose()
                 raise _singular(failed)
@@ -354,21 +342,22 @@ class Solver:
         self._solved_with = None
         return moved, len(fresh)
 
-    def _advance(self, edges: Index, vertices: Index) -> tuple[int, Index]:
-        touched, self._touched, self._loose, self._broken = self._touched, _NONE, False, False
-        while True:
-            status, cliques, failed, moved = incremental.advance(
-                self._tree, edges, touched, vertices, _TAIL, self.settings.tolerance
-            )
-            if status == incremental.DONE:
-                return failed, moved
-            touched = cliques
-            self._make_room()
+    def _restructure(self, vertices: Index, edges: Index) -> Index:
+        """Order and group what new vertices and edges touch; returns the cliques whose numbers are to be made."""
+        touched = incremental.ends_of(self._tree, edges)
+        if len(self._touched):
+            touched = np.concatenate((touched, self._touched))
+        if self._broken:
+            vertices = self._unknowns()
+            incremental.reset(self._tree, vertices)
+        self._touched, self._broken, self._loose = _NONE, False, False
+        self._tree, cliques = incremental.restructure(self._tree, touched, vertices)
+        return cliques
 
     def _settle(self) -> None:
         """After a batch: make the numbers of the tree at its result, which stays."""
         self._linearize(self._active())
-        failed, _ = incremental.renumber(self._tree, self._active(), np.inf)
+        failed, _ = incremental.renumber(self._tree, self._active(), np.inf, 0.0)
         if failed != NOTHING:
             self._broken = True
         self._settled = True
@@ -405,25 +394,6 @@ class Solver:
             for b in linearize(self.graph, self._tree.value, rows_of(self.graph, ids), losses):
                 refuse_nonfinite(b)
                 store(self._tree, b.rows, b.table.id.values, b.residual, b.jacobian)
-
-    def _restructure(self, vertices: Index, edges: Index) -> None:
-        """Order and group what new vertices and edges touch, for a batch to make the numbers."""
-        touched = np.concatenate((incremental.ends_of(self._tree, edges), self._touched))
-        if self._broken:
-            vertices = self._unknowns()
-            incremental.reset(self._tree, vertices)
-        self._touched, self._broken, self._loose = _NONE, False, False
-        while True:
-            status, touched = incremental.restructure(self._tree, touched, vertices, _TAIL)
-            if status == incremental.DONE:
-                return
-            self._make_room()
-
-    def _make_room(self) -> None:
-        state = self._tree.state
-        self._reserve(
-            clique=int(state[CLIQUES_WANTED]), members=int(state[MEMBERS_WANTED]), fronts=int(state[FRONTS_WANTED])
-        )
 
     def _put_off(self, vertices: Index, edges: Index) -> None:
         """Take back an update that failed: what it added waits again, and the tree is made anew without it."""
@@ -466,12 +436,3 @@ def _admit(ids: Index, inside: NDArray[np.bool_], count: int, what: str) -> None
     if unfit != NOTHING:
         _known(ids[unfit], count, what)
         raise GraphSlamError(f"{what} {int(ids[unfit])} was added before")
-
-
-def _longer(array: NDArray[Any], count: int) -> NDArray[Any]:
-    """The array with room for so many rows, and more to come."""
-    if count <= len(array):
-        return array
-    grown = np.zeros((max(count, 2 * len(array), 64), *array.shape[1:]), dtype=array.dtype)
-    grown[: len(array)] = array
-    return grown

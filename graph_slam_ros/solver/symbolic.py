@@ -223,21 +223,27 @@ def capacity_class(size: int) -> int:
 
 
 @kernel
-def room_for(t: Tree, size: Index) -> tuple[int, int, int]:
-    """What new cliques of these sizes add to the pools, beside what is vacant: cliques, members, numbers of fronts."""
+def room_for(t: Tree, size: Index, leaving: Index) -> tuple[int, int, int]:
+    """What new cliques of these sizes add to the pools: cliques, members, numbers of fronts.
+
+    They take the places of those that leave, and vacant ones, first.
+    """
     clique, vacant = t.clique, t.vacant
     wanted = np.zeros(len(CAPACITIES), np.int64)
     for s in size:
         wanted[capacity_class(s)] += 1
+    for c in leaving:
+        wanted[clique[c, CLASS]] -= 1
     count = members = numbers = 0
     for k in range(len(CAPACITIES)):
         c = vacant[k]
         while c != NOTHING and wanted[k] > 0:
             wanted[k] -= 1
             c = clique[c, SIBLING]
-        count += wanted[k]
-        members += wanted[k] * CAPACITIES[k]
-        numbers += wanted[k] * CAPACITIES[k] * (CAPACITIES[k] + 1)
+        more = max(wanted[k], 0)
+        count += more
+        members += more * CAPACITIES[k]
+        numbers += more * CAPACITIES[k] * (CAPACITIES[k] + 1)
     return count, members, numbers
 
 

@@ -12,7 +12,8 @@ Because contributions are kept, an update touches only the cliques of changed ed
 Records are columns of integer arrays, so that compiled code reaches everything through one tuple.
 """
 
-from typing import NamedTuple
+from sys import getrefcount
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,7 @@ PARENT, CHILD, SIBLING, MEMBERS, FRONTALS, SIZE, FRONT_DOF, FULL_DOF, FRONT, CLA
 # the first vertex of its own
 R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = range(8)
 
-# tops of the pools, and what an update counts
+# tops of the pools, what decides how long the tail is kept, and what updates count
 (
     LINKS,
     CLIQUES,
@@ -53,15 +54,25 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
     BLOCKS_TOP,
     TAIL_FIRST,
     TAIL_END,
+    TAIL_KEPT,
+    RESTRUCTURED,
     AFFECTED,
     FLOPS,
+    FLOPS_SEEN,
+    RESTRUCTURED_SEEN,
+    FLOPS_USUAL,
     CLIQUES_WANTED,
     MEMBERS_WANTED,
     FRONTS_WANTED,
     STATE_COLUMNS,
-) = range(15)
+) = range(20)
 
 VECTOR, SE2_KIND, SE3_KIND = range(3)
+
+TAIL_LEAST = 8  # newest vertices that stay in the tail in any case
+RECENT = 32  # closures that are looked at
+
+_REFERENCES = 3  # to an array that is about to grow: its owner's, an argument, and another
 
 _STEPS = np.array([4, 5, 6, 7])
 CAPACITIES = np.concatenate([[1, 2, 3], *(_STEPS * 2**k for k in range(13))]).astype(np.int64)
@@ -77,6 +88,7 @@ class Tree(NamedTuple):
     diagonal : of the information matrix, all edges together
     step : of each unknown, from its linearisation point ``value``; ``estimate`` is ``value [+] step``
     tail : the newest vertices, eliminated last and in order of time
+    reach : how far back the recent closures reached, in vertices
     vacant : by size class, the first of the cliques that may be used again
     """
 
@@ -87,6 +99,7 @@ class Tree(NamedTuple):
     region: Index
     members: Index
     tail: Index
+    reach: Index
     vacant: Index
     state: Index
     fronts: Array
@@ -102,7 +115,7 @@ def empty_tree() -> Tree:
     region = np.full((16, REGION_COLUMNS), NOTHING, dtype=np.int64)
     region[0] = [NOTHING, 0, NOTHING, NOTHING, 0, 0, NOTHING]
     state = np.zeros(STATE_COLUMNS, dtype=np.int64)
-    state[REGIONS], state[FREE_REGION] = 1, NOTHING
+    state[REGIONS], state[FREE_REGION], state[TAIL_KEPT] = 1, NOTHING, TAIL_LEAST
     return Tree(
         vertex=np.zeros((0, VERTEX_COLUMNS), dtype=np.int64),
         edge=np.zeros((0, EDGE_COLUMNS), dtype=np.int64),
@@ -111,6 +124,7 @@ def empty_tree() -> Tree:
         region=region,
         members=np.zeros(0, dtype=np.int64),
         tail=np.zeros(0, dtype=np.int64),
+        reach=np.full(RECENT, np.iinfo(np.int64).max),
         vacant=np.full(len(CAPACITIES), NOTHING, dtype=np.int64),
         state=state,
         fronts=np.zeros(0),
@@ -120,3 +134,22 @@ def empty_tree() -> Tree:
         value=np.zeros(0),
         estimate=np.zeros(0),
     )
+
+
+def with_room(tree: Tree, **lengths: int) -> Tree:
+    """The tree with arrays of at least so many rows."""
+    short = {name: count for name, count in lengths.items() if len(getattr(tree, name)) < count}
+    return tree._replace(**{name: longer(getattr(tree, name), n) for name, n in short.items()}) if short else tree
+
+
+def longer(array: NDArray[Any], count: int) -> NDArray[Any]:
+    """The array with so many rows at least, and room for more to come; those added are zero."""
+    if count <= len(array):
+        return array
+    shape = (max(count, len(array) + len(array) // 4, 64), *array.shape[1:])
+    if getrefcount(array) <= _REFERENCES:  # no view of it: the system need not copy it, nor hand out its memory anew
+        array.resize(shape, refcheck=False)
+        return array
+    grown = np.zeros(shape, dtype=array.dtype)
+    grown[: len(array)] = array
+    return grown
