@@ -429,7 +429,7 @@ def test_a_vertex_is_held_at_its_estimate_and_not_where_it_was_linearised(exact_
     solver.settings = Settings(**exact_or_default)
     append(solver, 13, 6)
     solver.update()
-    assert off_by(solver, held=[6]) < (1e-6 if exact_or_default else 0.01)
+    assert off_by(solver, held=[6]) < (1e-6 if exact_or_default else 0.02)
     solver.optimize(Settings(**BATCH))
     assert off_by(solver, held=[6]) < 1e-6
     assert np.array_equal(solver.estimate([6]), before)

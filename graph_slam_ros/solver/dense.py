@@ -15,7 +15,7 @@ STRIP = 64  # rows of one product: half of what it makes on the diagonal is not 
 dense = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 
 # BLAS as Numba calls it for np.dot, which would copy each panel and its product: here they stay in the front.
-ensure_blas()
+ensure_blas()  # type: ignore[no-untyped-call]
 _gemm = _BLAS().numba_xxgemm(types.float64)  # type: ignore[no-untyped-call]
 _DOUBLE, _PLAIN, _TRANSPOSED = (np.int8(ord(letter)) for letter in "dnt")
 

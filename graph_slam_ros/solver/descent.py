@@ -225,7 +225,9 @@ def _dogleg(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
     iterations: list[Iteration] = []
     while len(iterations) < settings.max_iterations:
         slope = gradient(problem.tree, problem.edges)
-        steepest = -slope * (slope @ slope) / max(curvature(problem.tree, problem.edges, slope), _TINY)
+        largest = max(float(np.abs(slope).max(initial=0.0)), _TINY)
+        along = slope / largest  # its square need not fit a double
+        steepest = -along * (largest * (along @ along) / max(curvature(problem.tree, problem.edges, along), _TINY))
         try:
             problem.solve()
             newton = problem.tree.step.copy()

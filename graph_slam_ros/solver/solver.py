@@ -10,7 +10,7 @@ from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
 from graph_slam_ros.solver.gauge import check_gauge
 from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, rows_of, store
-from graph_slam_ros.solver.numeric import marginal, settle
+from graph_slam_ros.solver.numeric import marginals, settle
 from graph_slam_ros.solver.report import Change, Report
 from graph_slam_ros.solver.tree import (
     ACTIVE,
@@ -24,6 +24,7 @@ from graph_slam_ros.solver.tree import (
     SE3_KIND,
     TAIL_END,
     TAIL_FIRST,
+    TAIL_LEAST,
     VECTOR,
     empty_tree,
     longer,
@@ -33,7 +34,7 @@ from graph_slam_ros.solver.tree import (
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_BY_FAR = 5.0  # times the threshold: steps that are linearised anew at once
+_BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
 _NONE = np.empty(0, dtype=np.int64)
 _KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
 
@@ -164,7 +165,7 @@ class Solver:
         count = len(moved)
         self._moved_since.append(moved)
         self._updates_since += 1
-        due = self._updates_since >= settings.relinearize_every
+        due = self._updates_since * (3 if count > TAIL_LEAST else 2) >= 2 * settings.relinearize_every
         if due:
             moved = np.unique(np.concatenate(self._moved_since))
             self._moved_since, self._updates_since = [], 0
@@ -251,10 +252,16 @@ class Solver:
             raise GraphSlamError(f"vertex {int(wanted[~self._inside[wanted]][0])} is not in the problem")
         if not self._held[wanted].all() and (self._waiting() or not self._settled):
             self._moved_since.append(self._take_in()[0])
-        out = []
+        free = wanted[~self._held[wanted]]
+        numbers = marginals(self._tree, free) if len(free) else np.empty(0)
+        out, at = [], 0
         for vertex in wanted.tolist():
             dof = self.graph.kind_of(vertex).dof
-            out.append(np.zeros((dof, dof)) if self._held[vertex] else marginal(self._tree, vertex))
+            if self._held[vertex]:
+                out.append(np.zeros((dof, dof)))
+            else:
+                out.append(numbers[at : at + dof**2].reshape(dof, dof))
+                at += dof**2
         return out
 
     def information_matrix(self) -> Array:

@@ -30,6 +30,7 @@ from graph_slam_ros.solver.tree import (
     NOTHING,
     OWNER,
     PARENT,
+    REGION,
     SIBLING,
     SIZE,
     Index,
@@ -114,18 +115,11 @@ def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
     It is joined by edges, by the separators of orphans, and by what earlier vertices left (its children in the
     elimination tree). Returns where each begins (n + 1) and the numbers.
     """
-    vertex, edge, link, clique, members = t.vertex, t.edge, t.link, t.clique, t.members
+    vertex = t.vertex
     n = len(order)
     for k in range(n):
         vertex[order[k], LOCAL] = k
-    orphan_of, orphan_next = np.full(n, NOTHING, np.int64), np.empty(len(orphans), np.int64)
-    for i in range(len(orphans)):
-        c = orphans[i]
-        first = n
-        for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
-            first = min(first, vertex[members[m], LOCAL])
-        orphan_next[i] = orphan_of[first]
-        orphan_of[first] = i
+    orphan_of, orphan_next = _by_first(t, orphans, n)
     child_of, child_next = np.full(n, NOTHING, np.int64), np.full(n, NOTHING, np.int64)
     seen = np.full(n, NOTHING, np.int64)
     start = np.zeros(n + 1, np.int64)
@@ -135,48 +129,18 @@ def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
         start[k] = top
         if top + n - k > len(later):
             later = np.concatenate((later, np.empty(len(later) + n, np.int64)))
-        a = vertex[order[k], LINK]
-        while a != NOTHING:
-            e = link[a, LINK_EDGE]
-            a = link[a, LINK_NEXT]
-            if edge[e, ACTIVE] == 0:
-                continue
-            first = True
-            for s in range(edge[e, COUNT]):
-                w = edge[e, END + s]
-                u = vertex[w, LOCAL]
-                if u < k and vertex[w, FREE] == 1:
-                    first = False
-                if u > k and seen[u] != k:
-                    seen[u] = k
-                    later[top] = u
-                    top += 1
-            if first:
-                edge[e, OWNER] = order[k]
+        top = _joined_by_edges(t, order[k], k, seen, later, top)
         i = orphan_of[k]
         while i != NOTHING:
-            c = orphans[i]
+            top = _joined_by_orphan(t, orphans[i], k, seen, later, top)
             i = orphan_next[i]
-            for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
-                u = vertex[members[m], LOCAL]
-                if u > k and seen[u] != k:
-                    seen[u] = k
-                    later[top] = u
-                    top += 1
         i = child_of[k]
         while i != NOTHING:
             for m in range(start[i], start[i + 1]):
-                u = later[m]
-                if u > k and seen[u] != k:
-                    seen[u] = k
-                    later[top] = u
-                    top += 1
+                top = _note(later[m], k, seen, later, top)
             i = child_next[i]
         if top > start[k]:
-            nearest = start[k]
-            for m in range(start[k], top):
-                if later[m] < later[nearest]:
-                    nearest = m
+            nearest = start[k] + np.argmin(later[start[k] : top])
             later[start[k]], later[nearest] = later[nearest], later[start[k]]
             parent = later[start[k]]
             child_next[k] = child_of[parent]
@@ -185,6 +149,61 @@ def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
     for v in order:
         vertex[v, LOCAL] = NOTHING
     return start, later
+
+
+@kernel
+def _by_first(t: Tree, orphans: Index, n: int) -> tuple[Index, Index]:
+    """Linked lists of the orphans by the vertex of their separator that is eliminated first."""
+    vertex, clique, members = t.vertex, t.clique, t.members
+    orphan_of, orphan_next = np.full(n, NOTHING, np.int64), np.empty(len(orphans), np.int64)
+    for i in range(len(orphans)):
+        c = orphans[i]
+        first = n
+        for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
+            first = min(first, vertex[members[m], LOCAL])
+        orphan_next[i] = orphan_of[first]
+        orphan_of[first] = i
+    return orphan_of, orphan_next
+
+
+@kernel
+def _note(u: int, k: int, seen: Index, later: Index, top: int) -> int:
+    """Note u as connected to k, once, if it is later; returns how many are noted."""
+    if u > k and seen[u] != k:
+        seen[u] = k
+        later[top] = u
+        return top + 1
+    return top
+
+
+@kernel
+def _joined_by_edges(t: Tree, v: int, k: int, seen: Index, later: Index, top: int) -> int:
+    """Note what edges join to v; it owns those of which it is eliminated first."""
+    vertex, edge, link = t.vertex, t.edge, t.link
+    a = vertex[v, LINK]
+    while a != NOTHING:
+        e = link[a, LINK_EDGE]
+        a = link[a, LINK_NEXT]
+        if edge[e, ACTIVE] == 0:
+            continue
+        first = True
+        for s in range(edge[e, COUNT]):
+            w = edge[e, END + s]
+            u = vertex[w, LOCAL]
+            first = first and not (u < k and vertex[w, FREE] == 1)
+            top = _note(u, k, seen, later, top)
+        if first:
+            edge[e, OWNER] = v
+    return top
+
+
+@kernel
+def _joined_by_orphan(t: Tree, c: int, k: int, seen: Index, later: Index, top: int) -> int:
+    """Note what an orphan's separator joins."""
+    vertex, clique, members = t.vertex, t.clique, t.members
+    for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
+        top = _note(vertex[members[m], LOCAL], k, seen, later, top)
+    return top
 
 
 @kernel
@@ -207,7 +226,9 @@ def cliques_of(t: Tree, order: Index, start: Index, later: Index) -> tuple[Index
         if width > 0:
             parent = later[start[k]]
             c = clique[parent]
-            if head[c] == parent and ((size[c] - width) * dof <= RELAXED or size[c] - width <= SHARE * size[c]):
+            same = (vertex[order[k], REGION] == NOTHING) == (vertex[order[parent], REGION] == NOTHING)
+            zeros = size[c] - width
+            if head[c] == parent and (zeros * dof <= RELAXED or (same and zeros <= SHARE * size[c])):
                 clique[k], head[c] = c, k
                 size[c] += dof
                 continue
