@@ -7,7 +7,7 @@ from scipy.linalg import solve_triangular
 from graph_slam_ros.solver.dense import WIDE, partial_cholesky, solve_upper
 from graph_slam_ros.solver.tree import NOTHING
 
-SIZES = [(1, 1), (3, 3), (6, 2), (7, 7), (12, 5), (40, 33), (90, 47)]
+SIZES = [(1, 1), (3, 3), (6, 2), (7, 7), (12, 5), (26, 2), (26, 3), (27, 3), (40, 33), (90, 47)]
 SIZES += [(3 * WIDE - 1, WIDE), (3 * WIDE, WIDE - 1), (3 * WIDE, WIDE), (3 * WIDE + 1, WIDE + 3)]
 SIZES += [(4 * WIDE + 5, 2 * WIDE + 1), (5 * WIDE, 5 * WIDE), (401, 230), (500, 20)]
 

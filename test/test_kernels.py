@@ -23,7 +23,7 @@ SMALL = [
     "test_online.py::test_a_removed_vertex_may_be_added_again_and_is_there_once[60-40]",
     "test_ordering.py::test_the_tree_holds_after_edges_between_old_vertices_and_without_some[0]",
     "test_ordering.py::test_what_a_separator_separates_is_never_adjacent[drive-200]",
-    "test_dense.py::test_elimination_leaves_the_factor_and_the_schur_complement[145-51-1]",
+    "test_dense.py::test_elimination_leaves_the_factor_and_the_schur_complement[37-15-1]",
 ]
 
 

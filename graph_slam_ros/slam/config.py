@@ -186,13 +186,19 @@ class SolveConfig:
     )
     relinearize_every: int = _setting(
         _SOLVER.relinearize_every,
-        "look for those at every so many updates (at each for five times that far)",
+        "look for those at every so many updates (at each for ten times that far)",
         "updates",
         low=1,
         high=1_000_000,
     )
     tolerance: float = _setting(
         _SOLVER.tolerance, "changes up to this are not followed through the graph", "m, rad", low=0.0
+    )
+    tolerance_sigmas: float = _setting(
+        _SOLVER.tolerance_sigmas,
+        "nor are those up to so many standard deviations of a pose or landmark given its neighbours",
+        "sigma",
+        low=0.0,
     )
     method: str = _setting(
         _SOLVER.method,
@@ -295,6 +301,7 @@ class Config:
             relinearize_error=s.relinearize_error,
             relinearize_every=s.relinearize_every,
             tolerance=s.tolerance,
+            tolerance_sigmas=s.tolerance_sigmas,
         )
 
 

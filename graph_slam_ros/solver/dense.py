@@ -1,8 +1,12 @@
 """Dense kernels of the fronts: partial Cholesky and the triangular solution. Sums may be reordered, nothing more."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numba
 import numpy as np
 from numba.core import types
+from numba.extending import overload
 from numba.np.linalg import _BLAS, ensure_blas
 
 from graph_slam_ros.solver.tree import NOTHING, Array
@@ -14,10 +18,31 @@ STRIP = 64  # rows of one product: half of what it makes on the diagonal is not 
 
 dense = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 
-# BLAS as Numba calls it for np.dot, which would copy each panel and its product: here they stay in the front.
+
+def _subtract_product(front: Array, low: int, high: int, first: int, last: int) -> None:
+    """Take the share of the pivot rows [low, high) out of the rows [first, last)."""
+    front[first:last, first:] -= front[low:high, first:last].T @ front[low:high, first:]
+
+
+# Compiled, it is one call of BLAS in place, by the way that Numba itself takes for np.dot: that would copy the rows and
+# their product.
 ensure_blas()  # type: ignore[no-untyped-call]
 _gemm = _BLAS().numba_xxgemm(types.float64)  # type: ignore[no-untyped-call]
 _DOUBLE, _PLAIN, _TRANSPOSED = (np.int8(ord(letter)) for letter in "dnt")
+
+
+@overload(_subtract_product, jit_options={"error_model": "numpy"})
+def _subtract_product_in_place(front: Any, low: Any, high: Any, first: Any, last: Any) -> Callable[..., None]:
+    def compiled(front: Any, low: Any, high: Any, first: Any, last: Any) -> None:
+        stride = front.shape[1]
+        panel, rows = front[low:, first:].ctypes, front[first:, first:].ctypes
+        minus, plus = np.full(1, -1.0).ctypes, np.full(1, 1.0).ctypes
+        _gemm(
+            _DOUBLE, _PLAIN, _TRANSPOSED, stride - first, last - first, high - low,
+            minus, panel, stride, panel, stride, plus, rows, stride,
+        )  # fmt: skip
+
+    return compiled
 
 
 @dense
@@ -37,7 +62,8 @@ def partial_cholesky(front: Array, frontal: int, diagonal: Array) -> int:
         if failed != NOTHING:
             return failed
         if wide:
-            _subtract_panel(front, done, end)
+            for first in range(end, n, STRIP):
+                _subtract_product(front, done, end, first, min(first + STRIP, n))
         done = end
     return NOTHING
 
@@ -82,19 +108,6 @@ def _subtract_four(front: Array, low: int, high: int, pivot: int) -> None:
         a, b, c, d = one[i], two[i], three[i], four[i]
         for j in range(i, front.shape[1]):
             row[j] -= a * one[j] + b * two[j] + c * three[j] + d * four[j]
-
-
-@dense
-def _subtract_panel(front: Array, low: int, high: int) -> None:
-    """Take pivot rows' shares out of all rows below, by matrix products in place."""
-    n, stride = front.shape
-    minus, plus = np.full(1, -1.0), np.full(1, 1.0)
-    for first in range(high, n, STRIP):
-        panel, rows = front[low:, first:].ctypes, front[first:, first:].ctypes
-        _gemm(
-            _DOUBLE, _PLAIN, _TRANSPOSED, stride - first, min(STRIP, n - first), high - low,
-            minus.ctypes, panel, stride, panel, stride, plus.ctypes, rows, stride,
-        )  # fmt: skip
 
 
 @dense

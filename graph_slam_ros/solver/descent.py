@@ -37,7 +37,8 @@ class Settings:
         stages keeps its last. Online an edge has the first at its first update and the last from then on
     relinearize_above : online, a vertex is linearised anew when a component of its step is larger [m, rad]
     relinearize_error : or when its step squared is more than so many standard deviations of its strongest measurement
-    relinearize_every : that is looked for at every so many updates; steps five times as large are at any
+    relinearize_every : that is looked for at every so many updates, or after two thirds of these at one that closes a
+        loop; steps ten times as large are at any
     relinearize_passes : how often at most within one update
     tolerance : online, changes of a step up to this are not followed [m, rad]
     tolerance_sigmas : nor are those up to so many standard deviations of the vertex given its neighbours

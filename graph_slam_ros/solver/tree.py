@@ -71,6 +71,7 @@ VECTOR, SE2_KIND, SE3_KIND = range(3)
 
 TAIL_LEAST = 8  # newest vertices that stay in the tail in any case
 RECENT = 32  # closures that are looked at
+FAR = 1 << 40  # vertices: further than any closure reaches
 
 _REFERENCES = 3  # to an array that is about to grow: its owner's, an argument, and another
 
@@ -124,7 +125,7 @@ def empty_tree() -> Tree:
         region=region,
         members=np.zeros(0, dtype=np.int64),
         tail=np.zeros(0, dtype=np.int64),
-        reach=np.full(RECENT, np.iinfo(np.int64).max),
+        reach=np.full(RECENT, FAR),
         vacant=np.full(len(CAPACITIES), NOTHING, dtype=np.int64),
         state=state,
         fronts=np.zeros(0),
