@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from graph_slam_ros.formats.g2o import G2oFile
+    from graph_slam_ros.formats.graph_file import G2oFile
     from graph_slam_ros.graph import EdgeType, Graph
 
 Array = NDArray[np.float64]
@@ -156,7 +156,7 @@ def read_problem(path: Path) -> Problem:
 
 def city_problem(poses: int, seed: int = 1) -> Problem:
     """Our simulator's Manhattan: 60 by 60 blocks, a closure per three poses once streets are revisited."""
-    from graph_slam_ros.formats.g2o import G2oFile
+    from graph_slam_ros.formats.graph_file import G2oFile
     from graph_slam_ros.simulation.pose_graph import city_graph
 
     graph, _ = city_graph(seed, poses=poses)

@@ -9,7 +9,8 @@ __version__ = "0.1.0"
 TYPE_CHECKING = False  # type checkers take it for true; typing itself is slow to import
 if TYPE_CHECKING:
     from graph_slam_ros.batch import Solution, optimize
-    from graph_slam_ros.formats.g2o import read_g2o, write_g2o
+    from graph_slam_ros.formats.g2o import read_g2o
+    from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.graph import Gaussian, Graph
     from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
     from graph_slam_ros.solver import Settings, Solver
@@ -33,7 +34,8 @@ __all__ = [
 
 _HOMES = {
     "batch": ("Solution", "optimize"),
-    "formats.g2o": ("read_g2o", "write_g2o"),
+    "formats.g2o": ("read_g2o",),
+    "formats.g2o_writer": ("write_g2o",),
     "graph": ("Gaussian", "Graph"),
     "slam": ("Config", "Control", "GraphSlam", "Odometry", "Sighting", "Sightings"),
     "solver": ("Settings", "Solver"),

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.formats.g2o import G2oFile, read_g2o
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.solver import Report, Settings, Solver, initial_values
 

@@ -13,7 +13,8 @@ from typing import Any
 
 from graph_slam_ros import __version__
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.g2o import G2oFile, write_g2o
+from graph_slam_ros.formats.g2o_writer import write_g2o
+from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.ingest import IngestWriter, ingest_files
 from graph_slam_ros.formats.parameters import parameters_text, read_parameters
 from graph_slam_ros.formats.tum import tum_text

@@ -12,7 +12,9 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.convert import ENDINGS, format_of, write_graph
 from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, from_g2o_words, in_g2o_words
-from graph_slam_ros.formats.g2o import G2oFile, read_g2o, write_g2o
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.formats.g2o_writer import write_g2o
+from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import R2, RELATIVE_POSE, SE2, TAG_POSITION, Gaussian, Graph
 from graph_slam_ros.solver import Solver, initial_values
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.errors import SingularError
-from graph_slam_ros.formats.g2o import G2oFile, write_g2o
+from graph_slam_ros.formats.g2o_writer import write_g2o
+from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, SE2, TAG_POSITION
 from graph_slam_ros.lie import se2
 from graph_slam_ros.run import summarize

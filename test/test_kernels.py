@@ -16,6 +16,8 @@ SMALL = [
     "test_solver.py::test_a_held_vertex_stays_and_is_certain",
     "test_solver.py::test_where_all_is_held_nothing_is_to_do",
     "test_solver.py::test_marginals_are_the_blocks_of_the_dense_inverse",
+    "test_solver.py::test_a_joint_marginal_is_the_block_of_the_dense_inverse_in_the_order_asked_for",
+    "test_edges.py",
     "test_solver.py::test_vectors_are_solved_in_one_step_to_the_weighted_mean",
     "test_solver.py::test_parts_without_a_link_are_solved_as_if_alone",
     "test_online.py::test_updates_that_fail_many_times_write_nothing_beyond_the_arrays",
@@ -81,6 +83,7 @@ for path in sys.argv[1:]:
     for method in ("gn", "lm", "dogleg"):
         solver.optimize(Settings(method=method, max_iterations=2))
     solver.marginal([1])
+    solver.joint_marginal([1, 2])
     solver.set_weight(file.graph.edge_count - 1, 0.0)
     solver.update()
 print([name for name, count in signatures().items() if count != before.get(name, 0)])

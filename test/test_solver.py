@@ -273,6 +273,32 @@ def test_marginals_are_the_blocks_of_the_dense_inverse(loss):
         assert np.array_equal(found, found.T)
 
 
+@pytest.mark.parametrize("wanted", [[3], [0, POSES, 7], [POSES + 2, 1, POSES - 1, POSES], list(range(POSES + POINTS))])
+def test_a_joint_marginal_is_the_block_of_the_dense_inverse_in_the_order_asked_for(wanted):
+    world = World(5)
+    solver = world.solver()
+    solver.optimize()
+    h, inverse, first = dense_of(world, solver)
+    rows = np.concatenate([np.arange(first[v], first[v + 1]) for v in wanted])
+    block = inverse[np.ix_(rows, rows)]
+    found = solver.joint_marginal(wanted)
+    assert np.abs(found - block).max() <= max(1e-9, 100 * EPS * np.linalg.cond(h)) * np.diag(block).max()
+    assert np.array_equal(found, found.T)
+
+
+def test_a_joint_marginal_is_zero_where_a_vertex_is_held_and_refuses_one_asked_for_twice():
+    world = World(5)
+    solver = world.solver()
+    solver.hold(2)
+    solver.optimize()
+    found = solver.joint_marginal([2, 4])
+    assert np.array_equal(found[:3], np.zeros((3, 6)))
+    assert found[3:, 3:] == pytest.approx(solver.marginal([4])[0], abs=1e-15)
+    assert not solver.joint_marginal([2]).any()
+    with pytest.raises(GraphSlamError, match="with itself"):
+        solver.joint_marginal([1, 4, 1])
+
+
 def test_the_information_matrix_is_that_of_numeric_derivatives():
     world = World(5)
     solver = world.solver()

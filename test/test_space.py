@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from graph_slam_ros.formats.g2o import read_g2o, write_g2o
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.graph import LANDMARK_POSITION_3D, POSE_PRIOR_3D, RELATIVE_POSE_3D, numeric_jacobian
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.solver import Solver

@@ -10,7 +10,7 @@ from graph_slam_ros.cli import console
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
-    from graph_slam_ros.formats.g2o import G2oFile
+    from graph_slam_ros.formats.graph_file import G2oFile
     from graph_slam_ros.graph import Graph, Loss
     from graph_slam_ros.solver import Report, Solver
 
@@ -21,7 +21,7 @@ _NO_VALUES = "the file has no vertex lines"
 def optimize(args: argparse.Namespace) -> int:
     """Solve a graph, say how it went, write it and draw it."""
     from graph_slam_ros.batch import started, take_whole
-    from graph_slam_ros.formats.g2o import write_g2o
+    from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.solver import Settings
 
     file = _read_graph(args, error_map=args.error_map)

@@ -1,88 +1,41 @@
-"""g2o text files: poses and point landmarks in the plane and in space, relative poses, priors, FIX.
+"""Reading g2o text files: poses and point landmarks in the plane and in space, relative poses, sightings, priors, FIX.
 
 Information matrices are taken as they are, but for one thing: g2o measures a rotation in space by the vector part of
 its quaternion, which is half the rotation vector, so a rotation's information counts a quarter in our residual.
-Unknown tags are kept, word for word, and written back. TORO's, iSAM's and GTSAM's texts are read as well
-(``dialects``, and ``convert`` to write them), and files without vertex lines.
+A sighting in space is measured in a sensor's frame, and names the parameter that says where that is on the robot; in
+the graph it is in the robot's. Tags of ours stand for what g2o has no word for. Unknown tags are kept, word for word,
+and written back. TORO's, iSAM's and GTSAM's texts are read as well (``dialects``, and ``convert`` to write them), and
+files without vertex lines.
 """
 
-import gzip
 import itertools
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError, NoiseError
 from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, in_g2o_words
-from graph_slam_ros.formats.strict import expect, integer, is_gzipped, lines, numbers
+from graph_slam_ros.formats.graph_file import AT_OFFSET, EDGE_TAGS, HALVED, OFFSET, VERTEX_TAGS, Array, G2oFile, moved
+from graph_slam_ros.formats.strict import expect, integer, lines, numbers
 from graph_slam_ros.graph import (
     INVERSE_RELATIVE_POSE,
-    LANDMARK_POSITION,
-    POSE_PRIOR,
-    R2,
-    R3,
+    LANDMARK_POSITION_3D,
     RELATIVE_POSE,
-    RELATIVE_POSE_3D,
     SE2,
     SE3,
-    TAG_POSITION,
     EdgeType,
     Gaussian,
     Graph,
-    VertexKind,
 )
+from graph_slam_ros.lie import se3
 
-Array = NDArray[np.float64]
-Values: TypeAlias = Callable[[Sequence[int]], Array]
-
-VERTEX_TAGS: dict[str, VertexKind] = {
-    "VERTEX_SE2": SE2,
-    "VERTEX_XY": R2,
-    "VERTEX_SE3:QUAT": SE3,
-    "VERTEX_TRACKXYZ": R3,
-}
-EDGE_TAGS: dict[str, EdgeType] = {
-    "EDGE_SE2": RELATIVE_POSE,
-    "EDGE_SE2_XY": LANDMARK_POSITION,
-    "EDGE_PRIOR_SE2": POSE_PRIOR,
-    "EDGE_SE3:QUAT": RELATIVE_POSE_3D,
-    "EDGE_SE2_POSITION": TAG_POSITION,  # ours: of a landmark that is a pose, only the position was seen
-}
 _RELATIVE = ("EDGE_SE2", "EDGE_SE3:QUAT")
-_HALVED = {RELATIVE_POSE_3D: np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])}  # of our residual, in g2o's
-# Our comment, the label of the edges that follow it. Its code and their number come first since GTSAM looks for two
-# integers behind every tag in the plane: where a line has none (a FIX line as well), it reads no edge after it.
-_CLASS = re.compile(r"#\s+(?:\d+\s+\d+\s+)?class\s+(\S+)\s*", re.ASCII)
+_CLASS = re.compile(r"#\s+(?:\d+\s+\d+\s+)?class\s+(\S+)\s*", re.ASCII)  # our comment, the label of what follows it
 _UNIT = 1e-12  # a squared quaternion norm this near to 1 is left as it was written
 ERROR_MAPS = {"relative": RELATIVE_POSE, "seed": INVERSE_RELATIVE_POSE}
-
-
-@dataclass(slots=True)
-class G2oFile:
-    """A graph as read from, or to be written to, a g2o file.
-
-    Attributes
-    ----------
-    ids : the file's id of each vertex of the graph
-    fixed : vertices (ids of the graph) that FIX lines hold
-    unknown : lines with tags that are not understood, in order
-    skipped : in lenient reading, what was wrong with each line left out
-    raw : whether the information of rotations in space was, and is to be written, unscaled
-    has_values : whether the file gave initial values; without, all are at the origin
-    """
-
-    graph: Graph
-    ids: list[int]
-    fixed: list[int] = field(default_factory=list)
-    unknown: list[str] = field(default_factory=list)
-    skipped: list[str] = field(default_factory=list)
-    raw: bool = False
-    has_values: bool = True
 
 
 @dataclass(slots=True)
@@ -92,6 +45,7 @@ class _Edge:
     measured: list[float]
     information: list[float]
     label: str
+    offset: int | None = None
 
 
 class _Reader:
@@ -102,6 +56,7 @@ class _Reader:
         self.vertices: dict[int, tuple[str, list[float]]] = {}
         self.edges: dict[str, list[_Edge]] = {tag: [] for tag in EDGE_TAGS}
         self.fixed: list[tuple[int, int]] = []
+        self.offsets: dict[int, se3.Pose] = {}
         self.unknown: list[str] = []
         self.skipped: list[str] = []
         self.has_values = True
@@ -126,6 +81,8 @@ class _Reader:
                 self._vertex(tag, words)
             elif tag in EDGE_TAGS:
                 self.edges[tag].append(self._edge(line, tag, words))
+            elif tag == OFFSET:
+                self._offset(words)
             elif tag == "FIX":
                 if len(words) < 2:
                     raise FormatError("FIX names no vertex")
@@ -143,14 +100,20 @@ class _Reader:
             raise FormatError(f"vertex {vertex} was declared before, with other values")
         self.vertices[vertex] = (tag, value)
 
+    def _offset(self, words: list[str]) -> None:
+        expect(words, 1 + SE3.size)
+        x, y, z, *q = _with_unit_quaternion(numbers(words[2:]), SE3.size)
+        self.offsets[integer(words[1])] = (x, y, z, q[0], q[1], q[2], q[3])
+
     def _edge(self, line: int, tag: str, words: list[str]) -> _Edge:
         edge = EDGE_TAGS[tag]
-        slots, m = len(edge.accepts), edge.residual_size
-        expect(words, slots + edge.measured_size + m * (m + 1) // 2)
+        slots, m, from_offset = len(edge.accepts), edge.residual_size, tag in AT_OFFSET
+        expect(words, slots + from_offset + edge.measured_size + m * (m + 1) // 2)
         vertices = tuple(integer(word) for word in words[1 : 1 + slots])
-        values = numbers(words[1 + slots :])
+        values = numbers(words[1 + slots + from_offset :])
         measured = _with_unit_quaternion(values[: edge.measured_size], edge.measured_size)
-        return _Edge(line, vertices, measured, values[edge.measured_size :], self.label)
+        offset = integer(words[1 + slots]) if from_offset else None
+        return _Edge(line, vertices, measured, values[edge.measured_size :], self.label, offset)
 
     def declare_all(self) -> None:
         """A file of edges alone: its vertices are those the edges name, in order of id and without values."""
@@ -173,17 +136,28 @@ class _Reader:
             at[file_id] = graph.add_vertex(VERTEX_TAGS[tag], value)
         poses = sorted(file_id for file_id, (tag, _) in self.vertices.items() if VERTEX_TAGS[tag] in (SE2, SE3))
         follows = dict(itertools.pairwise(poses))
+        seen_from: dict[int, int] = {}
         for tag, edges in self.edges.items():
             edge_type = relative_pose if tag == "EDGE_SE2" else EDGE_TAGS[tag]
             for label, members in _by_label(tag, self._known(tag, edges), follows).items():
-                self._add(graph, edge_type, label, members, at)
+                seen_from |= self._add(graph, edge_type, label, members, at)
         fixed = []
         for line, file_id in self.fixed:
             if file_id in at:
                 fixed.append(at[file_id])
             else:
                 self.refuse(line, f"FIX names vertex {file_id}, which is not declared")
-        return G2oFile(graph, list(at), fixed, self.unknown, self.skipped, self.text.raw, self.has_values)
+        return G2oFile(
+            graph,
+            list(at),
+            fixed,
+            self.offsets,
+            seen_from,
+            self.unknown,
+            self.skipped,
+            self.text.raw,
+            self.has_values,
+        )
 
     def _known(self, tag: str, edges: Sequence[_Edge]) -> Iterator[_Edge]:
         """Edges whose vertices exist and are of the right kind, and whose information is positive definite."""
@@ -199,13 +173,27 @@ class _Reader:
             else:
                 if len(set(edge.vertices)) < len(edge.vertices):
                     self.refuse(edge.line, f"edge from vertex {edge.vertices[0]} to itself")
-                    continue
-                yield edge
+                elif edge.offset is None or self._is_at(tag, edge):
+                    yield edge
 
-    def _add(self, graph: Graph, edge_type: EdgeType, label: str, edges: list[_Edge], at: dict[int, int]) -> None:
+    def _is_at(self, tag: str, edge: _Edge) -> bool:
+        """Whether the place of an edge's sensor is known, and such that its measurement can be used."""
+        offset = self.offsets.get(edge.offset or 0)
+        if offset is None and edge.offset:  # some files leave out parameter 0, which is then the robot's frame itself
+            self.refuse(edge.line, f"parameter {edge.offset}, which is not declared")
+            return False
+        if tag == "EDGE_SE3_PRIOR" and offset not in (None, se3.IDENTITY):
+            self.refuse(edge.line, f"{tag} of a sensor that is not at the robot's origin")
+            return False
+        return True
+
+    def _add(
+        self, graph: Graph, edge_type: EdgeType, label: str, edges: list[_Edge], at: dict[int, int]
+    ) -> dict[int, int]:
+        """Add edges to the graph; returns the parameters of those that have one."""
         information = _symmetric(np.array([e.information for e in edges]), edge_type.residual_size)
-        if edge_type in _HALVED and not self.text.raw:
-            information *= np.outer(_HALVED[edge_type], _HALVED[edge_type])
+        if edge_type in HALVED and not self.text.raw:
+            information *= np.outer(HALVED[edge_type], HALVED[edge_type])
         good = list(range(len(edges)))
         try:
             noise = Gaussian.from_information(information)
@@ -218,15 +206,16 @@ class _Reader:
                 except NoiseError as error:
                     self.refuse(edge.line, str(error).replace("information 0", "information", 1))
             if not good:
-                return
+                return {}
             noise = Gaussian.from_information(information[good])
-        graph.add_edges(
-            edge_type,
-            [[at[v] for v in edges[k].vertices] for k in good],
-            [edges[k].measured for k in good],
-            noise,
-            label,
-        )
+        edges = [edges[k] for k in good]
+        measured = np.array([edge.measured for edge in edges])
+        if edge_type is LANDMARK_POSITION_3D:
+            offsets = [self.offsets.get(edge.offset or 0, se3.IDENTITY) for edge in edges]
+            measured, noise = moved(measured, noise.sqrt_information, offsets)
+        ids = graph.add_edges(edge_type, [[at[v] for v in edge.vertices] for edge in edges], measured, noise, label)
+        seen_from = zip(ids.tolist(), edges, strict=True)
+        return {edge_id: edge.offset for edge_id, edge in seen_from if edge.offset is not None}
 
 
 def read_g2o(
@@ -273,72 +262,6 @@ def read_g2o(
     return reader.graph(ERROR_MAPS[error_map])
 
 
-def write_g2o(path: Path | str, file: G2oFile, values: Values) -> int:
-    """Write a graph; ``values(ids)`` gives the numbers of vertices of one kind, e.g. ``Solver.estimate``.
-
-    17 significant digits: what is read back is what was written. The information of an edge is multiplied by its
-    weight; one of weight 0 is out of the problem, and left out. Returns how many were.
-    """
-    write_text(path, "\n".join(graph_lines(file, values)) + "\n")
-    return weightless(file.graph)
-
-
-def weightless(graph: Graph) -> int:
-    """How many edges are of weight 0."""
-    return sum(int((table.weight.values == 0.0).sum()) for table in graph.tables.values())
-
-
-def write_text(path: Path | str, text: str) -> None:
-    """Write a file, gzipped where its name ends so. Raises FormatError."""
-    content = text.encode()
-    try:
-        Path(path).write_bytes(gzip.compress(content, mtime=0) if is_gzipped(Path(path)) else content)
-    except OSError as error:
-        raise FormatError(f"{path}: {error.strerror}") from None
-
-
-def graph_lines(file: G2oFile, values: Values | None) -> list[str]:
-    """The lines of a g2o file; without values, those of the edges alone."""
-    out = [] if values is None else _vertex_lines(file, values)
-    edges = sorted(_edge_lines(file), key=lambda edge: edge[:2])
-    for label, group in itertools.groupby(edges, key=lambda edge: edge[0]):
-        members = [text for _, _, text in group]
-        out += [f"# {label} {len(members)} class {file.graph.labels[label]}", *members]
-    return out + [f"FIX {file.ids[vertex]}" for vertex in file.fixed] + file.unknown
-
-
-def _vertex_lines(file: G2oFile, values: Values) -> list[str]:
-    graph = file.graph
-    tag_of_kind = {kind: tag for tag, kind in VERTEX_TAGS.items()}
-    rows: list[tuple[int, str]] = []
-    for code, kind in enumerate(graph.kinds):
-        members = np.flatnonzero(graph.kind.values == code).tolist()
-        if kind not in tag_of_kind:
-            raise FormatError(f"g2o has no tag for a vertex {kind.name}")
-        for vertex, value in zip(members, values(members).tolist(), strict=True):
-            rows.append((vertex, f"{tag_of_kind[kind]} {file.ids[vertex]} {_text(value)}"))
-    return [row for _, row in sorted(rows)]
-
-
-def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
-    """Code of the label, id and line of each edge in the problem."""
-    tag_of_edge = {edge: tag for tag, edge in EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
-    for edge_type, table in file.graph.tables.items():
-        if edge_type not in tag_of_edge:
-            raise FormatError(f"g2o has no tag for an edge {edge_type.name}")
-        root = table.sqrt_information.values
-        upper = np.triu_indices(edge_type.residual_size)
-        full = np.swapaxes(root, 1, 2) @ root * table.weight.values[:, None, None]
-        if edge_type in _HALVED and not file.raw:
-            full /= np.outer(_HALVED[edge_type], _HALVED[edge_type])
-        information = full[:, upper[0], upper[1]]
-        for row in np.flatnonzero(table.weight.values != 0.0).tolist():
-            ends = " ".join(str(file.ids[v]) for v in table.vertices.values[row].tolist())
-            numbers = _text([*table.measured.values[row].tolist(), *information[row].tolist()])
-            label, edge = int(table.label.values[row]), int(table.id.values[row])
-            yield label, edge, f"{tag_of_edge[edge_type]} {ends} {numbers}"
-
-
 def _with_unit_quaternion(numbers: list[float], size: int) -> list[float]:
     """The last four of a pose in space, (x, y, z, w), brought to unit length."""
     if size != SE3.size:
@@ -361,7 +284,7 @@ def _by_label(tag: str, edges: Iterable[_Edge], follows: dict[int, int]) -> dict
 def _usual_label(tag: str, edge: _Edge, follows: dict[int, int]) -> str:
     if tag in _RELATIVE:
         return "odometry" if follows.get(min(edge.vertices)) == max(edge.vertices) else "closures"
-    return "priors" if tag == "EDGE_PRIOR_SE2" else "landmarks"
+    return "priors" if len(EDGE_TAGS[tag].accepts) == 1 else "landmarks"
 
 
 def _symmetric(upper: Array, size: int) -> Array:
@@ -370,7 +293,3 @@ def _symmetric(upper: Array, size: int) -> Array:
     full[:, i, j] = upper
     full[:, j, i] = upper
     return full
-
-
-def _text(numbers: Sequence[float]) -> str:
-    return " ".join(repr(float(n)) for n in numbers)

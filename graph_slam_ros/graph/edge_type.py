@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from graph_slam_ros.graph.vertices import VertexKind
 
@@ -43,6 +43,41 @@ class EdgeType:
         return tuple(kinds[0].dof for kinds in self.accepts)
 
 
+Residual = Callable[[tuple[Array, ...], Array], ArrayLike]
+
+
+def edge_from_residual(
+    name: str,
+    accepts: tuple[tuple[VertexKind, ...], ...],
+    measured_size: int,
+    residual_size: int,
+    residual: Residual,
+    jacobian: Residual | None = None,
+) -> EdgeType:
+    """An edge type of one's own, from a function of one edge in plain Python.
+
+    Parameters
+    ----------
+    residual : the stored numbers of the edge's vertices, and what was measured (p,), to what they disagree by (m,).
+        An angle in it must be wrapped to (-pi, pi]
+    jacobian : the same to (m, D), over the right perturbations of the vertices side by side; without it, central
+        differences of the residual. ``check_edge`` compares the two
+    """
+    sizes = [kinds[0].size for kinds in accepts]
+    kinds = tuple(kinds[0] for kinds in accepts)
+    derivative = jacobian or (lambda values, measured: _differences(kinds, values, lambda v: residual(v, measured)))
+
+    def linearize(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+        residuals = np.empty((len(at), residual_size))
+        jacobians = np.empty((len(at), residual_size, sum(kind.dof for kind in kinds)))
+        for e, begins in enumerate(at.tolist()):
+            values = tuple(x[begin : begin + size] for begin, size in zip(begins, sizes, strict=True))
+            residuals[e], jacobians[e] = residual(values, measured[e]), derivative(values, measured[e])
+        return residuals, jacobians
+
+    return EdgeType(name, accepts, measured_size, residual_size, linearize)
+
+
 def numeric_jacobian(edge: EdgeType, values: tuple[Array, ...], measured: Array, step: float = 1e-6) -> Array:
     """Jacobian (m, D) of one edge by central differences through ``retract``: the check of every analytic one.
 
@@ -51,16 +86,28 @@ def numeric_jacobian(edge: EdgeType, values: tuple[Array, ...], measured: Array,
     values : the stored numbers of each of the edge's vertices, of the kinds ``edge.accepts`` names first
     measured : (p,)
     """
-    kinds = [accepted[0] for accepted in edge.accepts]
+    kinds = tuple(accepted[0] for accepted in edge.accepts)
     at = np.cumsum([0, *(k.size for k in kinds[:-1])]).astype(np.int64)[None, :]
+    z = np.asarray(measured, dtype=float)[None, :]
+    return _differences(kinds, values, lambda moved: edge.linearize(np.concatenate(moved), at, z)[0][0], step)
 
-    def residual(slot: int, d: Array) -> Array:
+
+def _differences(
+    kinds: tuple[VertexKind, ...],
+    values: tuple[Array, ...],
+    residual: Callable[[tuple[Array, ...]], ArrayLike],
+    step: float = 1e-6,
+) -> Array:
+    """Derivative (m, D) over the right perturbations, also where an angle goes over the cut between them."""
+
+    def at(slot: int, d: Array) -> Array:
         moved = [np.asarray(v, dtype=float) for v in values]
         moved[slot] = kinds[slot].retract(moved[slot][None, :], d[None, :])[0]
-        return edge.linearize(np.concatenate(moved), at, np.asarray(measured, dtype=float)[None, :])[0][0]
+        return np.asarray(residual(tuple(moved)), dtype=float)
 
     columns = []
     for slot, kind in enumerate(kinds):
         for d in step * np.eye(kind.dof):
-            columns.append((residual(slot, d) - residual(slot, -d)) / (2.0 * step))
+            change = at(slot, d) - at(slot, -d)
+            columns.append((change - 2.0 * np.pi * np.round(change / (2.0 * np.pi))) / (2.0 * step))
     return np.stack(columns, axis=1)

@@ -93,7 +93,24 @@ def _landmark_position(x: Array, at: Index, measured: Array) -> tuple[Array, Arr
     return residual, jacobian
 
 
+@kernel
+def _tag_position(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+    """As a point landmark, for a landmark whose orientation is a part of the state but was not seen this time."""
+    residual, of_point = _landmark_position(x, at, measured)
+    n = at.shape[0]
+    jacobian = np.zeros((n, 3, 12))
+    for k in range(n):
+        turn = so3.matrix(se3.rotation(_pose(x, at[k, 1])))
+        jacobian[k, :, :6] = of_point[k, :, :6]
+        for a in range(3):
+            for b in range(3):
+                for c in range(3):
+                    jacobian[k, a, 6 + b] += of_point[k, a, 6 + c] * turn[c, b]
+    return residual, jacobian
+
+
 _POSE, _POINT = (SE3,), (R3,)
 RELATIVE_POSE_3D = EdgeType("relative pose 3D", (_POSE, _POSE), 7, 6, _relative_pose)
 POSE_PRIOR_3D = EdgeType("pose prior 3D", (_POSE,), 7, 6, _pose_prior)
 LANDMARK_POSITION_3D = EdgeType("landmark position 3D", (_POSE, _POINT), 3, 3, _landmark_position)
+TAG_POSITION_3D = EdgeType("tag position 3D", (_POSE, _POSE), 3, 3, _tag_position)

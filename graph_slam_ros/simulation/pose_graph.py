@@ -9,7 +9,8 @@ import numpy as np
 from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
-from graph_slam_ros.formats.g2o import G2oFile, write_g2o
+from graph_slam_ros.formats.g2o_writer import write_g2o
+from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import LANDMARK_POSITION, R2, RELATIVE_POSE, SE2, Gaussian, Graph
 from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.manhattan import STEP_M, stroll

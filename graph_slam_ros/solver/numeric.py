@@ -1,4 +1,4 @@
-"""The numbers of the clique tree: assembly and elimination, back-substitution, covariances.
+"""The numbers of the clique tree: assembly and elimination, back-substitution, steps.
 
 Kernels take the arrays out of the tree once: each access through the tuple would count references.
 """
@@ -8,11 +8,9 @@ import numpy as np
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.dense import partial_cholesky, solve_upper
-from graph_slam_ros.solver.symbolic import mark
 from graph_slam_ros.solver.tree import (
     BLOCK,
     CHILD,
-    CLIQUE,
     COUNT,
     DOF,
     END,
@@ -56,7 +54,7 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
     scale = np.empty(0)
     failed = NOTHING
     for c in cliques:
-        front, frontal = _front(clique, fronts, c), clique[c, FRONT_DOF]
+        front, frontal = front_of(clique, fronts, c), clique[c, FRONT_DOF]
         if len(scale) < frontal:
             scale = np.empty(2 * frontal)
         front[:] = 0.0
@@ -86,7 +84,7 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
 
 
 @kernel
-def _front(clique: Index, fronts: Array, c: int) -> Array:
+def front_of(clique: Index, fronts: Array, c: int) -> Array:
     """The front (full, full + 1): an upper triangle, and the right side as its last column."""
     full, base = clique[c, FULL_DOF], clique[c, FRONT]
     return fronts[base : base + full * (full + 1)].reshape(full, full + 1)
@@ -133,7 +131,7 @@ def _add_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, f
 @kernel
 def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Array, child: int, front: Array) -> None:
     """Add what a child's subtree says of its separator."""
-    of_child = _front(clique, fronts, child)
+    of_child = front_of(clique, fronts, child)
     right, of_right = front.shape[0], of_child.shape[0]
     low, high = clique[child, MEMBERS] + clique[child, FRONTALS], clique[child, MEMBERS] + clique[child, SIZE]
     row = clique[child, FRONT_DOF]
@@ -196,7 +194,7 @@ def back_substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float) ->
             at += vertex[v, DOF]
         if not to_solve:
             continue
-        solve_upper(_front(clique, fronts, c), frontal, x)
+        solve_upper(front_of(clique, fronts, c), frontal, x)
         if count + clique[c, FRONTALS] > len(moved):
             moved = np.concatenate((moved, np.empty(count + clique[c, FRONTALS], np.int64)))
         at = 0
@@ -245,92 +243,6 @@ def _retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) 
     else:
         for i in range(vertex[v, DOF]):
             estimate[x + i] = value[x + i] + step[d + i]
-
-
-@kernel
-def marginals(t: Tree, vertices: Index) -> Array:
-    """Covariances of vertices, (dof, dof) each, end to end.
-
-    From the root down to their cliques: each clique's own given its parent's, once for all of them (Kaess and
-    Dellaert, "Covariance recovery from a square root information matrix for data association", 2009).
-    """
-    vertex, clique, members = t.vertex, t.clique, t.members
-    cliques = mark(t, vertices)[::-1]
-    start, size = np.zeros(len(cliques) + 1, np.int64), 0
-    for k in range(len(cliques)):
-        clique[cliques[k], MARK] = k
-        start[k + 1] = start[k] + clique[cliques[k], FULL_DOF] ** 2
-    for v in vertices:
-        size += vertex[v, DOF] ** 2
-    pool, out = np.empty(start[-1]), np.empty(size)
-    for k in range(len(cliques)):
-        c = cliques[k]
-        full = clique[c, FULL_DOF]
-        covariance = pool[start[k] : start[k + 1]].reshape(full, full)
-        if clique[c, PARENT] != NOTHING:
-            above = clique[clique[c, PARENT], MARK]
-            wide = clique[clique[c, PARENT], FULL_DOF]
-            _inherit(t, c, pool[start[above] : start[above + 1]].reshape(wide, wide), covariance)
-        _complete(_front(clique, t.fronts, c), clique[c, FRONT_DOF], covariance)
-    size = 0
-    for v in vertices:
-        c, dof = vertex[v, CLIQUE], vertex[v, DOF]
-        full, at = clique[c, FULL_DOF], _place_in(vertex, clique, members, c, v)
-        covariance = pool[start[clique[c, MARK]] : start[clique[c, MARK] + 1]].reshape(full, full)
-        for i in range(dof):
-            for j in range(dof):
-                out[size] = covariance[at + i, at + j]
-                size += 1
-    for c in cliques:
-        clique[c, MARK] = 0
-    return out
-
-
-@kernel
-def _place_in(vertex: Index, clique: Index, members: Index, c: int, v: int) -> int:
-    """Where a member begins in a clique's front."""
-    at = 0
-    m = clique[c, MEMBERS]
-    while members[m] != v:
-        at += vertex[members[m], DOF]
-        m += 1
-    return at
-
-
-@kernel
-def _inherit(t: Tree, c: int, above: Array, covariance: Array) -> None:
-    """Take the covariance of a separator out of the parent's."""
-    vertex, clique, members = t.vertex, t.clique, t.members
-    frontal, full = clique[c, FRONT_DOF], clique[c, FULL_DOF]
-    parent = clique[c, PARENT]
-    at = 0
-    for m in range(clique[parent, MEMBERS], clique[parent, MEMBERS] + clique[parent, SIZE]):
-        vertex[members[m], LOCAL] = at
-        at += vertex[members[m], DOF]
-    place = np.empty(full - frontal, np.int64)
-    at = 0
-    for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
-        for i in range(vertex[members[m], DOF]):
-            place[at] = vertex[members[m], LOCAL] + i
-            at += 1
-    for m in range(clique[parent, MEMBERS], clique[parent, MEMBERS] + clique[parent, SIZE]):
-        vertex[members[m], LOCAL] = NOTHING
-    for i in range(at):
-        for j in range(at):
-            covariance[frontal + i, frontal + j] = above[place[i], place[j]]
-
-
-@kernel
-def _complete(front: Array, frontal: int, covariance: Array) -> None:
-    """From the separator's block to the whole: ``U11 X = [1 / U11', 0] - U12 Sigma``, column after column."""
-    full = len(covariance)
-    for j in range(full - 1, -1, -1):
-        row = covariance[j]  # symmetric: also its column
-        for a in range(min(frontal - 1, j), -1, -1):
-            s = front[a, a] if a == j else 0.0
-            for i in range(a + 1, full):
-                s -= front[a, i] * row[i]
-            row[a] = covariance[a, j] = s * front[a, a]
 
 
 @kernel

@@ -7,15 +7,17 @@ from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import SE2, SE3, Graph
 from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.solver import incremental
+from graph_slam_ros.solver.covariance import joint, marginals
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
 from graph_slam_ros.solver.gauge import check_gauge
 from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, rows_of, store
-from graph_slam_ros.solver.numeric import marginals, settle
+from graph_slam_ros.solver.numeric import settle
 from graph_slam_ros.solver.report import Change, Report
 from graph_slam_ros.solver.tree import (
     ACTIVE,
     AFFECTED,
     BLOCKS_TOP,
+    DOF,
     FREE,
     KEY,
     LINKS,
@@ -246,12 +248,7 @@ class Solver:
         GaugeError, SingularError
             A covariance that does not exist is refused.
         """
-        self._grow()
-        wanted = _known(ids, self._vertices, "vertex")
-        if not self._inside[wanted].all():
-            raise GraphSlamError(f"vertex {int(wanted[~self._inside[wanted]][0])} is not in the problem")
-        if not self._held[wanted].all() and (self._waiting() or not self._settled):
-            self._moved_since.append(self._take_in()[0])
+        wanted = self._certain(ids)
         free = wanted[~self._held[wanted]]
         numbers = marginals(self._tree, free) if len(free) else np.empty(0)
         out, at = [], 0
@@ -262,6 +259,19 @@ class Solver:
             else:
                 out.append(numbers[at : at + dof**2].reshape(dof, dof))
                 at += dof**2
+        return out
+
+    def joint_marginal(self, ids: ArrayLike) -> Array:
+        """Covariance (D, D) of some vertices together, in the order given, each once; as ``marginal`` for each."""
+        wanted = self._certain(ids)
+        if len(np.unique(wanted)) < len(wanted):
+            raise GraphSlamError("a joint covariance of a vertex with itself")
+        dof = self._tree.vertex[wanted, DOF]
+        free = ~self._held[wanted]
+        out = np.zeros((int(dof.sum()), int(dof.sum())))
+        if free.any():
+            at = np.flatnonzero(np.repeat(free, dof))
+            out[np.ix_(at, at)] = joint(self._tree, wanted[free])
         return out
 
     def information_matrix(self) -> Array:
@@ -307,6 +317,16 @@ class Solver:
         blocks = int(state[BLOCKS_TOP]) + len(rows) * width * (width + 1)
         self._tree = with_room(self._tree, link=links, blocks=blocks)
         incremental.append_edges(self._tree, rows, table.id.values, table.vertices.values)
+
+    def _certain(self, ids: ArrayLike) -> Index:
+        """Vertices whose covariance can be told: what waits for an update is taken in."""
+        self._grow()
+        wanted = _known(ids, self._vertices, "vertex")
+        if not self._inside[wanted].all():
+            raise GraphSlamError(f"vertex {int(wanted[~self._inside[wanted]][0])} is not in the problem")
+        if not self._held[wanted].all() and (self._waiting() or not self._settled):
+            self._moved_since.append(self._take_in()[0])
+        return wanted
 
     def _waiting(self) -> bool:
         return bool(len(self._new_vertices) or len(self._new_edges) or len(self._touched) or self._broken)

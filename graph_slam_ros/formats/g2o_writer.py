@@ -1,0 +1,107 @@
+"""Writing g2o text files."""
+
+import gzip
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.graph_file import (
+    AT_OFFSET,
+    EDGE_TAGS,
+    HALVED,
+    OFFSET,
+    VERTEX_TAGS,
+    G2oFile,
+    Values,
+    moved,
+)
+from graph_slam_ros.formats.strict import is_gzipped
+from graph_slam_ros.graph import INVERSE_RELATIVE_POSE, LANDMARK_POSITION_3D, POSE_PRIOR_3D, Graph
+from graph_slam_ros.lie import se3
+
+
+def write_g2o(path: Path | str, file: G2oFile, values: Values) -> int:
+    """Write a graph; ``values(ids)`` gives the numbers of vertices of one kind, e.g. ``Solver.estimate``.
+
+    17 significant digits: what is read back is what was written. The information of an edge is multiplied by its
+    weight; one of weight 0 is out of the problem, and left out. Returns how many were.
+    """
+    write_text(path, "\n".join(graph_lines(file, values)) + "\n")
+    return weightless(file.graph)
+
+
+def weightless(graph: Graph) -> int:
+    """How many edges are of weight 0."""
+    return sum(int((table.weight.values == 0.0).sum()) for table in graph.tables.values())
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write a file, gzipped where its name ends so. Raises FormatError."""
+    content = text.encode()
+    try:
+        Path(path).write_bytes(gzip.compress(content, mtime=0) if is_gzipped(Path(path)) else content)
+    except OSError as error:
+        raise FormatError(f"{path}: {error.strerror}") from None
+
+
+def graph_lines(file: G2oFile, values: Values | None) -> list[str]:
+    """The lines of a g2o file; without values, those of the edges alone."""
+    out = [] if values is None else _vertex_lines(file, values)
+    edges = sorted(_edge_lines(file), key=lambda edge: edge[:2])
+    # A label's code and the number of its edges come first since GTSAM looks for two integers behind every tag in the
+    # plane: where a line has none (a FIX line as well), it reads no edge after it.
+    for label, group in itertools.groupby(edges, key=lambda edge: edge[0]):
+        members = [text for _, _, text in group]
+        out += [f"# {label} {len(members)} class {file.graph.labels[label]}", *members]
+    return _offset_lines(file) + out + [f"FIX {file.ids[vertex]}" for vertex in file.fixed] + file.unknown
+
+
+def _offset_lines(file: G2oFile) -> list[str]:
+    """The parameters; number 0, the robot's own frame, is added where edges name it."""
+    named = any(edge in file.graph.tables for edge in (LANDMARK_POSITION_3D, POSE_PRIOR_3D))
+    offsets = ({0: se3.IDENTITY} if named else {}) | file.offsets
+    return [f"{OFFSET} {number} {_text(offset)}" for number, offset in sorted(offsets.items())]
+
+
+def _vertex_lines(file: G2oFile, values: Values) -> list[str]:
+    graph = file.graph
+    tag_of_kind = {kind: tag for tag, kind in VERTEX_TAGS.items()}
+    rows: list[tuple[int, str]] = []
+    for code, kind in enumerate(graph.kinds):
+        members = np.flatnonzero(graph.kind.values == code).tolist()
+        if kind not in tag_of_kind:
+            raise FormatError(f"g2o has no tag for a vertex {kind.name}")
+        for vertex, value in zip(members, values(members).tolist(), strict=True):
+            rows.append((vertex, f"{tag_of_kind[kind]} {file.ids[vertex]} {_text(value)}"))
+    return [row for _, row in sorted(rows)]
+
+
+def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
+    """Code of the label, id and line of each edge in the problem."""
+    tag_of_edge = {edge: tag for tag, edge in EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
+    for edge_type, table in file.graph.tables.items():
+        if edge_type not in tag_of_edge:
+            raise FormatError(f"g2o has no tag for an edge {edge_type.name}")
+        root, measured = table.sqrt_information.values, table.measured.values
+        numbers = [file.seen_from.get(edge, 0) for edge in table.id.values.tolist()]
+        if edge_type is LANDMARK_POSITION_3D:
+            back = [se3.inverse(file.offsets.get(number, se3.IDENTITY)) for number in numbers]
+            measured, noise = moved(measured, root, back)
+            root = noise.sqrt_information
+        upper = np.triu_indices(edge_type.residual_size)
+        full = np.swapaxes(root, 1, 2) @ root * table.weight.values[:, None, None]
+        if edge_type in HALVED and not file.raw:
+            full /= np.outer(HALVED[edge_type], HALVED[edge_type])
+        information = full[:, upper[0], upper[1]]
+        for row in np.flatnonzero(table.weight.values != 0.0).tolist():
+            words = [tag_of_edge[edge_type], *(str(file.ids[v]) for v in table.vertices.values[row].tolist())]
+            words += [str(numbers[row])] * (words[0] in AT_OFFSET)
+            words.append(_text([*measured[row].tolist(), *information[row].tolist()]))
+            yield int(table.label.values[row]), int(table.id.values[row]), " ".join(words)
+
+
+def _text(numbers: Sequence[float]) -> str:
+    return " ".join(repr(float(n)) for n in numbers)

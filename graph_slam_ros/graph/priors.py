@@ -1,0 +1,127 @@
+"""Edge types on one pose alone: what a receiver, a compass or an inertial sensor says of it in the map's axes.
+
+A fix that knows some axes only, or some better than others in correlated ways, is said by coordinates along the
+principal axes of its covariance: each of them is one number.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph.edge_type import EdgeType
+from graph_slam_ros.graph.vertices import SE2, SE3
+from graph_slam_ros.lie import se2, so3
+from graph_slam_ros.lie.jit import kernel
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@kernel
+def _position(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+    """``r = t - z``."""
+    n = at.shape[0]
+    residual, jacobian = np.zeros((n, 2)), np.zeros((n, 2, 3))
+    for e in range(n):
+        i = at[e, 0]
+        residual[e, 0], residual[e, 1] = x[i] - measured[e, 0], x[i + 1] - measured[e, 1]
+        c, s = np.cos(x[i + 2]), np.sin(x[i + 2])
+        jacobian[e, 0, 0], jacobian[e, 0, 1] = c, -s
+        jacobian[e, 1, 0], jacobian[e, 1, 1] = s, c
+    return residual, jacobian
+
+
+@kernel
+def _coordinate(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+    """``r = u't - z`` with measured = (u, z): one coordinate, along a direction u of unit length."""
+    n = at.shape[0]
+    residual, jacobian = np.zeros((n, 1)), np.zeros((n, 1, 3))
+    for e in range(n):
+        i = at[e, 0]
+        u, v = measured[e, 0], measured[e, 1]
+        residual[e, 0] = u * x[i] + v * x[i + 1] - measured[e, 2]
+        c, s = np.cos(x[i + 2]), np.sin(x[i + 2])
+        jacobian[e, 0, 0], jacobian[e, 0, 1] = c * u + s * v, c * v - s * u
+    return residual, jacobian
+
+
+@kernel
+def _heading(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+    """``r = theta - z``."""
+    n = at.shape[0]
+    residual, jacobian = np.zeros((n, 1)), np.zeros((n, 1, 3))
+    for e in range(n):
+        residual[e, 0] = se2.wrap(x[at[e, 0] + 2] - measured[e, 0])
+        jacobian[e, 0, 2] = 1.0
+    return residual, jacobian
+
+
+@kernel
+def _position_3d(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+    """``r = t - z``."""
+    n = at.shape[0]
+    residual, jacobian = np.zeros((n, 3)), np.zeros((n, 3, 6))
+    for e in range(n):
+        i = at[e, 0]
+        turn = so3.matrix((x[i + 3], x[i + 4], x[i + 5], x[i + 6]))
+        for k in range(3):
+            residual[e, k] = x[i + k] - measured[e, k]
+            for c in range(3):
+                jacobian[e, k, c] = turn[k, c]
+    return residual, jacobian
+
+
+@kernel
+def _coordinate_3d(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+    """``r = u't - z`` with measured = (u, z): one coordinate, along a direction u of unit length."""
+    n = at.shape[0]
+    residual, jacobian = np.zeros((n, 1)), np.zeros((n, 1, 6))
+    for e in range(n):
+        i = at[e, 0]
+        u = (measured[e, 0], measured[e, 1], measured[e, 2])
+        residual[e, 0] = u[0] * x[i] + u[1] * x[i + 1] + u[2] * x[i + 2] - measured[e, 3]
+        back = so3.act(so3.inverse((x[i + 3], x[i + 4], x[i + 5], x[i + 6])), u)
+        jacobian[e, 0, 0], jacobian[e, 0, 1], jacobian[e, 0, 2] = back
+    return residual, jacobian
+
+
+@kernel
+def _attitude_3d(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+    """``r = Log(Z^-1 R)``: the rotation vector from the measured orientation to the pose's, in the body's axes."""
+    n = at.shape[0]
+    residual, jacobian = np.zeros((n, 3)), np.zeros((n, 3, 6))
+    for e in range(n):
+        i = at[e, 0]
+        z = (measured[e, 0], measured[e, 1], measured[e, 2], measured[e, 3])
+        w = so3.log(so3.compose(so3.inverse(z), (x[i + 3], x[i + 4], x[i + 5], x[i + 6])))
+        residual[e, 0], residual[e, 1], residual[e, 2] = w
+        for c in range(3):
+            axis = (1.0 if c == 0 else 0.0, 1.0 if c == 1 else 0.0, 1.0 if c == 2 else 0.0)
+            d = so3.right_jacobian_inverse(w, axis)
+            jacobian[e, 0, 3 + c], jacobian[e, 1, 3 + c], jacobian[e, 2, 3 + c] = d
+    return residual, jacobian
+
+
+@kernel
+def _heading_3d(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
+    """``r = yaw - z``: the angle from the map's x to the body's x, both seen from above."""
+    n = at.shape[0]
+    residual, jacobian = np.zeros((n, 1)), np.zeros((n, 1, 6))
+    for e in range(n):
+        i = at[e, 0]
+        turn = so3.matrix((x[i + 3], x[i + 4], x[i + 5], x[i + 6]))
+        a, b = turn[0, 0], turn[1, 0]
+        residual[e, 0] = se2.wrap(np.arctan2(b, a) - measured[e, 0])
+        square = max(a * a + b * b, 1e-18)  # 0 where the body points straight up: then there is no heading
+        for k in range(2):  # turning about the body's y moves its x along -z, about its z along y
+            da, db = (-turn[0, 2], -turn[1, 2]) if k == 0 else (turn[0, 1], turn[1, 1])
+            jacobian[e, 0, 4 + k] = (a * db - b * da) / square
+    return residual, jacobian
+
+
+POSITION_PRIOR = EdgeType("position prior", ((SE2,),), 2, 2, _position)
+COORDINATE_PRIOR = EdgeType("coordinate prior", ((SE2,),), 3, 1, _coordinate)
+HEADING_PRIOR = EdgeType("heading prior", ((SE2,),), 1, 1, _heading)
+POSITION_PRIOR_3D = EdgeType("position prior 3D", ((SE3,),), 3, 3, _position_3d)
+COORDINATE_PRIOR_3D = EdgeType("coordinate prior 3D", ((SE3,),), 4, 1, _coordinate_3d)
+ATTITUDE_PRIOR_3D = EdgeType("attitude prior 3D", ((SE3,),), 4, 3, _attitude_3d)
+HEADING_PRIOR_3D = EdgeType("heading prior 3D", ((SE3,),), 1, 1, _heading_3d)
