@@ -50,6 +50,7 @@ def warmup() -> float:
     solver.update()
     solver.marginal([0])
     solver.joint_marginal([0, 1])
+    solver.compact()
     solver.estimate([0])
     solver.add([], [edges.stop])
     solver.update()

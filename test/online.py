@@ -82,7 +82,9 @@ def check_tree(solver, *, regions_separate=False):
     for c in in_use:
         assert set(_listed(clique[c, t.CHILD], clique[:, t.SIBLING], len(in_use), "list of children")) == children[c]
     vacant = [_listed(first, clique[:, t.SIBLING], state[t.CLIQUES], "list of vacant cliques") for first in tree.vacant]
-    assert not in_use & {c for group in vacant for c in group}
+    free_records = _listed(state[t.FREE_CLIQUE], clique[:, t.SIBLING], state[t.CLIQUES], "list of free records")
+    assert sorted([*in_use, *(c for group in vacant for c in group), *free_records]) == list(range(state[t.CLIQUES]))
+    _check_memory(tree, in_use, [c for group in vacant for c in group])
     for e in np.flatnonzero(tree.edge[:, t.ACTIVE] == 1):
         ends = tree.edge[e, t.END : t.END + tree.edge[e, t.COUNT]]
         ends = [int(v) for v in ends if vertex[v, t.FREE] == 1]
@@ -92,6 +94,21 @@ def check_tree(solver, *, regions_separate=False):
             assert set(ends) <= set(members[int(vertex[owner, t.CLIQUE])])
     assert (vertex[: solver._vertices, t.LOCAL] == t.NOTHING).all()
     _check_regions(solver, free, separate=regions_separate)
+
+
+def _check_memory(tree, in_use, vacant):
+    """No two cliques share memory, and each has as much as its class says."""
+    clique, state = tree.clique, tree.state
+    held = np.array(sorted([*in_use, *vacant]), dtype=np.int64)
+    members = t.CAPACITIES[clique[held, t.CLASS]]
+    assert (clique[held, t.FULL_DOF] <= members).all()
+    for column, sizes, top in ((t.MEMBERS, members, t.MEMBERS_TOP), (t.FRONT, members * (members + 1), t.FRONTS_TOP)):
+        order = np.argsort(clique[held, column])
+        begin, end = clique[held, column][order], clique[held, column][order] + sizes[order]
+        assert (end[:-1] <= begin[1:]).all()
+        assert end.max(initial=0) <= state[top]
+    live = t.CAPACITIES[clique[sorted(in_use), t.CLASS]] if in_use else np.empty(0, dtype=np.int64)
+    assert state[t.LIVE] == (live * (live + 1)).sum()
 
 
 def _check_regions(solver, free, *, separate):

@@ -8,7 +8,7 @@ from graph_slam_ros.graph import POSE_PRIOR, RELATIVE_POSE, SE2, Gaussian, Graph
 from graph_slam_ros.simulation import city_graph
 from graph_slam_ros.solver import Settings, Solver
 from graph_slam_ros.solver.separator import HEAVIEST, separate
-from graph_slam_ros.solver.tree import CLIQUE, FULL_DOF, NOTHING, PARENT
+from graph_slam_ros.solver.tree import CLIQUE, FRONTS_TOP, FULL_DOF, LIVE, NOTHING, PARENT
 
 
 def arrays(n, pairs, weight=None):
@@ -165,3 +165,23 @@ def shape(solver):
         return count
 
     return max(map(depth, cliques)), max(int(clique[c, FULL_DOF]) for c in cliques)
+
+
+def test_moving_cliques_together_in_memory_changes_nothing_else():
+    graph, _ = city_graph(3, poses=300)
+    ends = np.concatenate([table.vertices.values.max(axis=1) for table in graph.tables.values()])
+    ids = np.concatenate([table.id.values for table in graph.tables.values()])
+    solvers = Solver(graph), Solver(graph)
+    for pose in range(graph.vertex_count):
+        for solver in solvers:
+            solver.add([pose], ids[ends == pose])
+            if pose == 0:
+                solver.hold(0)
+            solver.update()
+        if pose % 10 == 9:
+            solvers[1].compact()
+            check_tree(solvers[1])
+            assert solvers[1]._tree.state[FRONTS_TOP] == solvers[1]._tree.state[LIVE]
+    everything = range(graph.vertex_count)
+    assert np.array_equal(solvers[0].estimate(everything), solvers[1].estimate(everything))
+    assert np.array_equal(solvers[0].joint_marginal([7, 250]), solvers[1].joint_marginal([7, 250]))

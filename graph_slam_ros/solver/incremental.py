@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.numeric import add_to_diagonal, back_substitute, eliminate, settle
 from graph_slam_ros.solver.ordering import key_of, move_tail, neighbourhood
-from graph_slam_ros.solver.symbolic import build, cliques_of, collect, mark, release, room_for, structure
+from graph_slam_ros.solver.symbolic import build, cliques_of, collect, compact, mark, release, room_for, structure
 from graph_slam_ros.solver.tree import (
     ACTIVE,
     AFFECTED,
@@ -20,6 +20,7 @@ from graph_slam_ros.solver.tree import (
     END,
     FLOPS,
     FREE,
+    FREE_CLIQUE,
     FREE_REGION,
     FRONT_DOF,
     FRONTS_TOP,
@@ -31,6 +32,7 @@ from graph_slam_ros.solver.tree import (
     LINK_EDGE,
     LINK_NEXT,
     LINKS,
+    LIVE,
     LOCAL,
     MEMBERS_TOP,
     MEMBERS_WANTED,
@@ -54,6 +56,7 @@ from graph_slam_ros.solver.tree import (
     with_room,
 )
 
+SPARSE = 1.2  # of the memory of fronts, as a multiple of those in use: then it is compacted, not lengthened
 FEW = 64  # new vertices whose anchorage is looked for; more are said to be loose, which is then looked into
 
 
@@ -183,7 +186,8 @@ def deactivate(t: Tree, edges: Index) -> None:
 def reset(t: Tree, unknowns: Index) -> None:
     """Forget order and cliques: all unknowns are new."""
     vertex, region, state = t.vertex, t.region, t.state
-    state[CLIQUES] = state[MEMBERS_TOP] = state[FRONTS_TOP] = 0
+    state[CLIQUES] = state[MEMBERS_TOP] = state[FRONTS_TOP] = state[LIVE] = 0
+    state[FREE_CLIQUE] = NOTHING
     state[REGIONS], state[FREE_REGION] = 1, NOTHING
     region[0, :] = NOTHING
     region[0, R_DEPTH] = region[0, R_COUNT] = region[0, R_MADE] = 0
@@ -280,6 +284,9 @@ def restructure(tree: Tree, touched: Index, new: Index) -> tuple[Tree, Index]:
         if done:
             return tree, out
         touched, state = out, tree.state
+        if state[FRONTS_TOP] > SPARSE * state[LIVE]:
+            compact(tree)
+            continue
         tree = with_room(tree, clique=state[CLIQUES_WANTED], members=state[MEMBERS_WANTED], fronts=state[FRONTS_WANTED])
 
 

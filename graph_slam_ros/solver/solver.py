@@ -13,6 +13,7 @@ from graph_slam_ros.solver.gauge import check_gauge
 from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, rows_of, store
 from graph_slam_ros.solver.numeric import settle
 from graph_slam_ros.solver.report import Change, Report
+from graph_slam_ros.solver.symbolic import compact
 from graph_slam_ros.solver.tree import (
     ACTIVE,
     AFFECTED,
@@ -290,6 +291,10 @@ class Solver:
                 at = [first[v] + d for v, d in zip(ends[slots][mine].tolist(), within[mine].tolist(), strict=True)]
                 out[np.ix_(at, at)] += jacobian[:, mine].T @ jacobian[:, mine]
         return out
+
+    def compact(self) -> None:
+        """Keep no more memory between what is in use than must be; done by itself before memory is asked for."""
+        compact(self._tree)
 
     # -- inside ------------------------------------------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from graph_slam_ros.solver.tree import (
     DOF,
     END,
     FREE,
+    FREE_CLIQUE,
     FRONT,
     FRONT_DOF,
     FRONTALS,
@@ -23,6 +24,7 @@ from graph_slam_ros.solver.tree import (
     LINK,
     LINK_EDGE,
     LINK_NEXT,
+    LIVE,
     LOCAL,
     MARK,
     MEMBERS,
@@ -264,7 +266,7 @@ def room_for(t: Tree, size: Index, leaving: Index) -> tuple[int, int, int]:
         more = max(wanted[k], 0)
         count += more
         members += more * CAPACITIES[k]
-        numbers += more * CAPACITIES[k] * (CAPACITIES[k] + 1)
+        numbers += more * numbers_of(k)
     return count, members, numbers
 
 
@@ -279,6 +281,7 @@ def release(t: Tree, cliques: Index) -> None:
         k = clique[c, CLASS]
         clique[c, SIBLING] = vacant[k]
         vacant[k] = c
+        t.state[LIVE] -= numbers_of(k)
 
 
 @kernel
@@ -286,18 +289,59 @@ def _take(t: Tree, size: int) -> int:
     clique, vacant, state = t.clique, t.vacant, t.state
     k = capacity_class(size)
     c = vacant[k]
+    state[LIVE] += numbers_of(k)
     if c != NOTHING:
         vacant[k] = clique[c, SIBLING]
         return c
-    c = state[CLIQUES]
-    state[CLIQUES] += 1
+    c = state[FREE_CLIQUE]
+    if c != NOTHING:
+        state[FREE_CLIQUE] = clique[c, SIBLING]
+    else:
+        c = state[CLIQUES]
+        state[CLIQUES] += 1
     clique[c, CLASS] = k
     clique[c, MARK] = 0
     clique[c, MEMBERS] = state[MEMBERS_TOP]
     clique[c, FRONT] = state[FRONTS_TOP]
     state[MEMBERS_TOP] += CAPACITIES[k]
-    state[FRONTS_TOP] += CAPACITIES[k] * (CAPACITIES[k] + 1)
+    state[FRONTS_TOP] += numbers_of(k)
     return c
+
+
+@kernel
+def numbers_of(size_class: int) -> int:
+    """The numbers of a front."""
+    return CAPACITIES[size_class] * (CAPACITIES[size_class] + 1)
+
+
+@kernel
+def compact(t: Tree) -> None:
+    """Move all cliques together in memory; those that are vacant keep none."""
+    clique, vacant, members, fronts, state = t.clique, t.vacant, t.members, t.fronts, t.state
+    live = np.ones(state[CLIQUES], np.bool_)
+    c = state[FREE_CLIQUE]
+    while c != NOTHING:
+        live[c] = False
+        c = clique[c, SIBLING]
+    for k in range(len(vacant)):
+        while vacant[k] != NOTHING:
+            c = vacant[k]
+            vacant[k] = clique[c, SIBLING]
+            live[c] = False
+            clique[c, SIBLING] = state[FREE_CLIQUE]
+            state[FREE_CLIQUE] = c
+    member = front = 0
+    for c in np.argsort(clique[: state[CLIQUES], FRONT]):  # each goes down, so none is written over before it has moved
+        if live[c]:
+            k = clique[c, CLASS]
+            for i in range(CAPACITIES[k]):
+                members[member + i] = members[clique[c, MEMBERS] + i]
+            for i in range(numbers_of(k)):
+                fronts[front + i] = fronts[clique[c, FRONT] + i]
+            clique[c, MEMBERS], clique[c, FRONT] = member, front
+            member += CAPACITIES[k]
+            front += numbers_of(k)
+    state[MEMBERS_TOP], state[FRONTS_TOP] = member, front
 
 
 @kernel

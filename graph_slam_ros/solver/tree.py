@@ -61,11 +61,13 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
     FLOPS_SEEN,
     RESTRUCTURED_SEEN,
     FLOPS_USUAL,
+    FREE_CLIQUE,
+    LIVE,
     CLIQUES_WANTED,
     MEMBERS_WANTED,
     FRONTS_WANTED,
     STATE_COLUMNS,
-) = range(20)
+) = range(22)
 
 VECTOR, SE2_KIND, SE3_KIND = range(3)
 
@@ -116,7 +118,7 @@ def empty_tree() -> Tree:
     region = np.full((16, REGION_COLUMNS), NOTHING, dtype=np.int64)
     region[0] = [NOTHING, 0, NOTHING, NOTHING, 0, 0, NOTHING]
     state = np.zeros(STATE_COLUMNS, dtype=np.int64)
-    state[REGIONS], state[FREE_REGION], state[TAIL_KEPT] = 1, NOTHING, TAIL_LEAST
+    state[REGIONS], state[FREE_REGION], state[TAIL_KEPT], state[FREE_CLIQUE] = 1, NOTHING, TAIL_LEAST, NOTHING
     return Tree(
         vertex=np.zeros((0, VERTEX_COLUMNS), dtype=np.int64),
         edge=np.zeros((0, EDGE_COLUMNS), dtype=np.int64),
@@ -147,7 +149,7 @@ def longer(array: NDArray[Any], count: int) -> NDArray[Any]:
     """The array with so many rows at least, and room for more to come; those added are zero."""
     if count <= len(array):
         return array
-    shape = (max(count, len(array) + len(array) // 4, 64), *array.shape[1:])
+    shape = (max(count, len(array) + len(array) // 8, 64), *array.shape[1:])
     if getrefcount(array) <= _REFERENCES:  # no view of it: the system need not copy it, nor hand out its memory anew
         array.resize(shape, refcheck=False)
         return array
