@@ -50,7 +50,7 @@ def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = N
     Parameters
     ----------
     init : where to start: ``file`` (initial values as they are; the tree where a file has none), ``tree`` (poses
-        composed along a spanning tree) or ``chordal``
+        composed along a spanning tree), ``chordal``, or ``online`` (pose after pose, in order of id)
 
     Raises
     ------
@@ -72,7 +72,8 @@ def started(file: G2oFile, init: str) -> tuple[Solver, str]:
     """A solver with initial values, and where they are from: edges alone leave nothing but their tree."""
     start = init if file.has_values or init != "file" else "tree"
     solver = Solver(file.graph)
-    solver.start_at(initial_values(file.graph, start, _root(file)))
+    in_time = sorted(range(file.graph.vertex_count), key=lambda vertex: file.ids[vertex])
+    solver.start_at(initial_values(file.graph, start, _root(file), in_time))
     return solver, start
 
 

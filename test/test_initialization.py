@@ -1,4 +1,4 @@
-"""Starts that do not need the file's values: spanning tree and chordal, in the plane and in space."""
+"""Starts that do not need the file's values: spanning tree, chordal, online, in the plane and in space."""
 
 import functools
 import os
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graph_slam_ros.batch import optimize
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import LANDMARK_POSITION, R2, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Gaussian, Graph
@@ -39,7 +40,7 @@ def exact_graph(seed, kind, edge, group, dof):
     return graph, np.array(truth)
 
 
-@pytest.mark.parametrize("method", ["tree", "chordal"])
+@pytest.mark.parametrize("method", ["tree", "chordal", "online"])
 @pytest.mark.parametrize(
     ("kind", "edge", "group", "dof"), [(SE2, RELATIVE_POSE, se2, 3), (SE3, RELATIVE_POSE_3D, se3, 6)], ids=["2D", "3D"]
 )
@@ -80,7 +81,7 @@ def test_a_city_with_bad_odometry_reaches_one_optimum_from_either_start(factor):
     assert tree.chi2_final < 1.2 * (3 * graph.edge_count - 3 * graph.vertex_count)  # about its degrees of freedom
 
 
-@pytest.mark.parametrize("start", ["tree", "chordal"])
+@pytest.mark.parametrize("start", ["tree", "chordal", "online"])
 @pytest.mark.parametrize("factor", [2.0, 5.0, 10.0])
 def test_a_city_with_bad_odometry_comes_to_what_online_updates_come_to(factor, start):
     graph, _ = city_graph(seed=1, poses=1500, blocks=20, odometry_noise_factor=factor)
@@ -110,3 +111,31 @@ def test_public_graphs_reach_their_optimum_from_a_chordal_start(name, optimum):
     assert solved(read_g2o(GRAPHS / f"{name}.g2o", raw=True).graph, "chordal").chi2_final == pytest.approx(
         optimum, 1e-6
     )
+
+
+@pytest.mark.skipif(not GRAPHS.exists(), reason=f"no public graphs under {GRAPHS}")
+def test_a_graph_of_landmarks_that_no_other_start_solves_is_driven_through():
+    solution = optimize(GRAPHS / "victoria_park.txt", Settings(max_iterations=50), init="online")
+    assert solution.report.converged
+    assert solution.report.chi2_final == pytest.approx(6184.12, rel=1e-5)
+
+
+def test_a_pose_that_nothing_joins_to_an_earlier_one_is_named():
+    graph, _ = exact_graph(5, SE2, RELATIVE_POSE, se2, 3)
+    with pytest.raises(GraphSlamError, match="joins vertex 3 to an earlier one"):
+        initial_values(graph, "online", 0, [0, 3, 1, 2, *range(4, 12)])
+
+
+def test_a_vertex_is_placed_only_before_it_is_in_the_problem():
+    graph, _ = exact_graph(5, SE2, RELATIVE_POSE, se2, 3)
+    solver = Solver(graph)
+    solver.place(3, [1.0, 2.0, 0.5])
+    assert solver.estimate([3])[0].tolist() == [1.0, 2.0, 0.5]
+    for value in ([1.0, 2.0], [1.0, np.nan, 0.0]):
+        with pytest.raises(GraphSlamError, match="vertex 3: expected 3 finite numbers"):
+            solver.place(3, value)
+    solver.add([3], [])
+    with pytest.raises(GraphSlamError, match="vertex 3 is in the problem"):
+        solver.place(3, [1.0, 2.0, 0.5])
+    with pytest.raises(GraphSlamError, match="vertex 99 does not exist"):
+        solver.place(99, [1.0, 2.0, 0.5])

@@ -177,7 +177,12 @@ def test_the_text_shows_cost_and_chi2_side_by_side_where_a_loss_makes_them_two(r
 
 
 def test_the_start_is_told(run, graph):
-    for init, words in (("file", "the file"), ("tree", "the spanning tree"), ("chordal", "the chordal relaxation")):
+    for init, words in (
+        ("file", "the file"),
+        ("tree", "the spanning tree"),
+        ("chordal", "the chordal relaxation"),
+        ("online", "the drive"),
+    ):
         assert run(graph, "--init", init)[1].splitlines()[0].endswith(f"   from {words}")
         assert answer_of(run, graph, "--init", init)["start"] == init
 

@@ -14,7 +14,12 @@ if TYPE_CHECKING:
     from graph_slam_ros.graph import Graph, Loss
     from graph_slam_ros.solver import Report, Solver
 
-_START = {"file": "the file", "tree": "the spanning tree", "chordal": "the chordal relaxation"}
+_START = {
+    "file": "the file",
+    "tree": "the spanning tree",
+    "chordal": "the chordal relaxation",
+    "online": "the drive, pose after pose",
+}
 _NO_VALUES = "the file has no vertex lines"
 
 

@@ -103,9 +103,9 @@ def _optimize(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument(
         "--init",
-        choices=("file", "tree", "chordal"),
+        choices=("file", "tree", "chordal", "online"),
         default="file",
-        help="where to start (file; tree without vertices)",
+        help="where to start (file; tree without vertices); online: pose after pose, for what no other start solves",
     )
     sub.add_argument("--error-map", choices=("relative", "seed"), default="relative", help="seed: of the inverse")
     _add_reading(sub)

@@ -1,6 +1,7 @@
 """Where to start: initial values from the edges alone, for graphs without values or with a bad start.
 
 * ``tree``: poses composed along a breadth-first spanning tree of the relative poses.
+* ``online``: pose after pose, in order of time (``replayed_start``).
 * ``chordal``: rotations from a linear least-squares problem in their matrices, brought back to rotations, then
   positions from a second one. L. Carlone, R. Tron, K. Daniilidis, F. Dellaert, "Initialization techniques for 3D SLAM:
   a survey on rotation estimation and its use in pose graph optimization", ICRA 2015.
@@ -9,7 +10,7 @@ Point landmarks are placed by their first sighting.
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +32,12 @@ from graph_slam_ros.graph import (
     VertexKind,
 )
 from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.solver.replayed_start import replayed_values
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-INITS = ("file", "tree", "chordal")
+INITS = ("file", "tree", "chordal", "online")
 
 _RELATIVE: dict[VertexKind, tuple[EdgeType, ...]] = {
     SE2: (RELATIVE_POSE, INVERSE_RELATIVE_POSE),
@@ -45,13 +47,14 @@ _SIGHTING = {SE2: LANDMARK_POSITION, SE3: LANDMARK_POSITION_3D}
 _GROUP = {SE2: se2, SE3: se3}
 
 
-def initial_values(graph: Graph, method: str, root: int) -> Array:
+def initial_values(graph: Graph, method: str, root: int, in_time: Sequence[int] | None = None) -> Array:
     """Stored numbers of all vertices, as ``Graph.initial``.
 
     Parameters
     ----------
-    method : ``file`` (as they are), ``tree`` or ``chordal``
+    method : ``file`` (as they are), ``tree``, ``chordal`` or ``online``
     root : the pose that keeps its value
+    in_time : all vertices in order of time, for ``online``; without, in order of id
 
     Raises
     ------
@@ -67,6 +70,10 @@ def initial_values(graph: Graph, method: str, root: int) -> Array:
     if kind not in _GROUP:
         raise GraphSlamError(f"init {method}: vertex {root} is {kind.name}, not a pose")
     poses = np.flatnonzero(graph.kind.values == graph.kinds.index(kind))
+    if method == "online":
+        of_kind = set(poses.tolist())
+        others = [v for v in (range(graph.vertex_count) if in_time is None else in_time) if v in of_kind and v != root]
+        return replayed_values(graph, values, [root, *others], _RELATIVE[kind], _SIGHTING[kind])
     ends, measured = _relative_edges(graph, kind)
     _along_tree(graph, values, kind, root, poses, ends, measured)
     if method == "chordal":

@@ -102,6 +102,18 @@ class Solver:
         self._set_estimate(values)
         self._broken = True
 
+    def place(self, vertex: int, value: ArrayLike) -> None:
+        """Begin with another value than the graph's initial one for a vertex that is not in the problem yet."""
+        self._grow()
+        _known([vertex], self._vertices, "vertex")
+        if self._inside[vertex]:
+            raise GraphSlamError(f"vertex {vertex} is in the problem: it has an estimate")
+        numbers, at = np.asarray(value, dtype=float), int(self.graph.offset.values[vertex])
+        size = self.graph.kind_of(vertex).size
+        if numbers.shape != (size,) or not np.isfinite(numbers).all():
+            raise GraphSlamError(f"vertex {vertex}: expected {size} finite numbers, got {numbers.tolist()}")
+        self._tree.value[at : at + size] = self._tree.estimate[at : at + size] = numbers
+
     def set_weight(self, edge: int, weight: float) -> None:
         """Multiply the information of an edge; 0 takes it out of the structure, another value puts it back."""
         if not (np.isfinite(weight) and weight >= 0.0):

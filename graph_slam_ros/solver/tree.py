@@ -149,7 +149,7 @@ def longer(array: NDArray[Any], count: int) -> NDArray[Any]:
     """The array with so many rows at least, and room for more to come; those added are zero."""
     if count <= len(array):
         return array
-    shape = (max(count, len(array) + len(array) // 8, 64), *array.shape[1:])
+    shape = (max(count, len(array) + len(array) // 16, 64), *array.shape[1:])
     if getrefcount(array) <= _REFERENCES:  # no view of it: the system need not copy it, nor hand out its memory anew
         array.resize(shape, refcheck=False)
         return array
