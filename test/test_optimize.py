@@ -181,7 +181,7 @@ def test_the_start_is_told(run, graph):
         ("file", "the file"),
         ("tree", "the spanning tree"),
         ("chordal", "the chordal relaxation"),
-        ("online", "the drive"),
+        ("online", "the drive, pose after pose"),
     ):
         assert run(graph, "--init", init)[1].splitlines()[0].endswith(f"   from {words}")
         assert answer_of(run, graph, "--init", init)["start"] == init
