@@ -32,11 +32,11 @@ def seen(t_s, *sightings, topic="/landmarks"):
 
 
 def point(name="a", at=(2.0, 1.0), covariance=POINT):
-    return Sighting(name, at, covariance)
+    return Sighting(name, "position", at, covariance)
 
 
 def tag(name="a", at=(2.0, 1.0, 0.5), covariance=POSE):
-    return Sighting(name, at, covariance)
+    return Sighting(name, "pose", at, covariance)
 
 
 def slam(sink=None, **sections):

@@ -18,7 +18,7 @@ def odometry(ms, x=0.0):
 
 
 def seen(ms, topic="/landmarks", name="a"):
-    return Sightings(T0 + ms * MS, topic, (Sighting(name, (1.0, 0.0), (1.0, 0.0, 0.0, 1.0)),))
+    return Sightings(T0 + ms * MS, topic, (Sighting(name, "position", (1.0, 0.0), (1.0, 0.0, 0.0, 1.0)),))
 
 
 def order(window_s=0.05, max_waiting=1000):

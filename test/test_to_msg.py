@@ -106,8 +106,8 @@ def solved():
     for k in range(8):
         stamp = STAMP_NS + k * 10**9
         slam.process(Odometry(stamp, (0.5 * k, 0.0, 0.1 * k)))
-        tag = Sighting("tag", (1.0, 0.2, 0.3), tuple(0.01 * np.eye(3).ravel()))
-        point = Sighting("point", (2.0, -0.1 * k), (0.01, 0.0, 0.0, 0.01))
+        tag = Sighting("tag", "pose", (1.0, 0.2, 0.3), tuple(0.01 * np.eye(3).ravel()))
+        point = Sighting("point", "position", (2.0, -0.1 * k), (0.01, 0.0, 0.0, 0.01))
         slam.process(Sightings(stamp, "/landmarks", (tag, point)))
     for event in ("flush", "optimize"):
         slam.process(Control(event))

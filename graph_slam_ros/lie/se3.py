@@ -7,9 +7,12 @@ A pose is a tuple (x, y, z, qx, qy, qz, qw), metres and a unit quaternion; a com
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graph_slam_ros.lie import so3
-from graph_slam_ros.lie.jit import jitable
+from graph_slam_ros.lie.jit import jitable, kernel
+
+Array = NDArray[np.float64]
 
 Pose: TypeAlias = tuple[Any, Any, Any, Any, Any, Any, Any]
 Tangent: TypeAlias = tuple[Any, Any, Any, Any, Any, Any]
@@ -116,6 +119,64 @@ def retract(a: Pose, d: Tangent) -> Pose:
 def local(a: Pose, b: Pose) -> Tangent:
     """``a [-] b = Log(b^-1 a)``."""
     return log(between(b, a))
+
+
+def interpolate(a: Pose, b: Pose, fraction: float) -> Pose:
+    """Pose on the geodesic from a (fraction 0) to b (fraction 1)."""
+    v = local(b, a)
+    return retract(
+        a, (fraction * v[0], fraction * v[1], fraction * v[2], fraction * v[3], fraction * v[4], fraction * v[5])
+    )
+
+
+@jitable
+def adjoint(a: Pose) -> Array:
+    """Adjoint matrix (6, 6) of one pose, eq. (175): ``a Exp(d) = Exp(Ad d) a``."""
+    turn = so3.matrix(rotation(a))
+    out = np.zeros((6, 6))
+    out[:3, :3] = turn
+    out[:3, 3:] = so3.hat(position(a)) @ turn
+    out[3:, 3:] = turn
+    return out
+
+
+@jitable
+def right_jacobian(d: Tangent) -> Array:
+    """``Exp(d + e) = Exp(d) Exp(J e)`` to first order in e; (6, 6) of one vector.
+
+    The series ``sum_k (-ad d)^k / (k + 1)!``, to the last digit: at most 30 terms for rotations up to pi.
+    """
+    lie = np.zeros((6, 6))
+    lie[:3, :3] = so3.hat((d[3], d[4], d[5]))
+    lie[:3, 3:] = so3.hat((d[0], d[1], d[2]))
+    lie[3:, 3:] = lie[:3, :3]
+    term, out = np.eye(6), np.eye(6)
+    for k in range(2, 40):
+        term = term @ lie * (-1.0 / k)
+        out += term
+        if np.abs(term).max() < 1e-17:
+            break
+    return out
+
+
+@kernel
+def noise_during(step: Pose, covariance: Array) -> Array:
+    """Noise (6, 6) of velocities that acted all through a step, in the tangent space at its end; see ``se2``."""
+    j = right_jacobian(log(step))
+    return j @ covariance @ j.T
+
+
+@kernel
+def propagate(covariance: Array, step: Pose, added: Array) -> Array:
+    """Covariance (6, 6) of a motion lengthened by one step; see ``se2``."""
+    a = adjoint(inverse(step))
+    return a @ covariance @ a.T + added
+
+
+@kernel
+def propagate_during(covariance: Array, step: Pose, of_twist: Array) -> Array:
+    """As ``propagate``, for noise that acted all through the step (``noise_during``)."""
+    return propagate(covariance, step, noise_during(step, of_twist))
 
 
 @jitable

@@ -161,10 +161,10 @@ class Border:
         yaw = self._known_heading(topic, seen.orientation, turn, full)
         if yaw is None:
             covariance = self._landmark_covariance(topic, full[:2, :2])
-            return Sighting(name, (x, y), tuple(covariance.ravel().tolist()))
+            return Sighting(name, "position", (x, y), tuple(covariance.ravel().tolist()))
         into = se2.adjoint((0.0, 0.0, -yaw))  # from the base's axes to the landmark's
         covariance = into @ self._landmark_covariance(topic, full[_PLANAR]) @ into.T
-        return Sighting(name, (x, y, yaw), tuple(covariance.ravel().tolist()))
+        return Sighting(name, "pose", (x, y, yaw), tuple(covariance.ravel().tolist()))
 
     def _identity(self, detection: Any) -> str:
         if self._config.landmarks.id_from == "class_id":
@@ -320,7 +320,7 @@ def _planar(T: Array) -> se2.Pose:
 
 def _merge(a: Sighting, b: Sighting) -> Sighting | None:
     """Information-weighted mean of two sightings that agree, else None."""
-    if len(a.measured) != len(b.measured):
+    if a.kind != b.kind:
         return None
     m = len(a.measured)
     difference = np.subtract(b.measured, a.measured)
@@ -335,4 +335,4 @@ def _merge(a: Sighting, b: Sighting) -> Sighting | None:
     step = gain @ difference
     at = np.add(a.measured, step).tolist() if m == 2 else se2.retract(a.measured, tuple(step.tolist()))
     merged = cov_a - gain @ cov_a
-    return Sighting(a.id, tuple(map(float, at)), tuple((0.5 * (merged + merged.T)).ravel().tolist()))
+    return Sighting(a.id, a.kind, tuple(map(float, at)), tuple((0.5 * (merged + merged.T)).ravel().tolist()))

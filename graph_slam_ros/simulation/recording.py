@@ -70,7 +70,8 @@ def measurements(recording: Recording) -> Iterator[Odometry | Sightings]:
 
 def _sightings(seen: Seen) -> Sightings:
     rows = zip(seen.ids, seen.measured.tolist(), seen.covariance, strict=True)
-    found = [Sighting(name, tuple(z), tuple(_in_tangent(z, c).ravel().tolist())) for name, z, c in rows]
+    kind = "position" if seen.measured.shape[1] == 2 else "pose"
+    found = [Sighting(name, kind, tuple(z), tuple(_in_tangent(z, c).ravel().tolist())) for name, z, c in rows]
     return Sightings(seen.stamp_ns, LANDMARKS_TOPIC, tuple(found))
 
 

@@ -3,12 +3,14 @@
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.graph_slam import GraphSlam, Keyframe, Landmark, Update
-from graph_slam_ros.slam.measurements import Control, Measurement, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.measurements import Closure, Control, Fix, Measurement, Odometry, Sighting, Sightings
 
 __all__ = [
+    "Closure",
     "Config",
     "Control",
     "Counters",
+    "Fix",
     "GraphSlam",
     "Keyframe",
     "Landmark",

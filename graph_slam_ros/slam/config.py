@@ -13,6 +13,7 @@ from typing import Any
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import Loss
+from graph_slam_ros.slam.space import PLANE, SPACE, Space
 from graph_slam_ros.solver import METHODS, Settings
 
 
@@ -75,6 +76,13 @@ class FramesConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class WorldConfig:
+    """Where the robot moves."""
+
+    dimensions: int = _setting(2, "2: in a plane, of what is seen only that part is used; 3: in space", low=2, high=3)
+
+
+@dataclass(frozen=True, slots=True)
 class OdometryConfig:
     """Noise of the motion between keyframes."""
 
@@ -93,7 +101,11 @@ class OdometryConfig:
         low=1e-6,
         high=10.0,
     )
+    vertical_density: float = _setting(0.005, "random walk upwards, in space", "m/sqrt(s)", low=1e-6, high=10.0)
     rotation_density: float = _setting(0.05, "random walk of the heading", "rad/sqrt(s)", low=1e-6, high=10.0)
+    tilt_density: float = _setting(
+        0.02, "random walk of roll and of pitch, in space", "rad/sqrt(s)", low=1e-6, high=10.0
+    )
     twist_correlation_s: float = _setting(
         0.25,
         "how long the error of a velocity lasts: the noise of a step is covariance * dt * max(dt, this)",
@@ -251,6 +263,7 @@ class OutputConfig:
 class Config:
     """All parameters."""
 
+    world: WorldConfig = WorldConfig()
     frames: FramesConfig = FramesConfig()
     odometry: OdometryConfig = OdometryConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
@@ -285,6 +298,11 @@ class Config:
     def as_mapping(self) -> dict[str, dict[str, Any]]:
         """Nested plain values, every parameter named."""
         return dataclasses.asdict(self)
+
+    @property
+    def space(self) -> Space:
+        """The plane or space."""
+        return PLANE if self.world.dimensions == 2 else SPACE
 
     def solver_settings(self) -> Settings:
         """How the solver is to be run, online and at the end."""

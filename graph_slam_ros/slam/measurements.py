@@ -1,13 +1,15 @@
 """What can be handed to ``GraphSlam.process``: frozen values, checked at the border, exact in JSON.
 
-Covariances are flat, row-major, in tangent order (x, y, theta).
+A pose is (x, y, theta) in the plane and (x, y, z, qx, qy, qz, qw) in space. Covariances are flat, row-major, in tangent
+order: (x, y, theta), or (x, y, z, rotation vector). Nothing here tells which message it came from.
 """
 
 from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.lie import se2
+
+Numbers: TypeAlias = tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,27 +18,36 @@ class Odometry:
 
     Attributes
     ----------
-    twist_covariance : 9 numbers, (m/s, m/s, rad/s) in the base frame, or None where unknown
+    twist_covariance : 9 (36) numbers, (m/s, rad/s) in the base frame, or None where unknown
+    source : which odometry it is, where there are several; their priority is in the configuration
     """
 
     stamp_ns: int
-    T_odom_base: se2.Pose
-    twist_covariance: tuple[float, ...] | None = None
+    T_odom_base: Numbers
+    twist_covariance: Numbers | None = None
+    source: str = "odometry"
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A landmark with identity, seen from the base frame.
+    """A landmark, seen by a sensor of the robot.
 
     Attributes
     ----------
-    measured : (x, y) of a point, or (x, y, theta) where the landmark's orientation was seen too
-    covariance : 4 numbers in the axes of the base frame, or 9 in the tangent space of the measured pose
+    id : its identity; empty where the sensor does not know it
+    kind : what was measured
+    measured : by ``kind``: of ``position`` and ``pose``, the point or pose in the base frame; else in the sensor's:
+        of ``range_bearing`` (range, bearing) or (range, azimuth, elevation), of ``bearing`` the same without the range,
+        of ``range`` one number
+    covariance : of ``measured``: of a position in the axes of the base frame, of a pose in its tangent space
+    T_base_sensor : where the sensor is, for the kinds that are measured in its frame; None: at the base
     """
 
     id: str
-    measured: tuple[float, ...]
-    covariance: tuple[float, ...]
+    kind: str
+    measured: Numbers
+    covariance: Numbers
+    T_base_sensor: Numbers | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +60,45 @@ class Sightings:
 
 
 @dataclass(frozen=True, slots=True)
+class Fix:
+    """What is known of the robot in the map frame itself: a receiver's position, a compass, a pose from elsewhere.
+
+    Attributes
+    ----------
+    measured : by ``kind``: of ``pose``, T_map_base; of ``position``, the coordinates of ``point`` in map; of
+        ``heading``, one angle; of ``attitude``, the quaternion (x, y, z, w) of R_map_base, in space only
+    covariance : of ``measured``: of a position in the axes of map, where a variance of 1e6 m^2 or more says that an
+        axis is not known; of a pose or attitude in its tangent space
+    point : of ``position``, the antenna in the base frame; empty: its origin
+    """
+
+    stamp_ns: int
+    topic: str
+    kind: str
+    measured: Numbers
+    covariance: Numbers
+    point: Numbers = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """A loop closure: where the robot at one stamp was, seen from where it was at an earlier one.
+
+    Attributes
+    ----------
+    from_stamp_ns : the earlier (or later) stamp
+    T_from_base : the base at ``stamp_ns`` in the base at ``from_stamp_ns``
+    covariance : of that pose in its tangent space
+    """
+
+    stamp_ns: int
+    from_stamp_ns: int
+    topic: str
+    T_from_base: Numbers
+    covariance: Numbers
+
+
+@dataclass(frozen=True, slots=True)
 class Control:
     """An event that is not a measurement.
 
@@ -58,17 +108,19 @@ class Control:
     event: str
 
 
-Measurement: TypeAlias = Odometry | Sightings | Control
+Observation: TypeAlias = Sightings | Fix | Closure
+Measurement: TypeAlias = Odometry | Observation | Control
 
-_TYPES = {"odometry": Odometry, "sightings": Sightings, "control": Control}
+_TYPES = {"odometry": Odometry, "sightings": Sightings, "fix": Fix, "closure": Closure, "control": Control}
 _NAMES = {cls: name for name, cls in _TYPES.items()}
 
 
 def to_record(measurement: Measurement) -> dict[str, Any]:
     """Plain dictionary of a measurement; floats survive JSON exactly."""
     match measurement:
-        case Odometry(stamp_ns, pose, covariance):  # by hand: thousands a second
-            return {"type": "odometry", "stamp_ns": stamp_ns, "T_odom_base": pose, "twist_covariance": covariance}
+        case Odometry(stamp_ns, pose, covariance, source):  # by hand: thousands a second
+            out = {"type": "odometry", "stamp_ns": stamp_ns, "T_odom_base": pose, "twist_covariance": covariance}
+            return out | {"source": source}
         case _:
             return {"type": _NAMES[type(measurement)], **asdict(measurement)}
 
@@ -82,7 +134,7 @@ def from_record(record: dict[str, Any]) -> Measurement:
     try:
         if cls is Sightings:
             fields["sightings"] = tuple(Sighting(**_tuples(one)) for one in fields["sightings"])
-        return cls(**_tuples(fields))
+        return cls(**_tuples(fields))  # type: ignore[return-value]
     except (KeyError, TypeError) as error:
         raise FormatError(f"{record['type']}: {error}") from None
 

@@ -1,0 +1,116 @@
+"""The plane and space: what the pipeline needs to know of where the robot moves, to be written once for both."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros import graph
+from graph_slam_ros.graph import EdgeType, VertexKind
+from graph_slam_ros.lie import se2, se3, so3
+
+Array = NDArray[np.float64]
+Numbers = tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Space:
+    """A group of rigid motions with its vertices and edges.
+
+    Attributes
+    ----------
+    pose, point : kinds of vertices
+    group : ``lie.se2`` or ``lie.se3``
+    turn : rotation matrix of a pose
+    sightings, fixes : edge types by the kind of ``Sighting`` and ``Fix``
+    """
+
+    pose: VertexKind
+    point: VertexKind
+    group: Any
+    identity: Numbers
+    turn: Callable[[Numbers], Array]
+    relative_pose: EdgeType
+    pose_prior: EdgeType
+    tag_position: EdgeType
+    coordinate_prior: EdgeType
+    sightings: Mapping[str, EdgeType]
+    fixes: Mapping[str, EdgeType]
+
+    @property
+    def dimensions(self) -> int:
+        """2 or 3."""
+        return self.point.dof
+
+    @property
+    def dof(self) -> int:
+        """Of a pose: 3 or 6."""
+        return self.pose.dof
+
+    def in_parent_axes(self, pose: Numbers, covariance: Array) -> Array:
+        """Tangent-space covariance of a pose turned into the axes of its parent frame, as ROS publishes it."""
+        turn, n = np.eye(self.dof), self.dimensions
+        turn[:n, :n] = self.turn(pose)
+        if n == 3:
+            turn[3:, 3:] = turn[:3, :3]
+        return turn @ covariance @ turn.T
+
+    def in_tangent(self, pose: Numbers, covariance: Array) -> Array:
+        """Inverse of ``in_parent_axes``."""
+        return self.in_parent_axes(self.group.inverse(pose), covariance)
+
+
+def _turn_2d(pose: Numbers) -> Array:
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return np.array([[c, -s], [s, c]])
+
+
+def _turn_3d(pose: Numbers) -> Array:
+    return so3.matrix((pose[3], pose[4], pose[5], pose[6]))
+
+
+PLANE = Space(
+    graph.SE2,
+    graph.R2,
+    se2,
+    se2.IDENTITY,
+    _turn_2d,
+    graph.RELATIVE_POSE,
+    graph.POSE_PRIOR,
+    graph.TAG_POSITION,
+    graph.COORDINATE_PRIOR,
+    {
+        "position": graph.LANDMARK_POSITION,
+        "pose": graph.RELATIVE_POSE,
+        "range_bearing": graph.RANGE_BEARING,
+        "bearing": graph.BEARING,
+        "range": graph.RANGE,
+    },
+    {"pose": graph.POSE_PRIOR, "position": graph.POSITION_PRIOR, "heading": graph.HEADING_PRIOR},
+)
+SPACE = Space(
+    graph.SE3,
+    graph.R3,
+    se3,
+    se3.IDENTITY,
+    _turn_3d,
+    graph.RELATIVE_POSE_3D,
+    graph.POSE_PRIOR_3D,
+    graph.TAG_POSITION_3D,
+    graph.COORDINATE_PRIOR_3D,
+    {
+        "position": graph.LANDMARK_POSITION_3D,
+        "pose": graph.RELATIVE_POSE_3D,
+        "range_bearing": graph.RANGE_BEARING_3D,
+        "bearing": graph.BEARING_3D,
+        "range": graph.RANGE_3D,
+    },
+    {
+        "pose": graph.POSE_PRIOR_3D,
+        "position": graph.POSITION_PRIOR_3D,
+        "heading": graph.HEADING_PRIOR_3D,
+        "attitude": graph.ATTITUDE_PRIOR_3D,
+    },
+)
