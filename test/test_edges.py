@@ -46,10 +46,21 @@ def test_an_edge_type_is_what_the_solver_takes_it_for(edge):
     g.check_edge(edge, DRAWN[edge], tolerance=3e-7)
 
 
+@pytest.mark.parametrize("edge", [edge for edge in DRAWN if edge.tail], ids=lambda edge: edge.name)
+def test_so_it_is_with_a_sensor_anywhere_on_the_robot(edge):
+    def draw(rng):
+        size = len(edge.tail)
+        place = se3.exp(tuple(rng.standard_normal(6))) if size == 7 else rng.standard_normal(size)
+        head = DRAWN[edge](rng) if DRAWN[edge] else rng.standard_normal(edge.measured_size - size)
+        return [*head, *place]
+
+    g.check_edge(edge, draw, tolerance=3e-6)  # relative to derivatives that grow where a landmark is near the sensor
+
+
 def residual(edge, values, measured):
     x = np.concatenate([np.asarray(v, dtype=float) for v in values])
     at = np.cumsum([0, *(len(v) for v in values[:-1])])[None, :]
-    return edge.linearize(x, at, np.asarray(measured, dtype=float)[None, :])[0][0]
+    return edge.linearize(x, at, edge.whole([measured]))[0][0]
 
 
 UP = (*so3.exp((0.0, 0.0, np.pi / 2)),)  # a quarter turn to the left
@@ -69,6 +80,14 @@ NOSE_UP = (*so3.exp((0.0, -np.pi / 4, 0.0)),)
         (g.BEARING_3D, ([0, 0, 0, *UP], [-2, 0, 0]), [0.0, 0.0], [np.pi / 2, 0.0]),
         (g.RANGE_3D, ([1, 2, 0, *UP], [1, 5, 4]), [4.0], [1.0]),
         (g.RANGE_WITH_OFFSET_3D, ([1, 2, 0, *UP], [1, 5, 4], [-2.0]), [4.0], [-1.0]),
+        # and so it does by a sensor at its 1 ahead, 2 to its left, that looks to its left: 2 ahead, 2 to the right
+        (g.RANGE_BEARING, ([1, 2, np.pi / 2], [-3, 5]), [2, 0, 1, 2, np.pi / 2], [8**0.5 - 2, -np.pi / 4]),
+        (g.RANGE, ([1, 2, np.pi / 2], [-3, 5]), [2, 1, 2, 7], [8**0.5 - 2]),
+        (g.BEARING_3D, ([0, 0, 0, *UP], [-2, 0, 1]), [0, 0, 0, 0, 1, *UP], [0, 0]),
+        (g.POSITION_PRIOR, ([3, 4, np.pi / 2],), [1, 1, 10, 20], [-18, 13]),
+        (g.COORDINATE_PRIOR, ([3, 4, np.pi / 2],), [0, 1, 1, 10, 20], [13]),
+        (g.POSITION_PRIOR_3D, ([3, 4, 5, *UP],), [1, 1, 1, 10, 20, 30], [-18, 13, 34]),
+        (g.COORDINATE_PRIOR_3D, ([3, 4, 5, *UP],), [0, 1, 0, 1, 10, 20, 30], [13]),
         (g.POSITION_PRIOR, ([3, 4, 1],), [1, 1], [2, 3]),
         (g.COORDINATE_PRIOR, ([3, 4, 1],), [0.6, 0.8, 1], [4]),
         (g.HEADING_PRIOR, ([3, 4, 3.0],), [-3.0], [6 - 2 * np.pi]),

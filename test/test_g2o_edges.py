@@ -7,8 +7,16 @@ from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import EDGE_TAGS, G2oFile
-from graph_slam_ros.graph import LANDMARK_POSITION_3D, SE3, Gaussian, Graph
-from graph_slam_ros.lie import se3
+from graph_slam_ros.graph import (
+    ATTITUDE_PRIOR_3D,
+    LANDMARK_POSITION_3D,
+    POSE_PRIOR_3D,
+    RELATIVE_POSE_3D,
+    SE3,
+    Gaussian,
+    Graph,
+)
+from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.solver import Solver
 
 UPPER = "5 1 2 0 0 0 6 3 0 0 0 7 0 0 0 8 1 0 9 2 10"  # of an information matrix of six
@@ -34,8 +42,12 @@ def everything():
             at.append(graph.add_vertex(kinds[0], [*value[:3], 0, 0, 0, 1] if kinds[0] is SE3 else value))
         root = rng.standard_normal((edge.residual_size, edge.residual_size))
         measured = rng.standard_normal(edge.measured_size)
-        if edge.measured_size == 7:
+        if edge in (RELATIVE_POSE_3D, POSE_PRIOR_3D):
             measured = np.array(se3.exp(tuple(measured[:6])))
+        elif edge.tail == se3.IDENTITY:  # each other one with its sensor elsewhere
+            measured[-7:] = se3.exp(tuple(measured[-6:])) if "range" in edge.name else edge.tail
+        elif edge is ATTITUDE_PRIOR_3D:
+            measured = np.array(so3.exp(tuple(measured[:3])))
         noise = Gaussian.from_information(root @ root.T + np.eye(len(root)))
         graph.add_edge(edge, at, measured, noise, edge.name.replace(" ", "_"))
     return graph

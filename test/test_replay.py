@@ -1,5 +1,6 @@
 """Replay and the run folder: the same sequence gives the same bytes, and nothing is overwritten that is not a run."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -199,7 +200,7 @@ def test_a_landmarks_name_may_hold_anything(tmp_path, folder):
     for record in read_ingest(tmp_path / "run", []):
         m = from_record(record)
         if hasattr(m, "sightings"):
-            m = type(m)(m.stamp_ns, m.topic, tuple(type(s)(name + s.id, s.measured, s.covariance) for s in m.sightings))
+            m = type(m)(m.stamp_ns, m.topic, tuple(dataclasses.replace(s, id=name + s.id) for s in m.sightings))
         slam.process(m)
     recorder.save(slam)
     import csv

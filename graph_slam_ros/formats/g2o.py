@@ -21,9 +21,12 @@ from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, i
 from graph_slam_ros.formats.graph_file import AT_OFFSET, EDGE_TAGS, HALVED, OFFSET, VERTEX_TAGS, Array, G2oFile, moved
 from graph_slam_ros.formats.strict import expect, integer, lines, numbers
 from graph_slam_ros.graph import (
+    ATTITUDE_PRIOR_3D,
     INVERSE_RELATIVE_POSE,
     LANDMARK_POSITION_3D,
+    POSE_PRIOR_3D,
     RELATIVE_POSE,
+    RELATIVE_POSE_3D,
     SE2,
     SE3,
     EdgeType,
@@ -95,25 +98,28 @@ class _Reader:
     def _vertex(self, tag: str, words: list[str]) -> None:
         kind = VERTEX_TAGS[tag]
         expect(words, 1 + kind.size)
-        vertex, value = integer(words[1]), _with_unit_quaternion(numbers(words[2:]), kind.size)
+        vertex, value = integer(words[1]), _with_unit_quaternion(numbers(words[2:]), 3 if kind is SE3 else None)
         if vertex in self.vertices and self.vertices[vertex] != (tag, value):
             raise FormatError(f"vertex {vertex} was declared before, with other values")
         self.vertices[vertex] = (tag, value)
 
     def _offset(self, words: list[str]) -> None:
         expect(words, 1 + SE3.size)
-        x, y, z, *q = _with_unit_quaternion(numbers(words[2:]), SE3.size)
+        x, y, z, *q = _with_unit_quaternion(numbers(words[2:]), 3)
         self.offsets[integer(words[1])] = (x, y, z, q[0], q[1], q[2], q[3])
 
     def _edge(self, line: int, tag: str, words: list[str]) -> _Edge:
         edge = EDGE_TAGS[tag]
         slots, m, from_offset = len(edge.accepts), edge.residual_size, tag in AT_OFFSET
-        expect(words, slots + from_offset + edge.measured_size + m * (m + 1) // 2)
+        others, size = slots + from_offset + m * (m + 1) // 2, edge.measured_size
+        if len(words) - 1 == others + size - len(edge.tail):
+            size -= len(edge.tail)
+        expect(words, others + size)
         vertices = tuple(integer(word) for word in words[1 : 1 + slots])
         values = numbers(words[1 + slots + from_offset :])
-        measured = _with_unit_quaternion(values[: edge.measured_size], edge.measured_size)
+        measured = edge.whole(_with_unit_quaternion(values[:size], _quaternion_at(edge))).tolist()
         offset = integer(words[1 + slots]) if from_offset else None
-        return _Edge(line, vertices, measured, values[edge.measured_size :], self.label, offset)
+        return _Edge(line, vertices, measured, values[size:], self.label, offset)
 
     def declare_all(self) -> None:
         """A file of edges alone: its vertices are those the edges name, in order of id and without values."""
@@ -262,16 +268,25 @@ def read_g2o(
     return reader.graph(ERROR_MAPS[error_map])
 
 
-def _with_unit_quaternion(numbers: list[float], size: int) -> list[float]:
-    """The last four of a pose in space, (x, y, z, w), brought to unit length."""
-    if size != SE3.size:
+def _quaternion_at(edge: EdgeType) -> int | None:
+    """Where in what an edge measured a quaternion begins, if there is one."""
+    if edge in (RELATIVE_POSE_3D, POSE_PRIOR_3D):
+        return 3
+    if edge is ATTITUDE_PRIOR_3D:
+        return 0
+    return edge.measured_size - 4 if edge.tail == se3.IDENTITY else None
+
+
+def _with_unit_quaternion(numbers: list[float], at: int | None) -> list[float]:
+    """A quaternion (x, y, z, w) that begins there, if the numbers reach so far, brought to unit length."""
+    if at is None or len(numbers) <= at:
         return numbers
-    square = sum(q * q for q in numbers[3:])
+    square = sum(q * q for q in numbers[at:])
     if square == 0.0:
         raise FormatError("the quaternion is zero")
     if abs(square - 1.0) <= _UNIT:
         return numbers
-    return numbers[:3] + [q / square**0.5 for q in numbers[3:]]
+    return numbers[:at] + [q / square**0.5 for q in numbers[at:]]
 
 
 def _by_label(tag: str, edges: Iterable[_Edge], follows: dict[int, int]) -> dict[str, list[_Edge]]:

@@ -19,7 +19,7 @@ from graph_slam_ros.formats.graph_file import (
     moved,
 )
 from graph_slam_ros.formats.strict import is_gzipped
-from graph_slam_ros.graph import INVERSE_RELATIVE_POSE, LANDMARK_POSITION_3D, POSE_PRIOR_3D, Graph
+from graph_slam_ros.graph import INVERSE_RELATIVE_POSE, LANDMARK_POSITION_3D, POSE_PRIOR_3D, EdgeType, Graph
 from graph_slam_ros.lie import se3
 
 
@@ -99,8 +99,14 @@ def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
         for row in np.flatnonzero(table.weight.values != 0.0).tolist():
             words = [tag_of_edge[edge_type], *(str(file.ids[v]) for v in table.vertices.values[row].tolist())]
             words += [str(numbers[row])] * (words[0] in AT_OFFSET)
-            words.append(_text([*measured[row].tolist(), *information[row].tolist()]))
+            words.append(_text([*_short(edge_type, measured[row].tolist()), *information[row].tolist()]))
             yield int(table.label.values[row]), int(table.id.values[row]), " ".join(words)
+
+
+def _short(edge: EdgeType, measured: list[float]) -> list[float]:
+    """Without the tail where it says nothing."""
+    head = edge.measured_size - len(edge.tail)
+    return measured[:head] if tuple(measured[head:]) == edge.tail else measured
 
 
 def _text(numbers: Sequence[float]) -> str:

@@ -67,7 +67,7 @@ def _measured(
 ) -> Array:
     if draw is None:
         return rng.standard_normal(edge.measured_size)
-    value = np.asarray(draw(rng), dtype=float)
+    value = edge.whole(draw(rng))
     if value.shape != (edge.measured_size,):
         raise GraphSlamError(f"{edge.name}: measured has the shape {value.shape}, not ({edge.measured_size},)")
     return value

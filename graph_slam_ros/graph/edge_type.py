@@ -29,6 +29,7 @@ class EdgeType:
     Attributes
     ----------
     accepts : for each slot the vertex kinds it takes, all of the same dof
+    tail : what the last numbers of ``measured`` are where they are left out: a sensor's place on the robot
     """
 
     name: str
@@ -36,11 +37,19 @@ class EdgeType:
     measured_size: int
     residual_size: int
     linearize: Callable[[Array, Index, Array], tuple[Array, Array]]
+    tail: tuple[float, ...] = ()
 
     @property
     def dofs(self) -> tuple[int, ...]:
         """Degrees of freedom of each slot."""
         return tuple(kinds[0].dof for kinds in self.accepts)
+
+    def whole(self, measured: ArrayLike) -> Array:
+        """What was measured, (p,) or (n, p), with the tail where it was left out."""
+        given = np.asarray(measured, dtype=np.float64)
+        if self.tail and given.shape and given.shape[-1] == self.measured_size - len(self.tail):
+            return np.concatenate([given, np.broadcast_to(self.tail, (*given.shape[:-1], len(self.tail)))], axis=-1)
+        return given
 
 
 Residual = Callable[[tuple[Array, ...], Array], ArrayLike]

@@ -132,12 +132,12 @@ class Graph:
         Parameters
         ----------
         vertices : (n, k) ids of existing vertices of the kinds the edge type accepts
-        measured : (n, p), finite
+        measured : (n, p), finite; its tail may be left out
         noise : one for all, or n
         label : the class an edge is counted under, e.g. ``odometry``
         """
         at = np.asarray(vertices, dtype=np.int64).reshape(-1, len(edge.accepts))
-        z = np.asarray(measured, dtype=float).reshape(-1, edge.measured_size)
+        z = edge.whole(measured).reshape(-1, edge.measured_size)
         self._check(edge, at, z, noise)
         table = self.tables.setdefault(edge, EdgeTable(edge))
         ids, count = np.arange(self.edge_count, self.edge_count + len(at)), len(at)
