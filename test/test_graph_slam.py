@@ -137,9 +137,27 @@ def test_B3_odometry_of_one_stamp_is_used_once_and_counted_by_whether_it_differs
 
 
 def test_late_sightings_are_dropped_and_counted_each():
-    p = run(slam(), *straight(1), seen(0.05, point("a"), point("b")), seen(1.0, point("c")))
+    p = slam(ordering={"late_s": 0.2})
+    run(p, *straight(1), seen(0.05, point("a"), point("b")), seen(1.0, point("c")))
     assert p.counters.as_dict() == {"/landmarks": {"late": 2}}
     assert set(p.landmarks) == {"c"}
+
+
+def test_late_sightings_go_where_they_belong():
+    late = run(slam(), *straight(9), seen(3.7, point("a")), seen(8.2, point("b")), *END)
+    in_time = slam()
+    for m in straight(9):
+        in_time.process(m)
+        for t, name in ((3.7, "a"), (8.2, "b")):
+            if m.stamp_ns == T0 + round(t * S):
+                in_time.process(seen(t, point(name)))
+    run(in_time, *END)
+    assert late.counters.as_dict() == {}
+    for name in "ab":
+        there, here = (p.solver.estimate([p.landmarks[name].vertex])[0] for p in (late, in_time))
+        assert there == pytest.approx(here, abs=1e-9)
+        at = [table(p, LANDMARK_POSITION).measured.values for p in (late, in_time)]
+    assert np.sort(at[0], axis=0) == pytest.approx(np.sort(at[1], axis=0), abs=1e-12)
 
 
 def test_sightings_from_before_the_first_odometry_are_counted_whenever_they_come():

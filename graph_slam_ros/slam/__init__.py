@@ -2,7 +2,8 @@
 
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
-from graph_slam_ros.slam.graph_slam import GraphSlam, Keyframe, Landmark, Update
+from graph_slam_ros.slam.graph_slam import GraphSlam, Keyframe, Update
+from graph_slam_ros.slam.landmarks import Landmark
 from graph_slam_ros.slam.measurements import Closure, Control, Fix, Measurement, Odometry, Sighting, Sightings
 
 __all__ = [

@@ -116,6 +116,15 @@ class OdometryConfig:
         1e-3, "slower than this and the next, the robot stands: no noise is added", "m/s", low=0.0
     )
     still_rad_s: float = _setting(1e-3, "see still_m_s", "rad/s", low=0.0)
+    priority: str = _setting("", "sources in order of priority, by name; others follow in the order they come")
+    timeout_s: float = _setting(
+        0.5, "a source that is silent for longer, in stamp time, gives way to the next", "s", low=1e-3
+    )
+    max_speed_m_s: float = _setting(
+        50.0, "faster than this, odometry has jumped: a new segment begins", "m/s", low=1e-3
+    )
+    jump_sigma_m: float = _setting(10.0, "what is known of the motion over a jump: standard deviation", "m", low=1e-3)
+    jump_sigma_rad: float = _setting(3.0, "and of the rotation", "rad", low=1e-3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +153,28 @@ class LandmarksConfig:
     orientation_known_below_rad: float = _setting(
         0.5, "a landmark is a full pose where its heading's standard deviation is below this", "rad", low=0.0
     )
+    association: str = _setting(
+        "id",
+        "none: landmarks are not used; id: by their identity; nearest, joint: those without one are associated, each by"
+        " itself or all of a message together",
+        choices=("none", "id", "nearest", "joint"),
+    )
+    determined_below: float = _setting(
+        0.2,
+        "a landmark seen by range or bearing waits until its standard deviation is below this part of its distance",
+        "m/m",
+        low=1e-3,
+        high=10.0,
+    )
+    mirror_chi2: float = _setting(
+        12.0, "and until every other place it may be at fits worse by this much", "chi2", low=0.0
+    )
+    range_offset_sigma_m: float = _setting(
+        0.0,
+        "standard deviation of an offset that all ranges of a topic share and that is estimated; 0: there is none",
+        "m",
+        low=0.0,
+    )
     loss: str = _setting(
         "huber_then_cauchy",
         "robust loss; huber_then_cauchy converges with the first, then with the second",
@@ -168,6 +199,9 @@ class OrderingConfig:
 
     window_s: float = _setting(
         0.05, "how much later than newer odometry a message may come, in stamp time", "s", low=0.0
+    )
+    late_s: float = _setting(
+        10.0, "sightings, fixes and closures up to this much older than odometry go where they belong", "s", low=0.0
     )
     max_waiting: int = _setting(
         1000, "messages that may wait for their turn, or for odometry", "messages", low=1, high=1_000_000
@@ -314,7 +348,7 @@ class Config:
             s.max_iterations,
             s.step_tolerance,
             s.cost_tolerance,
-            {"landmarks": stages},
+            {"landmarks": stages, "fixes": stages, "closures": stages},
             relinearize_above=s.relinearize_above,
             relinearize_error=s.relinearize_error,
             relinearize_every=s.relinearize_every,

@@ -10,30 +10,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.errors import GraphSlamError, NoiseError
-from graph_slam_ros.graph import (
-    LANDMARK_POSITION,
-    POSE_PRIOR,
-    R2,
-    RELATIVE_POSE,
-    SE2,
-    TAG_POSITION,
-    Gaussian,
-    Graph,
-)
-from graph_slam_ros.lie import se2
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph import Gaussian, Graph
+from graph_slam_ros.slam import carry
+from graph_slam_ros.slam.carry import Where
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
-from graph_slam_ros.slam.measurements import Control, Measurement, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.motion import Motion, Moved
+from graph_slam_ros.slam.edge_noise import edge_noise
+from graph_slam_ros.slam.landmarks import Landmark, Landmarks
+from graph_slam_ros.slam.measurements import Closure, Control, Fix, Measurement, Observation, Odometry, Sightings
+from graph_slam_ros.slam.motion import Motion, OdometryNoise
+from graph_slam_ros.slam.odometry_choice import OdometryChoice, Step
+from graph_slam_ros.slam.space import Numbers
 from graph_slam_ros.slam.stamp_order import StampOrder
 from graph_slam_ros.slam.track import Track
 from graph_slam_ros.solver import Report, Settings, Solver
 
 Array = NDArray[np.float64]
-
-_LEAST_VARIANCE = np.array([1e-8, 1e-8, 1e-10])  # 0.1 mm, 0.01 mrad: nothing is ever certain
-_LEAST_EIGENVALUE = 1e-9  # of the largest, where rounding has left a covariance indefinite
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,16 +35,7 @@ class Keyframe:
 
     vertex: int
     stamp_ns: int
-    T_odom_base: se2.Pose
-
-
-@dataclass(slots=True)
-class Landmark:
-    """A landmark with identity: its vertex and how often and when it was seen."""
-
-    vertex: int
-    sightings: int
-    last_seen_ns: int
+    T_odom_base: Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +44,7 @@ class SightingPose:
 
     keyframe: int
     stamp_ns: int
-    T_keyframe_base: se2.Pose
+    T_keyframe_base: Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +63,7 @@ _NOTHING = Update()
 
 
 class GraphSlam:
-    """Online pose-graph SLAM in the plane, from odometry and sightings of landmarks with known identity.
+    """Online pose-graph SLAM, in the plane or in space, from odometry, landmarks, fixes and loop closures.
 
     Parameters
     ----------
@@ -89,20 +73,23 @@ class GraphSlam:
 
     def __init__(self, config: Config | None = None, sink: Callable[[Measurement], None] | None = None) -> None:
         self.config = config or Config()
+        self.space = self.config.space
         self.counters = Counters()
         self.graph = Graph()
         self.solver = Solver(self.graph, self.config.solver_settings())
-        self.keyframes = Track(Keyframe)
-        self.landmarks: dict[str, Landmark] = {}
-        self.sighting_poses = Track(SightingPose)
+        self.keyframes = Track(Keyframe, self.space.pose.size)
+        self.sighting_poses = Track(SightingPose, self.space.pose.size)
+        self.segments: list[int] = []  # keyframes at which odometry began, or began anew
         self.solves = 0
         self.report: Report | None = None  # of the last solve of everything
         self._sink = sink
         self._order = StampOrder(self.config.ordering, self.counters)
-        self._odometry: Odometry | None = None
-        self._motions: deque[Motion] = deque(maxlen=2)  # since the newest keyframe, and since the one before
-        self._waiting: list[Sightings] = []
-        self._covariance = np.zeros((3, 3))
+        self._odometry = OdometryChoice(self.config.odometry, self.space, self.counters)
+        self._noise = OdometryNoise(self.config.odometry, self.space)
+        self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters)
+        self._motions: deque[Motion] = deque()  # since each of the last keyframes, as far back as late ones may reach
+        self._waiting: list[Observation] = []
+        self._covariance = np.zeros((self.space.dof, self.space.dof))
         self._handed_over = 0, 0  # vertices and edges the solver has
         self._solved_vertices = 0  # of these, what the last solve took in: none where it failed
         self._unsolved_keyframes = 0
@@ -117,7 +104,7 @@ class GraphSlam:
             self._sink(measurement)
         first_new, solves, report = len(self.keyframes), self.solves, self.report
         match measurement:
-            case Odometry() | Sightings():
+            case Odometry() | Sightings() | Fix() | Closure():
                 self._use(self._order.push(measurement))
             case Control("flush"):
                 self._use(self._order.flush())
@@ -126,8 +113,8 @@ class GraphSlam:
                 self._drop_unreached()
             case Control("optimize"):
                 self._solve(self.config.solver_settings())
-            case _:
-                self.counters.count("control", f"unknown event {measurement.event}")
+            case Control(event):
+                self.counters.count("control", f"unknown event {event}")
         if len(self.keyframes) == first_new and self.solves == solves:
             return _NOTHING
         new = self.report if self.report is not report else None
@@ -135,40 +122,51 @@ class GraphSlam:
 
     # -- what is known now ---------------------------------------------------------------------------------------
 
+    @property
+    def landmarks(self) -> dict[str, Landmark]:
+        """Landmarks of the graph, by identity."""
+        return self._landmarks.known
+
+    @property
+    def waiting(self) -> dict[str, str]:
+        """Why each landmark waits that was seen but is not in the graph yet, by identity."""
+        return {name: waiting.reason for name, waiting in self._landmarks.waiting.items()}
+
     def trajectory(self) -> Array:
-        """Estimated poses ``T_map_base`` of all keyframes, (n, 3)."""
-        return self.solver.estimate(self.keyframes.ids).reshape(-1, 3)
+        """Estimated poses ``T_map_base`` of all keyframes, (n, 3) or (n, 7)."""
+        return self.solver.estimate(self.keyframes.ids).reshape(-1, self.space.pose.size)
 
     def sighting_trajectory(self) -> Array:
-        """Estimated poses ``T_map_base`` at the stamps of the sightings, (n, 3)."""
+        """Estimated poses ``T_map_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""
         return self._at_sightings(self.trajectory())
 
     def sighting_odometry(self) -> Array:
-        """What odometry alone says, ``T_odom_base`` at the stamps of the sightings, (n, 3)."""
+        """What odometry alone says, ``T_odom_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""
         return self._at_sightings(self.keyframes.poses)
 
     def _at_sightings(self, keyframe_poses: Array) -> Array:
         keyframes = keyframe_poses[self.sighting_poses.ids]
-        return np.stack(se2.compose(tuple(keyframes.T), tuple(self.sighting_poses.poses.T)), axis=-1)
+        return np.stack(self.space.group.compose(tuple(keyframes.T), tuple(self.sighting_poses.poses.T)), axis=-1)
 
     @property
-    def T_map_odom(self) -> se2.Pose:
+    def T_map_odom(self) -> Numbers:
         """The correction: odometry's drift at the newest keyframe."""
         if not self.keyframes:
-            return se2.IDENTITY
-        newest = self.keyframes[-1]
-        return se2.compose(self._pose(newest), se2.inverse(newest.T_odom_base))
+            return self.space.identity
+        newest, group = self.keyframes[-1], self.space.group
+        out: Numbers = group.compose(self._pose(newest.vertex), group.inverse(newest.T_odom_base))
+        return out
 
     @property
     def pose_covariance(self) -> Array:
-        """Covariance (3, 3) of the newest keyframe's pose in its tangent space.
+        """Covariance (3, 3) or (6, 6) of the newest keyframe's pose in its tangent space.
 
         The marginal of the last solve, lengthened by the odometry since.
         """
         return self._covariance.copy()
 
     def landmark_covariances(self) -> list[Array]:
-        """Marginal of each landmark, (2, 2) in the map's axes or (3, 3) in its tangent space; NaN where unknown.
+        """Marginal of each landmark, in the map's axes, or of a pose in its tangent space; NaN where unknown.
 
         Looking changes nothing: a landmark that was first seen after the last solve is unknown until the next, and so
         are all where that failed.
@@ -183,113 +181,167 @@ class GraphSlam:
     @property
     def newest_odometry_ns(self) -> int | None:
         """Stamp of the last odometry that was used."""
-        return None if self._odometry is None else self._odometry.stamp_ns
+        return self._odometry.newest_ns
 
     # -- odometry ------------------------------------------------------------------------------------------------
 
-    def _use(self, released: list[Odometry | Sightings]) -> None:
+    def _use(self, released: list[Odometry | Observation]) -> None:
         for m in released:
             if isinstance(m, Odometry):
-                self._on_odometry(m)
+                for step in self._odometry.take(m):
+                    self._on_step(step)
             else:
-                self._on_sightings(m)
+                self._on_observation(m)
 
-    def _on_odometry(self, m: Odometry) -> None:
-        if self._odometry is None:
-            self._odometry = m
-            self._first_keyframe(m)
-            return
-        if m.stamp_ns == self._odometry.stamp_ns:
-            self.counters.count("odometry", "duplicate" if m == self._odometry else "duplicate_stamp")
-            return
-        self._motions[-1].step(m)
-        self._odometry = m
-        self._see_waiting()
-        if self._keyframe_due():
-            self._next_keyframe(m)
+    def _on_step(self, step: Step) -> None:
+        if not self._motions:
+            self._first_keyframe(step)
+        elif step.broken:
+            self._begin_segment(step)
+        else:
+            self._motions[-1].step(step)
+            self._use_waiting(step.stamp_ns)
+            if self._keyframe_due():
+                self._next_keyframe(step, self._motions[-1].now.covariance)
 
     def _keyframe_due(self) -> bool:
-        due, motion = self.config.keyframes, self._motions[-1]
-        x, y, theta = motion.now.T_keyframe_base
-        far = x * x + y * y >= due.min_distance_m**2 or abs(theta) >= due.min_angle_rad
+        due, motion, n = self.config.keyframes, self._motions[-1], self.space.dimensions
+        at = motion.now.T_keyframe_base
+        far = sum(x * x for x in at[:n]) >= due.min_distance_m**2 or self.space.angle(at) >= due.min_angle_rad
         return far or motion.moving_ns / 1e9 >= due.max_interval_s
 
-    def _first_keyframe(self, m: Odometry) -> None:
+    def _first_keyframe(self, step: Step) -> None:
         """Map begins where odom begins: the first pose is anchored at its odometry pose."""
-        vertex = self.graph.add_vertex(SE2, m.T_odom_base)
-        anchor = self.config.anchor
-        noise = Gaussian.from_sigmas(anchor.sigma_m, anchor.sigma_m, anchor.sigma_rad)
-        self._covariance = np.diag([anchor.sigma_m**2, anchor.sigma_m**2, anchor.sigma_rad**2])
-        self.graph.add_edge(POSE_PRIOR, [vertex], m.T_odom_base, noise, "anchor")
-        self.keyframes.append(vertex, m.stamp_ns, m.T_odom_base)
-        self._motions.append(Motion(self.config.odometry, 0, m))
+        vertex = self.graph.add_vertex(self.space.pose, step.T_odom_base)
+        anchor, n = self.config.anchor, self.space.dimensions
+        sigmas = [anchor.sigma_m] * n + [anchor.sigma_rad] * (self.space.dof - n)
+        self._covariance = np.diag(np.square(sigmas))
+        self.graph.add_edge(self.space.pose_prior, [vertex], step.T_odom_base, Gaussian.from_sigmas(*sigmas), "anchor")
+        self.segments.append(0)
+        self._append_keyframe(vertex, step)
 
-    def _next_keyframe(self, m: Odometry) -> None:
-        motion, last = self._motions[-1].now, self.keyframes[-1]
-        noise = self._noise("odometry", motion.covariance)
-        vertex = self.graph.add_vertex(SE2, se2.compose(self._pose(last), motion.T_keyframe_base))
-        self.graph.add_edge(RELATIVE_POSE, [last.vertex, vertex], motion.T_keyframe_base, noise, "odometry")
-        self.keyframes.append(vertex, m.stamp_ns, m.T_odom_base)
-        self._covariance = se2.propagate(self._covariance, motion.T_keyframe_base, motion.covariance)
-        self._motions.append(Motion(self.config.odometry, len(self.keyframes) - 1, m))
+    def _next_keyframe(self, step: Step, covariance: Array) -> None:
+        """A vertex where odometry is now, and the motion to it from the last as an edge."""
+        space, last = self.space, self.keyframes[-1]
+        T_last_now = self._motions[-1].now.T_keyframe_base
+        noise = edge_noise(self.counters, "odometry", covariance, space.dimensions)
+        vertex = self.graph.add_vertex(space.pose, space.group.compose(self._pose(last.vertex), T_last_now))
+        self.graph.add_edge(space.relative_pose, [last.vertex, vertex], T_last_now, noise, "odometry")
+        self._covariance = space.group.propagate(self._covariance, T_last_now, covariance)
+        self._append_keyframe(vertex, step)
         self._unsolved_keyframes += 1
         self._solve_if_due()
 
-    # -- landmarks -----------------------------------------------------------------------------------------------
+    def _begin_segment(self, step: Step) -> None:
+        """Where odometry jumped, nearly nothing is known of the motion; what the robot sees will tell."""
+        self._use_waiting(self._motions[-1].now.stamp_ns)
+        jump, n = self.config.odometry, self.space.dimensions
+        loose = [jump.jump_sigma_m] * n + [jump.jump_sigma_rad] * (self.space.dof - n)
+        self.segments.append(len(self.keyframes))
+        self._next_keyframe(step, self._motions[-1].now.covariance + np.diag(np.square(loose)))
+        self._use_waiting(step.stamp_ns)
 
-    def _on_sightings(self, m: Sightings) -> None:
-        """Use what was seen since the keyframe before last; what is newer than all odometry waits for the next."""
-        if self._odometry is None or m.stamp_ns < self.keyframes[0].stamp_ns:
-            self.counters.count(m.topic, "before_odometry", len(m.sightings))
+    def _append_keyframe(self, vertex: int, step: Step) -> None:
+        self.keyframes.append(vertex, step.stamp_ns, step.T_odom_base)
+        self._motions.append(Motion(self._noise, self.space, len(self.keyframes) - 1, step.stamp_ns))
+        oldest_ns = step.stamp_ns - round(self.config.ordering.late_s * 1e9)
+        while len(self._motions) > 2 and self._motions[1].start_ns <= oldest_ns:
+            self._motions.popleft()
+
+    # -- observations --------------------------------------------------------------------------------------------
+
+    def _on_observation(self, m: Observation) -> None:
+        """Use what is not too late; what is newer than all odometry waits for the next."""
+        newest_ns = self.newest_odometry_ns
+        if newest_ns is None or m.stamp_ns < self.keyframes[0].stamp_ns:
+            self._count(m, "before_odometry")
         elif m.stamp_ns < self._motions[0].start_ns:
-            self.counters.count(m.topic, "late", len(m.sightings))
-        elif m.stamp_ns <= self._odometry.stamp_ns:
-            self._see(m)
+            self._count(m, "late")
+        elif m.stamp_ns <= newest_ns:
+            self._observe(m)
         elif len(self._waiting) >= self.config.ordering.max_waiting:
-            self.counters.count(m.topic, "overflow", len(m.sightings))
+            self._count(m, "overflow")
         else:
             self._waiting.append(m)
 
-    def _see_waiting(self) -> None:
+    def _use_waiting(self, until_ns: int) -> None:
         """Use what waited for the odometry that has come."""
         if self._waiting:
-            waiting, self._waiting = self._waiting, []
-            for m in waiting:
-                self._on_sightings(m)
+            ready = [m for m in self._waiting if m.stamp_ns <= until_ns]
+            self._waiting = [m for m in self._waiting if m.stamp_ns > until_ns]
+            for m in ready:
+                self._on_observation(m)
 
     def _drop_unreached(self) -> None:
         for m in self._waiting:
-            self.counters.count(m.topic, "after_odometry", len(m.sightings))
+            self._count(m, "after_odometry")
         self._waiting.clear()
 
-    def _see(self, m: Sightings) -> None:
-        """Carry sightings to the keyframe before them by the odometry in between, whose noise adds to theirs."""
-        motion = next(motion for motion in reversed(self._motions) if motion.start_ns <= m.stamp_ns)
-        moved, keyframe = motion.at(m.stamp_ns), self.keyframes[motion.keyframe]
-        self.sighting_poses.append(motion.keyframe, m.stamp_ns, moved.T_keyframe_base)
-        for sighting in m.sightings:
-            self._add_sighting(m.topic, sighting, m.stamp_ns, keyframe, moved)
+    def _count(self, m: Observation, reason: str) -> None:
+        self.counters.count(m.topic, reason, len(m.sightings) if isinstance(m, Sightings) else 1)
+
+    def _observe(self, m: Observation) -> None:
+        where = self._where(m.stamp_ns)
+        match m:
+            case Sightings():
+                self.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
+                self._landmarks.see(m, where)
+            case Fix():
+                self._add_fix(m, where)
+            case Closure():
+                self._add_closure(m, where)
         self._solve_if_due()
 
-    def _add_sighting(self, topic: str, sighting: Sighting, stamp_ns: int, keyframe: Keyframe, moved: Moved) -> None:
-        landmark = self.landmarks.get(sighting.id)
-        is_point = len(sighting.measured) == 2 or (landmark is not None and self.graph.kind_of(landmark.vertex) is R2)
-        carry = _carry_point if is_point else _carry_pose
-        measured, covariance = carry(sighting, moved.T_keyframe_base, moved.covariance)
-        covariance[:2, :2] += self.config.landmarks.added_sigma_m**2 * np.eye(2)
-        noise = self._noise(topic, covariance)
-        if landmark is None:
-            act = se2.act if is_point else se2.compose
-            kind = R2 if is_point else SE2
-            vertex = self.graph.add_vertex(kind, act(self._pose(keyframe), measured))
-            landmark = self.landmarks[sighting.id] = Landmark(vertex, 0, stamp_ns)
-        if not is_point:
-            edge_type = RELATIVE_POSE
-        else:
-            edge_type = LANDMARK_POSITION if self.graph.kind_of(landmark.vertex) is R2 else TAG_POSITION
-        self.graph.add_edge(edge_type, [keyframe.vertex, landmark.vertex], measured, noise, "landmarks")
-        landmark.sightings += 1
-        landmark.last_seen_ns = stamp_ns
+    def _where(self, stamp_ns: int) -> Where:
+        """Where the robot was, by the keyframe before and the odometry in between."""
+        motion = next((m for m in reversed(self._motions) if m.start_ns <= stamp_ns), None)
+        if motion is None:
+            return self._where_long_ago(stamp_ns)
+        moved = motion.at(stamp_ns)
+        vertex = int(self.keyframes.ids[motion.keyframe])
+        return Where(motion.keyframe, vertex, stamp_ns, moved.T_keyframe_base, moved.covariance)
+
+    def _where_long_ago(self, stamp_ns: int) -> Where:
+        """Between two keyframes whose odometry is forgotten: evenly from one to the next."""
+        k = int(np.searchsorted(self.keyframes.stamps_ns, stamp_ns, side="right")) - 1
+        group, (a, b) = self.space.group, (self.keyframes[k], self.keyframes[k + 1])
+        T_a_b = self.space.identity if k + 1 in self.segments else group.between(a.T_odom_base, b.T_odom_base)
+        fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+        moved = group.interpolate(self.space.identity, T_a_b, fraction)
+        noise = self._noise.of((stamp_ns - a.stamp_ns) * 1e-9, None)
+        return Where(k, a.vertex, stamp_ns, moved, group.noise_during(moved, noise))
+
+    def _add_fix(self, m: Fix, where: Where) -> None:
+        """A prior on a keyframe; of a position that lacks some axes, one on each principal axis that is known."""
+        space = self.space
+        if m.kind not in space.fixes:
+            self.counters.count(m.topic, f"{m.kind}_not_in_the_plane")
+            return
+        carried = carry.fix(space, m, where, self._pose(where.vertex))
+        n = space.dimensions
+        axes = carry.axes_known(carried.covariance) if m.kind == "position" else []
+        for axis, variance in axes:
+            noise = edge_noise(self.counters, m.topic, np.array([[variance]]), 1)
+            along = float(axis @ carried.measured[:n])
+            measured = (*axis.tolist(), along, *carried.measured[n:])
+            self.graph.add_edge(space.coordinate_prior, [where.vertex], measured, noise, "fixes")
+        if not axes:
+            metres = n if m.kind in ("pose", "position") else 0
+            noise = edge_noise(self.counters, m.topic, carried.covariance, metres)
+            self.graph.add_edge(space.fixes[m.kind], [where.vertex], carried.measured, noise, "fixes")
+
+    def _add_closure(self, m: Closure, where: Where) -> None:
+        if not self.keyframes[0].stamp_ns <= m.from_stamp_ns <= (self.newest_odometry_ns or 0):
+            self.counters.count(m.topic, "from_where_there_was_no_odometry")
+            return
+        earlier = self._where(m.from_stamp_ns)
+        if earlier.keyframe == where.keyframe:
+            self.counters.count(m.topic, "within_one_keyframe")
+            return
+        carried = carry.closure(self.space, m, earlier, where)
+        noise = edge_noise(self.counters, m.topic, carried.covariance, self.space.dimensions)
+        vertices = [earlier.vertex, where.vertex]
+        self.graph.add_edge(self.space.relative_pose, vertices, carried.measured, noise, "closures")
 
     # -- solving -------------------------------------------------------------------------------------------------
 
@@ -322,41 +374,5 @@ class GraphSlam:
         self._handed_over = self.graph.vertex_count, self.graph.edge_count
         self.solver.add(range(vertices, self.graph.vertex_count), range(edges, self.graph.edge_count))
 
-    def _noise(self, source: str, covariance: Array) -> Gaussian:
-        """Noise of an edge, made before anything is added to the graph: it must not fail half-way."""
-        size = len(covariance)
-        least = covariance + np.diag(_LEAST_VARIANCE[:size])
-        try:
-            return Gaussian.from_covariance(least)
-        except NoiseError:  # of extreme numbers: a kilometre's lever arm, an hour's motion in one step
-            self.counters.count(source, "covariance_floored")
-            values, vectors = np.linalg.eigh(0.5 * (least + least.T))
-            floored = np.maximum(values, _LEAST_EIGENVALUE * values[-1])
-            return Gaussian.from_covariance((vectors * floored) @ vectors.T)
-
-    def _pose(self, keyframe: Keyframe) -> se2.Pose:
-        x, y, theta = self.solver.estimate([keyframe.vertex])[0].tolist()
-        return x, y, theta
-
-
-def _carry_point(s: Sighting, T_a_b: se2.Pose, motion_covariance: Array) -> tuple[tuple[float, ...], Array]:
-    """A point seen from b, seen from a: ``p_a = T_a_b p_b`` and the noise of both."""
-    x, y = s.measured[:2]
-    c, n = np.cos(T_a_b[2]), np.sin(T_a_b[2])
-    rotation = np.array([[c, -n], [n, c]])
-    if len(s.measured) == 2:
-        own = np.array(s.covariance).reshape(2, 2)
-    else:  # tangent space of the measured pose to the axes of b
-        c, n = np.cos(s.measured[2]), np.sin(s.measured[2])
-        turn = np.array([[c, -n], [n, c]])
-        own = turn @ np.array(s.covariance).reshape(3, 3)[:2, :2] @ turn.T
-    by_motion = np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
-    covariance = rotation @ (own + by_motion @ motion_covariance @ by_motion.T) @ rotation.T
-    return se2.act(T_a_b, (x, y)), covariance
-
-
-def _carry_pose(s: Sighting, T_a_b: se2.Pose, motion_covariance: Array) -> tuple[tuple[float, ...], Array]:
-    """A pose seen from b, seen from a: ``T_a_c = T_a_b T_b_c`` and the noise of both."""
-    own = np.array(s.covariance).reshape(3, 3)
-    measured: se2.Pose = (s.measured[0], s.measured[1], s.measured[2])
-    return se2.compose(T_a_b, measured), se2.propagate(motion_covariance, measured, own)
+    def _pose(self, vertex: int) -> Numbers:
+        return tuple(self.solver.estimate([vertex])[0].tolist())

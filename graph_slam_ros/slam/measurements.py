@@ -134,7 +134,7 @@ def from_record(record: dict[str, Any]) -> Measurement:
     try:
         if cls is Sightings:
             fields["sightings"] = tuple(Sighting(**_tuples(one)) for one in fields["sightings"])
-        return cls(**_tuples(fields))  # type: ignore[return-value]
+        return cls(**_tuples(fields))
     except (KeyError, TypeError) as error:
         raise FormatError(f"{record['type']}: {error}") from None
 

@@ -6,41 +6,73 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.config import OdometryConfig
-from graph_slam_ros.slam.measurements import Odometry
+from graph_slam_ros.slam.odometry_choice import Step
+from graph_slam_ros.slam.space import Numbers, Space
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """``T_keyframe_base`` at a stamp, and its covariance (3, 3) in right tangent coordinates."""
+    """``T_keyframe_base`` at a stamp, and its covariance (dof, dof) in right tangent coordinates."""
 
-    odometry: Odometry
-    T_keyframe_base: se2.Pose
+    stamp_ns: int
+    T_keyframe_base: Numbers
     covariance: Array
+    twist_covariance: Numbers | None = None
+
+
+class OdometryNoise:
+    """Noise of a motion from its duration.
+
+    A step of dt seconds adds density^2 dt. From a twist covariance C a step adds C dt max(dt, tau), since errors of
+    velocity last for about tau. A robot that stands gathers none.
+    """
+
+    __slots__ = ("_config", "_density", "_flat", "_space", "_square")
+
+    def __init__(self, config: OdometryConfig, space: Space) -> None:
+        self._config, self._space = config, space
+        c = config
+        sigmas = [c.translation_density, c.lateral_density, c.rotation_density]
+        if space.dimensions == 3:
+            sigmas[2:] = [c.vertical_density, c.tilt_density, c.tilt_density, c.rotation_density]
+        self._density = np.diag(np.square(sigmas))
+        self._flat: Numbers = ()
+        self._square: Array = self._density
+
+    def stands(self, step: Numbers, dt: float) -> bool:
+        """Whether a step in dt seconds is too slow to be one."""
+        c = self._config
+        slow_m, slow_rad = c.still_m_s * dt, c.still_rad_s * dt
+        if self._space.dimensions == 2:
+            return step[0] ** 2 + step[1] ** 2 < slow_m**2 and abs(step[2]) < slow_rad
+        turn = 2.0 * (step[3] ** 2 + step[4] ** 2 + step[5] ** 2) ** 0.5  # of a small rotation
+        return step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < slow_m**2 and turn < slow_rad
+
+    def of(self, dt: float, twist_covariance: Numbers | None) -> Array:
+        """Covariance (dof, dof) of the velocities' integral over dt seconds."""
+        if self._config.noise == "twist" and twist_covariance is not None:
+            return self._twist(twist_covariance) * (dt * max(dt, self._config.twist_correlation_s))
+        return self._density * dt
+
+    def _twist(self, flat: Numbers) -> Array:
+        if flat is not self._flat:  # drivers repeat the same covariance
+            self._flat, self._square = flat, np.array(flat).reshape(self._density.shape)
+        return self._square
 
 
 class Motion:
-    """The motion since a keyframe, remembered odometry by odometry.
+    """The motion since a keyframe, remembered odometry by odometry."""
 
-    Noise is a density: a step of dt seconds adds density^2 dt. From a twist covariance C a step adds C dt max(dt, tau),
-    since errors of velocity last for about tau. A robot that stands gathers none.
-    """
+    __slots__ = ("_moved", "_noise", "_space", "keyframe", "moving_ns")
 
-    __slots__ = ("_config", "_density", "_flat", "_moved", "_square", "keyframe", "moving_ns")
-
-    def __init__(self, config: OdometryConfig, keyframe: int, start: Odometry) -> None:
+    def __init__(self, noise: OdometryNoise, space: Space, keyframe: int, start_ns: int) -> None:
         self.keyframe = keyframe
         self.moving_ns = 0  # whole numbers: a sum of seconds would round
-        self._config = config
-        self._density = np.diag(
-            np.square([config.translation_density, config.lateral_density, config.rotation_density])
-        )
-        self._flat: tuple[float, ...] = ()
-        self._square: Array = self._density
-        self._moved = [Moved(start, se2.IDENTITY, np.zeros((3, 3)))]
+        self._noise, self._space = noise, space
+        self._moved = [Moved(start_ns, space.identity, np.zeros((space.dof, space.dof)))]
 
     @property
     def now(self) -> Moved:
@@ -50,50 +82,33 @@ class Motion:
     @property
     def start_ns(self) -> int:
         """Stamp of the keyframe."""
-        return self._moved[0].odometry.stamp_ns
+        return self._moved[0].stamp_ns
 
-    def step(self, b: Odometry) -> None:
-        """Go on to odometry b."""
-        last = self._moved[-1]
-        step = se2.between(last.odometry.T_odom_base, b.T_odom_base)
-        elapsed_ns = b.stamp_ns - last.odometry.stamp_ns
-        dt = elapsed_ns * 1e-9
-        moves = not self._stands(step, dt)
+    def step(self, step: Step) -> None:
+        """Go on by one step of odometry."""
+        elapsed_ns = step.stamp_ns - self.now.stamp_ns
+        moves = not self._noise.stands(step.T_last_base, elapsed_ns * 1e-9)
         self.moving_ns += elapsed_ns * moves
-        self._moved.append(self._extended(last, step, dt * moves, b))
+        self._moved.append(self._extended(self.now, step.T_last_base, elapsed_ns * moves, step))
 
     def at(self, stamp_ns: int) -> Moved:
         """At a stamp from the keyframe's to the newest odometry's, between two odometry messages by interpolation."""
         k = bisect_right(self._moved, stamp_ns, key=_stamp) - 1
         a = self._moved[k]
-        if a.odometry.stamp_ns == stamp_ns:
+        if a.stamp_ns == stamp_ns or k + 1 == len(self._moved):
             return a
-        b = self._moved[k + 1].odometry
-        fraction = (stamp_ns - a.odometry.stamp_ns) / (b.stamp_ns - a.odometry.stamp_ns)
-        at = se2.interpolate(a.odometry.T_odom_base, b.T_odom_base, fraction)
-        step, dt = se2.between(a.odometry.T_odom_base, at), (stamp_ns - a.odometry.stamp_ns) * 1e-9
-        return self._extended(a, step, dt * (not self._stands(step, dt)), b)
+        b, group = self._moved[k + 1], self._space.group
+        fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+        step = group.interpolate(self._space.identity, group.between(a.T_keyframe_base, b.T_keyframe_base), fraction)
+        elapsed_ns = stamp_ns - a.stamp_ns
+        moves = not self._noise.stands(step, elapsed_ns * 1e-9)
+        return self._extended(a, step, elapsed_ns * moves, Step(stamp_ns, step, b.T_keyframe_base, b.twist_covariance))
 
-    def _extended(self, a: Moved, step: se2.Pose, moving_s: float, source: Odometry) -> Moved:
-        covariance = se2.propagate_during(a.covariance, step, self._noise(moving_s, source))
-        return Moved(source, se2.compose(a.T_keyframe_base, step), covariance)
-
-    def _stands(self, step: se2.Pose, dt: float) -> bool:
-        c = self._config
-        still: bool = step[0] ** 2 + step[1] ** 2 < (c.still_m_s * dt) ** 2 and abs(step[2]) < c.still_rad_s * dt
-        return still
-
-    def _noise(self, dt: float, source: Odometry) -> Array:
-        tau = self._config.twist_correlation_s
-        if self._config.noise == "twist" and source.twist_covariance is not None:
-            return self._twist(source.twist_covariance) * (dt * max(dt, tau))
-        return self._density * dt
-
-    def _twist(self, flat: tuple[float, ...]) -> Array:
-        if flat is not self._flat:  # drivers repeat the same covariance
-            self._flat, self._square = flat, np.array(flat).reshape(3, 3)
-        return self._square
+    def _extended(self, a: Moved, T_a_b: Numbers, moving_ns: int, step: Step) -> Moved:
+        group, noise = self._space.group, self._noise.of(moving_ns * 1e-9, step.twist_covariance)
+        covariance = group.propagate_during(a.covariance, T_a_b, noise)
+        return Moved(step.stamp_ns, group.compose(a.T_keyframe_base, T_a_b), covariance, step.twist_covariance)
 
 
 def _stamp(moved: Moved) -> int:
-    return moved.odometry.stamp_ns
+    return moved.stamp_ns

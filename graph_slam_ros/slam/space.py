@@ -36,6 +36,7 @@ class Space:
     pose_prior: EdgeType
     tag_position: EdgeType
     coordinate_prior: EdgeType
+    range_with_offset: EdgeType
     sightings: Mapping[str, EdgeType]
     fixes: Mapping[str, EdgeType]
 
@@ -49,11 +50,22 @@ class Space:
         """Of a pose: 3 or 6."""
         return self.pose.dof
 
+    def angle(self, pose: Numbers) -> float:
+        """How far a pose is turned, about whatever axis."""
+        if self.dimensions == 2:
+            return abs(pose[2])
+        return float(2.0 * np.arctan2(np.linalg.norm(pose[3:6]), abs(pose[6])))
+
+    def heading(self, pose: Numbers) -> float:
+        """Angle from the parent's x to the pose's x, seen from above."""
+        turn = self.turn(pose)
+        return float(np.arctan2(turn[1, 0], turn[0, 0]))
+
     def in_parent_axes(self, pose: Numbers, covariance: Array) -> Array:
         """Tangent-space covariance of a pose turned into the axes of its parent frame, as ROS publishes it."""
         turn, n = np.eye(self.dof), self.dimensions
         turn[:n, :n] = self.turn(pose)
-        if n == 3:
+        if n == 3:  # a rotation in the plane turns with nothing
             turn[3:, 3:] = turn[:3, :3]
         return turn @ covariance @ turn.T
 
@@ -81,6 +93,7 @@ PLANE = Space(
     graph.POSE_PRIOR,
     graph.TAG_POSITION,
     graph.COORDINATE_PRIOR,
+    graph.RANGE_WITH_OFFSET,
     {
         "position": graph.LANDMARK_POSITION,
         "pose": graph.RELATIVE_POSE,
@@ -100,6 +113,7 @@ SPACE = Space(
     graph.POSE_PRIOR_3D,
     graph.TAG_POSITION_3D,
     graph.COORDINATE_PRIOR_3D,
+    graph.RANGE_WITH_OFFSET_3D,
     {
         "position": graph.LANDMARK_POSITION_3D,
         "pose": graph.RELATIVE_POSE_3D,

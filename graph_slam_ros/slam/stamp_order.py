@@ -8,7 +8,7 @@ import heapq
 
 from graph_slam_ros.slam.config import OrderingConfig
 from graph_slam_ros.slam.counters import Counters
-from graph_slam_ros.slam.measurements import Odometry, Sightings
+from graph_slam_ros.slam.measurements import Observation, Odometry, Sightings
 
 NS = 1_000_000_000
 
@@ -20,30 +20,30 @@ class StampOrder:
         self._window_ns = round(config.window_s * NS)
         self._max_waiting = config.max_waiting
         self._counters = counters
-        self._heap: list[tuple[int, int, str, int, Odometry | Sightings]] = []
+        self._heap: list[tuple[int, int, str, int, Odometry | Observation]] = []
         self._arrivals = 0
         self._newest_odometry_ns: int | None = None
         self._released_ns: int | None = None
 
-    def accepts(self, m: Odometry | Sightings) -> bool:
+    def accepts(self, m: Odometry | Observation) -> bool:
         """Whether there is room, and an odometry message is not older than what was released; else it is counted.
 
         Odometry newer than all before always has room: it is what makes others leave.
         """
         full = len(self._heap) >= self._max_waiting
-        if isinstance(m, Sightings):
+        if not isinstance(m, Odometry):
             if full:
-                self._counters.count(m.topic, "overflow", len(m.sightings))
+                self._counters.count(m.topic, "overflow", len(m.sightings) if isinstance(m, Sightings) else 1)
             return not full
         if self._released_ns is not None and m.stamp_ns < self._released_ns:
-            self._counters.count("odometry", "late")
+            self._counters.count(m.source, "late")
             return False
         if full and self._newest_odometry_ns is not None and m.stamp_ns <= self._newest_odometry_ns:
-            self._counters.count("odometry", "overflow")
+            self._counters.count(m.source, "overflow")
             return False
         return True
 
-    def push(self, m: Odometry | Sightings) -> list[Odometry | Sightings]:
+    def push(self, m: Odometry | Observation) -> list[Odometry | Observation]:
         """Take one measurement; returns those whose turn has come."""
         rank, topic = (0, "") if isinstance(m, Odometry) else (1, m.topic)
         heapq.heappush(self._heap, (m.stamp_ns, rank, topic, self._arrivals, m))
@@ -54,11 +54,11 @@ class StampOrder:
             return []
         return self._release(self._newest_odometry_ns - self._window_ns)
 
-    def flush(self) -> list[Odometry | Sightings]:
+    def flush(self) -> list[Odometry | Observation]:
         """Release everything that waits for its turn."""
         return self._release(max((entry[0] for entry in self._heap), default=0))
 
-    def _release(self, until_ns: int) -> list[Odometry | Sightings]:
+    def _release(self, until_ns: int) -> list[Odometry | Observation]:
         out = []
         while self._heap and self._heap[0][0] <= until_ns:
             stamp_ns, _, _, _, m = heapq.heappop(self._heap)

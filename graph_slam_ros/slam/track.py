@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.graph.graph import Column
-from graph_slam_ros.lie import se2
+from graph_slam_ros.slam.space import Numbers
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -20,13 +20,14 @@ class Track(Generic[Instant]):
     Parameters
     ----------
     record : makes the record of one instant of these three
+    size : numbers of a pose
     """
 
     __slots__ = ("_id", "_pose", "_record", "_stamp_ns")
 
-    def __init__(self, record: Callable[[int, int, se2.Pose], Instant]) -> None:
+    def __init__(self, record: Callable[[int, int, Numbers], Instant], size: int) -> None:
         self._record = record
-        self._id, self._stamp_ns, self._pose = Column(np.int64), Column(np.int64), Column(np.float64, 3)
+        self._id, self._stamp_ns, self._pose = Column(np.int64), Column(np.int64), Column(np.float64, size)
 
     @property
     def ids(self) -> Index:
@@ -40,10 +41,10 @@ class Track(Generic[Instant]):
 
     @property
     def poses(self) -> Array:
-        """Pose of each, (n, 3), a view."""
+        """Pose of each, (n, size), a view."""
         return self._pose.values
 
-    def append(self, id_: int, stamp_ns: int, pose: se2.Pose) -> None:
+    def append(self, id_: int, stamp_ns: int, pose: Numbers) -> None:
         """Add an instant."""
         self._id.extend(id_, 1)
         self._stamp_ns.extend(stamp_ns, 1)
@@ -53,8 +54,7 @@ class Track(Generic[Instant]):
         return len(self._id)
 
     def __getitem__(self, index: int) -> Instant:
-        x, y, theta = self.poses[index].tolist()
-        return self._record(int(self.ids[index]), int(self.stamps_ns[index]), (x, y, theta))
+        return self._record(int(self.ids[index]), int(self.stamps_ns[index]), tuple(self.poses[index].tolist()))
 
     def __iter__(self) -> Iterator[Instant]:
         return (self[k] for k in range(len(self)))

@@ -1,0 +1,200 @@
+"""Landmarks: from sightings to vertices and edges, and what still waits to be determined, with the reason."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian, Graph
+from graph_slam_ros.slam import carry, triangulation
+from graph_slam_ros.slam.carry import Carried, Where
+from graph_slam_ros.slam.config import Config
+from graph_slam_ros.slam.counters import Counters
+from graph_slam_ros.slam.edge_noise import edge_noise
+from graph_slam_ros.slam.measurements import Sighting, Sightings
+from graph_slam_ros.slam.space import Numbers
+from graph_slam_ros.slam.triangulation import Glance, Place
+from graph_slam_ros.solver import Solver
+
+Array = NDArray[np.float64]
+
+LABEL = "landmarks"
+_MOST_WAITING = 60  # sightings of one landmark: every other is forgotten beyond
+
+
+@dataclass(slots=True)
+class Landmark:
+    """A landmark of the graph: its vertex, how often and when it was seen, and the edges that say so."""
+
+    vertex: int
+    sightings: int = 0
+    last_seen_ns: int = 0
+    edges: list[int] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Waiting:
+    """A landmark that no vertex has yet: what was seen of it, where it may be, and why that is not enough."""
+
+    topic: str
+    seen: list[tuple[Where, Sighting]] = field(default_factory=list)
+    places: list[Place] = field(default_factory=list)
+    reason: str = ""
+
+
+class Landmarks:
+    """Landmarks with identity.
+
+    Attributes
+    ----------
+    known : those in the graph, by identity
+    waiting : those that are not determined yet
+    """
+
+    def __init__(self, config: Config, graph: Graph, solver: Solver, counters: Counters) -> None:
+        self.known: dict[str, Landmark] = {}
+        self.waiting: dict[str, Waiting] = {}
+        self._config, self._space = config, config.space
+        self._graph, self._solver, self._counters = graph, solver, counters
+        self._offsets: dict[str, int] = {}
+
+    def see(self, m: Sightings, where: Where) -> None:
+        """Take the sightings of one message."""
+        for s in m.sightings:
+            self.add(m.topic, s.id, s, where)
+
+    def add(self, topic: str, name: str, s: Sighting, where: Where) -> None:
+        """Take a sighting of a landmark with this identity."""
+        landmark = self.known.get(name)
+        if landmark is not None:
+            self._add_edge(topic, landmark, s, where)
+        elif s.kind == "pose":
+            self._begin(topic, name, s, where, carry.pose(self._space, s, where).measured)
+        elif s.kind == "position":
+            self._begin(topic, name, s, where, self._in_map(where, carry.position(self._space, s, where).measured))
+        elif s.kind == "range_bearing":
+            point = carry.point_of(self._space, s.measured)
+            self._begin(topic, name, s, where, tuple(self._from_sensor(s, where, point).tolist()))
+        else:
+            self._wait(topic, name, s, where)
+
+    # -- in the graph --------------------------------------------------------------------------------------------
+
+    def _begin(self, topic: str, name: str, s: Sighting, where: Where, value: Numbers) -> None:
+        """Add a vertex; ``value`` is in map, but for a pose, which is still in the keyframe's frame."""
+        kind = self._space.pose if s.kind == "pose" else self._space.point
+        if s.kind == "pose":
+            value = self._space.group.compose(self._pose(where), value)
+        landmark = self.known[name] = Landmark(self._graph.add_vertex(kind, value))
+        self._add_edge(topic, landmark, s, where)
+
+    def _add_edge(self, topic: str, landmark: Landmark, s: Sighting, where: Where) -> None:
+        space = self._space
+        is_pose = self._graph.kind_of(landmark.vertex) is space.pose
+        vertices, metres = [where.vertex, landmark.vertex], space.dimensions
+        if s.kind == "pose" and is_pose:
+            edge_type, carried = space.relative_pose, carry.pose(space, s, where)
+        elif s.kind in ("pose", "position"):
+            edge_type = space.tag_position if is_pose else space.sightings["position"]
+            carried = carry.position(space, s, where)
+        elif is_pose:
+            self._counters.count(topic, "not_for_a_pose")
+            return
+        else:
+            edge_type, metres = space.sightings[s.kind], 0 if s.kind == "bearing" else 1
+            carried = self._from_sensors(s, where, landmark)
+            if s.kind == "range" and self._config.landmarks.range_offset_sigma_m > 0.0:
+                edge_type = space.range_with_offset
+                vertices.append(self._offset(topic))
+        noise = edge_noise(self._counters, topic, self._blurred(s, carried), metres)
+        edge = self._graph.add_edge(edge_type, vertices, carried.measured, noise, LABEL)
+        landmark.edges.append(edge)
+        landmark.sightings += 1
+        landmark.last_seen_ns = max(landmark.last_seen_ns, where.stamp_ns)
+
+    def _from_sensors(self, s: Sighting, where: Where, landmark: Landmark) -> Carried:
+        at = self._solver.estimate([landmark.vertex])[0]
+        group = self._space.group
+        seen = np.array(group.act(group.inverse(self._pose(where)), tuple(at.tolist())))
+        return carry.seen_from_sensor(self._space, s, where, seen)
+
+    def _blurred(self, s: Sighting, carried: Carried) -> Array:
+        """With what messages leave out: clocks, mounting, size."""
+        covariance, added = carried.covariance.copy(), self._config.landmarks.added_sigma_m**2
+        if s.kind in ("pose", "position"):
+            n = self._space.dimensions
+            covariance[:n, :n] += added * np.eye(n)
+        elif s.kind != "bearing":
+            covariance[0, 0] += added
+        return covariance
+
+    def _offset(self, topic: str) -> int:
+        """The vertex of what all ranges of a topic have in common."""
+        if topic not in self._offsets:
+            vertex = self._offsets[topic] = self._graph.add_vertex(R1, [0.0])
+            noise = Gaussian.from_sigmas(self._config.landmarks.range_offset_sigma_m)
+            self._graph.add_edge(POINT_PRIOR[R1], [vertex], [0.0], noise, "range_offset")
+        return self._offsets[topic]
+
+    # -- not determined yet --------------------------------------------------------------------------------------
+
+    def _wait(self, topic: str, name: str, s: Sighting, where: Where) -> None:
+        waiting = self.waiting.setdefault(name, Waiting(topic))
+        is_elsewhere = not waiting.seen or waiting.seen[-1][0].keyframe != where.keyframe
+        waiting.seen.append((where, s))
+        if is_elsewhere:  # another look from where the last was taken determines nothing
+            self._determine(name, waiting)
+        if len(waiting.seen) > _MOST_WAITING:
+            del waiting.seen[1::2]
+
+    def _determine(self, name: str, waiting: Waiting) -> None:
+        glances = []
+        for where, s in waiting.seen:
+            m = len(s.measured)
+            covariance = np.array(s.covariance).reshape(m, m) + 1e-10 * np.eye(m)
+            glances.append(Glance(self._sensor_pose(s, where), s.kind, s.measured, covariance))
+        waiting.places = triangulation.places(self._space, glances, self._config.landmarks.range_offset_sigma_m)
+        waiting.reason = self._why_not(waiting.places, glances)
+        if not waiting.reason:
+            del self.waiting[name]
+            at = tuple(waiting.places[0].position.tolist())
+            landmark = self.known[name] = Landmark(self._graph.add_vertex(self._space.point, at))
+            for where, s in waiting.seen:
+                self._add_edge(waiting.topic, landmark, s, where)
+
+    def _why_not(self, places: list[Place], glances: list[Glance]) -> str:
+        """Why a landmark is not determined; empty where it is."""
+        settings, count = self._config.landmarks, len(glances)
+        if count <= self._space.dimensions - (glances[0].kind != "range"):
+            return f"{count} {'sightings' if count > 1 else 'sighting'} by {glances[0].kind}: too few"
+        if not places:
+            return f"no place fits {count} sightings by {glances[0].kind}"
+        best = places[0]
+        others = [p for p in places[1:] if p.chi2 < best.chi2 + settings.mirror_chi2]
+        if others:
+            fits = " and ".join("(" + ", ".join(f"{x:.2f}" for x in p.position) + ")" for p in [best, *others[:2]])
+            return f"{1 + len(others)} places fit: {fits}"
+        n = self._space.dimensions
+        distance = min(float(np.linalg.norm(best.position - np.array(g.T_map_sensor[:n]))) for g in glances)
+        sigma = (
+            float(np.sqrt(np.linalg.eigvalsh(best.covariance)[-1])) if np.isfinite(best.covariance).all() else np.inf
+        )
+        if sigma > settings.determined_below * distance:
+            return f"sigma {sigma:.2f} m at {distance:.2f} m: more than {settings.determined_below:g} of the distance"
+        return ""
+
+    # -- where things are ----------------------------------------------------------------------------------------
+
+    def _pose(self, where: Where) -> Numbers:
+        return tuple(self._solver.estimate([where.vertex])[0].tolist())
+
+    def _in_map(self, where: Where, point: Numbers) -> Numbers:
+        return tuple(map(float, self._space.group.act(self._pose(where), point)))
+
+    def _sensor_pose(self, s: Sighting, where: Where) -> Numbers:
+        group = self._space.group
+        T_map_base = group.compose(self._pose(where), where.T_keyframe_base)
+        return tuple(map(float, group.compose(T_map_base, s.T_base_sensor or self._space.identity)))
+
+    def _from_sensor(self, s: Sighting, where: Where, point: Array) -> Array:
+        return np.array(self._space.group.act(self._sensor_pose(s, where), tuple(point.tolist())))

@@ -1,0 +1,112 @@
+"""One odometry out of several: the first in priority that is alive, told as steps; and where it does not hold."""
+
+from collections import deque
+from dataclasses import dataclass
+
+from graph_slam_ros.slam.config import OdometryConfig
+from graph_slam_ros.slam.counters import Counters
+from graph_slam_ros.slam.measurements import Odometry
+from graph_slam_ros.slam.space import Numbers, Space
+
+_REMEMBERED = 1000  # messages of a source that is not in use, to take over from where the one in use fell silent
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """The motion since the step before.
+
+    Attributes
+    ----------
+    T_odom_base : the pose in the frame of the odometry in use
+    broken : whether odometry jumped here, so that ``T_last_base`` is no motion of the robot
+    """
+
+    stamp_ns: int
+    T_last_base: Numbers
+    T_odom_base: Numbers
+    twist_covariance: Numbers | None = None
+    broken: bool = False
+
+
+class OdometryChoice:
+    """Chooses by stamps alone: what is used follows from what was accepted, not from when it came."""
+
+    def __init__(self, config: OdometryConfig, space: Space, counters: Counters) -> None:
+        self._config, self._space, self._counters = config, space, counters
+        self._silent_ns = round(config.timeout_s * 1e9)
+        self._order = config.priority.split()
+        self._past: dict[str, deque[Odometry]] = {}
+        self._used: Odometry | None = None
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the last odometry that was used."""
+        return None if self._used is None else self._used.stamp_ns
+
+    def take(self, m: Odometry) -> list[Step]:
+        """The steps that a message leads to: none where it is not the odometry in use."""
+        if m.source not in self._past:
+            self._past[m.source] = deque(maxlen=_REMEMBERED)
+            if m.source not in self._order:
+                self._order.append(m.source)
+        past, used = self._past[m.source], self._used
+        if past and past[-1].stamp_ns == m.stamp_ns:
+            self._counters.count(m.source, "duplicate" if past[-1] == m else "duplicate_stamp")
+            return []
+        past.append(m)
+        if used is None:
+            return [self._use(m, self._space.identity, broken=False)]
+        if m.source == used.source:
+            return [self._follow(used, m)]
+        if self._takes_over(m, used):
+            return self._switched(past, used)
+        self._counters.count(m.source, "not_in_use")
+        return []
+
+    def _takes_over(self, m: Odometry, used: Odometry) -> bool:
+        if self._order.index(m.source) < self._order.index(used.source):
+            return m.stamp_ns >= used.stamp_ns
+        return m.stamp_ns - used.stamp_ns > self._silent_ns
+
+    def _switched(self, past: "deque[Odometry]", used: Odometry) -> list[Step]:
+        """From where the other was used last, by interpolation of this one; not before it reaches back so far."""
+        group = self._space.group
+        newer = [m for m in past if m.stamp_ns > used.stamp_ns]
+        older = [m for m in past if m.stamp_ns <= used.stamp_ns]
+        source = past[-1].source
+        if not older:
+            if newer[-1].stamp_ns - used.stamp_ns <= self._silent_ns:
+                self._counters.count(source, "not_in_use")
+                return []
+            self._counters.count(source, "switched_to_unlinked")
+            return [self._use(newer[-1], self._space.identity, broken=True)]
+        self._counters.count(source, "switched_to")
+        if not newer:  # of the very stamp that was used last
+            self._used = older[-1]
+            return []
+        a, b = older[-1], newer[0]
+        fraction = (used.stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+        at = Odometry(used.stamp_ns, group.interpolate(a.T_odom_base, b.T_odom_base, fraction), None, b.source)
+        out = []
+        for m in newer:
+            out.append(self._follow(at, m))
+            at = m
+        return out
+
+    def _follow(self, a: Odometry, b: Odometry) -> Step:
+        step = self._space.group.between(a.T_odom_base, b.T_odom_base)
+        return self._use(b, step, broken=self._jumps(step, (b.stamp_ns - a.stamp_ns) * 1e-9))
+
+    def _use(self, m: Odometry, step: Numbers, *, broken: bool) -> Step:
+        if broken:
+            self._counters.count(m.source, "jump")
+        self._used = m
+        return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, broken)
+
+    def _jumps(self, step: Numbers, dt: float) -> bool:
+        """No robot moves like this: odometry was set anew, or has slipped by a lap."""
+        n = self._space.dimensions
+        return sum(x * x for x in step[:n]) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
+
+
+_LEAST_S = 0.02  # stamps of some drivers crowd together: a pair of them says nothing of speed

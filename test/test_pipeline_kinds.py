@@ -1,0 +1,316 @@
+"""Every kind of measurement through the pipeline, in the plane and in space, against a world that is known."""
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.carry import seen_as
+from graph_slam_ros.slam.measurements import from_record, to_record
+from graph_slam_ros.slam.space import PLANE, SPACE
+
+S = 1_000_000_000
+T0 = 1_700_000_000 * S
+HZ = 20
+END = (Control("end"), Control("optimize"))
+BOTH = pytest.mark.parametrize("space", [PLANE, SPACE], ids=["plane", "space"])
+SENSOR = {PLANE: (0.3, -0.2, 0.5), SPACE: (0.3, -0.2, 0.1, *so3.exp((0.2, -0.3, 0.5)))}
+EXACT = 1e-3  # standard deviation given to measurements without error
+
+
+def slam(space, **settings):
+    base = {"world.dimensions": space.dimensions, "ordering.window_s": 0.0, "landmarks.added_sigma_m": 0.0}
+    base |= {"odometry.noise": "density", "landmarks.loss": "none"}
+    return GraphSlam(Config.from_mapping(base | {k.replace("__", "."): v for k, v in settings.items()}))
+
+
+def twist(space, t):
+    """Velocities of a winding drive, banking and climbing in space."""
+    if space is PLANE:
+        return (1.0, 0.0, 0.6 * np.sin(0.7 * t))
+    return (1.0, 0.0, 0.2 * np.cos(t), 0.3 * np.sin(1.3 * t), 0.2 * np.cos(0.9 * t), 0.6 * np.sin(0.7 * t))
+
+
+def drive(space, seconds, drift=0.0):
+    """True poses and those of odometry, which turns a little too much, at HZ."""
+    true, odom = [space.identity], [space.identity]
+    for k in range(round(seconds * HZ)):
+        v = np.array(twist(space, k / HZ)) / HZ
+        true.append(space.group.retract(true[-1], tuple(v)))
+        v[-1] += drift / HZ
+        odom.append(space.group.retract(odom[-1], tuple(v)))
+    return true, odom
+
+
+def stamp(k):
+    return T0 + k * S // HZ
+
+
+def covariance(size, sigma=EXACT):
+    return tuple((sigma**2 * np.eye(size)).ravel().tolist())
+
+
+def floats(numbers):
+    return tuple(float(x) for x in numbers)
+
+
+def sighting(space, kind, name, T_map_base, landmark, sigma=EXACT):
+    """What a sensor sees of a landmark, without error."""
+    group, T_base_sensor = space.group, SENSOR[space]
+    n = space.dimensions
+    if kind == "pose":
+        return Sighting(name, kind, floats(group.between(T_map_base, landmark)), covariance(space.dof, sigma))
+    if kind == "position":
+        return Sighting(name, kind, floats(group.act(group.inverse(T_map_base), landmark[:n])), covariance(n, sigma))
+    p = group.act(group.inverse(group.compose(T_map_base, T_base_sensor)), landmark[:n])
+    said = seen_as(space, kind, np.array(p))
+    return Sighting(name, kind, floats(said), covariance(len(said), sigma), T_base_sensor)
+
+
+def landmarks(space):
+    rng = np.random.default_rng(5)
+    n = space.dimensions
+    points = {f"m{k}": rng.uniform(-4, 8, n) for k in range(8)}
+    if space is PLANE:
+        return {name: (*p, rng.uniform(-3, 3)) for name, p in points.items()}
+    return {name: (*p, *so3.exp(tuple(rng.standard_normal(3)))) for name, p in points.items()}
+
+
+def errors(space, pipeline, true):
+    """Distance of every keyframe from where it was."""
+    k = (pipeline.keyframes.stamps_ns - T0) * HZ // S
+    n = space.dimensions
+    return np.linalg.norm(pipeline.trajectory()[:, :n] - np.array(true)[k, :n], axis=1)
+
+
+@BOTH
+@pytest.mark.parametrize("kind", ["position", "pose", "range_bearing", "bearing", "range"])
+def test_landmarks_seen_in_any_way_put_the_path_right(space, kind):
+    true, odom = drive(space, 20.0, drift=0.02)
+    world = landmarks(space)
+    pipeline = slam(space)
+    for k, at in enumerate(odom):
+        pipeline.process(Odometry(stamp(k), at))
+        if k % 4 == 1:
+            seen = tuple(sighting(space, kind, name, true[k], p) for name, p in world.items())
+            pipeline.process(from_record(to_record(Sightings(stamp(k), "seen", seen))))
+    [pipeline.process(event) for event in END]
+    drifted = np.linalg.norm(np.subtract(true[-1], odom[-1])[: space.dimensions])
+    assert set(pipeline.landmarks) == set(world)
+    assert not pipeline.waiting
+    assert errors(space, pipeline, true).max() < 0.1 * drifted
+    for name, landmark in pipeline.landmarks.items():
+        found = pipeline.solver.estimate([landmark.vertex])[0]
+        assert found[: space.dimensions] == pytest.approx(world[name][: space.dimensions], abs=0.1 * drifted)
+
+
+@BOTH
+def test_what_is_seen_between_keyframes_by_a_sensor_anywhere_costs_nothing_where_all_is_exact(space):
+    true, odom = drive(space, 6.0)
+    world = landmarks(space)
+    pipeline = slam(space, keyframes__min_distance_m=1.0)
+    for k, at in enumerate(odom):
+        pipeline.process(Odometry(stamp(k), at))
+        kinds = ["position", "pose", "range_bearing", "bearing", "range"]
+        names = list(world)
+        if k % 3 == 1:
+            seen = [sighting(space, kind, names[j], true[k], world[names[j]]) for j, kind in enumerate(kinds)]
+            pipeline.process(Sightings(stamp(k), "seen", tuple(seen)))
+    [pipeline.process(event) for event in END]
+    assert pipeline.report.chi2_final < 1e-6
+
+
+@BOTH
+def test_ranges_that_share_an_offset_say_how_large_it_is(space):
+    true, odom = drive(space, 20.0)
+    world = landmarks(space)
+    pipeline = slam(space, landmarks__range_offset_sigma_m=1.0)
+    for k, at in enumerate(odom):
+        pipeline.process(Odometry(stamp(k), at))
+        if k % 4 == 1:
+            seen = [sighting(space, "range", name, true[k], p, 0.01) for name, p in world.items()]
+            longer = [Sighting(s.id, s.kind, (s.measured[0] + 0.4,), s.covariance, s.T_base_sensor) for s in seen]
+            pipeline.process(Sightings(stamp(k), "seen", tuple(longer)))
+    [pipeline.process(event) for event in END]
+    (offset,) = [v for v in range(pipeline.graph.vertex_count) if pipeline.graph.kind_of(v).dof == 1]
+    assert pipeline.solver.estimate([offset])[0] == pytest.approx([0.4], abs=0.02)
+
+
+def test_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why():
+    pipeline = slam(PLANE)
+    for k in range(40):
+        pipeline.process(Odometry(stamp(k), (0.0, 0.0, 0.0)))
+        pipeline.process(Sightings(stamp(k), "seen", (sighting(PLANE, "bearing", "a", PLANE.identity, (3.0, 1.0, 0)),)))
+    assert not pipeline.landmarks
+    assert "too few" in pipeline.waiting["a"]
+
+
+def test_both_mirror_places_of_a_landmark_are_kept_until_the_robot_turns():
+    pipeline, at = slam(PLANE, landmarks__mirror_chi2=20.0), PLANE.identity
+    for k in range(160):
+        pipeline.process(Odometry(stamp(k), at))
+        if k == 60:  # straight ahead all the way: the beacon is on the left or on the right
+            waiting = pipeline._landmarks.waiting["a"]
+            assert "2 places fit" in pipeline.waiting["a"]
+            found = sorted((place.position.tolist() for place in waiting.places), key=lambda at: at[1])
+            assert np.array(found) == pytest.approx(np.array([[2.0, -3.0], [2.0, 3.0]]), abs=0.01)
+        s = Sighting("a", "range", (float(np.hypot(at[0] - 2.0, at[1] - 3.0)),), covariance(1, 0.01))
+        pipeline.process(Sightings(stamp(k), "ranges", (s,)))
+        at = se2.retract(at, (1.0 / HZ, 0.0, 0.0 if k < 60 else 0.8 / HZ))
+    assert pipeline.solver.estimate([pipeline.landmarks["a"].vertex])[0] == pytest.approx([2.0, 3.0], abs=0.05)
+    assert not pipeline.waiting
+
+
+@BOTH
+@pytest.mark.parametrize("kind", ["pose", "position"])
+def test_fixes_hold_the_path_where_odometry_drifts(space, kind):
+    true, odom = drive(space, 20.0, drift=0.05)
+    n = space.dimensions
+    antenna = (0.5, 0.3, 0.2)[:n]
+    pipeline = slam(space)
+    for k, at in enumerate(odom):
+        pipeline.process(Odometry(stamp(k), at))
+        if k % 7 == 1:
+            if kind == "pose":
+                fix = Fix(stamp(k), "fix", kind, floats(true[k]), covariance(space.dof, 0.01))
+            else:
+                measured = floats(space.group.act(true[k], antenna))
+                fix = Fix(stamp(k), "fix", kind, measured, covariance(n, 0.01), antenna)
+            pipeline.process(from_record(to_record(fix)))
+    [pipeline.process(event) for event in END]
+    assert np.linalg.norm(np.subtract(true[-1], odom[-1])[:n]) > 1.0
+    assert errors(space, pipeline, true).max() < 0.05
+
+
+@BOTH
+def test_a_fix_that_lacks_an_axis_tells_of_the_others(space):
+    true, odom = drive(space, 10.0)
+    n = space.dimensions
+    pipeline = slam(space)
+    [pipeline.process(Odometry(stamp(k), at)) for k, at in enumerate(odom)]
+    unknown = np.eye(n) * 1e-4
+    unknown[0, 0] = 1e6
+    measured = np.array(true[-1][:n]) + [0.0, 1.0, 1.0][:n]  # disagrees, and x is nonsense
+    measured[0] = 1e5
+    pipeline.process(Fix(stamp(len(odom) - 1), "fix", "position", floats(measured), floats(unknown.ravel())))
+    [pipeline.process(event) for event in END]
+    assert len(pipeline.graph.tables[space.coordinate_prior]) == n - 1
+    last = pipeline.trajectory()[-1, :n]
+    assert last[1:] == pytest.approx(measured[1:], abs=0.1)
+    assert abs(last[0] - true[-1][0]) < 2.0  # turned a little, but not drawn to the nonsense
+
+
+@BOTH
+def test_a_compass_holds_the_heading(space):
+    true, odom = drive(space, 20.0, drift=0.05)
+    pipeline = slam(space)
+    for k, at in enumerate(odom):
+        pipeline.process(Odometry(stamp(k), at))
+        if k % 7 == 1:
+            fix = Fix(stamp(k), "compass", "heading", (space.heading(true[k]),), (1e-6,))
+            pipeline.process(fix)
+    [pipeline.process(event) for event in END]
+    last = pipeline.trajectory()[-1]
+    at = round((pipeline.keyframes.stamps_ns[-1] - T0) / S * HZ)
+    assert abs(se2.wrap(space.heading(tuple(last)) - space.heading(true[at]))) < 0.01
+    assert abs(se2.wrap(space.heading(odom[at]) - space.heading(true[at]))) > 0.5
+
+
+def test_an_attitude_holds_roll_and_pitch_and_is_refused_in_the_plane():
+    true, odom = drive(SPACE, 20.0, drift=0.05)
+    pipeline = slam(SPACE)
+    for k, at in enumerate(odom):
+        pipeline.process(Odometry(stamp(k), at))
+        if k % 7 == 1:
+            pipeline.process(Fix(stamp(k), "imu", "attitude", floats(true[k][3:]), covariance(3)))
+    [pipeline.process(event) for event in END]
+    at = round((pipeline.keyframes.stamps_ns[-1] - T0) / S * HZ)
+    apart = se3.local(tuple(pipeline.trajectory()[-1]), true[at])
+    assert np.linalg.norm(apart[3:]) < 0.01
+    planar = slam(PLANE)
+    planar.process(Odometry(stamp(0), (0.0, 0.0, 0.0)))
+    planar.process(Fix(stamp(0), "imu", "attitude", (0.0, 0.0, 0.0, 1.0), covariance(3)))
+    assert planar.counters.as_dict() == {"imu": {"attitude_not_in_the_plane": 1}}
+
+
+@BOTH
+def test_a_loop_closure_between_any_two_stamps_closes_the_loop(space):
+    true, odom = drive(space, 30.0, drift=0.02)
+    pipeline = slam(space, ordering__late_s=2.0)
+    [pipeline.process(Odometry(stamp(k), at)) for k, at in enumerate(odom)]
+    before = errors(space, pipeline, true)[-1]
+    earlier, later = 61, len(odom) - 13
+    between = floats(space.group.between(true[earlier], true[later]))
+    closing = Closure(stamp(later), stamp(earlier), "closures", between, covariance(space.dof))
+    pipeline.process(from_record(to_record(closing)))
+    pipeline.process(Closure(stamp(later), stamp(0) - S, "closures", between, covariance(space.dof)))
+    [pipeline.process(event) for event in END]
+    assert pipeline.counters.as_dict() == {"closures": {"from_where_there_was_no_odometry": 1}}
+    assert errors(space, pipeline, true)[-1] < 0.3 * before
+
+
+@BOTH
+def test_where_odometry_is_set_anew_a_segment_begins_and_the_map_stays_straight(space):
+    true, odom = drive(space, 20.0)
+    world = landmarks(space)
+    pipeline = slam(space)
+    middle = len(odom) // 2
+    for k in range(len(odom)):
+        at = odom[k] if k < middle else space.group.between(odom[middle], odom[k])
+        pipeline.process(Odometry(stamp(k), floats(at)))
+        if k % 4 == 1:
+            seen = tuple(sighting(space, "position", name, true[k], p, 0.01) for name, p in world.items())
+            pipeline.process(Sightings(stamp(k), "seen", seen))
+    [pipeline.process(event) for event in END]
+    assert pipeline.counters.as_dict() == {"odometry": {"jump": 1}}
+    assert len(pipeline.segments) == 2
+    assert errors(space, pipeline, true).max() < 0.02
+
+
+@BOTH
+def test_the_next_odometry_takes_over_where_the_first_falls_silent_and_gives_way_where_it_is_back(space):
+    true, odom = drive(space, 20.0)
+    elsewhere = floats(space.group.exp(tuple(0.3 * np.arange(1, space.dof + 1))))
+    pipeline = slam(space, odometry__priority="wheels camera", odometry__timeout_s=0.3)
+    for k, at in enumerate(odom):
+        pipeline.process(Odometry(stamp(k), floats(space.group.compose(elsewhere, at)), None, "camera"))
+        if not 100 <= k < 200:
+            pipeline.process(Odometry(stamp(k), at, None, "wheels"))
+    [pipeline.process(event) for event in END]
+    counted = pipeline.counters.as_dict()
+    assert counted["camera"]["switched_to"] == 1
+    assert counted["wheels"]["switched_to"] == 2  # the camera came first of all
+    assert counted["camera"]["not_in_use"] > 250
+    assert errors(space, pipeline, [space.group.compose(elsewhere, p) for p in true]).max() < 1e-3
+    gaps = np.diff(pipeline.keyframes.stamps_ns)
+    assert gaps.max() < 0.5 * S
+
+
+@BOTH
+def test_the_same_sequence_gives_the_same_bytes(space):
+    true, odom = drive(space, 5.0, drift=0.1)
+    world = landmarks(space)
+    kept = []
+
+    def once(measurements):
+        pipeline = slam(space)
+        pipeline._sink = kept.append
+        [pipeline.process(m) for m in measurements]
+        return pipeline.trajectory().tobytes()
+
+    def sequence():
+        for k, at in enumerate(odom):
+            yield Odometry(stamp(k), at)
+            if k % 5 == 3:
+                seen = tuple(sighting(space, "bearing", name, true[k - 3], p) for name, p in world.items())
+                yield Sightings(stamp(k - 3), "seen", seen)
+                yield Fix(
+                    stamp(k - 2),
+                    "fix",
+                    "position",
+                    floats(true[k - 2][: space.dimensions]),
+                    covariance(space.dimensions, 1.0),
+                )
+
+    first = once([*sequence(), *END])
+    assert once([from_record(to_record(m)) for m in list(kept)]) == first
