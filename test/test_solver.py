@@ -171,6 +171,7 @@ def test_a_report_adds_up():
     labels = np.concatenate([[label] * len(z) for _, _, z, _, label in world.edges])
     for name, part in report.classes.items():
         assert part.chi2 == pytest.approx((r[labels == name] ** 2).sum(), rel=1e-12)
+        assert part.residuals == (labels == name).sum()
     last = report.iterations[-1]
     assert (last.chi2, last.cost) == pytest.approx((report.chi2_final, report.cost_final), rel=1e-12)
     assert last.damping == 0.0

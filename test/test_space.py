@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.graph import LANDMARK_POSITION_3D, POSE_PRIOR_3D, RELATIVE_POSE_3D, numeric_jacobian
-from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.solver import Solver
 
 GRAPHS = Path(os.environ.get("GRAPH_SLAM_DATASETS", Path(__file__).resolve().parents[1] / "../shared/datasets"))
@@ -129,3 +129,21 @@ def solved(file):
 def initial(graph, ids):
     size = graph.kind_of(ids[0]).size
     return graph.initial.values[graph.offset.values[np.asarray(ids)][:, None] + np.arange(size)]
+
+
+def test_the_plane_lies_in_space_level_and_at_height_zero_and_its_motions_stay_its_motions():
+    rng = np.random.default_rng(4)
+    a, b = rng.uniform(-3.0, 3.0, (2, 20, 3))
+    together = np.stack(se2.compose(tuple(a.T), tuple(b.T)), axis=1)
+    raised = np.stack(se3.compose(tuple(se3.in_space(a).T), tuple(se3.in_space(b).T)), axis=1)
+    assert raised[:, 2:5].tolist() == [[0.0] * 3] * 20
+    back = se3.in_plane(raised)
+    assert back[:, :2] == pytest.approx(together[:, :2])
+    assert back[:, 2] == pytest.approx(se2.wrap(together[:, 2]))
+    assert se3.in_space(raised) is raised
+    assert se3.in_space((1.0, 2.0, np.pi)) == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+
+
+def test_a_pose_in_space_leaves_the_heading_of_its_x_axis_in_the_plane():
+    rolled = so3.compose(so3.exp((0.0, 0.0, 2.5)), so3.compose(so3.exp((0.0, -0.6, 0.0)), so3.exp((0.9, 0.0, 0.0))))
+    assert se3.in_plane((1.0, 2.0, 9.0, *rolled)) == pytest.approx([1.0, 2.0, 2.5])

@@ -7,7 +7,7 @@ A pose is a tuple (x, y, z, qx, qy, qz, qw), metres and a unit quaternion; a com
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from graph_slam_ros.lie import so3
 from graph_slam_ros.lie.jit import jitable, kernel
@@ -18,6 +18,23 @@ Pose: TypeAlias = tuple[Any, Any, Any, Any, Any, Any, Any]
 Tangent: TypeAlias = tuple[Any, Any, Any, Any, Any, Any]
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def in_space(poses: ArrayLike) -> Array:
+    """Poses (..., 7): those of the plane (..., 3) at height 0 and level, those of space as they are."""
+    given = np.asarray(poses, dtype=np.float64)
+    if given.shape[-1] == 7:
+        return given
+    out = np.zeros((*given.shape[:-1], 7))
+    out[..., :2] = given[..., :2]
+    out[..., 5], out[..., 6] = np.sin(0.5 * given[..., 2]), np.cos(0.5 * given[..., 2])
+    return out
+
+
+def in_plane(poses: ArrayLike) -> Array:
+    """Poses (..., 3) of those of space (..., 7): x, y and the heading of their x axis; height, roll, pitch are lost."""
+    x, y, _, qx, qy, qz, qw = np.moveaxis(np.asarray(poses, dtype=np.float64), -1, 0)
+    return np.stack([x, y, np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)], axis=-1)
 
 
 @jitable

@@ -159,7 +159,7 @@ def refuse_nonfinite(block: Block) -> None:
 
 @dataclass(slots=True)
 class Costs:
-    """Sums over edges: chi2 without and cost with their losses, and chi2 and number by label."""
+    """Sums over edges: chi2 without and cost with their losses, and chi2 and numbers by label."""
 
     chi2: float
     cost: float
@@ -168,11 +168,18 @@ class Costs:
 
 def costs(graph: Graph, blocks: Iterable[Block]) -> Costs:
     """Add up the costs of linearised edges."""
-    count, chi2, cost = np.zeros(len(graph.labels), dtype=np.int64), np.zeros(len(graph.labels)), 0.0
+    count, residuals = np.zeros((2, len(graph.labels)), dtype=np.int64)
+    chi2, cost = np.zeros(len(graph.labels)), 0.0
     for b in blocks:
         label = b.table.label.values[b.rows]
-        count += np.bincount(label, minlength=len(count))
+        edges = np.bincount(label, minlength=len(count))
+        count += edges
+        residuals += b.table.type.residual_size * edges
         chi2 += np.bincount(label, b.chi2, minlength=len(count))
         cost += float(b.cost.sum())
-    classes = {name: ClassCost(int(count[k]), float(chi2[k])) for k, name in enumerate(graph.labels) if count[k]}
+    classes = {
+        name: ClassCost(int(count[k]), float(chi2[k]), int(residuals[k]))
+        for k, name in enumerate(graph.labels)
+        if count[k]
+    }
     return Costs(float(chi2.sum()), cost, classes)

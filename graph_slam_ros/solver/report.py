@@ -15,10 +15,11 @@ class Iteration:
 
 @dataclass(frozen=True, slots=True)
 class ClassCost:
-    """How many edges a label has, and their share of chi2."""
+    """How many edges a label has, their share of chi2, and how many residuals it is the sum of."""
 
     edges: int
     chi2: float
+    residuals: int
 
 
 @dataclass(frozen=True, slots=True)
