@@ -1,15 +1,23 @@
 """The run folder: everything a run leaves behind, written the same way by the node and by replay.
 
-``graph.g2o`` and ``graph_vertices.csv`` (stamp and name of each vertex), ``path.tum``, ``sightings.tum``,
-``odometry.tum``, ``landmarks.csv``, ``run.mcap``, ``ingest.mcap``, ``config.yaml``, ``run.json``.
+``graph.g2o`` and ``graph_vertices.csv`` (stamp and name of each vertex), ``path.tum``, ``covariances.csv``,
+``sightings.tum``, ``odometry.tum``, ``landmarks.csv``, ``run.mcap``, ``ingest.mcap``, ``config.yaml``, ``run.json``.
+
+Covariances are written as their upper triangle, row by row. Those of ``covariances.csv``, of each pose of ``path.tum``,
+are in the pose's tangent space, with (x, y, theta) or (x, y, z, rotation vector) along and about the axes of the robot;
+those of ``landmarks.csv`` are in the axes of map. What is not known is nan; what a point does not have is empty.
 """
 
 import itertools
 import json
 import os
 import re
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from graph_slam_ros import __version__
 from graph_slam_ros.errors import GraphSlamError
@@ -23,7 +31,8 @@ from graph_slam_ros.ros.bag import BagWriter
 from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.measurements import to_record
 
-SUMMARY, _CONFIG = "run.json", "config.yaml"
+SUMMARY, COVARIANCES, _CONFIG = "run.json", "covariances.csv", "config.yaml"
+Name = TypeVar("Name")
 _RECORDED = re.compile(r"(ingest|run)(_\d+)?\.mcap")
 
 _RESULTS = {
@@ -31,11 +40,14 @@ _RESULTS = {
     "graph.g2o",
     "graph_vertices.csv",
     "path.tum",
+    COVARIANCES,
     "sightings.tum",
     "odometry.tum",
     "landmarks.csv",
     "path.png",
 }
+_TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
+_POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
 _PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
 
 
@@ -137,6 +149,7 @@ class RunRecorder:
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
         _replace(self.folder / "path.tum", tum_text(slam.keyframes.stamps_ns.tolist(), slam.trajectory()))
+        _replace(self.folder / COVARIANCES, _covariance_table(slam))
         stamps = slam.sighting_poses.stamps_ns.tolist()
         _replace(self.folder / "sightings.tum", tum_text(stamps, slam.sighting_trajectory()))
         _replace(self.folder / "odometry.tum", tum_text(stamps, slam.sighting_odometry()))
@@ -181,7 +194,7 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
         "cost": last.cost_final if last else 0.0,
         "converged": last.converged if last else True,
         "stop": last.stop if last else "nothing_to_do",
-        "classes": {name: {"edges": c.edges, "chi2": c.chi2} for name, c in (last.classes if last else {}).items()},
+        "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
         "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
         "counters": slam.counters.as_dict(),
     }
@@ -205,14 +218,28 @@ def _write_graph(folder: Path, slam: GraphSlam) -> None:
     _replace(folder / "graph_vertices.csv", "\n".join(rows) + "\n")
 
 
-def _landmark_table(slam: GraphSlam) -> str:
-    rows = ["id,kind,x,y,theta,sightings,cov_xx,cov_xy,cov_yy"]
-    for name, value, covariance in results.landmark_estimates(slam):
-        kind, theta = ("pose", repr(value[2])) if len(value) == 3 else ("point", "")
-        spread = f"{covariance[0, 0]:.6e},{covariance[0, 1]:.6e},{covariance[1, 1]:.6e}"
-        seen = slam.landmarks[name].sightings
-        rows.append(f"{_csv(name)},{kind},{value[0]!r},{value[1]!r},{theta},{seen},{spread}")
+def _covariance_table(slam: GraphSlam) -> str:
+    dof = slam.config.space.dof
+    rows = [f"stamp_ns,{','.join(f'tangent_{a}{b}' for a, b in _upper(_TANGENT[dof]))}"]
+    for stamp_ns, covariance in zip(slam.keyframes.stamps_ns, results.keyframe_covariances(slam), strict=True):
+        rows.append(f"{stamp_ns},{','.join(map(repr, covariance[np.triu_indices(dof)].tolist()))}")
     return "\n".join(rows) + "\n"
+
+
+def _landmark_table(slam: GraphSlam) -> str:
+    space = slam.config.space
+    rows = [f"id,kind,{_POSE[space.dof]},sightings,{','.join(f'cov_{a}{b}' for a, b in _upper(_TANGENT[space.dof]))}"]
+    for name, value, covariance in results.landmark_estimates(slam):
+        kind = "pose" if len(value) == space.pose.size else "point"
+        at = [*map(repr, value), *[""] * (space.pose.size - len(value))]
+        spread = [f"{covariance[i, j]:.9e}" if j < len(covariance) else "" for i, j in _upper(range(space.dof))]
+        rows.append(",".join([_csv(name), kind, *at, str(slam.landmarks[name].sightings), *spread]))
+    return "\n".join(rows) + "\n"
+
+
+def _upper(names: Sequence[Name]) -> Iterator[tuple[Name, Name]]:
+    """Pairs of the upper triangle of a matrix, row by row."""
+    return itertools.combinations_with_replacement(names, 2)
 
 
 def _csv(text: str) -> str:

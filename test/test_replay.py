@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import re
 import shutil
 
@@ -15,6 +16,7 @@ from graph_slam_ros.evaluation import read_tum
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.ingest import IngestWriter, ingest_files, read_ingest
 from graph_slam_ros.replay import replay
+from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter, open_bag
 from graph_slam_ros.ros.interfaces import typestore
 from graph_slam_ros.run import RunError, RunRecorder, is_run, run_config
@@ -22,7 +24,7 @@ from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 from graph_slam_ros.slam.measurements import from_record, to_record
 
-RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv")
+RESULTS = ("graph.g2o", "path.tum", "covariances.csv", "sightings.tum", "landmarks.csv")
 ALL = {*RESULTS, "graph_vertices.csv", "odometry.tum", "run.mcap", "ingest.mcap", "config.yaml", "run.json"}
 
 
@@ -181,14 +183,51 @@ def test_trajectories_have_a_line_for_each_keyframe_and_each_sighting(folder, ru
 
 def test_the_table_of_landmarks_has_estimate_and_covariance(folder, run):
     rows = [line.split(",") for line in (folder / "landmarks.csv").read_text().splitlines()]
-    assert rows[0] == ["id", "kind", "x", "y", "theta", "sightings", "cov_xx", "cov_xy", "cov_yy"]
+    spread = ["cov_xx", "cov_xy", "cov_xtheta", "cov_yy", "cov_ytheta", "cov_thetatheta"]
+    assert rows[0] == ["id", "kind", "x", "y", "theta", "sightings", *spread]
+    covariances = {name: covariance for name, _, covariance in results.landmark_estimates(run.slam)}
     assert [row[0] for row in rows[1:]] == list(run.slam.landmarks)
     for row in rows[1:]:
         landmark = run.slam.landmarks[row[0]]
         assert [float(v) for v in row[2:5]] == run.slam.solver.estimate([landmark.vertex])[0].tolist()
         assert int(row[5]) == landmark.sightings
-        xx, xy, yy = map(float, row[6:])
-        assert xx * yy > xy * xy
+        assert np.array(row[6:], float) == pytest.approx(covariances[row[0]][np.triu_indices(3)], rel=1e-8)
+
+
+def test_what_a_point_does_not_have_is_empty_and_what_is_not_known_is_no_number(tmp_path):
+    config = Config.from_mapping({"solve.every_keyframes": 100})
+    recorder = RunRecorder(tmp_path / "run", config)
+    slam = GraphSlam(config, recorder.sink)
+    for m in measurements(simulate("pythonrobotics", 1, poses=3)):
+        slam.process(m)
+    slam.process(Control("flush"))
+    recorder.save(slam)
+    rows = [line.split(",") for line in (tmp_path / "run" / "landmarks.csv").read_text().splitlines()[1:]]
+    assert [row[1] for row in rows] == ["point"] * 5
+    for row in rows:
+        assert (row[4], row[8], row[10], row[11]) == ("", "", "", "")
+        assert np.isfinite(np.array([row[k] for k in (2, 3)], float)).all()
+        assert [math.isnan(float(row[k])) for k in (6, 7, 9)] == [True] * 3, "not solved yet"
+
+
+def test_the_covariance_of_every_keyframe_is_in_its_tangent_space(folder, run):
+    header, *rows = [line.split(",") for line in (folder / "covariances.csv").read_text().splitlines()]
+    names = ["xx", "xy", "xtheta", "yy", "ytheta", "thetatheta"]
+    assert header == ["stamp_ns", *[f"tangent_{name}" for name in names]]
+    assert [int(row[0]) for row in rows] == run.slam.keyframes.stamps_ns.tolist()
+    for row, covariance in zip(rows, run.slam.solver.marginal(run.slam.keyframes.ids), strict=True):
+        assert np.array(row[1:], float) == pytest.approx(covariance[np.triu_indices(3)])
+
+
+def test_the_summary_tells_of_each_class_its_edges_residuals_and_chi2(folder, run):
+    summary = json.loads((folder / "run.json").read_text())
+    count = len(run.slam.keyframes)
+    assert {name: (c["edges"], c["residuals"]) for name, c in summary["classes"].items()} == {
+        "anchor": (1, 3),
+        "odometry": (count - 1, 3 * (count - 1)),
+        "landmarks": (summary["sightings"], 3 * summary["sightings"]),
+    }
+    assert sum(c["chi2"] for c in summary["classes"].values()) == pytest.approx(summary["chi2"])
 
 
 def test_a_landmarks_name_may_hold_anything(tmp_path, folder):
@@ -234,11 +273,10 @@ def test_the_recording_of_a_run_is_read_by_mcap_and_by_rosbags(folder):
 def test_the_recorded_path_is_the_saved_one(folder):
     *_, last = open_bag(folder / "run.mcap").messages({"/path"})
     path = typestore().deserialize_cdr(last.cdr, "nav_msgs/msg/Path")
-    recorded = [
-        f"{p.header.stamp.sec}.{p.header.stamp.nanosec:09d} {p.pose.position.x!r} {p.pose.position.y!r} 0 0 0"
-        f" {p.pose.orientation.z!r} {p.pose.orientation.w!r}"
-        for p in path.poses
-    ]
+    recorded = []
+    for stamped in path.poses:
+        stamp, p, q = stamped.header.stamp, stamped.pose.position, stamped.pose.orientation
+        recorded.append(f"{stamp.sec}.{stamp.nanosec:09d} {p.x!r} {p.y!r} {p.z!r} {q.x!r} {q.y!r} {q.z!r} {q.w!r}")
     assert recorded == (folder / "path.tum").read_text().splitlines()
 
 

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from graph_slam_ros.errors import SingularError
+from graph_slam_ros.lie import so3
 from graph_slam_ros.ros import results, to_msg
 from graph_slam_ros.ros.interfaces import typestore
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
@@ -16,12 +18,13 @@ def decode(cdr, name):
     return typestore().deserialize_cdr(cdr, name)
 
 
+@pytest.mark.parametrize("size", [3, 7])
 @pytest.mark.parametrize("n", [0, 1, 2, 5])
 @pytest.mark.parametrize("length", range(1, 17))
-def test_a_path_has_the_bytes_of_the_serialiser_for_every_length_of_the_frames_name(length, n):
+def test_a_path_has_the_bytes_of_the_serialiser_for_every_length_of_the_frames_name(length, n, size):
     frame = "abcdefghijklmnop"[:length]
     rng = np.random.default_rng(length)
-    poses = rng.uniform(-9.0, 9.0, (n, 3))
+    poses = rng.uniform(-9.0, 9.0, (n, size))
     stamps = [STAMP_NS + 1_100_000_000 * k for k in range(n)]
     stamped = [
         to_msg.make("geometry_msgs/msg/PoseStamped", header=to_msg.header(stamp, frame), pose=to_msg.pose(tuple(p)))
@@ -49,7 +52,7 @@ def test_a_path_keeps_the_stamp_of_each_pose_and_carries_the_newest():
 def test_a_covariance_is_published_in_the_axes_of_the_parent_frame():
     # at 90 degrees the robot's x (variance 1) is the map's y, its y (4) the map's -x
     tangent = np.array([[1.0, 0.5, 0.1], [0.5, 4.0, 0.2], [0.1, 0.2, 9.0]])
-    cdr = to_msg.pose_with_covariance(STAMP_NS, "map", (3.0, -2.0, math.pi / 2), tangent, 1e6)
+    cdr = to_msg.pose_with_covariance_stamped(STAMP_NS, "map", (3.0, -2.0, math.pi / 2), tangent, 1e6)
     message = decode(cdr, "geometry_msgs/msg/PoseWithCovarianceStamped")
     full = message.pose.covariance.reshape(6, 6)
     expected = np.diag([4.0, 1.0, 1e6, 1e6, 1e6, 9.0])
@@ -61,6 +64,28 @@ def test_a_covariance_is_published_in_the_axes_of_the_parent_frame():
     assert (at.position.x, at.position.y, at.position.z) == (3.0, -2.0, 0.0)
     assert at.orientation.z == pytest.approx(math.sqrt(0.5))
     assert message.header.frame_id == "map"
+
+
+def test_in_space_all_of_a_covariance_is_published_in_the_axes_of_the_parent_frame():
+    # half a turn about the diagonal of x and y: the robot's x is the map's y, its y the map's x, its z the map's -z
+    half = math.sqrt(0.5)
+    root = np.random.default_rng(1).standard_normal((6, 6))
+    tangent = root @ root.T
+    pose = (3.0, -2.0, 1.0, half, half, 0.0, 0.0)
+    message = decode(to_msg.pose_with_covariance_stamped(STAMP_NS, "map", pose, tangent, 1e6), results.POSE)
+    at, signs = [1, 0, 2, 4, 3, 5], np.array([1, 1, -1, 1, 1, -1])
+    expected = signs[:, None] * tangent[np.ix_(at, at)] * signs
+    assert message.pose.covariance.reshape(6, 6) == pytest.approx(expected)
+    p, q = message.pose.pose.position, message.pose.pose.orientation
+    assert (p.x, p.y, p.z, q.x, q.y, q.z, q.w) == pose
+    assert np.diag(expected)[3] == pytest.approx(tangent[4, 4]), "rotations come after translations"
+
+
+def test_a_transform_in_space_has_all_seven_numbers():
+    motion = (1.0, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5)
+    (t,) = decode(to_msg.transform(STAMP_NS, "map", "odom", motion), "tf2_msgs/msg/TFMessage").transforms
+    p, q = t.transform.translation, t.transform.rotation
+    assert (p.x, p.y, p.z, q.x, q.y, q.z, q.w) == motion
 
 
 def test_a_transform_names_its_frames_and_its_stamp():
@@ -93,6 +118,19 @@ def test_markers_replace_the_former_ones_and_draw_each_landmark_as_its_two_sigma
     assert name.text == "a"
     assert (exact.scale.x, exact.scale.y) == (0.05, 0.05), "never too small to see"
     assert {m.header.frame_id for m in drawn} == {"map"}
+
+
+def test_in_space_a_landmark_is_drawn_as_its_two_sigma_ellipsoid_or_small_where_that_is_unknown():
+    turn = so3.matrix(so3.exp((0.4, -1.1, 0.7)))
+    covariances = [turn @ np.diag([0.01, 0.09, 0.25]) @ turn.T, np.full((3, 3), np.nan)]
+    positions = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    cdr = to_msg.landmark_markers(STAMP_NS, "map", ["a", "b"], positions, covariances)
+    _, ellipsoid, _, unknown, _ = decode(cdr, results.LANDMARKS).markers
+    p, q, size = ellipsoid.pose.position, ellipsoid.pose.orientation, ellipsoid.scale
+    assert (ellipsoid.type, p.x, p.y, p.z) == (2, 1.0, 2.0, 3.0)
+    axes = so3.matrix((q.x, q.y, q.z, q.w))
+    assert axes @ np.diag(np.square([size.x, size.y, size.z]) / 16) @ axes.T == pytest.approx(covariances[0])
+    assert (unknown.scale.x, unknown.scale.y, unknown.scale.z) == (0.05, 0.05, 0.05)
 
 
 def test_no_landmarks_are_drawn_as_none():
@@ -129,12 +167,26 @@ def test_the_published_pose_is_the_paths_last_and_the_correction_leads_there(sol
     assert odometry.transform.translation.x == 3.5
 
 
-def test_a_landmarks_covariance_is_that_of_its_position_in_the_map(solved):
+def test_a_landmarks_covariance_is_in_the_axes_of_the_map(solved):
     by_name = {name: (value, covariance) for name, value, covariance in results.landmark_estimates(solved)}
     value, covariance = by_name["tag"]
     (marginal,) = solved.solver.marginal([solved.landmarks["tag"].vertex])
     c, s = math.cos(value[2]), math.sin(value[2])
-    turn = np.array([[c, -s], [s, c]])
-    assert covariance == pytest.approx(turn @ marginal[:2, :2] @ turn.T)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    assert covariance == pytest.approx(turn @ marginal @ turn.T)
     assert len(by_name["point"][0]) == 2
     assert by_name["point"][1] == pytest.approx(solved.solver.marginal([solved.landmarks["point"].vertex])[0])
+
+
+def test_every_keyframe_has_its_covariance_or_nothing_that_could_be_mistaken_for_one(solved, monkeypatch):
+    ids = solved.keyframes.ids
+    covariances = results.keyframe_covariances(solved)
+    assert covariances.shape == (len(ids), 3, 3)
+    assert covariances[-1] == pytest.approx(solved.pose_covariance)
+
+    def fails(_):
+        raise SingularError("the edges do not determine vertex 3")
+
+    monkeypatch.setattr(solved.solver, "marginal", fails)
+    assert np.isnan(results.keyframe_covariances(solved)).all()
+    assert results.keyframe_covariances(GraphSlam()).shape == (0, 3, 3)

@@ -3,12 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.graph import SE2
-from graph_slam_ros.lie import se2
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.ros import to_msg
 from graph_slam_ros.slam import GraphSlam
 
 Array = NDArray[np.float64]
+Numbers = tuple[float, ...]
 
 PATH, POSE, LANDMARKS, TF = (
     "nav_msgs/msg/Path",
@@ -18,9 +18,10 @@ PATH, POSE, LANDMARKS, TF = (
 )
 
 
-def newest_pose(slam: GraphSlam) -> se2.Pose:
+def newest_pose(slam: GraphSlam) -> Numbers:
     """Estimated ``T_map_base`` at the newest keyframe."""
-    return se2.compose(slam.T_map_odom, slam.keyframes[-1].T_odom_base)
+    out: Numbers = slam.config.space.group.compose(slam.T_map_odom, slam.keyframes[-1].T_odom_base)
+    return out
 
 
 def path(slam: GraphSlam) -> bytes:
@@ -30,7 +31,7 @@ def path(slam: GraphSlam) -> bytes:
 
 def pose(slam: GraphSlam) -> bytes:
     """The newest keyframe's pose and covariance."""
-    return to_msg.pose_with_covariance(
+    return to_msg.pose_with_covariance_stamped(
         slam.keyframes[-1].stamp_ns,
         slam.config.frames.map,
         newest_pose(slam),
@@ -51,21 +52,30 @@ def odom_to_base(slam: GraphSlam) -> bytes:
 
 
 def landmarks(slam: GraphSlam) -> bytes:
-    """Landmarks as 2-sigma ellipses with names."""
-    found = landmark_estimates(slam)
-    positions = np.array([pose[:2] for _, pose, _ in found]).reshape(-1, 2)
-    names, covariances = [name for name, _, _ in found], [covariance for _, _, covariance in found]
-    return to_msg.landmark_markers(slam.keyframes[-1].stamp_ns, slam.config.frames.map, names, positions, covariances)
+    """Landmarks as 2-sigma ellipses, in space ellipsoids, with names."""
+    n = slam.config.space.dimensions
+    names, values, covariances = zip(*landmark_estimates(slam), strict=True) if slam.landmarks else ((), (), ())
+    positions = np.array([value[:n] for value in values]).reshape(-1, n)
+    spreads = [covariance[:n, :n] for covariance in covariances]
+    return to_msg.landmark_markers(slam.keyframes[-1].stamp_ns, slam.config.frames.map, names, positions, spreads)
 
 
-def landmark_estimates(slam: GraphSlam) -> list[tuple[str, tuple[float, ...], Array]]:
-    """(id, (x, y) or (x, y, theta), covariance (2, 2) of the position), all in the map frame."""
-    vertices = [landmark.vertex for landmark in slam.landmarks.values()]
-    marginals = slam.landmark_covariances() if vertices else []
-    out = []
-    for name, vertex, marginal in zip(slam.landmarks, vertices, marginals, strict=True):
-        value = tuple(slam.solver.estimate([vertex])[0].tolist())
-        if slam.graph.kind_of(vertex) is SE2:
-            marginal = to_msg.in_parent_axes((value[0], value[1], value[2]), marginal)
-        out.append((name, value, marginal[:2, :2]))
+def landmark_estimates(slam: GraphSlam) -> list[tuple[str, Numbers, Array]]:
+    """(id, point or pose, its covariance), all in the axes of the map frame; NaN where a covariance is unknown."""
+    space, out = slam.config.space, []
+    marginals = slam.landmark_covariances() if slam.landmarks else []
+    for (name, landmark), marginal in zip(slam.landmarks.items(), marginals, strict=True):
+        value = tuple(slam.solver.estimate([landmark.vertex])[0].tolist())
+        if slam.graph.kind_of(landmark.vertex) is space.pose:
+            marginal = space.in_parent_axes(value, marginal)
+        out.append((name, value, marginal))
     return out
+
+
+def keyframe_covariances(slam: GraphSlam) -> Array:
+    """Marginal covariance of every keyframe in its tangent space, (n, 3, 3) or (n, 6, 6); NaN where unsolved."""
+    n, dof = len(slam.keyframes), slam.config.space.dof
+    try:
+        return np.array(slam.solver.marginal(slam.keyframes.ids)).reshape(n, dof, dof)
+    except GraphSlamError:  # the last solve failed, and was counted
+        return np.full((n, dof, dof), np.nan)

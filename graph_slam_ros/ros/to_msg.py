@@ -1,6 +1,7 @@
 """Results to messages, as CDR bytes: the node publishes them as they are, replay and simulation write them into bags.
 
-One encoder for all, rosbags' type store, so nothing here needs ROS. A path is written with NumPy: 10,000 poses as
+A pose is (x, y, theta) or (x, y, z, qx, qy, qz, qw) throughout, its covariance (3, 3) or (6, 6). One encoder for all,
+rosbags' type store, so nothing here needs ROS. A path is written with NumPy: 10,000 poses as
 message objects would cost a tenth of a second each time.
 """
 
@@ -9,11 +10,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
-from graph_slam_ros.lie import se2
+from graph_slam_ros.lie import se3
 from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.slam.space import PLANE, SPACE
 
 Array = NDArray[np.float64]
+Numbers = tuple[float, ...]
 
 _NS = 1_000_000_000
 _HEADER = b"\x00\x01\x00\x00"  # CDR, little endian
@@ -49,47 +53,56 @@ def vector(x: float, y: float, z: float = 0.0) -> Any:
     return make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
 
 
+def quaternion(x: float, y: float, z: float, w: float) -> Any:
+    """geometry_msgs/Quaternion."""
+    return make("geometry_msgs/msg/Quaternion", x=float(x), y=float(y), z=float(z), w=float(w))
+
+
 def heading(theta: float) -> Any:
     """geometry_msgs/Quaternion of a rotation about z."""
-    w, z = float(np.cos(0.5 * theta)), float(np.sin(0.5 * theta))
-    return make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
+    return quaternion(0.0, 0.0, np.sin(0.5 * theta), np.cos(0.5 * theta))
 
 
-def pose(p: se2.Pose) -> Any:
+def pose(p: ArrayLike) -> Any:
     """geometry_msgs/Pose."""
-    return make("geometry_msgs/msg/Pose", position=point(p[0], p[1]), orientation=heading(p[2]))
+    x, y, z, *quat_xyzw = se3.in_space(p).tolist()
+    return make("geometry_msgs/msg/Pose", position=point(x, y, z), orientation=quaternion(*quat_xyzw))
 
 
-def covariance6(planar: Array, unused: float) -> Array:
-    """(3, 3) over (x, y, yaw) in ROS's row-major 6x6; z, roll and pitch get the variance ``unused``."""
+def covariance6(covariance: Array, unused: float) -> Array:
+    """ROS's row-major 6x6, of (6, 6), or of (3, 3) over (x, y, yaw): z, roll and pitch get the variance ``unused``."""
+    if len(covariance) == 6:
+        return np.ravel(covariance)
     full = np.diag([0.0, 0.0, unused, unused, unused, 0.0])
-    full[np.ix_([0, 1, 5], [0, 1, 5])] = planar
+    full[np.ix_([0, 1, 5], [0, 1, 5])] = covariance
     return full.ravel()
 
 
-def in_parent_axes(p: se2.Pose, covariance: Array) -> Array:
-    """Tangent-space covariance (3, 3) of a pose turned into the axes of its parent frame, as ROS publishes it."""
-    c, s = np.cos(p[2]), np.sin(p[2])
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return turn @ covariance @ turn.T
+def pose_with_covariance(p: Numbers, covariance: Array, unused: float) -> Any:
+    """geometry_msgs/PoseWithCovariance, in the axes of the parent frame, from a covariance in the pose's tangent space.
+
+    In the plane z, roll and pitch get the variance ``unused``.
+    """
+    space = PLANE if len(p) == 3 else SPACE
+    full = covariance6(space.in_parent_axes(p, covariance), unused)
+    return make("geometry_msgs/msg/PoseWithCovariance", pose=pose(p), covariance=full)
 
 
-def pose_stamped(stamp_ns: int, frame: str, p: se2.Pose) -> bytes:
+def pose_stamped(stamp_ns: int, frame: str, p: Numbers) -> bytes:
     """geometry_msgs/PoseStamped."""
     return encode(make("geometry_msgs/msg/PoseStamped", header=header(stamp_ns, frame), pose=pose(p)))
 
 
-def pose_with_covariance(stamp_ns: int, frame: str, p: se2.Pose, covariance: Array, unused: float) -> bytes:
-    """geometry_msgs/PoseWithCovarianceStamped from a tangent-space covariance (3, 3)."""
-    full = covariance6(in_parent_axes(p, covariance), unused)
-    inner = make("geometry_msgs/msg/PoseWithCovariance", pose=pose(p), covariance=full)
+def pose_with_covariance_stamped(stamp_ns: int, frame: str, p: Numbers, covariance: Array, unused: float) -> bytes:
+    """geometry_msgs/PoseWithCovarianceStamped; see ``pose_with_covariance``."""
+    inner = pose_with_covariance(p, covariance, unused)
     return encode(make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(stamp_ns, frame), pose=inner))
 
 
-def transform(stamp_ns: int, parent: str, child: str, T_parent_child: se2.Pose) -> bytes:
+def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Numbers) -> bytes:
     """tf2_msgs/TFMessage with one transform."""
-    x, y, theta = T_parent_child
-    moved = make("geometry_msgs/msg/Transform", translation=vector(x, y), rotation=heading(theta))
+    x, y, z, *quat_xyzw = se3.in_space(T_parent_child).tolist()
+    moved = make("geometry_msgs/msg/Transform", translation=vector(x, y, z), rotation=quaternion(*quat_xyzw))
     stamped = make(
         "geometry_msgs/msg/TransformStamped", header=header(stamp_ns, parent), child_frame_id=child, transform=moved
     )
@@ -102,7 +115,7 @@ def clock(stamp_ns: int) -> bytes:
 
 
 def path(frame: str, stamps_ns: ArrayLike, poses: Array) -> bytes:
-    """nav_msgs/Path of poses (n, 3) and their stamps (n,); its header carries the newest stamp.
+    """nav_msgs/Path of poses (n, 3) or (n, 7) and their stamps (n,); its header carries the newest stamp.
 
     All poses after the first take the same number of bytes; the first is preceded by its own padding.
     """
@@ -136,31 +149,37 @@ def _pose_rows(name: bytes, stamps: NDArray[np.int64], poses: Array, start: int)
     rows = np.zeros(len(stamps), dtype=row)
     rows["sec"], rows["nanosec"] = np.divmod(stamps, _NS)
     rows["length"], rows["frame"] = len(name), name
-    half = 0.5 * poses[:, 2]
-    rows["values"][:, :2] = poses[:, :2]
-    rows["values"][:, 5], rows["values"][:, 6] = np.sin(half), np.cos(half)
+    rows["values"] = se3.in_space(poses)
     return rows.view(np.uint8)
 
 
 def landmark_markers(
     stamp_ns: int, frame: str, names: Sequence[str], positions: Array, covariances: Sequence[Array]
 ) -> bytes:
-    """visualization_msgs/MarkerArray: all former markers deleted, then an ellipse (2 sigma) and a name each.
+    """visualization_msgs/MarkerArray: all former markers deleted, then a 2-sigma ellipse or ellipsoid and a name each.
 
     Parameters
     ----------
-    positions : (n, 2); covariances : n of (2, 2), both in ``frame``
+    positions : (n, 2) or (n, 3); covariances : n of (2, 2) or (3, 3), both in ``frame``
     """
     markers = [_marker(stamp_ns, frame, "", 0, action=3)]
-    for k, (name, position, covariance) in enumerate(zip(names, positions.tolist(), covariances, strict=True)):
-        known = np.isfinite(covariance).all()
-        variances, axes = np.linalg.eigh(covariance if known else np.zeros((2, 2)))
-        size = np.maximum(4.0 * np.sqrt(np.maximum(variances, 0.0)), 0.05)
-        tilt = float(np.arctan2(axes[1, 0], axes[0, 0]))
-        at = (position[0], position[1], tilt)
-        markers.append(_marker(stamp_ns, frame, "landmarks", k, type_=3, at=at, scale=(size[0], size[1], 0.05)))
-        markers.append(_marker(stamp_ns, frame, "names", k, type_=9, at=at, scale=(0.0, 0.0, 0.25), text=name))
+    for k, (name, position, covariance) in enumerate(zip(names, positions, covariances, strict=True)):
+        axes, size = _two_sigma(covariance)
+        at = np.concatenate([np.zeros(3), Rotation.from_matrix(axes).as_quat()])
+        at[: len(position)] = position
+        markers.append(_marker(stamp_ns, frame, "landmarks", k, type_=3 if len(position) == 2 else 2, at=at, size=size))
+        markers.append(_marker(stamp_ns, frame, "names", k, type_=9, at=at, size=(0.0, 0.0, 0.25), text=name))
     return encode(make("visualization_msgs/msg/MarkerArray", markers=markers))
+
+
+def _two_sigma(covariance: Array) -> tuple[Array, Numbers]:
+    """Axes, as the columns of a rotation, and diameters [m]; never too small to see, also where it is unknown."""
+    n = len(covariance)
+    variances, directions = np.linalg.eigh(covariance if np.isfinite(covariance).all() else np.zeros((n, n)))
+    axes, size = np.eye(3), np.zeros(3)
+    axes[:n, :n], size[:n] = directions, 4.0 * np.sqrt(np.maximum(variances, 0.0))
+    axes[:, 0] *= np.sign(np.linalg.det(axes))  # a rotation, not its mirror image
+    return axes, tuple(np.maximum(size, 0.05).tolist())
 
 
 def _marker(
@@ -171,8 +190,8 @@ def _marker(
     *,
     action: int = 0,
     type_: int = 0,
-    at: se2.Pose = se2.IDENTITY,
-    scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    at: ArrayLike = se3.IDENTITY,
+    size: Numbers = (1.0, 1.0, 1.0),
     text: str = "",
 ) -> Any:
     zero = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
@@ -184,7 +203,7 @@ def _marker(
         type=type_,
         action=action,
         pose=pose(at),
-        scale=vector(*scale),
+        scale=vector(*size),
         color=make("std_msgs/msg/ColorRGBA", r=0.9, g=0.5, b=0.1, a=0.8),
         lifetime=zero,
         frame_locked=False,
