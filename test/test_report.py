@@ -54,7 +54,7 @@ def run(tmp_path, recording):
     for name in ("path.tum", "sightings.tum"):
         (tmp_path / name).write_text(tum(stamps_s, np.add(truth, (40.0, 0.0, 0.0))))
     (tmp_path / "odometry.tum").write_text(tum(stamps_s, recording.T_odom_base))
-    rows = [f"{name},point,{40.0 + x},{y},,5,1,0,1" for name, (x, y, _) in recording.landmarks.items() if name != "4"]
+    rows = [f"{name},point,{40.0 + x},{y},,5,1,0,1" for name, (x, y) in recording.landmarks.items() if name != "4"]
     (tmp_path / "landmarks.csv").write_text("\n".join([COLUMNS, *rows]) + "\n")
     write_bag(recording, tmp_path / "bag.mcap")
     return tmp_path

@@ -46,7 +46,9 @@ def parser() -> argparse.ArgumentParser:
     )
     _simulate(
         command(
-            "simulate", recordings.simulate, "record a synthetic world with truth: pythonrobotics, manhattan, warehouse"
+            "simulate",
+            recordings.simulate,
+            "record a synthetic world with truth: pythonrobotics, manhattan, warehouse, flight",
         )
     )
     _evaluate(command("evaluate", recordings.evaluate, "position, heading and map error of a run, and a picture"))

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.simulation import manhattan, pythonrobotics, warehouse
+from graph_slam_ros.simulation import flight, manhattan, pythonrobotics, warehouse
 from graph_slam_ros.simulation.bag import write_bag
 from graph_slam_ros.simulation.options import Option, fill, options_of
 from graph_slam_ros.simulation.pose_graph import CityGraph, city_graph, landmark_graph, write_graph
-from graph_slam_ros.simulation.recording import Recording, Seen, measurements
+from graph_slam_ros.simulation.recording import Recording, measurements
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +33,7 @@ WORLDS: dict[str, World] = {
     "pythonrobotics": World(pythonrobotics.PythonRobotics, pythonrobotics.simulate),
     "manhattan": World(manhattan.Manhattan, manhattan.simulate),
     "warehouse": World(warehouse.Warehouse, warehouse.simulate),
+    "flight": World(flight.Flight, flight.simulate),
 }
 
 
@@ -56,7 +57,6 @@ __all__ = [
     "CityGraph",
     "Option",
     "Recording",
-    "Seen",
     "World",
     "city_graph",
     "landmark_graph",

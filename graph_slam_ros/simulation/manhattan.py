@@ -6,12 +6,12 @@ import numpy as np
 from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
-from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
-from graph_slam_ros.simulation.recording import Recording
-from graph_slam_ros.simulation.sensing import RangeBearing
+from graph_slam_ros.simulation.recording import Numbers, Recording
+from graph_slam_ros.simulation.sensing import KINDS, RangeBearing
+from graph_slam_ros.slam import Sighting
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -31,6 +31,7 @@ class Manhattan:
     """Options: blocks of 4 m; the robot drives 1 m a step and chooses its way at every crossing."""
 
     poses: int = option(500, "steps to drive, 1 m each", "", 1, 1e6)
+    sensor: str = option("position", "what it says of a landmark", choices=KINDS)
     blocks: int = option(60, "the city is this many blocks wide and deep", "", 1, 1000)
     sigma_speed_m_s: float = option(0.05, "error of the measured speed", "m/s", 1e-6, 1)
     sigma_sideways_m_s: float = option(0.01, "speed of slipping sideways", "m/s", 1e-6, 1)
@@ -75,15 +76,14 @@ def simulate(seed: int, options: Manhattan) -> Recording:
     points = np.asarray(corners * (STEPS_PER_BLOCK * STEP_M) + CURB_M, dtype=np.float64)
     names = [f"{i}/{j}" for i, j in corners.tolist()]
 
-    def look(T_world_base: se2.Pose) -> tuple[tuple[str, ...], Array, Array]:
-        at = SENSOR.visible(T_world_base, points)
-        return tuple(names[k] for k in at.tolist()), *SENSOR.measure(rng, T_world_base, points[at])
+    def look(T_world_base: Numbers) -> list[Sighting]:
+        return SENSOR.look(rng, T_world_base, names, points, options.sensor)
 
     noise = VelocityNoise(
         (options.sigma_speed_m_s, options.sigma_sideways_m_s, options.sigma_turn_rad_s), options.correlation_time_s
     )
     start = (*(STEP_M * cells[0]).tolist(), 0.5 * np.pi * float(ways[0]))
-    landmarks = {name: (x, y, 0.0) for name, (x, y) in zip(names, points.tolist(), strict=True)}
+    landmarks = dict(zip(names, map(tuple, points.tolist()), strict=True))
     return drive(rng, start, _twists(ways), TICK_NS, noise, look, LOOK_EVERY, landmarks)
 
 

@@ -1,14 +1,17 @@
 """True motion, and the odometry that measures it with errors of velocity."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from graph_slam_ros.lie import se2
+from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.slam.space import PLANE, SPACE, Space
 
 Array = NDArray[np.float64]
+Numbers = tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,25 +20,26 @@ class VelocityNoise:
 
     Attributes
     ----------
-    sigmas : standard deviations of forward, sideways and turning speed [m/s, m/s, rad/s]
+    sigmas : standard deviations in tangent order: forward, sideways and turning speed in the plane, six in space
+        [m/s, rad/s]
     correlation_time_s : how long an error lasts (1/e); 0: each tick draws its own, which holds for the tick
     """
 
-    sigmas: tuple[float, float, float]
+    sigmas: tuple[float, ...]
     correlation_time_s: float = 0.0
 
     @property
     def covariance(self) -> Array:
-        """(3, 3) of one measured twist."""
+        """(d, d) of one measured twist."""
         return np.diag(np.square(self.sigmas))
 
     def _memory(self, dt_s: float) -> float:
         return float(np.exp(-dt_s / self.correlation_time_s)) if self.correlation_time_s > 0.0 else 0.0
 
     def draw(self, rng: Generator, ticks: int, dt_s: float) -> Array:
-        """Errors (ticks, 3) of successive ticks, stationary from the first."""
+        """Errors (ticks, d) of successive ticks, stationary from the first."""
         memory = self._memory(dt_s)
-        errors = rng.standard_normal((ticks, 3))
+        errors = rng.standard_normal((ticks, len(self.sigmas)))
         fresh = np.sqrt(1.0 - memory**2)
         if memory:
             for k in range(1, ticks):
@@ -43,13 +47,28 @@ class VelocityNoise:
         return errors * self.sigmas
 
     def per_tick(self, dt_s: float) -> Array:
-        """Covariance (3, 3) that a tick adds to the integral in the long run: sigma^2 dt^2 (1 + a) / (1 - a)."""
+        """Covariance (d, d) that a tick adds to the integral in the long run: sigma^2 dt^2 (1 + a) / (1 - a)."""
         memory = self._memory(dt_s)
         return self.covariance * (dt_s**2 * (1.0 + memory) / (1.0 - memory))
 
 
-def integrate(start: se2.Pose, steps: Array) -> Array:
-    """Poses (n + 1, 3) from a start by n tangent steps: ``T[k + 1] = T[k] Exp(steps[k])``, angles wrapped."""
+def space_of(pose: Sequence[float] | Array) -> Space:
+    """Where a pose is, by how many numbers it has."""
+    return PLANE if len(pose) == PLANE.pose.size else SPACE
+
+
+def integrate(start: Numbers, steps: Array) -> Array:
+    """Poses (n + 1, 3) or (n + 1, 7) from a start by n tangent steps: ``T[k + 1] = T[k] Exp(steps[k])``."""
+    if space_of(start) is PLANE:
+        return _integrate_planar(start, steps)
+    poses = [start]
+    for step in steps.tolist():
+        poses.append(se3.retract(poses[-1], tuple(step)))
+    return np.array(poses)
+
+
+def _integrate_planar(start: Numbers, steps: Array) -> Array:
+    """In closed form, since headings add up; angles wrapped."""
     theta = start[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
     c, s = np.cos(theta[:-1]), np.sin(theta[:-1])
     dx, dy, _ = se2.exp(tuple(steps.T))
@@ -59,14 +78,22 @@ def integrate(start: se2.Pose, steps: Array) -> Array:
 
 
 def step_covariance(step: Array, per_tick: Array) -> Array:
-    """Covariance (3, 3) of ``Exp(step)`` in its tangent space, from that of the step's components."""
-    return se2.noise_during(se2.exp(tuple(step.tolist())), per_tick)
+    """Covariance (d, d) of ``Exp(step)`` in its tangent space, from that of the step's d components."""
+    group = se2 if len(step) == 3 else se3
+    return group.noise_during(_exp(step), per_tick)
 
 
 def accumulated(steps: Array, per_tick: Array) -> Array:
-    """Covariance (n + 1, 3, 3) of the poses that n steps lead to, each in its tangent space; the first is zero."""
-    out = np.zeros((len(steps) + 1, 3, 3))
+    """Covariance (n + 1, d, d) of the poses that n steps lead to, each in its tangent space; the first is zero."""
+    n, d = steps.shape
+    group = se2 if d == 3 else se3
+    out = np.zeros((n + 1, d, d))
     for k, step in enumerate(steps):
-        x, y, theta = se2.exp(tuple(step.tolist()))
-        out[k + 1] = se2.propagate(out[k], (float(x), float(y), float(theta)), step_covariance(step, per_tick))
+        out[k + 1] = group.propagate(out[k], _exp(step), step_covariance(step, per_tick))
     return out
+
+
+def _exp(step: Array) -> Numbers:
+    """In plain floats, for the kernels."""
+    group = se2 if len(step) == 3 else se3
+    return tuple(float(number) for number in group.exp(tuple(step.tolist())))

@@ -13,7 +13,7 @@ Options = TypeVar("Options")
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """What is known of one option; ``low`` and ``high`` are inclusive."""
+    """What is known of one option; ``low`` and ``high`` are inclusive, ``choices`` those of a text."""
 
     name: str
     default: Any
@@ -21,6 +21,7 @@ class Option:
     unit: str
     low: float
     high: float
+    choices: tuple[str, ...]
 
     def check(self, world: str, value: Any) -> Any:
         """The value in the option's type. Raises GraphSlamError naming world, option and what is allowed."""
@@ -29,17 +30,22 @@ class Option:
             value = float(value)
         if type(value) is not kind:
             raise GraphSlamError(f"{world}: {self.name}: {value!r} is not {_ARTICLE[kind]}")
-        if kind is not bool and not (math.isfinite(value) and self.low <= value <= self.high):
+        if kind is str:
+            if value not in self.choices:
+                raise GraphSlamError(f"{world}: {self.name}: {value!r} is not one of {', '.join(self.choices)}")
+        elif kind is not bool and not (math.isfinite(value) and self.low <= value <= self.high):
             raise GraphSlamError(f"{world}: {self.name}: {value!r} is not in [{self.low:g}, {self.high:g}]")
         return value
 
 
-_ARTICLE = {bool: "true or false", int: "an integer", float: "a number"}
+_ARTICLE = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
 
 
-def option(default: Any, meaning: str, unit: str = "", low: float = 0.0, high: float = 1e6) -> Any:
+def option(
+    default: Any, meaning: str, unit: str = "", low: float = 0.0, high: float = 1e6, choices: tuple[str, ...] = ()
+) -> Any:
     """Dataclass field of an option."""
-    return field(default=default, metadata={"about": (meaning, unit, low, high)})
+    return field(default=default, metadata={"about": (meaning, unit, low, high, choices)})
 
 
 def options_of(cls: type) -> Iterator[Option]:

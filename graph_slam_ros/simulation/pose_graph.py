@@ -133,11 +133,13 @@ def landmark_graph(recording: Recording) -> Graph:
     pose_at = dict(zip(recording.stamps_ns.tolist(), poses.tolist(), strict=True))
     for seen in recording.seen:
         pose = pose_at[seen.stamp_ns]
-        for name, z in zip(seen.ids, seen.measured, strict=True):
-            if name not in vertex_of:
-                vertex_of[name] = graph.add_vertex(R2, se2.act(tuple(recording.T_odom_base[pose]), z))
-        pairs = [(pose, vertex_of[name]) for name in seen.ids]
-        graph.add_edges(LANDMARK_POSITION, pairs, seen.measured, Gaussian.from_covariance(seen.covariance), "landmarks")
+        for s in seen.sightings:
+            if s.id not in vertex_of:
+                vertex_of[s.id] = graph.add_vertex(R2, se2.act(tuple(recording.T_odom_base[pose]), s.measured))
+        pairs = [(pose, vertex_of[s.id]) for s in seen.sightings]
+        measured = [s.measured for s in seen.sightings]
+        covariances = np.reshape([s.covariance for s in seen.sightings], (-1, 2, 2))
+        graph.add_edges(LANDMARK_POSITION, pairs, measured, Gaussian.from_covariance(covariances), "landmarks")
     return graph
 
 

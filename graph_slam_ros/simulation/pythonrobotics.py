@@ -4,16 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import PCG64, Generator
-from numpy.typing import NDArray
 
 from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
-from graph_slam_ros.simulation.recording import Recording
-from graph_slam_ros.simulation.sensing import RangeBearing
-
-Array = NDArray[np.float64]
+from graph_slam_ros.simulation.recording import Numbers, Recording
+from graph_slam_ros.simulation.sensing import KINDS, RangeBearing
+from graph_slam_ros.slam import Sighting
 
 LANDMARKS = ((10.0, -2.0), (15.0, 10.0), (3.0, 15.0), (-5.0, 20.0), (-5.0, 5.0))
 SPEED_M_S, TURN_RAD_S = 1.0, 0.1
@@ -27,6 +25,7 @@ class PythonRobotics:
     """Options: 1 m/s and 0.1 rad/s in ticks of 2 s, everything within 30 m seen at every tick."""
 
     poses: int = option(50, "ticks to drive, 2 s each", "", 1, 1e6)
+    sensor: str = option("position", "what it says of a landmark", choices=KINDS)
     as_original: bool = option(False, "squared noise as the original has it: 0.01 m/s, 0.03 rad/s, 0.04 m, 3e-4 rad")
 
 
@@ -38,12 +37,11 @@ def simulate(seed: int, options: PythonRobotics) -> Recording:
         speed, turn, distance, bearing = speed**2, turn**2, distance**2, bearing**2
     sensor = RangeBearing(distance, bearing, MAX_RANGE_M)
     points = np.array(LANDMARKS)
+    landmarks = {str(k): at for k, at in enumerate(LANDMARKS)}
 
-    def look(T_world_base: se2.Pose) -> tuple[tuple[str, ...], Array, Array]:
-        at = sensor.visible(T_world_base, points)
-        return tuple(str(k) for k in at.tolist()), *sensor.measure(rng, T_world_base, points[at])
+    def look(T_world_base: Numbers) -> list[Sighting]:
+        return sensor.look(rng, T_world_base, list(landmarks), points, options.sensor)
 
     twists = np.tile([SPEED_M_S, 0.0, TURN_RAD_S], (options.poses, 1))
     noise = VelocityNoise((speed, SIDEWAYS_M_S, turn))
-    landmarks = {str(k): (x, y, 0.0) for k, (x, y) in enumerate(LANDMARKS)}
     return drive(rng, se2.IDENTITY, twists, TICK_NS, noise, look, 1, landmarks)

@@ -11,8 +11,10 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
-from graph_slam_ros.simulation.recording import Recording
-from graph_slam_ros.simulation.sensing import RangeBearing
+from graph_slam_ros.simulation.recording import Numbers, Recording
+from graph_slam_ros.simulation.sensing import KINDS, RangeBearing, sightings
+from graph_slam_ros.slam import Sighting
+from graph_slam_ros.slam.space import PLANE
 
 Array = NDArray[np.float64]
 
@@ -40,6 +42,7 @@ class Warehouse:
     laps: int = option(
         2, "how often all aisles are driven; with an odd number of them, from the other end each time", "", 1, 1000
     )
+    sensor: str = option("pose", "what it says of a tag", choices=("pose", *KINDS))
     sigma_speed_m_s: float = option(0.05, "error of the measured speed", "m/s", 1e-6, 1)
     sigma_sideways_m_s: float = option(0.01, "speed of slipping sideways", "m/s", 1e-6, 1)
     sigma_turn_rad_s: float = option(0.05, "error of the measured turning speed", "rad/s", 1e-6, 1)
@@ -51,15 +54,20 @@ def simulate(seed: int, options: Warehouse) -> Recording:
     rng = Generator(PCG64(seed))
     names, tags = _tags(options)
 
-    def look(T_world_base: se2.Pose) -> tuple[tuple[str, ...], Array, Array]:
+    def look(T_world_base: Numbers) -> list[Sighting]:
         at = CAMERA.visible(T_world_base, tags[:, :2])
         at = at[_is_facing(T_world_base, tags[at])]
-        positions, covariance = CAMERA.measure(rng, T_world_base, tags[at, :2])
+        seen = [names[k] for k in at]
+        if options.sensor != "pose":
+            return sightings(seen, options.sensor, *CAMERA.measure(rng, T_world_base, tags[at, :2], options.sensor))
+        positions, covariance = CAMERA.measure(rng, T_world_base, tags[at, :2], "position")
         yaw = se2.wrap(tags[at, 2] - T_world_base[2] + SIGMA_YAW_RAD * rng.standard_normal(len(at)))
         full = np.zeros((len(at), 3, 3))
         full[:, :2, :2] = covariance
         full[:, 2, 2] = SIGMA_YAW_RAD**2
-        return tuple(names[k] for k in at.tolist()), np.column_stack([positions, yaw]), full
+        poses = np.column_stack([positions, yaw])
+        in_tangent = [PLANE.in_tangent(tuple(z), c) for z, c in zip(poses.tolist(), full, strict=True)]
+        return sightings(seen, "pose", poses, np.array(in_tangent).reshape(-1, 3, 3))
 
     twists = follow(_route(options), CORNER_RADIUS_M, SPEED_M_S, TICK_NS * 1e-9)
     noise = VelocityNoise(
@@ -90,7 +98,7 @@ def _tags(options: Warehouse) -> tuple[list[str], Array]:
     return list(tags), np.array(list(tags.values()))
 
 
-def _is_facing(T_world_base: se2.Pose, tags: Array) -> NDArray[np.bool_]:
+def _is_facing(T_world_base: Numbers, tags: Array) -> NDArray[np.bool_]:
     toward = np.arctan2(T_world_base[1] - tags[:, 1], T_world_base[0] - tags[:, 0])
     return np.asarray(np.abs(se2.wrap(toward - tags[:, 2])) <= MAX_SLANT_RAD)
 
