@@ -1,71 +1,30 @@
-"""How far a run is from the truth: position, heading and map, measured by evo.
+"""How far a run is from the truth: position, orientation and map, measured by evo; and whether it knows how far.
 
-The estimate is moved onto the truth by the rigid motion of the plane that fits best, without scale; poses are compared
-where both have a stamp within 0.05 s.
+For the errors the estimate is moved onto the truth by the rigid motion that fits best, of the plane or of space as the
+run was made, without scale; poses are compared where both have a stamp within 0.05 s. Consistency is told in the frame
+that both share at the run's first pose.
 """
 
-import csv
-from collections.abc import Iterator
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from graph_slam_ros.consistency import Consistency, class_noise, landmark_nees, pose_nees
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.lie import se2
-from graph_slam_ros.ros.bag import Bag, open_bag
-from graph_slam_ros.ros.definitions import recorded_decoder
+from graph_slam_ros.lie import se3
+from graph_slam_ros.run import COVARIANCES, SUMMARY, is_run, run_config
+from graph_slam_ros.truth import Point, Trajectory, Truth, read_covariances, read_landmarks, read_truth, read_tum
 
 Array = NDArray[np.float64]
 
 MAX_STAMP_DIFFERENCE_S = 0.05
-TRUTH_TOPIC = "/ground_truth"
-TRUE_LANDMARKS_TOPIC = "/landmarks_ground_truth"
-_ODOMETRY_TOPIC = "/odom"
-_ODOMETRY = "nav_msgs/msg/Odometry"
-_POSE_TYPES = (
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "geometry_msgs/msg/TransformStamped",
-    _ODOMETRY,
-)
 _STATISTICS = ("rmse", "median", "max")
-
-
-@dataclass(frozen=True, slots=True)
-class Trajectory:
-    """Poses of the plane at stamps.
-
-    Attributes
-    ----------
-    stamps_s : (n,) seconds, increasing
-    poses : (n, 3) x, y [m], theta [rad]
-    """
-
-    stamps_s: Array
-    poses: Array
-
-    def moved(self, T_new_old: se2.Pose) -> "Trajectory":
-        """The same trajectory in another frame."""
-        x, y, theta = se2.compose(T_new_old, tuple(self.poses.T))
-        return Trajectory(self.stamps_s, np.column_stack([x, y, se2.wrap(theta)]))
-
-
-@dataclass(frozen=True, slots=True)
-class Truth:
-    """What is known to be true.
-
-    Attributes
-    ----------
-    landmarks : positions (x, y) in metres by id, where they are known
-    losses : what of the recording could not be read
-    """
-
-    trajectory: Trajectory
-    landmarks: dict[str, tuple[float, float]]
-    losses: tuple[str, ...] = ()
+_EXACT_S = 1e-6  # stamps in seconds are rounded to less
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +32,7 @@ class PathError:
     """Errors of a path at n stamps, each as {rmse, median, max}."""
 
     position_m: dict[str, float]
-    heading_rad: dict[str, float]
+    angle_rad: dict[str, float]
     n: int
 
 
@@ -84,25 +43,33 @@ class Scores:
     Attributes
     ----------
     odometry : the same for dead reckoning, or None where the run has none
-    map_rmse_m : of landmarks with the same id, aligned by themselves; None with fewer than two or without truth
+    map_rmse_m : of landmarks with the same id, aligned by themselves; None with too few to align or without truth
+    consistency : of the run, or None where it left no covariances
+    dimensions : 2 or 3
     losses : what of the truth could not be read
     """
 
     estimate: PathError
     odometry: PathError | None
     map_rmse_m: float | None
+    consistency: Consistency | None = None
+    dimensions: int = 2
     losses: tuple[str, ...] = ()
 
+    @property
+    def _angle(self) -> str:
+        return "heading" if self.dimensions == 2 else "angle"
+
     def as_dict(self) -> dict[str, Any]:
-        """Plain values; ``map_m`` and ``odometry`` are None where there are none."""
-        odometry = self.odometry
-        return {
-            "position_m": self.estimate.position_m,
-            "heading_rad": self.estimate.heading_rad,
+        """Plain values; what there is not is None. Angles are ``heading_rad`` in the plane, ``angle_rad`` in space."""
+
+        def plain(error: PathError) -> dict[str, Any]:
+            return {"position_m": error.position_m, f"{self._angle}_rad": error.angle_rad, "n": error.n}
+
+        return plain(self.estimate) | {
             "map_m": None if self.map_rmse_m is None else {"rmse": self.map_rmse_m},
-            "n": self.estimate.n,
-            "odometry": odometry
-            and {"position_m": odometry.position_m, "heading_rad": odometry.heading_rad, "n": odometry.n},
+            "odometry": self.odometry and plain(self.odometry),
+            "consistency": self.consistency and self.consistency.as_dict(),
         }
 
     def __str__(self) -> str:
@@ -110,9 +77,11 @@ class Scores:
         for name, error in (("estimate", self.estimate), ("dead reckoning", self.odometry)):
             if error is not None:
                 lines.append(_line(f"{name}, position [m]", error.position_m, 1.0, 3))
-                lines.append(_line(f"{name}, heading [deg]", error.heading_rad, 180.0 / np.pi, 2))
+                lines.append(_line(f"{name}, {self._angle} [deg]", error.angle_rad, 180.0 / np.pi, 2))
         if self.map_rmse_m is not None:
             lines.append(f"{'landmarks, position [m]':30s}{self.map_rmse_m:10.3f}")
+        if self.consistency is not None:
+            lines.append(str(self.consistency))
         return "\n".join(lines)
 
 
@@ -133,21 +102,31 @@ def evaluate(run: Path, truth: str | Path, estimate: str = "sightings.tum") -> S
     GraphSlamError
         A file or topic that is missing or unreadable, too few common stamps, or no evo.
     """
-    known = read_truth(truth)
+    known, dimensions = read_truth(truth), dimensions_of(run)
     odometry = run / "odometry.tum"
+    landmarks = {name: landmark.position for name, landmark in read_landmarks(run / "landmarks.csv").items()}
     return Scores(
-        path_error(read_tum(run / estimate), known.trajectory),
-        path_error(read_tum(odometry), known.trajectory) if odometry.exists() else None,
-        _map_rmse(read_landmarks(run / "landmarks.csv"), known.landmarks),
+        path_error(read_tum(run / estimate), known.trajectory, dimensions),
+        path_error(read_tum(odometry), known.trajectory, dimensions) if odometry.exists() else None,
+        _map_rmse(landmarks, known.landmarks, dimensions),
+        _consistency(run, known),
+        dimensions,
         known.losses,
     )
 
 
-def path_error(estimate: Trajectory, truth: Trajectory) -> PathError:
+def dimensions_of(run: Path) -> int:
+    """In how many dimensions a run was made: 2 where it does not say."""
+    return run_config(run).world.dimensions if is_run(run) else 2
+
+
+def path_error(estimate: Trajectory, truth: Trajectory, dimensions: int = 2) -> PathError:
     """Errors of one path, aligned by itself."""
     metrics = _evo("metrics")
+    if dimensions == 2:
+        estimate, truth = estimate.in_plane(), truth.in_plane()
     matched, reference = associate(estimate, truth)
-    aligned = matched.moved(alignment(matched.poses[:, :2], reference.poses[:, :2]))
+    aligned = matched.moved(alignment(matched.poses[:, :dimensions], reference.poses[:, :dimensions]))
     found = []
     for relation in (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad):
         error = metrics.APE(relation)
@@ -175,37 +154,86 @@ def associate(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Traj
     return tuple(Trajectory(t.stamps_s[at], t.poses[at]) for t, at in ((estimate, mine), (truth, theirs)))  # type: ignore[return-value]
 
 
-def alignment(points: Array, reference: Array) -> se2.Pose:
-    """The rigid motion of the plane that takes points (n, 2) nearest to their reference (n, 2).
+def alignment(points: Array, reference: Array) -> se3.Pose:
+    """The rigid motion that takes points (n, 2) or (n, 3) nearest to their reference.
 
-    In two dimensions, where a rotation cannot turn into the mirror image that turning over in space would allow.
+    Of the plane where they have two coordinates: a rotation there cannot turn into the mirror image that turning over
+    in space would allow.
 
     Raises
     ------
     GraphSlamError
-        All points are in one place.
+        All points are in one place, or in space on a line.
     """
     geometry = _evo("geometry")
+    dimensions = points.shape[1]
     try:
         rotation, translation, _ = geometry.umeyama_alignment(points.T, reference.T, False)
     except geometry.GeometryException:
-        raise GraphSlamError("cannot align: all positions are in one place") from None
-    return float(translation[0]), float(translation[1]), float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+        where = "in one place" if dimensions == 2 else "on a line"
+        raise GraphSlamError(f"cannot align: all positions are {where}") from None
+    full = np.eye(3)
+    full[:dimensions, :dimensions] = rotation
+    turn = Rotation.from_matrix(full).as_quat()
+    x, y, z = (*translation.tolist(), 0.0)[:3]
+    return (x, y, z, *turn.tolist())
 
 
-def _map_rmse(landmarks: dict[str, tuple[float, float]], true: dict[str, tuple[float, float]]) -> float | None:
+def _map_rmse(landmarks: dict[str, Point], true: dict[str, Point], dimensions: int) -> float | None:
     """RMSE in metres of the landmarks whose ids both have."""
     shared = sorted(set(landmarks) & set(true))
-    if len(shared) < 2:
+    if len(shared) < dimensions:
         return None
-    points, reference = (np.array([where[name] for name in shared]) for where in (landmarks, true))
-    x, y = se2.act(alignment(points, reference), tuple(points.T))
+    flat = np.array([1.0, 1.0, 0.0 if dimensions == 2 else 1.0])
+    points, reference = (np.array([where[name] for name in shared]) * flat for where in (landmarks, true))
+    moved = np.stack(se3.act(alignment(points[:, :dimensions], reference[:, :dimensions]), tuple(points.T)), axis=1)
+    level = np.tile(se3.IDENTITY[3:], (len(shared), 1))
     metrics = _evo("metrics")
     error = metrics.APE(metrics.PoseRelation.translation_part)
     at = np.zeros(len(shared))
-    pair = (Trajectory(at, np.column_stack([*reference.T, at])), Trajectory(at, np.column_stack([x, y, at])))
-    error.process_data(tuple(_evo_path(t) for t in pair))
+    error.process_data(tuple(_evo_path(Trajectory(at, np.hstack([p, level]))) for p in (reference, moved)))
     return float(error.get_statistic(metrics.StatisticsType.rmse))
+
+
+def _consistency(run: Path, known: Truth) -> Consistency | None:
+    """From what the run left; None where it left no covariances."""
+    if not (run / COVARIANCES).exists():
+        return None
+    path, covariances = read_tum(run / "path.tum"), read_covariances(run / COVARIANCES)
+    if len(covariances) != len(path.stamps_s):
+        raise GraphSlamError(f"{run / COVARIANCES}: {len(covariances)} covariances of {len(path.stamps_s)} poses")
+    truth = known.trajectory if covariances.shape[1] == 6 else known.trajectory.in_plane()
+    true = interpolated(truth, path.stamps_s)
+    landmarks = read_landmarks(run / "landmarks.csv")
+    unknown = (np.nan, np.nan, np.nan)
+    of_landmarks = landmark_nees(
+        np.array([landmark.position for landmark in landmarks.values()]).reshape(-1, 3),
+        np.array([known.landmarks.get(name, unknown) for name in landmarks]).reshape(-1, 3),
+        np.array([landmark.covariance for landmark in landmarks.values()]).reshape(-1, 3, 3),
+        path.poses[0],
+        true[0],
+        covariances[0],
+    )
+    summary = json.loads((run / SUMMARY).read_text(encoding="utf-8"))
+    return Consistency(
+        *pose_nees(path.poses, true, covariances),
+        of_landmarks,
+        class_noise(summary["classes"], summary["leverage"]),
+    )
+
+
+def interpolated(truth: Trajectory, stamps_s: Array) -> Array:
+    """True poses (n, 7) at stamps (n,), between neighbours at most twice 0.05 s apart; elsewhere NaN."""
+    after = np.clip(np.searchsorted(truth.stamps_s, stamps_s), 1, max(1, len(truth.stamps_s) - 1))
+    before = after - 1
+    after = np.minimum(after, len(truth.stamps_s) - 1)
+    first, gap = truth.stamps_s[before], truth.stamps_s[after] - truth.stamps_s[before]
+    fraction = (stamps_s - first) / np.where(gap > 0.0, gap, 1.0)
+    out = np.stack(se3.interpolate(tuple(truth.poses[before].T), tuple(truth.poses[after].T), fraction), axis=1)
+    off_s = np.minimum(np.abs(stamps_s - first), np.abs(truth.stamps_s[after] - stamps_s))
+    between = (fraction >= 0.0) & (fraction <= 1.0) & (gap <= 2.0 * MAX_STAMP_DIFFERENCE_S)
+    out[~(between | (off_s <= _EXACT_S))] = np.nan
+    return out
 
 
 def _evo(module: str) -> Any:
@@ -218,143 +246,8 @@ def _evo(module: str) -> Any:
 
 
 def _evo_path(t: Trajectory) -> Any:
-    x, y, theta = t.poses.T
-    zero = np.zeros(len(x))
-    quat_wxyz = np.column_stack([np.cos(0.5 * theta), zero, zero, np.sin(0.5 * theta)])
-    return _evo("trajectory").PosePath3D(np.column_stack([x, y, zero]), quat_wxyz)
+    return _evo("trajectory").PosePath3D(t.poses[:, :3], np.roll(t.poses[:, 3:], 1, axis=1))
 
 
 def _span(t: Trajectory) -> str:
     return f"{t.stamps_s[0]:.3f} to {t.stamps_s[-1]:.3f} s"
-
-
-# -- files -----------------------------------------------------------------------------------------------------------
-
-
-def read_tum(path: Path) -> Trajectory:
-    """Poses of a TUM file (stamp x y z qx qy qz qw); z, roll and pitch are left out.
-
-    Raises
-    ------
-    GraphSlamError
-        No such file, nothing in it, or rows that are not eight numbers.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise GraphSlamError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise GraphSlamError(f"{path}: not a readable text file ({type(error).__name__})") from None
-    found = []
-    for number, line in enumerate(lines, start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            try:
-                found.append([float(word) for word in line.split()])
-            except ValueError as error:
-                raise GraphSlamError(f"{path}:{number}: {error}") from None
-            if len(found[-1]) != 8 or not np.isfinite(found[-1]).all():
-                raise GraphSlamError(f"{path}:{number}: a row of a TUM file is eight finite numbers")
-    if not found:
-        raise GraphSlamError(f"{path}: no pose in it")
-    rows = np.array(found)
-    return _trajectory(rows[:, 0], rows[:, 1:3], rows[:, 4:])
-
-
-def _trajectory(stamps_s: Array, positions: Array, quat_xyzw: Array) -> Trajectory:
-    """Planar poses in order of stamp."""
-    qx, qy, qz, qw = quat_xyzw.T
-    theta = np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
-    order = np.argsort(stamps_s, kind="stable")
-    return Trajectory(stamps_s[order], np.column_stack([positions, theta])[order])
-
-
-def read_landmarks(path: Path) -> dict[str, tuple[float, float]]:
-    """Positions (x, y) [m] by id of a run's ``landmarks.csv``; empty where there is no such file."""
-    if not path.exists():
-        return {}
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            return {row["id"]: (float(row["x"]), float(row["y"])) for row in csv.DictReader(stream)}
-    except (KeyError, TypeError, ValueError) as error:
-        raise GraphSlamError(f"{path}: not a table of landmarks ({error})") from None
-
-
-def read_truth(truth: str | Path) -> Truth:
-    """True poses and landmarks from ``BAG``, ``BAG:TOPIC`` or ``FILE.tum``.
-
-    Raises
-    ------
-    GraphSlamError
-        No such file, or no such topic; those that exist are named.
-    """
-    path, topic = Path(truth), ""
-    if not path.exists() and ":" in str(truth):
-        before, _, topic = str(truth).rpartition(":")
-        path = Path(before)
-    if path.suffix in (".tum", ".txt"):
-        return Truth(read_tum(path), {})
-    bag = open_bag(path)
-    poses, landmarks = _recorded_poses(bag, topic or _truth_topic(bag, path), path), _recorded_landmarks(bag)
-    return Truth(poses, landmarks, tuple(bag.losses))
-
-
-def _truth_topic(bag: Bag, path: Path) -> str:
-    """``/ground_truth``, or the only topic of poses besides the odometry (of its type only where there is no other)."""
-    if TRUTH_TOPIC in bag.topics:
-        return TRUTH_TOPIC
-    poses = [t for t in bag.topics.values() if t.type in _POSE_TYPES and t.name != _ODOMETRY_TOPIC]
-    best = [t.name for t in poses if t.type != _ODOMETRY] or [t.name for t in poses]
-    if len(best) == 1:
-        return best[0]
-    raise GraphSlamError(f"{path}: no topic {TRUTH_TOPIC}; name the truth as BAG:TOPIC, {_listed(bag)}")
-
-
-def _listed(bag: Bag) -> str:
-    names = sorted(t.name for t in bag.topics.values() if t.type in _POSE_TYPES)
-    return f"with poses there are {', '.join(names)}" if names else "but no topic has poses"
-
-
-def _recorded_poses(bag: Bag, topic: str, path: Path) -> Trajectory:
-    if topic not in bag.topics or bag.topics[topic].type not in _POSE_TYPES:
-        raise GraphSlamError(f"{path}: no topic {topic} of poses; {_listed(bag)}")
-    stamps, rows = [], []
-    for message in _decoded(bag, topic):
-        p, q = _position_and_orientation(message)
-        # One rounding, as of the decimal text in a TUM file: equal stamps stay equal.
-        stamps.append((message.header.stamp.sec * 10**9 + message.header.stamp.nanosec) / 10**9)
-        rows.append((p.x, p.y, q.x, q.y, q.z, q.w))
-    if not rows:
-        raise GraphSlamError(f"{path}: no message on {topic}")
-    table = np.array(rows)
-    return _trajectory(np.array(stamps), table[:, :2], table[:, 2:])
-
-
-def _decoded(bag: Bag, topic: str) -> Iterator[Any]:
-    decode = recorded_decoder(bag.topics[topic])
-    for record in bag.messages([topic]):
-        try:
-            message = decode(record.cdr)
-        except Exception:  # of damaged bytes rosbags raises almost anything
-            loss = f"a message on {topic} cannot be decoded"
-            bag.losses += [loss] if loss not in bag.losses else []
-            continue
-        yield message
-
-
-def _position_and_orientation(message: Any) -> tuple[Any, Any]:
-    if hasattr(message, "transform"):
-        return message.transform.translation, message.transform.rotation
-    pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
-    return pose.position, pose.orientation
-
-
-def _recorded_landmarks(bag: Bag) -> dict[str, tuple[float, float]]:
-    kind = "vision_msgs/msg/Detection3DArray"
-    if TRUE_LANDMARKS_TOPIC not in bag.topics or bag.topics[TRUE_LANDMARKS_TOPIC].type != kind:
-        return {}
-    out = {}
-    for message in _decoded(bag, TRUE_LANDMARKS_TOPIC):
-        for detection in message.detections:
-            at = detection.bbox.center.position
-            out[detection.id] = (float(at.x), float(at.y))
-    return out

@@ -9,14 +9,17 @@ from numpy.typing import NDArray
 
 from graph_slam_ros import evaluation
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.evaluation import Trajectory
-from graph_slam_ros.lie import se2
+from graph_slam_ros.lie import se3
+from graph_slam_ros.truth import Trajectory, read_landmarks, read_truth, read_tum
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _TRUTH, _ODOMETRY, _ESTIMATE, _LANDMARK = "#1f6fd6", "#1a1a1a", "#d62728", "#e08a00"
 _CLOSURE, _SIGHTING, _QUIET = "#d62728", "#e08a00", "#9aa0a6"
+_TRUTH_LOOK = {"label": "truth", "color": _TRUTH, "linewidth": 2.4, "zorder": 2}
+_ODOMETRY_LOOK = {"label": "dead reckoning", "color": _ODOMETRY, "linewidth": 1.0, "zorder": 3}
+_ESTIMATE_LOOK = {"label": "estimate", "color": _ESTIMATE, "linewidth": 1.3, "zorder": 4}
 _INCHES, _DPI = 8.0, 150
 _GAP_S, _LONG_STEPS = 1.0, 5.0  # truth was not recorded where stamps are farther apart and this many times the usual
 
@@ -25,7 +28,7 @@ def draw_run(run: Path, truth: str | Path | None, out_png: Path) -> None:
     """Draw a run: dead reckoning black, estimate red, landmarks as stars; truth blue, true landmarks as circles.
 
     With truth, everything is in its frame, each path moved onto it as for the scores (landmarks with the estimate);
-    without, in the frame map.
+    without, in the frame map. In space it is drawn from above and from the side.
 
     Parameters
     ----------
@@ -37,37 +40,37 @@ def draw_run(run: Path, truth: str | Path | None, out_png: Path) -> None:
     GraphSlamError
         A file that is missing or unreadable, or no evo to align with.
     """
-    path = evaluation.read_tum(run / "path.tum")
-    odometry = evaluation.read_tum(run / "odometry.tum") if (run / "odometry.tum").exists() else None
-    landmarks = evaluation.read_landmarks(run / "landmarks.csv")
-    figure, axes = _figure()
-    true_landmarks: dict[str, tuple[float, float]] = {}
-    T_world_map = se2.IDENTITY
+    dimensions = evaluation.dimensions_of(run)
+    path = read_tum(run / "path.tum")
+    odometry = read_tum(run / "odometry.tum") if (run / "odometry.tum").exists() else None
+    landmarks = {name: landmark.position for name, landmark in read_landmarks(run / "landmarks.csv").items()}
+    true_path, true_landmarks = None, np.zeros((0, 3))
+    T_world_map = se3.IDENTITY
     if truth is not None:
-        known = evaluation.read_truth(truth)
-        true_landmarks = known.landmarks
+        known = read_truth(truth)
+        true_landmarks = np.array([at for name, at in known.landmarks.items() if name in landmarks]).reshape(-1, 3)
         scored = run / "sightings.tum"
         has_sightings = scored.exists() and scored.stat().st_size > 0
-        T_world_map = _onto(evaluation.read_tum(scored) if has_sightings else path, known.trajectory)
+        T_world_map = _onto(read_tum(scored) if has_sightings else path, known.trajectory, dimensions)
         if odometry is not None:
-            odometry = odometry.moved(_onto(odometry, known.trajectory))
-        _draw_path(axes, _with_gaps(_within(known.trajectory, path)), "truth", _TRUTH, 2.4, 2)
-    if odometry is not None:
-        _draw_path(axes, odometry, "dead reckoning", _ODOMETRY, 1.0, 3)
-    _draw_path(axes, path.moved(T_world_map), "estimate", _ESTIMATE, 1.3, 4)
-    if landmarks:
-        x, y = se2.act(T_world_map, tuple(np.array(list(landmarks.values())).T))
-        axes.scatter(
-            x, y, s=70, marker="*", color=_LANDMARK, edgecolors="white", linewidths=0.4, zorder=6, label="landmarks"
-        )
-    shown = np.array([at for name, at in true_landmarks.items() if name in landmarks]).reshape(-1, 2)
-    if len(shown):
-        axes.scatter(
-            *shown.T, s=90, facecolors="none", edgecolors=_TRUTH, linewidths=1.0, zorder=5, label="true landmarks"
-        )
-    start_x, start_y = path.moved(T_world_map).poses[0, :2]
-    axes.plot(start_x, start_y, "o", color=_ESTIMATE, markeredgecolor="white", markersize=7, zorder=7, label="start")
-    _legend(axes, at=0.5, side="center")
+            odometry = odometry.moved(_onto(odometry, known.trajectory, dimensions))
+        true_path = _with_gaps(_within(known.trajectory, path))
+    path = path.moved(T_world_map)
+    points = np.stack(se3.act(T_world_map, tuple(np.array(list(landmarks.values())).reshape(-1, 3).T)), axis=1)
+    figure, panels = _figure(dimensions - 1)
+    for axes, shown in zip(np.ravel(panels), ([0, 1], [0, 2]), strict=False):
+        axes.set_ylabel("xyz"[shown[1]] + " [m]")
+        for drawn, look in ((true_path, _TRUTH_LOOK), (odometry, _ODOMETRY_LOOK), (path, _ESTIMATE_LOOK)):
+            if drawn is not None:
+                axes.plot(*drawn.poses[:, shown].T, solid_joinstyle="round", **look)
+        if len(points):
+            _draw_stars(axes, points[:, shown])
+        if len(true_landmarks):
+            circles = {"s": 90, "facecolors": "none", "edgecolors": _TRUTH, "linewidths": 1.0, "zorder": 5}
+            axes.scatter(*true_landmarks[:, shown].T, label="true landmarks", **circles)
+        start = {"color": _ESTIMATE, "markeredgecolor": "white", "markersize": 7, "zorder": 7, "label": "start"}
+        axes.plot(*path.poses[0, shown], "o", **start)
+    _legend(np.ravel(panels)[-1], at=0.5 if dimensions == 2 else 1.0, side="center" if dimensions == 2 else "right")
     _save(figure, out_png)
 
 
@@ -95,10 +98,7 @@ def draw_graph(
         for order, (label, ends) in enumerate(edges.items()):
             _draw_edges(axes, values[:, :2], np.asarray(ends).reshape(-1, 2), label, order)
         if is_point.any():
-            x, y = values[is_point, 0], values[is_point, 1]
-            axes.scatter(
-                x, y, s=60, marker="*", color=_LANDMARK, edgecolors="white", linewidths=0.4, zorder=6, label="landmarks"
-            )
+            _draw_stars(axes, values[is_point, :2])
         elif not edges:
             axes.plot(values[:, 0], values[:, 1], ".", color=_ODOMETRY, markersize=2)
         axes.autoscale_view()
@@ -106,9 +106,9 @@ def draw_graph(
     _save(figure, out_png)
 
 
-def _onto(path: Trajectory, truth: Trajectory) -> se2.Pose:
+def _onto(path: Trajectory, truth: Trajectory, dimensions: int) -> se3.Pose:
     mine, theirs = evaluation.associate(path, truth)
-    return evaluation.alignment(mine.poses[:, :2], theirs.poses[:, :2])
+    return evaluation.alignment(mine.poses[:, :dimensions], theirs.poses[:, :dimensions])
 
 
 def _within(truth: Trajectory, path: Trajectory) -> Trajectory:
@@ -117,8 +117,9 @@ def _within(truth: Trajectory, path: Trajectory) -> Trajectory:
     return Trajectory(truth.stamps_s[at], truth.poses[at])
 
 
-def _draw_path(axes: Any, path: Trajectory, label: str, color: str, width: float, order: int) -> None:
-    axes.plot(*path.poses[:, :2].T, color=color, linewidth=width, label=label, zorder=order, solid_joinstyle="round")
+def _draw_stars(axes: Any, points: Array) -> None:
+    look = {"marker": "*", "color": _LANDMARK, "edgecolors": "white", "linewidths": 0.4, "zorder": 6}
+    axes.scatter(*points.T, s=70, label="landmarks", **look)
 
 
 def _with_gaps(truth: Trajectory) -> Trajectory:

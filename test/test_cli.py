@@ -112,7 +112,7 @@ def test_simulate_replay_evaluate_end_to_end(bag, run, capsys):
     code, out, err = told(capsys, "evaluate", run, "--truth", bag, "--json")
     assert (code, err) == (0, [])
     scores = json.loads(out)
-    assert set(scores) == {"position_m", "heading_rad", "map_m", "n", "odometry"}
+    assert set(scores) == {"position_m", "heading_rad", "map_m", "n", "odometry", "consistency"}
     assert set(scores["position_m"]) == set(scores["heading_rad"]) == {"rmse", "median", "max"}
     assert set(scores["map_m"]) == {"rmse"}
     assert scores["n"] > 50

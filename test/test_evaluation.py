@@ -1,4 +1,3 @@
-import math
 import sys
 
 import numpy as np
@@ -14,7 +13,8 @@ from graph_slam_ros.evaluation import (
     read_truth,
     read_tum,
 )
-from graph_slam_ros.lie import se2
+from graph_slam_ros.formats.tum import tum_text
+from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.ros.bag import BagWriter
 from graph_slam_ros.ros.to_msg import encode, header, heading, make, point, pose, pose_stamped, vector
 from graph_slam_ros.simulation import simulate, write_bag
@@ -25,10 +25,7 @@ START_S = 1_700_000_000
 
 
 def write_tum(path, stamps_s, poses):
-    rows = zip(np.asarray(stamps_s).tolist(), np.asarray(poses).tolist(), strict=True)
-    path.write_text(
-        "".join(f"{s:.9f} {x} {y} 0 0 0 {math.sin(0.5 * a)} {math.cos(0.5 * a)}\n" for s, (x, y, a) in rows)
-    )
+    path.write_text(tum_text([round(s * 1e9) for s in stamps_s], poses))
 
 
 def write_truth(path, stamps_s, poses, topic="/ground_truth"):
@@ -42,27 +39,56 @@ def eight(count=200, dt_s=0.1):
     """A figure of eight, which has no symmetry that an alignment could confuse after its first half."""
     t = np.linspace(0.0, 5.0, count)
     poses = np.column_stack([4.0 * np.sin(t), 3.0 * np.sin(2.0 * t) + 0.2 * t, se2.wrap(t)])
-    return Trajectory(START_S + dt_s * np.arange(count), poses)
+    return planar(START_S + dt_s * np.arange(count), poses)
+
+
+def planar(stamps_s, poses):
+    return Trajectory(np.asarray(stamps_s), se3.in_space(poses))
+
+
+def motion(x, y, theta):
+    return tuple(se3.in_space((x, y, theta)))
 
 
 def ring(radii, turn=0.0):
     """Four corners of a square per radius: what moves them outward moves neither their centre nor their direction."""
     corners = np.arange(4) * 0.5 * np.pi
     poses = [(r * np.cos(a), r * np.sin(a), turn) for r in radii for a in corners]
-    return Trajectory(START_S + np.arange(len(poses), dtype=float), np.array(poses))
+    return planar(START_S + np.arange(len(poses), dtype=float), poses)
 
 
 def test_known_errors_come_out_with_their_statistics_and_units():
-    error = path_error(ring([2.1, 5.3], turn=0.25).moved((30.0, -7.0, 2.0)), ring([2.0, 5.0]).moved((0.0, 0.0, 0.0)))
+    error = path_error(
+        ring([2.1, 5.3], turn=0.25).moved(motion(30.0, -7.0, 2.0)), ring([2.0, 5.0]).moved(motion(0.0, 0.0, 0.0))
+    )
     assert error.position_m == pytest.approx({"rmse": np.sqrt(0.05), "median": 0.2, "max": 0.3})
-    assert error.heading_rad == pytest.approx({"rmse": 0.25, "median": 0.25, "max": 0.25})
+    assert error.angle_rad == pytest.approx({"rmse": 0.25, "median": 0.25, "max": 0.25})
     assert error.n == 8
 
 
 def test_a_rigid_motion_is_no_error():
-    error = path_error(eight().moved((5.0, -3.0, 2.1)), eight())
+    error = path_error(eight().moved(motion(5.0, -3.0, 2.1)), eight())
     assert error.position_m["max"] < 1e-9
-    assert error.heading_rad["max"] < 1e-7
+    assert error.angle_rad["max"] < 1e-7
+
+
+def test_in_space_the_alignment_has_six_degrees_of_freedom_and_the_error_all_three_axes():
+    rng = np.random.default_rng(3)
+    truth = Trajectory(START_S + np.arange(50.0), np.array([se3.exp(tuple(d)) for d in rng.normal(size=(50, 6))]))
+    moved = truth.moved(se3.exp((5.0, -3.0, 2.0, 1.0, -0.7, 2.0)))
+    error = path_error(moved, truth, 3)
+    assert error.position_m["max"] < 1e-9
+    assert error.angle_rad["max"] < 1e-7
+    tilted = np.stack(se3.compose(tuple(moved.poses.T), se3.exp((0.0, 0.0, 0.0, 0.05, 0.0, 0.0))), axis=1)
+    assert path_error(Trajectory(truth.stamps_s, tilted), truth, 3).angle_rad["rmse"] == pytest.approx(0.05)
+    high = truth.poses * np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+    assert path_error(Trajectory(truth.stamps_s, high), truth, 3).position_m["rmse"] > 0.3
+    assert path_error(Trajectory(truth.stamps_s, high), truth, 2).position_m["rmse"] < 1e-9
+
+
+def test_positions_on_a_line_leave_a_turn_open_in_space():
+    with pytest.raises(GraphSlamError, match="on a line"):
+        alignment(np.outer(np.arange(5.0), (1.0, 2.0, 3.0)), np.outer(np.arange(5.0), (1.0, 0.0, 0.0)))
 
 
 def test_a_wrong_scale_is_an_error():
@@ -73,10 +99,10 @@ def test_a_wrong_scale_is_an_error():
 def test_the_alignment_stays_in_the_plane_and_never_mirrors():
     truth = eight().poses[:, :2]
     mirrored = truth * (1.0, -1.0)
-    x, y = se2.act(alignment(mirrored, truth), tuple(mirrored.T))
+    x, y = se2.act(tuple(se3.in_plane(alignment(mirrored, truth))), tuple(mirrored.T))
     assert np.hypot(x - truth[:, 0], y - truth[:, 1]).max() > 1.0  # turned over in space it would fit exactly
     line = np.column_stack([np.arange(5.0), np.zeros(5)])
-    assert alignment(line, line[:, ::-1]) == pytest.approx((0.0, 0.0, np.pi / 2))
+    assert alignment(line, line[:, ::-1]) == pytest.approx(motion(0.0, 0.0, np.pi / 2))
 
 
 def test_positions_in_one_place_cannot_be_aligned():
@@ -86,8 +112,9 @@ def test_positions_in_one_place_cannot_be_aligned():
 
 def test_headings_are_compared_across_the_turn_from_plus_to_minus_pi():
     truth, estimate = eight(), eight()
-    truth.poses[:, 2], estimate.poses[:, 2] = np.pi - 0.01, -np.pi + 0.02
-    assert path_error(estimate, truth).heading_rad["max"] == pytest.approx(0.03)
+    for path, theta in ((truth, np.pi - 0.01), (estimate, -np.pi + 0.02)):
+        path.poses[:, 3:] = motion(0.0, 0.0, theta)[3:]
+    assert path_error(estimate, truth).angle_rad["max"] == pytest.approx(0.03)
 
 
 def test_only_stamps_within_a_twentieth_of_a_second_of_the_truth_are_scored():
@@ -103,9 +130,9 @@ def test_only_stamps_within_a_twentieth_of_a_second_of_the_truth_are_scored():
 
 
 def test_nothing_before_or_after_the_truth_is_scored_but_its_ends_are():
-    truth = Trajectory(START_S + np.array([1.0, 2.0, 3.0]), np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
+    truth = planar(START_S + np.array([1.0, 2.0, 3.0]), np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
     stamps = START_S + np.array([0.97, 1.0, 2.0, 3.0, 3.03])
-    mine, _ = associate(Trajectory(stamps, np.zeros((5, 3))), truth)
+    mine, _ = associate(planar(stamps, np.zeros((5, 3))), truth)
     assert (mine.stamps_s - START_S).tolist() == [1.0, 2.0, 3.0]
 
 
@@ -121,9 +148,9 @@ def run(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     truth = eight()
-    write_tum(folder / "sightings.tum", truth.stamps_s, truth.moved((1.0, 2.0, 0.5)).poses)
-    write_tum(folder / "odometry.tum", truth.stamps_s, truth.poses * (1.1, 1.1, 1.0))
-    write_tum(folder / "path.tum", truth.stamps_s[::2], truth.moved((1.0, 2.0, 0.5)).poses[::2])
+    write_tum(folder / "sightings.tum", truth.stamps_s, truth.moved(motion(1.0, 2.0, 0.5)).poses)
+    write_tum(folder / "odometry.tum", truth.stamps_s, truth.poses * (1.1, 1.1, *[1.0] * 5))
+    write_tum(folder / "path.tum", truth.stamps_s[::2], truth.moved(motion(1.0, 2.0, 0.5)).poses[::2])
     rows = ["id,kind,x,y,theta,sightings,cov_xx,cov_xy,cov_yy"]
     rows += [f"{name},point,{x},{y},,3,1,0,1" for name, x, y in (("a", 7, 0), ("b", 0, 7), ("c", -7, 0), ("d", 0, -7))]
     (folder / "landmarks.csv").write_text("\n".join([*rows, "never surveyed,point,50,50,,1,1,0,1"]) + "\n")
@@ -165,7 +192,7 @@ def test_the_scores_as_plain_values_are_exactly_these(run, tmp_path):
     add_true_landmarks(tmp_path / "map.mcap", {"a": (7.0, 0.0), "b": (0.0, 7.0)})
     scores = evaluate(run, str(tmp_path / "map.mcap")).as_dict()
     three = {"rmse", "median", "max"}
-    assert set(scores) == {"position_m", "heading_rad", "map_m", "n", "odometry"}
+    assert set(scores) == {"position_m", "heading_rad", "map_m", "n", "odometry", "consistency"}
     assert set(scores["position_m"]) == set(scores["heading_rad"]) == three
     assert set(scores["map_m"]) == {"rmse"}
     assert set(scores["odometry"]) == {"position_m", "heading_rad", "n"}
@@ -181,7 +208,7 @@ def test_a_run_without_dead_reckoning_or_landmarks_is_scored_without(run, tmp_pa
 
 
 def test_the_table_tells_metres_and_degrees(run, tmp_path):
-    poses = np.add(eight().poses, (0.0, 0.0, np.deg2rad(3.0)))
+    poses = np.add(se3.in_plane(eight().poses), (0.0, 0.0, np.deg2rad(3.0)))
     write_tum(run / "sightings.tum", eight().stamps_s, poses)
     lines = str(evaluate(run, tmp_path / "truth.mcap")).splitlines()
     assert [line.split() for line in lines if "estimate" in line] == [
@@ -210,7 +237,7 @@ def test_truth_is_read_from_every_type_of_pose(tmp_path):
             bag.write("/here", kind, 1, encode(make(kind, header=header(stamp_ns, "world"), **fields)))
         trajectory = read_truth(f"{tmp_path / str(number)}.mcap:/here").trajectory
         assert trajectory.stamps_s.tolist() == [float("1700000000.123456789")]
-        assert trajectory.poses == pytest.approx(np.array([[1.0, 2.0, 2.5]]))
+        assert trajectory.poses == pytest.approx(np.array([[1.0, 2.0, 9.0, *motion(0.0, 0.0, 2.5)[3:]]]))
 
 
 def write_topics(path, **kinds):
@@ -268,6 +295,7 @@ def test_an_unknown_topic_is_refused_with_those_that_exist(run, tmp_path):
         ("1 2 3\n", "eight finite numbers"),
         ("1 2 3 0 0 0 nan 1\n", "eight finite numbers"),
         ("1 two 3 0 0 0 0 1\n", "two"),
+        ("1 2 3 0 0 0 0 0\n", "a quaternion of zeros"),
     ],
 )
 def test_a_file_that_is_no_path_is_refused_by_name_in_one_line(tmp_path, text, reason):

@@ -7,8 +7,12 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from graph_slam_ros.formats.parameters import parameters_text
+from graph_slam_ros.formats.tum import tum_text
+from graph_slam_ros.lie import se3
 from graph_slam_ros.report import draw_graph, draw_run
 from graph_slam_ros.simulation import simulate, write_bag
+from graph_slam_ros.slam import Config
 
 COLUMNS = "id,kind,x,y,theta,sightings,cov_xx,cov_xy,cov_yy"
 
@@ -123,6 +127,23 @@ def test_no_line_crosses_a_gap_in_the_truth_and_none_of_it_outside_the_run_is_dr
     assert np.nanmax(np.abs(drawn)) < 50.0
 
 
+def test_a_run_in_space_is_drawn_from_above_and_from_the_side(tmp_path, figures):
+    pytest.importorskip("evo")
+    flight = simulate("flight", 1, laps=1)
+    write_bag(flight, tmp_path / "bag.mcap")
+    stamps, truth = flight.stamps_ns.tolist(), flight.T_world_base
+    turned = np.stack(se3.compose(se3.exp((9.0, 2.0, 5.0, 0.4, 0.1, 2.0)), tuple(truth.T)), axis=1)
+    for name in ("path.tum", "sightings.tum"):
+        (tmp_path / name).write_text(tum_text(stamps, turned))
+    (tmp_path / "config.yaml").write_text(parameters_text(Config.from_mapping({"world.dimensions": 3}).as_mapping()))
+    (tmp_path / "ingest.mcap").write_bytes(b"")
+    draw_run(tmp_path, tmp_path / "bag.mcap", tmp_path / "run.png")
+    above, side = figures[0].axes
+    assert (above.get_xlabel(), above.get_ylabel(), side.get_ylabel()) == ("x [m]", "y [m]", "z [m]")
+    assert lines(above)["estimate"] == pytest.approx(truth[:, [0, 1]], abs=1e-6)
+    assert lines(side)["estimate"] == pytest.approx(truth[:, [0, 2]], abs=1e-6)
+
+
 def test_a_graph_is_drawn_before_and_after_with_closures_unlike_odometry(tmp_path, figures):
     final = np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]])
     initial = final * (1.0, 0.5, 1.0)
@@ -156,6 +177,9 @@ def test_matplotlib_is_imported_when_something_is_drawn_and_pyplot_never(tmp_pat
     script = f"""
 import sys
 import numpy as np
+from graph_slam_ros.formats.parameters import parameters_text
+from graph_slam_ros.formats.tum import tum_text
+from graph_slam_ros.lie import se3
 from graph_slam_ros.report import draw_graph
 assert "matplotlib" not in sys.modules
 draw_graph({str(tmp_path / "graph.png")!r}, np.zeros((2, 3)), np.eye(2, 3), {{"odometry": np.array([[0, 1]])}})

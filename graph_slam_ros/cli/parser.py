@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
             "record a synthetic world with truth: pythonrobotics, manhattan, warehouse, flight",
         )
     )
-    _evaluate(command("evaluate", recordings.evaluate, "position, heading and map error of a run, and a picture"))
+    _evaluate(command("evaluate", recordings.evaluate, "errors of a run, and whether it knows them; a picture"))
     command("warmup", recordings.warmup, "compile the kernels")
     _demo(command("demo", recordings.demo, "replay the recording that comes with the source through a live ROS graph"))
     return whole

@@ -138,7 +138,7 @@ def local(a: Pose, b: Pose) -> Tangent:
     return log(between(b, a))
 
 
-def interpolate(a: Pose, b: Pose, fraction: float) -> Pose:
+def interpolate(a: Pose, b: Pose, fraction: Any) -> Pose:
     """Pose on the geodesic from a (fraction 0) to b (fraction 1)."""
     v = local(b, a)
     return retract(

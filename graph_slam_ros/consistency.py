@@ -1,0 +1,187 @@
+"""Whether a run's covariances and its configured noise are what its errors say.
+
+NEES is the normalised estimation error squared, ``e' Sigma^-1 e`` (Bar-Shalom, Li, Kirubarajan, "Estimation with
+applications to tracking and navigation", 2001, section 5.4): of a consistent estimate it is chi-square distributed with
+as many degrees of freedom as e has components, which is also its mean.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2 as chi_square
+
+from graph_slam_ros.lie import se3, so3
+
+Array = NDArray[np.float64]
+
+_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+_BAND = (0.025, 0.975)
+
+
+@dataclass(frozen=True, slots=True)
+class Nees:
+    """The normalised estimation errors squared of some estimates.
+
+    Attributes
+    ----------
+    mean : ``dof`` is expected; more: the estimate is too sure of itself; less: it is more cautious than need be
+    band : where the mean lies in 95 % of runs, were the n errors independent. Those of a path hardly are: then the band
+        is too narrow, and ``inside`` tells more
+    inside : the share of single ones in their own 95 % band
+    n, skipped : how many were used, and had no covariance or no truth
+    """
+
+    mean: float
+    dof: int
+    band: tuple[float, float]
+    inside: float
+    n: int
+    skipped: int
+
+    @classmethod
+    def of(cls, errors: Array, covariances: Array) -> "Nees | None":
+        """Of errors (n, d) and covariances (n, d, d), NaN where unknown; None where all are."""
+        known = np.asarray(np.isfinite(errors).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
+        n, dof = int(known.sum()), errors.shape[1]
+        if not n:
+            return None
+        e = errors[known]
+        values = np.einsum("ni,ni->n", e, np.linalg.solve(covariances[known], e[:, :, None])[:, :, 0])
+        low, high = (float(edge) / n for edge in chi_square.ppf(_BAND, n * dof))
+        single = chi_square.ppf(_BAND, dof)
+        inside = float(((values >= single[0]) & (values <= single[1])).mean())
+        return cls(float(values.mean()), dof, (low, high), inside, n, len(known) - n)
+
+
+@dataclass(frozen=True, slots=True)
+class ClassNoise:
+    """What the residuals of a class of edges say of its sigmas.
+
+    Attributes
+    ----------
+    per_dof : chi2 per degree of freedom: 1 is expected
+    factor : what its sigmas should be multiplied by for that; of a class that is disturbed by outliers it is too large
+    """
+
+    edges: int
+    residuals: int
+    chi2: float
+    dof: float
+    per_dof: float
+    factor: float
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """NEES of the last pose, of all poses and of landmarks' positions, each None where it is not known, and classes."""
+
+    last_pose: Nees | None
+    poses: Nees | None
+    landmarks: Nees | None
+    classes: dict[str, ClassNoise]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        lines = []
+        named = {"last pose": self.last_pose, "poses": self.poses, "landmarks": self.landmarks}
+        if any(named.values()):
+            lines.append(
+                f"{'NEES':30s}{'mean':>10s}{'expected':>10s}{'95 % band':>16s}{'inside':>8s}{'n':>7s}{'skipped':>9s}"
+            )
+        for name, nees in named.items():
+            if nees is not None:
+                band = f"{nees.band[0]:.2f} to {nees.band[1]:.2f}"
+                lines.append(
+                    f"{name:30s}{nees.mean:10.2f}{nees.dof:10d}{band:>16s}{nees.inside:8.0%}{nees.n:7d}{nees.skipped:9d}"
+                )
+        if self.classes:
+            lines.append(f"{'class of edges':30s}{'residuals':>10s}{'dof':>10s}{'chi2/dof':>16s}   sigmas should be")
+        for name, c in self.classes.items():
+            lines.append(f"{name:30s}{c.residuals:10d}{c.dof:10.1f}{c.per_dof:16.3f}   {c.factor:.3g} times as large")
+        return "\n".join(lines)
+
+
+def pose_nees(estimate: Array, truth: Array, covariances: Array) -> tuple[Nees | None, Nees | None]:
+    """NEES of the last pose and of all but the first, in the frame that the first pose and its truth share.
+
+    A map begins where the robot did: what is known of its place in the world is no error of the estimate. So the first
+    pose is moved onto its truth, and its covariance, which all others inherit, is taken off theirs. That holds for runs
+    without fixes, whose map only the first pose holds.
+
+    Parameters
+    ----------
+    estimate, truth : (n, 7) T_map_base and T_world_base, of the latter NaN where unknown
+    covariances : (n, 3, 3) or (n, 6, 6) in the tangent space of each estimate
+    """
+    if len(estimate) < 2 or not np.isfinite(truth[0]).all():
+        return None, None
+    true = np.stack(se3.compose(_T_map_world(estimate, truth), tuple(truth.T)), axis=1)
+    errors = np.stack(se3.local(tuple(true.T), tuple(estimate.T)), axis=1)
+    first, planar = in_six(covariances[0]), covariances.shape[1] == 3
+    relative = np.empty_like(covariances)
+    for k, pose in enumerate(estimate):
+        step = se3.between(tuple(estimate[0]), tuple(pose))
+        inherited = se3.propagate(first, tuple(map(float, step)), np.zeros((6, 6)))
+        relative[k] = covariances[k] - (inherited[_PLANAR] if planar else inherited)
+    if planar:
+        errors = errors[:, [0, 1, 5]]
+    return Nees.of(errors[-1:], relative[-1:]), Nees.of(errors[1:], relative[1:])
+
+
+def landmark_nees(
+    positions: Array, truth: Array, covariances: Array, first: Array, true_first: Array, first_covariance: Array
+) -> Nees | None:
+    """NEES of landmarks' positions, as ``pose_nees`` of poses.
+
+    Parameters
+    ----------
+    positions, truth : (m, 3) in map and in world, of the latter NaN where unknown
+    covariances : (m, 3, 3) in the axes of map
+    first, true_first : (7,) the first pose in map and in world; first_covariance : (3, 3) or (6, 6)
+    """
+    if not np.isfinite(true_first).all():
+        return None
+    dimensions = 2 if len(first_covariance) == 3 else 3
+    true = np.stack(se3.act(_T_map_world(first[None], true_first[None]), tuple(truth.T)), axis=1)
+    turn, inherited = so3.matrix(tuple(first[3:])), in_six(first_covariance)
+    relative = np.empty((len(positions), dimensions, dimensions))
+    for k, position in enumerate(positions):
+        seen = se3.act(se3.inverse(tuple(first)), tuple(position))
+        by_first = turn @ np.hstack([np.eye(3), -so3.hat(tuple(map(float, seen)))])
+        relative[k] = (covariances[k] - by_first @ inherited @ by_first.T)[:dimensions, :dimensions]
+    return Nees.of((true - positions)[:, :dimensions], relative)
+
+
+def class_noise(classes: Mapping[str, Mapping[str, float]], leverage: Mapping[str, float]) -> dict[str, ClassNoise]:
+    """What each class of edges says of its sigmas, from its chi2, its number of residuals and its leverage.
+
+    The leverages of all classes add up to the number of unknowns: each has as many degrees of freedom as it has
+    residuals beyond the unknowns that it determines itself. A class without any, such as the anchor, is left out.
+    """
+    out = {}
+    for name, c in classes.items():
+        dof = c["residuals"] - leverage.get(name, np.nan)
+        if dof >= 1.0:
+            per_dof = c["chi2"] / dof
+            factor = float(np.sqrt(per_dof))
+            out[name] = ClassNoise(int(c["edges"]), int(c["residuals"]), c["chi2"], dof, per_dof, factor)
+    return out
+
+
+def in_six(covariance: Array) -> Array:
+    """(6, 6) of (3, 3) over x, y and heading, with zeros for the rest; or of (6, 6)."""
+    if len(covariance) == 6:
+        return covariance
+    out = np.zeros((6, 6))
+    out[_PLANAR] = covariance
+    return out
+
+
+def _T_map_world(estimate: Array, truth: Array) -> se3.Pose:
+    return se3.compose(tuple(estimate[0]), se3.inverse(tuple(truth[0])))

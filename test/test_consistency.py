@@ -1,0 +1,193 @@
+"""Consistency: NEES and the noise of classes come out as they were put in, and a good run is found to be good."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from graph_slam_ros.consistency import Nees, class_noise, landmark_nees, pose_nees
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.evaluation import Trajectory, evaluate, interpolated
+from graph_slam_ros.leverage import leverage
+from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.run import RunRecorder
+from graph_slam_ros.simulation import measurements, simulate, write_bag
+from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.truth import read_covariances
+
+
+def spread(rng, dof):
+    root = rng.normal(size=(dof, dof))
+    return root @ root.T + 0.1 * np.eye(dof)
+
+
+@pytest.mark.parametrize("dof", [2, 3, 6])
+def test_errors_drawn_from_their_covariances_have_as_much_nees_as_dimensions(dof):
+    rng = np.random.default_rng(1)
+    covariances = np.array([spread(rng, dof) for _ in range(2000)])
+    errors = np.array([rng.multivariate_normal(np.zeros(dof), c) for c in covariances])
+    nees = Nees.of(errors, covariances)
+    assert (nees.dof, nees.n, nees.skipped) == (dof, 2000, 0)
+    assert nees.band[0] < nees.mean < nees.band[1]
+    assert nees.inside == pytest.approx(0.95, abs=0.02)
+    assert Nees.of(2.0 * errors, covariances).mean == pytest.approx(4.0 * nees.mean)
+    assert Nees.of(errors[:1], covariances[:1]).band == pytest.approx(chi2.ppf([0.025, 0.975], dof))
+
+
+def test_what_is_not_known_is_skipped_and_counted_and_never_scored():
+    errors, covariances = np.ones((4, 2)), np.tile(np.eye(2), (4, 1, 1))
+    errors[1, 0] = covariances[2, 1, 1] = np.nan
+    nees = Nees.of(errors, covariances)
+    assert (nees.mean, nees.n, nees.skipped) == (2.0, 2, 2)
+    assert Nees.of(np.full((3, 2), np.nan), np.tile(np.eye(2), (3, 1, 1))) is None
+    assert Nees.of(np.empty((0, 2)), np.empty((0, 2, 2))) is None
+
+
+@pytest.mark.parametrize("group, dof", [(se2, 3), (se3, 6)])
+def test_poses_and_landmarks_are_compared_from_the_first_pose_on_wherever_the_map_is(group, dof):
+    """The first pose's own uncertainty is all others' too, and no part of their errors seen from it."""
+    rng, n = np.random.default_rng(2), 400
+    anchor, added = spread(rng, dof), 1e-6 * spread(rng, dof)
+    first, step = group.exp(tuple(rng.normal(size=dof))), group.exp(tuple(rng.normal(size=dof)))
+    step = tuple(map(float, step))
+    estimate = se3.in_space(np.array([first] + [group.compose(first, step)] * n))
+    errors = rng.multivariate_normal(np.zeros(dof), added, n)
+    true = [first] + [group.retract(group.compose(first, step), tuple(e)) for e in errors]
+    T_world_map = group.exp(tuple(3.0 * rng.normal(size=dof)))
+    truth = se3.in_space(np.array([group.compose(T_world_map, pose) for pose in true]))
+    covariances = np.array([anchor] + [group.propagate(anchor, step, added)] * n)
+    last, poses = pose_nees(estimate, truth, covariances)
+    single = errors[-1] @ np.linalg.solve(added, errors[-1])
+    assert (last.mean, last.n, last.dof) == (pytest.approx(single, rel=1e-2), 1, dof)
+    assert (poses.n, poses.dof) == (n, dof)
+    assert poses.band[0] < poses.mean < poses.band[1]
+
+    # landmarks: where the poses are, by their positions
+    axes = np.array([np.array(group.local(group.retract(first, tuple(e)), first)) for e in np.eye(dof)])
+    assert axes == pytest.approx(np.eye(dof))
+    size = dof // 2 + (dof == 3)
+    spot = np.zeros((3, 3))
+    spot[:size, :size] = spread(rng, size)
+    turned, h = [], 1e-6
+    for e in np.eye(dof):
+        ends = [group.compose(group.retract(first, tuple(h * sign * e)), step)[:size] for sign in (1, -1)]
+        turned.append((np.array(ends[0]) - ends[1]) / (2.0 * h))
+    by_first = np.array(turned).T
+    inherited = np.zeros((3, 3))
+    inherited[:size, :size] = by_first @ anchor @ by_first.T
+    off = np.zeros((n, 3))
+    off[:, :size] = rng.multivariate_normal(np.zeros(size), spot[:size, :size], n)
+    at = estimate[1:, :3]
+    true_at = np.stack(se3.act(tuple(se3.in_space(T_world_map)), tuple((at + off).T)), axis=1)
+    landmarks = landmark_nees(at, true_at, np.tile(spot + inherited, (n, 1, 1)), estimate[0], truth[0], anchor)
+    assert (landmarks.n, landmarks.dof) == (n, size)
+    whitened = np.einsum("ni,ni->n", off[:, :size], np.linalg.solve(spot[:size, :size], off[:, :size].T).T)
+    assert landmarks.mean == pytest.approx(whitened.mean(), rel=1e-6)
+
+
+def test_without_the_truth_of_the_first_pose_nothing_is_said_of_poses():
+    poses = np.tile(se3.IDENTITY, (3, 1))
+    truth = poses.copy()
+    truth[0] = np.nan
+    assert pose_nees(poses, truth, np.tile(np.eye(3), (3, 1, 1))) == (None, None)
+    assert (
+        landmark_nees(poses[:, :3], poses[:, :3], np.tile(np.eye(3), (3, 1, 1)), poses[0], truth[0], np.eye(3)) is None
+    )
+
+
+def test_the_truth_is_taken_between_its_neighbours_and_not_across_gaps_or_beyond_its_ends():
+    truth = Trajectory(np.array([0.0, 0.1, 0.2, 2.0]), se3.in_space([[0, 0, 3.0], [1, 0, -3.0], [2, 0, 0], [9, 9, 0]]))
+    at = interpolated(truth, np.array([-1.0, 0.0, 0.05, 0.2, 1.0, 2.0, 2.01]))
+    assert np.isnan(at).any(axis=1).tolist() == [True, False, False, False, True, False, True]
+    assert se3.in_plane(at[2])[2] % (2.0 * np.pi) == pytest.approx(np.pi)
+    assert at[5] == pytest.approx(truth.poses[3])
+    assert interpolated(Trajectory(truth.stamps_s[:1], truth.poses[:1]), np.array([0.0])) == pytest.approx(
+        truth.poses[:1]
+    )
+
+
+def test_a_class_with_sigmas_half_of_the_true_ones_is_told_to_double_them():
+    classes = {
+        "anchor": {"edges": 1, "residuals": 3, "chi2": 0.0},
+        "odometry": {"edges": 100, "residuals": 300, "chi2": 400.0},
+        "landmarks": {"edges": 300, "residuals": 600, "chi2": 500.0},
+    }
+    found = class_noise(classes, {"anchor": 3.0, "odometry": 200.0, "landmarks": 100.0})
+    assert set(found) == {"odometry", "landmarks"}, "the anchor has nothing beyond what it determines"
+    assert (found["odometry"].dof, found["odometry"].per_dof, found["odometry"].factor) == (100.0, 4.0, 2.0)
+    assert (found["landmarks"].dof, found["landmarks"].factor) == (500.0, 1.0)
+    assert class_noise(classes, {"anchor": np.nan, "odometry": np.nan, "landmarks": np.nan}) == {}
+
+
+CLEAN = {"odometry.twist_correlation_s": 0.0, "landmarks.added_sigma_m": 0.0, "landmarks.loss": "none"}
+
+
+def run(recording, folder, settings):
+    config = Config.from_mapping(settings)
+    recorder = RunRecorder(folder, config)
+    slam = GraphSlam(config, recorder.sink)
+    for m in [*measurements(recording), Control("end"), Control("optimize")]:
+        slam.process(m)
+    recorder.save(slam)
+    return slam
+
+
+def test_leverages_add_up_to_the_unknowns_and_a_sample_of_edges_tells_them_too(tmp_path, monkeypatch):
+    slam = run(simulate("warehouse", 3, aisles=2, laps=1), tmp_path / "run", CLEAN)
+    told = leverage(slam)
+    monkeypatch.setattr("graph_slam_ros.leverage._MOST", 10**6)
+    exact = leverage(slam)
+    assert sum(exact.values()) == pytest.approx(3 * slam.graph.vertex_count, rel=1e-9)
+    assert exact["anchor"] == pytest.approx(3.0, rel=1e-6)
+    assert told == pytest.approx(exact, rel=0.05)
+    assert told != exact
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["leverage"] == told
+
+
+@pytest.mark.parametrize("world, n", [("warehouse", 3), ("flight", 6)])
+def test_a_run_with_the_noise_it_was_told_of_is_consistent_and_its_sigmas_are_right(tmp_path, world, n):
+    pytest.importorskip("evo")
+    options = {"warehouse": {"aisles": 2, "laps": 1, "aisle_m": 6.0}, "flight": {"laps": 1, "beacons": 3}}[world]
+    # a keyframe at each look: what is carried from look to keyframe shares its noise, which is not modelled
+    settings = CLEAN | {"world.dimensions": n // 3 + 1, "keyframes.max_interval_s": 0.15}
+    last, runs = [], 8
+    for seed in range(runs):
+        recording = simulate(world, seed, **options, correlation_time_s=0.0)
+        run(recording, tmp_path / "run", settings)
+        write_bag(recording, tmp_path / "truth.mcap")
+        scores = evaluate(tmp_path / "run", tmp_path / "truth.mcap")
+        last.append(scores.consistency.last_pose.mean)
+        for noise in scores.consistency.classes.values():
+            assert noise.per_dof == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / noise.dof))
+    low, high = chi2.ppf([0.001, 0.999], n * runs) / runs
+    assert low < np.mean(last) < high
+
+
+def test_a_flight_is_scored_in_space_in_words_and_in_plain_values(tmp_path):
+    pytest.importorskip("evo")
+    recording = simulate("flight", 1, laps=1)
+    slam = run(recording, tmp_path / "run", {"world.dimensions": 3})
+    write_bag(recording, tmp_path / "truth.mcap")
+    scores = evaluate(tmp_path / "run", tmp_path / "truth.mcap")
+    plain = json.loads(json.dumps(scores.as_dict()))
+    assert set(plain) == {"position_m", "angle_rad", "n", "map_m", "odometry", "consistency"}
+    assert plain["position_m"]["rmse"] < 0.05 < plain["odometry"]["position_m"]["rmse"]
+    assert plain["map_m"]["rmse"] < 0.1
+    assert plain["consistency"]["poses"]["dof"] == 6
+    assert plain["consistency"]["poses"]["n"] == len(slam.keyframes) - 1
+    assert plain["consistency"]["landmarks"]["dof"] == 3
+    assert plain["consistency"]["landmarks"]["n"] == len(slam.landmarks)
+    assert set(plain["consistency"]["classes"]) == {"odometry", "landmarks"}
+    text = str(scores)
+    assert all(word in text for word in ("angle [deg]", "NEES", "last pose", "chi2/dof", "times as large"))
+    assert read_covariances(tmp_path / "run" / "covariances.csv") == pytest.approx(
+        np.array(slam.solver.marginal(slam.keyframes.ids))
+    )
+
+
+@pytest.mark.parametrize("text", ["", "stamp_ns,a\n1,2\n", "stamp_ns,a\n1,two\n"])
+def test_a_file_that_is_no_table_of_covariances_is_refused_by_name(tmp_path, text):
+    (tmp_path / "covariances.csv").write_text(text)
+    with pytest.raises(GraphSlamError, match=r"covariances\.csv: not a table of covariances"):
+        read_covariances(tmp_path / "covariances.csv")
