@@ -14,7 +14,7 @@ def leverage(slam: GraphSlam) -> dict[str, float]:
 
     Over all classes it is the number of unknowns; a class of M residuals has M less this degrees of freedom (Hoaglin,
     Welsch, "The hat matrix in regression and ANOVA", 1978). A class of more than 200 edges of a type is told from
-    every so manieth of them. NaN where the last solve failed.
+    every so manieth of them. Empty where the last solve failed.
     """
     graph, solver = slam.graph, slam.solver
     x = np.empty(len(graph.initial))
@@ -32,6 +32,6 @@ def leverage(slam: GraphSlam) -> dict[str, float]:
                     try:
                         covariance = solver.joint_marginal(ends)
                     except GraphSlamError:
-                        covariance = np.full((jacobian.shape[1],) * 2, np.nan)
+                        return {}
                     out[label] += float(((jacobian @ covariance) * jacobian).sum()) * len(rows) / len(looked_at)
     return {label: trace for label, trace in out.items() if trace}

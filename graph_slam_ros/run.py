@@ -203,12 +203,17 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
 
 
 def _write_graph(folder: Path, slam: GraphSlam) -> None:
-    """Poses are numbered from 0 in order of time, landmarks after them: other tools read odometry from that."""
+    """Poses are numbered from 0 in order of time, landmarks after them: other tools read odometry from that.
+
+    What is neither is an offset that the ranges of a sensor share.
+    """
     names: list[tuple[int, str, int | str, str]] = []
     for k, keyframe in enumerate(slam.keyframes):
         names.append((keyframe.vertex, "keyframe", keyframe.stamp_ns, str(k)))
     for name, landmark in slam.landmarks.items():
         names.append((landmark.vertex, "landmark", "", name))
+    named = {vertex for vertex, *_ in names}
+    names += [(vertex, "offset", "", "") for vertex in range(slam.graph.vertex_count) if vertex not in named]
     ids = [0] * slam.graph.vertex_count
     rows = ["id,vertex,stamp_ns,name"]
     for file_id, (vertex, what, stamp, name) in enumerate(names):

@@ -387,3 +387,49 @@ def test_a_folder_that_cannot_be_made_or_goes_away_is_refused_by_name(tmp_path, 
     shutil.rmtree(tmp_path / "run")
     with pytest.raises(GraphSlamError, match="run"):
         recorder.save(slam)
+
+
+def test_a_run_in_space_leaves_positions_rotations_and_all_covariances(tmp_path):
+    config = Config.from_mapping({"world.dimensions": 3})
+    recorder = RunRecorder(tmp_path / "run", config)
+    slam = GraphSlam(config, recorder.sink)
+    for m in [*measurements(simulate("flight", 2, laps=1, beacons=4)), Control("end"), Control("optimize")]:
+        recorder.record(slam, slam.process(m))
+    recorder.save(slam)
+    assert read_tum(tmp_path / "run" / "path.tum").poses == pytest.approx(slam.trajectory(), abs=1e-12)
+    header, *rows = [line.split(",") for line in (tmp_path / "run" / "landmarks.csv").read_text().splitlines()]
+    names = ["x", "y", "z", "rx", "ry", "rz"]
+    pairs = [(i, j) for i in range(6) for j in range(i, 6)]
+    assert header[:10] == ["id", "kind", "x", "y", "z", "qx", "qy", "qz", "qw", "sightings"]
+    assert header[10:] == [f"cov_{names[i]}{names[j]}" for i, j in pairs]
+    estimates = {name: (value, covariance) for name, value, covariance in results.landmark_estimates(slam)}
+    assert {row[1] for row in rows} == {"pose", "point"}
+    for row in rows:
+        value, covariance = estimates[row[0]]
+        size, dof = (7, 6) if row[1] == "pose" else (3, 3)
+        assert tuple(map(float, row[2 : 2 + size])) == value
+        assert row[2 + size : 9] == [""] * (7 - size)
+        for word, (i, j) in zip(row[10:], pairs, strict=True):
+            assert word == "" if j >= dof else float(word) == pytest.approx(covariance[i, j], rel=1e-8)
+    named = (tmp_path / "run" / "covariances.csv").read_text().splitlines()[0].split(",")
+    assert named == ["stamp_ns", *[f"tangent_{names[i]}{names[j]}" for i, j in pairs]]
+    *_, last = open_bag(tmp_path / "run" / "run.mcap").messages({"/pose"})
+    q = typestore().deserialize_cdr(last.cdr, "geometry_msgs/msg/PoseWithCovarianceStamped").pose.pose.orientation
+    assert np.array([q.x, q.y, q.z, q.w]) == pytest.approx(slam.trajectory()[-1, 3:])
+    again = replay(tmp_path / "run", tmp_path / "again")
+    assert contents(tmp_path / "again") == contents(tmp_path / "run")
+    assert again.slam.config.world.dimensions == 3
+
+
+def test_an_offset_that_ranges_share_is_a_vertex_of_its_own_in_the_saved_graph(tmp_path):
+    config = Config.from_mapping({"landmarks.range_offset_sigma_m": 0.5})
+    recorder = RunRecorder(tmp_path, config)
+    slam = GraphSlam(config, recorder.sink)
+    for m in [*measurements(simulate("warehouse", 0, aisles=2, laps=1, sensor="range")), Control("optimize")]:
+        slam.process(m)
+    recorder.save(slam)
+    file = read_g2o(tmp_path / "graph.g2o")
+    assert file.graph.vertex_count == slam.graph.vertex_count == len(set(file.ids))
+    vertices = [line.split(",") for line in (tmp_path / "graph_vertices.csv").read_text().splitlines()[1:]]
+    assert [row[1] for row in vertices].count("offset") == 1
+    assert len(vertices) == slam.graph.vertex_count
