@@ -45,6 +45,7 @@ class Nees:
     def of(cls, errors: Array, covariances: Array) -> "Nees | None":
         """Of errors (n, d) and covariances (n, d, d), NaN where unknown; None where all are."""
         known = np.asarray(np.isfinite(errors).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
+        known[known] = np.linalg.eigvalsh(covariances[known])[:, 0] > 0.0  # of what is certain no error has a size
         n, dof = int(known.sum()), errors.shape[1]
         if not n:
             return None
@@ -111,8 +112,8 @@ def pose_nees(estimate: Array, truth: Array, covariances: Array) -> tuple[Nees |
     """NEES of the last pose and of all but the first, in the frame that the first pose and its truth share.
 
     A map begins where the robot did: what is known of its place in the world is no error of the estimate. So the first
-    pose is moved onto its truth, and its covariance, which all others inherit, is taken off theirs. That holds for runs
-    without fixes, whose map only the first pose holds.
+    pose is moved onto its truth, and its covariance, which all others inherit, is taken off theirs. That holds where
+    the first pose alone holds the map.
 
     Parameters
     ----------
@@ -123,7 +124,7 @@ def pose_nees(estimate: Array, truth: Array, covariances: Array) -> tuple[Nees |
         return None, None
     true = np.stack(se3.compose(_T_map_world(estimate, truth), tuple(truth.T)), axis=1)
     errors = np.stack(se3.local(tuple(true.T), tuple(estimate.T)), axis=1)
-    first, planar = in_six(covariances[0]), covariances.shape[1] == 3
+    first, planar = _in_six(covariances[0]), covariances.shape[1] == 3
     relative = np.empty_like(covariances)
     for k, pose in enumerate(estimate):
         step = se3.between(tuple(estimate[0]), tuple(pose))
@@ -149,7 +150,7 @@ def landmark_nees(
         return None
     dimensions = 2 if len(first_covariance) == 3 else 3
     true = np.stack(se3.act(_T_map_world(first[None], true_first[None]), tuple(truth.T)), axis=1)
-    turn, inherited = so3.matrix(tuple(first[3:])), in_six(first_covariance)
+    turn, inherited = so3.matrix(tuple(first[3:])), _in_six(first_covariance)
     relative = np.empty((len(positions), dimensions, dimensions))
     for k, position in enumerate(positions):
         seen = se3.act(se3.inverse(tuple(first)), tuple(position))
@@ -174,7 +175,7 @@ def class_noise(classes: Mapping[str, Mapping[str, float]], leverage: Mapping[st
     return out
 
 
-def in_six(covariance: Array) -> Array:
+def _in_six(covariance: Array) -> Array:
     """(6, 6) of (3, 3) over x, y and heading, with zeros for the rest; or of (6, 6)."""
     if len(covariance) == 6:
         return covariance

@@ -36,10 +36,11 @@ def test_errors_drawn_from_their_covariances_have_as_much_nees_as_dimensions(dof
 
 
 def test_what_is_not_known_is_skipped_and_counted_and_never_scored():
-    errors, covariances = np.ones((4, 2)), np.tile(np.eye(2), (4, 1, 1))
+    errors, covariances = np.ones((5, 2)), np.tile(np.eye(2), (5, 1, 1))
     errors[1, 0] = covariances[2, 1, 1] = np.nan
+    covariances[3, 1, 1] = 0.0
     nees = Nees.of(errors, covariances)
-    assert (nees.mean, nees.n, nees.skipped) == (2.0, 2, 2)
+    assert (nees.mean, nees.n, nees.skipped) == (2.0, 2, 3)
     assert Nees.of(np.full((3, 2), np.nan), np.tile(np.eye(2), (3, 1, 1))) is None
     assert Nees.of(np.empty((0, 2)), np.empty((0, 2, 2))) is None
 
@@ -181,6 +182,11 @@ def test_a_flight_is_scored_in_space_in_words_and_in_plain_values(tmp_path):
     assert set(plain["consistency"]["classes"]) == {"odometry", "landmarks"}
     text = str(scores)
     assert all(word in text for word in ("angle [deg]", "NEES", "last pose", "chi2/dof", "times as large"))
+    summary = json.loads((tmp_path / "run" / "run.json").read_text())
+    summary["classes"]["fixes"] = {"edges": 1, "residuals": 3, "chi2": 1.0}
+    (tmp_path / "run" / "run.json").write_text(json.dumps(summary))
+    held = evaluate(tmp_path / "run", tmp_path / "truth.mcap").consistency
+    assert (held.last_pose, held.poses, held.landmarks) == (None, None, None), "the map is held elsewhere"
     assert read_covariances(tmp_path / "run" / "covariances.csv") == pytest.approx(
         np.array(slam.solver.marginal(slam.keyframes.ids))
     )
