@@ -348,9 +348,41 @@ def seven(pose):
     return [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
 
 
-def test_what_a_detection_cannot_say_is_not_recorded(tmp_path):
-    with pytest.raises(GraphSlamError, match="bearing: only positions and poses"):
-        write_bag(simulate("warehouse", 1, **SMALL["warehouse"], sensor="bearing"), tmp_path / "bag.mcap")
+@pytest.mark.parametrize("world", ["warehouse", "flight"])
+@pytest.mark.parametrize("sensor", ["range_bearing", "bearing", "range"])
+def test_ranges_and_bearings_are_points_with_named_fields_in_the_frame_of_the_sensor(tmp_path, world, sensor):
+    recording = simulate(world, 1, laps=1, sensor=sensor)
+    write_bag(recording, tmp_path / "bag.mcap")
+    bag = open_bag(tmp_path / "bag.mcap")
+    first = {}
+    for record in bag.messages(list(bag.topics)):
+        if record.topic not in first:
+            first[record.topic] = typestore().deserialize_cdr(record.cdr, bag.topics[record.topic].type)
+    (mounted,) = first["/tf_static"].transforms
+    seen, names = recording.seen[0], list(recording.landmarks)
+    T_base_sensor = seen.sightings[0].T_base_sensor or (0.0, 0.0, 0.0)
+    assert (mounted.header.frame_id, mounted.child_frame_id) == ("base_link", "sensor")
+    p, q = mounted.transform.translation, mounted.transform.rotation
+    assert [p.x, p.y, p.z, q.x, q.y, q.z, q.w] == pytest.approx(se3.in_space(T_base_sensor))
+    cloud = first["/landmarks"]
+    assert cloud.header.frame_id == "sensor"
+    points = np.frombuffer(bytes(cloud.data), np.dtype([(f.name, "<f8") for f in cloud.fields]))
+    angles = ["bearing", "elevation"][: 1 if world == "warehouse" else 2] if "bearing" in sensor else []
+    measured = ["range"] * ("range" in sensor) + angles
+    assert len(points) == cloud.width == len(seen.sightings)
+    for point, s in zip(points, seen.sightings, strict=True):
+        assert names[int(point["id"])] == s.id
+        assert tuple(point[name] for name in measured) == s.measured
+        sigmas = np.sqrt(np.reshape(s.covariance, (len(measured), -1)).diagonal())
+        assert point["sigma"] == pytest.approx(sigmas[0])
+        if sensor == "range_bearing":
+            assert sigmas[1:] == pytest.approx(point["sigma_bearing"])
+    assert [d.id for d in first["/landmarks_ground_truth"].detections] == [str(k) for k in range(len(names))]
+
+
+def test_kinds_that_no_one_message_holds_are_not_recorded(tmp_path):
+    with pytest.raises(GraphSlamError, match="no message holds bearing and position together"):
+        write_bag(simulate("flight", 1, laps=1, sensor="bearing", beacons=3), tmp_path / "bag.mcap")
     assert not (tmp_path / "bag.mcap").exists()
 
 

@@ -28,7 +28,7 @@ def encode(message: Any) -> bytes:
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
-def make(name: str, **fields: Any) -> Any:
+def make(name: str, /, **fields: Any) -> Any:
     """A message object, ``make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=0.0)``."""
     return typestore().types[name](**fields)
 

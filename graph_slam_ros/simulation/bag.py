@@ -1,5 +1,7 @@
 """A recording as one mcap bag: what a robot would have recorded, and the truth beside it."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +10,16 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.ros.to_msg import covariance6, encode, header, make, pose_stamped, pose_with_covariance, vector
+from graph_slam_ros.ros.to_msg import (
+    covariance6,
+    encode,
+    header,
+    make,
+    pose_stamped,
+    pose_with_covariance,
+    transform,
+    vector,
+)
 from graph_slam_ros.simulation.motion import space_of
 from graph_slam_ros.simulation.recording import LANDMARKS_TOPIC, Recording
 from graph_slam_ros.slam import Sighting, Sightings
@@ -20,6 +31,8 @@ ODOMETRY_TOPIC = "/odom"
 TRUTH_TOPIC = "/ground_truth"
 TRUE_LANDMARKS_TOPIC = "/landmarks_ground_truth"
 _DETECTIONS = "vision_msgs/msg/Detection3DArray"
+_POINTS = "sensor_msgs/msg/PointCloud2"
+_SENSOR = "sensor"
 _UNUSED = 1e6  # variance of what is not measured: z, roll, pitch of a planar robot, the rotation of a point
 _SURVEYED_M = 1e-3  # truth has no error; a covariance of zero would mean unknown
 
@@ -30,27 +43,41 @@ def write_bag(recording: Recording, path: Path | str) -> None:
     ``/odom`` nav_msgs/Odometry (odom, base_link), ``/landmarks`` vision_msgs/Detection3DArray (base_link),
     ``/ground_truth`` geometry_msgs/PoseStamped and, once, ``/landmarks_ground_truth`` Detection3DArray (world).
 
+    Ranges and bearings are sensor_msgs/PointCloud2 instead, with the fields ``id``, ``range``, ``bearing``,
+    ``elevation``, ``sigma`` and ``sigma_bearing``, as far as they are measured, in the frame ``sensor`` of
+    ``/tf_static``. A field holds no name: landmarks then go by their numbers, in the truth, too.
+
     Raises
     ------
     GraphSlamError
-        The sensor says what a detection cannot: a range or a bearing. Nothing was written.
+        What is seen is of kinds that no one message has.
     """
-    kinds = {s.kind for seen in recording.seen for s in seen.sightings} - {"position", "pose"}
-    if kinds:
-        raise GraphSlamError(f"no message of a bag says {kinds.pop()}: only positions and poses can be recorded")
     space, seen = space_of(recording.T_world_base[0]), {s.stamp_ns: s for s in recording.seen}
+    kinds = {s.kind for one in recording.seen for s in one.sightings}
+    polar = bool(kinds - {"position", "pose"})
+    if polar and len(kinds) > 1:
+        raise GraphSlamError(f"no message holds {' and '.join(sorted(kinds))} together")
+    number = {name: k for k, name in enumerate(recording.landmarks)}
     twist_covariance = covariance6(recording.twist_covariance, _UNUSED)
     with BagWriter(path) as bag:
         first_ns = int(recording.stamps_ns[0])
         for k, stamp_ns in enumerate(recording.stamps_ns.tolist()):
+            if polar and stamp_ns == first_ns:
+                T_base_sensor = next(s.T_base_sensor for one in recording.seen for s in one.sightings) or space.identity
+                mounted = transform(stamp_ns, "base_link", _SENSOR, T_base_sensor)
+                bag.write("/tf_static", "tf2_msgs/msg/TFMessage", stamp_ns, mounted)
             bag.write(ODOMETRY_TOPIC, "nav_msgs/msg/Odometry", stamp_ns, _odometry(recording, k, twist_covariance))
-            if stamp_ns in seen:
+            if stamp_ns in seen and polar:
+                bag.write(LANDMARKS_TOPIC, _POINTS, stamp_ns, _point_cloud(seen[stamp_ns], number))
+            elif stamp_ns in seen:
                 bag.write(LANDMARKS_TOPIC, _DETECTIONS, stamp_ns, _detections(seen[stamp_ns], "base_link", space))
             truth = pose_stamped(stamp_ns, "world", tuple(recording.T_world_base[k].tolist()))
             bag.write(TRUTH_TOPIC, "geometry_msgs/msg/PoseStamped", stamp_ns, truth)
             if stamp_ns == first_ns:
-                true = _detections(_true_landmarks(recording, space), "world", space)
-                bag.write(TRUE_LANDMARKS_TOPIC, _DETECTIONS, stamp_ns, true)
+                true = _true_landmarks(recording, space)
+                if polar:
+                    true = replace(true, sightings=tuple(replace(s, id=str(number[s.id])) for s in true.sightings))
+                bag.write(TRUE_LANDMARKS_TOPIC, _DETECTIONS, stamp_ns, _detections(true, "world", space))
 
 
 def _odometry(recording: Recording, k: int, twist_covariance: Array) -> bytes:
@@ -80,6 +107,36 @@ def _true_landmarks(recording: Recording, space: Space) -> Sightings:
 def _detections(seen: Sightings, frame: str, space: Space) -> bytes:
     head = header(seen.stamp_ns, frame)
     return encode(make(_DETECTIONS, header=head, detections=[_detection(head, s, space) for s in seen.sightings]))
+
+
+def _point_cloud(seen: Sightings, number: Mapping[str, int]) -> bytes:
+    """A PointCloud2 of doubles, a point for each sighting; its sigmas are the roots of the variances."""
+    kind = seen.sightings[0].kind
+    angles = ("bearing", "elevation")[: len(seen.sightings[0].measured) - ("range" in kind)]
+    measured = ("range", *angles) if "range" in kind else angles
+    sigmas = ("sigma", "sigma_bearing") if kind == "range_bearing" else ("sigma",)
+    rows = []
+    for s in seen.sightings:
+        variances = np.reshape(s.covariance, (len(measured), -1)).diagonal()
+        rows.append([number[s.id], *s.measured, *np.sqrt(variances[: len(sigmas)])])
+    points = np.array(rows, dtype="<f8")
+    fields = [
+        make("sensor_msgs/msg/PointField", name=name, offset=8 * k, datatype=8, count=1)
+        for k, name in enumerate(("id", *measured, *sigmas))
+    ]
+    message = make(
+        _POINTS,
+        header=header(seen.stamp_ns, _SENSOR),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=8 * len(fields),
+        row_step=points.nbytes,
+        data=points.ravel().view(np.uint8),
+        is_dense=True,
+    )
+    return encode(message)
 
 
 def _detection(head: Any, s: Sighting, space: Space) -> Any:
