@@ -119,7 +119,7 @@ def test_tum_has_the_poses_in_order_of_id_with_the_id_as_stamp(convert):
     assert (code, err) == (0, [])
     assert out == f"wrote {target} as TUM: 3 of 4 vertices, 0 of 2 edges\n"
     rows = [[float(v) for v in line.split()] for line in target.read_text().splitlines()]
-    assert target.read_text().startswith("10.000000000 0.1 -2e-07 0 0 0 ")
+    assert target.read_text().startswith("10.000000000 0.1 -2e-07 0.0 0.0 0.0 ")
     assert [row[0] for row in rows] == [10, 11, 30]
     angles = [Rotation.from_quat(row[4:]).as_euler("xyz")[2] for row in rows]
     assert angles == pytest.approx([3, 0.25, -1], abs=1e-15)
