@@ -159,6 +159,35 @@ class LandmarksConfig:
         " itself or all of a message together",
         choices=("none", "id", "nearest", "joint"),
     )
+    gate_same: float = _setting(
+        0.999, "a sighting without identity is of a landmark within this probability", "probability", low=0.5, high=1.0
+    )
+    gate_other: float = _setting(
+        0.99999, "and of a new one outside this; between the two it is not used", "probability", low=0.5, high=1.0
+    )
+    close_m: float = _setting(
+        0.5, "landmarks this close are not told apart by force: what may be of either says less", "m", low=0.0
+    )
+    unnamed_sigma_m: float = _setting(
+        0.1, "position noise added to sightings without identity: they may be of one close by", "m", low=0.0
+    )
+    density_per_m: float = _setting(
+        0.03,
+        "landmarks that there may be to a metre along each axis: a sighting must be likelier to be of a known one",
+        "1/m",
+        low=1e-4,
+    )
+    ambiguity_chi2: float = _setting(6.0, "and all else must fit worse by this much", "chi2", low=0.0)
+    confirm_sightings: int = _setting(5, "a new landmark is believed after so many sightings", "sightings", low=1)
+    confirm_s: float = _setting(2.0, "over so much time", "s", low=0.0)
+    follow_s: float = _setting(
+        10.0,
+        "a sighting is compared with landmarks seen not longer ago; what is seen again later is merged",
+        "s",
+        low=0.0,
+    )
+    give_up_s: float = _setting(60.0, "or given up where it has not been seen for so long", "s", low=0.0)
+    review_every_keyframes: int = _setting(10, "look for all that after so many keyframes", "keyframes", low=1)
     determined_below: float = _setting(
         0.2,
         "a landmark seen by range or bearing waits until its standard deviation is below this part of its distance",

@@ -18,12 +18,22 @@ from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.edge_noise import edge_noise
 from graph_slam_ros.slam.landmarks import Landmark, Landmarks
-from graph_slam_ros.slam.measurements import Closure, Control, Fix, Measurement, Observation, Odometry, Sightings
+from graph_slam_ros.slam.measurements import (
+    Closure,
+    Control,
+    Fix,
+    Measurement,
+    Observation,
+    Odometry,
+    Sighting,
+    Sightings,
+)
 from graph_slam_ros.slam.motion import Motion, OdometryNoise
 from graph_slam_ros.slam.odometry_choice import OdometryChoice, Step
 from graph_slam_ros.slam.space import Numbers
 from graph_slam_ros.slam.stamp_order import StampOrder
 from graph_slam_ros.slam.track import Track
+from graph_slam_ros.slam.unnamed import Unnamed
 from graph_slam_ros.solver import Report, Settings, Solver
 
 Array = NDArray[np.float64]
@@ -87,6 +97,7 @@ class GraphSlam:
         self._odometry = OdometryChoice(self.config.odometry, self.space, self.counters)
         self._noise = OdometryNoise(self.config.odometry, self.space)
         self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters)
+        self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self._hand_over)
         self._motions: deque[Motion] = deque()  # since each of the last keyframes, as far back as late ones may reach
         self._waiting: list[Observation] = []
         self._covariance = np.zeros((self.space.dof, self.space.dof))
@@ -124,8 +135,8 @@ class GraphSlam:
 
     @property
     def landmarks(self) -> dict[str, Landmark]:
-        """Landmarks of the graph, by identity."""
-        return self._landmarks.known
+        """Landmarks of the graph, by identity; but for tentative ones."""
+        return {name: mark for name, mark in self._landmarks.known.items() if not mark.is_tentative}
 
     @property
     def waiting(self) -> dict[str, str]:
@@ -285,12 +296,23 @@ class GraphSlam:
         match m:
             case Sightings():
                 self.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
-                self._landmarks.see(m, where)
+                for name, sighting in self._identified(m, where):
+                    self._landmarks.add(m.topic, name, sighting, where)
             case Fix():
                 self._add_fix(m, where)
             case Closure():
                 self._add_closure(m, where)
         self._solve_if_due()
+
+    def _identified(self, m: Sightings, where: Where) -> list[tuple[str, Sighting]]:
+        """The sightings to be used, each with the landmark it is of."""
+        how = self.config.landmarks.association
+        if how == "none":
+            self._count(m, "not_used")
+            return []
+        if how == "id":
+            return [(s.id, s) for s in m.sightings]
+        return self._unnamed.identified(m, where)
 
     def _where(self, stamp_ns: int) -> Where:
         """Where the robot was, by the keyframe before and the odometry in between."""
@@ -363,8 +385,17 @@ class GraphSlam:
             (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
             self.solves += 1
             self._solved_vertices = self._handed_over[0]
+            self._review(everything)
         except GraphSlamError as error:
             self.counters.count("solver", type(error).__name__)
+
+    def _review(self, everything: Settings | None) -> None:
+        """Look at the unnamed landmarks again now and then; what that changes, the next solve takes in."""
+        if self.config.landmarks.association in ("none", "id"):
+            return
+        due = self.config.landmarks.review_every_keyframes
+        if everything is None and len(self.keyframes) % due == 0:
+            self._unnamed.review(self.keyframes[-1].stamp_ns)
 
     def _hand_over(self) -> None:
         """Give the solver what is new in the graph."""

@@ -1,17 +1,18 @@
 """Landmarks: from sightings to vertices and edges, and what still waits to be determined, with the reason."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian, Graph
+from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian, Graph, VertexKind
 from graph_slam_ros.slam import carry, triangulation
 from graph_slam_ros.slam.carry import Carried, Where
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.edge_noise import edge_noise
-from graph_slam_ros.slam.measurements import Sighting, Sightings
+from graph_slam_ros.slam.measurements import Sighting
 from graph_slam_ros.slam.space import Numbers
 from graph_slam_ros.slam.triangulation import Glance, Place
 from graph_slam_ros.solver import Solver
@@ -22,14 +23,37 @@ LABEL = "landmarks"
 _MOST_WAITING = 60  # sightings of one landmark: every other is forgotten beyond
 
 
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One sighting of a landmark, and the edge that says so."""
+
+    edge: int
+    topic: str
+    sighting: Sighting
+    where: Where
+
+
 @dataclass(slots=True)
 class Landmark:
-    """A landmark of the graph: its vertex, how often and when it was seen, and the edges that say so."""
+    """A landmark of the graph.
+
+    Attributes
+    ----------
+    is_tentative : whether it is too new to be believed: it may be given up
+    seen : its sightings, where these may change hands: those of landmarks without a name
+    """
 
     vertex: int
     sightings: int = 0
+    first_seen_ns: int = 0
     last_seen_ns: int = 0
-    edges: list[int] = field(default_factory=list)
+    is_tentative: bool = False
+    seen: list[Seen] = field(default_factory=list)
+
+    @property
+    def stamps(self) -> set[int]:
+        """When it was seen: never twice at once."""
+        return {one.where.stamp_ns for one in self.seen}
 
 
 @dataclass(slots=True)
@@ -58,11 +82,6 @@ class Landmarks:
         self._graph, self._solver, self._counters = graph, solver, counters
         self._offsets: dict[str, int] = {}
 
-    def see(self, m: Sightings, where: Where) -> None:
-        """Take the sightings of one message."""
-        for s in m.sightings:
-            self.add(m.topic, s.id, s, where)
-
     def add(self, topic: str, name: str, s: Sighting, where: Where) -> None:
         """Take a sighting of a landmark with this identity."""
         landmark = self.known.get(name)
@@ -85,7 +104,7 @@ class Landmarks:
         kind = self._space.pose if s.kind == "pose" else self._space.point
         if s.kind == "pose":
             value = self._space.group.compose(self._pose(where), value)
-        landmark = self.known[name] = Landmark(self._graph.add_vertex(kind, value))
+        landmark = self.known[name] = Landmark(self._graph.add_vertex(kind, value), is_tentative=not s.id)
         self._add_edge(topic, landmark, s, where)
 
     def _add_edge(self, topic: str, landmark: Landmark, s: Sighting, where: Where) -> None:
@@ -108,8 +127,10 @@ class Landmarks:
                 vertices.append(self._offset(topic))
         noise = edge_noise(self._counters, topic, self._blurred(s, carried), metres)
         edge = self._graph.add_edge(edge_type, vertices, carried.measured, noise, LABEL)
-        landmark.edges.append(edge)
+        if not s.id:
+            landmark.seen.append(Seen(edge, topic, s, where))
         landmark.sightings += 1
+        landmark.first_seen_ns = min(landmark.first_seen_ns or where.stamp_ns, where.stamp_ns)
         landmark.last_seen_ns = max(landmark.last_seen_ns, where.stamp_ns)
 
     def _from_sensors(self, s: Sighting, where: Where, landmark: Landmark) -> Carried:
@@ -135,6 +156,54 @@ class Landmarks:
             noise = Gaussian.from_sigmas(self._config.landmarks.range_offset_sigma_m)
             self._graph.add_edge(POINT_PRIOR[R1], [vertex], [0.0], noise, "range_offset")
         return self._offsets[topic]
+
+    # -- taken back ----------------------------------------------------------------------------------------------
+
+    def give_up(self, name: str) -> None:
+        """Take a landmark and its edges out of the problem."""
+        landmark = self.known.pop(name)
+        self._take_out(landmark.seen)
+        self._solver.remove(landmark.vertex)
+
+    def merge(self, kept: str, merged: str) -> int:
+        """Give the sightings of one landmark to another; returns how many."""
+        a, b = self.known[kept], self.known[merged]
+        self.give_up(merged)
+        for one in b.seen:
+            self._add_edge(one.topic, a, one.sighting, one.where)
+        return len(b.seen)
+
+    def part(self, kept: str, merged: str, first: int, count: int) -> None:
+        """Take a merger back: these sightings are of a landmark of their own."""
+        a = self.known[kept]
+        moved = a.seen[first : first + count]
+        del a.seen[first : first + count]
+        a.sightings -= len(moved)
+        self._take_out(moved)
+        for one in moved:
+            self.add(one.topic, merged, one.sighting, one.where)
+        self.known[merged].is_tentative = False
+
+    def _take_out(self, seen: Sequence[Seen]) -> None:
+        for one in seen:
+            self._solver.set_weight(one.edge, 0.0)
+
+    def kind_of(self, landmark: Landmark) -> VertexKind:
+        """Point or pose."""
+        return self._graph.kind_of(landmark.vertex)
+
+    def chi2_of(self, edges: Sequence[int]) -> tuple[float, int]:
+        """Sum of the squared whitened residuals of some edges, without loss, and how many numbers they are."""
+        total, count = 0.0, 0
+        for edge in edges:
+            table = list(self._graph.tables.values())[self._graph.table_of_edge.values[edge]]
+            row = int(self._graph.row_of_edge.values[edge])
+            values = [self._solver.estimate([v])[0] for v in table.vertices.values[row].tolist()]
+            at = np.cumsum([0, *(len(v) for v in values[:-1])])[None, :]
+            residual, _ = table.type.linearize(np.concatenate(values), at, table.measured.values[row : row + 1])
+            whitened = table.sqrt_information.values[row] @ residual[0]
+            total, count = total + float(whitened @ whitened), count + len(whitened)
+        return total, count
 
     # -- not determined yet --------------------------------------------------------------------------------------
 

@@ -132,7 +132,7 @@ def _covariance(information: Array) -> Array:
     values = np.linalg.eigvalsh(information)
     if values[0] <= max(_LEAST_CURVATURE, 1e-9 * values[-1]):
         return np.full_like(information, np.inf)
-    inverse: Array = np.linalg.inv(information)
+    inverse: Array = np.asarray(np.linalg.inv(information), dtype=np.float64)
     return inverse
 
 

@@ -1,0 +1,203 @@
+"""Which landmark is it? For sightings that do not say: what each may be, by the covariance of robot and map together.
+
+The innovation of sighting i with landmark j, ``r = z_i - h_j(x)``, has the covariance ``S = H_j P H_j' + R_i`` with the
+joint covariance P of the keyframe and the landmarks nearby. A pair costs ``r' S^-1 r + log |2 pi S|``, and one that was
+never seen ``-2 log`` of how many of them there are to a square (cubic) metre: so the vaguer a landmark is foreseen, the
+less it is taken for what is seen. ``nearest`` decides sighting by sighting (an assignment, since one message shows each
+landmark once), ``joint`` demands that all pairs of a message fit together: J. Neira, J. D. Tardos, "Data association in
+stochastic mapping using the joint compatibility test", 2001.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2
+
+from graph_slam_ros.slam.carry import Carried, by_motion
+from graph_slam_ros.slam.space import Numbers, Space
+
+Array = NDArray[np.float64]
+
+NEW, UNCLEAR = -1, -2
+_MOST_TRIED = 2000  # pairings of one message; the best so far is taken then
+
+
+@dataclass(frozen=True, slots=True)
+class Gates:
+    """When a sighting is one of a landmark.
+
+    Attributes
+    ----------
+    same : probability with which a true pair passes
+    other : outside this a sighting is of none of them
+    density : landmarks to a square or cubic metre
+    margin : how much worse (chi2) all else must fit
+    close_m : but for landmarks this close to each other
+    """
+
+    same: float
+    other: float
+    density: float
+    margin: float
+    close_m: float
+
+    @property
+    def new(self) -> float:
+        """What a landmark costs that was never seen."""
+        return -2.0 * float(np.log(self.density))
+
+    def chi2(self, dof: int) -> float:
+        """The largest statistic of a pair, or of several together."""
+        return float(chi2.ppf(self.same, dof))
+
+    def other_chi2(self, dof: int) -> float:
+        """The least statistic of what does not belong together."""
+        return float(chi2.ppf(self.other, dof))
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What landmarks look like from a keyframe.
+
+    Attributes
+    ----------
+    points : (L, n) where each is expected, in the keyframe's frame
+    covariance : (L n, L n) of all of them together
+    """
+
+    points: Array
+    covariance: Array
+
+
+def expected(space: Space, T_map_keyframe: Numbers, landmarks: Sequence[Numbers], joint: Array) -> Expected:
+    """Positions of landmarks in a keyframe's frame.
+
+    Parameters
+    ----------
+    landmarks : points or poses in map
+    joint : (D, D) covariance of the keyframe and these landmarks, in this order
+    """
+    n, dof = space.dimensions, space.dof
+    back, turn = space.group.inverse(T_map_keyframe), space.turn(T_map_keyframe)
+    points = np.empty((len(landmarks), n))
+    jacobian = np.zeros((len(landmarks) * n, len(joint)))
+    at = dof
+    for j, landmark in enumerate(landmarks):
+        points[j] = space.group.act(back, landmark[:n])
+        rows = slice(j * n, (j + 1) * n)
+        jacobian[rows, :dof] = -by_motion(space, points[j])
+        is_pose = len(landmark) == space.pose.size
+        jacobian[rows, at : at + n] = turn.T @ space.turn(landmark) if is_pose else turn.T
+        at += dof if is_pose else n
+    return Expected(points, jacobian @ joint @ jacobian.T)
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """What a sighting was found to be.
+
+    Attributes
+    ----------
+    landmark : its index, ``NEW`` where it is none of them, ``UNCLEAR`` where that is open
+    spread : (n, n) what is added to the sighting's covariance, in the keyframe's axes, since it may as well be of
+        another landmark close by
+    """
+
+    landmark: int
+    spread: Array | None = None
+
+
+def associate(gates: Gates, seen: Sequence[Carried], what: Expected, *, jointly: bool) -> list[Match]:
+    """Of each sighting its landmark, by index."""
+    statistic, cost = _costs(seen, what)
+    n = what.points.shape[1]
+    possible = np.where(statistic > gates.chi2(n), np.inf, cost)
+    pairs = _jointly(gates, seen, what, possible) if jointly else _one_by_one(possible, gates.new)
+    beyond = gates.other_chi2(n)
+    out = []
+    for i in range(len(seen)):
+        j = pairs.get(i)
+        if j is None:
+            out.append(Match(NEW if not len(statistic[i]) or statistic[i].min() > beyond else UNCLEAR))
+        else:
+            taken = [k for k in pairs.values() if k != j]
+            rivals = np.flatnonzero(possible[i] < cost[i, j] + gates.margin)
+            out.append(_among_rivals(gates, what.points, cost[i], j, [k for k in rivals.tolist() if k not in taken]))
+    return out
+
+
+def _among_rivals(gates: Gates, points: Array, cost: Array, j: int, rivals: list[int]) -> Match:
+    """The best where all that fit nearly as well are close to it; then the sighting says as much less."""
+    offsets = points[rivals] - points[j]
+    if np.linalg.norm(offsets, axis=1).max() > gates.close_m:
+        return Match(UNCLEAR)
+    weights = np.exp(-0.5 * (cost[rivals] - cost[rivals].min()))
+    return Match(j, (offsets.T * (weights / weights.sum())) @ offsets)
+
+
+def pair_cost(residual: Array, covariance: Array) -> tuple[float, float]:
+    """chi2 of a residual (n,), and with the log of its density's volume."""
+    statistic = float(residual @ np.linalg.solve(covariance, residual))
+    return statistic, statistic + float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
+
+
+def _costs(seen: Sequence[Carried], what: Expected) -> tuple[Array, Array]:
+    """chi2 and cost of each sighting (a row) with each landmark."""
+    count, n = what.points.shape
+    out = np.empty((2, len(seen), count))
+    for j in range(count):
+        block = what.covariance[j * n : (j + 1) * n, j * n : (j + 1) * n]
+        for i, z in enumerate(seen):
+            out[:, i, j] = pair_cost(np.array(z.measured[:n]) - what.points[j], block + z.covariance)
+    return out[0], out[1]
+
+
+def _one_by_one(cost: Array, new: float) -> dict[int, int]:
+    """The assignment with the least sum."""
+    rows, columns = cost.shape
+    full = np.full((rows, columns + rows), new)
+    full[:, :columns] = np.where(np.isfinite(cost), cost, 1e6)
+    found = zip(*linear_sum_assignment(full), strict=True)
+    return {int(i): int(j) for i, j in found if j < columns and np.isfinite(cost[i, j])}
+
+
+def _jointly(gates: Gates, seen: Sequence[Carried], what: Expected, cost: Array) -> dict[int, int]:
+    """The pairs that fit together and cost the least: branch and bound."""
+    n = what.points.shape[1]
+    options = [[int(j) for j in np.argsort(row) if np.isfinite(row[j])] for row in cost]
+    order = sorted((i for i in range(len(seen)) if options[i]), key=lambda i: len(options[i]))
+    best: dict[int, int] = {}
+    best_cost, tried = np.inf, 0
+    least = [min(0.0, *(cost[i, options[i]] - gates.new)) for i in order]
+
+    def descend(depth: int, pairs: dict[int, int], so_far: float) -> None:
+        nonlocal best, best_cost, tried
+        tried += 1
+        if so_far + sum(least[depth:]) >= best_cost or tried > _MOST_TRIED:
+            return
+        if depth == len(order):
+            best, best_cost = dict(pairs), so_far
+            return
+        i = order[depth]
+        for j in options[i]:
+            if j not in pairs.values():
+                longer = pairs | {i: j}
+                if _joint_statistic(seen, what, longer) < gates.chi2(n * len(longer)):
+                    descend(depth + 1, longer, so_far + cost[i, j] - gates.new)
+        descend(depth + 1, pairs, so_far)
+
+    descend(0, {}, 0.0)
+    return best
+
+
+def _joint_statistic(seen: Sequence[Carried], what: Expected, pairs: dict[int, int]) -> float:
+    n = what.points.shape[1]
+    rows = np.concatenate([np.arange(j * n, (j + 1) * n) for j in pairs.values()])
+    covariance = what.covariance[np.ix_(rows, rows)]
+    for k, i in enumerate(pairs):
+        covariance[k * n : (k + 1) * n, k * n : (k + 1) * n] += seen[i].covariance
+    r = np.concatenate([np.array(seen[i].measured[:n]) - what.points[j] for i, j in pairs.items()])
+    return float(r @ np.linalg.solve(covariance, r))
