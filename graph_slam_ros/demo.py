@@ -52,7 +52,7 @@ def _live(recording: Path, out: Path, progress: Callable[[str], Any]) -> int:
     from graph_slam_ros.ros.player import own_node, play
 
     bag = open_bag(recording)
-    inputs = choose_inputs(bag, None, None)
+    inputs = choose_inputs(bag, Config())
     with own_node(out, inputs, Config()) as own:
         return play(bag, inputs, own=own, progress=progress("play")).lost
 

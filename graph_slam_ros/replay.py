@@ -1,8 +1,7 @@
 """Replay: a recording, or the ingest sequence of an earlier run, through ``GraphSlam`` as fast as the CPU allows."""
 
-import shlex
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,28 +9,33 @@ from typing import Any
 from graph_slam_ros.formats.ingest import read_ingest
 from graph_slam_ros.ros.bag import Bag, BagError, open_bag
 from graph_slam_ros.ros.definitions import recorded_decoder
-from graph_slam_ros.ros.from_msg import DETECTIONS, ODOMETRY, TRANSFORMS, Border
+from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border
+from graph_slam_ros.ros.inputs import Measured, uses
 from graph_slam_ros.run import RunRecorder, check_room, is_run, run_config, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
+from graph_slam_ros.slam.input_config import InputConfig, default_input
 from graph_slam_ros.slam.measurements import from_record
 
-TF_STATIC = "/tf_static"
-_ARROW = " -> "
+TF_STATIC_TOPIC, TF_TOPIC = "/tf_static", "/tf"
+_OPTIONS = {"odometry": "--odom", "landmarks": "--landmarks"}
+_OPTIONAL = default_input("detections")  # a recording need not have what nobody asked for
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The topics of a recording that are used; ``landmarks`` and ``tf_static`` may be empty."""
+    """The topics of a recording that are used, by the name of the input, ``tf_static`` and ``tf`` included."""
 
-    odometry: str
-    landmarks: str
-    tf_static: str
+    topics: Mapping[str, str]
 
-    def names(self) -> list[str]:
-        """Those that are there."""
-        return [name for name in (self.odometry, self.landmarks, self.tf_static) if name]
+    def by_topic(self) -> dict[str, list[str]]:
+        """Names of the inputs of each topic that is read in order of recording; ``tf`` is the first of its own."""
+        out: dict[str, list[str]] = {}
+        for name in sorted(self.topics, key=lambda name: name != TF):
+            if name != TF_STATIC:
+                out.setdefault(self.topics[name], []).append(name)
+        return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,46 +47,63 @@ class Replayed:
     losses: list[str]
 
 
-def choose_inputs(bag: Bag, odometry: str | None, landmarks: str | None) -> Inputs:
-    """The topics to use: those named, else the one of its type, else the one with the usual name.
+def choose_inputs(bag: Bag, config: Config, odometry: str | None = None, landmarks: str | None = None) -> Inputs:
+    """The topic of each input: the one named, else the configured one, else the only one of its type.
+
+    Parameters
+    ----------
+    odometry, landmarks : topics of the first input that is used so, whatever is configured
 
     Raises
     ------
     BagError
-        A named topic does not exist or has another type, or there is no odometry; the topics that exist are listed.
+        A named topic does not exist or has another type, or there is none; the topics that exist are listed.
     """
-    return Inputs(
-        _choose(bag, ODOMETRY, odometry, "/odom", "--odom", required=True),
-        _choose(bag, DETECTIONS, landmarks, "/landmarks", "--landmarks", required=False),
-        TF_STATIC if TF_STATIC in bag.topics else "",
-    )
+    named = {"odometry": odometry, "landmarks": landmarks}
+    by_name = {settings.name: settings for settings in config.sources}
+    topics = {}
+    for name, use in uses(config).items():
+        option, topic = _OPTIONS.get(use) if use in named else None, named.pop(use, None)
+        found = _choose(bag, by_name[name], topic, option or f"--set {name}.topic=")
+        if found:
+            topics[name] = found
+    if named.get("landmarks"):
+        raise BagError(f"no input is used as landmarks: {landmarks} cannot be one")
+    if TF_STATIC_TOPIC in bag.topics:
+        topics[TF_STATIC] = TF_STATIC_TOPIC
+    if config.inputs.tf and TF_TOPIC in bag.topics and bag.topics[TF_TOPIC].type == TRANSFORMS:
+        topics[TF] = TF_TOPIC
+    return Inputs(topics)
 
 
-def _choose(bag: Bag, type_name: str, named: str | None, usual: str, option: str, *, required: bool) -> str:
+def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> str:
     there = ", ".join(f"{t.name} ({t.type or 'no type'})" for t in bag.topics.values())
+    usual = f"/{settings.topic.lstrip('/')}"
+    if named is None and settings.topic != default_input(settings.name).topic:
+        named = usual
     if named is not None:
         topic = bag.topics.get(named)
         if topic is None:
             raise BagError(f"no topic {named} in the recording; there are {there}")
         if not topic.type:
             raise BagError(f"topic {named} has no type: the recording lacks its schema")
-        if topic.type != type_name:
-            raise BagError(f"topic {named} is {topic.type}, not {type_name}")
+        if topic.type != settings.type:
+            raise BagError(f"topic {named} is {topic.type}, not {settings.type}")
         return named
-    found = [t.name for t in bag.topics.values() if t.type == type_name]
+    found = [t.name for t in bag.topics.values() if t.type == settings.type and t.name != TF_STATIC_TOPIC]
     if usual in found:
         return usual
     if len(found) == 1:
         return found[0]
     if found:
-        raise BagError(f"several topics of type {type_name} ({', '.join(found)}): choose one with {option}")
-    if required:
-        raise BagError(f"no topic of type {type_name} in the recording; there are {there}")
+        raise BagError(f"several topics of type {settings.type} ({', '.join(found)}): choose one with {option}")
+    if settings != _OPTIONAL:
+        raise BagError(f"no topic of type {settings.type} in the recording; there are {there}")
     return ""
 
 
-def measurements(bag: Bag, inputs: Inputs, config: Config, counters: Counters) -> Iterator[Measurement | None]:
-    """What the border makes of each recorded message, in order; None for one it refused.
+def measurements(bag: Bag, inputs: Inputs, config: Config, counters: Counters) -> Iterator[list[Measured]]:
+    """What the border makes of each recorded message, in order, and at the end of what has waited.
 
     Static transforms are read first: they hold for the whole recording.
 
@@ -91,21 +112,18 @@ def measurements(bag: Bag, inputs: Inputs, config: Config, counters: Counters) -
     BagError
         At once, before anything is read: a recorded definition is not what we can use.
     """
-    used = {name: bag.topics[name] for name in inputs.names()}
-    types = {inputs.odometry: ODOMETRY, inputs.landmarks: DETECTIONS, inputs.tf_static: TRANSFORMS}
-    decoders = {types[name]: recorded_decoder(topic) for name, topic in used.items()}
-    return _through(Border(config, counters, decoders), bag, inputs)
+    used = [bag.topics[topic] for topic in inputs.topics.values()]
+    return _through(Border(config, counters, {topic.type: recorded_decoder(topic) for topic in used}), bag, inputs)
 
 
-def _through(border: Border, bag: Bag, inputs: Inputs) -> Iterator[Measurement | None]:
-    if inputs.tf_static:
-        for message in bag.messages({inputs.tf_static}):
-            border.static_transforms(message.cdr)
-    for message in bag.messages({inputs.odometry, inputs.landmarks} - {""}):
-        if message.topic == inputs.odometry:
-            yield border.odometry(message.cdr)
-        else:
-            yield border.sightings(message.topic, message.cdr)
+def _through(border: Border, bag: Bag, inputs: Inputs) -> Iterator[list[Measured]]:
+    if TF_STATIC in inputs.topics:
+        for message in bag.messages({inputs.topics[TF_STATIC]}):
+            border.take(TF_STATIC, message.cdr)
+    by_topic = inputs.by_topic()
+    for message in bag.messages(set(by_topic)):
+        yield [m for name in by_topic[message.topic] for m in border.take(name, message.cdr)]
+    yield border.finish()
 
 
 def replay(
@@ -130,20 +148,20 @@ def replay(
     if is_run(source):
         config = config or run_config(source)
         losses: list[str] = []
-        items: Iterable[Measurement | None] = map(from_record, read_ingest(source, losses))
+        items: Iterable[Sequence[Measurement]] = ([from_record(record)] for record in read_ingest(source, losses))
         total = 0
     else:
         config = config or Config()
         bag = open_bag(source)
-        inputs = choose_inputs(bag, odometry, landmarks)
+        inputs = choose_inputs(bag, config, odometry, landmarks)
         items = _with_end(measurements(bag, inputs, config, counters))
-        total = sum(bag.topics[name].count for name in (inputs.odometry, inputs.landmarks) if name) + 2
+        total = sum(bag.topics[topic].count for topic in inputs.by_topic()) + 3
         losses = bag.losses
     recorder = RunRecorder(out, config)
     slam = GraphSlam(config, recorder.sink)
     try:
-        for measurement in progress(items, total):
-            if measurement is not None:
+        for several in progress(items, total):
+            for measurement in several:
                 recorder.record(slam, slam.process(measurement))
         slam.counters.update(counters)
         took = {"time_s": time.perf_counter() - start, "cpu_s": time.process_time() - cpu}
@@ -154,56 +172,8 @@ def replay(
     return Replayed(slam, summary, summary["losses"])
 
 
-def _with_end(items: Iterable[Measurement | None]) -> Iterator[Measurement | None]:
+def _with_end(items: Iterable[Sequence[Measurement]]) -> Iterator[Sequence[Measurement]]:
     """A recording ends: what waits is released, and the whole is solved."""
     yield from items
-    yield Control("end")
-    yield Control("optimize")
-
-
-def describe(bag: Bag, path: Path) -> list[str]:
-    """Topics, types, rates, frames and span of a recording, and the replay command that fits."""
-    span: dict[str, tuple[int, int]] = {}
-    frames: dict[str, str] = {}
-    decoders = {t.name: recorded_decoder(t) for t in bag.topics.values() if t.type in (ODOMETRY, DETECTIONS)}
-    for message in bag.messages(set(bag.topics)):
-        first, _ = span.get(message.topic, (message.log_ns, 0))
-        span[message.topic] = (first, message.log_ns)
-        if message.topic in decoders and message.topic not in frames:
-            frames[message.topic] = _frames(decoders[message.topic], message.cdr)
-    lines = []
-    for name, topic in sorted(bag.topics.items()):
-        first, last = span.get(name, (0, 0))
-        rate = f"{(topic.count - 1) / ((last - first) * 1e-9):.1f} Hz" if last > first else "-"
-        lines.append(f"{name:28s} {topic.type:40s} {topic.count:8d}  {rate:>10s}  {frames.get(name, '')}".rstrip())
-    if span:
-        first, last = min(a for a, _ in span.values()), max(b for _, b in span.values())
-        lines.append(f"span {(last - first) * 1e-9:.3f} s, from {first * 1e-9:.3f}")
-    lines.append(_suggestion(bag, path, frames))
-    return lines
-
-
-def _frames(decode: Callable[[bytes], Any], cdr: bytes) -> str:
-    try:
-        message = decode(cdr)
-    except Exception:  # damaged bytes: replay counts them
-        return "(undecodable)"
-    child = getattr(message, "child_frame_id", "")
-    return f"{message.header.frame_id}{_ARROW + child if child else ''}"
-
-
-def _suggestion(bag: Bag, path: Path, frames: dict[str, str]) -> str:
-    try:
-        inputs = choose_inputs(bag, None, None)
-    except BagError as error:
-        return f"not ready for replay: {error}"
-    words = ["graph_slam", "replay", str(path), "--odom", inputs.odometry]
-    if inputs.landmarks:
-        words += ["--landmarks", inputs.landmarks]
-    parent, _, child = frames.get(inputs.odometry, "").partition(_ARROW)
-    usual = Config().frames
-    if parent not in ("", usual.odom):
-        words += ["--set", f"frames.odom={parent}"]
-    if child not in ("", usual.base):
-        words += ["--set", f"frames.base={child}"]
-    return shlex.join([*words, "--out", "run"])
+    yield [Control("end")]
+    yield [Control("optimize")]

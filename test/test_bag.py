@@ -21,6 +21,7 @@ from graph_slam_ros.ros.bag import BagError, BagWriter, open_bag
 from graph_slam_ros.ros.definitions import recorded_decoder
 from graph_slam_ros.ros.interfaces import INTERFACES, typestore
 from graph_slam_ros.simulation import simulate, write_bag
+from graph_slam_ros.slam import Config
 
 ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
 TOPICS = {"/odom": ODOMETRY, "/landmarks": DETECTIONS}
@@ -386,7 +387,7 @@ def test_F11_without_a_schema_the_refusal_says_so(tmp_path, messages):
     with pytest.raises(BagError, match="/odom has no type: the recording lacks its schema"):
         replay_with(tmp_path, messages, schemas=False)
     with pytest.raises(BagError, match=r"no topic of type nav_msgs/msg/Odometry .* /odom \(no type\)"):
-        choose_inputs(open_bag(tmp_path / "a.mcap"), None, None)
+        choose_inputs(open_bag(tmp_path / "a.mcap"), Config())
 
 
 def test_F11_a_schema_without_text_is_decoded_by_our_own_definition(tmp_path, messages, reference):
@@ -471,14 +472,14 @@ def test_an_unknown_topic_is_refused_with_those_there_are(recorded):
     with pytest.raises(
         BagError, match=r"no topic /wheel in the recording; there are .*/odom \(nav_msgs/msg/Odometry\)"
     ):
-        choose_inputs(open_bag(recorded), "/wheel", None)
+        choose_inputs(open_bag(recorded), Config(), "/wheel")
 
 
 def test_a_topic_of_another_type_is_refused(recorded):
     with pytest.raises(
         BagError, match="topic /ground_truth is geometry_msgs/msg/PoseStamped, not nav_msgs/msg/Odometry"
     ):
-        choose_inputs(open_bag(recorded), "/ground_truth", None)
+        choose_inputs(open_bag(recorded), Config(), "/ground_truth")
 
 
 def test_one_of_several_odometry_topics_must_be_chosen_unless_one_has_the_usual_name(tmp_path, messages):
@@ -486,10 +487,10 @@ def test_one_of_several_odometry_topics_must_be_chosen_unless_one_has_the_usual_
     names = {"/a/odom": ODOMETRY, "/b/odom": ODOMETRY}
     bag = open_bag(write_mcap(tmp_path / "a.mcap", some, types=names))
     with pytest.raises(BagError, match=r"several topics .* \(/a/odom, /b/odom\): choose one with --odom"):
-        choose_inputs(bag, None, None)
-    assert choose_inputs(bag, "/b/odom", None).odometry == "/b/odom"
+        choose_inputs(bag, Config())
+    assert choose_inputs(bag, Config(), "/b/odom").topics["odom"] == "/b/odom"
     usual = open_bag(write_mcap(tmp_path / "b.mcap", some + messages, types=names | TOPICS))
-    assert choose_inputs(usual, None, None).odometry == "/odom"
+    assert choose_inputs(usual, Config()).topics["odom"] == "/odom"
 
 
 def test_a_recording_without_landmarks_is_dead_reckoning(tmp_path, messages):

@@ -227,9 +227,9 @@ def test_refused_messages_are_counted_and_shown_but_are_no_loss(bag, tmp_path, c
             writer.write("/odom", "nav_msgs/msg/Odometry", m.log_ns, m.cdr[:50] if k % 10 == 3 else m.cdr)
     code, out, err = told(capsys, "replay", file, "--out", tmp_path / "run")
     assert (code, err) == (0, [])
-    refused = json.loads((tmp_path / "run" / "run.json").read_text())["counters"]["odometry"]["undecodable"]
+    refused = json.loads((tmp_path / "run" / "run.json").read_text())["counters"]["odom"]["undecodable"]
     assert refused > 5
-    assert f"counted    odometry: undecodable {refused}" in out
+    assert f"counted    odom: undecodable {refused}" in out
 
 
 def test_a_fault_of_ours_is_one_line_with_code_1(bag, tmp_path, capsys, monkeypatch):

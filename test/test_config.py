@@ -12,7 +12,9 @@ from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.config import SolveConfig, notes, parameters
 from graph_slam_ros.solver import Settings
 
-SHIPPED = Path(__file__).resolve().parents[1] / "config" / "planar.yaml"
+CONFIG = Path(__file__).resolve().parents[1] / "config"
+SHIPPED = CONFIG / "planar.yaml"
+IN_SPACE = {"world.dimensions": 3}
 
 
 def read(tmp_path, text):
@@ -27,6 +29,34 @@ def test_the_shipped_file_is_exactly_what_the_code_writes_of_its_defaults():
 
 def test_the_shipped_file_reads_back_as_the_defaults():
     assert Config.from_mapping(read_parameters(SHIPPED)) == Config()
+
+
+def test_the_shipped_file_for_space_is_what_the_code_writes_and_differs_in_the_dimensions_alone():
+    config = Config.from_mapping(IN_SPACE)
+    assert (CONFIG / "spatial.yaml").read_text() == parameters_text(config.as_mapping(), notes())
+    assert Config.from_mapping(read_parameters(CONFIG / "spatial.yaml")) == config
+
+
+def test_every_input_has_a_section_and_only_those():
+    config = Config.from_mapping(
+        {"inputs.names": "odom gps", "gps": {"type": "sensor_msgs/msg/NavSatFix", "sigma_m": 2}}
+    )
+    assert [(one.name, one.topic, one.sigma_m) for one in config.sources] == [
+        ("odom", "odom", 0.0),
+        ("gps", "gps", 2.0),
+    ]
+    assert list(config.as_mapping())[-2:] == ["odom", "gps"]
+    assert Config.from_mapping(config.as_mapping()) == config
+    names = {p.name for p in parameters(["odom", "gps"])}
+    assert {"odom.topic", "gps.datum", "inputs.names"} <= names
+    assert "detections.topic" not in names
+
+
+def test_a_section_of_no_input_is_refused_and_says_what_there_is():
+    with pytest.raises(
+        ConfigError, match=r"did you mean 'odom.topic'\? 'gps' is not in inputs.names \(odom detections\)"
+    ):
+        Config.from_mapping({"gps.topic": "fix"})
 
 
 def test_every_parameter_says_what_it_means_and_its_default_is_valid():

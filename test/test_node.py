@@ -20,6 +20,7 @@ pytest.importorskip("vision_msgs")
 pytest.importorskip("tf2_msgs")
 
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
+from messages import record_drive  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from nav_msgs.msg import Path as PathMsg  # noqa: E402
 from rclpy.context import Context  # noqa: E402
@@ -261,6 +262,44 @@ def test_a_recording_with_late_and_broken_messages_is_the_same_live_and_offline(
     assert results(tmp_path / "live") == results(tmp_path / "offline")
 
 
+def test_several_inputs_and_a_sensor_on_a_joint_are_saved_byte_for_byte_as_offline(tmp_path):
+    drive = record_drive(tmp_path / "drive.mcap")
+    inputs = {
+        "inputs.names": "odom detections gps tags",
+        "gps.topic": "/fix",
+        "gps.type": "sensor_msgs/msg/NavSatFix",
+        "tags.topic": "/tf",
+        "tags.type": "tf2_msgs/msg/TFMessage",
+        "tags.use": "landmarks",
+        "tags.frame_prefix": "tag36h11",
+    }
+    settings = [word for key, value in inputs.items() for word in ("--set", f"{key}={value}")]
+    assert graph_slam("replay", drive, "--out", tmp_path / "offline", *settings).returncode == 0
+    done = graph_slam("replay", drive, "--ros", "--out", tmp_path / "live", *settings)
+    assert done.returncode == 0, done.stderr
+    assert " 0 lost; results in" in done.stdout
+    assert results(tmp_path / "live") == results(tmp_path / "offline")
+    assert replayed(tmp_path / "live", tmp_path) == results(tmp_path / "live")
+
+
+def test_a_running_node_is_played_what_it_listens_to(tmp_path):
+    drive = record_drive(tmp_path / "drive.mcap", seconds=5)
+    words = ("inputs.names:=odom gps", "gps.type:=sensor_msgs/msg/NavSatFix", "gps.topic:=/fix", "inputs.tf:=false")
+    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", *words) as n:
+        done = graph_slam("replay", drive, "--ros")
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.startswith("56 messages sent, 0 lost"), "50 of odometry, 5 fixes, and what is fixed"
+        assert n.stop()[0] == 0
+
+
+def test_a_node_with_an_input_of_a_package_that_is_not_installed_says_so(tmp_path):
+    words = ("inputs.names:=odom tags", "tags.type:=apriltag_msgs/msg/AprilTagDetectionArray", "output.folder:=''")
+    with node(*words) as n:
+        _, said = n.process.communicate(timeout=60.0)
+    assert n.process.returncode == 2
+    assert "apriltag_msgs is not installed here" in said
+
+
 def test_a_recording_is_played_into_a_node_that_runs_already(bag, offline, tmp_path):
     with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", module=False) as n:
         done = graph_slam("replay", bag, "--ros")
@@ -285,7 +324,7 @@ def test_without_a_node_the_player_says_so(bag, monkeypatch, capsys):
     monkeypatch.setattr(player, "_PATIENCE_S", 0.5)
     monkeypatch.setattr(os, "environ", ENVIRONMENT)
     assert main(["replay", str(bag), "--ros", "--node", "/nobody"]) == 2
-    assert capsys.readouterr().err == "graph_slam: no /nobody/received: is the node running?\n"
+    assert capsys.readouterr().err == "graph_slam: no parameters of /nobody: is the node running?\n"
 
 
 # -- what the node publishes ----------------------------------------------------------------------------------------

@@ -39,17 +39,19 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
     if not console.has_ros():
         raise GraphSlamError("--ros needs ROS 2 (no rclpy here); without --ros the same replay runs without it")
     bag = open_bag(args.bag)
-    inputs = choose_inputs(bag, args.odom, args.landmarks)
-    from graph_slam_ros.ros.player import own_node, play
+    from graph_slam_ros.ros.player import config_of, own_node, play
     from graph_slam_ros.run import check_room
 
-    options: dict[str, Any] = {"rate": args.rate, "progress": console.progress("play")}
+    node_name = args.node or "/graph_slam"
+    config = config_of(node_name) if args.out is None else config
+    inputs = choose_inputs(bag, config, args.odom, args.landmarks)
+    options: dict[str, Any] = {"config": config, "rate": args.rate, "progress": console.progress("play")}
     if args.out is None:
-        played = play(bag, inputs, node_name=args.node or "/graph_slam", **options)
+        played = play(bag, inputs, node_name=node_name, **options)
     else:
         check_room(args.out, args.bag)
         with own_node(args.out, inputs, config) as own:
-            played = play(bag, inputs, own=own, window_s=config.ordering.window_s, **options)
+            played = play(bag, inputs, own=own, **options)
         _say_run(args.bag, json.loads((args.out / "run.json").read_text()))
     console.say(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
     return console.told(bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else []))
@@ -57,7 +59,7 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
 
 def info(args: argparse.Namespace) -> int:
     """Say what a recording holds."""
-    from graph_slam_ros.replay import describe
+    from graph_slam_ros.info import describe
     from graph_slam_ros.ros.bag import open_bag
     from graph_slam_ros.run import is_run
 

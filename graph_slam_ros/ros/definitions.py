@@ -27,7 +27,62 @@ _NEEDED: dict[str, tuple[str, ...]] = {
     "geometry_msgs/msg/TransformStamped": ("header", "child_frame_id", "transform"),
     "geometry_msgs/msg/Transform": ("translation", "rotation"),
     "geometry_msgs/msg/Vector3": ("x", "y", "z"),
+    "geometry_msgs/msg/PoseStamped": ("header", "pose"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("header", "pose"),
+    "sensor_msgs/msg/NavSatFix": (
+        "header",
+        "status",
+        "latitude",
+        "longitude",
+        "altitude",
+        "position_covariance",
+        "position_covariance_type",
+    ),
+    "sensor_msgs/msg/NavSatStatus": ("status",),
+    "sensor_msgs/msg/Imu": ("header", "orientation", "orientation_covariance"),
+    "sensor_msgs/msg/PointCloud2": (
+        "header",
+        "height",
+        "width",
+        "fields",
+        "is_bigendian",
+        "point_step",
+        "row_step",
+        "data",
+    ),
+    "sensor_msgs/msg/PointField": ("name", "offset", "datatype"),
+    "visualization_msgs/msg/MarkerArray": ("markers",),
+    "visualization_msgs/msg/Marker": ("header", "ns", "id", "action", "pose"),
+    "apriltag_msgs/msg/AprilTagDetectionArray": ("header", "detections"),
+    "apriltag_msgs/msg/AprilTagDetection": ("family", "id", "hamming", "decision_margin"),
+    "aruco_msgs/msg/MarkerArray": ("header", "markers"),
+    "aruco_msgs/msg/Marker": ("header", "id", "pose"),
+    "ros2_aruco_interfaces/msg/ArucoMarkers": ("header", "marker_ids", "poses"),
+    "aruco_opencv_msgs/msg/ArucoDetection": ("header", "markers", "boards"),
+    "aruco_opencv_msgs/msg/MarkerPose": ("marker_id", "pose"),
+    "aruco_opencv_msgs/msg/BoardPose": ("board_name", "pose"),
+    "rtabmap_msgs/msg/LandmarkDetections": ("header", "landmarks"),
+    "rtabmap_msgs/msg/LandmarkDetection": ("header", "id", "pose"),
+    "cartographer_ros_msgs/msg/LandmarkList": ("header", "landmarks"),
+    "cartographer_ros_msgs/msg/LandmarkEntry": (
+        "id",
+        "tracking_from_landmark_transform",
+        "translation_weight",
+        "rotation_weight",
+    ),
+    "mrpt_msgs/msg/ObservationRangeBearing": (
+        "header",
+        "sensor_pose_on_robot",
+        "sensor_std_range",
+        "sensor_std_yaw",
+        "sensor_std_pitch",
+        "sensed_data",
+    ),
+    "mrpt_msgs/msg/SingleRangeBearingObservation": ("range", "yaw", "pitch", "id"),
+    "mrpt_msgs/msg/ObservationRangeBeacon": ("header", "sensor_pose_on_robot", "sensor_std_range", "sensed_data"),
+    "mrpt_msgs/msg/SingleRangeBeaconObservation": ("range", "id"),
 }
+"""What the converters read of each type. Those of packages that we have no layout of are compared by name only."""
 
 
 def recorded_decoder(topic: Topic) -> Decoder:
@@ -53,7 +108,7 @@ def recorded_decoder(topic: Topic) -> Decoder:
         return decoder(topic.type)
     for name, (_, fields) in recorded.items():
         there = dict(fields)
-        known = dict(ours[name][1]) if name in ours else {}
+        known = dict(ours[name][1]) if name in ours else there
         for field in _NEEDED.get(name, ()):
             if field not in there:
                 raise BagError(f"topic {topic.name}: {name} of this recording has no field {field!r}")

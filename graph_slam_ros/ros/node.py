@@ -3,40 +3,44 @@
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy comes in: threads would reorder sums
 
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Path
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
-from vision_msgs.msg import Detection3DArray
 from visualization_msgs.msg import MarkerArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.ros import results
-from graph_slam_ros.ros.from_msg import Border
+from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border, Decoder, is_correction
+from graph_slam_ros.ros.inputs import uses
+from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.ros.message_class import message_class
 from graph_slam_ros.ros.params import declare_parameters
 from graph_slam_ros.run import RunRecorder, keep_earlier
-from graph_slam_ros.slam import Control, GraphSlam, Measurement, Update
+from graph_slam_ros.slam import Config, Control, GraphSlam, Measurement, Update
 from graph_slam_ros.warmup import warmup
 
 _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class GraphSlamNode(Node):
-    """Online pose-graph SLAM of odometry and landmark sightings.
+    """Online pose-graph SLAM of odometry, landmark sightings, fixes and closures.
 
-    Subscribes ``odom``, ``landmarks`` and ``/tf_static``; publishes ``~/path``, ``~/pose``, ``~/landmarks``,
+    Subscribes the configured inputs, ``/tf`` and ``/tf_static``; publishes ``~/path``, ``~/pose``, ``~/landmarks``,
     ``~/received`` and the transform map -> odom; serves ``~/save``.
     """
 
@@ -50,7 +54,7 @@ class GraphSlamNode(Node):
         self.get_logger().info(f"kernels ready after {warmup():.1f} s")
         self._slam = GraphSlam(config, self._recorder.sink if self._recorder else None)
         self._slam.counters.on_first = self._tell
-        self._border = Border(config, self._slam.counters)
+        self._border = Border(config, self._slam.counters, _installed(config))
         self._received = 0
         self._acknowledged = -1
         self._has_player = False
@@ -75,12 +79,14 @@ class GraphSlamNode(Node):
         static = QoSProfile(
             depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
         )
-        self.create_subscription(TFMessage, "/tf_static", self._received_by(self._on_tf_static), static, raw=True)
-        self.create_subscription(Odometry, "odom", self._received_by(self._on_odometry), qos, raw=True)
-        seen = self.create_subscription(
-            Detection3DArray, "landmarks", self._received_by(self._on_landmarks), qos, raw=True
-        )
-        self._landmark_topic = seen.topic_name
+        self._subscribe(TRANSFORMS, "/tf_static", [TF_STATIC], static)
+        inputs: dict[tuple[str, str], list[str]] = {(TRANSFORMS, "/tf"): [TF]} if config.inputs.tf else {}
+        used = uses(config)
+        for one in config.sources:
+            if one.name in used:
+                inputs.setdefault((one.type, self.resolve_topic_name(one.topic)), []).append(one.name)
+        for (type_name, topic), names in inputs.items():
+            self._subscribe(type_name, topic, names, qos)
         if config.tf.publish:
             self.create_timer(config.tf.period_s, self._guarded(self._publish_tf))
         # a player with /clock waits for this one, so it must not wait for /clock
@@ -88,20 +94,32 @@ class GraphSlamNode(Node):
 
     # -- messages in -------------------------------------------------------------------------------------------------
 
-    def _on_odometry(self, cdr: bytes) -> None:
-        self._take(self._border.odometry(cdr))
+    def _subscribe(self, type_name: str, topic: str, names: list[str], qos: QoSProfile) -> None:
+        """Hand every message of a topic to the inputs of these names, one after the other."""
 
-    def _on_landmarks(self, cdr: bytes) -> None:
-        self._take(self._border.sightings(self._landmark_topic, cdr))
+        def on_message(cdr: bytes) -> None:
+            for name in names:
+                self._take(self._border.take(name, cdr))
 
-    def _on_tf_static(self, cdr: bytes) -> None:
-        self._border.static_transforms(cdr)
+        received = self._received_by(on_message)
+        if TF in names:
+            received = self._but_our_own(received)
+        self.create_subscription(message_class(type_name), topic, received, qos, raw=True)
 
-    def _take(self, measurement: Measurement | None) -> None:
-        if measurement is None:
-            return
-        self._saved = False
-        self._process(measurement)
+    def _but_our_own(self, callback: Callable[[bytes], None]) -> Callable[[bytes], None]:
+        """Of /tf we hear what we say ourselves, too."""
+        map_frame = self._slam.config.frames.map
+
+        def heard(cdr: bytes) -> None:
+            if not is_correction(cdr, map_frame):
+                callback(cdr)
+
+        return heard
+
+    def _take(self, measurements: Sequence[Measurement]) -> None:
+        for measurement in measurements:
+            self._saved = False
+            self._process(measurement)
 
     def _process(self, measurement: Measurement) -> None:
         update = self._slam.process(measurement)
@@ -178,6 +196,7 @@ class GraphSlamNode(Node):
         """Release what waits, solve, and write the run folder; returns its name."""
         if self._recorder is None:
             raise GraphSlamError("output.folder is empty: nowhere to save")
+        self._take(self._border.finish())
         if not self._saved:
             for event in (release, "optimize"):
                 self._process(Control(event))
@@ -192,6 +211,12 @@ class GraphSlamNode(Node):
         if not self._saved:
             self.get_logger().info(f"saved {self.save('end')}")
         self._recorder.close()
+
+
+def _installed(config: Config) -> dict[str, Decoder]:
+    """Decoders of the types whose layout is known to the packages that are installed, and not to us."""
+    names = {one.type for one in config.sources if one.name in uses(config)} - set(typestore().types)
+    return {name: partial(deserialize_message, message_type=message_class(name)) for name in names}
 
 
 class _Told:

@@ -5,7 +5,8 @@ from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
-from graph_slam_ros.slam.config import Config, Parameter, flatten, parameters
+from graph_slam_ros.slam.config import Config, flatten, parameters
+from graph_slam_ros.slam.parameter import Parameter
 
 _OTHERS = {"use_sim_time", "start_type_description_service"}  # rclpy's own
 
@@ -26,7 +27,7 @@ def declare_parameters(node: Any) -> Config:
         }
     )
     used = dict(flatten(config.as_mapping()))
-    for p in parameters():
+    for p in parameters(one.name for one in config.sources):
         node.declare_parameter(p.name, used[p.name], _descriptor(p), ignore_override=True)
     return config
 

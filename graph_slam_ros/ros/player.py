@@ -5,7 +5,6 @@ lets a message of one topic overtake those of another by more than the node's wi
 what would be is counted.
 """
 
-import importlib
 import os
 import random
 import signal
@@ -22,7 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import UInt64
@@ -33,9 +34,12 @@ from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.replay import Inputs
 from graph_slam_ros.ros import to_msg
 from graph_slam_ros.ros.bag import Bag, BagMessage
+from graph_slam_ros.ros.from_msg import TF, TF_STATIC, is_correction
+from graph_slam_ros.ros.message_class import message_class
 from graph_slam_ros.slam import Config
-from graph_slam_ros.slam.config import OrderingConfig
+from graph_slam_ros.slam.config import parameters
 
+_LISTS = {"tf2_msgs/msg/TFMessage", "visualization_msgs/msg/MarkerArray"}  # a header stands in each item
 _AHEAD = 256  # messages on their way
 _OVERTAKE_NS = 20_000_000  # at most, and well inside the node's ordering window
 _CLOCK_NS = 5_000_000
@@ -61,17 +65,21 @@ class Player:
     """A publisher of recorded messages that waits for a graph_slam node."""
 
     def __init__(
-        self, bag: Bag, inputs: Inputs, node_name: str, window_s: float, own: subprocess.Popen[bytes] | None
+        self, bag: Bag, inputs: Inputs, node_name: str, config: Config, own: subprocess.Popen[bytes] | None
     ) -> None:
-        self._bag, self._inputs, self._name, self._own = bag, inputs, node_name, own
-        self._overtake_ns = min(_OVERTAKE_NS, round(0.5e9 * window_s))
+        self._bag, self._name, self._own = bag, node_name, own
+        self._static = inputs.topics.get(TF_STATIC)
+        self._moving = inputs.topics.get(TF)
+        self._topics = set(inputs.by_topic())
+        self._map_frame = config.frames.map
+        self._overtake_ns = min(_OVERTAKE_NS, round(0.5e9 * config.ordering.window_s))
         self._node = Node("graph_slam_player")
         self._sent = self._received = self._lost = 0
         self._before: int | None = None
         self._on_the_way: dict[str, tuple[int, int]] = {}  # oldest and newest stamp by topic
         self._clock_ns = 0
         self._clock = self._node.create_publisher(Clock, "/clock", 10)
-        self._publishers = {topic: self._publisher(topic) for topic in inputs.names()}
+        self._publishers = {topic: self._publisher(topic) for topic in set(inputs.topics.values())}
         self._node.create_subscription(UInt64, f"{node_name}/received", self._on_received, _LATCHED)
 
     def play(self, rate: float | None, progress: Callable[[Iterable[Any], int], Iterable[Any]]) -> Played:
@@ -85,13 +93,14 @@ class Player:
         self._wait(lambda: self._before is not None, f"no {self._name}/received: is the node running?", patience_s)
         for topic, publisher in self._publishers.items():
             self._wait(partial(_has_subscriber, publisher), f"nobody subscribes to {topic}")
-        for message in self._bag.messages({self._inputs.tf_static} - {""}):
+        for message in self._bag.messages({self._static} if self._static else ()):
             self._send(message)
         self._settle()
-        inputs = {self._inputs.odometry, self._inputs.landmarks} - {""}
-        total = sum(self._bag.topics[name].count for name in inputs)
+        total = sum(self._bag.topics[topic].count for topic in self._topics)
         start_wall, start_log = time.monotonic(), None
-        for message in progress(self._bag.messages(inputs), total):
+        for message in progress(self._bag.messages(self._topics), total):
+            if message.topic == self._moving and is_correction(message.cdr, self._map_frame):
+                continue  # of the map, one node tells: now it is ours
             start_log = message.log_ns if start_log is None else start_log
             if rate:
                 self._pause(start_wall + (message.log_ns - start_log) * 1e-9 / rate)
@@ -105,9 +114,8 @@ class Player:
         self._node.destroy_node()
 
     def _publisher(self, topic: str) -> Any:
-        package, _, name = self._bag.topics[topic].type.split("/")
-        kind = getattr(importlib.import_module(f"{package}.msg"), name)
-        latched = topic == self._inputs.tf_static
+        kind = message_class(self._bag.topics[topic].type)
+        latched = topic == self._static
         return self._node.create_publisher(
             kind, topic, QoSProfile(depth=100, durability=_LATCHED.durability) if latched else 4 * _AHEAD
         )
@@ -125,19 +133,22 @@ class Player:
             self._clock.publish(to_msg.clock(message.log_ns))
         self._publishers[message.topic].publish(message.cdr)
         self._sent += 1
-        stamp_ns = _stamp_ns(message.cdr)
+        stamp_ns = self._stamp_ns(message)
         oldest, newest = self._on_the_way.get(message.topic, (stamp_ns, stamp_ns))
         self._on_the_way[message.topic] = min(oldest, stamp_ns), max(newest, stamp_ns)
 
     def _keep_order(self, message: BagMessage) -> None:
         """Wait where the queues are full, or where it would matter which of two topics' messages arrives first."""
-        stamp_ns = _stamp_ns(message.cdr)
+        stamp_ns = self._stamp_ns(message)
         others = [stamps for topic, stamps in self._on_the_way.items() if topic != message.topic]
         apart = self._overtake_ns
         if any(stamp_ns - oldest >= apart or newest - stamp_ns >= apart for oldest, newest in others):
             self._settle()
         elif self._sent - self._received - self._lost >= _AHEAD:
             self._until_received(self._sent - self._lost - _AHEAD // 2)
+
+    def _stamp_ns(self, message: BagMessage) -> int:
+        return _stamp_ns(message.cdr, 4 if self._bag.topics[message.topic].type not in _LISTS else 8)
 
     def _settle(self) -> None:
         self._until_received(self._sent - self._lost)
@@ -184,12 +195,43 @@ class Player:
         return str(answer.message)
 
 
+def config_of(node_name: str) -> Config:
+    """The configuration of a running node, by its parameters: what it listens to.
+
+    Raises
+    ------
+    PlayError
+        There is no such node.
+    """
+    rclpy.init(args=[])
+    try:
+        node = Node("graph_slam_player")
+
+        def answer(kind: Any, service: str, **fields: Any) -> Any:
+            client = node.create_client(kind, f"{node_name}/{service}")
+            if not client.wait_for_service(timeout_sec=_PATIENCE_S):
+                raise PlayError(f"no parameters of {node_name}: is the node running?")
+            future = client.call_async(kind.Request(**fields))
+            rclpy.spin_until_future_complete(node, future, timeout_sec=_PATIENCE_S)
+            if future.result() is None:
+                raise PlayError(f"{node_name}/{service}: no answer")
+            return future.result()
+
+        there = set(answer(ListParameters, "list_parameters").result.names)
+        (inputs,) = answer(GetParameters, "get_parameters", names=["inputs.names"]).values
+        names = [p.name for p in parameters(inputs.string_value.split()) if p.name in there]
+        values = answer(GetParameters, "get_parameters", names=names).values
+        return Config.from_mapping(dict(zip(names, map(parameter_value_to_python, values), strict=True)))
+    finally:
+        rclpy.try_shutdown()
+
+
 def play(
     bag: Bag,
     inputs: Inputs,
     *,
     node_name: str = "/graph_slam",
-    window_s: float = OrderingConfig().window_s,
+    config: Config | None = None,
     own: subprocess.Popen[bytes] | None = None,
     rate: float | None = None,
     progress: Callable[[Iterable[Any], int], Iterable[Any]] = lambda items, total: items,
@@ -197,7 +239,7 @@ def play(
     """Play a recording into the running node of that name, or into one of our own (``own_node``)."""
     rclpy.init(args=[])
     try:
-        player = Player(bag, inputs, node_name, window_s, own)
+        player = Player(bag, inputs, node_name, config or Config(), own)
         try:
             return player.play(rate, progress)
         finally:
@@ -214,15 +256,14 @@ def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subproces
     config = replace(
         config,
         inputs=replace(config.inputs, reliable=True),
+        sources=tuple(replace(one, topic=inputs.topics.get(one.name, one.topic)) for one in config.sources),
         output=replace(config.output, folder=str(folder), keep_earlier=False),
     )
     with tempfile.TemporaryDirectory() as scratch:
         parameters = Path(scratch) / "parameters.yaml"
         parameters.write_text(parameters_text(config.as_mapping()), encoding="utf-8")
         command = [sys.executable, "-m", "graph_slam_ros.ros.node", "--ros-args", "--params-file", str(parameters)]
-        command += ["-p", "use_sim_time:=true"]
-        command += ["-r", f"odom:={inputs.odometry}", "-r", f"landmarks:={inputs.landmarks or 'landmarks'}"]
-        command += ["--log-level", "warn"]
+        command += ["-p", "use_sim_time:=true", "--log-level", "warn"]
         process = subprocess.Popen(command)
         try:
             yield process
@@ -238,9 +279,9 @@ def _has_subscriber(publisher: Any) -> bool:
     return bool(publisher.get_subscription_count())
 
 
-def _stamp_ns(cdr: bytes) -> int:
-    """Stamp of a message that begins with a header, without decoding the rest; 0 where it is too short for one."""
-    if len(cdr) < 12:
+def _stamp_ns(cdr: bytes, at: int = 4) -> int:
+    """Stamp of the header at an offset, without decoding the rest; 0 where the message is too short for one."""
+    if len(cdr) < at + 8:
         return 0
-    sec, nanosec = struct.unpack_from("<iI" if cdr[1] & 1 else ">iI", cdr, 4)
+    sec, nanosec = struct.unpack_from("<iI" if cdr[1] & 1 else ">iI", cdr, at)
     return int(sec) * 1_000_000_000 + int(nanosec)

@@ -1,60 +1,107 @@
-"""Static transforms between frames: where sensors sit on the robot."""
+"""Transforms between frames: where sensors sit on the robot, fixed or on moving joints."""
 
+from bisect import bisect_left
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from graph_slam_ros.lie import se3, so3
 
 
-def rotation_matrix(q: Any) -> Array:
-    """(3, 3) from a unit quaternion message."""
-    x, y, z, w = q.x, q.y, q.z, q.w
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def pose(translation: Any, rotation: so3.Quaternion) -> se3.Pose:
+    """From a translation or position message and a unit quaternion."""
+    x, y, z, w = rotation
+    return float(translation.x), float(translation.y), float(translation.z), x, y, z, w
 
 
-def matrix(translation: Any, rotation: Any) -> Array:
-    """(4, 4) from a translation or position message and a unit quaternion message."""
-    out = np.eye(4)
-    out[:3, :3] = rotation_matrix(rotation)
-    out[:3, 3] = translation.x, translation.y, translation.z
-    return out
+class Transforms:
+    """What /tf_static and /tf have said so far.
 
+    Parameters
+    ----------
+    keep_ns : how much older than its newest a transform of /tf may get
 
-class StaticTransforms:
-    """What /tf_static has said so far."""
+    Attributes
+    ----------
+    now_ns : the newest stamp of odometry, None before the first: what may still come is judged by it
+    """
 
-    def __init__(self) -> None:
-        self._parent: dict[str, tuple[str, Array]] = {}
+    def __init__(self, keep_ns: int = 10_000_000_000) -> None:
+        self._keep_ns = keep_ns
+        self._fixed: dict[str, tuple[str, se3.Pose]] = {}
+        self._moving: dict[str, _Joint] = {}
+        self.now_ns: int | None = None
 
-    def add(self, parent: str, child: str, T_parent_child: Array) -> None:
-        """Take one transform; a later one for the same child replaces it."""
-        self._parent[child] = (parent, T_parent_child)
+    def add(self, parent: str, child: str, T_parent_child: se3.Pose) -> None:
+        """Take one that holds always; a later one for the same child replaces it."""
+        self._fixed[child] = (parent, T_parent_child)
 
-    def lookup(self, target: str, source: str) -> Array | None:
-        """``T_target_source`` (4, 4), or None where the frames are not linked."""
-        to_root_target, to_root_source = self._to_root(target), self._to_root(source)
+    def add_at(self, stamp_ns: int, parent: str, child: str, T_parent_child: se3.Pose) -> None:
+        """Take one that holds at its stamp."""
+        joint = self._moving.get(child)
+        if joint is None or joint.parent != parent:
+            joint = self._moving[child] = _Joint(parent)
+        joint.add(stamp_ns, T_parent_child, self._keep_ns)
+
+    def knows(self, frame: str) -> bool:
+        """Whether the frame has a parent."""
+        return frame in self._fixed or frame in self._moving
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> se3.Pose | None:
+        """``T_target_source`` at a stamp, or of what never moves; None where the frames are not linked then."""
+        if target == source:
+            return se3.IDENTITY
+        to_root_target, to_root_source = self._to_root(target, stamp_ns), self._to_root(source, stamp_ns)
         for frame, T_frame_source in to_root_source.items():
             if frame in to_root_target:
-                linked: Array = np.linalg.inv(to_root_target[frame]) @ T_frame_source
-                return linked
+                return se3.compose(se3.inverse(to_root_target[frame]), T_frame_source)
         return None
 
-    def _to_root(self, frame: str) -> dict[str, Array]:
+    def _to_root(self, frame: str, stamp_ns: int | None) -> dict[str, se3.Pose]:
         """``T_ancestor_frame`` of the frame itself and each ancestor, nearest first."""
-        out = {frame: np.eye(4)}
-        at, T_at_frame = frame, np.eye(4)
-        while at in self._parent:
-            at, T_parent_at = self._parent[at]
+        out: dict[str, se3.Pose] = {frame: se3.IDENTITY}
+        at, T_at_frame = frame, se3.IDENTITY
+        while (link := self._link(at, stamp_ns)) is not None:
+            at, T_parent_at = link
             if at in out:  # a loop
                 break
-            T_at_frame = T_parent_at @ T_at_frame
+            T_at_frame = se3.compose(T_parent_at, T_at_frame)
             out[at] = T_at_frame
         return out
+
+    def _link(self, child: str, stamp_ns: int | None) -> tuple[str, se3.Pose] | None:
+        if child in self._fixed:
+            return self._fixed[child]
+        joint = self._moving.get(child)
+        T = None if joint is None or stamp_ns is None else joint.at(stamp_ns)
+        return None if joint is None or T is None else (joint.parent, T)
+
+
+class _Joint:
+    """The recent motion of one frame in its parent."""
+
+    def __init__(self, parent: str) -> None:
+        self.parent = parent
+        self._stamps_ns: list[int] = []
+        self._poses: list[se3.Pose] = []
+
+    def add(self, stamp_ns: int, T_parent_child: se3.Pose, keep_ns: int) -> None:
+        at = bisect_left(self._stamps_ns, stamp_ns)
+        if at < len(self._stamps_ns) and self._stamps_ns[at] == stamp_ns:
+            self._poses[at] = T_parent_child
+            return
+        self._stamps_ns.insert(at, stamp_ns)
+        self._poses.insert(at, T_parent_child)
+        old = bisect_left(self._stamps_ns, self._stamps_ns[-1] - keep_ns)
+        del self._stamps_ns[:old], self._poses[:old]
+
+    def at(self, stamp_ns: int) -> se3.Pose | None:
+        """Interpolated; None before the first and after the last: nothing is extrapolated."""
+        after = bisect_left(self._stamps_ns, stamp_ns)
+        if after == len(self._stamps_ns):
+            return None
+        if self._stamps_ns[after] == stamp_ns:
+            return self._poses[after]
+        if after == 0:
+            return None
+        start, end = self._stamps_ns[after - 1 : after + 1]
+        a, b = self._poses[after - 1 : after + 1]
+        return se3.interpolate(a, b, (stamp_ns - start) / (end - start))

@@ -7,63 +7,20 @@ types and values out of range are refused with the name of the culprit.
 import dataclasses
 import difflib
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import Loss
+from graph_slam_ros.slam.input_config import DEFAULT_INPUTS, InputConfig, default_input
+from graph_slam_ros.slam.parameter import Parameter, section_parameters
+from graph_slam_ros.slam.parameter import setting as _setting
 from graph_slam_ros.slam.space import PLANE, SPACE, Space
 from graph_slam_ros.solver import METHODS, Settings
 
-
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """What is known of one parameter; ``low`` and ``high`` are inclusive."""
-
-    name: str
-    type: type
-    default: Any
-    meaning: str
-    unit: str
-    low: float | None
-    high: float | None
-    choices: tuple[str, ...]
-
-    def check(self, value: Any) -> Any:
-        """The value in its type. Raises ConfigError naming parameter, value and what is allowed."""
-        if self.type is float and type(value) is int and abs(value) < 2**1000:
-            value = float(value)
-        if type(value) is not self.type:
-            raise ConfigError(f"{self.name}: {value!r} is not {_ARTICLE[self.type]}")
-        if self.choices and value not in self.choices:
-            raise ConfigError(f"{self.name}: {value!r} is not one of {', '.join(self.choices)}")
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
-            if not math.isfinite(value):
-                raise ConfigError(f"{self.name}: {value!r} is not finite")
-            if (self.low is not None and value < self.low) or (self.high is not None and value > self.high):
-                raise ConfigError(f"{self.name}: {value!r} is not in {self.range_text()}")
-        return value
-
-    def range_text(self) -> str:
-        """The allowed interval in words."""
-        low = "-inf" if self.low is None else f"{self.low:g}"
-        return f"[{low}, {'inf' if self.high is None else f'{self.high:g}'}]"
-
-
-_ARTICLE = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
-
-
-def _setting(
-    default: Any,
-    meaning: str,
-    unit: str = "",
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] = (),
-) -> Any:
-    return field(default=default, metadata={"about": (meaning, unit, low, high, choices)})
+_USUAL_INPUTS = tuple(one.name for one in DEFAULT_INPUTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,10 +255,19 @@ class TfConfig:
 
 @dataclass(frozen=True, slots=True)
 class InputsConfig:
-    """Subscriptions of the node."""
+    """What is listened to."""
 
+    names: str = _setting(" ".join(_USUAL_INPUTS), "the inputs, each with a section of its name")
     reliable: bool = _setting(False, "ask for reliable delivery (a best-effort publisher then does not connect)")
     depth: int = _setting(1000, "messages the middleware may hold for a subscription", "messages", low=1, high=100_000)
+    tf: bool = _setting(True, "whether /tf is listened to, for sensors on moving joints; /tf_static always is")
+    tf_buffer_s: float = _setting(10.0, "how long transforms of /tf are kept", "s", low=0.1)
+    tf_wait_s: float = _setting(
+        0.2,
+        "how much newer odometry may get before what is seen in a frame that /tf does not tell of is refused",
+        "s",
+        low=0.0,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -337,6 +303,7 @@ class Config:
     tf: TfConfig = TfConfig()
     inputs: InputsConfig = InputsConfig()
     output: OutputConfig = OutputConfig()
+    sources: tuple[InputConfig, ...] = DEFAULT_INPUTS
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> "Config":
@@ -347,20 +314,26 @@ class Config:
         ConfigError
             Unknown name (the nearest known one is suggested), wrong type, or a value out of range.
         """
+        given = dict(flatten(values))
+        names = _input_names(given.get("inputs.names", InputsConfig().names))
+        known = {p.name: p for p in parameters(names)}
         sections: dict[str, dict[str, Any]] = {}
-        known = {p.name: p for p in parameters()}
-        for name, value in flatten(values):
+        for name, value in given.items():
             if name not in known:
                 near = difflib.get_close_matches(name, known, 1, 0.0)
-                raise ConfigError(f"unknown parameter {name!r}; did you mean {near[0]!r}?")
+                raise ConfigError(f"unknown parameter {name!r}; did you mean {near[0]!r}?{_unlisted(name, names)}")
             section, key = name.split(".")
             sections.setdefault(section, {})[key] = known[name].check(value)
-        trees = {s.name: _section_type(s)(**sections.get(s.name, {})) for s in dataclasses.fields(cls)}
-        return cls(**trees)
+        trees = {name: type(default)(**sections.get(name, {})) for name, default in _sections()}
+        inputs = (dataclasses.replace(default_input(name), **sections.get(name, {})) for name in names)
+        return cls(**trees, sources=tuple(inputs))
 
     def as_mapping(self) -> dict[str, dict[str, Any]]:
         """Nested plain values, every parameter named."""
-        return dataclasses.asdict(self)
+        out = dataclasses.asdict(self)
+        for section in out.pop("sources"):
+            out[section.pop("name")] = section
+        return out
 
     @property
     def space(self) -> Space:
@@ -386,17 +359,41 @@ class Config:
         )
 
 
-def _section_type(section: "dataclasses.Field[Any]") -> type:
-    return type(section.default)
-
-
-def parameters() -> Iterator[Parameter]:
-    """Every parameter, in the order of the tree, named ``section.key``."""
+def _sections() -> Iterator[tuple[str, Any]]:
+    """Name and defaults of each section but those of inputs."""
     for section in dataclasses.fields(Config):
-        for key in dataclasses.fields(_section_type(section)):
-            meaning, unit, low, high, choices = key.metadata["about"]
-            name = f"{section.name}.{key.name}"
-            yield Parameter(name, type(key.default), key.default, meaning, unit, low, high, choices)
+        if section.name != "sources":
+            yield section.name, section.default
+
+
+def _input_names(text: Any) -> list[str]:
+    """Names that are separated by spaces. Raises ConfigError for what cannot be the name of a section of its own."""
+    if not isinstance(text, str):
+        raise ConfigError(f"inputs.names: {text!r} is not a text of names")
+    names, taken = text.split(), {name for name, _ in _sections()} | {"tf_static"}
+    for name in names:
+        if not re.fullmatch(r"[a-zA-Z]\w*", name, re.ASCII):
+            raise ConfigError(f"inputs.names: {name!r} is not a name (letters, digits, _)")
+        if name in taken:
+            raise ConfigError(f"inputs.names: {name!r} is taken or given twice")
+        taken.add(name)
+    return names
+
+
+def _unlisted(name: str, names: list[str]) -> str:
+    """A hint where a parameter looks like one of an input."""
+    section, _, key = name.partition(".")
+    if section in names or section in dict(_sections()) or key not in InputConfig.__slots__:
+        return ""
+    return f" {section!r} is not in inputs.names ({' '.join(names)})"
+
+
+def parameters(names: Iterable[str] = _USUAL_INPUTS) -> Iterator[Parameter]:
+    """Every parameter, in the order of the tree, named ``section.key``, with a section for each named input."""
+    for name, defaults in _sections():
+        yield from section_parameters(name, defaults)
+    for name in names:
+        yield from section_parameters(name, default_input(name))
 
 
 def notes() -> dict[str, str]:

@@ -1,0 +1,193 @@
+"""One input at the border: its settings, where its sensor is, and the noise its messages do not tell."""
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.ros.inputs import checks
+from graph_slam_ros.ros.inputs.checks import MessageError
+from graph_slam_ros.ros.transforms import Transforms
+from graph_slam_ros.slam.config import Config
+from graph_slam_ros.slam.input_config import InputConfig
+
+Array = NDArray[np.float64]
+Numbers = tuple[float, ...]
+
+_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+_BEYOND_MEANING = 1e12  # [m^2, rad^2]: larger numbers could not be turned into other axes
+_FLAT = 0.5  # the horizontal part of an x axis that is too short to have a heading
+
+
+class NotYet(Exception):
+    """/tf may still tell where the sensor was: the message is to be tried again."""
+
+
+class Source:
+    """What a converter knows besides the message.
+
+    Parameters
+    ----------
+    use : what the input is used as
+
+    Attributes
+    ----------
+    tally : refusals and repairs of the present message by reason
+    hurried : whether nothing is waited for any more
+    state : what converters have to remember between messages
+    """
+
+    def __init__(self, settings: InputConfig, use: str, config: Config, transforms: Transforms) -> None:
+        self.name = settings.name
+        self.settings = settings
+        self.use = use
+        self.config = config
+        self.space = config.space
+        self.transforms = transforms
+        self.tally: Counter[str] = Counter()
+        self.hurried = not config.inputs.tf
+        self.state: dict[str, Any] = {}
+        self._wait_ns = round(config.inputs.tf_wait_s * 1e9)
+        self._mount = _mount(settings)
+
+    def count(self, reason: str, times: int = 1) -> None:
+        """A refusal or a repair."""
+        self.tally[reason] += times
+
+    # -- frames ------------------------------------------------------------------------------------------------------
+
+    def frame(self, name: str) -> str:
+        """The frame as configured, else as the message says."""
+        if self.settings.frame:
+            return self.settings.frame
+        if name.startswith("/"):
+            self.count("frame_slash_stripped")
+            name = name[1:]
+        if not name and self._mount is None:
+            raise MessageError("frame_empty")
+        return name
+
+    def T_base(self, frame: str, stamp_ns: int) -> se3.Pose:
+        """Where a frame was on the robot: by TF, else as configured.
+
+        Raises
+        ------
+        NotYet
+            Neither tells, and odometry is not much newer than the stamp.
+        """
+        found = self.transforms.lookup(self.config.frames.base, frame, stamp_ns)
+        if found is not None:
+            return found
+        if self._mount is not None and not self.transforms.knows(frame):
+            return self._mount
+        now_ns = self.transforms.now_ns
+        if self.hurried or (now_ns is not None and now_ns > stamp_ns + self._wait_ns):
+            raise MessageError("frame_unknown")
+        raise NotYet
+
+    def T_base_child(self, child: str) -> se3.Pose:
+        """Where a frame always is on the robot; an empty one is where it is configured to be, or the base."""
+        found = self.transforms.lookup(self.config.frames.base, child) if child else None
+        if found is None:
+            found = self._mount if self._mount is not None or child else se3.IDENTITY
+        if found is None:
+            raise MessageError("child_frame_unknown")
+        return found
+
+    def T_fixed(self, target: str, frame: str) -> se3.Pose:
+        """Between frames that do not move."""
+        found = self.transforms.lookup(target, frame)
+        if found is None:
+            raise MessageError("frame_unknown")
+        return found
+
+    # -- rotations ---------------------------------------------------------------------------------------------------
+
+    def unit(self, q: Any) -> so3.Quaternion:
+        """Unit quaternion (x, y, z, w) of a message."""
+        out, repaired = checks.quaternion(q)
+        if repaired:
+            self.count("quaternion_normalized")
+        return out
+
+    def projected(self, T: se3.Pose) -> Numbers:
+        """A pose of the plane or of space; in the plane the heading is that of the x axis."""
+        if self.space.dimensions == 3:
+            return tuple(map(float, T))
+        ahead = so3.act(se3.rotation(T), (1.0, 0.0, 0.0))
+        return float(T[0]), float(T[1]), math.atan2(ahead[1], ahead[0])
+
+    def has_heading(self, T: se3.Pose) -> bool:
+        """In space always; in the plane where the x axis does not point up."""
+        ahead = so3.act(se3.rotation(T), (1.0, 0.0, 0.0))
+        return self.space.dimensions == 3 or bool(math.hypot(ahead[0], ahead[1]) >= _FLAT)
+
+    # -- noise -------------------------------------------------------------------------------------------------------
+
+    def block(self, covariance: Array) -> Array:
+        """Of a pose's covariance (6, 6), what the space has of it: (3, 3) or all."""
+        return covariance if self.space.dimensions == 3 else covariance[_PLANAR]
+
+    def orientation_known(self, covariance: Array) -> bool:
+        """Whether a pose's covariance (6, 6) says so: of the heading in the plane, of all three axes in space."""
+        variances = np.diag(covariance)[5 if self.space.dimensions == 2 else 3 :]
+        most = self.config.landmarks.orientation_known_below_rad**2
+        return bool(((variances > 0.0) & (variances < most)).all())
+
+    def pose_covariance(self, flat: Any, distance_m: float) -> Array:
+        """Covariance (6, 6) in the axes of the frame: of the message, or of the settings where it has none."""
+        if flat is None or self.settings.noise == "sigmas":
+            sigmas = [self.sigma_m(distance_m)] * 3 + [self.settings.sigma_rad] * 3
+            return np.diag(np.square(sigmas))
+        covariance: Array = np.asarray(flat, dtype=float).reshape(6, 6)
+        if not np.isfinite(covariance).all():
+            raise MessageError("nonfinite_covariance")
+        return np.clip(covariance, -_BEYOND_MEANING, _BEYOND_MEANING)
+
+    def sigma_m(self, distance_m: float = 0.0) -> float:
+        """Standard deviation of a position at a distance where the message does not tell it."""
+        sigma_m = self.settings.sigma_m
+        if sigma_m == 0.0 and self.use == "landmarks":
+            sigma_m = self.config.landmarks.sigma_m
+        if sigma_m == 0.0:
+            raise MessageError("covariance_unknown")
+        return sigma_m + self.settings.sigma_per_m * distance_m
+
+    def checked(self, block: Array, lengths: int, distance_m: float = 0.0) -> Numbers:
+        """Flat covariance; positions' part is that of the settings where all of it is zero.
+
+        Parameters
+        ----------
+        block : (n, n), the first ``lengths`` in m^2, the others in rad^2
+        """
+        if lengths and not block[:lengths, :lengths].any():
+            self.count("covariance_unknown")
+            filled = np.zeros_like(block)
+            filled[:lengths, :lengths] = np.eye(lengths) * self.sigma_m(distance_m) ** 2
+            filled[lengths:, lengths:] = block[lengths:, lengths:]
+            block = filled
+        covariance, repairs = checks.covariance(block, lengths)
+        for repair in repairs:
+            self.count(repair)
+        return tuple(covariance.ravel().tolist())
+
+
+def turned(T: se3.Pose, covariance: Array) -> Array:
+    """Covariance (6, 6) of a pose, in the axes of the frame that T puts it into."""
+    both = np.kron(np.eye(2), so3.matrix(se3.rotation(T)))
+    out: Array = both @ covariance @ both.T
+    return out
+
+
+def _mount(settings: InputConfig) -> se3.Pose | None:
+    given = settings.numbers("mount", 6)
+    if not given:
+        return None
+    x, y, z, roll, pitch, yaw = given
+    q = so3.IDENTITY
+    for angle, axis in ((yaw, 2), (pitch, 1), (roll, 0)):  # fixed axes: roll is applied first
+        q = so3.compose(q, so3.exp(tuple(angle if k == axis else 0.0 for k in range(3))))
+    return x, y, z, float(q[0]), float(q[1]), float(q[2]), float(q[3])

@@ -1,0 +1,78 @@
+"""Parameters of one input: what is listened to, what it is used as, and what its messages leave unsaid."""
+
+import math
+from dataclasses import dataclass
+
+from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.slam.parameter import setting
+
+
+@dataclass(frozen=True, slots=True)
+class InputConfig:
+    """The section of an input.
+
+    Attributes
+    ----------
+    name : of the input and of its section
+    """
+
+    name: str
+    topic: str = setting("", "where it comes from; in a recording without that topic, the only one of its type")
+    type: str = setting("", "type of its messages, package/msg/Name")
+    use: str = setting(
+        "auto",
+        "what it is used as; auto: what its type is for, the first thing where it is for several; none: not at all",
+        choices=("auto", "odometry", "landmarks", "fix", "closure", "none"),
+    )
+    frame: str = setting("", "frame it is measured in, whatever its messages say; empty: as they say")
+    mount: str = setting(
+        "", "where that frame is on the robot if TF does not tell: x y z roll pitch yaw; empty: refused then", "m, rad"
+    )
+    noise: str = setting(
+        "message",
+        "message: the messages' covariance, the sigmas where it is unknown; sigmas: always these",
+        choices=("message", "sigmas"),
+    )
+    sigma_m: float = setting(
+        0.0, "position noise; 0: landmarks.sigma_m of landmarks, others of unknown covariance are refused", "m", low=0.0
+    )
+    sigma_per_m: float = setting(0.0, "added to sigma_m for each metre of distance", "m/m", low=0.0)
+    sigma_rad: float = setting(0.0, "noise of an orientation or bearing; 0: unknown", "rad", low=0.0, high=math.pi)
+    id: str = setting("", "identity of the landmark in messages that carry none")
+    id_prefix: str = setting("", "put before every identity, where two inputs have the same for different landmarks")
+    frame_prefix: str = setting("", "of transforms as landmarks: what the names of their frames begin with")
+    hamming_max: int = setting(255, "tags with more corrected bits are left out", "bits", low=0, high=255)
+    decision_margin_min: float = setting(
+        0.0, "tags that were told from others by less are left out", "grey levels", low=0.0
+    )
+    datum: str = setting(
+        "", "latitude longitude altitude of the map's origin, in degrees and metres; empty: the first fix", "deg, m"
+    )
+
+    def __post_init__(self) -> None:
+        self.numbers("mount", 6)
+        latitude, *_ = self.numbers("datum", 3) or (0.0,)
+        if abs(latitude) > 90.0:
+            raise ConfigError(f"{self.name}.datum: latitude {latitude:g} is not in [-90, 90]")
+
+    def numbers(self, key: str, count: int) -> tuple[float, ...]:
+        """Numbers of a text; none if it is empty. Raises ConfigError for anything else than ``count`` of them."""
+        text = getattr(self, key)
+        try:
+            found = tuple(map(float, text.split()))
+        except ValueError:
+            found = (math.nan,)
+        if len(found) not in (0, count) or not all(map(math.isfinite, found)):
+            raise ConfigError(f"{self.name}.{key}: {text!r} is not {count} numbers")
+        return found
+
+
+DEFAULT_INPUTS = (
+    InputConfig("odom", topic="odom", type="nav_msgs/msg/Odometry"),
+    InputConfig("detections", topic="landmarks", type="vision_msgs/msg/Detection3DArray"),
+)
+
+
+def default_input(name: str) -> InputConfig:
+    """What is known of an input by its name alone."""
+    return next((one for one in DEFAULT_INPUTS if one.name == name), InputConfig(name, topic=name))

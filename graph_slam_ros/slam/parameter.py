@@ -1,0 +1,68 @@
+"""Parameters: what is known of each, and how a section of them is declared."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from graph_slam_ros.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """What is known of one parameter; ``low`` and ``high`` are inclusive."""
+
+    name: str
+    type: type
+    default: Any
+    meaning: str
+    unit: str
+    low: float | None
+    high: float | None
+    choices: tuple[str, ...]
+
+    def check(self, value: Any) -> Any:
+        """The value in its type. Raises ConfigError naming parameter, value and what is allowed."""
+        if self.type is float and type(value) is int and abs(value) < 2**1000:
+            value = float(value)
+        if type(value) is not self.type:
+            raise ConfigError(f"{self.name}: {value!r} is not {_ARTICLE[self.type]}")
+        if self.choices and value not in self.choices:
+            raise ConfigError(f"{self.name}: {value!r} is not one of {', '.join(self.choices)}")
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            if not math.isfinite(value):
+                raise ConfigError(f"{self.name}: {value!r} is not finite")
+            if (self.low is not None and value < self.low) or (self.high is not None and value > self.high):
+                raise ConfigError(f"{self.name}: {value!r} is not in {self.range_text()}")
+        return value
+
+    def range_text(self) -> str:
+        """The allowed interval in words."""
+        low = "-inf" if self.low is None else f"{self.low:g}"
+        return f"[{low}, {'inf' if self.high is None else f'{self.high:g}'}]"
+
+
+_ARTICLE = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
+
+
+def setting(
+    default: Any,
+    meaning: str,
+    unit: str = "",
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A field of a section: its default, meaning, unit, bounds and choices."""
+    return field(default=default, metadata={"about": (meaning, unit, low, high, choices)})
+
+
+def section_parameters(section: str, members: Any) -> Iterator[Parameter]:
+    """The parameters of a section: ``members`` holds their defaults."""
+    for key in dataclasses.fields(members):
+        if "about" in key.metadata:
+            meaning, unit, low, high, choices = key.metadata["about"]
+            default = getattr(members, key.name)
+            yield Parameter(f"{section}.{key.name}", type(default), default, meaning, unit, low, high, choices)
