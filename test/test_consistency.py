@@ -11,6 +11,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.evaluation import Trajectory, evaluate, interpolated
 from graph_slam_ros.leverage import leverage
 from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.replay import replay
 from graph_slam_ros.run import RunRecorder
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam
@@ -197,3 +198,21 @@ def test_a_file_that_is_no_table_of_covariances_is_refused_by_name(tmp_path, tex
     (tmp_path / "covariances.csv").write_text(text)
     with pytest.raises(GraphSlamError, match=r"covariances\.csv: not a table of covariances"):
         read_covariances(tmp_path / "covariances.csv")
+
+
+@pytest.mark.parametrize(
+    "world, sensor", [("flight", "pose"), ("flight", "range_bearing"), ("warehouse", "range_bearing")]
+)
+def test_a_simulated_bag_is_replayed_to_a_run_that_is_near_the_truth_and_knows_it(tmp_path, world, sensor):
+    pytest.importorskip("evo")
+    write_bag(simulate(world, 1, laps=1, sensor=sensor), tmp_path / "bag.mcap")
+    settings = {"world.dimensions": 3 if world == "flight" else 2}
+    if sensor != "pose":
+        settings |= {"inputs.names": "odom points", "points.type": "sensor_msgs/msg/PointCloud2"}
+        settings |= {"points.topic": "/landmarks"}
+    replay(tmp_path / "bag.mcap", tmp_path / "run", Config.from_mapping(settings))
+    scores = evaluate(tmp_path / "run", tmp_path / "bag.mcap")
+    assert scores.dimensions == settings["world.dimensions"]
+    assert scores.estimate.position_m["rmse"] < 0.3 * scores.odometry.position_m["rmse"]
+    assert scores.map_rmse_m < 0.3
+    assert scores.consistency.last_pose.mean < chi2.ppf(0.9999, scores.consistency.last_pose.dof)
