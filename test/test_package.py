@@ -39,7 +39,7 @@ THIRD_PARTY = {
     "lie": {"numpy", "numba"},
     "graph": {"numpy", "numba"},
     "solver": {"numpy", "numba", "scipy"},
-    "slam": {"numpy"},
+    "slam": {"numpy", "scipy"},
     "formats": {"numpy", "mcap", "yaml"},
     "ros/from_msg.py": {"numpy", "rosbags", "mcap"},
     "ros/bag.py": {"numpy", "rosbags", "mcap"},

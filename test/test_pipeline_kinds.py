@@ -15,6 +15,11 @@ HZ = 20
 END = (Control("end"), Control("optimize"))
 BOTH = pytest.mark.parametrize("space", [PLANE, SPACE], ids=["plane", "space"])
 SENSOR = {PLANE: (0.3, -0.2, 0.5), SPACE: (0.3, -0.2, 0.1, *so3.exp((0.2, -0.3, 0.5)))}
+SOURCES = {
+    "inputs__names": "wheels camera",
+    "wheels__type": "nav_msgs/msg/Odometry",
+    "camera__type": "nav_msgs/msg/Odometry",
+}
 EXACT = 1e-3  # standard deviation given to measurements without error
 
 
@@ -271,7 +276,7 @@ def test_where_odometry_is_set_anew_a_segment_begins_and_the_map_stays_straight(
 def test_the_next_odometry_takes_over_where_the_first_falls_silent_and_gives_way_where_it_is_back(space):
     true, odom = drive(space, 20.0)
     elsewhere = floats(space.group.exp(tuple(0.3 * np.arange(1, space.dof + 1))))
-    pipeline = slam(space, odometry__priority="wheels camera", odometry__timeout_s=0.3)
+    pipeline = slam(space, odometry__timeout_s=0.3, **SOURCES)
     for k, at in enumerate(odom):
         pipeline.process(Odometry(stamp(k), floats(space.group.compose(elsewhere, at)), None, "camera"))
         if not 100 <= k < 200:

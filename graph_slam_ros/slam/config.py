@@ -73,9 +73,11 @@ class OdometryConfig:
         1e-3, "slower than this and the next, the robot stands: no noise is added", "m/s", low=0.0
     )
     still_rad_s: float = _setting(1e-3, "see still_m_s", "rad/s", low=0.0)
-    priority: str = _setting("", "sources in order of priority, by name; others follow in the order they come")
     timeout_s: float = _setting(
-        0.5, "a source that is silent for longer, in stamp time, gives way to the next", "s", low=1e-3
+        0.5,
+        "an odometry that is silent for longer, in stamp time, gives way to the next of inputs.names",
+        "s",
+        low=1e-3,
     )
     max_speed_m_s: float = _setting(
         50.0, "faster than this, odometry has jumped: a new segment begins", "m/s", low=1e-3

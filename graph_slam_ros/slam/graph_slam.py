@@ -94,7 +94,9 @@ class GraphSlam:
         self.report: Report | None = None  # of the last solve of everything
         self._sink = sink
         self._order = StampOrder(self.config.ordering, self.counters)
-        self._odometry = OdometryChoice(self.config.odometry, self.space, self.counters)
+        self._odometry = OdometryChoice(
+            self.config.odometry, self.config.inputs.names.split(), self.space, self.counters
+        )
         self._noise = OdometryNoise(self.config.odometry, self.space)
         self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters)
         self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self._hand_over)

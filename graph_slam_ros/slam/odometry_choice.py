@@ -1,6 +1,7 @@
 """One odometry out of several: the first in priority that is alive, told as steps; and where it does not hold."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from graph_slam_ros.slam.config import OdometryConfig
@@ -29,12 +30,17 @@ class Step:
 
 
 class OdometryChoice:
-    """Chooses by stamps alone: what is used follows from what was accepted, not from when it came."""
+    """Chooses by stamps alone: what is used follows from what was accepted, not from when it came.
 
-    def __init__(self, config: OdometryConfig, space: Space, counters: Counters) -> None:
+    Parameters
+    ----------
+    priority : names of sources, the best first; others follow in the order they come
+    """
+
+    def __init__(self, config: OdometryConfig, priority: Sequence[str], space: Space, counters: Counters) -> None:
         self._config, self._space, self._counters = config, space, counters
         self._silent_ns = round(config.timeout_s * 1e9)
-        self._order = config.priority.split()
+        self._order = list(priority)
         self._past: dict[str, deque[Odometry]] = {}
         self._used: Odometry | None = None
 

@@ -7,7 +7,7 @@ giving the sightings of one to the other, and are parted again where these do no
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,8 @@ from graph_slam_ros.solver import Solver
 Array = NDArray[np.float64]
 
 _MOST_CANDIDATES = 24  # landmarks that one message is compared with: the nearest
+_MOST_AT_ONCE = 8  # new landmarks whose pairings are weighed together: the latest
+_MOST_TRIED = 1000
 _REACH_SIGMA = 5.0
 _POSITIONED = ("position", "pose", "range_bearing")
 
@@ -163,71 +165,123 @@ class Unnamed:
     # -- afterwards ----------------------------------------------------------------------------------------------
 
     def review(self, now_ns: int) -> None:
-        """Look at all landmarks again: confirm, give up, merge, part."""
+        """Look at all landmarks again: part, merge, believe, give up."""
         self._part()
+        for group in self._groups():
+            self._merge(group)
         for name, landmark in list(self._landmarks.known.items()):
-            if landmark.seen:
-                self._settle(name, landmark, now_ns)
+            if landmark.is_tentative:
+                self._believe_or_give_up(name, landmark, now_ns)
 
-    def _settle(self, name: str, landmark: Landmark, now_ns: int) -> bool:
-        """Merge a landmark into the one it is; believe a tentative one that is none of the others, or give it up.
+    def _groups(self) -> list[list[str]]:
+        """Landmarks that may be older ones: the tentative ones together, each of the others by itself."""
+        known = self._landmarks.known
+        young = [name for name, mark in known.items() if mark.is_tentative and mark.sightings > 1]
+        others = [[name] for name, mark in known.items() if mark.seen and not mark.is_tentative]
+        return ([young] if self._config.association == "joint" else [[name] for name in young]) + others
 
-        Returns whether the graph changed.
-        """
-        c = self._config
-        costs = self._costs_as_others(name, landmark)
-        if costs and costs[0][0] + self._gates.margin < self._gates.new:
-            best, other = costs[0]
-            rivals = [o for cost, o in costs[1:] if cost < best + self._gates.margin]
-            if self._all_close([other, *rivals]):
+    def _merge(self, names: list[str]) -> None:
+        """Merge those of a group of which it is clear which others they are."""
+        names = [name for name in names if name in self._landmarks.known][-_MOST_AT_ONCE:]
+        options = self._options(names)
+        if not any(options.values()):
+            return
+        likely = self._likely_pairings(names, options)
+        for name, other in likely[0].items():
+            if all(name in pairs and self._are_close(pairs[name], other) for pairs in likely):
                 self._counters.count("landmarks", "merged")
                 first = len(self._landmarks.known[other].seen)
                 self._mergers.append(Merger(other, name, first, self._landmarks.merge(other, name)))
-                return True
-        if not landmark.is_tentative:
-            return False
-        for_long = landmark.last_seen_ns - landmark.first_seen_ns >= round(c.confirm_s * 1e9)
-        if not costs and landmark.sightings >= c.confirm_sightings and for_long:
-            landmark.is_tentative = False
-        elif now_ns - landmark.last_seen_ns > round(c.give_up_s * 1e9):
-            self._landmarks.give_up(name)
-            self._counters.count("landmarks", "given_up")
-            return True
-        return False
+                self._hand_over()
 
-    def _all_close(self, names: list[str]) -> bool:
-        at = self._positions(np.array([self._landmarks.known[name].vertex for name in names]))
-        return float(np.linalg.norm(at - at[0], axis=1).max()) <= self._gates.close_m
+    def _options(self, names: list[str]) -> dict[str, list[str]]:
+        """Believed landmarks that each may be: near enough by the covariance of both, never seen together with it."""
+        known = self._landmarks.known
+        older = [name for name, mark in known.items() if not mark.is_tentative]
+        at = {name: self._positions(np.array([known[name].vertex]))[0] for name in {*names, *older}}
+        out: dict[str, list[str]] = {}
+        for name in names:
+            mark = known[name]
+            others = [o for o in older if self._may_be(name, o)]
+            others.sort(key=lambda o: float(np.linalg.norm(at[o] - at[name])))
+            out[name] = []
+            for other in others[:_MOST_CANDIDATES]:
+                apart, covariance = self._apart([(mark, known[other])])
+                if association.pair_cost(apart, covariance)[0] < self._gates.other_chi2(len(apart)):
+                    out[name].append(other)
+        return out
 
-    def _costs_as_others(self, name: str, landmark: Landmark) -> list[tuple[float, str]]:
-        """What it costs to take a landmark for each believed one nearby that was never seen together with it."""
-        others = [(o, mark) for o, mark in self._landmarks.known.items() if o != name and not mark.is_tentative]
-        if not others:
-            return []
-        at = self._positions(np.array([landmark.vertex, *(mark.vertex for _, mark in others)]))
-        apart = at[1:] - at[0]
-        out = []
-        for k in np.argsort(np.linalg.norm(apart, axis=1), kind="stable")[:_MOST_CANDIDATES].tolist():
-            other, mark = others[k]
-            if (other, name) not in self._parted and not landmark.stamps & mark.stamps:
-                statistic, cost = association.pair_cost(apart[k], self._apart(landmark, mark))
-                if statistic < self._gates.other_chi2(len(at[0])):
-                    out.append((cost, other))
-        return sorted(out)
+    def _may_be(self, name: str, other: str) -> bool:
+        a, b = self._landmarks.known[name], self._landmarks.known[other]
+        is_later = a.is_tentative or (b.first_seen_ns, other) < (a.first_seen_ns, name)
+        return name != other and is_later and (other, name) not in self._parted and not a.stamps & b.stamps
 
-    def _apart(self, a: Landmark, b: Landmark) -> Array:
-        """Covariance (n, n) of the difference of two landmarks' positions in map."""
-        n, dof = self._space.dimensions, self._landmarks.kind_of(a).dof
-        joint = self._solver.joint_marginal([a.vertex, b.vertex])
-        j = np.zeros((n, len(joint)))
-        j[:, :n], j[:, dof : dof + n] = self._axes(a), -self._axes(b)
-        return j @ joint @ j.T + self._extent()
+    def _likely_pairings(self, names: list[str], options: dict[str, list[str]]) -> list[dict[str, str]]:
+        """The pairings, the best first, that cost at most ``margin`` more than it; none of them may be the best."""
+        known = self._landmarks.known
+        found: list[tuple[float, dict[str, str]]] = []
+
+        def descend(depth: int, pairs: dict[str, str]) -> None:
+            if len(found) > _MOST_TRIED:
+                return
+            if depth == len(names):
+                found.append((self._cost(pairs), pairs))
+                return
+            descend(depth + 1, pairs)
+            for other in options[names[depth]]:
+                same = [name for name, o in pairs.items() if o == other]
+                if not any(known[name].stamps & known[names[depth]].stamps for name in same):
+                    descend(depth + 1, pairs | {names[depth]: other})
+
+        descend(0, {})
+        found = [(cost, pairs) for cost, pairs in found if np.isfinite(cost)]
+        found.sort(key=lambda item: item[0])
+        return [pairs for cost, pairs in found if cost <= found[0][0] + self._gates.margin]
+
+    def _cost(self, pairs: dict[str, str]) -> float:
+        """Of taking landmarks for others together, against all of them being new; infinite where they do not fit."""
+        if not pairs:
+            return 0.0
+        known = self._landmarks.known
+        apart, covariance = self._apart([(known[a], known[b]) for a, b in pairs.items()])
+        statistic, cost = association.pair_cost(apart, covariance)
+        return cost - len(pairs) * self._gates.new if statistic < self._gates.chi2(len(apart)) else np.inf
+
+    def _are_close(self, a: str, b: str) -> bool:
+        at = self._positions(np.array([self._landmarks.known[name].vertex for name in (a, b)]))
+        return float(np.linalg.norm(at[1] - at[0])) <= self._gates.close_m
+
+    def _apart(self, pairs: Sequence[tuple[Landmark, Landmark]]) -> tuple[Array, Array]:
+        """Differences (k n,) of the positions of pairs in map, and their covariance together."""
+        n = self._space.dimensions
+        marks = list({id(mark): mark for pair in pairs for mark in pair}.values())
+        joint = self._solver.joint_marginal([mark.vertex for mark in marks])
+        first = dict(zip(map(id, marks), np.cumsum([0, *map(self._dof, marks)]).tolist(), strict=False))
+        j, r = np.zeros((len(pairs) * n, len(joint))), np.zeros(len(pairs) * n)
+        for k, (a, b) in enumerate(pairs):
+            for mark, sign in ((a, 1.0), (b, -1.0)):
+                j[k * n : (k + 1) * n, first[id(mark)] : first[id(mark)] + n] = sign * self._axes(mark)
+                r[k * n : (k + 1) * n] += sign * self._positions(np.array([mark.vertex]))[0]
+        return r, j @ joint @ j.T + np.kron(np.eye(len(pairs)), self._extent())
+
+    def _dof(self, landmark: Landmark) -> int:
+        return self._landmarks.kind_of(landmark).dof
 
     def _axes(self, landmark: Landmark) -> Array:
         """From the landmark's tangent space to the map's axes, of its position."""
         if self._landmarks.kind_of(landmark) is self._space.point:
             return np.eye(self._space.dimensions)
         return self._space.turn(tuple(self._solver.estimate([landmark.vertex])[0].tolist()))
+
+    def _believe_or_give_up(self, name: str, landmark: Landmark, now_ns: int) -> None:
+        """Believe a tentative landmark that is none of the others; give up what was not seen for long."""
+        c = self._config
+        for_long = landmark.last_seen_ns - landmark.first_seen_ns >= round(c.confirm_s * 1e9)
+        if landmark.sightings >= c.confirm_sightings and for_long and not self._options([name])[name]:
+            landmark.is_tentative = False
+        elif now_ns - landmark.last_seen_ns > round(c.give_up_s * 1e9):
+            self._landmarks.give_up(name)
+            self._counters.count("landmarks", "given_up")
 
     def _part(self) -> None:
         """Take back a merger whose sightings do not fit."""
@@ -241,6 +295,7 @@ class Unnamed:
             if fits > chi2.ppf(1.0 - 1e-6, dof) and fits > 4.0 * dof:
                 self._counters.count("landmarks", "parted")
                 self._landmarks.part(merger.kept, merger.merged, merger.first, merger.count)
+                self._hand_over()
                 self._parted.add((merger.kept, merger.merged))
                 self._mergers.remove(merger)
                 return
