@@ -98,6 +98,13 @@ class KeyframesConfig:
         "s",
         low=1e-3,
     )
+    shared_noise: float = _setting(
+        0.05,
+        "or at what is seen, where the motion since the last keyframe would add more than this to its variance, and the"
+        " same to all that is seen at once",
+        "part of variance",
+        low=0.0,
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -234,6 +234,10 @@ class GraphSlam:
         self._append_keyframe(vertex, step)
 
     def _next_keyframe(self, step: Step, covariance: Array) -> None:
+        self._add_keyframe(step, covariance)
+        self._solve_if_due()
+
+    def _add_keyframe(self, step: Step, covariance: Array) -> None:
         """A vertex where odometry is now, and the motion to it from the last as an edge."""
         space, last = self.space, self.keyframes[-1]
         T_last_now = self._motions[-1].now.T_keyframe_base
@@ -243,7 +247,6 @@ class GraphSlam:
         self._covariance = space.group.propagate(self._covariance, T_last_now, covariance)
         self._append_keyframe(vertex, step)
         self._unsolved_keyframes += 1
-        self._solve_if_due()
 
     def _begin_segment(self, step: Step) -> None:
         """Where odometry jumped, nearly nothing is known of the motion; what the robot sees will tell."""
@@ -295,6 +298,8 @@ class GraphSlam:
 
     def _observe(self, m: Observation) -> None:
         where = self._where(m.stamp_ns)
+        if self._deserves_keyframe(m, where):
+            where = self._keyframe_at(where)
         match m:
             case Sightings():
                 self.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
@@ -305,6 +310,24 @@ class GraphSlam:
             case Closure():
                 self._add_closure(m, where)
         self._solve_if_due()
+
+    def _deserves_keyframe(self, m: Observation, where: Where) -> bool:
+        """Where the motion since the keyframe would be too much of the noise of what was measured."""
+        newest = self._motions[-1]
+        if where.keyframe != newest.keyframe or not newest.before_last_ns < where.stamp_ns:
+            return False
+        return carry.shared_noise(self.space, m, where) > self.config.keyframes.shared_noise
+
+    def _keyframe_at(self, where: Where) -> Where:
+        """A keyframe at a stamp within the last step of odometry, which is cut in two."""
+        group, size = self.space.group, self.space.dof
+        T_odom_base = group.compose(self.keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
+        rest = self._motions[-1].cut(where.stamp_ns)
+        self._add_keyframe(Step(where.stamp_ns, self.space.identity, T_odom_base), where.covariance)
+        if rest is not None:
+            self._motions[-1].step(rest)
+        vertex = self.keyframes[-1].vertex
+        return Where(len(self.keyframes) - 1, vertex, where.stamp_ns, self.space.identity, np.zeros((size, size)))
 
     def _identified(self, m: Sightings, where: Where) -> list[tuple[str, Sighting]]:
         """The sightings to be used, each with the landmark it is of."""

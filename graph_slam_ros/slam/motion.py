@@ -104,6 +104,21 @@ class Motion:
         moves = not self._noise.stands(step, elapsed_ns * 1e-9)
         return self._extended(a, step, elapsed_ns * moves, Step(stamp_ns, step, b.T_keyframe_base, b.twist_covariance))
 
+    def cut(self, stamp_ns: int) -> Step | None:
+        """End the motion at a stamp after the last odometry but one; returns the step that is left over, if any."""
+        last, group = self.now, self._space.group
+        if stamp_ns == last.stamp_ns:
+            return None
+        at = self.at(stamp_ns)
+        rest = group.between(at.T_keyframe_base, last.T_keyframe_base)
+        self._moved[-1] = at
+        return Step(last.stamp_ns, rest, rest, last.twist_covariance)
+
+    @property
+    def before_last_ns(self) -> int:
+        """Stamp of the last odometry but one, or of the keyframe."""
+        return self._moved[-2].stamp_ns if len(self._moved) > 1 else self.start_ns
+
     def _extended(self, a: Moved, T_a_b: Numbers, moving_ns: int, step: Step) -> Moved:
         group, noise = self._space.group, self._noise.of(moving_ns * 1e-9, step.twist_covariance)
         covariance = group.propagate_during(a.covariance, T_a_b, noise)
