@@ -22,6 +22,7 @@ from graph_slam_ros.slam.space import Numbers, Space
 Array = NDArray[np.float64]
 
 NEW, UNCLEAR = -1, -2
+_SURE = 0.95
 _MOST_TRIED = 2000  # pairings of one message; the best so far is taken then
 
 
@@ -53,6 +54,10 @@ class Gates:
         """The largest statistic of a pair, or of several together."""
         return float(chi2.ppf(self.same, dof))
 
+    def sure_chi2(self, dof: int) -> float:
+        """Up to this a sighting is of a landmark whatever else it may be."""
+        return float(chi2.ppf(_SURE, dof))
+
     def other_chi2(self, dof: int) -> float:
         """The least statistic of what does not belong together."""
         return float(chi2.ppf(self.other, dof))
@@ -66,13 +71,17 @@ class Expected:
     ----------
     points : (L, n) where each is expected, in the keyframe's frame
     covariance : (L n, L n) of all of them together
+    is_followed : (L,) which of them were seen just now: the others are only what a sighting may be as well
     """
 
     points: Array
     covariance: Array
+    is_followed: NDArray[np.bool_]
 
 
-def expected(space: Space, T_map_keyframe: Numbers, landmarks: Sequence[Numbers], joint: Array) -> Expected:
+def expected(
+    space: Space, T_map_keyframe: Numbers, landmarks: Sequence[Numbers], joint: Array, is_followed: NDArray[np.bool_]
+) -> Expected:
     """Positions of landmarks in a keyframe's frame.
 
     Parameters
@@ -92,7 +101,7 @@ def expected(space: Space, T_map_keyframe: Numbers, landmarks: Sequence[Numbers]
         is_pose = len(landmark) == space.pose.size
         jacobian[rows, at : at + n] = turn.T @ space.turn(landmark) if is_pose else turn.T
         at += dof if is_pose else n
-    return Expected(points, jacobian @ joint @ jacobian.T)
+    return Expected(points, jacobian @ joint @ jacobian.T, is_followed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,18 +122,21 @@ class Match:
 def associate(gates: Gates, seen: Sequence[Carried], what: Expected, *, jointly: bool) -> list[Match]:
     """Of each sighting its landmark, by index."""
     statistic, cost = _costs(seen, what)
-    n = what.points.shape[1]
+    n, followed = what.points.shape[1], what.is_followed
     possible = np.where(statistic > gates.chi2(n), np.inf, cost)
-    pairs = _jointly(gates, seen, what, possible) if jointly else _one_by_one(possible, gates.new)
-    beyond = gates.other_chi2(n)
+    mine = np.where(followed, possible, np.inf)
+    pairs = _jointly(gates, seen, what, mine) if jointly else _one_by_one(mine, gates.new)
     out = []
     for i in range(len(seen)):
         j = pairs.get(i)
         if j is None:
-            out.append(Match(NEW if not len(statistic[i]) or statistic[i].min() > beyond else UNCLEAR))
+            is_apart = not followed.any() or statistic[i, followed].min() > gates.other_chi2(n)
+            out.append(Match(NEW if is_apart else UNCLEAR))
+        elif statistic[i, j] > gates.sure_chi2(n) and (possible[i, ~followed] < cost[i, j]).any():
+            out.append(Match(NEW))
         else:
             taken = [k for k in pairs.values() if k != j]
-            rivals = np.flatnonzero(possible[i] < cost[i, j] + gates.margin)
+            rivals = np.flatnonzero(mine[i] < cost[i, j] + gates.margin)
             out.append(_among_rivals(gates, what.points, cost[i], j, [k for k in rivals.tolist() if k not in taken]))
     return out
 

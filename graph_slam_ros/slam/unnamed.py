@@ -137,8 +137,7 @@ class Unnamed:
         """Landmarks that may be seen here, and what they look like."""
         space, n = self._space, self._space.dimensions
         self._hand_over()
-        oldest_ns = where.stamp_ns - round(self._config.follow_s * 1e9)
-        names = [name for name, mark in self._landmarks.known.items() if mark.last_seen_ns >= oldest_ns]
+        names = list(self._landmarks.known)
         vertices = np.array([self._landmarks.known[name].vertex for name in names], dtype=np.int64)
         T_map_keyframe: Numbers = tuple(self._solver.estimate([where.vertex])[0].tolist())
         if len(names):
@@ -156,7 +155,10 @@ class Unnamed:
         chosen = [int(vertices[k]) for k in near]
         joint = self._solver.joint_marginal([where.vertex, *chosen])
         values = [tuple(self._solver.estimate([v])[0].tolist()) for v in chosen]
-        return [names[k] for k in near], association.expected(space, T_map_keyframe, values, joint)
+        oldest_ns = where.stamp_ns - round(self._config.follow_s * 1e9)
+        is_followed = [self._landmarks.known[names[k]].last_seen_ns >= oldest_ns for k in near]
+        what = association.expected(space, T_map_keyframe, values, joint, np.array(is_followed, dtype=bool))
+        return [names[k] for k in near], what
 
     def _positions(self, vertices: NDArray[np.int64]) -> Array:
         n = self._space.dimensions
