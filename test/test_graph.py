@@ -18,7 +18,9 @@ from graph_slam_ros.graph import (
     R3,
     RELATIVE_POSE,
     SE2,
+    SE3,
     TAG_POSITION,
+    EdgeType,
     Gaussian,
     Graph,
     numeric_jacobian,
@@ -236,7 +238,7 @@ def two_poses_and_a_point():
 def test_an_edge_that_is_refused_is_named_and_leaves_no_trace(edge, ends, measured, noise, culprit):
     graph = two_poses_and_a_point()
     with pytest.raises(GraphSlamError, match=culprit):
-        graph.add_edges(edge, ends, measured, noise, "closures")
+        graph.add_edges(edge, np.atleast_2d(ends), np.atleast_2d(measured), noise, "closures")
     assert graph.edge_count == 1
     assert (list(graph.tables), graph.labels) == ([RELATIVE_POSE], ["odometry"])
     assert graph.add_edge(RELATIVE_POSE, [1, 0], [1, 0, 0], UNIT, "closures") == 1
@@ -247,3 +249,49 @@ def test_a_vertex_that_is_not_finite_is_named_and_leaves_no_trace():
     with pytest.raises(GraphSlamError, match=r"\[0.0, nan, 0.0\] of vertex 4"):
         graph.add_vertices(SE2, [[0, 0, 0], [0, np.nan, 0]])
     assert (graph.vertex_count, len(graph.initial)) == (3, 8)
+
+
+@pytest.mark.parametrize(
+    "add, complaint",
+    [
+        (lambda g: g.add_vertex(SE2, [1, 2, 3, 4, 5, 6]), r"SE2: values of shape \(1, 6\)"),
+        (lambda g: g.add_vertices(SE2, [1, 2, 3, 4, 5, 6]), r"SE2: values of shape \(6,\)"),
+        (lambda g: g.add_vertex(SE3, [0.0] * 7), "SE3: its quaternion is not of unit length"),
+        (lambda g: g.add_edge(RELATIVE_POSE, [0, 1, 1, 0], [1, 0, 0] * 2, UNIT, "x"), r"vertices of shape \(1, 4\)"),
+        (lambda g: g.add_edge(RELATIVE_POSE, [0, 1], [1, 0, 0] * 2, UNIT, "x"), r"measurements of shape \(1, 6\)"),
+        (lambda g: g.add_edges(RELATIVE_POSE, [0, 1], [1, 0, 0], UNIT, "x"), r"vertices of shape \(2,\)"),
+        (lambda g: g.add_edge(RELATIVE_POSE, [0.9, 1.2], [1, 0, 0], UNIT, "x"), "whole numbers"),
+    ],
+)
+def test_numbers_are_not_taken_for_what_they_were_not_given_as(add, complaint):
+    graph = two_poses_and_a_point()
+    with pytest.raises(GraphSlamError, match=complaint):
+        add(graph)
+    assert (graph.vertex_count, graph.edge_count) == (3, 1)
+
+
+def test_an_edge_does_not_meet_a_vertex_twice_in_any_two_of_its_slots():
+    graph, three = Graph(), EdgeType("three", ((R2,), (R2,), (R2,)), 2, 2, lambda x, at, z: (z, z))
+    graph.add_vertices(R2, np.zeros((2, 2)))
+    with pytest.raises(GraphSlamError, match="vertex 1 to itself"):
+        graph.add_edge(three, [1, 0, 1], [0, 0], Gaussian.from_sigmas(1, 1), "x")
+
+
+@pytest.mark.parametrize(
+    "accepts, complaint",
+    [
+        ((), "0 vertices"),
+        (((R2,),) * 4, "4 vertices; an edge has 1 to 3"),
+        (((R2,), (R2, SE2)), "slot 1 takes R2, SE2: not kinds of one and the same dof"),
+        (((R2,), ()), "slot 1 takes nothing"),
+    ],
+)
+def test_an_edge_type_that_the_solver_has_no_room_for_is_refused(accepts, complaint):
+    with pytest.raises(GraphSlamError, match=complaint):
+        EdgeType("odd", accepts, 1, 1, lambda x, at, z: (z, z))
+
+
+def test_a_standard_deviation_that_is_not_positive_is_refused():
+    for sigma in (-0.1, 0.0, np.nan):
+        with pytest.raises(GraphSlamError, match="must be > 0"):
+            Gaussian.from_sigmas(0.1, sigma)

@@ -42,7 +42,7 @@ class Online:
     def take(self, step: Step, pose: Array, landmarks: Array) -> None:
         """See ``contenders.Online``."""
         graph = self.graph
-        new = self.poses[step.pose : step.pose + 1] = graph.add_vertices(self.kind, pose)
+        new = self.poses[step.pose : step.pose + 1] = graph.add_vertices(self.kind, pose[None])
         edges = self._add(self.edge, self.poses[step.relative.ends], step.relative)
         if len(step.sightings):
             if len(landmarks):

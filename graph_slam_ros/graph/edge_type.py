@@ -16,10 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.vertices import VertexKind
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+MOST_SLOTS = 3  # vertices of one edge: what the solver's records have room for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +31,7 @@ class EdgeType:
 
     Attributes
     ----------
-    accepts : for each slot the vertex kinds it takes, all of the same dof
+    accepts : for each of one to three slots the vertex kinds it takes, all of the same dof
     tail : what the last numbers of ``measured`` are where they are left out: a sensor's place on the robot
     """
 
@@ -38,6 +41,19 @@ class EdgeType:
     residual_size: int
     linearize: Callable[[Array, Index, Array], tuple[Array, Array]]
     tail: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.accepts) <= MOST_SLOTS:
+            raise GraphSlamError(f"{self.name}: {len(self.accepts)} vertices; an edge has 1 to {MOST_SLOTS}")
+        for slot, kinds in enumerate(self.accepts):
+            if len({kind.dof for kind in kinds}) != 1:
+                names = ", ".join(kind.name for kind in kinds) or "nothing"
+                raise GraphSlamError(f"{self.name}: slot {slot} takes {names}: not kinds of one and the same dof")
+        if min(self.residual_size, self.measured_size - len(self.tail)) < 0 or not self.residual_size:
+            raise GraphSlamError(
+                f"{self.name}: a residual of {self.residual_size} numbers, a measurement of {self.measured_size}"
+                f" with a tail of {len(self.tail)}"
+            )
 
     @property
     def dofs(self) -> tuple[int, ...]:

@@ -1,6 +1,7 @@
 """The graph: append-only records of vertices and edges, kept as arrays."""
 
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -43,17 +44,27 @@ class Column:
         self._length = end
 
 
+def whole_numbers(ids: ArrayLike, what: str) -> Index:
+    """Ids as an array; what is not a whole number is refused, not cut off."""
+    given = np.asarray(ids)
+    if given.dtype.kind not in "iu" and given.size:
+        raise GraphSlamError(f"{what}: ids must be whole numbers, got {given.ravel()[:5].tolist()}")
+    return given.astype(np.int64, copy=False)
+
+
 @dataclass(slots=True, eq=False)
 class EdgeTable:
     """All edges of one type, a row each.
 
     Attributes
     ----------
+    code : its place among the graph's tables
     id : edge ids; vertices : (n, k) vertex ids; measured : (n, p); sqrt_information : (n, m, m)
     label : codes into ``Graph.labels``; weight : a factor on the information, 0 = out of the problem
     """
 
     type: EdgeType
+    code: int
     id: Column = field(init=False)
     vertices: Column = field(init=False)
     measured: Column = field(init=False)
@@ -92,6 +103,7 @@ class Graph:
         self.offset = Column(np.int64)
         self.initial = Column(np.float64)
         self.tables: dict[EdgeType, EdgeTable] = {}
+        self._in_order: list[EdgeTable] = []
         self.labels: list[str] = []
         self.table_of_edge = Column(np.int64)
         self.row_of_edge = Column(np.int64)
@@ -107,12 +119,16 @@ class Graph:
         return len(self.row_of_edge)
 
     def add_vertices(self, kind: VertexKind, values: ArrayLike) -> Index:
-        """Add n vertices with initial values (n, size); returns their ids."""
-        rows = np.asarray(values, dtype=float).reshape(-1, kind.size)
-        if not np.isfinite(rows).all():
-            row = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
-            vertex = self.vertex_count + row
-            raise GraphSlamError(f"initial value {rows[row].tolist()} of vertex {vertex} is not finite")
+        """Add n vertices with initial values (n, size), also (n,) where one number each is stored; returns their ids."""
+        rows = np.asarray(values, dtype=float)
+        if rows.ndim == 1 and kind.size == 1:
+            rows = rows[:, None]
+        if rows.shape != (len(rows) if rows.ndim else 0, kind.size):
+            raise GraphSlamError(f"{kind.name}: values of shape {rows.shape}, not (n, {kind.size})")
+        fault = kind.fault(rows)
+        if fault is not None:
+            row, why = fault
+            raise GraphSlamError(f"initial value {rows[row].tolist()} of vertex {self.vertex_count + row} {why}")
         count, start = len(rows), len(self.initial)
         ids = np.arange(self.vertex_count, self.vertex_count + count)
         if kind not in self.kinds:
@@ -123,8 +139,8 @@ class Graph:
         return ids
 
     def add_vertex(self, kind: VertexKind, value: ArrayLike) -> int:
-        """Add one vertex; returns its id."""
-        return int(self.add_vertices(kind, value)[0])
+        """Add one vertex with its initial value (size,); returns its id."""
+        return int(self.add_vertices(kind, np.asarray(value, dtype=float)[None])[0])
 
     def add_edges(self, edge: EdgeType, vertices: ArrayLike, measured: ArrayLike, noise: Gaussian, label: str) -> Index:
         """Add n edges of one type; returns their ids.
@@ -136,12 +152,14 @@ class Graph:
         noise : one for all, or n
         label : the class an edge is counted under, e.g. ``odometry``
         """
-        at = np.asarray(vertices, dtype=np.int64).reshape(-1, len(edge.accepts))
-        z = edge.whole(measured).reshape(-1, edge.measured_size)
+        at, z = whole_numbers(vertices, edge.name), edge.whole(measured)
         self._check(edge, at, z, noise)
-        table = self.tables.setdefault(edge, EdgeTable(edge))
+        table = self.tables.get(edge)
+        if table is None:
+            table = self.tables[edge] = EdgeTable(edge, len(self.tables))
+            self._in_order.append(table)
         ids, count = np.arange(self.edge_count, self.edge_count + len(at)), len(at)
-        self.table_of_edge.extend(list(self.tables).index(edge), count)
+        self.table_of_edge.extend(table.code, count)
         self.row_of_edge.extend(np.arange(len(table), len(table) + count), count)
         table.id.extend(ids, count)
         table.vertices.extend(at, count)
@@ -152,8 +170,9 @@ class Graph:
         return ids
 
     def add_edge(self, edge: EdgeType, vertices: ArrayLike, measured: ArrayLike, noise: Gaussian, label: str) -> int:
-        """Add one edge; returns its id."""
-        return int(self.add_edges(edge, vertices, measured, noise, label)[0])
+        """Add one edge, of (k,) vertices and what was measured (p,); returns its id."""
+        one = np.asarray(vertices)[None], np.asarray(measured, dtype=float)[None]
+        return int(self.add_edges(edge, *one, noise, label)[0])
 
     def kind_of(self, vertex: int) -> VertexKind:
         """The kind of one vertex."""
@@ -161,7 +180,7 @@ class Graph:
 
     def row(self, edge_id: int) -> tuple[EdgeTable, int]:
         """The table and row of an edge."""
-        return list(self.tables.values())[self.table_of_edge.values[edge_id]], int(self.row_of_edge.values[edge_id])
+        return self._in_order[self.table_of_edge.values[edge_id]], int(self.row_of_edge.values[edge_id])
 
     def _label_code(self, label: str) -> int:
         if label not in self.labels:
@@ -169,6 +188,10 @@ class Graph:
         return self.labels.index(label)
 
     def _check(self, edge: EdgeType, at: Index, measured: Array, noise: Gaussian) -> None:
+        for what, given, size in (("vertices", at, len(edge.accepts)), ("measurements", measured, edge.measured_size)):
+            if given.ndim != 2 or given.shape[1] != size:
+                shape = tuple(given.shape)
+                raise GraphSlamError(f"{edge.name}: {what} of shape {shape}, not (n, {size})")
         if len(at) != len(measured):
             raise GraphSlamError(f"{edge.name}: {len(at)} edges but {len(measured)} measurements")
         if noise.sqrt_information.shape[-1] != edge.residual_size or (
@@ -183,8 +206,8 @@ class Graph:
         if len(at) and (at.min() < 0 or at.max() >= self.vertex_count):
             missing = int(at.max() if at.max() >= self.vertex_count else at.min())
             raise GraphSlamError(f"{edge.name}: vertex {missing} does not exist")
-        for slot in range(1, at.shape[1]):
-            itself = at[:, slot] == at[:, slot - 1]
+        for other, slot in combinations(range(at.shape[1]), 2):
+            itself = at[:, slot] == at[:, other]
             if itself.any():
                 raise GraphSlamError(f"{edge.name}: edge from vertex {int(at[itself, slot][0])} to itself")
         for slot, kinds in enumerate(edge.accepts):

@@ -36,7 +36,9 @@ class Gaussian:
 
     @classmethod
     def from_sigmas(cls, *sigmas: float) -> "Gaussian":
-        """From independent standard deviations."""
+        """From independent standard deviations. Raises NoiseError where one is not positive."""
+        if not all(sigma > 0.0 for sigma in sigmas):
+            raise NoiseError(f"standard deviations {list(sigmas)}: each must be > 0")
         return cls.from_covariance(np.diag(np.square(sigmas)))
 
     @property

@@ -11,6 +11,8 @@ from graph_slam_ros.lie.jit import kernel
 
 Array = NDArray[np.float64]
 
+_UNIT = 1e-2  # a squared norm of a quaternion this near to 1 is that of few digits
+
 
 @dataclass(frozen=True, slots=True)
 class VertexKind:
@@ -20,6 +22,7 @@ class VertexKind:
     ----------
     retract : (n, size), (n, dof) -> (n, size), the operator [+]
     local : (n, size), (n, size) -> (n, dof), the operator [-]: ``retract(b, local(a, b)) == a``
+    holds : (n, size) -> (n,), whether finite numbers are one of its values; any are where it is left out
     """
 
     name: str
@@ -27,6 +30,15 @@ class VertexKind:
     dof: int
     retract: Callable[[Array, Array], Array]
     local: Callable[[Array, Array], Array]
+    holds: Callable[[Array], NDArray[np.bool_]] | None = None
+
+    def fault(self, values: Array) -> tuple[int, str] | None:
+        """The first row of (n, size) that is none of its values, and why."""
+        fit = np.isfinite(values).all(axis=1)
+        why = "is not finite"
+        if self.holds is not None and fit.all():
+            fit, why = self.holds(values), f"is no {self.name}: its quaternion is not of unit length"
+        return None if fit.all() else (int(fit.argmin()), why)
 
 
 @kernel
@@ -50,10 +62,14 @@ def _local_se3(a: Array, b: Array) -> Array:
     return np.stack(se3.local(tuple(a.T), tuple(b.T)), axis=-1)
 
 
+def _has_unit_quaternion(values: Array) -> NDArray[np.bool_]:
+    return np.asarray(np.abs((values[:, 3:] ** 2).sum(axis=1) - 1.0) < _UNIT)
+
+
 def _vector_kind(dof: int) -> VertexKind:
     return VertexKind(f"R{dof}", dof, dof, np.add, np.subtract)
 
 
 SE2 = VertexKind("SE2", 3, 3, _retract_se2, _local_se2)
-SE3 = VertexKind("SE3", 7, 6, _retract_se3, _local_se3)
+SE3 = VertexKind("SE3", 7, 6, _retract_se3, _local_se3, _has_unit_quaternion)
 R1, R2, R3 = _vector_kind(1), _vector_kind(2), _vector_kind(3)

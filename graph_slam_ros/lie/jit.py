@@ -51,7 +51,10 @@ numba.config.CACHE_DIR = str(CACHE_DIR)  # type: ignore[attr-defined]
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a loop over arrays; results do not depend on threads (never parallel, no unsafe maths)."""
+    """Compile a loop over arrays; it runs on one thread, without unsafe maths.
+
+    Where it calls BLAS (wide fronts) that library may take more: for the same bytes every time it must have one.
+    """
     compiled: Callable[..., Any] = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     return compiled
 

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.graph.edge_type import MOST_SLOTS
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.numeric import add_to_diagonal, back_substitute, eliminate, settle
 from graph_slam_ros.solver.ordering import key_of, move_tail, neighbourhood
@@ -122,6 +123,8 @@ def append_edges(t: Tree, rows: Index, all_ids: Index, all_ends: Index) -> None:
     vertex, edge, t_link, state, blocks = t.vertex, t.edge, t.link, t.state, t.blocks
     for row in rows:
         e = all_ids[row]
+        if edge[e, COUNT] > 0:  # by a call that was interrupted
+            continue
         width = 0
         edge[e, COUNT] = all_ends.shape[1]
         for s in range(all_ends.shape[1]):
@@ -229,7 +232,7 @@ def _anchored(t: Tree, new: Index) -> bool:
 def ends_of(t: Tree, edges: Index) -> Index:
     """The vertices of edges; some more than once."""
     edge = t.edge
-    out = np.empty(3 * len(edges), np.int64)
+    out = np.empty(MOST_SLOTS * len(edges), np.int64)
     count = 0
     for e in edges:
         for s in range(edge[e, COUNT]):

@@ -12,11 +12,13 @@ Because contributions are kept, an update touches only the cliques of changed ed
 Records are columns of integer arrays, so that compiled code reaches everything through one tuple.
 """
 
-from sys import getrefcount
+from sys import getrefcount, version_info
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from graph_slam_ros.graph.edge_type import MOST_SLOTS
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -28,9 +30,10 @@ NOTHING = -1
 # scratch, NOTHING between uses
 DOF, STEP, VALUE, KIND, KEY, CLIQUE, LINK, REGION, NEXT, FREE, LOCAL, VERTEX_COLUMNS = range(12)
 
-# edge: vertices (at most 3); their degrees of freedom; where its block begins; 1 where it is in the structure; which of
+# edge: how many vertices, 0 where it is not known yet; these; their degrees of freedom; where its block begins; 1 where it is in the structure; which of
 # its vertices is eliminated first; scratch
-COUNT, END, WIDTH, BLOCK, ACTIVE, OWNER, TAKEN, EDGE_COLUMNS = 0, 1, 4, 5, 6, 7, 8, 9
+COUNT, END = range(2)
+WIDTH, BLOCK, ACTIVE, OWNER, TAKEN, EDGE_COLUMNS = range(END + MOST_SLOTS, END + MOST_SLOTS + 6)
 
 # link: an edge of a vertex, and the vertex's next link
 LINK_EDGE, LINK_NEXT, LINK_COLUMNS = range(3)
@@ -76,6 +79,7 @@ RECENT = 32  # closures that are looked at
 FAR = 1 << 40  # vertices: further than any closure reaches
 
 _REFERENCES = 3  # to an array that is about to grow: its owner's, an argument, and another
+_UNCOUNTED = (3, 14)  # from then on references may be borrowed, so that a count says nothing of views
 
 _STEPS = np.array([4, 5, 6, 7])
 CAPACITIES = np.concatenate([[1, 2, 3], *(_STEPS * 2**k for k in range(13))]).astype(np.int64)
@@ -150,7 +154,8 @@ def longer(array: NDArray[Any], count: int) -> NDArray[Any]:
     if count <= len(array):
         return array
     shape = (max(count, len(array) + len(array) // 16, 64), *array.shape[1:])
-    if getrefcount(array) <= _REFERENCES:  # no view of it: the system need not copy it, nor hand out its memory anew
+    if version_info < _UNCOUNTED and getrefcount(array) <= _REFERENCES:
+        # no view of it: the system need not copy it, nor hand out its memory anew
         array.resize(shape, refcheck=False)
         return array
     grown = np.zeros(shape, dtype=array.dtype)
