@@ -119,7 +119,7 @@ class Graph:
         return len(self.row_of_edge)
 
     def add_vertices(self, kind: VertexKind, values: ArrayLike) -> Index:
-        """Add n vertices with initial values (n, size), also (n,) where one number each is stored; returns their ids."""
+        """Add n vertices with initial values (n, size), or (n,) where one number is stored; returns their ids."""
         rows = np.asarray(values, dtype=float)
         if rows.ndim == 1 and kind.size == 1:
             rows = rows[:, None]

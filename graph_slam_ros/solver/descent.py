@@ -21,6 +21,17 @@ Index = NDArray[np.int64]
 _TINY = 1e-12  # a cost of zero up to rounding has converged
 _DAMPING_FIRST, _DAMPING_LEAST, _DAMPING_MOST, _DAMPING_FACTOR = 1e-4, 1e-12, 1e12, 10.0
 _RADIUS_FIRST, _RADIUS_LEAST = 1.0, 1e-12
+_LEAST = {  # of the settings that are numbers
+    "max_iterations": 0,
+    "step_tolerance": 0.0,
+    "cost_tolerance": 0.0,
+    "relinearize_above": 0.0,
+    "relinearize_error": 0.0,
+    "relinearize_every": 1,
+    "relinearize_passes": 0,
+    "tolerance": 0.0,
+    "tolerance_sigmas": 0.0,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +70,28 @@ class Settings:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise GraphSlamError(f"method {self.method!r}: choose {', '.join(METHODS[:-1])} or {METHODS[-1]}")
+        for name, least in _LEAST.items():
+            if not getattr(self, name) >= least:  # nor is NaN
+                raise GraphSlamError(f"{name} {getattr(self, name)}: must be a number >= {least}")
+        for label, stages in self.losses.items():
+            if not len(stages):
+                raise GraphSlamError(f"losses: {label!r} has no stage; leave it out, or give it a loss")
 
     def stages(self) -> list[dict[str, Loss]]:
         """One loss per label for each stage."""
         count = max((len(stages) for stages in self.losses.values()), default=1)
         return [{name: s[min(k, len(s) - 1)] for name, s in self.losses.items()} for k in range(count)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Saved:
+    """Where a problem was."""
+
+    value: Array
+    blocks: Array
+    diagonal: Array
+    chi2: float
+    cost: float
 
 
 class Problem:
@@ -82,10 +110,12 @@ class Problem:
         self.chi2 = self.cost = 0.0
         settle(tree, unknowns)
 
-    def linearize(self, losses: Losses) -> None:
-        """Put the blocks of all edges at the linearisation points into the tree."""
+    def linearize(self, losses: Losses, *, refuse: bool = False) -> None:
+        """Put the blocks of all edges at the linearisation points into the tree; costs not finite may be refused."""
         self.chi2 = self.cost = 0.0
         for b in linearize(self.graph, self.tree.value, self.rows, losses):
+            if refuse:
+                refuse_nonfinite(b)
             store(self.tree, b.rows, b.table.id.values, b.residual, b.jacobian)
             self.chi2 += float(b.chi2.sum())
             self.cost += float(b.cost.sum())
@@ -112,17 +142,24 @@ class Problem:
         """Take the step: the estimate becomes the linearisation point."""
         settle(self.tree, self.unknowns)
 
-    def saved(self) -> tuple[Array, ...]:
-        """Linearisation points and blocks, to come back to."""
-        tree = self.tree
-        return tree.value[: self._size].copy(), tree.blocks.copy(), tree.diagonal.copy()
+    def here(self) -> Array:
+        """The linearisation points, to come back to."""
+        return self.tree.value[: self._size].copy()
 
-    def restore(self, saved: tuple[Array, ...]) -> None:
-        """Come back to what was saved."""
-        value, blocks, diagonal = saved
-        self.tree.value[: self._size] = self.tree.estimate[: self._size] = value
-        self.tree.blocks[:], self.tree.diagonal[:] = blocks, diagonal
+    def back_to(self, here: Array) -> None:
+        """Come back to linearisation points, without a step; what is linearised is left as it is."""
+        self.tree.value[: self._size] = self.tree.estimate[: self._size] = here
         self.tree.step[:] = 0.0
+
+    def saved(self) -> _Saved:
+        """Linearisation points, and what is linearised there, to come back to."""
+        return _Saved(self.here(), self.tree.blocks.copy(), self.tree.diagonal.copy(), self.chi2, self.cost)
+
+    def restore(self, saved: _Saved) -> None:
+        """Come back to what was saved."""
+        self.back_to(saved.value)
+        self.tree.blocks[:], self.tree.diagonal[:] = saved.blocks, saved.diagonal
+        self.chi2, self.cost = saved.chi2, saved.cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,31 +185,30 @@ def minimise(problem: Problem, settings: Settings) -> Report:
         The cost is not finite where it starts.
     """
     stages = [Losses(problem.graph, by_label) for by_label in settings.stages()]
-    for block in linearize(problem.graph, problem.tree.value, problem.rows, stages[0]):
-        refuse_nonfinite(block)
-    problem.linearize(stages[0])
+    problem.linearize(stages[0], refuse=True)
     chi2_initial, cost_initial = problem.chi2, problem.cost
     iterations: list[Iteration] = []
     used, stop = settings.method, ""
     for losses in stages:
-        begin = problem.saved()
+        begin = problem.here()
+        if losses is not stages[0]:
+            problem.linearize(losses)
         descent = _DESCENTS[settings.method](problem, losses, settings)
         if settings.method == "gn" and descent.stop not in ("step", "cost"):
-            problem.restore(begin)
+            problem.back_to(begin)
+            problem.linearize(losses)
             descent = _levenberg_marquardt(problem, losses, settings)
             used = "lm"
         stop = descent.stop
         iterations += descent.iterations
     if used != "gn":
         problem.solve()
-        problem.tree.step[:] = 0.0
-        problem.restore(problem.saved())
+        problem.back_to(problem.here())
     end = costs(problem.graph, linearize(problem.graph, problem.tree.value, problem.rows, stages[-1]))
     return Report(used, stop, chi2_initial, end.chi2, cost_initial, end.cost, tuple(iterations), end.classes)
 
 
 def _gauss_newton(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
-    problem.linearize(losses)
     start = problem.cost
     iterations: list[Iteration] = []
     for _ in range(settings.max_iterations):
@@ -195,19 +231,17 @@ def _gauss_newton(problem: Problem, losses: Losses, settings: Settings) -> _Desc
 
 def _levenberg_marquardt(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
     """Marquardt 1963: the diagonal is enlarged until the cost falls."""
-    problem.linearize(losses)
     damping = _DAMPING_FIRST
     iterations: list[Iteration] = []
     while len(iterations) < settings.max_iterations:
-        previous, here = problem.cost, problem.saved()
+        previous, before = problem.cost, problem.saved()
         while True:
             step = problem.solve(damping)
             problem.move()
             problem.linearize(losses)
             if problem.cost <= previous:
                 break
-            problem.restore(here)
-            problem.cost = previous
+            problem.restore(before)
             if damping >= _DAMPING_MOST or step < settings.step_tolerance:
                 return _Descent(iterations, "step" if damping < _DAMPING_MOST else "no_decrease")
             damping *= _DAMPING_FACTOR
@@ -221,7 +255,6 @@ def _levenberg_marquardt(problem: Problem, losses: Losses, settings: Settings) -
 
 def _dogleg(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
     """Powell 1970: within a radius, from steepest descent's minimum towards the Gauss-Newton step."""
-    problem.linearize(losses)
     radius = _RADIUS_FIRST
     iterations: list[Iteration] = []
     while len(iterations) < settings.max_iterations:
@@ -234,7 +267,7 @@ def _dogleg(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
             newton = problem.tree.step.copy()
         except SingularError:  # as where it starts: another point may tell more
             newton = steepest
-        previous, here = problem.cost, problem.saved()
+        previous, before = problem.cost, problem.saved()
         while True:
             step = _within(radius, newton, steepest)
             length = float(np.abs(step).max(initial=0.0))
@@ -245,8 +278,7 @@ def _dogleg(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
             kept = (previous - problem.cost) / promised if promised > 0.0 else 0.0
             if problem.cost <= previous:
                 break
-            problem.restore(here)
-            problem.cost = previous
+            problem.restore(before)
             if length < settings.step_tolerance or radius < _RADIUS_LEAST:
                 return _Descent(iterations, "step")
             radius = 0.25 * min(radius, float(np.linalg.norm(step)))

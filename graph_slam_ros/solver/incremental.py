@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.graph.edge_type import MOST_SLOTS
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.numeric import add_to_diagonal, back_substitute, eliminate, settle
+from graph_slam_ros.solver.numeric import back_substitute, clear_block, eliminate, settle
 from graph_slam_ros.solver.ordering import key_of, move_tail, neighbourhood
 from graph_slam_ros.solver.symbolic import build, cliques_of, collect, compact, mark, release, room_for, structure
 from graph_slam_ros.solver.tree import (
@@ -95,11 +95,11 @@ def admit(ids: Index, inside: NDArray[np.bool_], count: int) -> int:
 
 
 @kernel
-def outside(rows: Index, ends: Index, inside: NDArray[np.bool_]) -> int:
-    """A vertex that edges, rows of a table, need and that is not inside, or NOTHING."""
+def outside(rows: Index, ends: Index, weight: Array, inside: NDArray[np.bool_]) -> int:
+    """A vertex that edges with a weight, rows of a table, need and that is not inside, or NOTHING."""
     for row in rows:
         for s in range(ends.shape[1]):
-            if not inside[ends[row, s]]:
+            if weight[row] != 0.0 and not inside[ends[row, s]]:
                 return ends[row, s]
     return NOTHING
 
@@ -142,11 +142,8 @@ def append_edges(t: Tree, rows: Index, all_ids: Index, all_ends: Index) -> None:
 
 
 @kernel
-def enter(t: Tree, vertices: Index, edges: Index) -> bool:
-    """Make vertices unknowns, the newest, and put edges, whose blocks are still to be made, into the structure.
-
-    Returns whether a chain of edges joins each of them to an older vertex or to an edge on one vertex alone.
-    """
+def enter(t: Tree, vertices: Index, edges: Index) -> None:
+    """Make vertices unknowns, the newest, and put edges, whose blocks are still to be made, into the structure."""
     vertex, tail, state = t.vertex, t.tail, t.state
     for v in vertices:
         vertex[v, FREE] = 1
@@ -160,7 +157,6 @@ def enter(t: Tree, vertices: Index, edges: Index) -> bool:
         state[TAIL_END] += 1
     for e in edges:
         t.edge[e, ACTIVE] = 1
-    return _anchored(t, vertices)
 
 
 @kernel
@@ -176,13 +172,10 @@ def leave(t: Tree, vertices: Index, edges: Index) -> Index:
 @kernel
 def deactivate(t: Tree, edges: Index) -> None:
     """Take edges, and what they add to the diagonal of H, out of the structure."""
-    vertex, edge, blocks, diagonal = t.vertex, t.edge, t.blocks, t.diagonal
+    edge = t.edge
     for e in edges:
-        width = edge[e, WIDTH]
         edge[e, ACTIVE], edge[e, OWNER] = 0, NOTHING
-        block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
-        add_to_diagonal(vertex, edge, e, block, diagonal, -1.0)
-        block[:] = 0.0
+        clear_block(t, e)
 
 
 @kernel
@@ -202,10 +195,12 @@ def reset(t: Tree, unknowns: Index) -> None:
 
 
 @kernel
-def _anchored(t: Tree, new: Index) -> bool:
-    vertex, edge, link = t.vertex, t.edge, t.link
+def anchored(vertex: Index, edge: Index, link: Index, new: Index, edges: Index) -> bool:
+    """Whether some edges join each of new vertices, by a chain, to an older one or to an edge on one vertex alone."""
     for v in new:
         vertex[v, LOCAL] = 0
+    for e in edges:
+        edge[e, TAKEN] = 1
     count, gained = 0, len(new) <= FEW
     while gained and count < len(new):
         gained = False
@@ -214,7 +209,7 @@ def _anchored(t: Tree, new: Index) -> bool:
             while a != NOTHING and vertex[v, LOCAL] == 0:
                 e = link[a, LINK_EDGE]
                 a = link[a, LINK_NEXT]
-                if edge[e, ACTIVE] == 0:
+                if edge[e, TAKEN] == 0:
                     continue
                 fixed = edge[e, COUNT] == 1
                 for s in range(edge[e, COUNT]):
@@ -225,7 +220,23 @@ def _anchored(t: Tree, new: Index) -> bool:
                     gained = True
     for v in new:
         vertex[v, LOCAL] = NOTHING
+    for e in edges:
+        edge[e, TAKEN] = 0
     return count == len(new)
+
+
+@kernel
+def edges_of(vertex: Index, link: Index, v: int) -> Index:
+    """All edges on a vertex, also those that are not in the structure, in order."""
+    out, count = np.empty(16, np.int64), 0
+    a = vertex[v, LINK]
+    while a != NOTHING:
+        if count == len(out):
+            out = np.concatenate((out, np.empty(count, np.int64)))
+        out[count] = link[a, LINK_EDGE]
+        count += 1
+        a = link[a, LINK_NEXT]
+    return np.sort(out[:count])
 
 
 @kernel

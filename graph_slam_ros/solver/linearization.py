@@ -11,7 +11,7 @@ from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.numeric import add_to_diagonal
+from graph_slam_ros.solver.numeric import add_to_diagonal, clear_block
 from graph_slam_ros.solver.report import ClassCost
 from graph_slam_ros.solver.tree import BLOCK, Tree
 
@@ -124,15 +124,14 @@ def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) ->
     for k in range(n):
         e = ids[rows[k]]
         block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
-        add_to_diagonal(vertex, edge, e, block, diagonal, -1.0)
-        block[:] = 0.0
+        clear_block(t, e)
         for a in range(m):
             for p in range(width):
                 x = jacobian[k, a, p]
                 for c in range(width):
                     block[p, c] += x * jacobian[k, a, c]
                 block[p, width] += x * residual[k, a]
-        add_to_diagonal(vertex, edge, e, block, diagonal, 1.0)
+        add_to_diagonal(vertex, edge, e, block, diagonal)
 
 
 def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:

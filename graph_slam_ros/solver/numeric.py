@@ -42,6 +42,7 @@ from graph_slam_ros.solver.tree import (
 )
 
 MOVED = -2  # in LOCAL: its step has changed
+CANCELLED = 1e-4  # of what is taken off a sum: less than that left has lost digits
 
 
 @kernel
@@ -246,14 +247,64 @@ def _retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) 
 
 
 @kernel
-def add_to_diagonal(vertex: Index, edge: Index, e: int, block: Array, diagonal: Array, sign: float) -> None:
+def add_to_diagonal(vertex: Index, edge: Index, e: int, block: Array, diagonal: Array) -> None:
     """Add the diagonal of an edge's block to that of the information matrix."""
     p = 0
     for s in range(edge[e, COUNT]):
         v = edge[e, END + s]
         for i in range(vertex[v, DOF]):
-            diagonal[vertex[v, STEP] + i] += sign * block[p, p]
+            diagonal[vertex[v, STEP] + i] += block[p, p]
             p += 1
+
+
+@kernel
+def clear_block(t: Tree, e: int) -> None:
+    """Forget an edge's block, and what it adds to the diagonal of H.
+
+    Where that was nearly all of it, what would be left is rounding: then it is added up anew.
+    """
+    vertex, edge, blocks, diagonal = t.vertex, t.edge, t.blocks, t.diagonal
+    width = edge[e, WIDTH]
+    block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
+    p = 0
+    cancelled = False
+    for s in range(edge[e, COUNT]):
+        v = edge[e, END + s]
+        for i in range(vertex[v, DOF]):
+            diagonal[vertex[v, STEP] + i] -= block[p, p]
+            cancelled = cancelled or diagonal[vertex[v, STEP] + i] < CANCELLED * block[p, p]
+            p += 1
+    block[:] = 0.0
+    if cancelled:
+        for s in range(edge[e, COUNT]):
+            _add_up_diagonal(t, edge[e, END + s])
+
+
+@kernel
+def _add_up_diagonal(t: Tree, v: int) -> None:
+    vertex, edge, link, blocks = t.vertex, t.edge, t.link, t.blocks
+    own = t.diagonal[vertex[v, STEP] : vertex[v, STEP] + vertex[v, DOF]]
+    own[:] = 0.0
+    a = vertex[v, LINK]
+    while a != NOTHING:
+        e = link[a, LINK_EDGE]
+        a = link[a, LINK_NEXT]
+        at, across = edge[e, BLOCK], edge[e, WIDTH] + 2  # from one number of a diagonal to the next
+        for s in range(edge[e, COUNT]):
+            u = edge[e, END + s]
+            if u == v:
+                for i in range(vertex[v, DOF]):
+                    own[i] += blocks[at + i * across]
+            at += vertex[u, DOF] * across
+
+
+@kernel
+def keep(vertex: Index, estimate: Array, kept: Array, vertices: Index) -> None:
+    """Copy the estimates of vertices."""
+    for v in vertices:
+        x = vertex[v, VALUE]
+        for i in range(7 if vertex[v, KIND] == SE3_KIND else vertex[v, DOF]):
+            kept[x + i] = estimate[x + i]
 
 
 @kernel

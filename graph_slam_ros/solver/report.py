@@ -24,7 +24,7 @@ class ClassCost:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Result of ``Solver.update``: what one increment cost.
+    """Result of ``Solver.update``: what one increment cost, counted once more in each pass that linearises anew.
 
     Attributes
     ----------

@@ -1,23 +1,28 @@
 """The seam between the problem and its solution: what it is made of, its estimate, its covariances."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import SE2, SE3, Graph
-from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.graph.graph import EdgeTable, whole_numbers
 from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.covariance import joint, marginals
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
 from graph_slam_ros.solver.gauge import check_gauge
 from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, rows_of, store
-from graph_slam_ros.solver.numeric import settle
+from graph_slam_ros.solver.numeric import keep, settle
 from graph_slam_ros.solver.report import Change, Report
 from graph_slam_ros.solver.symbolic import compact
 from graph_slam_ros.solver.tree import (
     ACTIVE,
     AFFECTED,
     BLOCKS_TOP,
+    CLIQUE,
     DOF,
     FREE,
     KEY,
@@ -42,11 +47,39 @@ _NONE = np.empty(0, dtype=np.int64)
 _KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
 
 
+def _nothing() -> Index:
+    return _NONE
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """What has changed since the last update.
+
+    Attributes
+    ----------
+    vertices : that were added
+    edges : that were added or came back, or have another weight or a newly held vertex
+    touched : vertices that lost an edge or a neighbour
+    loose : whether something that held parts together may be gone
+    broken : whether the tree must be made anew
+    """
+
+    vertices: Index = field(default_factory=_nothing)
+    edges: Index = field(default_factory=_nothing)
+    touched: Index = field(default_factory=_nothing)
+    loose: bool = False
+    broken: bool = False
+
+    def __bool__(self) -> bool:
+        return bool(len(self.vertices) or len(self.edges) or len(self.touched) or self.broken)
+
+
 class Solver:
     """Maximum-likelihood estimate of the vertices it was given, online and in batch; it owns their estimates.
 
     Vertices and edges are records of a ``Graph``; the solver minimises over those that were added to it. ``update``
-    costs what has changed, ``optimize`` what there is; both work on one clique tree.
+    costs what has changed, ``optimize`` what there is; both work on one clique tree. What fails, for whatever reason,
+    leaves the estimate as it was. The weight of an edge is the graph's, so a graph has but one solver that changes it.
     """
 
     def __init__(self, graph: Graph, settings: Settings | None = None) -> None:
@@ -57,12 +90,11 @@ class Solver:
         self._inside = np.zeros(0, dtype=bool)  # vertices of the problem
         self._held = np.zeros(0, dtype=bool)
         self._taken = np.zeros(0, dtype=bool)  # edges of the problem
-        self._new_vertices, self._new_edges = _NONE, _NONE  # since the last update
-        self._touched = _NONE  # vertices that lost an edge or a neighbour since
+        self._waiting = _Waiting()
+        self._kept = np.zeros(0)  # the estimate that the last call left
         self._young = _NONE  # edges that have had but one update, with the first stage of their loss
-        self._broken = False  # the tree must be made anew
-        self._settled = True  # its numbers are those at its linearisation points
-        self._loose = False  # something that held parts together may be gone
+        self._settled = True  # the tree's numbers are those at its linearisation points
+        self._unfinished = False  # a batch stopped before the optimum
         self._moved_since: list[Index] = []  # large steps were last looked for
         self._updates_since = 0
         self._stages: list[Losses] = []
@@ -74,24 +106,29 @@ class Solver:
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Take vertices (at their initial values) and edges of the graph into the problem, by id, each once."""
         self._grow()
-        new, new_edges = np.asarray(vertices, dtype=np.int64).ravel(), np.asarray(edges, dtype=np.int64).ravel()
+        waiting = self._waiting
+        new, new_edges = whole_numbers(vertices, "vertex").ravel(), whole_numbers(edges, "edge").ravel()
         _admit(new, self._inside, self._vertices, "vertex")
         try:
             _admit(new_edges, self._taken, self.graph.edge_count, "edge")
-        except GraphSlamError:
+        except BaseException:
             self._inside[new] = False
             raise
-        rows = rows_of(self.graph, new_edges)
-        for table, chosen in rows.items():
-            missing = incremental.outside(chosen, table.vertices.values, self._inside)
-            if missing != NOTHING:
-                self._inside[new], self._taken[new_edges] = False, False
-                raise GraphSlamError(f"an edge needs vertex {missing}, which was not added")
-        for table, chosen in rows.items():
-            self._record(table, chosen)
-        self._broken |= bool((self._tree.vertex[new, KEY] != NOTHING).any())  # removed before: it is in the order still
-        self._new_vertices = np.concatenate((self._new_vertices, new)) if len(self._new_vertices) else new
-        self._new_edges = np.concatenate((self._new_edges, new_edges)) if len(self._new_edges) else new_edges
+        try:
+            rows = rows_of(self.graph, new_edges)
+            for table, chosen in rows.items():
+                missing = incremental.outside(chosen, table.vertices.values, table.weight.values, self._inside)
+                if missing != NOTHING:
+                    raise GraphSlamError(f"an edge needs vertex {missing}, which was not added")
+            for table, chosen in rows.items():
+                self._record(table, chosen)
+            there = (self._tree.vertex[new, KEY] != NOTHING).any()  # removed before: they are in the order still
+        except BaseException:
+            self._inside[new], self._taken[new_edges] = False, False
+            raise
+        waiting.broken |= bool(there)
+        waiting.vertices = np.concatenate((waiting.vertices, new)) if len(waiting.vertices) else new
+        waiting.edges = np.concatenate((waiting.edges, new_edges)) if len(waiting.edges) else new_edges
 
     def start_at(self, values: Array) -> None:
         """Begin from other values than the graph's initial ones: the stored numbers of all vertices, end to end."""
@@ -100,7 +137,7 @@ class Solver:
         if values.shape != (size,) or not np.isfinite(values).all():
             raise GraphSlamError(f"start: expected {size} finite numbers, got an array {values.shape}")
         self._set_estimate(values)
-        self._broken = True
+        self._waiting.broken = True
 
     def place(self, vertex: int, value: ArrayLike) -> None:
         """Begin with another value than the graph's initial one for a vertex that is not in the problem yet."""
@@ -109,10 +146,13 @@ class Solver:
         if self._inside[vertex]:
             raise GraphSlamError(f"vertex {vertex} is in the problem: it has an estimate")
         numbers, at = np.asarray(value, dtype=float), int(self.graph.offset.values[vertex])
-        size = self.graph.kind_of(vertex).size
-        if numbers.shape != (size,) or not np.isfinite(numbers).all():
-            raise GraphSlamError(f"vertex {vertex}: expected {size} finite numbers, got {numbers.tolist()}")
-        self._tree.value[at : at + size] = self._tree.estimate[at : at + size] = numbers
+        kind = self.graph.kind_of(vertex)
+        if numbers.shape != (kind.size,) or kind.fault(numbers[None]) is not None:
+            raise GraphSlamError(
+                f"vertex {vertex}: expected {kind.size} finite numbers of {kind.name}, got {numbers.tolist()}"
+            )
+        for array in (self._tree.value, self._tree.estimate, self._kept):
+            array[at : at + kind.size] = numbers
 
     def set_weight(self, edge: int, weight: float) -> None:
         """Multiply the information of an edge; 0 takes it out of the structure, another value puts it back."""
@@ -127,12 +167,13 @@ class Solver:
         table.weight.values[row] = weight
         if not self._taken[edge]:
             return
+        waiting = self._waiting
         if weight:
-            self._new_edges = np.union1d(self._new_edges, one)
+            waiting.edges = np.union1d(waiting.edges, one)
         elif self._tree.edge[edge, ACTIVE]:
+            waiting.touched = np.concatenate((waiting.touched, ends))
+            waiting.loose = True
             incremental.deactivate(self._tree, one)
-            self._touched = np.concatenate((self._touched, ends))
-            self._loose = True
 
     def hold(self, vertex: int) -> None:
         """Keep a vertex at its present estimate."""
@@ -140,11 +181,10 @@ class Solver:
         one = _known([vertex], self._vertices, "vertex")
         self._held[vertex] = True
         if self._tree.vertex[vertex, FREE]:
-            settle(self._tree, one)
-            for table, rows in self._active_rows().items():  # they are linearised where it is held
-                on_it = (table.vertices.values[rows] == vertex).any(axis=1)
-                self._new_edges = np.union1d(self._new_edges, table.id.values[rows[on_it]])
-        self._take_out(one)
+            on_it = incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
+            on_it = on_it[self._tree.edge[on_it, ACTIVE] == 1]  # they are linearised where it is held
+            self._waiting.edges = np.union1d(self._waiting.edges, on_it)
+            self._take_out(one)
 
     def remove(self, vertex: int) -> None:
         """Take a vertex out of the problem again; all its edges must be out (weight 0) before."""
@@ -152,13 +192,12 @@ class Solver:
         one = _known([vertex], self._vertices, "vertex")
         if not self._inside[vertex]:
             raise GraphSlamError(f"vertex {vertex} is not in the problem")
-        for table in self.graph.tables.values():
-            there = (table.weight.values != 0.0) & self._taken[table.id.values]
-            there &= (table.vertices.values == vertex).any(axis=1)
-            if there.any():
-                raise GraphSlamError(f"vertex {vertex} is needed by edge {int(table.id.values[there][0])}")
-        self._inside[vertex] = False
-        self._new_vertices = self._new_vertices[self._new_vertices != vertex]
+        on_it = incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
+        there = self._weighted(on_it[self._taken[on_it]])
+        if len(there):
+            raise GraphSlamError(f"vertex {vertex} is needed by edge {int(there[0])}")
+        self._inside[vertex] = self._held[vertex] = False
+        self._waiting.vertices = self._waiting.vertices[self._waiting.vertices != vertex]
         self._take_out(one)
 
     # -- its solution ------------------------------------------------------------------------------------------------
@@ -171,36 +210,22 @@ class Solver:
         Raises
         ------
         GaugeError, SingularError
-            The estimate stays; what was added since the last update is not in it, and waits for the next. Where all
-            was taken in, and only linearising anew shows a vertex to be undetermined, the estimate is that of before
-            this.
+            The estimate stays; what was added since the last update is not in it, and waits for the next. So it is with
+            any other exception, e.g. of a residual of one's own.
         """
-        settings, eliminated = self.settings, int(self._tree.state[AFFECTED])
-        moved, linearized = self._take_in()
-        count = len(moved)
-        self._moved_since.append(moved)
-        self._updates_since += 1
-        due = self._updates_since * (3 if count > TAIL_LEAST else 2) >= 2 * settings.relinearize_every
-        if due:
-            moved = np.unique(np.concatenate(self._moved_since))
-            self._moved_since, self._updates_since = [], 0
-        for _ in range(settings.relinearize_passes):
-            far = 1.0 if due else _BY_FAR
-            edges = incremental.relinearize(
-                self._tree, moved, far * settings.relinearize_above, far**2 * settings.relinearize_error
-            )
-            if not len(edges):
-                break
-            self._linearize(edges)
-            failed, moved = incremental.renumber(self._tree, edges, settings.tolerance, settings.tolerance_sigmas)
-            if failed != NOTHING:
-                self._broken = True
-                raise _singular(failed)
-            self._moved_since.append(moved)
-            linearized += len(edges)
-            count += len(moved)
-            due = True
-        return Change(int(self._tree.state[AFFECTED]) - eliminated, linearized, count)
+        eliminated = int(self._tree.state[AFFECTED])
+        arriving = self._arriving()
+        with self._transaction(*arriving):
+            moved, linearized = self._take_in(*arriving)
+            if self._unfinished:
+                moved = self._go_on()
+            changed = [moved]
+            for edges, these in self._relinearized(moved):
+                linearized += edges
+                changed.append(these)
+        for moved in changed:
+            self._keep(moved)
+        return Change(int(self._tree.state[AFFECTED]) - eliminated, linearized, sum(map(len, changed)))
 
     def optimize(self, settings: Settings | None = None) -> Report:
         """Minimise the cost over everything, from the present estimate, until converged.
@@ -212,26 +237,28 @@ class Solver:
         """
         settings = settings or self.settings
         self._grow()
-        if self._solved_with == settings and not self._waiting():
+        if self._solved_with == settings and not self._waiting:
             return self.evaluate(settings)
-        before = self._tree.estimate[: len(self.graph.initial)].copy()
-        vertices, edges, _ = self._activate()
-        try:
-            if not len(self._unknowns()):
-                return self.evaluate(settings)
-            self._refuse_loose()
-            self._restructure(vertices, edges)
-            report = minimise(Problem(self.graph, self._tree, self._active_rows(), self._unknowns()), settings)
-        except GraphSlamError:
-            self._set_estimate(before)
-            self._put_off(vertices, edges)
-            raise
+        arriving = self._arriving(surely=True)
+        with self._transaction(*arriving):
+            self._forget_numbers()
+            self._restructure(*arriving)
+            unknowns = self._unknowns()
+            if len(unknowns):
+                report = minimise(Problem(self.graph, self._tree, self._active_rows(), unknowns), settings)
+            else:
+                report = self.evaluate(settings)
+        self._kept[:] = self._tree.estimate
         self._settled, self._young = False, _NONE
         self._solved_with = settings if report.converged else None
+        self._unfinished = not report.converged
         return report
 
     def evaluate(self, settings: Settings | None = None) -> Report:
-        """Chi2 and cost of the present estimate, with the last stage of the losses."""
+        """Chi2 and cost of the present estimate, with the last stage of the losses.
+
+        Edges that wait for an update do not count yet.
+        """
         self._grow()
         losses = Losses(self.graph, (settings or self.settings).stages()[-1])
         now = costs(self.graph, linearize(self.graph, self._tree.estimate, self._active_rows(), losses))
@@ -240,7 +267,7 @@ class Solver:
     def estimate(self, ids: ArrayLike) -> Array:
         """Values of vertices of one kind, (n, size)."""
         self._grow()
-        at = np.asarray(ids, dtype=np.int64).ravel()
+        at = whole_numbers(ids, "vertex").ravel()
         if not len(at):
             return np.empty((0, 0))
         graph = self.graph
@@ -288,13 +315,17 @@ class Solver:
         return out
 
     def information_matrix(self) -> Array:
-        """H as a dense matrix at the present estimate, vertices in order of id: for tests and small examples."""
+        """H as a dense matrix, vertices in order of id, with edges that wait: for tests and small examples.
+
+        It is linearised at the present estimate with the last stage of the losses; ``marginal`` is of the tree, whose
+        linearisation points may be a small step (``Settings.relinearize_above``) away.
+        """
         self._grow()
         free = np.flatnonzero(self._inside & ~self._held)
         dof = np.array([self.graph.kind_of(v).dof for v in free.tolist()], dtype=np.int64)
         first = dict(zip(free.tolist(), (np.cumsum(dof) - dof).tolist(), strict=True))
         out = np.zeros((int(dof.sum()), int(dof.sum())))
-        rows = rows_of(self.graph, np.union1d(self._active(), self._new_edges))
+        rows = rows_of(self.graph, self._weighted(np.flatnonzero(self._taken)))
         for b in linearize(self.graph, self._tree.estimate, rows, self._losses()[-1]):
             slots = np.repeat(np.arange(len(b.table.type.dofs)), b.table.type.dofs)
             within = np.concatenate([np.arange(d) for d in b.table.type.dofs])
@@ -305,7 +336,10 @@ class Solver:
         return out
 
     def compact(self) -> None:
-        """Keep no more memory between what is in use than must be; done by itself before memory is asked for."""
+        """Move the fronts in use together, so that what is free lies behind them; memory is not given back.
+
+        It is done by itself before more memory is asked for.
+        """
         compact(self._tree)
 
     # -- inside ------------------------------------------------------------------------------------------------------
@@ -318,6 +352,9 @@ class Solver:
             self._tree = with_room(self._tree, vertex=count, region=2 * count, tail=2 * count)
             self._tree = with_room(self._tree, diagonal=size, step=size, value=size, estimate=size)
             self._inside, self._held = longer(self._inside, count), longer(self._held, count)
+            self._kept = longer(self._kept, len(self._tree.estimate))
+            first = int(graph.offset.values[known])
+            self._kept[first:size] = graph.initial.values[first:]
             shapes = np.array([(k.dof, k.size, _KINDS.get(k, VECTOR)) for k in graph.kinds])
             incremental.append_vertices(
                 self._tree, known, graph.offset.values[known:], graph.initial.values, shapes[graph.kind.values[known:]]
@@ -341,12 +378,16 @@ class Solver:
         wanted = _known(ids, self._vertices, "vertex")
         if not self._inside[wanted].all():
             raise GraphSlamError(f"vertex {int(wanted[~self._inside[wanted]][0])} is not in the problem")
-        if not self._held[wanted].all() and (self._waiting() or not self._settled):
-            self._moved_since.append(self._take_in()[0])
+        if not self._held[wanted].all():
+            if self._waiting or not self._settled:
+                arriving = self._arriving()
+                with self._transaction(*arriving):
+                    moved, _ = self._take_in(*arriving)
+                self._keep(moved)
+                self._moved_since.append(moved)
+            if (self._tree.vertex[wanted[~self._held[wanted]], CLIQUE] == NOTHING).any():
+                raise GraphSlamError("a covariance was asked for within an update")
         return wanted
-
-    def _waiting(self) -> bool:
-        return bool(len(self._new_vertices) or len(self._new_edges) or len(self._touched) or self._broken)
 
     def _unknowns(self) -> Index:
         return np.flatnonzero(self._tree.vertex[: self._vertices, FREE])
@@ -357,44 +398,129 @@ class Solver:
     def _active_rows(self) -> dict[EdgeTable, Index]:
         return rows_of(self.graph, self._active())
 
-    def _take_in(self) -> tuple[Index, int]:
-        """Put what waits into the tree and solve; the vertices that moved, and how many edges were linearised."""
+    def _weighted(self, edges: Index) -> Index:
+        """Those with a weight."""
+        for table, rows in rows_of(self.graph, edges).items():
+            weight = table.weight.values[rows]
+            if not weight.all():
+                edges = np.setdiff1d(edges, table.id.values[rows[weight == 0.0]])
+        return edges
+
+    def _arriving(self, *, surely: bool = False) -> tuple[Index, Index]:
+        """The unknowns and edges that will be part of the problem; all is as it was.
+
+        Raises
+        ------
+        GaugeError
+            With them, nothing fixes a part of it; that is looked into where it may be so, or ``surely``.
+        """
         self._grow()
-        if not self._settled:
-            self._settle()
-        if not self._waiting() and not len(self._young):
-            return _NONE, 0
-        grown_up = self._young
-        vertices, edges, anchored = self._activate()
-        self._young = edges if len(self._losses()) > 1 else _NONE
+        waiting, tree = self._waiting, self._tree
+        vertices, edges = waiting.vertices, self._weighted(waiting.edges)
+        wanted = self._inside[vertices] & ~self._held[vertices]
+        if not wanted.all():
+            vertices = vertices[wanted]
+        if (
+            surely
+            or waiting.loose
+            or waiting.broken
+            or not incremental.anchored(tree.vertex, tree.edge, tree.link, vertices, edges)
+        ):
+            self._refuse_loose()
+        return vertices, edges
+
+    @contextmanager
+    def _transaction(self, vertices: Index, edges: Index) -> Iterator[None]:
+        """Let vertices and edges enter; whatever fails then, they are out again and wait, and the estimate stays.
+
+        The tree is made anew at the next update: its numbers are half old and half new.
+        """
+        waiting, tree = self._waiting, self._tree
         try:
-            if self._loose or self._broken or not anchored:
-                self._refuse_loose()
-            fresh = np.union1d(edges, grown_up) if len(grown_up) else edges
-            if self._broken:
-                fresh = self._active()
-            self._linearize(fresh)
-            cliques = self._restructure(vertices, fresh)
-            settings = self.settings
-            failed, moved = incremental.solve(self._tree, cliques, settings.tolerance, settings.tolerance_sigmas)
-            if failed != NOTHING:
-                self._refuse_loose()
-                raise _singular(failed)
-        except GraphSlamError:
-            self._put_off(vertices, edges)
+            incremental.enter(tree, vertices, edges)
+            yield
+        except BaseException:
+            waiting.broken, self._young, self._settled = True, _NONE, True
+            incremental.leave(self._tree, vertices, edges)
+            self._set_estimate(self._kept)
+            tree.state[TAIL_FIRST] = tree.state[TAIL_END] = 0  # it is filled anew with the tree
             raise
-        self._solved_with = None
+        self._waiting = _Waiting()
+
+    def _keep(self, moved: Index) -> None:
+        """The estimates of vertices are those to come back to."""
+        if len(moved):
+            keep(self._tree.vertex, self._tree.estimate, self._kept, moved)
+
+    def _take_in(self, vertices: Index, edges: Index) -> tuple[Index, int]:
+        """Solve with what arrives; the vertices that moved, and how many edges were linearised."""
+        waiting, settings = self._waiting, self.settings
+        if not self._settled and not waiting.broken:
+            self._settle()
+        if not waiting and not len(self._young):
+            return _NONE, 0
+        fresh = np.union1d(edges, self._young) if len(self._young) else edges
+        self._young = edges if len(self._losses()) > 1 else _NONE
+        if waiting.broken:
+            self._forget_numbers()
+            fresh = self._active()
+        self._linearize(fresh)
+        cliques = self._restructure(vertices, fresh)
+        failed, moved = incremental.solve(self._tree, cliques, settings.tolerance, settings.tolerance_sigmas)
+        if failed != NOTHING:
+            self._refuse_loose()
+            raise _singular(failed)
+        self._solved_with, self._settled = None, True
         return moved, len(fresh)
+
+    def _go_on(self) -> Index:
+        """Step from where a batch stopped before the optimum; the vertices that moved."""
+        settings, self._unfinished = self.settings, False
+        failed, moved = incremental.renumber(self._tree, self._active(), settings.tolerance, settings.tolerance_sigmas)
+        if failed != NOTHING:
+            raise _singular(failed)
+        self._updates_since = settings.relinearize_every
+        return moved
+
+    def _relinearized(self, moved: Index) -> Iterator[tuple[int, Index]]:
+        """Pass after pass: how many edges were linearised anew, and the vertices that this moved."""
+        settings = self.settings
+        self._moved_since.append(moved)
+        due = self._is_due(len(moved))
+        if due:
+            moved = np.unique(np.concatenate(self._moved_since))
+            self._moved_since, self._updates_since = [], 0
+        for _ in range(settings.relinearize_passes):
+            far = 1.0 if due else _BY_FAR
+            edges = incremental.relinearize(
+                self._tree, moved, far * settings.relinearize_above, far**2 * settings.relinearize_error
+            )
+            if not len(edges):
+                return
+            self._linearize(edges)
+            failed, moved = incremental.renumber(self._tree, edges, settings.tolerance, settings.tolerance_sigmas)
+            if failed != NOTHING:
+                raise _singular(failed)
+            self._moved_since.append(moved)
+            due = True
+            yield len(edges), moved
+
+    def _is_due(self, moved: int) -> bool:
+        """Whether large steps are looked for among all that moved since they last were; sooner if much moved anyway."""
+        self._updates_since += 1
+        return self._updates_since * (3 if moved > TAIL_LEAST else 2) >= 2 * self.settings.relinearize_every
+
+    def _forget_numbers(self) -> None:
+        """All edges are about to be linearised: sums begin at zero."""
+        self._tree.blocks[:] = 0.0
+        self._tree.diagonal[:] = 0.0
 
     def _restructure(self, vertices: Index, edges: Index) -> Index:
         """Order and group what new vertices and edges touch; returns the cliques whose numbers are to be made."""
-        touched = incremental.ends_of(self._tree, edges)
-        if len(self._touched):
-            touched = np.concatenate((touched, self._touched))
-        if self._broken:
+        touched = np.concatenate((incremental.ends_of(self._tree, edges), self._waiting.touched))
+        if self._waiting.broken:
             vertices = self._unknowns()
             incremental.reset(self._tree, vertices)
-        self._touched, self._broken, self._loose = _NONE, False, False
         self._tree, cliques = incremental.restructure(self._tree, touched, vertices)
         return cliques
 
@@ -403,21 +529,8 @@ class Solver:
         self._linearize(self._active())
         failed, _ = incremental.renumber(self._tree, self._active(), np.inf, 0.0)
         if failed != NOTHING:
-            self._broken = True
+            self._waiting.broken = True
         self._settled = True
-
-    def _activate(self) -> tuple[Index, Index, bool]:
-        """Make what was added part of the problem: new unknowns, edges with a weight, and the answer of ``enter``."""
-        vertices, edges = self._new_vertices, self._new_edges
-        wanted = self._inside[vertices] & ~self._held[vertices]
-        if not wanted.all():
-            vertices = vertices[wanted]
-        for table, rows in rows_of(self.graph, edges).items():
-            weight = table.weight.values[rows]
-            if not weight.all():
-                edges = np.setdiff1d(edges, table.id.values[rows[weight == 0.0]])
-        self._new_vertices = self._new_edges = _NONE
-        return vertices, edges, incremental.enter(self._tree, vertices, edges)
 
     def _losses(self) -> list[Losses]:
         """Of each stage."""
@@ -439,27 +552,23 @@ class Solver:
                 refuse_nonfinite(b)
                 store(self._tree, b.rows, b.table.id.values, b.residual, b.jacobian)
 
-    def _put_off(self, vertices: Index, edges: Index) -> None:
-        """Take back an update that failed: what it added waits again, and the tree is made anew without it."""
-        incremental.leave(self._tree, vertices, edges)
-        self._new_vertices = np.concatenate((vertices, self._new_vertices))
-        self._new_edges = np.union1d(edges, self._new_edges)
-        self._young, self._broken, self._settled = _NONE, True, True
-        self._tree.state[TAIL_FIRST] = self._tree.state[TAIL_END] = 0  # it is filled anew with the tree
-
     def _take_out(self, one: Index) -> None:
-        """Make a vertex no unknown any more."""
+        """Make a vertex no unknown any more; it stays at its estimate."""
+        settle(self._tree, one)
         if self._tree.vertex[one[0], FREE]:
-            self._touched = np.concatenate((self._touched, incremental.leave(self._tree, one, _NONE)))
-        self._loose = True
+            self._waiting.touched = np.concatenate((self._waiting.touched, incremental.leave(self._tree, one, _NONE)))
 
     def _set_estimate(self, values: Array) -> None:
-        self._tree.value[: len(values)] = self._tree.estimate[: len(values)] = values
+        for array in (self._tree.value, self._tree.estimate, self._kept):
+            array[: len(values)] = values
         self._tree.step[:] = 0.0
 
     def _refuse_loose(self) -> None:
-        held = np.flatnonzero(self._inside & self._held)
-        check_gauge(self.graph, self._unknowns(), held, self._active_rows())
+        """Raise GaugeError where nothing fixes a part of the problem, with all that waits."""
+        rows = rows_of(self.graph, self._weighted(np.flatnonzero(self._taken)))
+        check_gauge(
+            self.graph, np.flatnonzero(self._inside & ~self._held), np.flatnonzero(self._inside & self._held), rows
+        )
 
 
 def _singular(vertex: int) -> SingularError:
@@ -467,7 +576,7 @@ def _singular(vertex: int) -> SingularError:
 
 
 def _known(ids: ArrayLike, count: int, what: str) -> Index:
-    at = np.asarray(ids, dtype=np.int64).ravel()
+    at = whole_numbers(ids, what).ravel()
     strange = (at < 0) | (at >= count)
     if strange.any():
         raise GraphSlamError(f"{what} {int(at[strange][0])} does not exist")

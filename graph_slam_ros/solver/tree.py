@@ -30,8 +30,8 @@ NOTHING = -1
 # scratch, NOTHING between uses
 DOF, STEP, VALUE, KIND, KEY, CLIQUE, LINK, REGION, NEXT, FREE, LOCAL, VERTEX_COLUMNS = range(12)
 
-# edge: how many vertices, 0 where it is not known yet; these; their degrees of freedom; where its block begins; 1 where it is in the structure; which of
-# its vertices is eliminated first; scratch
+# edge: how many vertices, 0 where it is not known yet; these; their degrees of freedom; where its block begins; 1 where
+# it is in the structure; which of its vertices is eliminated first; scratch
 COUNT, END = range(2)
 WIDTH, BLOCK, ACTIVE, OWNER, TAKEN, EDGE_COLUMNS = range(END + MOST_SLOTS, END + MOST_SLOTS + 6)
 
