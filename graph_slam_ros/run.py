@@ -189,6 +189,8 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
         "version": __version__,
         "keyframes": len(slam.keyframes),
         "landmarks": len(slam.landmarks),
+        "waiting": slam.waiting,
+        "segments": len(slam.segments),
         "sightings": sum(landmark.sightings for landmark in slam.landmarks.values()),
         "edges": slam.graph.edge_count,
         "solves": slam.solves,

@@ -168,4 +168,5 @@ def _run_text(summary: dict[str, Any]) -> str:
     ]
     if "time_s" in summary:
         lines.append(f"time       {summary['time_s']:10.1f} s")
-    return "\n".join(lines + [f"counted    {text}" for text in counters])
+    waiting = [f"waiting    {name}: {reason}" for name, reason in summary["waiting"].items()]
+    return "\n".join(lines + waiting + [f"counted    {text}" for text in counters])

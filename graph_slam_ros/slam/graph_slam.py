@@ -142,8 +142,13 @@ class GraphSlam:
 
     @property
     def waiting(self) -> dict[str, str]:
-        """Why each landmark waits that was seen but is not in the graph yet, by identity."""
-        return {name: waiting.reason for name, waiting in self._landmarks.waiting.items()}
+        """Why each landmark waits that was seen but is not among ``landmarks`` yet, by identity."""
+        tentative = {
+            name: f"seen {mark.sightings} times, without an identity: not believed yet"
+            for name, mark in self._landmarks.known.items()
+            if mark.is_tentative
+        }
+        return {name: waiting.reason for name, waiting in self._landmarks.waiting.items()} | tentative
 
     def trajectory(self) -> Array:
         """Estimated poses ``T_map_base`` of all keyframes, (n, 3) or (n, 7)."""
