@@ -81,27 +81,35 @@ def seen_from_sensor(space: Space, s: Sighting, where: Where, p_keyframe: Array)
     return Carried((*s.measured, *_floats(space.group.compose(where.T_keyframe_base, T_base_sensor))), covariance)
 
 
-def shared_noise(space: Space, m: Sightings | Fix | Closure, where: Where) -> float:
-    """How large the variance that the motion adds is against what was measured: all of a message have it in common."""
+def shared_noise(space: Space, m: Sightings | Fix | Closure, where: Where, added_sigma_m: float) -> float:
+    """How large the variance that the motion adds is against what was measured: all of a message have it in common.
+
+    Parameters
+    ----------
+    added_sigma_m : what is added to sightings besides
+    """
     n, motion = space.dimensions, where.covariance
     if not isinstance(m, Sightings):
         size = round(len(m.covariance) ** 0.5)
         own = float(np.trace(np.array(m.covariance).reshape(size, size)))
         return float(np.trace(motion)) / own
-    return max((_share(space, s, motion[:n, :n], motion[n:, n:]) for s in m.sightings), default=0.0)
+    moved, turned = float(np.trace(motion[:n, :n])), float(np.trace(motion[n:, n:]))
+    return max((_share(space, s, moved, turned, added_sigma_m**2) for s in m.sightings), default=0.0)
 
 
-def _share(space: Space, s: Sighting, moved: Array, turned: Array) -> float:
+def _share(space: Space, s: Sighting, moved: float, turned: float, added: float) -> float:
     n, m = space.dimensions, len(s.measured)
     size = space.dof if s.kind == "pose" else m
     own = np.diag(np.array(s.covariance).reshape(size, size))
     if s.kind == "bearing":
-        return float(np.trace(turned) / own.sum())
+        return turned / float(own.sum())
     if s.kind == "range":
-        return float(np.trace(moved) / own[0])
-    far = s.measured[0] if s.kind == "range_bearing" else float(np.linalg.norm(s.measured[:n]))
-    across = own[:n].sum() if s.kind != "range_bearing" else own[0] + far**2 * own[1:].sum()
-    return float((np.trace(moved) + far**2 * np.trace(turned)) / across)
+        return moved / float(own[0] + added)
+    if s.kind == "range_bearing":
+        far = s.measured[0]
+        return (moved + far**2 * turned) / float(own[0] + far**2 * own[1:].sum() + added)
+    far = float(np.linalg.norm(s.measured[:n]))
+    return (moved + far**2 * turned) / float(own[:n].sum() + n * added)
 
 
 def gradient(space: Space, kind: str, p: Array) -> Array:

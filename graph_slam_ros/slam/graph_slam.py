@@ -321,7 +321,8 @@ class GraphSlam:
         newest = self._motions[-1]
         if where.keyframe != newest.keyframe or not newest.before_last_ns < where.stamp_ns:
             return False
-        return carry.shared_noise(self.space, m, where) > self.config.keyframes.shared_noise
+        shared = carry.shared_noise(self.space, m, where, self.config.landmarks.added_sigma_m)
+        return shared > self.config.keyframes.shared_noise
 
     def _keyframe_at(self, where: Where) -> Where:
         """A keyframe at a stamp within the last step of odometry, which is cut in two."""
