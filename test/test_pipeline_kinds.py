@@ -319,3 +319,19 @@ def test_the_same_sequence_gives_the_same_bytes(space):
 
     first = once([*sequence(), *END])
     assert once([from_record(to_record(m)) for m in list(kept)]) == first
+
+
+@BOTH
+@pytest.mark.parametrize("turn", [0.5, 2.0, -3.0])
+def test_where_the_anchor_is_loose_the_map_turns_into_the_frame_of_the_fixes(space, turn):
+    true, odom = drive(space, 30.0, drift=0.02)
+    n = space.dimensions
+    rotation = (30.0, -20.0, turn) if n == 2 else (30.0, -20.0, 5.0, *so3.exp((0.0, 0.0, turn)))
+    pipeline = slam(space, anchor__sigma_m=1e3, anchor__sigma_rad=3.0)
+    for k, at in enumerate(odom):
+        pipeline.process(Odometry(stamp(k), at))
+        if k % 20 == 1:
+            measured = floats(space.group.compose(rotation, true[k])[:n])
+            pipeline.process(Fix(stamp(k), "gps", "position", measured, covariance(n, 0.1)))
+    [pipeline.process(event) for event in END]
+    assert errors(space, pipeline, [space.group.compose(rotation, at) for at in true])[20:].max() < 0.5
