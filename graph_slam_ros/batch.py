@@ -23,7 +23,7 @@ class Solution:
     file : the graph, and what a file says of it: ``write_g2o(path, solution.file, solution.solver.estimate)``
     solver : has the estimates and marginals of all vertices, by their ids in the graph
     report : how it went, and why it stopped
-    start : where the initial values were from: ``file``, ``tree`` or ``chordal``
+    start : where the initial values were from: ``file``, ``tree``, ``chordal`` or ``online``
     """
 
     file: G2oFile
@@ -45,12 +45,14 @@ class Solution:
 def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = None, *, init: str = "file") -> Solution:
     """Solve a whole graph: of a file, as read from one, or made by hand.
 
-    What FIX lines name is held; where there are none and no priors either, the first pose is.
+    What FIX lines name is held; where there are none, and priors do not fix both position and heading, the first pose
+    is.
 
     Parameters
     ----------
     init : where to start: ``file`` (initial values as they are; the tree where a file has none), ``tree`` (poses
-        composed along a spanning tree), ``chordal``, or ``online`` (pose after pose, in order of id)
+        composed along a spanning tree), ``chordal``, or ``online`` (pose after pose, in order of id). Without
+        poses it is always the first
 
     Raises
     ------
@@ -70,10 +72,12 @@ def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = N
 
 def started(file: G2oFile, init: str) -> tuple[Solver, str]:
     """A solver with initial values, and where they are from: edges alone leave nothing but their tree."""
-    start = init if file.has_values or init != "file" else "tree"
+    root, start = _root(file), init if file.has_values or init != "file" else "tree"
+    if root is None or not _is_pose(file.graph, root):
+        start = "file"
     solver = Solver(file.graph)
     in_time = sorted(range(file.graph.vertex_count), key=lambda vertex: file.ids[vertex])
-    solver.start_at(initial_values(file.graph, start, _root(file), in_time))
+    solver.start_at(initial_values(file.graph, start, root or 0, in_time))
     return solver, start
 
 
@@ -81,13 +85,17 @@ def take_whole(solver: Solver, file: G2oFile) -> None:
     """Give a solver all of a graph, and hold what FIX lines name; the first pose where nothing else fixes it."""
     graph = file.graph
     solver.add(range(graph.vertex_count), range(graph.edge_count))
-    has_prior = any(len(edge.accepts) == 1 for edge in graph.tables)
-    for vertex in file.fixed if file.fixed or has_prior else [_root(file)]:
+    for vertex in file.fixed:
         solver.hold(vertex)
+    root = _root(file)
+    if root is not None and not solver.is_fixed():
+        solver.hold(root)
 
 
-def _root(file: G2oFile) -> int:
-    """The first pose of a FIX line, or that of the least id."""
+def _root(file: G2oFile) -> int | None:
+    """The first pose of a FIX line, or that of the least id; where there are no poses, a landmark."""
+    if not file.graph.vertex_count:
+        return None
     of_no_pose = [not _is_pose(file.graph, v) for v in range(file.graph.vertex_count)]
     fixed = [v for v in file.fixed if not of_no_pose[v]]
     return fixed[0] if fixed else min(range(file.graph.vertex_count), key=lambda v: (of_no_pose[v], file.ids[v]))

@@ -8,10 +8,16 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from graph_slam_ros.errors import GaugeError
-from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph import R2, R3, SE2, SE3, Graph, VertexKind
 from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.lie import so3
+from graph_slam_ros.solver.linearization import Losses, linearize
 
+Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+_AXES = {SE2: 2, R2: 2, SE3: 3, R3: 3}
+_LEAST_EIGENVALUE = 1e-9  # of correlations: less is no information
 
 
 def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable, Index]) -> None:
@@ -39,3 +45,54 @@ def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable,
             f"nothing fixes the gauge of vertex {int(loose[0])} and {more} more joined to it: add a prior"
             " (an anchor) or hold a vertex"
         )
+
+
+def fix_the_whole(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index]) -> bool:
+    """Whether edges on one vertex alone together resist every rigid motion of the whole, at the stored values x.
+
+    One position leaves the heading open, and so does one heading the position; several may fix both. In a graph without
+    poses any such edge is taken to do.
+    """
+    alone = {table: chosen for table, chosen in rows.items() if len(table.type.accepts) == 1}
+    axes = max((_AXES[kind] for kind in graph.kinds if kind in (SE2, SE3)), default=0)
+    if not axes:
+        return any(len(chosen) for chosen in alone.values())
+    motions = axes + (1 if axes == 2 else 3)
+    information, centre = np.zeros((motions, motions)), None
+    for block in linearize(graph, x, alone, Losses(graph, {})):
+        vertices = block.table.vertices.values[block.rows, 0]
+        for code in np.unique(graph.kind.values[vertices]):
+            kind, mine = graph.kinds[code], graph.kind.values[vertices] == code
+            if _AXES.get(kind) != axes:
+                continue
+            values = x[graph.offset.values[vertices[mine]][:, None] + np.arange(kind.size)]
+            centre = values[0, :axes] if centre is None else centre
+            moves = (block.jacobian[mine] @ _motions(kind, values, centre)).reshape(-1, motions)
+            information += moves.T @ moves
+    scale = np.sqrt(np.diag(information))
+    if not scale.all():
+        return False
+    return bool(np.linalg.eigvalsh(information / np.outer(scale, scale))[0] > _LEAST_EIGENVALUE)
+
+
+def _motions(kind: VertexKind, values: Array, centre: Array) -> Array:
+    """Steps (n, dof, 3 or 6) of vertices when the whole moves along each axis, and turns about each at the centre."""
+    axes = len(centre)
+    arm = values[:, :axes] - centre
+    along = np.broadcast_to(np.eye(axes), (len(values), axes, axes))
+    if axes == 2:
+        turning = np.stack([-arm[:, 1], arm[:, 0]], axis=-1)[:, :, None]
+        c, s = np.cos(values[:, -1]), np.sin(values[:, -1])
+        to_body = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], axis=1) if kind is SE2 else along
+        turned = np.ones((len(values), 1, 1))
+    else:
+        turning = np.swapaxes(np.cross(np.eye(3)[None], arm[:, None]), 1, 2)
+        to_body = np.moveaxis(np.asarray(so3.matrix(tuple(values[:, 3:].T))), -1, 0) if kind is SE3 else along
+        to_body = np.swapaxes(to_body, 1, 2)
+        turned = to_body
+    position = to_body @ np.concatenate([along, turning], axis=2)
+    if kind not in (SE2, SE3):
+        return position
+    return np.concatenate(
+        [position, np.concatenate([np.zeros((len(values), len(turned[0]), axes)), turned], 2)], axis=1
+    )

@@ -6,7 +6,7 @@
   positions from a second one. L. Carlone, R. Tron, K. Daniilidis, F. Dellaert, "Initialization techniques for 3D SLAM:
   a survey on rotation estimation and its use in pose graph optimization", ICRA 2015.
 
-Point landmarks are placed by their first sighting.
+Point landmarks are placed by their first sighting. Edges of weight 0 do not count.
 """
 
 from collections import deque
@@ -31,6 +31,7 @@ from graph_slam_ros.graph import (
     Graph,
     VertexKind,
 )
+from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.solver.replayed_start import replayed_values
 
@@ -76,19 +77,28 @@ def initial_values(graph: Graph, method: str, root: int, in_time: Sequence[int] 
         return replayed_values(graph, values, [root, *others], _RELATIVE[kind], _SIGHTING[kind])
     ends, measured = _relative_edges(graph, kind)
     _along_tree(graph, values, kind, root, poses, ends, measured)
-    if method == "chordal":
+    if method == "chordal" and len(poses) > 1:
         _chordal(graph, values, kind, root, poses, ends, measured)
     _place_landmarks(graph, values, kind)
     return values
 
 
 def _relative_edges(graph: Graph, kind: VertexKind) -> tuple[Index, Array]:
-    tables = [graph.tables[edge] for edge in _RELATIVE[kind] if edge in graph.tables]
+    """Vertices and measurements of the relative poses that have a weight, in order of id."""
+    tables = [(graph.tables[edge], _weighted(graph.tables[edge])) for edge in _RELATIVE[kind] if edge in graph.tables]
     if not tables:
         return np.empty((0, 2), dtype=np.int64), np.empty((0, kind.size))
-    ends, measured = (np.concatenate([getattr(t, name).values for t in tables]) for name in ("vertices", "measured"))
-    order = np.argsort(np.concatenate([t.id.values for t in tables]))
+    ends, measured, ids = (
+        np.concatenate([getattr(table, name).values[rows] for table, rows in tables])
+        for name in ("vertices", "measured", "id")
+    )
+    order = np.argsort(ids)
     return ends[order], measured[order]
+
+
+def _weighted(table: EdgeTable) -> Index:
+    """The rows that count."""
+    return np.flatnonzero(table.weight.values)
 
 
 def _slots(graph: Graph, vertices: Index, size: int) -> Index:
@@ -173,7 +183,9 @@ def _place_landmarks(graph: Graph, values: Array, kind: VertexKind) -> None:
     table = graph.tables.get(_SIGHTING[kind])
     if table is None:
         return
-    vertices, first = np.unique(table.vertices.values[:, 1], return_index=True)
+    rows = _weighted(table)
+    vertices, first = np.unique(table.vertices.values[rows, 1], return_index=True)
+    first = rows[first]
     poses = values[_slots(graph, table.vertices.values[first, 0], kind.size)]
     points = _GROUP[kind].act(tuple(poses.T), tuple(table.measured.values[first].T))
     values[_slots(graph, vertices, len(points))] = np.stack(points, axis=-1)

@@ -46,7 +46,9 @@ def replayed_values(
     for edge in (*relative, sighting):
         if edge in graph.tables:
             table = graph.tables[edge]
-            for row, k in enumerate(rank[table.vertices.values].max(axis=1).tolist()):
+            rows = np.flatnonzero(table.weight.values)
+            newest = rank[table.vertices.values[rows]].max(axis=1)
+            for row, k in zip(rows.tolist(), newest.tolist(), strict=True):
                 arriving[k].append((int(table.id.values[row]), edge, row))
     for k, pose in enumerate(poses):
         drive.to(pose, sorted(arriving[k], key=lambda item: item[0]), rank, sighting)

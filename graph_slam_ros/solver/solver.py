@@ -13,7 +13,7 @@ from graph_slam_ros.graph.graph import EdgeTable, whole_numbers
 from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.covariance import joint, marginals
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
-from graph_slam_ros.solver.gauge import check_gauge
+from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole
 from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, rows_of, store
 from graph_slam_ros.solver.numeric import keep, settle
 from graph_slam_ros.solver.report import Change, Report
@@ -199,6 +199,14 @@ class Solver:
         self._inside[vertex] = self._held[vertex] = False
         self._waiting.vertices = self._waiting.vertices[self._waiting.vertices != vertex]
         self._take_out(one)
+
+    def is_fixed(self) -> bool:
+        """Whether a held vertex, or the edges on one vertex alone, fix position and heading of the whole."""
+        self._grow()
+        if (self._inside & self._held).any():
+            return True
+        rows = rows_of(self.graph, self._weighted(np.flatnonzero(self._taken)))
+        return fix_the_whole(self.graph, self._tree.estimate, rows)
 
     # -- its solution ------------------------------------------------------------------------------------------------
 
