@@ -5,9 +5,14 @@ when the cost changes by less than a millionth. Ordering and symbolic analysis a
 library's own graph from arrays is, and is told apart, because the peers have to do it edge by edge from Python.
 """
 
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+
+if not __package__:  # run as a script: what it imports is in the repository, not in its folder
+    sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from benchmarks import contenders, fresh, judge, options, table
 from benchmarks.contenders import BATCH_PEERS, OURS, OURS_AS_G2O, Solved

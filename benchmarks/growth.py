@@ -4,11 +4,15 @@
 are revisited. The path is not read: what is measured is the update and the newest pose.
 """
 
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+
+if not __package__:  # run as a script: what it imports is in the repository, not in its folder
+    sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from benchmarks import fresh, options, table
 from benchmarks.contenders import ONLINE_PEERS, OURS

@@ -3,9 +3,14 @@
 ``python -m benchmarks.memory``. Counted from before the first pose, when all code and the problem's arrays are loaded.
 """
 
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+
+if not __package__:  # run as a script: what it imports is in the repository, not in its folder
+    sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from benchmarks import fresh, options, table
 from benchmarks.contenders import ONLINE_PEERS, OURS

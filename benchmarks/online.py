@@ -5,9 +5,14 @@ the newest pose alone). New poses are predicted from the newest estimate and the
 sighting. Each repetition runs each contender in a fresh process, in turn.
 """
 
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+
+if not __package__:  # run as a script: what it imports is in the repository, not in its folder
+    sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 from benchmarks import contenders, fresh, judge, options, table
 from benchmarks.contenders import ONLINE_PEERS, OURS

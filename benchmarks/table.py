@@ -59,7 +59,8 @@ def finish(measured: Row, path: Path | None) -> None:
 
 def markdown(measured: Row) -> str:
     """The results of a programme, and below them how and on what they were measured."""
-    about = "".join(f"{text}; " for text in (measured["about"], _repeated(measured["rows"])) if text)
+    told = _repeated(measured["rows"]) if "repetitions" not in measured["about"] else ""
+    about = "".join(f"{text}; " for text in (measured["about"], told) if text)
     return f"{_TABLES[measured['programme']](measured['rows'])}\n\n{about}{measured['date']}, {measured['machine']}."
 
 

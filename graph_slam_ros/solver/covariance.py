@@ -14,13 +14,13 @@ from graph_slam_ros.solver.tree import (
     FRONT_DOF,
     FRONTALS,
     FULL_DOF,
+    KEY,
     LOCAL,
     MARK,
     MEMBERS,
     NOTHING,
     PARENT,
     SIZE,
-    STEP,
     Array,
     Index,
     Tree,
@@ -114,61 +114,66 @@ def _complete(front: Array, frontal: int, covariance: Array) -> None:
 
 @kernel
 def joint(t: Tree, vertices: Index) -> Array:
-    """Covariance (D, D) of some vertices together: the solutions of ``H X = E`` for the unit vectors of theirs.
+    """Covariance (D, D) of some vertices together: ``Y'Y`` with ``U'Y = E``, E the unit vectors of theirs.
 
-    Each goes from its vertex up to the root, and from there down to all of them.
+    Each column of Y goes from its vertex up to the root; all are taken up together. They are in order of elimination,
+    so that of each row those between its first and its last that are not zero are few.
     """
     vertex, clique, members = t.vertex, t.clique, t.members
     cliques = mark(t, vertices)
-    place = np.empty(np.sum(vertex[vertices, DOF]), np.int64)
-    size = widest = 0
-    for v in vertices:
-        for i in range(vertex[v, DOF]):
-            place[size] = vertex[v, STEP] + i
-            size += 1
+    rows = widest = 0
     for c in cliques:
         widest = max(widest, clique[c, FULL_DOF])
-    out, x, local = np.empty((size, size)), np.zeros(len(t.step)), np.empty(widest)
-    for column in range(size):
-        x[place[column]] = 1.0
-        for c in cliques:
-            _gather(vertex, clique, members, c, x, local)
-            front = front_of(clique, t.fronts, c)
-            for a in range(clique[c, FRONT_DOF]):
-                local[a] *= front[a, a]
-                for i in range(a + 1, clique[c, FULL_DOF]):
-                    local[i] -= front[a, i] * local[a]
-            _scatter(vertex, clique, members, c, local, x)
-        for c in cliques[::-1]:
-            _gather(vertex, clique, members, c, x, local)
-            front = front_of(clique, t.fronts, c)
-            for a in range(clique[c, FRONT_DOF] - 1, -1, -1):
-                s = local[a]
-                for i in range(a + 1, clique[c, FULL_DOF]):
-                    s -= front[a, i] * local[i]
-                local[a] = s * front[a, a]
-            _scatter(vertex, clique, members, c, local, x)
-        for row in range(size):
-            out[row, column] = x[place[row]]
-        for c in cliques:
-            for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
-                x[vertex[members[m], STEP] : vertex[members[m], STEP] + vertex[members[m], DOF]] = 0.0
-    return 0.5 * (out + out.T)
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+            vertex[members[m], LOCAL] = rows
+            rows += vertex[members[m], DOF]
+    size = np.sum(vertex[vertices, DOF])
+    y, first, end = np.zeros((rows, size)), np.full(rows, size), np.zeros(rows, np.int64)
+    column = 0
+    for v in vertices[np.argsort(vertex[vertices, KEY])]:
+        for row in range(vertex[v, LOCAL], vertex[v, LOCAL] + vertex[v, DOF]):
+            y[row, column] = 1.0
+            first[row], end[row] = column, column + 1
+            column += 1
+    place = np.empty(widest, np.int64)
+    for c in cliques:
+        front, at = front_of(clique, t.fronts, c), 0
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, SIZE]):
+            for i in range(vertex[members[m], DOF]):
+                place[at] = vertex[members[m], LOCAL] + i
+                at += 1
+        for a in range(clique[c, FRONT_DOF]):
+            p = place[a]
+            for k in range(first[p], end[p]):
+                y[p, k] *= front[a, a]
+            for i in range(a + 1, at if first[p] < end[p] else 0):
+                q, share = place[i], front[a, i]
+                for k in range(first[p], end[p]):
+                    y[q, k] -= share * y[p, k]
+                first[q], end[q] = min(first[q], first[p]), max(end[q], end[p])
+    for c in cliques:
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+            vertex[members[m], LOCAL] = NOTHING
+    ordered = y.T @ y
+    return _in_order_asked_for(vertex, vertices, ordered)
 
 
 @kernel
-def _gather(vertex: Index, clique: Index, members: Index, c: int, x: Array, local: Array) -> None:
+def _in_order_asked_for(vertex: Index, vertices: Index, ordered: Array) -> Array:
+    """A symmetric matrix over vertices in order of elimination, in the order of ``vertices``."""
+    begin = np.empty(len(vertices), np.int64)
     at = 0
-    for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, SIZE]):
-        for i in range(vertex[members[m], DOF]):
-            local[at] = x[vertex[members[m], STEP] + i]
-            at += 1
-
-
-@kernel
-def _scatter(vertex: Index, clique: Index, members: Index, c: int, local: Array, x: Array) -> None:
+    for k in np.argsort(vertex[vertices, KEY]):
+        begin[k] = at
+        at += vertex[vertices[k], DOF]
+    place = np.empty(at, np.int64)
     at = 0
-    for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, SIZE]):
-        for i in range(vertex[members[m], DOF]):
-            x[vertex[members[m], STEP] + i] = local[at]
+    for k in range(len(vertices)):
+        for i in range(vertex[vertices[k], DOF]):
+            place[at] = begin[k] + i
             at += 1
+    out = np.empty((at, at))
+    for i in range(at):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = ordered[place[i], place[j]]
+    return out
