@@ -89,11 +89,13 @@ def shared_noise(space: Space, m: Sightings | Fix | Closure, where: Where, added
     added_sigma_m : what is added to sightings besides
     """
     n, motion = space.dimensions, where.covariance
+    moved, turned = float(np.trace(motion[:n, :n])), float(np.trace(motion[n:, n:]))
     if not isinstance(m, Sightings):
         size = round(len(m.covariance) ** 0.5)
         own = float(np.trace(np.array(m.covariance).reshape(size, size)))
-        return float(np.trace(motion)) / own
-    moved, turned = float(np.trace(motion[:n, :n])), float(np.trace(motion[n:, n:]))
+        if isinstance(m, Fix) and m.kind != "pose":
+            return (moved if m.kind == "position" else turned) / own
+        return (moved + turned) / own
     return max((_share(space, s, moved, turned, added_sigma_m**2) for s in m.sightings), default=0.0)
 
 
