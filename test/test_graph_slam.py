@@ -40,8 +40,9 @@ def tag(name="a", at=(2.0, 1.0, 0.5), covariance=POSE):
 
 
 def slam(sink=None, **sections):
-    """A pipeline with no window and exact sightings, unless told otherwise."""
+    """A pipeline with no window, exact sightings and keyframes by motion alone, unless told otherwise."""
     base = {"ordering.window_s": 0.0, "landmarks.added_sigma_m": 0.0, "odometry.noise": "density"}
+    base |= {"keyframes.shared_noise": 1e9}
     dotted = {f"{section}.{key}": value for section, keys in sections.items() for key, value in keys.items()}
     return GraphSlam(Config.from_mapping(base | dotted), sink)
 
