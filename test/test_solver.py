@@ -17,6 +17,7 @@ from graph_slam_ros.graph import (
     NONE,
     POINT_PRIOR,
     POSE_PRIOR,
+    POSITION_PRIOR,
     R1,
     R2,
     RELATIVE_POSE,
@@ -711,3 +712,37 @@ def test_vectors_are_solved_in_one_step_to_the_weighted_mean():
     assert np.ravel(solver.marginal([0, 1])) == pytest.approx([0.2, 4.2], rel=1e-12)
     assert block_diag(*solver.marginal([0])).shape == (1, 1)
     assert report.iterations[1].step < 1e-12
+
+
+@pytest.mark.parametrize("count", [17, 31, 38, 59, 100, 143, 300])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_chain_that_may_turn_about_its_only_fix_is_refused_at_any_length(count, seed):
+    rng, graph, pose = np.random.default_rng(seed), Graph(), (0.0, 0.0, 0.0)
+    noise, edges, step = Gaussian.from_sigmas(0.1, 0.1, 0.05), [], None
+    for k in range(count):
+        graph.add_vertex(SE2, pose)
+        if k:
+            edges.append(graph.add_edge(RELATIVE_POSE, [k - 1, k], step, noise, "odometry"))
+        step = (1.0, 0.1 * rng.normal(), 0.3 * rng.normal())
+        pose = se2.compose(pose, step)
+    edges.append(graph.add_edge(POSITION_PRIOR, [0], [0, 0], Gaussian.from_sigmas(0.1, 0.1), "fix"))
+    for way in (Solver.update, Solver.optimize):
+        solver = Solver(graph)
+        solver.add(range(count), edges)
+        with pytest.raises(SingularError, match="rounding"):
+            way(solver)
+
+
+def test_the_end_of_a_long_open_chain_is_told_as_far_as_rounding_lets():
+    count, sigma, turn, anchor = 3000, 0.005, 0.02, 0.01
+    graph = Graph()
+    graph.add_vertices(SE2, [[k, 0.0, 0.0] for k in range(count)])
+    edges = [graph.add_edge(POSE_PRIOR, [0], [0, 0, 0], Gaussian.from_sigmas(anchor, anchor, anchor), "anchor")]
+    noise = Gaussian.from_sigmas(sigma, sigma, turn)
+    edges += [graph.add_edge(RELATIVE_POSE, [k, k + 1], [1, 0, 0], noise, "odometry") for k in range(count - 1)]
+    solver = Solver(graph)
+    solver.add(range(count), edges)
+    solver.update()
+    left = np.arange(count - 1)
+    across = anchor**2 * (1 + (count - 1) ** 2) + (count - 1) * sigma**2 + turn**2 * (left**2).sum()
+    assert solver.marginal([count - 1])[0][1, 1] == pytest.approx(across, rel=1e-2)

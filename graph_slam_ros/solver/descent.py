@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, store
 from graph_slam_ros.solver.numeric import back_substitute, curvature, eliminate, gradient, settle, step_by
 from graph_slam_ros.solver.report import Iteration, Report
@@ -130,7 +131,7 @@ class Problem:
         """
         vertex = eliminate(self.tree, self._cliques, damping)
         if vertex != NOTHING:
-            raise SingularError(f"the edges do not determine vertex {vertex}")
+            raise undetermined(vertex)
         back_substitute(self.tree, self._cliques, -1.0, -1.0)
         return self.largest_step()
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from graph_slam_ros.errors import GaugeError
+from graph_slam_ros.errors import GaugeError, SingularError
 from graph_slam_ros.graph import R2, R3, SE2, SE3, Graph, VertexKind
 from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.lie import so3
@@ -18,6 +18,11 @@ Index = NDArray[np.int64]
 
 _AXES = {SE2: 2, R2: 2, SE3: 3, R3: 3}
 _LEAST_EIGENVALUE = 1e-9  # of correlations: less is no information
+
+
+def undetermined(vertex: int) -> SingularError:
+    """What to raise where elimination leaves nothing of a vertex."""
+    return SingularError(f"a pivot cannot be told from rounding: the edges do not determine vertex {vertex}")
 
 
 def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable, Index]) -> None:

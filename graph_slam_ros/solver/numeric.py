@@ -42,12 +42,14 @@ from graph_slam_ros.solver.tree import (
 )
 
 MOVED = -2  # in LOCAL: its step has changed
+SUSPECT = 1e-9  # of its diagonal entry: a pivot below is looked into
+ROUNDING = 2.0**-52  # of the magnitudes that cancelled: a pivot below cannot be told from rounding
 CANCELLED = 1e-4  # of what is taken off a sum: less than that left has lost digits
 
 
 @kernel
 def eliminate(t: Tree, cliques: Index, damping: float) -> int:
-    """Factor the fronts of cliques, children before parents; returns a vertex without a positive pivot, or NOTHING.
+    """Factor the fronts of cliques, children before parents; returns a vertex whose pivot is rounding, or NOTHING.
 
     ``damping`` enlarges the diagonal of H by the factor 1 + damping (Marquardt).
     """
@@ -75,6 +77,10 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
             _add_contribution(vertex, clique, members, fronts, child, front)
             child = clique[child, SIBLING]
         failed = partial_cholesky(front, frontal, scale)
+        if failed == NOTHING and damping == 0.0:
+            failed = _suspect(front, frontal, scale)
+            if failed != NOTHING and not _is_rounding(t, c, failed):
+                failed = NOTHING
         if failed != NOTHING:
             failed = _member_at(vertex, clique, members, c, failed)
             break
@@ -82,6 +88,66 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
         for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
             vertex[members[m], LOCAL] = NOTHING
     return failed
+
+
+@kernel
+def _suspect(front: Array, frontal: int, diagonal: Array) -> int:
+    """The row of the least pivot, as a part of its diagonal entry, if it is suspiciously small, or NOTHING."""
+    found, least = NOTHING, 1.0 / SUSPECT
+    for a in range(frontal):
+        if front[a, a] * front[a, a] * diagonal[a] > least:  # inverted, and its root
+            found, least = a, front[a, a] * front[a, a] * diagonal[a]
+    return found
+
+
+@kernel
+def _is_rounding(t: Tree, c: int, row: int) -> bool:
+    """Whether a pivot cannot be told from rounding.
+
+    In the direction x of its unknown alone, where all that was eliminated before follows, the pivot is x'Hx. It is what
+    is left of a sum over the diagonal, whose rounding is in proportion to it.
+    """
+    vertex, clique, members, fronts = t.vertex, t.clique, t.members, t.fronts
+    step, stack, top = np.zeros(len(t.step)), np.empty(256, np.int64), 1
+    stack[0] = c
+    x, magnitude, front = np.empty(256), 0.0, front_of(clique, fronts, c)
+    pivot = 1.0 / front[row, row] ** 2
+    while top:
+        top -= 1
+        k = stack[top]
+        full, frontal, low = clique[k, FULL_DOF], clique[k, FRONT_DOF], clique[k, MEMBERS]
+        if len(x) < full:
+            x = np.empty(2 * full)
+        x[:full] = 0.0
+        at = frontal
+        if k == c:
+            x[row] = 1.0
+        else:
+            for m in range(low + clique[k, FRONTALS], low + clique[k, SIZE]):
+                for i in range(vertex[members[m], DOF]):
+                    x[at + i] = step[vertex[members[m], STEP] + i]
+                at += vertex[members[m], DOF]
+        front = front_of(clique, fronts, k)
+        for a in range((row if k == c else frontal) - 1, -1, -1):
+            s = 0.0
+            for i in range(a + 1, full):
+                s -= front[a, i] * x[i]
+            x[a] = s * front[a, a]
+        at = 0
+        for m in range(low, low + clique[k, FRONTALS]):
+            for i in range(vertex[members[m], DOF]):
+                d = vertex[members[m], STEP] + i
+                step[d] = x[at]
+                magnitude += t.diagonal[d] * x[at] * x[at]
+                at += 1
+        k = clique[k, CHILD]
+        while k != NOTHING:
+            if top == len(stack):
+                stack = np.concatenate((stack, np.empty(top, np.int64)))
+            stack[top] = k
+            top += 1
+            k = clique[k, SIBLING]
+    return pivot <= ROUNDING * magnitude
 
 
 @kernel

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from graph_slam_ros.errors import GraphSlamError, SingularError
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import SE2, SE3, Graph
 from graph_slam_ros.graph.graph import EdgeTable, whole_numbers
 from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.covariance import joint, marginals
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
-from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole
+from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole, undetermined
 from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, rows_of, store
 from graph_slam_ros.solver.numeric import keep, settle
 from graph_slam_ros.solver.report import Change, Report
@@ -477,7 +477,7 @@ class Solver:
         failed, moved = incremental.solve(self._tree, cliques, settings.tolerance, settings.tolerance_sigmas)
         if failed != NOTHING:
             self._refuse_loose()
-            raise _singular(failed)
+            raise undetermined(failed)
         self._solved_with, self._settled = None, True
         return moved, len(fresh)
 
@@ -486,7 +486,7 @@ class Solver:
         settings, self._unfinished = self.settings, False
         failed, moved = incremental.renumber(self._tree, self._active(), settings.tolerance, settings.tolerance_sigmas)
         if failed != NOTHING:
-            raise _singular(failed)
+            raise undetermined(failed)
         self._updates_since = settings.relinearize_every
         return moved
 
@@ -508,7 +508,7 @@ class Solver:
             self._linearize(edges)
             failed, moved = incremental.renumber(self._tree, edges, settings.tolerance, settings.tolerance_sigmas)
             if failed != NOTHING:
-                raise _singular(failed)
+                raise undetermined(failed)
             self._moved_since.append(moved)
             due = True
             yield len(edges), moved
@@ -577,10 +577,6 @@ class Solver:
         check_gauge(
             self.graph, np.flatnonzero(self._inside & ~self._held), np.flatnonzero(self._inside & self._held), rows
         )
-
-
-def _singular(vertex: int) -> SingularError:
-    return SingularError(f"the edges do not determine vertex {vertex}")
 
 
 def _known(ids: ArrayLike, count: int, what: str) -> Index:
