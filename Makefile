@@ -6,7 +6,7 @@
 # test-oldest   the tests without ROS, in .venv-oldest with the lowest versions that setup.py allows
 # lint, format  style and types: tell, mend
 # lock          write requirements.txt and constraints-oldest.txt from setup.py; LOCK=--upgrade takes newer versions
-# bench         measure ours against GTSAM, g2o and python-graphslam into docs/benchmarks.md; hours
+# bench         measure ours against GTSAM, g2o and python-graphslam into docs/benchmarks.md and accuracy.md; hours
 # clean         remove what these made
 
 PYTHON ?= python3

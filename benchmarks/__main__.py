@@ -1,6 +1,7 @@
-"""Everything, into docs/benchmarks.md: ``make bench``.
+"""Everything, into docs/benchmarks.md and docs/accuracy.md: ``make bench``.
 
-What follows on the command line goes to each programme, e.g. ``python -m benchmarks --poses 400`` for a short look.
+What follows on the command line goes to each programme that races, e.g. ``python -m benchmarks --poses 400`` for a
+short look.
 """
 
 import json
@@ -15,10 +16,12 @@ _RESULTS = ROOT / "benchmarks/results"
 
 def main() -> None:
     """One programme after the other; what is done is in the document even if the next is stopped."""
-    for name, *more in (["batch"], ["online"], ["online", "--no-path"], ["memory"], ["growth"]):
-        path = _RESULTS / f"{name}{''.join(more)}.json"
+    races = (["batch"], ["online"], ["online", "--no-path"], ["memory"], ["growth"])
+    for programme in (*races, ["consistency"], ["marginals"]):
+        asked = sys.argv[1:] if programme in races else []
+        path = _RESULTS / f"{''.join(programme)}.json"
         subprocess.run(
-            [sys.executable, "-m", f"benchmarks.{name}", *more, *sys.argv[1:], "--json", str(path)],
+            [sys.executable, "-m", f"benchmarks.{programme[0]}", *programme[1:], *asked, "--json", str(path)],
             cwd=ROOT,
             check=True,
         )

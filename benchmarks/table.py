@@ -1,6 +1,6 @@
-"""Results as JSON and as Markdown tables; a table has its place in docs/benchmarks.md between two markers.
+"""Results as JSON and as Markdown tables; a table has its place in a document between two markers.
 
-``python -m benchmarks.table RESULTS.json ...`` puts earlier results into the document.
+``python -m benchmarks.table RESULTS.json ...`` puts earlier results into docs/benchmarks.md or docs/accuracy.md.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ from benchmarks.fresh import ROOT
 Row = dict[str, Any]
 
 DOCUMENT = ROOT / "docs/benchmarks.md"
+_ACCURACY = ROOT / "docs/accuracy.md"
 _LIBRARIES = ("numpy", "scipy", "numba", "gtsam", "graphslam")
 
 # The lowest cost that anybody has found, in our error map with the information matrices of the file.
@@ -64,8 +65,9 @@ def markdown(measured: Row) -> str:
     return f"{_TABLES[measured['programme']](measured['rows'])}\n\n{about}{measured['date']}, {measured['machine']}."
 
 
-def into_document(measured: Row, document: Path = DOCUMENT) -> None:
+def into_document(measured: Row) -> None:
     """Put a table between its markers, in the place of an earlier one."""
+    document = _ACCURACY if measured["programme"] in ("consistency", "marginals") else DOCUMENT
     begin, end = (mark.format(measured["programme"]) for mark in ("<!-- {}: begin -->", "<!-- {}: end -->"))
     text = document.read_text(encoding="utf-8")
     head, rest = text.split(begin)
@@ -136,12 +138,52 @@ def _memory(rows: Sequence[Row]) -> str:
     return _table(names, lines)
 
 
+def _consistency(rows: Sequence[Row]) -> str:
+    names = ("world", "settings", "seeds", "NEES of", "mean", "expected", "99.9 % band", "", "within 3 sigma")
+    lines = []
+    for row in rows:
+        seeds = f"{row['first']} to {row['first'] + row['seeds'] - 1}"
+        band, verdict = f"{row['band'][0]:.3f} to {row['band'][1]:.3f}", "inside" if row["inside"] else "outside"
+        within = f"{100.0 * row['within']:.2f} % of {row['coordinates']}"
+        about = [row["world"], row["settings"], seeds, row["what"]]
+        lines.append([*about, f"{row['mean']:.3f}", str(row["expected"]), band, verdict, within])
+    return _table(names, lines)
+
+
+def _marginals(rows: Sequence[Row]) -> str:
+    names = (
+        "graph",
+        "poses, edges",
+        "against",
+        "largest difference",
+        "bound",
+        "",
+        "CPU ms",
+        "theirs, ms",
+        "ours / theirs",
+    )
+    lines = []
+    for row in rows:
+        about = [row["graph"], f"{row['poses']}, {row['edges']}", row["against"]]
+        difference = "" if row["difference"] is None else f"{row['difference']:.1e}"
+        bound = f"{row['bound']:.1e}" if difference else f"{row['bound']:g}x"
+        verdict = "fulfilled" if row["fulfilled"] else "not fulfilled"
+        times = ["", "", ""]
+        if "ours_s" in row:
+            theirs = row.get("gtsam_s", row.get("iteration_s"))
+            times = [f"{1e3 * row['ours_s']:.2f}", f"{1e3 * theirs:.2f}", f"{row['ours_s'] / theirs:.3f}"]
+        lines.append([*about, difference, bound, verdict, *times])
+    return _table(names, lines)
+
+
 _TABLES: dict[str, Callable[[Sequence[Row]], str]] = {
     "online": _online,
     "update": _online,
     "batch": _batch,
     "growth": _growth,
     "memory": _memory,
+    "consistency": _consistency,
+    "marginals": _marginals,
 }
 
 

@@ -109,7 +109,15 @@ class Consistency:
 
 
 def pose_nees(estimate: Array, truth: Array, covariances: Array) -> tuple[Nees | None, Nees | None]:
-    """NEES of the last pose and of all but the first, in the frame that the first pose and its truth share.
+    """NEES of the last pose and of all but the first, see ``pose_errors``; None where the first has no truth."""
+    if not len(estimate):
+        return None, None
+    errors, relative = pose_errors(estimate, truth, covariances)
+    return Nees.of(errors[-1:], relative[-1:]), Nees.of(errors, relative)
+
+
+def pose_errors(estimate: Array, truth: Array, covariances: Array) -> tuple[Array, Array]:
+    """Errors (n - 1, d) of all poses but the first, in their tangent spaces, and their covariances (n - 1, d, d).
 
     A map begins where the robot did: what is known of its place in the world is no error of the estimate. So the first
     pose is moved onto its truth, and its covariance, which all others inherit, is taken off theirs. That holds where
@@ -120,25 +128,28 @@ def pose_nees(estimate: Array, truth: Array, covariances: Array) -> tuple[Nees |
     estimate, truth : (n, 7) T_map_base and T_world_base, of the latter NaN where unknown
     covariances : (n, 3, 3) or (n, 6, 6) in the tangent space of each estimate
     """
-    if len(estimate) < 2 or not np.isfinite(truth[0]).all():
-        return None, None
+    planar = covariances.shape[1] == 3
     true = np.stack(se3.compose(_T_map_world(estimate, truth), tuple(truth.T)), axis=1)
-    errors = np.stack(se3.local(tuple(true.T), tuple(estimate.T)), axis=1)
-    first, planar = _in_six(covariances[0]), covariances.shape[1] == 3
-    relative = np.empty_like(covariances)
-    for k, pose in enumerate(estimate):
+    errors = np.stack(se3.local(tuple(true.T), tuple(estimate.T)), axis=1)[1:]
+    first, relative = _in_six(covariances[0]), np.empty_like(covariances[1:])
+    for k, pose in enumerate(estimate[1:]):
         step = se3.between(tuple(estimate[0]), tuple(pose))
         inherited = se3.propagate(first, tuple(map(float, step)), np.zeros((6, 6)))
-        relative[k] = covariances[k] - (inherited[_PLANAR] if planar else inherited)
-    if planar:
-        errors = errors[:, [0, 1, 5]]
-    return Nees.of(errors[-1:], relative[-1:]), Nees.of(errors[1:], relative[1:])
+        relative[k] = covariances[k + 1] - (inherited[_PLANAR] if planar else inherited)
+    return errors[:, [0, 1, 5]] if planar else errors, relative
 
 
 def landmark_nees(
     positions: Array, truth: Array, covariances: Array, first: Array, true_first: Array, first_covariance: Array
 ) -> Nees | None:
-    """NEES of landmarks' positions, as ``pose_nees`` of poses.
+    """NEES of landmarks' positions, see ``landmark_errors``; None where the first pose has no truth."""
+    return Nees.of(*landmark_errors(positions, truth, covariances, first, true_first, first_covariance))
+
+
+def landmark_errors(
+    positions: Array, truth: Array, covariances: Array, first: Array, true_first: Array, first_covariance: Array
+) -> tuple[Array, Array]:
+    """Errors (m, d) of landmarks' positions in the axes of map, and their covariances (m, d, d), as ``pose_errors``.
 
     Parameters
     ----------
@@ -146,8 +157,6 @@ def landmark_nees(
     covariances : (m, 3, 3) in the axes of map
     first, true_first : (7,) the first pose in map and in world; first_covariance : (3, 3) or (6, 6)
     """
-    if not np.isfinite(true_first).all():
-        return None
     dimensions = 2 if len(first_covariance) == 3 else 3
     true = np.stack(se3.act(_T_map_world(first[None], true_first[None]), tuple(truth.T)), axis=1)
     turn, inherited = so3.matrix(tuple(first[3:])), _in_six(first_covariance)
@@ -156,7 +165,7 @@ def landmark_nees(
         seen = se3.act(se3.inverse(tuple(first)), tuple(position))
         by_first = turn @ np.hstack([np.eye(3), -so3.hat(tuple(map(float, seen)))])
         relative[k] = (covariances[k] - by_first @ inherited @ by_first.T)[:dimensions, :dimensions]
-    return Nees.of((true - positions)[:, :dimensions], relative)
+    return (true - positions)[:, :dimensions], relative
 
 
 def class_noise(classes: Mapping[str, Mapping[str, float]], leverage: Mapping[str, float]) -> dict[str, ClassNoise]:
