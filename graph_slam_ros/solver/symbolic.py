@@ -45,26 +45,33 @@ SHARE = 0.12  # or this share of a large one
 
 @kernel
 def mark(t: Tree, touched: Index) -> Index:
-    """The cliques of the touched vertices and all their ancestors, children before parents."""
-    vertex, clique, members = t.vertex, t.clique, t.members
-    count = 0
-    out = np.empty(64, np.int64)
+    """The cliques of the touched vertices and all their ancestors, children before parents.
+
+    By the tree, not by the keys: where a region was ordered anew, what hangs below it may have later ones.
+    """
+    vertex, clique = t.vertex, t.clique
+    count = ways = 0
+    found, begin = np.empty(64, np.int64), np.empty(len(touched) + 1, np.int64)
     for v in touched:
         c = vertex[v, CLIQUE]
+        begin[ways] = count
         while c != NOTHING and clique[c, MARK] == 0:
             clique[c, MARK] = 1
-            if count == len(out):
-                out = np.concatenate((out, np.empty(count, np.int64)))
-            out[count] = c
+            if count == len(found):
+                found = np.concatenate((found, np.empty(count, np.int64)))
+            found[count] = c
             count += 1
             c = clique[c, PARENT]
-    marked = out[:count]
-    last = np.empty(count, np.int64)
-    for k in range(count):
-        c = marked[k]
-        clique[c, MARK] = 0
-        last[k] = vertex[members[clique[c, MEMBERS] + clique[c, FRONTALS] - 1], KEY]
-    return marked[np.argsort(last)]
+        ways += 1
+    begin[ways] = count
+    out = np.empty(count, np.int64)
+    at = 0
+    for w in range(ways - 1, -1, -1):  # each way ends below an earlier one
+        for k in range(begin[w], begin[w + 1]):
+            out[at] = found[k]
+            clique[found[k], MARK] = 0
+            at += 1
+    return out
 
 
 @kernel
