@@ -100,7 +100,7 @@ class Drive:
 
 
 def read_drive(folder: Path) -> Drive:
-    """Read the recording. Raises OSError where files are missing."""
+    """Read the recording."""
     recorded = loadmat(folder / "VictoriaParkSinSincronizar.mat")
     stamps_s = recorded["time"].ravel()
     speed, steering = recorded["u"]
@@ -183,11 +183,10 @@ def main() -> None:
     usual = Path(os.environ.get("GRAPH_SLAM_DATASETS", ROOT.parent / "shared/datasets")) / "recorded/victoria_park"
     parser.add_argument("folder", nargs="?", type=Path, default=usual, metavar="FOLDER")
     args = parser.parse_args()
-    try:
-        drive = read_drive(args.folder)
-    except OSError as error:
-        options.say(f"skipped: {error}")
+    if not args.folder.is_dir():
+        options.say(f"skipped: no {args.folder}: set GRAPH_SLAM_DATASETS")
         return
+    drive = read_drive(args.folder)
     slam, cpu_s = run(drive, SETTINGS)
     stamps_s = slam.sighting_poses.stamps_ns * 1e-9
     odometry = Track.of_laser(drive.odometry[:, 0], drive.odometry[:, 1:])
