@@ -10,6 +10,7 @@ stochastic mapping using the joint compatibility test", 2001.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ Array = NDArray[np.float64]
 NEW, UNCLEAR = -1, -2
 _SURE = 0.95
 _MOST_TRIED = 2000  # pairings of one message; the best so far is taken then
+_MOST_WEIGHED = 4000  # pairings of landmarks with older ones; none is clear then
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +54,20 @@ class Gates:
 
     def chi2(self, dof: int) -> float:
         """The largest statistic of a pair, or of several together."""
-        return float(chi2.ppf(self.same, dof))
+        return _quantile(self.same, dof)
 
     def sure_chi2(self, dof: int) -> float:
         """Up to this a sighting is of a landmark whatever else it may be."""
-        return float(chi2.ppf(_SURE, dof))
+        return _quantile(_SURE, dof)
 
     def other_chi2(self, dof: int) -> float:
         """The least statistic of what does not belong together."""
-        return float(chi2.ppf(self.other, dof))
+        return _quantile(self.other, dof)
+
+
+@cache
+def _quantile(probability: float, dof: int) -> float:
+    return float(chi2.ppf(probability, dof))
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,12 +166,13 @@ def pair_cost(residual: Array, covariance: Array) -> tuple[float, float]:
 def _costs(seen: Sequence[Carried], what: Expected) -> tuple[Array, Array]:
     """chi2 and cost of each sighting (a row) with each landmark."""
     count, n = what.points.shape
-    out = np.empty((2, len(seen), count))
-    for j in range(count):
-        block = what.covariance[j * n : (j + 1) * n, j * n : (j + 1) * n]
-        for i, z in enumerate(seen):
-            out[:, i, j] = pair_cost(np.array(z.measured[:n]) - what.points[j], block + z.covariance)
-    return out[0], out[1]
+    k = np.arange(count)
+    blocks = what.covariance.reshape(count, n, count, n)[k, :, k, :]
+    at = np.array([z.measured[:n] for z in seen])
+    covariance = blocks[None] + np.array([z.covariance for z in seen])[:, None]
+    r = at[:, None] - what.points[None]
+    statistic = np.einsum("ijk,ijk->ij", r, np.linalg.solve(covariance, r[..., None])[..., 0])
+    return statistic, statistic + np.linalg.slogdet(2.0 * np.pi * covariance)[1]
 
 
 def _one_by_one(cost: Array, new: float) -> dict[int, int]:
@@ -213,3 +221,69 @@ def _joint_statistic(seen: Sequence[Carried], what: Expected, pairs: dict[int, i
         covariance[k * n : (k + 1) * n, k * n : (k + 1) * n] += seen[i].covariance
     r = np.concatenate([np.array(seen[i].measured[:n]) - what.points[j] for i, j in pairs.items()])
     return float(r @ np.linalg.solve(covariance, r))
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Pairs of a landmark and an older one that may be the same.
+
+    Attributes
+    ----------
+    options : (k,) of each landmark the pairs it is in, the likeliest first
+    residual : (P n,) difference of the positions of each pair
+    covariance : (P n, P n) of all of them together
+    excluded : (P, P) which pairs are not both true
+    """
+
+    options: Sequence[Sequence[int]]
+    residual: Array
+    covariance: Array
+    excluded: NDArray[np.bool_]
+
+    def cost(self, pairs: Sequence[int]) -> tuple[float, float]:
+        """chi2 of some pairs together, and with the log of its density's volume."""
+        n = len(self.residual) // len(self.excluded)
+        rows = (np.array(pairs)[:, None] * n + np.arange(n)).ravel()
+        return pair_cost(self.residual[rows], self.covariance[rows[:, None], rows])
+
+
+def likely_pairings(gates: Gates, c: Candidates) -> list[tuple[int, ...]] | None:
+    """The sets of pairs that fit together and cost at most ``margin`` more than the best, the best first.
+
+    Branch and bound; None where that is too much to look through. A landmark in no pair costs as much as a new one.
+    """
+    count = len(c.excluded)
+    if not count:
+        return [()]
+    n = len(c.residual) // count
+    # A pair given all others is never foreseen better: what it may gain at most.
+    sharpest = np.linalg.inv(c.covariance).reshape(count, n, count, n)[range(count), :, range(count), :]
+    gain = gates.new + np.linalg.slogdet(sharpest / (2.0 * np.pi))[1]
+    names = sorted((k for k in range(len(c.options)) if c.options[k]), key=lambda k: len(c.options[k]))
+    hope = [max(0.0, *(float(gain[p]) for p in c.options[k])) for k in names]
+    to_come = np.r_[np.cumsum(hope[::-1])[::-1], 0.0]
+    found: list[tuple[float, tuple[int, ...]]] = []
+    best, tried = np.inf, 0
+
+    def descend(depth: int, pairs: tuple[int, ...], so_far: float) -> None:
+        nonlocal best, tried
+        tried += 1
+        if tried > _MOST_WEIGHED or so_far - to_come[depth] > best + gates.margin:
+            return
+        if depth == len(names):
+            best = min(best, so_far)
+            found.append((so_far, pairs))
+            return
+        for p in c.options[names[depth]]:
+            if not c.excluded[p, list(pairs)].any():
+                longer = (*pairs, p)
+                statistic, cost = c.cost(longer)
+                if statistic < gates.chi2(n * len(longer)):
+                    descend(depth + 1, longer, cost - len(longer) * gates.new)
+        descend(depth + 1, pairs, so_far)
+
+    descend(0, (), 0.0)
+    if tried > _MOST_WEIGHED:
+        return None
+    found.sort(key=lambda item: item[0])
+    return [pairs for cost, pairs in found if cost <= best + gates.margin]

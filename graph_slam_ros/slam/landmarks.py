@@ -41,6 +41,7 @@ class Landmark:
     ----------
     is_tentative : whether it is too new to be believed: it may be given up
     seen : its sightings, where these may change hands: those of landmarks without a name
+    stamps : of these; a landmark is never seen twice at once
     """
 
     vertex: int
@@ -49,11 +50,7 @@ class Landmark:
     last_seen_ns: int = 0
     is_tentative: bool = False
     seen: list[Seen] = field(default_factory=list)
-
-    @property
-    def stamps(self) -> set[int]:
-        """When it was seen: never twice at once."""
-        return {one.where.stamp_ns for one in self.seen}
+    stamps: set[int] = field(default_factory=set)
 
 
 @dataclass(slots=True)
@@ -129,6 +126,7 @@ class Landmarks:
         edge = self._graph.add_edge(edge_type, vertices, carried.measured, noise, LABEL)
         if not s.id:
             landmark.seen.append(Seen(edge, topic, s, where))
+            landmark.stamps.add(where.stamp_ns)
         landmark.sightings += 1
         landmark.first_seen_ns = min(landmark.first_seen_ns or where.stamp_ns, where.stamp_ns)
         landmark.last_seen_ns = max(landmark.last_seen_ns, where.stamp_ns)
@@ -178,6 +176,7 @@ class Landmarks:
         a = self.known[kept]
         moved = a.seen[first : first + count]
         del a.seen[first : first + count]
+        a.stamps = {one.where.stamp_ns for one in a.seen}
         a.sightings -= len(moved)
         self._take_out(moved)
         for one in moved:
@@ -191,6 +190,10 @@ class Landmarks:
     def kind_of(self, landmark: Landmark) -> VertexKind:
         """Point or pose."""
         return self._graph.kind_of(landmark.vertex)
+
+    def kind_at(self, vertex: int) -> VertexKind:
+        """Point or pose."""
+        return self._graph.kind_of(vertex)
 
     def chi2_of(self, edges: Sequence[int]) -> tuple[float, int]:
         """Sum of the squared whitened residuals of some edges, without loss, and how many numbers they are."""

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.slam import association, carry
-from graph_slam_ros.slam.association import NEW, UNCLEAR, Gates
+from graph_slam_ros.slam.association import NEW, UNCLEAR, Candidates, Gates
 from graph_slam_ros.slam.carry import Carried, Where
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 _MOST_CANDIDATES = 24  # landmarks that one message is compared with: the nearest
 _MOST_AT_ONCE = 8  # new landmarks whose pairings are weighed together: the latest
-_MOST_TRIED = 1000
+_MOST_OPTIONS = 12  # older ones that each may be: the nearest
 _REACH_SIGMA = 5.0
 _POSITIONED = ("position", "pose", "range_bearing")
 
@@ -42,6 +42,21 @@ class Merger:
     merged: str
     first: int
     count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Weighed:
+    """Pairs of a landmark and an older one: the differences of their positions (P n,), and their covariance."""
+
+    pairs: list[tuple[str, str]]
+    residual: Array
+    covariance: Array
+
+    def of(self, some: list[int]) -> "Weighed":
+        """Some of them."""
+        n = len(self.residual) // max(len(self.pairs), 1)
+        rows = (np.array(some, dtype=np.int64)[:, None] * n + np.arange(n)).ravel()
+        return Weighed([self.pairs[p] for p in some], self.residual[rows], self.covariance[rows[:, None], rows])
 
 
 class Unnamed:
@@ -141,7 +156,7 @@ class Unnamed:
         vertices = np.array([self._landmarks.known[name].vertex for name in names], dtype=np.int64)
         T_map_keyframe: Numbers = tuple(self._solver.estimate([where.vertex])[0].tolist())
         if len(names):
-            (pose_covariance,) = self._solver.marginal([where.vertex])
+            pose_covariance = self._solver.joint_marginal([where.vertex])
             at = np.array([space.group.act(T_map_keyframe, z.measured[:n]) for z in seen])
             apart = np.linalg.norm(self._positions(vertices)[None] - at[:, None], axis=2).min(axis=0)
             lever = max(float(np.linalg.norm(z.measured[:n])) for z in seen)
@@ -161,93 +176,115 @@ class Unnamed:
         return [names[k] for k in near], what
 
     def _positions(self, vertices: NDArray[np.int64]) -> Array:
+        """Of landmarks (k, n), in map."""
         n = self._space.dimensions
-        return np.array([self._solver.estimate([v])[0][:n] for v in vertices.tolist()]).reshape(-1, n)
+        out = np.empty((len(vertices), n))
+        is_point = np.array([self._landmarks.kind_at(v) is self._space.point for v in vertices.tolist()], dtype=bool)
+        for some in (is_point, ~is_point):
+            if some.any():
+                out[some] = self._solver.estimate(vertices[some])[:, :n]
+        return out
 
     # -- afterwards ----------------------------------------------------------------------------------------------
 
     def review(self, now_ns: int) -> None:
-        """Look at all landmarks again: part, merge, believe, give up."""
+        """Look at landmarks again: part, merge, believe, give up."""
         self._part()
-        for group in self._groups():
-            self._merge(group)
-        for name, landmark in list(self._landmarks.known.items()):
-            if landmark.is_tentative:
-                self._believe_or_give_up(name, landmark, now_ns)
-
-    def _groups(self) -> list[list[str]]:
-        """Landmarks that may be older ones: the tentative ones together, each of the others by itself."""
         known = self._landmarks.known
         young = [name for name, mark in known.items() if mark.is_tentative and mark.sightings > 1]
-        others = [[name] for name, mark in known.items() if mark.seen and not mark.is_tentative]
-        return ([young] if self._config.association == "joint" else [[name] for name in young]) + others
+        if self._config.association == "joint":
+            young = young[-_MOST_AT_ONCE:]
+            self._merge(young, self._weighed(self._near(young)))
+        else:
+            for name in young:
+                self._merge([name], self._weighed(self._near([name])))
+        # of the others each by itself
+        weighed = self._weighed(self._near([name for name, mark in known.items() if mark.seen]))
+        for name in list(known):
+            if known[name].seen and not known[name].is_tentative:
+                self._merge([name], weighed)
+        for name in [name for name, mark in known.items() if mark.is_tentative]:
+            self._believe_or_give_up(name, weighed, now_ns)
 
-    def _merge(self, names: list[str]) -> None:
+    def _merge(self, names: list[str], weighed: Weighed) -> None:
         """Merge those of a group of which it is clear which others they are."""
-        names = [name for name in names if name in self._landmarks.known][-_MOST_AT_ONCE:]
-        options = self._options(names)
-        if not any(options.values()):
+        pairs, candidates = self._candidates(names, weighed)
+        if not pairs:
             return
-        likely = self._likely_pairings(names, options)
-        for name, other in likely[0].items():
-            if all(name in pairs and self._are_close(pairs[name], other) for pairs in likely):
-                self._counters.count("landmarks", "merged")
-                first = len(self._landmarks.known[other].seen)
-                self._mergers.append(Merger(other, name, first, self._landmarks.merge(other, name)))
-                self._hand_over()
+        likely = association.likely_pairings(self._gates, candidates)
+        if likely is None:
+            self._counters.count("landmarks", "undecided")
+            return
+        chosen = [{pairs[p][0]: pairs[p][1] for p in one} for one in likely]
+        for name, other in chosen[0].items():
+            if all(name in one and self._are_close(one[name], other) for one in chosen):
+                self._merge_into(other, name)
 
-    def _options(self, names: list[str]) -> dict[str, list[str]]:
-        """Believed landmarks that each may be: near enough by the covariance of both, never seen together with it."""
+    def _merge_into(self, kept: str, merged: str) -> None:
+        self._counters.count("landmarks", "merged")
+        first = len(self._landmarks.known[kept].seen)
+        self._mergers.append(Merger(kept, merged, first, self._landmarks.merge(kept, merged)))
+        self._hand_over()
+
+    def _weighed(self, pairs: list[tuple[str, str]]) -> Weighed:
+        """Those of the pairs that fit, the likeliest first."""
+        known, n = self._landmarks.known, self._space.dimensions
+        if not pairs:
+            return Weighed([], np.empty(0), np.empty((0, 0)))
+        r, covariance = self._apart([(known[a], known[b]) for a, b in pairs])
+        fits = []
+        for p in range(len(pairs)):
+            own = slice(p * n, (p + 1) * n)
+            statistic, cost = association.pair_cost(r[own], covariance[own, own])
+            if statistic < self._gates.other_chi2(n):
+                fits.append((cost, p))
+        return Weighed(pairs, r, covariance).of([p for _, p in sorted(fits)])
+
+    def _candidates(self, names: list[str], weighed: Weighed) -> tuple[list[tuple[str, str]], Candidates]:
+        """Pairs of these with believed landmarks, as they are now."""
+        known, wanted = self._landmarks.known, set(names)
+        kept = []
+        for p, (name, other) in enumerate(weighed.pairs):
+            is_there = name in wanted and {name, other} <= known.keys()
+            if is_there and not known[other].is_tentative and self._may_be(name, other):
+                kept.append(p)
+        some = weighed.of(kept)
+        options = [[k for k, (name, _) in enumerate(some.pairs) if name == one] for one in names]
+        excluded = np.array([[self._exclude_each_other(a, b) for b in some.pairs] for a in some.pairs], dtype=bool)
+        return some.pairs, Candidates(options, some.residual, some.covariance, excluded)
+
+    def _exclude_each_other(self, one: tuple[str, str], two: tuple[str, str]) -> bool:
+        """Whether two landmarks that were seen at once would be the same, or one would be two."""
         known = self._landmarks.known
-        older = [name for name, mark in known.items() if not mark.is_tentative]
-        at = {name: self._positions(np.array([known[name].vertex]))[0] for name in {*names, *older}}
-        out: dict[str, list[str]] = {}
+        if one[0] == two[0]:
+            return True
+        return one[1] == two[1] and not known[one[0]].stamps.isdisjoint(known[two[0]].stamps)
+
+    def _near(self, names: list[str]) -> list[tuple[str, str]]:
+        """Pairs of each with those that it may be, by an upper bound of their covariance; of many the nearest."""
+        known = self._landmarks.known
+        older = [name for name, mark in known.items() if not mark.is_tentative or self._is_sure(mark)]
+        if not older or not names:
+            return []
+        everyone = {name: k for k, name in enumerate(dict.fromkeys([*names, *older]))}
+        vertices = np.array([known[name].vertex for name in everyone], dtype=np.int64)
+        n = self._space.dimensions
+        sigma = np.sqrt([np.trace(c[:n, :n]) for c in self._solver.marginal(vertices)])
+        at = self._positions(vertices)
+        is_older, extent = [everyone[o] for o in older], float(np.trace(self._extent()))
+        out: list[tuple[str, str]] = []
         for name in names:
-            mark = known[name]
-            others = [o for o in older if self._may_be(name, o)]
-            others.sort(key=lambda o: float(np.linalg.norm(at[o] - at[name])))
-            out[name] = []
-            for other in others[:_MOST_CANDIDATES]:
-                apart, covariance = self._apart([(mark, known[other])])
-                if association.pair_cost(apart, covariance)[0] < self._gates.other_chi2(len(apart)):
-                    out[name].append(other)
+            k = everyone[name]
+            apart = np.sum((at[is_older] - at[k]) ** 2, axis=1)
+            reach = self._gates.other_chi2(n) * ((sigma[is_older] + sigma[k]) ** 2 + extent)
+            nearest = [older[j] for j in np.argsort(apart, kind="stable").tolist() if apart[j] < reach[j]]
+            out += [(name, other) for other in nearest if self._may_be(name, other)][:_MOST_OPTIONS]
         return out
 
     def _may_be(self, name: str, other: str) -> bool:
         a, b = self._landmarks.known[name], self._landmarks.known[other]
         is_later = a.is_tentative or (b.first_seen_ns, other) < (a.first_seen_ns, name)
-        return name != other and is_later and (other, name) not in self._parted and not a.stamps & b.stamps
-
-    def _likely_pairings(self, names: list[str], options: dict[str, list[str]]) -> list[dict[str, str]]:
-        """The pairings, the best first, that cost at most ``margin`` more than it; none of them may be the best."""
-        known = self._landmarks.known
-        found: list[tuple[float, dict[str, str]]] = []
-
-        def descend(depth: int, pairs: dict[str, str]) -> None:
-            if len(found) > _MOST_TRIED:
-                return
-            if depth == len(names):
-                found.append((self._cost(pairs), pairs))
-                return
-            descend(depth + 1, pairs)
-            for other in options[names[depth]]:
-                same = [name for name, o in pairs.items() if o == other]
-                if not any(known[name].stamps & known[names[depth]].stamps for name in same):
-                    descend(depth + 1, pairs | {names[depth]: other})
-
-        descend(0, {})
-        found = [(cost, pairs) for cost, pairs in found if np.isfinite(cost)]
-        found.sort(key=lambda item: item[0])
-        return [pairs for cost, pairs in found if cost <= found[0][0] + self._gates.margin]
-
-    def _cost(self, pairs: dict[str, str]) -> float:
-        """Of taking landmarks for others together, against all of them being new; infinite where they do not fit."""
-        if not pairs:
-            return 0.0
-        known = self._landmarks.known
-        apart, covariance = self._apart([(known[a], known[b]) for a, b in pairs.items()])
-        statistic, cost = association.pair_cost(apart, covariance)
-        return cost - len(pairs) * self._gates.new if statistic < self._gates.chi2(len(apart)) else np.inf
+        return name != other and is_later and (other, name) not in self._parted and a.stamps.isdisjoint(b.stamps)
 
     def _are_close(self, a: str, b: str) -> bool:
         at = self._positions(np.array([self._landmarks.known[name].vertex for name in (a, b)]))
@@ -275,13 +312,18 @@ class Unnamed:
             return np.eye(self._space.dimensions)
         return self._space.turn(tuple(self._solver.estimate([landmark.vertex])[0].tolist()))
 
-    def _believe_or_give_up(self, name: str, landmark: Landmark, now_ns: int) -> None:
-        """Believe a tentative landmark that is none of the others; give up what was not seen for long."""
+    def _is_sure(self, landmark: Landmark) -> bool:
+        """Whether it was seen often enough, for long enough."""
         c = self._config
         for_long = landmark.last_seen_ns - landmark.first_seen_ns >= round(c.confirm_s * 1e9)
-        if landmark.sightings >= c.confirm_sightings and for_long and not self._options([name])[name]:
+        return landmark.sightings >= c.confirm_sightings and for_long
+
+    def _believe_or_give_up(self, name: str, weighed: Weighed, now_ns: int) -> None:
+        """Believe a tentative landmark that is none of the others; give up what was not seen for long."""
+        landmark = self._landmarks.known[name]
+        if self._is_sure(landmark) and not self._candidates([name], weighed)[0]:
             landmark.is_tentative = False
-        elif now_ns - landmark.last_seen_ns > round(c.give_up_s * 1e9):
+        elif now_ns - landmark.last_seen_ns > round(self._config.give_up_s * 1e9):
             self._landmarks.give_up(name)
             self._counters.count("landmarks", "given_up")
 
