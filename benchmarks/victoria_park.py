@@ -4,8 +4,8 @@
 steering become poses of the middle of the rear axle, each scan's trees become sightings without identity, and
 ``GraphSlam`` associates them. GPS is not used but to judge.
 
-What is compared is the path of the laser, at the front of the car: where the antenna was is not told, and the papers on
-this recording compare the laser's path with GPS.
+What is compared is the path of the laser, at the front of the car: where the antenna was is not told, but the rear axle
+is 4 m from where the estimate's turns have it.
 
 GPS was failing at times: it is judged on quiet stretches only. A fix counts where all of the last 5 s have fixes at the
 usual rate (none more than 0.5 s after the one before), and from each of them to this one GPS has moved as far as
