@@ -36,6 +36,7 @@ from graph_slam_ros.cli import main  # noqa: E402
 from graph_slam_ros.replay import replay  # noqa: E402
 from graph_slam_ros.ros.bag import BagWriter, open_bag  # noqa: E402
 from graph_slam_ros.simulation import simulate, write_bag  # noqa: E402
+from graph_slam_ros.slam import Config  # noqa: E402
 from graph_slam_ros.warmup import warmup  # noqa: E402
 
 RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv")
@@ -195,6 +196,16 @@ def test_a_recording_through_a_live_graph_is_saved_byte_for_byte_as_offline(bag,
     assert " 0 lost; results in" in done.stdout
     assert results(tmp_path / "123") == results(offline)
     assert replayed(tmp_path / "123", tmp_path) == results(offline)
+
+
+def test_a_flight_in_space_is_saved_byte_for_byte_as_offline(tmp_path):
+    flight, space = tmp_path / "flight.mcap", Config.from_mapping({"world.dimensions": 3})
+    write_bag(simulate("flight", 3, laps=1), flight)
+    replay(flight, tmp_path / "offline", space)
+    done = graph_slam("replay", flight, "--ros", "--out", tmp_path / "live", "--set", "world.dimensions=3")
+    assert done.returncode == 0, done.stderr
+    assert results(tmp_path / "live") == results(tmp_path / "offline")
+    assert results(tmp_path / "live")["path.tum"].count(b"\n") > 100
 
 
 def test_live_equals_offline_when_landmarks_come_faster_than_odometry(bag, messages, tmp_path):
