@@ -15,7 +15,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from graph_slam_ros.slam.carry import Carried, by_motion
 from graph_slam_ros.slam.space import Numbers, Space
@@ -54,20 +54,21 @@ class Gates:
 
     def chi2(self, dof: int) -> float:
         """The largest statistic of a pair, or of several together."""
-        return _quantile(self.same, dof)
+        return quantile(self.same, dof)
 
     def sure_chi2(self, dof: int) -> float:
         """Up to this a sighting is of a landmark whatever else it may be."""
-        return _quantile(_SURE, dof)
+        return quantile(_SURE, dof)
 
     def other_chi2(self, dof: int) -> float:
         """The least statistic of what does not belong together."""
-        return _quantile(self.other, dof)
+        return quantile(self.other, dof)
 
 
 @cache
-def _quantile(probability: float, dof: int) -> float:
-    return float(chi2.ppf(probability, dof))
+def quantile(probability: float, dof: int) -> float:
+    """Of the chi-square distribution; from the special function, since importing scipy.stats takes half a second."""
+    return 2.0 * float(gammaincinv(0.5 * dof, probability))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.slam import association, carry
@@ -336,7 +335,7 @@ class Unnamed:
                 continue
             edges = [record.edge for record in landmark.seen[merger.first : merger.first + merger.count]]
             fits, dof = self._landmarks.chi2_of(edges)
-            if fits > chi2.ppf(1.0 - 1e-6, dof) and fits > 4.0 * dof:
+            if fits > association.quantile(1.0 - 1e-6, dof) and fits > 4.0 * dof:
                 self._counters.count("landmarks", "parted")
                 self._landmarks.part(merger.kept, merger.merged, merger.first, merger.count)
                 self._hand_over()
