@@ -19,7 +19,7 @@ from scipy import stats
 from benchmarks import options, table
 from graph_slam_ros.consistency import Nees, landmark_errors, pose_errors
 from graph_slam_ros.lie import se3
-from graph_slam_ros.ros.results import keyframe_covariances, landmark_estimates
+from graph_slam_ros.ros.results import landmark_estimates
 from graph_slam_ros.simulation import Recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
 
@@ -130,7 +130,7 @@ def compare(slam: GraphSlam, recording: Recording) -> Run:
     at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns)
     true = recording.T_world_base[at]
     true = se3.in_space(true) if slam.space.dimensions == 2 else true
-    covariances = keyframe_covariances(slam)
+    covariances = slam.keyframe_covariances()
     n, found = slam.space.dimensions, landmark_estimates(slam)
     positions, true_positions = np.zeros((len(found), 3)), np.zeros((len(found), 3))
     of_positions = np.zeros((len(found), 3, 3))

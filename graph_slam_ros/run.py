@@ -230,7 +230,7 @@ def _write_graph(folder: Path, slam: GraphSlam) -> None:
 def _covariance_table(slam: GraphSlam) -> str:
     dof = slam.config.space.dof
     rows = [f"stamp_ns,{','.join(f'tangent_{a}{b}' for a, b in _upper(_TANGENT[dof]))}"]
-    for stamp_ns, covariance in zip(slam.keyframes.stamps_ns, results.keyframe_covariances(slam), strict=True):
+    for stamp_ns, covariance in zip(slam.keyframes.stamps_ns, slam.keyframe_covariances(), strict=True):
         rows.append(f"{stamp_ns},{','.join(map(repr, covariance[np.triu_indices(dof)].tolist()))}")
     return "\n".join(rows) + "\n"
 

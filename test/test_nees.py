@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from graph_slam_ros.consistency import landmark_nees, pose_nees
 from graph_slam_ros.lie import se3
-from graph_slam_ros.ros.results import keyframe_covariances, landmark_estimates
+from graph_slam_ros.ros.results import landmark_estimates
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 
@@ -37,7 +37,7 @@ def mean_nees(dimensions, told):
         poses, true = (
             se3.in_space(p) if dimensions == 2 else p for p in (slam.trajectory(), recording.T_world_base[at])
         )
-        covariances, found = keyframe_covariances(slam), landmark_estimates(slam)
+        covariances, found = slam.keyframe_covariances(), landmark_estimates(slam)
         last.append(pose_nees(poses, true, covariances)[0].mean)
         positions, spots, spreads = (np.zeros((len(found), *shape)) for shape in ((3,), (3,), (3, 3)))
         for k, (name, value, covariance) in enumerate(found):

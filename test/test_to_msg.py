@@ -180,7 +180,7 @@ def test_a_landmarks_covariance_is_in_the_axes_of_the_map(solved):
 
 def test_every_keyframe_has_its_covariance_or_nothing_that_could_be_mistaken_for_one(solved, monkeypatch):
     ids = solved.keyframes.ids
-    covariances = results.keyframe_covariances(solved)
+    covariances = solved.keyframe_covariances()
     assert covariances.shape == (len(ids), 3, 3)
     assert covariances[-1] == pytest.approx(solved.pose_covariance)
 
@@ -188,5 +188,5 @@ def test_every_keyframe_has_its_covariance_or_nothing_that_could_be_mistaken_for
         raise SingularError("the edges do not determine vertex 3")
 
     monkeypatch.setattr(solved.solver, "marginal", fails)
-    assert np.isnan(results.keyframe_covariances(solved)).all()
-    assert results.keyframe_covariances(GraphSlam()).shape == (0, 3, 3)
+    assert np.isnan(solved.keyframe_covariances()).all()
+    assert GraphSlam().keyframe_covariances().shape == (0, 3, 3)

@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.ros import to_msg
 from graph_slam_ros.slam import GraphSlam
 
@@ -70,12 +69,3 @@ def landmark_estimates(slam: GraphSlam) -> list[tuple[str, Numbers, Array]]:
             marginal = space.in_parent_axes(value, marginal)
         out.append((name, value, marginal))
     return out
-
-
-def keyframe_covariances(slam: GraphSlam) -> Array:
-    """Marginal covariance of every keyframe in its tangent space, (n, 3, 3) or (n, 6, 6); NaN where unsolved."""
-    n, dof = len(slam.keyframes), slam.config.space.dof
-    try:
-        return np.array(slam.solver.marginal(slam.keyframes.ids)).reshape(n, dof, dof)
-    except GraphSlamError:  # the last solve failed, and was counted
-        return np.full((n, dof, dof), np.nan)

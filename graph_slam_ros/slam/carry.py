@@ -50,19 +50,18 @@ def position(space: Space, s: Sighting, where: Where) -> Carried:
     """A landmark's position, from the sighting of a position or of a pose: ``p_a = T_a_b p_b``."""
     n = space.dimensions
     point = np.array(s.measured[:n])
-    own = np.array(s.covariance)
+    own = square(s.covariance)
     if s.kind == "pose":  # from the tangent space of the measured pose to the axes of b
-        own = space.in_parent_axes(s.measured, own.reshape(space.dof, space.dof))[:n, :n]
+        own = space.in_parent_axes(s.measured, own)[:n, :n]
     b, turn = by_motion(space, point), space.turn(where.T_keyframe_base)
-    covariance = turn @ (own.reshape(n, n) + b @ where.covariance @ b.T) @ turn.T
+    covariance = turn @ (own + b @ where.covariance @ b.T) @ turn.T
     return Carried(_floats(space.group.act(where.T_keyframe_base, tuple(point.tolist()))), covariance)
 
 
 def pose(space: Space, s: Sighting, where: Where) -> Carried:
     """A landmark's pose: ``T_a_c = T_a_b T_b_c``."""
-    own = np.array(s.covariance).reshape(space.dof, space.dof)
     measured = space.group.compose(where.T_keyframe_base, s.measured)
-    return Carried(_floats(measured), space.group.propagate(where.covariance, s.measured, own))
+    return Carried(_floats(measured), space.group.propagate(where.covariance, s.measured, square(s.covariance)))
 
 
 def seen_from_sensor(space: Space, s: Sighting, where: Where, p_keyframe: Array) -> Carried:
@@ -76,42 +75,46 @@ def seen_from_sensor(space: Space, s: Sighting, where: Where, p_keyframe: Array)
     p_base = np.array(space.group.act(space.group.inverse(where.T_keyframe_base), tuple(p_keyframe.tolist())))
     p_sensor = np.array(space.group.act(space.group.inverse(T_base_sensor), tuple(p_base.tolist())))
     j = gradient(space, s.kind, p_sensor) @ space.turn(T_base_sensor).T @ by_motion(space, p_base)
-    m = len(s.measured)
-    covariance = np.array(s.covariance).reshape(m, m) + j @ where.covariance @ j.T
+    covariance = square(s.covariance) + j @ where.covariance @ j.T
     return Carried((*s.measured, *_floats(space.group.compose(where.T_keyframe_base, T_base_sensor))), covariance)
 
 
-def shared_noise(space: Space, m: Sightings | Fix | Closure, where: Where, added_sigma_m: float) -> float:
-    """How large the variance that the motion adds is against what was measured: all of a message have it in common.
+def is_shared(space: Space, m: Sightings | Fix | Closure, where: Where, most: float, added_sigma_m: float) -> bool:
+    """Whether the motion adds more to the variance than a part of it: all that a message says has that in common.
 
     Parameters
     ----------
+    most : part of the variance
     added_sigma_m : what is added to sightings besides
     """
     n, motion = space.dimensions, where.covariance
     moved, turned = float(np.trace(motion[:n, :n])), float(np.trace(motion[n:, n:]))
-    if not isinstance(m, Sightings):
-        size = round(len(m.covariance) ** 0.5)
-        own = float(np.trace(np.array(m.covariance).reshape(size, size)))
-        if isinstance(m, Fix) and m.kind != "pose":
-            return (moved if m.kind == "position" else turned) / own
-        return (moved + turned) / own
-    return max((_share(space, s, moved, turned, added_sigma_m**2) for s in m.sightings), default=0.0)
+    if isinstance(m, Sightings):
+        return any(_adds(space, s, moved, turned, most, added_sigma_m**2) for s in m.sightings)
+    own = float(np.trace(square(m.covariance)))
+    if isinstance(m, Fix) and m.kind != "pose":
+        return (moved if m.kind == "position" else turned) > most * own
+    return moved + turned > most * own
 
 
-def _share(space: Space, s: Sighting, moved: float, turned: float, added: float) -> float:
-    n, m = space.dimensions, len(s.measured)
-    size = space.dof if s.kind == "pose" else m
-    own = np.diag(np.array(s.covariance).reshape(size, size))
+def _adds(space: Space, s: Sighting, moved: float, turned: float, most: float, added: float) -> bool:
+    own = np.diag(square(s.covariance)).tolist()
     if s.kind == "bearing":
-        return turned / float(own.sum())
+        return turned > most * sum(own)
     if s.kind == "range":
-        return moved / float(own[0] + added)
+        return moved > most * (own[0] + added)
     if s.kind == "range_bearing":
         far = s.measured[0]
-        return (moved + far**2 * turned) / float(own[0] + far**2 * own[1:].sum() + added)
+        return moved + far**2 * turned > most * (own[0] + far**2 * sum(own[1:]) + added)
+    n = space.dimensions
     far = float(np.linalg.norm(s.measured[:n]))
-    return (moved + far**2 * turned) / float(own[:n].sum() + n * added)
+    return moved + far**2 * turned > most * (sum(own[:n]) + n * added)
+
+
+def square(flat: Numbers) -> Array:
+    """A covariance as a matrix."""
+    size = round(len(flat) ** 0.5)
+    return np.array(flat).reshape(size, size)
 
 
 def gradient(space: Space, kind: str, p: Array) -> Array:
@@ -152,6 +155,22 @@ def point_of(space: Space, measured: Numbers) -> Array:
     return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), far * np.sin(measured[2])])
 
 
+def polar_derivative(space: Space, measured: Numbers) -> Array:
+    """Derivative (n, n) of that point with respect to range and angles."""
+    far, azimuth = measured[0], measured[1]
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    if space.dimensions == 2:
+        return np.array([[c, -far * s], [s, far * c]])
+    level, up = np.cos(measured[2]), np.sin(measured[2])
+    return np.array(
+        [
+            [level * c, -far * level * s, -far * up * c],
+            [level * s, far * level * c, -far * up * s],
+            [up, 0.0, far * level],
+        ]
+    )
+
+
 def fix(space: Space, m: Fix, where: Where, T_map_keyframe: Numbers) -> Carried:
     """What is known of the robot, as known of its keyframe.
 
@@ -160,8 +179,7 @@ def fix(space: Space, m: Fix, where: Where, T_map_keyframe: Numbers) -> Carried:
     T_map_keyframe : where the keyframe is thought to be: what of the motion a position or heading sees depends on it
     """
     group, T_a_b = space.group, where.T_keyframe_base
-    size = round(len(m.covariance) ** 0.5)
-    own = np.array(m.covariance).reshape(size, size)
+    own = square(m.covariance)
     if m.kind == "pose":
         into = group.adjoint(T_a_b)
         return Carried(
@@ -193,8 +211,7 @@ def axes_known(covariance: Array) -> list[tuple[Array, float]]:
 def closure(space: Space, m: Closure, earlier: Where, later: Where) -> Carried:
     """Between two keyframes: ``T_a_d = T_a_b T_b_c T_d_c^-1`` for the base b at the earlier stamp, c at the later."""
     group = space.group
-    size = space.dof
-    to_c = group.propagate(earlier.covariance, m.T_from_base, np.array(m.covariance).reshape(size, size))
+    to_c = group.propagate(earlier.covariance, m.T_from_base, square(m.covariance))
     into = group.adjoint(later.T_keyframe_base)
     back = group.inverse(later.T_keyframe_base)
     measured = group.compose(group.compose(earlier.T_keyframe_base, m.T_from_base), back)

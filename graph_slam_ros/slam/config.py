@@ -15,8 +15,7 @@ from typing import Any
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.slam.input_config import DEFAULT_INPUTS, InputConfig, default_input
-from graph_slam_ros.slam.parameter import Parameter, section_parameters
-from graph_slam_ros.slam.parameter import setting as _setting
+from graph_slam_ros.slam.parameter import Parameter, section_parameters, setting
 from graph_slam_ros.slam.space import PLANE, SPACE, Space
 from graph_slam_ros.solver import METHODS, Settings
 
@@ -27,78 +26,76 @@ _USUAL_INPUTS = tuple(one.name for one in DEFAULT_INPUTS)
 class FramesConfig:
     """Names of frames, REP-105."""
 
-    map: str = _setting("map", "frame of the corrected path")
-    odom: str = _setting("odom", "frame the odometry is given in")
-    base: str = _setting("base_link", "frame of the robot")
+    map: str = setting("map", "frame of the corrected path")
+    odom: str = setting("odom", "frame the odometry is given in")
+    base: str = setting("base_link", "frame of the robot")
 
 
 @dataclass(frozen=True, slots=True)
 class WorldConfig:
     """Where the robot moves."""
 
-    dimensions: int = _setting(2, "2: in a plane, of what is seen only that part is used; 3: in space", low=2, high=3)
+    dimensions: int = setting(2, "2: in a plane, of what is seen only that part is used; 3: in space", low=2, high=3)
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryConfig:
     """Noise of the motion between keyframes."""
 
-    noise: str = _setting(
+    noise: str = setting(
         "twist",
         "twist: from each message's twist covariance where it has one, else the densities; density: always these",
         choices=("twist", "density"),
     )
-    translation_density: float = _setting(
+    translation_density: float = setting(
         0.02, "random walk of the position along x of the base", "m/sqrt(s)", low=1e-6, high=10.0
     )
-    lateral_density: float = _setting(
+    lateral_density: float = setting(
         0.005,
         "random walk across; small for wheels, raise it for what can slide or hover",
         "m/sqrt(s)",
         low=1e-6,
         high=10.0,
     )
-    vertical_density: float = _setting(0.005, "random walk upwards, in space", "m/sqrt(s)", low=1e-6, high=10.0)
-    rotation_density: float = _setting(0.05, "random walk of the heading", "rad/sqrt(s)", low=1e-6, high=10.0)
-    tilt_density: float = _setting(
+    vertical_density: float = setting(0.005, "random walk upwards, in space", "m/sqrt(s)", low=1e-6, high=10.0)
+    rotation_density: float = setting(0.05, "random walk of the heading", "rad/sqrt(s)", low=1e-6, high=10.0)
+    tilt_density: float = setting(
         0.02, "random walk of roll and of pitch, in space", "rad/sqrt(s)", low=1e-6, high=10.0
     )
-    twist_correlation_s: float = _setting(
+    twist_correlation_s: float = setting(
         0.25,
         "how long the error of a velocity lasts: the noise of a step is covariance * dt * max(dt, this)",
         "s",
         low=0.0,
     )
-    still_m_s: float = _setting(
+    still_m_s: float = setting(
         1e-3, "slower than this and the next, the robot stands: no noise is added", "m/s", low=0.0
     )
-    still_rad_s: float = _setting(1e-3, "see still_m_s", "rad/s", low=0.0)
-    timeout_s: float = _setting(
+    still_rad_s: float = setting(1e-3, "see still_m_s", "rad/s", low=0.0)
+    timeout_s: float = setting(
         0.5,
         "an odometry that is silent for longer, in stamp time, gives way to the next of inputs.names",
         "s",
         low=1e-3,
     )
-    max_speed_m_s: float = _setting(
-        50.0, "faster than this, odometry has jumped: a new segment begins", "m/s", low=1e-3
-    )
-    jump_sigma_m: float = _setting(10.0, "what is known of the motion over a jump: standard deviation", "m", low=1e-3)
-    jump_sigma_rad: float = _setting(3.0, "and of the rotation", "rad", low=1e-3)
+    max_speed_m_s: float = setting(50.0, "faster than this, odometry has jumped: a new segment begins", "m/s", low=1e-3)
+    jump_sigma_m: float = setting(10.0, "what is known of the motion over a jump: standard deviation", "m", low=1e-3)
+    jump_sigma_rad: float = setting(3.0, "and of the rotation", "rad", low=1e-3)
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframesConfig:
     """When the robot's motion earns a new vertex."""
 
-    min_distance_m: float = _setting(0.25, "a keyframe after this distance", "m", low=1e-3)
-    min_angle_rad: float = _setting(0.25, "or after this change of heading", "rad", low=1e-3, high=math.pi)
-    max_interval_s: float = _setting(
+    min_distance_m: float = setting(0.25, "a keyframe after this distance", "m", low=1e-3)
+    min_angle_rad: float = setting(0.25, "or after this change of heading", "rad", low=1e-3, high=math.pi)
+    max_interval_s: float = setting(
         1.0,
         "or after this much time in motion: odometry's noise grows with time, and sightings in between share it",
         "s",
         low=1e-3,
     )
-    shared_noise: float = _setting(
+    shared_noise: float = setting(
         0.05,
         "or at what is seen, where the motion since the last keyframe would add more than this to its variance, and the"
         " same to all that is seen at once",
@@ -111,94 +108,92 @@ class KeyframesConfig:
 class LandmarksConfig:
     """Landmark sightings."""
 
-    id_from: str = _setting("id", "which field of a detection is the landmark's identity", choices=("id", "class_id"))
-    sigma_m: float = _setting(0.1, "position noise where a message's covariance is all zero (unknown)", "m", low=1e-4)
-    added_sigma_m: float = _setting(
+    id_from: str = setting("id", "which field of a detection is the landmark's identity", choices=("id", "class_id"))
+    sigma_m: float = setting(0.1, "position noise where a message's covariance is all zero (unknown)", "m", low=1e-4)
+    added_sigma_m: float = setting(
         0.05, "position noise added to every sighting for what messages leave out: clocks, mounting, size", "m", low=0.0
     )
-    orientation_known_below_rad: float = _setting(
+    orientation_known_below_rad: float = setting(
         0.5, "a landmark is a full pose where its heading's standard deviation is below this", "rad", low=0.0
     )
-    association: str = _setting(
+    association: str = setting(
         "id",
         "none: landmarks are not used; id: by their identity; nearest, joint: those without one are associated, each by"
         " itself or all of a message together",
         choices=("none", "id", "nearest", "joint"),
     )
-    gate_same: float = _setting(
+    gate_same: float = setting(
         0.999, "a sighting without identity is of a landmark within this probability", "probability", low=0.5, high=1.0
     )
-    gate_other: float = _setting(
+    gate_other: float = setting(
         0.99999, "and of a new one outside this; between the two it is not used", "probability", low=0.5, high=1.0
     )
-    close_m: float = _setting(
+    close_m: float = setting(
         0.5, "landmarks this close are not told apart by force: what may be of either says less", "m", low=0.0
     )
-    unnamed_sigma_m: float = _setting(
+    unnamed_sigma_m: float = setting(
         0.1, "position noise added to sightings without identity: they may be of one close by", "m", low=0.0
     )
-    density_per_m: float = _setting(
+    density_per_m: float = setting(
         0.03,
         "landmarks that there may be to a metre along each axis: a sighting must be likelier to be of a known one",
         "1/m",
         low=1e-4,
     )
-    ambiguity_chi2: float = _setting(6.0, "and all else must fit worse by this much", "chi2", low=0.0)
-    confirm_sightings: int = _setting(5, "a new landmark is believed after so many sightings", "sightings", low=1)
-    confirm_s: float = _setting(2.0, "over so much time", "s", low=0.0)
-    follow_s: float = _setting(
+    ambiguity_chi2: float = setting(6.0, "and all else must fit worse by this much", "chi2", low=0.0)
+    confirm_sightings: int = setting(5, "a new landmark is believed after so many sightings", "sightings", low=1)
+    confirm_s: float = setting(2.0, "over so much time", "s", low=0.0)
+    follow_s: float = setting(
         10.0,
         "a sighting is compared with landmarks seen not longer ago; what is seen again later is merged",
         "s",
         low=0.0,
     )
-    give_up_s: float = _setting(60.0, "or given up where it has not been seen for so long", "s", low=0.0)
-    review_every_keyframes: int = _setting(10, "look for all that after so many keyframes", "keyframes", low=1)
-    determined_below: float = _setting(
+    give_up_s: float = setting(60.0, "or given up where it has not been seen for so long", "s", low=0.0)
+    review_every_keyframes: int = setting(10, "look for all that after so many keyframes", "keyframes", low=1)
+    determined_below: float = setting(
         0.2,
         "a landmark seen by range or bearing waits until its standard deviation is below this part of its distance",
         "m/m",
         low=1e-3,
         high=10.0,
     )
-    mirror_chi2: float = _setting(
+    mirror_chi2: float = setting(
         12.0, "and until every other place it may be at fits worse by this much", "chi2", low=0.0
     )
-    range_offset_sigma_m: float = _setting(
+    range_offset_sigma_m: float = setting(
         0.0,
         "standard deviation of an offset that all ranges of a topic share and that is estimated; 0: there is none",
         "m",
         low=0.0,
     )
-    loss: str = _setting(
+    loss: str = setting(
         "huber_then_cauchy",
         "robust loss; huber_then_cauchy converges with the first, then with the second",
         choices=("none", "huber", "cauchy", "huber_then_cauchy"),
     )
-    loss_scale: float = _setting(
-        3.0, "residuals well below this many standard deviations count fully", "sigma", low=0.1
-    )
+    loss_scale: float = setting(3.0, "residuals well below this many standard deviations count fully", "sigma", low=0.1)
 
 
 @dataclass(frozen=True, slots=True)
 class AnchorConfig:
     """The prior on the first keyframe, which fixes the gauge: map begins where odom begins."""
 
-    sigma_m: float = _setting(1e-3, "standard deviation of its position", "m", low=1e-6)
-    sigma_rad: float = _setting(1e-3, "standard deviation of its heading", "rad", low=1e-6)
+    sigma_m: float = setting(1e-3, "standard deviation of its position", "m", low=1e-6)
+    sigma_rad: float = setting(1e-3, "standard deviation of its heading", "rad", low=1e-6)
 
 
 @dataclass(frozen=True, slots=True)
 class OrderingConfig:
     """The window in which messages are put in order of stamp."""
 
-    window_s: float = _setting(
+    window_s: float = setting(
         0.05, "how much later than newer odometry a message may come, in stamp time", "s", low=0.0
     )
-    late_s: float = _setting(
+    late_s: float = setting(
         10.0, "sightings, fixes and closures up to this much older than odometry go where they belong", "s", low=0.0
     )
-    max_waiting: int = _setting(
+    max_waiting: int = setting(
         1000, "messages that may wait for their turn, or for odometry", "messages", low=1, high=1_000_000
     )
 
@@ -210,68 +205,68 @@ _SOLVER = Settings()  # its defaults are ours, but for when the solve at the end
 class SolveConfig:
     """When and how the graph is solved: a little at each keyframe, and everything at the end."""
 
-    every_keyframes: int = _setting(
+    every_keyframes: int = setting(
         1, "update the estimate after this many keyframes", "keyframes", low=1, high=1_000_000
     )
-    relinearize_above: float = _setting(
+    relinearize_above: float = setting(
         _SOLVER.relinearize_above,
         "linearise a pose or landmark anew when it has moved by more since",
         "m, rad",
         low=0.0,
     )
-    relinearize_error: float = _setting(
+    relinearize_error: float = setting(
         _SOLVER.relinearize_error,
         "or when the square of that is more of the standard deviation of its strongest measurement",
         "sigma",
         low=0.0,
     )
-    relinearize_every: int = _setting(
+    relinearize_every: int = setting(
         _SOLVER.relinearize_every,
         "look for those at every so many updates (at each for ten times that far)",
         "updates",
         low=1,
         high=1_000_000,
     )
-    tolerance: float = _setting(
+    tolerance: float = setting(
         _SOLVER.tolerance, "changes up to this are not followed through the graph", "m, rad", low=0.0
     )
-    tolerance_sigmas: float = _setting(
+    tolerance_sigmas: float = setting(
         _SOLVER.tolerance_sigmas,
         "nor are those up to so many standard deviations of a pose or landmark given its neighbours",
         "sigma",
         low=0.0,
     )
-    method: str = _setting(
+    method: str = setting(
         _SOLVER.method,
         "of the solve at the end: gn (damped only where it fails to converge), lm or dogleg",
         choices=METHODS,
     )
-    max_iterations: int = _setting(
+    max_iterations: int = setting(
         _SOLVER.max_iterations, "of the solve at the end, of each stage of the losses", "", low=1, high=10_000
     )
-    step_tolerance: float = _setting(1e-5, "it has converged when no step is larger", "m, rad", low=0.0)
-    cost_tolerance: float = _setting(1e-9, "or when the cost changes by a smaller fraction", "", low=0.0)
+    step_tolerance: float = setting(1e-5, "it has converged when no step is larger", "m, rad", low=0.0)
+    cost_tolerance: float = setting(1e-9, "or when the cost changes by a smaller fraction", "", low=0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class TfConfig:
     """The transform map -> odom."""
 
-    publish: bool = _setting(True, "whether to broadcast map -> odom")
-    period_s: float = _setting(0.05, "broadcast this often, at most once per odometry stamp", "s", low=1e-3)
-    tolerance_s: float = _setting(0.1, "how far ahead of the odometry's stamp the transform is dated", "s", low=0.0)
+    publish: bool = setting(True, "whether to broadcast map -> odom")
+    period_s: float = setting(0.05, "broadcast this often, at most once per odometry stamp", "s", low=1e-3)
+    tolerance_s: float = setting(0.1, "how far ahead of the odometry's stamp the transform is dated", "s", low=0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class InputsConfig:
     """What is listened to."""
 
-    names: str = _setting(" ".join(_USUAL_INPUTS), "the inputs, each with a section of its name")
-    reliable: bool = _setting(False, "ask for reliable delivery (a best-effort publisher then does not connect)")
-    depth: int = _setting(1000, "messages the middleware may hold for a subscription", "messages", low=1, high=100_000)
-    tf: bool = _setting(True, "whether /tf is listened to, for sensors on moving joints; /tf_static always is")
-    tf_buffer_s: float = _setting(10.0, "how long transforms of /tf are kept", "s", low=0.1)
-    tf_wait_s: float = _setting(
+    names: str = setting(" ".join(_USUAL_INPUTS), "the inputs, each with a section of its name")
+    reliable: bool = setting(False, "ask for reliable delivery (a best-effort publisher then does not connect)")
+    depth: int = setting(1000, "messages the middleware may hold for a subscription", "messages", low=1, high=100_000)
+    tf: bool = setting(True, "whether /tf is listened to, for sensors on moving joints; /tf_static always is")
+    tf_buffer_s: float = setting(10.0, "how long transforms of /tf are kept", "s", low=0.1)
+    tf_wait_s: float = setting(
         0.2,
         "how much newer odometry may get before what is seen in a frame that /tf does not tell of is refused",
         "s",
@@ -283,16 +278,16 @@ class InputsConfig:
 class OutputConfig:
     """What the node publishes and leaves behind."""
 
-    folder: str = _setting("graph_slam_run", "run folder written by ~/save and at shutdown; empty: none at shutdown")
-    keep_earlier: bool = _setting(True, "an earlier run in the folder is renamed (folder-1, ...), not replaced")
-    landmarks_every_keyframes: int = _setting(
+    folder: str = setting("graph_slam_run", "run folder written by ~/save and at shutdown; empty: none at shutdown")
+    keep_earlier: bool = setting(True, "an earlier run in the folder is renamed (folder-1, ...), not replaced")
+    landmarks_every_keyframes: int = setting(
         20,
         "publish ~/landmarks after this many keyframes, and after each solve of everything; each landmark takes time",
         "keyframes",
         low=1,
         high=1_000_000,
     )
-    pose_covariance_max: float = _setting(
+    pose_covariance_max: float = setting(
         1e6, "variance published for what a planar robot does not estimate (z, roll, pitch)", "m^2, rad^2", low=0.0
     )
 

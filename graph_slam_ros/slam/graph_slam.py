@@ -184,17 +184,29 @@ class GraphSlam:
         return self._covariance.copy()
 
     def landmark_covariances(self) -> list[Array]:
-        """Marginal of each landmark, in the map's axes, or of a pose in its tangent space; NaN where unknown.
+        """Marginal of each landmark, in the map's axes, or of a pose in its tangent space; NaN where unknown."""
+        return self._marginals([landmark.vertex for landmark in self.landmarks.values()])
 
-        Looking changes nothing: a landmark that was first seen after the last solve is unknown until the next, and so
-        are all where that failed.
+    def keyframe_covariances(self) -> Array:
+        """Marginal of every keyframe in its tangent space, (n, 3, 3) or (n, 6, 6); NaN where unknown."""
+        dof = self.space.dof
+        return np.array(self._marginals(self.keyframes.ids.tolist())).reshape(-1, dof, dof)
+
+    def _marginals(self, vertices: list[int]) -> list[Array]:
+        """Looking changes nothing.
+
+        What came in after the last solve is unknown until the next, and all is where that failed.
         """
-        vertices = [landmark.vertex for landmark in self.landmarks.values()]
         out = [np.full((dof, dof), np.nan) for dof in (self.graph.kind_of(vertex).dof for vertex in vertices)]
         known = [k for k, vertex in enumerate(vertices) if vertex < self._solved_vertices]
         for k, marginal in zip(known, self.solver.marginal([vertices[k] for k in known]), strict=True):
             out[k] = marginal
         return out
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether the last solve succeeded, so that covariances exist."""
+        return self._solved_vertices > 0
 
     @property
     def newest_odometry_ns(self) -> int | None:
@@ -321,8 +333,8 @@ class GraphSlam:
         newest = self._motions[-1]
         if where.keyframe != newest.keyframe or not newest.before_last_ns < where.stamp_ns:
             return False
-        shared = carry.shared_noise(self.space, m, where, self.config.landmarks.added_sigma_m)
-        return shared > self.config.keyframes.shared_noise
+        most, added_sigma_m = self.config.keyframes.shared_noise, self.config.landmarks.added_sigma_m
+        return carry.is_shared(self.space, m, where, most, added_sigma_m)
 
     def _keyframe_at(self, where: Where) -> Where:
         """A keyframe at a stamp within the last step of odometry, which is cut in two."""
@@ -342,7 +354,10 @@ class GraphSlam:
             self._count(m, "not_used")
             return []
         if how == "id":
-            return [(s.id, s) for s in m.sightings]
+            named = [(s.id, s) for s in m.sightings if s.id]
+            if len(named) < len(m.sightings):
+                self.counters.count(m.topic, "no_id", len(m.sightings) - len(named))
+            return named
         return self._unnamed.identified(m, where)
 
     def _where(self, stamp_ns: int) -> Where:
@@ -410,22 +425,20 @@ class GraphSlam:
         self._hand_over()
         try:
             if everything is None:
+                self._review_if_due()
                 self.solver.update()
             else:
                 self.report = self.solver.optimize(everything)
             (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
             self.solves += 1
             self._solved_vertices = self._handed_over[0]
-            self._review(everything)
         except GraphSlamError as error:
             self.counters.count("solver", type(error).__name__)
 
-    def _review(self, everything: Settings | None) -> None:
-        """Look at the unnamed landmarks again now and then; what that changes, the next solve takes in."""
-        if self.config.landmarks.association in ("none", "id"):
-            return
+    def _review_if_due(self) -> None:
+        """Look at the unnamed landmarks again now and then; what that changes is part of the solve that follows."""
         due = self.config.landmarks.review_every_keyframes
-        if everything is None and len(self.keyframes) % due == 0:
+        if self.config.landmarks.association in ("nearest", "joint") and len(self.keyframes) % due == 0:
             self._unnamed.review(self.keyframes[-1].stamp_ns)
 
     def _hand_over(self) -> None:

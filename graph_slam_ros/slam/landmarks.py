@@ -11,7 +11,7 @@ from graph_slam_ros.slam import carry, triangulation
 from graph_slam_ros.slam.carry import Carried, Where
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
-from graph_slam_ros.slam.edge_noise import edge_noise
+from graph_slam_ros.slam.edge_noise import LEAST_RAD2, edge_noise
 from graph_slam_ros.slam.measurements import Sighting
 from graph_slam_ros.slam.space import Numbers
 from graph_slam_ros.slam.triangulation import Glance, Place
@@ -39,16 +39,18 @@ class Landmark:
 
     Attributes
     ----------
+    is_unnamed : whether no sighting of it tells which it is
     is_tentative : whether it is too new to be believed: it may be given up
-    seen : its sightings, where these may change hands: those of landmarks without a name
+    seen : its sightings that do not tell which it is: they may change hands
     stamps : of these; a landmark is never seen twice at once
     """
 
     vertex: int
+    is_unnamed: bool = False
+    is_tentative: bool = False
     sightings: int = 0
     first_seen_ns: int = 0
     last_seen_ns: int = 0
-    is_tentative: bool = False
     seen: list[Seen] = field(default_factory=list)
     stamps: set[int] = field(default_factory=set)
 
@@ -101,7 +103,7 @@ class Landmarks:
         kind = self._space.pose if s.kind == "pose" else self._space.point
         if s.kind == "pose":
             value = self._space.group.compose(self._pose(where), value)
-        landmark = self.known[name] = Landmark(self._graph.add_vertex(kind, value), is_tentative=not s.id)
+        landmark = self.known[name] = Landmark(self._graph.add_vertex(kind, value), not s.id, not s.id)
         self._add_edge(topic, landmark, s, where)
 
     def _add_edge(self, topic: str, landmark: Landmark, s: Sighting, where: Where) -> None:
@@ -163,19 +165,18 @@ class Landmarks:
         self._take_out(landmark.seen)
         self._solver.remove(landmark.vertex)
 
-    def merge(self, kept: str, merged: str) -> int:
-        """Give the sightings of one landmark to another; returns how many."""
+    def merge(self, kept: str, merged: str) -> None:
+        """Give the sightings of one landmark to another."""
         a, b = self.known[kept], self.known[merged]
         self.give_up(merged)
         for one in b.seen:
             self._add_edge(one.topic, a, one.sighting, one.where)
-        return len(b.seen)
 
-    def part(self, kept: str, merged: str, first: int, count: int) -> None:
+    def part(self, kept: str, merged: str, moved: Sequence[Seen]) -> None:
         """Take a merger back: these sightings are of a landmark of their own."""
         a = self.known[kept]
-        moved = a.seen[first : first + count]
-        del a.seen[first : first + count]
+        gone = {one.edge for one in moved}
+        a.seen = [one for one in a.seen if one.edge not in gone]
         a.stamps = {one.where.stamp_ns for one in a.seen}
         a.sightings -= len(moved)
         self._take_out(moved)
@@ -187,11 +188,7 @@ class Landmarks:
         for one in seen:
             self._solver.set_weight(one.edge, 0.0)
 
-    def kind_of(self, landmark: Landmark) -> VertexKind:
-        """Point or pose."""
-        return self._graph.kind_of(landmark.vertex)
-
-    def kind_at(self, vertex: int) -> VertexKind:
+    def kind_of(self, vertex: int) -> VertexKind:
         """Point or pose."""
         return self._graph.kind_of(vertex)
 
@@ -199,8 +196,7 @@ class Landmarks:
         """Sum of the squared whitened residuals of some edges, without loss, and how many numbers they are."""
         total, count = 0.0, 0
         for edge in edges:
-            table = list(self._graph.tables.values())[self._graph.table_of_edge.values[edge]]
-            row = int(self._graph.row_of_edge.values[edge])
+            table, row = self._graph.row(edge)
             values = [self._solver.estimate([v])[0] for v in table.vertices.values[row].tolist()]
             at = np.cumsum([0, *(len(v) for v in values[:-1])])[None, :]
             residual, _ = table.type.linearize(np.concatenate(values), at, table.measured.values[row : row + 1])
@@ -222,8 +218,7 @@ class Landmarks:
     def _determine(self, name: str, waiting: Waiting) -> None:
         glances = []
         for where, s in waiting.seen:
-            m = len(s.measured)
-            covariance = np.array(s.covariance).reshape(m, m) + 1e-10 * np.eye(m)
+            covariance = carry.square(s.covariance) + LEAST_RAD2 * np.eye(len(s.measured))
             glances.append(Glance(self._sensor_pose(s, where), s.kind, s.measured, covariance))
         waiting.places = triangulation.places(self._space, glances, self._config.landmarks.range_offset_sigma_m)
         waiting.reason = self._why_not(waiting.places, glances)

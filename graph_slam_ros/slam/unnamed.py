@@ -19,6 +19,7 @@ from graph_slam_ros.slam.association import NEW, UNCLEAR, Candidates, Gates
 from graph_slam_ros.slam.carry import Carried, Where
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
+from graph_slam_ros.slam.edge_noise import LEAST_M2
 from graph_slam_ros.slam.landmarks import Landmark, Landmarks
 from graph_slam_ros.slam.measurements import Sighting, Sightings
 from graph_slam_ros.slam.space import Numbers
@@ -35,12 +36,11 @@ _POSITIONED = ("position", "pose", "range_bearing")
 
 @dataclass(frozen=True, slots=True)
 class Merger:
-    """Two landmarks that became one: which, the sightings that changed hands, and the edges they are now."""
+    """Two landmarks that became one, and the sightings that changed hands, each by its stamp and itself."""
 
     kept: str
     merged: str
-    first: int
-    count: int
+    seen: frozenset[tuple[int, Sighting]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +82,14 @@ class Unnamed:
 
     def identified(self, m: Sightings, where: Where) -> list[tuple[str, Sighting]]:
         """The sightings of a message that can be used, each with an identity; the others are counted."""
-        out = [(s.id, s) for s in m.sightings if s.id]
+        known = self._landmarks.known
+        named = [(s.id, s) for s in m.sightings if s.id]
+        out = [(name, s) for name, s in named if name not in known or not known[name].is_unnamed]
+        if len(out) < len(named):  # whoever gives such names, an unnamed landmark cannot be taken back any more
+            self._counters.count(m.topic, "id_of_an_unnamed", len(named) - len(out))
         unnamed = [s for s in m.sightings if not s.id and s.kind in _POSITIONED]
-        if len(out) + len(unnamed) < len(m.sightings):
-            self._counters.count(m.topic, "no_id", len(m.sightings) - len(out) - len(unnamed))
+        if len(named) + len(unnamed) < len(m.sightings):
+            self._counters.count(m.topic, "no_id", len(m.sightings) - len(named) - len(unnamed))
         found = self._associated(unnamed, where) if unnamed else []
         if len(found) < len(unnamed):
             self._counters.count(m.topic, "unclear_which", len(unnamed) - len(found))
@@ -110,9 +114,9 @@ class Unnamed:
         """With a covariance (n, n) in the keyframe's axes added."""
         added = self._config.unnamed_sigma_m**2 * np.eye(self._space.dimensions)
         spread = added if spread is None else spread + added
-        space, size = self._space, len(s.measured)
-        n, covariance = space.dimensions, np.array(s.covariance).reshape(size, size)
-        axes = space.turn(where.T_keyframe_base).T
+        space = self._space
+        n, covariance = space.dimensions, carry.square(s.covariance)
+        axes: Array = space.turn(where.T_keyframe_base).T
         if s.kind == "pose":
             axes = space.turn(s.measured).T @ axes
         elif s.kind == "range_bearing":
@@ -123,11 +127,13 @@ class Unnamed:
 
     def _extent(self) -> Array:
         """Covariance of where on a landmark, or among several close by, it is seen."""
-        return (self._config.added_sigma_m**2 + self._config.unnamed_sigma_m**2) * np.eye(self._space.dimensions)
+        variance = self._config.added_sigma_m**2 + self._config.unnamed_sigma_m**2
+        return max(variance, LEAST_M2) * np.eye(self._space.dimensions)
 
     def _new_name(self) -> str:
         self._begun += 1
-        return f"unnamed{self._begun}"
+        name = f"unnamed{self._begun}"
+        return name if name not in self._landmarks.known else self._new_name()
 
     def _position(self, s: Sighting, where: Where) -> Carried:
         """Where it was seen, from the keyframe."""
@@ -140,9 +146,8 @@ class Unnamed:
     def _by_range_and_bearing(self, s: Sighting, where: Where) -> Carried:
         space, T_base_sensor = self._space, s.T_base_sensor or self._space.identity
         point = carry.point_of(space, s.measured)
-        n = space.dimensions
-        to_base = space.turn(T_base_sensor) @ np.linalg.inv(carry.gradient(space, s.kind, point))
-        own = to_base @ np.array(s.covariance).reshape(n, n) @ to_base.T
+        to_base = space.turn(T_base_sensor) @ carry.polar_derivative(space, s.measured)
+        own = to_base @ carry.square(s.covariance) @ to_base.T
         at_base = tuple(map(float, space.group.act(T_base_sensor, tuple(point.tolist()))))
         seen = Sighting("", "position", at_base, tuple(own.ravel().tolist()))
         return carry.position(space, seen, where)
@@ -178,7 +183,7 @@ class Unnamed:
         """Of landmarks (k, n), in map."""
         n = self._space.dimensions
         out = np.empty((len(vertices), n))
-        is_point = np.array([self._landmarks.kind_at(v) is self._space.point for v in vertices.tolist()], dtype=bool)
+        is_point = np.array([self._landmarks.kind_of(v) is self._space.point for v in vertices.tolist()], dtype=bool)
         for some in (is_point, ~is_point):
             if some.any():
                 out[some] = self._solver.estimate(vertices[some])[:, :n]
@@ -190,7 +195,8 @@ class Unnamed:
         """Look at landmarks again: part, merge, believe, give up."""
         self._part()
         known = self._landmarks.known
-        young = [name for name, mark in known.items() if mark.is_tentative and mark.sightings > 1]
+        unnamed = [name for name, mark in known.items() if mark.is_unnamed]
+        young = [name for name in unnamed if known[name].is_tentative and known[name].sightings > 1]
         if self._config.association == "joint":
             young = young[-_MOST_AT_ONCE:]
             self._merge(young, self._weighed(self._near(young)))
@@ -198,9 +204,10 @@ class Unnamed:
             for name in young:
                 self._merge([name], self._weighed(self._near([name])))
         # of the others each by itself
-        weighed = self._weighed(self._near([name for name, mark in known.items() if mark.seen]))
-        for name in list(known):
-            if known[name].seen and not known[name].is_tentative:
+        unnamed = [name for name in unnamed if name in known]
+        weighed = self._weighed(self._near(unnamed))
+        for name in unnamed:
+            if name in known and not known[name].is_tentative:
                 self._merge([name], weighed)
         for name in [name for name, mark in known.items() if mark.is_tentative]:
             self._believe_or_give_up(name, weighed, now_ns)
@@ -221,8 +228,10 @@ class Unnamed:
 
     def _merge_into(self, kept: str, merged: str) -> None:
         self._counters.count("landmarks", "merged")
-        first = len(self._landmarks.known[kept].seen)
-        self._mergers.append(Merger(kept, merged, first, self._landmarks.merge(kept, merged)))
+        seen = frozenset((one.where.stamp_ns, one.sighting) for one in self._landmarks.known[merged].seen)
+        followed = (replace(m, kept=kept) if m.kept == merged else m for m in self._mergers)
+        self._mergers = deque([*followed, Merger(kept, merged, seen)], self._mergers.maxlen)
+        self._landmarks.merge(kept, merged)
         self._hand_over()
 
     def _weighed(self, pairs: list[tuple[str, str]]) -> Weighed:
@@ -303,11 +312,11 @@ class Unnamed:
         return r, j @ joint @ j.T + np.kron(np.eye(len(pairs)), self._extent())
 
     def _dof(self, landmark: Landmark) -> int:
-        return self._landmarks.kind_of(landmark).dof
+        return self._landmarks.kind_of(landmark.vertex).dof
 
     def _axes(self, landmark: Landmark) -> Array:
         """From the landmark's tangent space to the map's axes, of its position."""
-        if self._landmarks.kind_of(landmark) is self._space.point:
+        if self._landmarks.kind_of(landmark.vertex) is self._space.point:
             return np.eye(self._space.dimensions)
         return self._space.turn(tuple(self._solver.estimate([landmark.vertex])[0].tolist()))
 
@@ -330,14 +339,16 @@ class Unnamed:
         """Take back a merger whose sightings do not fit."""
         for merger in list(self._mergers):
             landmark = self._landmarks.known.get(merger.kept)
-            if landmark is None:
+            moved = (
+                [one for one in landmark.seen if (one.where.stamp_ns, one.sighting) in merger.seen] if landmark else []
+            )
+            if not moved:
                 self._mergers.remove(merger)
                 continue
-            edges = [record.edge for record in landmark.seen[merger.first : merger.first + merger.count]]
-            fits, dof = self._landmarks.chi2_of(edges)
+            fits, dof = self._landmarks.chi2_of([one.edge for one in moved])
             if fits > association.quantile(1.0 - 1e-6, dof) and fits > 4.0 * dof:
                 self._counters.count("landmarks", "parted")
-                self._landmarks.part(merger.kept, merger.merged, merger.first, merger.count)
+                self._landmarks.part(merger.kept, merger.merged, moved)
                 self._hand_over()
                 self._parted.add((merger.kept, merger.merged))
                 self._mergers.remove(merger)

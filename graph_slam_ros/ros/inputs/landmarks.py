@@ -96,9 +96,7 @@ def _sighting(source: Source, stamp_ns: int, seen: Seen) -> Sighting:
 
 def _identity(source: Source, name: str) -> str:
     name = name or source.settings.id
-    if not name:
-        if source.config.landmarks.association == "id":
-            raise MessageError("no_id")
+    if not name:  # what becomes of it is the pipeline's to say
         return ""
     name = source.settings.id_prefix + name
     if len(name.encode()) > _LONGEST_ID:
