@@ -1,0 +1,67 @@
+"""What the node publishes, hears beside its inputs and serves: the node, the views and the tests read it here."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Interface:
+    """A topic or service; ``~`` is the node's own name, a relative name is in the node's namespace.
+
+    ``latched`` is reliable and transient local with depth 1: who joins late gets the last message.
+    """
+
+    name: str
+    type: str
+    meaning: str
+    latched: bool = False
+
+    def resolved(self, node: str = "/graph_slam") -> str:
+        """The name on a node of this fully qualified name."""
+        if self.name.startswith("~/"):
+            return node + self.name[1:]
+        return self.name if self.name.startswith("/") else f"{node.rpartition('/')[0]}/{self.name}"
+
+
+PUBLICATIONS = (
+    Interface("~/path", "nav_msgs/msg/Path", "the corrected path: every keyframe at its own stamp", latched=True),
+    Interface("~/path_updates", "nav_msgs/msg/Path", "the keyframes that are new or have moved"),
+    Interface(
+        "~/pose",
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "the newest keyframe in the map, with covariance",
+        latched=True,
+    ),
+    Interface("~/odometry", "nav_msgs/msg/Odometry", "the robot in the map, at each odometry message"),
+    Interface("~/landmarks", "visualization_msgs/msg/MarkerArray", "landmarks as 2-sigma ellipses", latched=True),
+    Interface(
+        "~/landmarks_estimate",
+        "vision_msgs/msg/Detection3DArray",
+        "landmarks with identity, position or pose, covariance",
+        latched=True,
+    ),
+    Interface("~/graph", "visualization_msgs/msg/MarkerArray", "vertices and edges of the graph", latched=True),
+    Interface("~/events", "diagnostic_msgs/msg/DiagnosticArray", "what has happened, once each"),
+    Interface("~/received", "std_msgs/msg/UInt64", "messages taken, for the player's pace", latched=True),
+    Interface("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", "state, counters, chi2, times"),
+    Interface("/tf", "tf2_msgs/msg/TFMessage", "map -> odom"),
+)
+
+# Beside the inputs (inputs.names); odom and detections are the default ones.
+SUBSCRIPTIONS = (
+    Interface("odom", "nav_msgs/msg/Odometry", "odometry"),
+    Interface("landmarks", "vision_msgs/msg/Detection3DArray", "sightings of landmarks"),
+    Interface("initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped", "where the robot is in the map"),
+    Interface("/tf", "tf2_msgs/msg/TFMessage", "sensors on moving joints, inputs on TF"),
+    Interface("/tf_static", "tf2_msgs/msg/TFMessage", "where sensors are on the robot", latched=True),
+    Interface("/clock", "rosgraph_msgs/msg/Clock", "time, with use_sim_time"),
+)
+
+SERVICES = (
+    Interface("~/save", "std_srvs/srv/Trigger", "solve everything and write the run folder"),
+    Interface("~/load", "std_srvs/srv/Trigger", "go on from a run folder"),
+    Interface("~/reset", "std_srvs/srv/Trigger", "forget everything and begin anew"),
+    Interface("~/pause", "std_srvs/srv/Trigger", "take no measurements until resumed"),
+    Interface("~/resume", "std_srvs/srv/Trigger", "take measurements again"),
+    Interface("~/optimize", "std_srvs/srv/Trigger", "solve everything until converged"),
+    Interface("~/clear_closures", "std_srvs/srv/Trigger", "take the loop closures out of the graph"),
+)
