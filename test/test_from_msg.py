@@ -213,7 +213,6 @@ LANDMARK_REFUSED = {
     ),
     "A9_inf": (lambda: detection(covariance=np.diag([0.01, math.inf])), "nonfinite_covariance"),
     "A15_unknown_frame": (lambda: detection(frame="camera"), "frame_unknown"),
-    "no_identity": (lambda: detection(name=""), "no_id"),
     "an_identity_of_more_than_128_bytes": (lambda: detection(name="ä" * 65), "id_too_long"),
     "A4_a_tag_of_known_heading_with_a_zero_quaternion": (
         lambda: detection(pose(q=quaternion(norm=0.0)), np.diag([0.01] * 6)),
@@ -281,8 +280,8 @@ def test_the_header_of_a_detection_goes_before_that_of_its_array():
 def test_class_id_is_the_identity_where_that_is_configured():
     b = border(landmarks={"id_from": "class_id"})
     found = (detection(name="x", class_id="tag7"), detection(name="y", class_id=""), detection(name="z", results=0))
-    assert only(heard(b, "detections", detections(*found))).id == "tag7"
-    assert counted(b) == {"detections": {"no_id": 2}}
+    assert [s.id for s in heard(b, "detections", detections(*found)).sightings] == ["tag7", "", ""]
+    assert counted(b) == {"detections": {"covariance_unknown": 1}}  # of z, which has no result
 
 
 def camera():

@@ -477,6 +477,13 @@ def test_a_closed_loop_moves_the_map_under_the_odometry_and_halves_its_error():
     assert np.hypot(*newest[:2]) < 0.5 * drift
 
 
+def test_with_identities_a_sighting_without_one_is_counted_and_the_others_of_its_message_are_used():
+    p = slam(landmarks={"association": "id"})
+    run(p, *straight(1), seen(0.5, point(""), point("a"), tag("")), seen(0.7, point("")), *END)
+    assert p.counters.as_dict() == {"/landmarks": {"no_id": 3}}
+    assert list(p.landmarks) == ["a"]
+
+
 class Failing:
     """A solver's update that fails while it is told to."""
 

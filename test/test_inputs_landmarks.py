@@ -2,6 +2,7 @@
 
 import math
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -127,14 +128,19 @@ def test_a_range_alone_is_a_range():
         (lambda: cloud(XYZ, (1.0, 2.0, 3.0, 4, math.nan)), "nonfinite_covariance"),
         (lambda: cloud([("id", "u4"), ("range", "f8")], (1, -2.0)), "range_not_positive"),
         (lambda: cloud([("id", "u4"), ("bearing", "f8")], (1, 0.2)), "covariance_unknown"),
-        (lambda: cloud([("x", "f4"), ("y", "f4")], (1.0, 2.0)), "no_id"),
-        (lambda: cloud([("x", "f4"), ("y", "f4"), ("id", "i4")], (1.0, 2.0, -1)), "no_id"),
     ],
 )
 def test_a_cloud_that_cannot_be_used_is_counted_under_its_reason(sent, reason):
     b = scanner(2)
     assert heard(b, "scan", sent()) is None
     assert counted(b) == {"scan": {reason: 1}}
+
+
+@pytest.mark.parametrize("number", [{}, {"id": -1}])
+def test_a_point_of_a_cloud_without_a_field_id_or_with_a_negative_one_has_no_identity(number):
+    layout = [("x", "f4"), ("y", "f4"), *((name, "i4") for name in number)]
+    s = only(heard(scanner(2, sigma_m=0.1), "scan", cloud(layout, (1.0, 2.0, *number.values()))))
+    assert (s.id, s.measured) == ("", (1.0, 2.0))
 
 
 def test_an_empty_cloud_is_a_legal_sign_of_life():
@@ -382,8 +388,9 @@ def test_rtabmaps_landmarks_have_their_own_frame_and_positive_ids():
         for k in (6, 0)
     ]
     m = heard(b, "seen", encoded(header=HEAD, landmarks=parts))
-    assert (only(m).id, only(m).kind, only(m).measured) == ("6", "pose", pytest.approx((3.0, 1.0, 0.0)))
-    assert counted(b) == {"seen": {"no_id": 1}}
+    assert [s.id for s in m.sightings] == ["6", ""]
+    assert {(s.kind, s.measured) for s in m.sightings} == {("pose", (3.0, 1.0, 0.0))}
+    assert counted(b) == {}
 
 
 def test_cartographers_weights_are_inverse_standard_deviations():
@@ -423,8 +430,9 @@ def test_mrpts_ranges_and_bearings_pitch_down_and_minus_one_is_no_identity(dimen
         sensor_std_pitch=0.03,
         sensed_data=parts,
     )
-    s = only(heard(b, "seen", sent))
+    s, unnamed = heard(b, "seen", sent).sightings
     assert (s.id, s.kind) == ("8", "range_bearing")
+    assert unnamed == replace(s, id="")
     level = math.cos(0.3)
     if dimensions == 3:
         assert s.measured == (5.0, 0.4, 0.3)
@@ -434,7 +442,7 @@ def test_mrpts_ranges_and_bearings_pitch_down_and_minus_one_is_no_identity(dimen
         assert s.measured == pytest.approx((5.0 * level, 0.5))
         assert np.diag(np.reshape(s.covariance, (2, 2))) == pytest.approx((0.01, (0.02 / level) ** 2))
         assert s.T_base_sensor == pytest.approx((1.0, 0.5, 0.0))
-    assert counted(b) == {"seen": {"no_id": 1}}
+    assert counted(b) == {}
 
 
 def test_mrpts_beacons_are_ranges():
