@@ -8,6 +8,7 @@ are in the pose's tangent space, with (x, y, theta) or (x, y, z, rotation vector
 those of ``landmarks.csv`` are in the axes of map. What is not known is nan; what a point does not have is empty.
 """
 
+import contextlib
 import itertools
 import json
 import os
@@ -83,16 +84,30 @@ def check_room(folder: Path, source: Path | None = None) -> None:
         raise RunError(f"{folder}: {error.strerror}") from None
 
 
-def keep_earlier(folder: Path | str) -> None:
-    """Move an earlier run out of the way: to ``folder-1``, or the first such name that is free."""
-    folder = Path(folder)
-    if not is_run(folder):
+def keep_earlier(folder: Path, most: int) -> None:
+    """Move an earlier run out of the way: to ``folder-1``, or one more than the last; so many of them are kept.
+
+    Of older ones the files that a run has are removed, and nothing else.
+    """
+    if not is_run(folder) or not most:
         return
-    free = next(name for k in itertools.count(1) if not (name := folder.with_name(f"{folder.name}-{k}")).exists())
+    earlier = earlier_runs(folder)
     try:
-        folder.rename(free)
+        folder.rename(folder.with_name(f"{folder.name}-{max(earlier, default=0) + 1}"))
+        for number in sorted(earlier)[: len(earlier) + 1 - most]:
+            _clear(earlier[number])
+            with contextlib.suppress(OSError):  # somebody has put more into it
+                earlier[number].rmdir()
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None
+
+
+def earlier_runs(folder: Path) -> dict[int, Path]:
+    """Earlier runs beside a run folder, by number."""
+    named = re.compile(re.escape(folder.name) + r"-([1-9]\d*)")
+    there = folder.parent.iterdir() if folder.parent.is_dir() else ()
+    found = {int(match[1]): run for run in there if (match := named.fullmatch(run.name))}
+    return {number: run for number, run in found.items() if is_run(run)}
 
 
 class RunRecorder:
@@ -264,11 +279,15 @@ def _make_room(folder: Path) -> None:
     check_room(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for file in folder.iterdir():
-            if file.name in _RESULTS or _is_of_a_start(file):
-                file.unlink()
+        _clear(folder)
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None
+
+
+def _clear(folder: Path) -> None:
+    for file in folder.iterdir():
+        if file.name in _RESULTS or _is_of_a_start(file):
+            file.unlink()
 
 
 def _temporary(path: Path) -> Path:

@@ -92,7 +92,7 @@ def test_a_file_may_be_flat_dotted_or_wrapped_as_ros_does(tmp_path):
 
 def test_an_empty_file_is_the_defaults_and_whole_numbers_do_for_floats(tmp_path):
     assert read(tmp_path, "") == Config()
-    assert read(tmp_path, "tf:\n  period_s: 1\n").tf.period_s == 1.0
+    assert read(tmp_path, "tf:\n  transform_tolerance: 1\n").tf.transform_tolerance == 1.0
 
 
 @pytest.mark.parametrize(
@@ -116,14 +116,14 @@ def test_F28_an_unknown_key_is_refused_with_the_nearest_known_one(name, nearest)
         ("solve.every_keyframes", 2.5, "2.5 is not an integer"),
         ("solve.every_keyframes", True, "True is not an integer"),
         ("solve.every_keyframes", 0, r"0 is not in \[1, 1e\+06\]"),
-        ("tf.publish", "yes", "'yes' is not true or false"),
-        ("tf.publish", 1, "1 is not true or false"),
-        ("tf.period_s", "1e-3", "'1e-3' is not a number"),
-        ("tf.period_s", None, "None is not a number"),
-        ("tf.period_s", [0.1], r"\[0.1\] is not a number"),
-        ("tf.period_s", float("nan"), "nan is not finite"),
-        ("tf.tolerance_s", float("inf"), "inf is not finite"),
-        ("tf.tolerance_s", 10**400, "is not a number"),
+        ("tf.publish_tf", "yes", "'yes' is not true or false"),
+        ("tf.publish_tf", 1, "1 is not true or false"),
+        ("tf.transform_publish_period", "1e-3", "'1e-3' is not a number"),
+        ("tf.transform_publish_period", None, "None is not a number"),
+        ("tf.transform_publish_period", [0.1], r"\[0.1\] is not a number"),
+        ("tf.transform_publish_period", float("nan"), "nan is not finite"),
+        ("tf.transform_tolerance", float("inf"), "inf is not finite"),
+        ("tf.transform_tolerance", 10**400, "is not a number"),
         ("keyframes.min_angle_rad", 3.2, r"3.2 is not in \[0.001, 3.14159\]"),
         ("anchor.sigma_m", -1, r"-1.0 is not in \[1e-06, inf\]"),
         ("frames.map", 3, "3 is not a text"),
@@ -139,9 +139,9 @@ def test_a_value_of_the_wrong_type_or_out_of_range_is_refused_by_name(name, valu
 @pytest.mark.parametrize(
     "text, complaint",
     [
-        ("tf:\n  period_s: 0.1\n  period_s: 0.2\n", "line 3: 'period_s' is given twice"),
+        ("tf:\n  stamp: now\n  stamp: now\n", "line 3: 'stamp' is given twice"),
         ("[1, 2]\n", "not a mapping of parameters"),
-        ("tf: {period_s: 0.1\n", "not valid YAML"),
+        ("tf: {stamp: now\n", "not valid YAML"),
         ("1: 2\n", "1 is not a name"),
         ("? [a, b]\n: 1\n", "line 1: a key is not a name"),
         ("? {a: b}\n: 1\n", "line 1: a key is not a name"),
@@ -172,7 +172,7 @@ def test_a_file_that_is_missing_or_no_text_is_refused_by_name(tmp_path, content)
 def test_a_setting_is_read_as_yaml_reads_it():
     assert parse_setting("a.b=0.5") == ("a.b", 0.5)
     assert parse_setting("frames.map=x=y") == ("frames.map", "x=y")
-    assert parse_setting("tf.publish=false") == ("tf.publish", False)
+    assert parse_setting("tf.publish_tf=false") == ("tf.publish_tf", False)
     assert parse_setting("output.folder=") == ("output.folder", None)
 
 
@@ -184,9 +184,9 @@ def test_a_setting_that_is_not_one_is_refused(text):
 
 def test_the_command_line_names_the_file_or_the_key_that_is_wrong(tmp_path, capsys):
     file = tmp_path / "mine.yaml"
-    file.write_text("tf:\n  periods: 0.1\n")
+    file.write_text("tf:\n  stamps: now\n")
     for options, culprit in (
-        (["--config", str(file)], "mine.yaml: unknown parameter 'tf.periods'; did you mean 'tf.period_s'?"),
+        (["--config", str(file)], "mine.yaml: unknown parameter 'tf.stamps'; did you mean 'tf.stamp'?"),
         (["--set", "solve.metod=lm"], "unknown parameter 'solve.metod'; did you mean 'solve.method'?"),
         (["--set", "ordering.window_s=-1"], "ordering.window_s: -1.0 is not in [0, inf]"),
     ):

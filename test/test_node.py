@@ -345,7 +345,7 @@ def test_without_a_node_the_player_says_so(bag, monkeypatch, capsys):
 def session(messages, tmp_path_factory):
     """One run of a node with all that was heard of it, and a listener that came late."""
     folder = tmp_path_factory.mktemp("session") / "run"
-    parameters = (f"output.folder:={folder}", "inputs.reliable:=true", "tf.period_s:=0.01")
+    parameters = (f"output.folder:={folder}", "inputs.reliable:=true", "tf.transform_publish_period:=0.01")
     with node(*parameters) as n, robot() as r:
         r.wait_for_node()
         for _ in range(20):

@@ -182,6 +182,14 @@ class Graph:
         """The table and row of an edge."""
         return self._in_order[self.table_of_edge.values[edge_id]], int(self.row_of_edge.values[edge_id])
 
+    def edges_of(self, label: str) -> Index:
+        """Ids of the edges of a class, in order."""
+        if label not in self.labels:
+            return np.empty(0, dtype=np.int64)
+        code = self.labels.index(label)
+        found = [table.id.values[table.label.values == code] for table in self.tables.values()]
+        return np.sort(np.concatenate(found))
+
     def _label_code(self, label: str) -> int:
         if label not in self.labels:
             self.labels.append(label)

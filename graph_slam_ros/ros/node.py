@@ -5,6 +5,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path as FilePath
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy comes in: threads would reorder sums
@@ -47,8 +48,8 @@ class GraphSlamNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__("graph_slam", **options)
         config = declare_parameters(self)
-        if config.output.folder and config.output.keep_earlier:
-            keep_earlier(config.output.folder)
+        if config.output.folder:
+            keep_earlier(FilePath(config.output.folder), config.output.keep_earlier)
         self._recorder = RunRecorder(config.output.folder, config) if config.output.folder else None
         self.get_logger().info("compiling kernels (once per installation)")
         self.get_logger().info(f"kernels ready after {warmup():.1f} s")
@@ -87,8 +88,8 @@ class GraphSlamNode(Node):
                 inputs.setdefault((one.type, self.resolve_topic_name(one.topic)), []).append(one.name)
         for (type_name, topic), names in inputs.items():
             self._subscribe(type_name, topic, names, qos)
-        if config.tf.publish:
-            self.create_timer(config.tf.period_s, self._guarded(self._publish_tf))
+        if config.tf.publish_tf:
+            self.create_timer(config.tf.transform_publish_period, self._guarded(self._publish_tf))
         # a player with /clock waits for this one, so it must not wait for /clock
         self.create_timer(0.1, self._guarded(self._look_for_player), clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -172,7 +173,7 @@ class GraphSlamNode(Node):
         if stamp_ns is None or stamp_ns <= self._sent_tf_ns:
             return
         self._sent_tf_ns = stamp_ns
-        ahead_ns = round(self._slam.config.tf.tolerance_s * 1e9)
+        ahead_ns = round(self._slam.config.tf.transform_tolerance * 1e9)
         self._tf.publish(results.map_to_odom(self._slam, stamp_ns + ahead_ns))
 
     def _look_for_player(self) -> None:

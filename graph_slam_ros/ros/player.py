@@ -257,7 +257,7 @@ def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subproces
         config,
         inputs=replace(config.inputs, reliable=True),
         sources=tuple(replace(one, topic=inputs.topics.get(one.name, one.topic)) for one in config.sources),
-        output=replace(config.output, folder=str(folder), keep_earlier=False),
+        output=replace(config.output, folder=str(folder), keep_earlier=0),
     )
     with tempfile.TemporaryDirectory() as scratch:
         parameters = Path(scratch) / "parameters.yaml"

@@ -15,11 +15,19 @@ from typing import Any
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.slam.input_config import DEFAULT_INPUTS, InputConfig, default_input
+from graph_slam_ros.slam.node_config import (
+    USUAL_INPUTS,
+    HealthConfig,
+    InitialPoseConfig,
+    InputsConfig,
+    NodeConfig,
+    OutputConfig,
+    TfConfig,
+    TimeConfig,
+)
 from graph_slam_ros.slam.parameter import Parameter, section_parameters, setting
 from graph_slam_ros.slam.space import PLANE, SPACE, Space
 from graph_slam_ros.solver import METHODS, Settings
-
-_USUAL_INPUTS = tuple(one.name for one in DEFAULT_INPUTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,13 +95,14 @@ class OdometryConfig:
 class KeyframesConfig:
     """When the robot's motion earns a new vertex."""
 
-    min_distance_m: float = setting(0.25, "a keyframe after this distance", "m", low=1e-3)
-    min_angle_rad: float = setting(0.25, "or after this change of heading", "rad", low=1e-3, high=math.pi)
+    min_distance_m: float = setting(0.25, "a keyframe after this distance", "m", low=1e-3, live=True)
+    min_angle_rad: float = setting(0.25, "or after this change of heading", "rad", low=1e-3, high=math.pi, live=True)
     max_interval_s: float = setting(
         1.0,
         "or after this much time in motion: odometry's noise grows with time, and sightings in between share it",
         "s",
         low=1e-3,
+        live=True,
     )
     shared_noise: float = setting(
         0.05,
@@ -101,6 +110,7 @@ class KeyframesConfig:
         " same to all that is seen at once",
         "part of variance",
         low=0.0,
+        live=True,
     )
 
 
@@ -206,19 +216,21 @@ class SolveConfig:
     """When and how the graph is solved: a little at each keyframe, and everything at the end."""
 
     every_keyframes: int = setting(
-        1, "update the estimate after this many keyframes", "keyframes", low=1, high=1_000_000
+        1, "update the estimate after this many keyframes", "keyframes", low=1, high=1_000_000, live=True
     )
     relinearize_above: float = setting(
         _SOLVER.relinearize_above,
         "linearise a pose or landmark anew when it has moved by more since",
         "m, rad",
         low=0.0,
+        live=True,
     )
     relinearize_error: float = setting(
         _SOLVER.relinearize_error,
         "or when the square of that is more of the standard deviation of its strongest measurement",
         "sigma",
         low=0.0,
+        live=True,
     )
     relinearize_every: int = setting(
         _SOLVER.relinearize_every,
@@ -226,70 +238,34 @@ class SolveConfig:
         "updates",
         low=1,
         high=1_000_000,
+        live=True,
     )
     tolerance: float = setting(
-        _SOLVER.tolerance, "changes up to this are not followed through the graph", "m, rad", low=0.0
+        _SOLVER.tolerance, "changes up to this are not followed through the graph", "m, rad", low=0.0, live=True
     )
     tolerance_sigmas: float = setting(
         _SOLVER.tolerance_sigmas,
         "nor are those up to so many standard deviations of a pose or landmark given its neighbours",
         "sigma",
         low=0.0,
+        live=True,
     )
     method: str = setting(
         _SOLVER.method,
         "of the solve at the end: gn (damped only where it fails to converge), lm or dogleg",
         choices=METHODS,
+        live=True,
     )
     max_iterations: int = setting(
-        _SOLVER.max_iterations, "of the solve at the end, of each stage of the losses", "", low=1, high=10_000
-    )
-    step_tolerance: float = setting(1e-5, "it has converged when no step is larger", "m, rad", low=0.0)
-    cost_tolerance: float = setting(1e-9, "or when the cost changes by a smaller fraction", "", low=0.0)
-
-
-@dataclass(frozen=True, slots=True)
-class TfConfig:
-    """The transform map -> odom."""
-
-    publish: bool = setting(True, "whether to broadcast map -> odom")
-    period_s: float = setting(0.05, "broadcast this often, at most once per odometry stamp", "s", low=1e-3)
-    tolerance_s: float = setting(0.1, "how far ahead of the odometry's stamp the transform is dated", "s", low=0.0)
-
-
-@dataclass(frozen=True, slots=True)
-class InputsConfig:
-    """What is listened to."""
-
-    names: str = setting(" ".join(_USUAL_INPUTS), "the inputs, each with a section of its name")
-    reliable: bool = setting(False, "ask for reliable delivery (a best-effort publisher then does not connect)")
-    depth: int = setting(1000, "messages the middleware may hold for a subscription", "messages", low=1, high=100_000)
-    tf: bool = setting(True, "whether /tf is listened to, for sensors on moving joints; /tf_static always is")
-    tf_buffer_s: float = setting(10.0, "how long transforms of /tf are kept", "s", low=0.1)
-    tf_wait_s: float = setting(
-        0.2,
-        "how much newer odometry may get before what is seen in a frame that /tf does not tell of is refused",
-        "s",
-        low=0.0,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class OutputConfig:
-    """What the node publishes and leaves behind."""
-
-    folder: str = setting("graph_slam_run", "run folder written by ~/save and at shutdown; empty: none at shutdown")
-    keep_earlier: bool = setting(True, "an earlier run in the folder is renamed (folder-1, ...), not replaced")
-    landmarks_every_keyframes: int = setting(
-        20,
-        "publish ~/landmarks after this many keyframes, and after each solve of everything; each landmark takes time",
-        "keyframes",
+        _SOLVER.max_iterations,
+        "of the solve at the end, of each stage of the losses",
+        "",
         low=1,
-        high=1_000_000,
+        high=10_000,
+        live=True,
     )
-    pose_covariance_max: float = setting(
-        1e6, "variance published for what a planar robot does not estimate (z, roll, pitch)", "m^2, rad^2", low=0.0
-    )
+    step_tolerance: float = setting(1e-5, "it has converged when no step is larger", "m, rad", low=0.0, live=True)
+    cost_tolerance: float = setting(1e-9, "or when the cost changes by a smaller fraction", "", low=0.0, live=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,9 +280,13 @@ class Config:
     anchor: AnchorConfig = AnchorConfig()
     ordering: OrderingConfig = OrderingConfig()
     solve: SolveConfig = SolveConfig()
+    initialpose: InitialPoseConfig = InitialPoseConfig()
     tf: TfConfig = TfConfig()
     inputs: InputsConfig = InputsConfig()
     output: OutputConfig = OutputConfig()
+    time: TimeConfig = TimeConfig()
+    health: HealthConfig = HealthConfig()
+    node: NodeConfig = NodeConfig()
     sources: tuple[InputConfig, ...] = DEFAULT_INPUTS
 
     @classmethod
@@ -331,6 +311,16 @@ class Config:
         trees = {name: type(default)(**sections.get(name, {})) for name, default in _sections()}
         inputs = (dataclasses.replace(default_input(name), **sections.get(name, {})) for name in names)
         return cls(**trees, sources=tuple(inputs))
+
+    def changed(self, values: Mapping[str, Any]) -> "Config":
+        """With other values of some parameters, by dotted name; all of them or none.
+
+        Raises
+        ------
+        ConfigError
+            As for ``from_mapping``.
+        """
+        return Config.from_mapping(dict(flatten(self.as_mapping())) | dict(values))
 
     def as_mapping(self) -> dict[str, dict[str, Any]]:
         """Nested plain values, every parameter named."""
@@ -392,7 +382,7 @@ def _unlisted(name: str, names: list[str]) -> str:
     return f" {section!r} is not in inputs.names ({' '.join(names)})"
 
 
-def parameters(names: Iterable[str] = _USUAL_INPUTS) -> Iterator[Parameter]:
+def parameters(names: Iterable[str] = USUAL_INPUTS) -> Iterator[Parameter]:
     """Every parameter, in the order of the tree, named ``section.key``, with a section for each named input."""
     for name, defaults in _sections():
         yield from section_parameters(name, defaults)

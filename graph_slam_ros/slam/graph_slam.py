@@ -3,6 +3,7 @@
 Its state is a function of the configuration and the sequence of accepted measurements, nothing else.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from graph_slam_ros.slam.measurements import (
     Closure,
     Control,
     Fix,
+    InitialPose,
     Measurement,
     Observation,
     Odometry,
@@ -58,18 +60,45 @@ class SightingPose:
 
 
 @dataclass(frozen=True, slots=True)
+class Correction:
+    """How far a solve moved map -> odom, and what new edges, odometry apart, it had to reconcile.
+
+    Attributes
+    ----------
+    distance_m, angle_rad : of the robot's newest keyframe, the jump that a user sees
+    edges : ids, the one that fitted least before first
+    chi2 : of each, per number measured, before the solve
+    """
+
+    distance_m: float = 0.0
+    angle_rad: float = 0.0
+    edges: tuple[int, ...] = ()
+    chi2: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Update:
-    """What ``process`` changed: indices of new keyframes; whether it solved; the report of a solve of everything."""
+    """What ``process`` changed.
+
+    Attributes
+    ----------
+    keyframes : indices of new ones
+    solved : whether it solved
+    report : of a solve of everything
+    correction : of the last solve
+    """
 
     keyframes: tuple[int, ...] = ()
     solved: bool = False
     report: Report | None = None
+    correction: Correction = Correction()
 
     def __bool__(self) -> bool:
         return bool(self.keyframes) or self.solved
 
 
 _NOTHING = Update()
+_BLAMED = 5  # edges that are named as the cause of a correction
 
 
 class GraphSlam:
@@ -92,6 +121,7 @@ class GraphSlam:
         self.segments: list[int] = []  # keyframes at which odometry began, or began anew
         self.solves = 0
         self.report: Report | None = None  # of the last solve of everything
+        self.correction = Correction()  # of the last solve
         self._sink = sink
         self._order = StampOrder(self.config.ordering, self.counters)
         self._odometry = OdometryChoice(
@@ -102,8 +132,11 @@ class GraphSlam:
         self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self._hand_over)
         self._motions: deque[Motion] = deque()  # since each of the last keyframes, as far back as late ones may reach
         self._waiting: list[Observation] = []
+        self._epoch = 0  # the first keyframe since stamps began anew
+        self._initial_pose: InitialPose | None = None  # for the next odometry
         self._covariance = np.zeros((self.space.dof, self.space.dof))
         self._handed_over = 0, 0  # vertices and edges the solver has
+        self._taken_in = 0  # edges of these
         self._solved_vertices = 0  # of these, what the last solve took in: none where it failed
         self._unsolved_keyframes = 0
 
@@ -111,7 +144,7 @@ class GraphSlam:
 
     def process(self, measurement: Measurement) -> Update:
         """Take one measurement or control event; returns what it changed."""
-        if not isinstance(measurement, Control) and not self._order.accepts(measurement):
+        if not isinstance(measurement, Control | InitialPose) and not self._order.accepts(measurement):
             return _NOTHING
         if self._sink is not None:
             self._sink(measurement)
@@ -124,14 +157,25 @@ class GraphSlam:
             case Control("end"):
                 self._use(self._order.flush())
                 self._drop_unreached()
+            case InitialPose():
+                self._initial_pose = measurement
             case Control("optimize"):
                 self._solve(self.config.solver_settings())
+            case Control("clear_closures"):
+                self._clear_closures()
+            case Control("time_jump"):
+                self._forget_time()
+            case Control("set", values):
+                self.config = self.config.changed(dict(values))
+                self.solver.settings = self.config.solver_settings()
             case Control(event):
                 self.counters.count("control", f"unknown event {event}")
         if len(self.keyframes) == first_new and self.solves == solves:
             return _NOTHING
         new = self.report if self.report is not report else None
-        return Update(tuple(range(first_new, len(self.keyframes))), self.solves > solves, new)
+        solved = self.solves > solves
+        correction = self.correction if solved else Correction()
+        return Update(tuple(range(first_new, len(self.keyframes))), solved, new, correction)
 
     # -- what is known now ---------------------------------------------------------------------------------------
 
@@ -213,6 +257,11 @@ class GraphSlam:
         """Stamp of the last odometry that was used."""
         return self._odometry.newest_ns
 
+    @property
+    def _oldest_ns(self) -> int:
+        """Stamp of the first keyframe, of those whose stamps are of the present time."""
+        return int(self.keyframes.stamps_ns[self._epoch])
+
     # -- odometry ------------------------------------------------------------------------------------------------
 
     def _use(self, released: list[Odometry | Observation]) -> None:
@@ -224,15 +273,15 @@ class GraphSlam:
                 self._on_observation(m)
 
     def _on_step(self, step: Step) -> None:
-        if not self._motions:
+        if not self.keyframes:
             self._first_keyframe(step)
-        elif step.broken:
+        elif step.broken or not self._motions or self._initial_pose:
             self._begin_segment(step)
         else:
             self._motions[-1].step(step)
             self._use_waiting(step.stamp_ns)
             if self._keyframe_due():
-                self._next_keyframe(step, self._motions[-1].now.covariance)
+                self._next_keyframe(step)
 
     def _keyframe_due(self) -> bool:
         due, motion, n = self.config.keyframes, self._motions[-1], self.space.dimensions
@@ -250,29 +299,68 @@ class GraphSlam:
         self.segments.append(0)
         self._append_keyframe(vertex, step)
 
-    def _next_keyframe(self, step: Step, covariance: Array) -> None:
-        self._add_keyframe(step, covariance)
+    def _next_keyframe(self, step: Step) -> None:
+        now = self._motions[-1].now
+        self._add_keyframe(step, now.T_keyframe_base, now.covariance)
         self._solve_if_due()
 
-    def _add_keyframe(self, step: Step, covariance: Array) -> None:
-        """A vertex where odometry is now, and the motion to it from the last as an edge."""
+    def _add_keyframe(self, step: Step, T_last_now: Numbers, covariance: Array, at: Numbers | None = None) -> None:
+        """A vertex where odometry is now, or where it is said to be, and the motion to it from the last as an edge."""
         space, last = self.space, self.keyframes[-1]
-        T_last_now = self._motions[-1].now.T_keyframe_base
         noise = edge_noise(self.counters, "odometry", covariance, space.dimensions)
-        vertex = self.graph.add_vertex(space.pose, space.group.compose(self._pose(last.vertex), T_last_now))
+        vertex = self.graph.add_vertex(space.pose, at or space.group.compose(self._pose(last.vertex), T_last_now))
         self.graph.add_edge(space.relative_pose, [last.vertex, vertex], T_last_now, noise, "odometry")
         self._covariance = space.group.propagate(self._covariance, T_last_now, covariance)
         self._append_keyframe(vertex, step)
         self._unsolved_keyframes += 1
 
     def _begin_segment(self, step: Step) -> None:
-        """Where odometry jumped, nearly nothing is known of the motion; what the robot sees will tell."""
-        self._use_waiting(self._motions[-1].now.stamp_ns)
-        jump, n = self.config.odometry, self.space.dimensions
-        loose = [jump.jump_sigma_m] * n + [jump.jump_sigma_rad] * (self.space.dof - n)
-        self.segments.append(len(self.keyframes))
-        self._next_keyframe(step, self._motions[-1].now.covariance + np.diag(np.square(loose)))
+        """Where odometry jumped, or time did, nearly nothing is known of the motion; what the robot sees will tell.
+
+        Or somebody tells: an initial pose.
+        """
+        said, self._initial_pose = self._initial_pose, None
+        T_last_now, covariance = self._motion_into(step)
+        loose, n = self._loose(said), self.space.dimensions
+        if said is None or self.config.initialpose.use == "segment":
+            self.segments.append(len(self.keyframes))
+        sigmas = [loose[0]] * n + [loose[1]] * (self.space.dof - n)
+        covariance = covariance + np.diag(np.square(sigmas))
+        self._add_keyframe(step, T_last_now, covariance, said.T_map_base if said else None)
+        if said:
+            noise = edge_noise(self.counters, "initialpose", carry.square(said.covariance), n)
+            self.graph.add_edge(
+                self.space.pose_prior, [self.keyframes[-1].vertex], said.T_map_base, noise, "initialpose"
+            )
+            self._solve()
+        self._solve_if_due()
         self._use_waiting(step.stamp_ns)
+
+    def _motion_into(self, step: Step) -> tuple[Numbers, Array]:
+        """From the last keyframe, as far as odometry tells: after a jump of time what it says is all there is."""
+        if not self._motions:
+            T_last_now = self.space.group.between(self.keyframes[-1].T_odom_base, step.T_odom_base)
+            return T_last_now, np.zeros((self.space.dof, self.space.dof))
+        if not step.broken:
+            self._motions[-1].step(step)
+        self._use_waiting(self._motions[-1].now.stamp_ns)
+        now = self._motions[-1].now
+        return now.T_keyframe_base, now.covariance
+
+    def _loose(self, said: InitialPose | None) -> tuple[float, float]:
+        """What is added to the noise of that motion, in metres and in radians."""
+        if said and self.config.initialpose.use == "prior":
+            return self.config.initialpose.loosen_m, self.config.initialpose.loosen_rad
+        return self.config.odometry.jump_sigma_m, self.config.odometry.jump_sigma_rad
+
+    def _forget_time(self) -> None:
+        """Stamps begin anew, the map stays: the next odometry begins a segment."""
+        self._use(self._order.flush())
+        self._drop_unreached()
+        self._order.forget()
+        self._odometry.forget()
+        self._motions.clear()
+        self._epoch = len(self.keyframes)
 
     def _append_keyframe(self, vertex: int, step: Step) -> None:
         self.keyframes.append(vertex, step.stamp_ns, step.T_odom_base)
@@ -286,7 +374,7 @@ class GraphSlam:
     def _on_observation(self, m: Observation) -> None:
         """Use what is not too late; what is newer than all odometry waits for the next."""
         newest_ns = self.newest_odometry_ns
-        if newest_ns is None or m.stamp_ns < self.keyframes[0].stamp_ns:
+        if newest_ns is None or m.stamp_ns < self._oldest_ns:
             self._count(m, "before_odometry")
         elif m.stamp_ns < self._motions[0].start_ns:
             self._count(m, "late")
@@ -340,8 +428,9 @@ class GraphSlam:
         """A keyframe at a stamp within the last step of odometry, which is cut in two."""
         group, size = self.space.group, self.space.dof
         T_odom_base = group.compose(self.keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
-        rest = self._motions[-1].cut(where.stamp_ns)
-        self._add_keyframe(Step(where.stamp_ns, self.space.identity, T_odom_base), where.covariance)
+        rest, now = self._motions[-1].cut(where.stamp_ns), self._motions[-1].now
+        step = Step(where.stamp_ns, self.space.identity, T_odom_base)
+        self._add_keyframe(step, now.T_keyframe_base, where.covariance)
         if rest is not None:
             self._motions[-1].step(rest)
         vertex = self.keyframes[-1].vertex
@@ -371,7 +460,8 @@ class GraphSlam:
 
     def _where_long_ago(self, stamp_ns: int) -> Where:
         """Between two keyframes whose odometry is forgotten: evenly from one to the next."""
-        k = int(np.searchsorted(self.keyframes.stamps_ns, stamp_ns, side="right")) - 1
+        present = self.keyframes.stamps_ns[self._epoch :]
+        k = self._epoch + int(np.searchsorted(present, stamp_ns, side="right")) - 1
         group, (a, b) = self.space.group, (self.keyframes[k], self.keyframes[k + 1])
         T_a_b = self.space.identity if k + 1 in self.segments else group.between(a.T_odom_base, b.T_odom_base)
         fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
@@ -399,7 +489,7 @@ class GraphSlam:
             self.graph.add_edge(space.fixes[m.kind], [where.vertex], carried.measured, noise, "fixes")
 
     def _add_closure(self, m: Closure, where: Where) -> None:
-        if not self.keyframes[0].stamp_ns <= m.from_stamp_ns <= (self.newest_odometry_ns or 0):
+        if not self._oldest_ns <= m.from_stamp_ns <= (self.newest_odometry_ns or 0):
             self.counters.count(m.topic, "from_where_there_was_no_odometry")
             return
         earlier = self._where(m.from_stamp_ns)
@@ -422,7 +512,9 @@ class GraphSlam:
         self._unsolved_keyframes = self._solved_vertices = 0
         if not self.keyframes:
             return
+        first_new = self._taken_in
         self._hand_over()
+        before, fits = self._pose(self.keyframes[-1].vertex), self._fit_of(range(first_new, self._handed_over[1]))
         try:
             if everything is None:
                 self._review_if_due()
@@ -431,9 +523,32 @@ class GraphSlam:
                 self.report = self.solver.optimize(everything)
             (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
             self.solves += 1
-            self._solved_vertices = self._handed_over[0]
+            self._solved_vertices, self._taken_in = self._handed_over
+            self.correction = self._correction_since(before, fits)
         except GraphSlamError as error:
             self.counters.count("solver", type(error).__name__)
+
+    def _fit_of(self, edges: range) -> list[tuple[float, int]]:
+        """(chi2 per number measured, edge) of the new edges that fit least: what may move the map."""
+        chi2, numbers = self.solver.chi2_of(edges)
+        fit = chi2 / numbers
+        return [(float(fit[k]), edges[k]) for k in np.argsort(-fit, kind="stable")[:_BLAMED].tolist()]
+
+    def _correction_since(self, before: Numbers, fits: list[tuple[float, int]]) -> Correction:
+        moved = self.space.group.between(before, self._pose(self.keyframes[-1].vertex))
+        distance_m = math.hypot(*moved[: self.space.dimensions])
+        chi2, edges = zip(*fits, strict=True) if fits else ((), ())
+        return Correction(distance_m, self.space.angle(moved), edges, chi2)
+
+    def _clear_closures(self) -> None:
+        """Take all loop closures out; the next solve goes without them."""
+        self._hand_over()
+        closures = self.graph.edges_of("closures").tolist()
+        for edge in closures:
+            self.solver.set_weight(edge, 0.0)
+        self.counters.count("closures", "cleared", len(closures))
+        if closures:
+            self._solve()
 
     def _review_if_due(self) -> None:
         """Look at the unnamed landmarks again now and then; what that changes is part of the solve that follows."""

@@ -194,17 +194,8 @@ class Landmarks:
 
     def chi2_of(self, edges: Sequence[int]) -> tuple[float, int]:
         """Sum of the squared whitened residuals of some edges, without loss, and how many numbers they are."""
-        total, count = 0.0, 0
-        for edge in edges:
-            table, row = self._graph.row(edge)
-            values = [self._solver.estimate([v])[0] for v in table.vertices.values[row].tolist()]
-            at = np.cumsum([0, *(len(v) for v in values[:-1])])[None, :]
-            residual, _ = table.type.linearize(np.concatenate(values), at, table.measured.values[row : row + 1])
-            whitened = table.sqrt_information.values[row] @ residual[0]
-            total, count = total + float(whitened @ whitened), count + len(whitened)
-        return total, count
-
-    # -- not determined yet --------------------------------------------------------------------------------------
+        chi2, numbers = self._solver.chi2_of(edges)
+        return float(chi2.sum()), int(numbers.sum())
 
     def _wait(self, topic: str, name: str, s: Sighting, where: Where) -> None:
         waiting = self.waiting.setdefault(name, Waiting(topic))

@@ -99,19 +99,42 @@ class Closure:
 
 
 @dataclass(frozen=True, slots=True)
+class InitialPose:
+    """Where somebody says that the robot is; it holds from the next odometry on.
+
+    Attributes
+    ----------
+    covariance : of ``T_map_base`` in its tangent space
+    """
+
+    T_map_base: Numbers
+    covariance: Numbers
+
+
+@dataclass(frozen=True, slots=True)
 class Control:
     """An event that is not a measurement.
 
-    ``flush`` releases what waits for its turn, ``end`` also gives up what no odometry reached, ``optimize`` solves now.
+    ``flush`` releases what waits for its turn, ``end`` also gives up what no odometry reached, ``optimize`` solves now,
+    ``clear_closures`` takes all loop closures out, ``time_jump`` begins a segment whose stamps may be older, ``set``
+    changes parameters to ``values``.
     """
 
     event: str
+    values: tuple[tuple[str, bool | int | float | str], ...] = ()
 
 
 Observation: TypeAlias = Sightings | Fix | Closure
-Measurement: TypeAlias = Odometry | Observation | Control
+Measurement: TypeAlias = Odometry | Observation | InitialPose | Control
 
-_TYPES = {"odometry": Odometry, "sightings": Sightings, "fix": Fix, "closure": Closure, "control": Control}
+_TYPES = {
+    "odometry": Odometry,
+    "sightings": Sightings,
+    "fix": Fix,
+    "closure": Closure,
+    "initial_pose": InitialPose,
+    "control": Control,
+}
 _NAMES = {cls: name for name, cls in _TYPES.items()}
 
 
@@ -134,8 +157,10 @@ def from_record(record: dict[str, Any]) -> Measurement:
     try:
         if cls is Sightings:
             fields["sightings"] = tuple(Sighting(**_tuples(one)) for one in fields["sightings"])
+        if cls is Control:
+            fields["values"] = tuple((name, value) for name, value in fields.get("values", ()))
         return cls(**_tuples(fields))
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{record['type']}: {error}") from None
 
 

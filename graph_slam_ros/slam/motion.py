@@ -66,12 +66,13 @@ class OdometryNoise:
 class Motion:
     """The motion since a keyframe, remembered odometry by odometry."""
 
-    __slots__ = ("_moved", "_noise", "_space", "keyframe", "moving_ns")
+    __slots__ = ("_moved", "_noise", "_space", "_stands", "keyframe", "moving_ns")
 
     def __init__(self, noise: OdometryNoise, space: Space, keyframe: int, start_ns: int) -> None:
         self.keyframe = keyframe
         self.moving_ns = 0  # whole numbers: a sum of seconds would round
         self._noise, self._space = noise, space
+        self._stands = False
         self._moved = [Moved(start_ns, space.identity, np.zeros((space.dof, space.dof)))]
 
     @property
@@ -89,7 +90,12 @@ class Motion:
         elapsed_ns = step.stamp_ns - self.now.stamp_ns
         moves = not self._noise.stands(step.T_last_base, elapsed_ns * 1e-9)
         self.moving_ns += elapsed_ns * moves
-        self._moved.append(self._extended(self.now, step.T_last_base, elapsed_ns * moves, step))
+        moved = self._extended(self.now, step.T_last_base, elapsed_ns * moves, step)
+        if self._stands and not moves:  # of a robot that stands for hours, only the last is remembered
+            self._moved[-1] = moved
+        else:
+            self._moved.append(moved)
+        self._stands = not moves
 
     def at(self, stamp_ns: int) -> Moved:
         """At a stamp from the keyframe's to the newest odometry's, between two odometry messages by interpolation."""
@@ -112,6 +118,7 @@ class Motion:
         at = self.at(stamp_ns)
         rest = group.between(at.T_keyframe_base, last.T_keyframe_base)
         self._moved[-1] = at
+        self._stands = False
         return Step(last.stamp_ns, rest, rest, last.twist_covariance)
 
     @property

@@ -49,12 +49,16 @@ class OdometryChoice:
         """Stamp of the last odometry that was used."""
         return None if self._used is None else self._used.stamp_ns
 
+    def forget(self) -> None:
+        """Begin anew with stamps of another time."""
+        self._past.clear()
+        self._used = None
+
     def take(self, m: Odometry) -> list[Step]:
         """The steps that a message leads to: none where it is not the odometry in use."""
-        if m.source not in self._past:
-            self._past[m.source] = deque(maxlen=_REMEMBERED)
-            if m.source not in self._order:
-                self._order.append(m.source)
+        if m.source not in self._order:
+            self._order.append(m.source)
+        self._past.setdefault(m.source, deque(maxlen=_REMEMBERED))
         past, used = self._past[m.source], self._used
         if past and past[-1].stamp_ns == m.stamp_ns:
             self._counters.count(m.source, "duplicate" if past[-1] == m else "duplicate_stamp")

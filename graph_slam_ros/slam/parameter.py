@@ -11,7 +11,7 @@ from graph_slam_ros.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """What is known of one parameter; ``low`` and ``high`` are inclusive."""
+    """What is known of one parameter; ``low`` and ``high`` are inclusive; ``live``: it may change at work."""
 
     name: str
     type: type
@@ -21,6 +21,7 @@ class Parameter:
     low: float | None
     high: float | None
     choices: tuple[str, ...]
+    live: bool = False
 
     def check(self, value: Any) -> Any:
         """The value in its type. Raises ConfigError naming parameter, value and what is allowed."""
@@ -54,15 +55,16 @@ def setting(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),
+    live: bool = False,
 ) -> Any:
-    """A field of a section: its default, meaning, unit, bounds and choices."""
-    return field(default=default, metadata={"about": (meaning, unit, low, high, choices)})
+    """A field of a section: its default, meaning, unit, bounds and choices, and whether it may change at work."""
+    return field(default=default, metadata={"about": (meaning, unit, low, high, choices, live)})
 
 
 def section_parameters(section: str, members: Any) -> Iterator[Parameter]:
     """The parameters of a section: ``members`` holds their defaults."""
     for key in dataclasses.fields(members):
         if "about" in key.metadata:
-            meaning, unit, low, high, choices = key.metadata["about"]
+            meaning, unit, *limits = key.metadata["about"]
             default = getattr(members, key.name)
-            yield Parameter(f"{section}.{key.name}", type(default), default, meaning, unit, low, high, choices)
+            yield Parameter(f"{section}.{key.name}", type(default), default, meaning, unit, *limits)

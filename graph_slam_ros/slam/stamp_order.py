@@ -58,6 +58,11 @@ class StampOrder:
         """Release everything that waits for its turn."""
         return self._release(max((entry[0] for entry in self._heap), default=0))
 
+    def forget(self) -> None:
+        """Begin anew with stamps of another time."""
+        self._heap.clear()
+        self._newest_odometry_ns = self._released_ns = None
+
     def _release(self, until_ns: int) -> list[Odometry | Observation]:
         out = []
         while self._heap and self._heap[0][0] <= until_ns:

@@ -116,6 +116,23 @@ def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: L
             yield Block(table, some, residual, jacobian, chi2, cost)
 
 
+def chi2_of(graph: Graph, x: Array, edges: Index) -> tuple[Array, Index]:
+    """Squared whitened residual of each edge at the stored values x, without loss and weight, and its numbers."""
+    chi2, numbers = np.empty(len(edges)), np.empty(len(edges), dtype=np.int64)
+    codes = graph.table_of_edge.values[edges]
+    for code, table in enumerate(graph.tables.values()):
+        of_table = np.flatnonzero(codes == code)
+        numbers[of_table] = table.type.residual_size
+        for first in range(0, len(of_table), CHUNK):
+            some = of_table[first : first + CHUNK]
+            rows = graph.row_of_edge.values[edges[some]]
+            at, measured = _take(rows, table.vertices.values, graph.offset.values, table.measured.values)
+            residual, _ = table.type.linearize(x, at, measured)
+            white = np.einsum("eab,eb->ea", table.sqrt_information.values[rows], residual)
+            chi2[some] = np.einsum("ea,ea->e", white, white)
+    return chi2, numbers
+
+
 @kernel
 def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) -> None:
     """Put the shares of whitened edges into the tree: J'J and J'r, and the diagonal of H."""

@@ -14,7 +14,7 @@ from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.covariance import joint, marginals
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
 from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole, undetermined
-from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, rows_of, store
+from graph_slam_ros.solver.linearization import Losses, chi2_of, costs, linearize, refuse_nonfinite, rows_of, store
 from graph_slam_ros.solver.numeric import keep, settle
 from graph_slam_ros.solver.report import Change, Report
 from graph_slam_ros.solver.symbolic import compact
@@ -271,6 +271,14 @@ class Solver:
         losses = Losses(self.graph, (settings or self.settings).stages()[-1])
         now = costs(self.graph, linearize(self.graph, self._tree.estimate, self._active_rows(), losses))
         return Report("gn", "nothing_to_do", now.chi2, now.chi2, now.cost, now.cost, (), now.classes)
+
+    def chi2_of(self, edges: ArrayLike) -> tuple[Array, Index]:
+        """How well each edge fits at the estimate: r' Omega r without loss and weight, and how many numbers r is."""
+        self._grow()
+        ids = whole_numbers(edges, "edge").ravel()
+        if len(ids):
+            _known(ids, self.graph.edge_count, "edge")
+        return chi2_of(self.graph, self._tree.estimate, ids)
 
     def estimate(self, ids: ArrayLike) -> Array:
         """Values of vertices of one kind, (n, size)."""
