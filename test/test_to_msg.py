@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.graph import R2
-from graph_slam_ros.lie import so3
+from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.ros import results, to_msg
+from graph_slam_ros.ros.from_msg import twist_of
 from graph_slam_ros.ros.interfaces import typestore
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 
@@ -94,6 +95,95 @@ def test_a_transform_names_its_frames_and_its_stamp():
     assert (t.header.stamp.sec, t.header.stamp.nanosec) == (1_700_000_000, 987_654_321)
     assert (t.transform.translation.x, t.transform.translation.y) == (1.0, 2.0)
     assert (t.transform.rotation.z, t.transform.rotation.w) == pytest.approx((1.0, 0.0))
+
+
+@pytest.mark.parametrize("pose", [(1.0, -2.0, 3.0), (1.0, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5)])
+@pytest.mark.parametrize("child", ["b", "base_link", "böse"])
+@pytest.mark.parametrize("length", range(1, 9))
+def test_a_transform_has_the_bytes_of_the_serialiser_for_every_length_of_the_frames_names(length, child, pose):
+    parent = "abcdefghijklmnop"[:length]
+    at = to_msg.pose(pose)
+    moved = to_msg.make(
+        "geometry_msgs/msg/Transform",
+        translation=to_msg.vector(at.position.x, at.position.y, at.position.z),
+        rotation=at.orientation,
+    )
+    stamped = to_msg.make(
+        "geometry_msgs/msg/TransformStamped",
+        header=to_msg.header(STAMP_NS, parent),
+        child_frame_id=child,
+        transform=moved,
+    )
+    expected = to_msg.encode(to_msg.make("tf2_msgs/msg/TFMessage", transforms=[stamped]))
+    assert to_msg.transform(STAMP_NS, parent, child, pose) == expected
+
+
+def odometry_message(frame, child, pose, covariance, twist):
+    vector = to_msg.vector
+    inner = to_msg.make("geometry_msgs/msg/Twist", linear=vector(*twist[:3]), angular=vector(*twist[3:6]))
+    return to_msg.make(
+        results.ODOMETRY,
+        header=to_msg.header(STAMP_NS, frame),
+        child_frame_id=child,
+        pose=to_msg.pose_with_covariance(pose, covariance, 1e6),
+        twist=to_msg.make("geometry_msgs/msg/TwistWithCovariance", twist=inner, covariance=twist[6:]),
+    )
+
+
+@pytest.mark.parametrize("pose", [(1.0, -2.0, 3.0), (1.0, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5)])
+@pytest.mark.parametrize("child", ["b", "ba", "bas", "base", "base_link", "böse"])
+@pytest.mark.parametrize("length", range(1, 9))
+def test_odometry_has_the_bytes_of_the_serialiser_for_every_length_of_the_frames_names(length, child, pose):
+    frame = "abcdefghijklmnop"[:length]
+    rng = np.random.default_rng(length)
+    dof, twist = 3 if len(pose) == 3 else 6, rng.standard_normal(42)
+    covariance = np.cov(rng.standard_normal((dof, 20)))
+    expected = to_msg.encode(odometry_message(frame, child, pose, covariance, twist))
+    assert to_msg.odometry(STAMP_NS, frame, child, pose, covariance, 1e6, twist.tobytes()) == expected
+    unknown = to_msg.odometry(STAMP_NS, frame, child, pose, covariance, 1e6)
+    still = np.concatenate((np.zeros(6), 1e6 * np.eye(6).ravel()))
+    assert unknown == to_msg.encode(odometry_message(frame, child, pose, covariance, still))
+
+
+@pytest.mark.parametrize("little_endian", [True, False])
+@pytest.mark.parametrize("child", ["b", "ba", "bas", "base", "base_link"])
+@pytest.mark.parametrize("length", range(1, 9))
+def test_the_twist_of_an_odometry_message_is_passed_on_as_it_was_received(length, child, little_endian):
+    twist = np.random.default_rng(length).standard_normal(42)
+    message = odometry_message("abcdefgh"[:length], child, (1.0, 2.0, 3.0), np.eye(3), twist)
+    cdr = bytes(typestore().serialize_cdr(message, results.ODOMETRY, little_endian=little_endian))
+    assert twist_of(cdr, child) == twist.tobytes()
+    assert twist_of(cdr, "wheel") is None, "what a wheel does is not what the robot does"
+
+
+def test_of_a_message_that_is_cut_off_there_is_no_twist():
+    cdr = to_msg.odometry(STAMP_NS, "odom", "base_link", (1.0, 2.0, 3.0), np.eye(3), 1e6)
+    assert all(twist_of(cdr[:length], "base_link") is None for length in range(len(cdr)))
+    slashed = to_msg.odometry(STAMP_NS, "odom", "/base_link", (1.0, 2.0, 3.0), np.eye(3), 1e6)
+    assert twist_of(slashed, "base_link") == cdr[-336:]
+
+
+def test_diagnostics_tell_of_each_status_its_level_its_words_and_its_values():
+    statuses = [
+        to_msg.Status(to_msg.WARN, "graph_slam: odometry", "silent for 2 s", "robot 1", {"rate_hz": "0", "lost": "3"}),
+        to_msg.Status(to_msg.OK, "graph_slam: graph"),
+    ]
+    message = decode(to_msg.diagnostics(STAMP_NS, iter(statuses)), "diagnostic_msgs/msg/DiagnosticArray")
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(STAMP_NS, 10**9)
+    assert message.header.frame_id == ""
+    odometry, graph = message.status
+    assert (odometry.level, odometry.name, odometry.message) == (1, "graph_slam: odometry", "silent for 2 s")
+    assert odometry.hardware_id == "robot 1"
+    assert [(v.key, v.value) for v in odometry.values] == [("rate_hz", "0"), ("lost", "3")]
+    assert (graph.level, graph.name, graph.message, graph.hardware_id, graph.values) == (
+        0,
+        "graph_slam: graph",
+        "",
+        "",
+        [],
+    )
+    kind = message.status[0]
+    assert (kind.OK, kind.WARN, kind.ERROR, kind.STALE) == (to_msg.OK, to_msg.WARN, to_msg.ERROR, to_msg.STALE)
 
 
 def test_the_clock_is_the_stamp():
@@ -193,3 +283,82 @@ def test_every_keyframe_has_its_covariance_or_nothing_that_could_be_mistaken_for
     assert np.isnan(slam.keyframe_covariances()).all()
     assert all(np.isnan(covariance).all() for _, _, covariance in results.landmark_estimates(slam))
     assert GraphSlam().keyframe_covariances().shape == (0, 3, 3)
+
+
+def round_a_curve(dimensions, every_m):
+    """A robot that goes round a curve, with a keyframe after so many metres."""
+    settings = {
+        "world.dimensions": dimensions,
+        "keyframes.min_distance_m": every_m,
+        "keyframes.min_angle_rad": 3.0,
+        "keyframes.max_interval_s": 1e3,
+        "ordering.window_s": 0.0,
+    }
+    slam = GraphSlam(Config.from_mapping(settings))
+    for k in range(20):
+        slam.process(drive(dimensions, k))
+    return slam
+
+
+def drive(dimensions, k, source="odometry"):
+    x, y, turn = 0.5 * k, 0.02 * k * k, 0.04 * k
+    stamp = STAMP_NS + k * 10**8
+    if dimensions == 2:
+        return Odometry(stamp, (x, y, turn), (4e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 9e-4), source)
+    q = so3.exp((0.01 * k, 0.02 * k, turn))
+    return Odometry(
+        stamp, (x, y, 0.1 * k, *map(float, q)), tuple(np.diag([4e-4, 1e-4, 2e-4, 3e-4, 5e-4, 9e-4]).ravel()), source
+    )
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_keyframe_there_would_be(dimensions):
+    rare, often = round_a_curve(dimensions, 3.2), round_a_curve(dimensions, 0.4)
+    m = drive(dimensions, 20)
+    at, covariance = rare.pose_at(m)
+    often.process(m)
+    newest = often.keyframes[-1]
+    assert (newest.stamp_ns, len(often.keyframes)) == (m.stamp_ns, 21)
+    assert len(rare.keyframes) < 10
+    assert at == pytest.approx(often.trajectory()[-1], abs=1e-9)
+    group, space = rare.space.group, rare.space
+    assert at == pytest.approx(group.compose(rare.T_map_odom, m.T_odom_base), abs=1e-9)
+    assert covariance == pytest.approx(often.pose_covariance, rel=1e-3, abs=1e-6)  # an edge has a least noise
+
+    message = decode(results.odometry(rare, m, np.arange(42.0).tobytes()), results.ODOMETRY)
+    p, q = message.pose.pose.position, message.pose.pose.orientation
+    assert (p.x, p.y, p.z, q.x, q.y, q.z, q.w) == pytest.approx(se3.in_space(at).tolist())
+    assert (message.header.frame_id, message.child_frame_id) == ("map", "base_link")
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(m.stamp_ns, 10**9)
+    expected = to_msg.covariance6(space.in_parent_axes(at, covariance), 1e6)
+    assert message.pose.covariance == pytest.approx(expected)
+    assert message.twist.twist.linear.y == 1.0
+    assert message.twist.covariance[-1] == 41.0
+
+
+def test_odometry_that_is_not_in_use_is_older_than_what_was_used_or_has_jumped_says_nothing_of_the_robot_in_the_map():
+    slam = round_a_curve(2, 3.2)
+    assert results.odometry(GraphSlam(), drive(2, 20)) is None
+    assert results.odometry(slam, drive(2, 20, "another")) is None
+    assert results.odometry(slam, drive(2, 18)) is None
+    assert results.odometry(slam, drive(2, 19)) is not None
+    jumped = Odometry(drive(2, 20).stamp_ns, (60.0, 0.0, 0.0))
+    assert results.odometry(slam, jumped) is None
+
+
+def test_what_is_told_ahead_of_its_turn_changes_nothing():
+    asked, other = round_a_curve(2, 3.2), round_a_curve(2, 3.2)
+    for k in range(20, 40):
+        m = drive(2, k)
+        assert asked.pose_at(m) is not None
+        asked.process(m)
+        other.process(m)
+    assert (asked.trajectory() == other.trajectory()).all()
+    assert (asked.pose_covariance == other.pose_covariance).all()
+
+
+def test_a_robot_that_stands_becomes_no_more_uncertain_ahead_of_its_turn_either():
+    slam = round_a_curve(2, 3.2)
+    last = drive(2, 19)
+    later = Odometry(last.stamp_ns + 10**9, last.T_odom_base, last.twist_covariance, last.source)
+    assert slam.pose_at(later)[1] == pytest.approx(slam.pose_at(last)[1])

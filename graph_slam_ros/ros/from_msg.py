@@ -24,6 +24,7 @@ Decoder = Callable[[bytes], Any]
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 TF_STATIC, TF = "tf_static", "tf"
+_POSE_SIZE = 8 * (7 + 36)  # of a geometry_msgs/PoseWithCovariance
 
 
 def decoder(type_name: str) -> Decoder:
@@ -39,6 +40,27 @@ def is_correction(cdr: bytes, map_frame: str) -> bool:
     order = "<" if cdr[1] & 1 else ">"
     (length,) = struct.unpack_from(order + "I", cdr, 16)  # after the encoding, the count and a stamp
     return cdr[20 : 20 + length].rstrip(b"\0").lstrip(b"/") == map_frame.encode()
+
+
+def twist_of(cdr: bytes, base_frame: str) -> bytes | None:
+    """The geometry_msgs/TwistWithCovariance, little endian, of a nav_msgs/Odometry, without decoding the rest.
+
+    None where it is of another frame than the base: what a wheel or a sensor does is not what the robot does.
+    """
+    if len(cdr) < 16:
+        return None
+    order = "<" if cdr[1] & 1 else ">"
+    try:
+        (length,) = struct.unpack_from(order + "I", cdr, 12)  # after the encoding and a stamp
+        start = 16 + length + -length % 4
+        (length,) = struct.unpack_from(order + "I", cdr, start)
+        child = cdr[start + 4 : start + 4 + length].rstrip(b"\0").lstrip(b"/")
+        start += 4 + length
+        start += (4 - start) % 8 + _POSE_SIZE
+        numbers = struct.unpack_from(f"{order}42d", cdr, start)
+    except struct.error:
+        return None
+    return struct.pack("<42d", *numbers) if child == base_frame.encode() else None
 
 
 class Border:

@@ -4,14 +4,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.ros import to_msg
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import GraphSlam, Odometry
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
 
-PATH, POSE, LANDMARKS, TF = (
+PATH, POSE, ODOMETRY, LANDMARKS, TF = (
     "nav_msgs/msg/Path",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "nav_msgs/msg/Odometry",
     "visualization_msgs/msg/MarkerArray",
     "tf2_msgs/msg/TFMessage",
 )
@@ -42,6 +43,18 @@ def pose(slam: GraphSlam) -> bytes:
 def map_to_odom(slam: GraphSlam, stamp_ns: int) -> bytes:
     """The correction as a transform."""
     return to_msg.transform(stamp_ns, slam.config.frames.map, slam.config.frames.odom, slam.T_map_odom)
+
+
+def odometry(slam: GraphSlam, m: Odometry, twist: bytes | None = None) -> bytes | None:
+    """The robot in the map at an odometry message, as soon as that comes; with ``from_msg.twist_of`` the message.
+
+    None where another odometry is in use, or this one has jumped.
+    """
+    now = slam.pose_at(m)
+    if now is None:
+        return None
+    frames, unused = slam.config.frames, slam.config.output.pose_covariance_max
+    return to_msg.odometry(m.stamp_ns, frames.map, frames.base, *now, unused, twist)
 
 
 def odom_to_base(slam: GraphSlam) -> bytes:

@@ -5,7 +5,10 @@ rosbags' type store, so nothing here needs ROS. A path is written with NumPy: 10
 message objects would cost a tenth of a second each time.
 """
 
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -20,6 +23,8 @@ Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
 
 _NS = 1_000_000_000
+_IN_PLANE = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])  # of the 36 numbers: x, y and yaw
+_OUT_OF_PLANE = np.array([14, 21, 28])  # the variances of z, roll and pitch
 _HEADER = b"\x00\x01\x00\x00"  # CDR, little endian
 
 
@@ -73,9 +78,9 @@ def covariance6(covariance: Array, unused: float) -> Array:
     """ROS's row-major 6x6, of (6, 6), or of (3, 3) over (x, y, yaw): z, roll and pitch get the variance ``unused``."""
     if len(covariance) == 6:
         return np.ravel(covariance)
-    full = np.diag([0.0, 0.0, unused, unused, unused, 0.0])
-    full[np.ix_([0, 1, 5], [0, 1, 5])] = covariance
-    return full.ravel()
+    full = np.zeros(36)
+    full[_IN_PLANE], full[_OUT_OF_PLANE] = np.ravel(covariance), unused
+    return full
 
 
 def pose_with_covariance(p: Numbers, covariance: Array, unused: float) -> Any:
@@ -100,13 +105,79 @@ def pose_with_covariance_stamped(stamp_ns: int, frame: str, p: Numbers, covarian
 
 
 def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Numbers) -> bytes:
-    """tf2_msgs/TFMessage with one transform."""
-    x, y, z, *quat_xyzw = se3.in_space(T_parent_child).tolist()
-    moved = make("geometry_msgs/msg/Transform", translation=vector(x, y, z), rotation=quaternion(*quat_xyzw))
-    stamped = make(
-        "geometry_msgs/msg/TransformStamped", header=header(stamp_ns, parent), child_frame_id=child, transform=moved
+    """tf2_msgs/TFMessage with one transform; quick, for it is sent with every odometry message."""
+    one, motion = np.uint32(1).tobytes(), se3.in_space(T_parent_child).tobytes()
+    return b"".join((_HEADER, one, _stamp(stamp_ns), _frames(12, parent, child), motion))
+
+
+def odometry(
+    stamp_ns: int, frame: str, child: str, p: Numbers, covariance: Array, unused: float, twist: bytes | None = None
+) -> bytes:
+    """nav_msgs/Odometry; quick, for it is sent with every odometry message.
+
+    Parameters
+    ----------
+    covariance : of the pose, in its tangent space
+    unused : variance of what a pose in the plane does not have, and of a twist that is unknown
+    twist : geometry_msgs/TwistWithCovariance as ``from_msg.twist_of`` gives it
+    """
+    space = PLANE if len(p) == 3 else SPACE
+    numbers = se3.in_space(p).tobytes(), covariance6(space.in_parent_axes(p, covariance), unused).tobytes()
+    moving = _unknown_twist(unused) if twist is None else twist
+    return b"".join((_HEADER, _stamp(stamp_ns), _frames(8, frame, child), *numbers, moving))
+
+
+@cache
+def _frames(start: int, *names: str) -> bytes:
+    """Strings, each at a multiple of 4 from the head of the message, and padding to a multiple of 8."""
+    out = b""
+    for name in names:
+        out += b"\x00" * (-(start + len(out)) % 4) + np.uint32(len(name.encode()) + 1).tobytes()
+        out += name.encode() + b"\x00"
+    return out + b"\x00" * (-(start + len(out)) % 8)
+
+
+@cache
+def _unknown_twist(variance: float) -> bytes:
+    """geometry_msgs/TwistWithCovariance."""
+    return np.concatenate((np.zeros(6), variance * np.eye(6).ravel())).tobytes()
+
+
+OK, WARN, ERROR, STALE = range(4)
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """diagnostic_msgs/DiagnosticStatus: ``level`` is one of ``OK``, ``WARN``, ``ERROR``, ``STALE``."""
+
+    level: int
+    name: str
+    message: str = ""
+    hardware_id: str = ""
+    values: Mapping[str, str] = field(default_factory=dict)
+
+
+def diagnostics(stamp_ns: int, statuses: Iterable[Status]) -> bytes:
+    """diagnostic_msgs/DiagnosticArray; it is about no frame."""
+    return encode(
+        make(
+            "diagnostic_msgs/msg/DiagnosticArray",
+            header=header(stamp_ns, ""),
+            status=[
+                make(
+                    "diagnostic_msgs/msg/DiagnosticStatus",
+                    level=one.level,
+                    name=one.name,
+                    message=one.message,
+                    hardware_id=one.hardware_id,
+                    values=[
+                        make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in one.values.items()
+                    ],
+                )
+                for one in statuses
+            ],
+        )
     )
-    return encode(make("tf2_msgs/msg/TFMessage", transforms=[stamped]))
 
 
 def clock(stamp_ns: int) -> bytes:
@@ -130,7 +201,7 @@ def path(frame: str, stamps_ns: ArrayLike, poses: Array) -> bytes:
 
 
 def _stamp(stamp_ns: int) -> bytes:
-    return np.int32(stamp_ns // _NS).tobytes() + np.uint32(stamp_ns % _NS).tobytes()
+    return struct.pack("<iI", *divmod(stamp_ns, _NS))
 
 
 def _pose_rows(name: bytes, stamps: NDArray[np.int64], poses: Array, start: int) -> NDArray[np.uint8]:

@@ -219,6 +219,22 @@ class GraphSlam:
         out: Numbers = group.compose(self._pose(newest.vertex), group.inverse(newest.T_odom_base))
         return out
 
+    def pose_at(self, m: Odometry) -> tuple[Numbers, Array] | None:
+        """``T_map_base`` at an odometry message, whether or not its turn has come, and its covariance.
+
+        That is in its tangent space: the newest keyframe's, lengthened by the odometry since. None where the message
+        is not of the odometry in use, is older than what was used, or has jumped.
+        """
+        used, group = self._odometry.used, self.space.group
+        if used is None or m.source != used.source or m.stamp_ns < used.stamp_ns:
+            return None
+        T_used_base = group.between(used.T_odom_base, m.T_odom_base)
+        if self._odometry.jumps(T_used_base, (m.stamp_ns - used.stamp_ns) * 1e-9):
+            return None
+        moved = self._motions[-1].after(Step(m.stamp_ns, T_used_base, m.T_odom_base, m.twist_covariance))
+        T_map_base = group.compose(self._pose(self.keyframes[-1].vertex), moved.T_keyframe_base)
+        return T_map_base, group.propagate(self._covariance, moved.T_keyframe_base, moved.covariance)
+
     @property
     def pose_covariance(self) -> Array:
         """Covariance (3, 3) or (6, 6) of the newest keyframe's pose in its tangent space.

@@ -87,15 +87,17 @@ class Motion:
 
     def step(self, step: Step) -> None:
         """Go on by one step of odometry."""
-        elapsed_ns = step.stamp_ns - self.now.stamp_ns
-        moves = not self._noise.stands(step.T_last_base, elapsed_ns * 1e-9)
-        self.moving_ns += elapsed_ns * moves
-        moved = self._extended(self.now, step.T_last_base, elapsed_ns * moves, step)
-        if self._stands and not moves:  # of a robot that stands for hours, only the last is remembered
+        stands, elapsed_ns, moved = self._after(step)
+        self.moving_ns += elapsed_ns * (not stands)
+        if self._stands and stands:  # of a robot that stands for hours, only the last is remembered
             self._moved[-1] = moved
         else:
             self._moved.append(moved)
-        self._stands = not moves
+        self._stands = stands
+
+    def after(self, step: Step) -> Moved:
+        """Where one more step of odometry would lead; it is not taken."""
+        return self._after(step)[2]
 
     def at(self, stamp_ns: int) -> Moved:
         """At a stamp from the keyframe's to the newest odometry's, between two odometry messages by interpolation."""
@@ -125,6 +127,12 @@ class Motion:
     def before_last_ns(self) -> int:
         """Stamp of the last odometry but one, or of the keyframe."""
         return self._moved[-2].stamp_ns if len(self._moved) > 1 else self.start_ns
+
+    def _after(self, step: Step) -> tuple[bool, int, Moved]:
+        """Whether the robot stands in a step, how long that takes, and where it is then."""
+        elapsed_ns = step.stamp_ns - self.now.stamp_ns
+        stands = self._noise.stands(step.T_last_base, elapsed_ns * 1e-9)
+        return stands, elapsed_ns, self._extended(self.now, step.T_last_base, elapsed_ns * (not stands), step)
 
     def _extended(self, a: Moved, T_a_b: Numbers, moving_ns: int, step: Step) -> Moved:
         group, noise = self._space.group, self._noise.of(moving_ns * 1e-9, step.twist_covariance)

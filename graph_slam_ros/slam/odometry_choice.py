@@ -45,6 +45,11 @@ class OdometryChoice:
         self._used: Odometry | None = None
 
     @property
+    def used(self) -> Odometry | None:
+        """The last odometry that was used."""
+        return self._used
+
+    @property
     def newest_ns(self) -> int | None:
         """Stamp of the last odometry that was used."""
         return None if self._used is None else self._used.stamp_ns
@@ -105,7 +110,7 @@ class OdometryChoice:
 
     def _follow(self, a: Odometry, b: Odometry) -> Step:
         step = self._space.group.between(a.T_odom_base, b.T_odom_base)
-        return self._use(b, step, broken=self._jumps(step, (b.stamp_ns - a.stamp_ns) * 1e-9))
+        return self._use(b, step, broken=self.jumps(step, (b.stamp_ns - a.stamp_ns) * 1e-9))
 
     def _use(self, m: Odometry, step: Numbers, *, broken: bool) -> Step:
         if broken:
@@ -113,7 +118,7 @@ class OdometryChoice:
         self._used = m
         return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, broken)
 
-    def _jumps(self, step: Numbers, dt: float) -> bool:
+    def jumps(self, step: Numbers, dt: float) -> bool:
         """No robot moves like this: odometry was set anew, or has slipped by a lap."""
         n = self._space.dimensions
         return sum(x * x for x in step[:n]) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
