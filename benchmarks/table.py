@@ -21,7 +21,7 @@ Row = dict[str, Any]
 
 DOCUMENT = ROOT / "docs/benchmarks.md"
 _ACCURACY = ROOT / "docs/accuracy.md"
-_LIBRARIES = ("numpy", "scipy", "numba", "gtsam", "graphslam")
+_LIBRARIES = ("numpy", "scipy", "numba", "gtsam", "graphslam", "ros-jazzy-rclpy")
 
 # The lowest cost that anybody has found, in our error map with the information matrices of the file.
 _BEST_KNOWN = {
@@ -41,11 +41,12 @@ _BEST_KNOWN = {
 
 def results(programme: str, rows: Sequence[Row], about: str = "") -> Row:
     """Rows with what they were measured by, on, and when."""
+    libraries = [*_versions(), *(() if programme.startswith("node-") else _pinned())]
     return {
         "programme": programme,
         "about": about,
         "date": datetime.date.today().isoformat(),
-        "machine": f"{_cpu()}, Python {platform.python_version()}, {', '.join([*_versions(), *_pinned()])}",
+        "machine": f"{_cpu()}, Python {platform.python_version()}, {', '.join(libraries)}",
         "rows": list(rows),
     }
 
@@ -62,7 +63,8 @@ def markdown(measured: Row) -> str:
     """The results of a programme, and below them how and on what they were measured."""
     told = _repeated(measured["rows"]) if "repetitions" not in measured["about"] else ""
     about = "".join(f"{text}; " for text in (measured["about"], told) if text)
-    return f"{_TABLES[measured['programme']](measured['rows'])}\n\n{about}{measured['date']}, {measured['machine']}."
+    columns = _TABLES.get(measured["programme"], _as_it_is)
+    return f"{columns(measured['rows'])}\n\n{about}{measured['date']}, {measured['machine']}."
 
 
 def into_document(measured: Row) -> None:
@@ -176,6 +178,19 @@ def _marginals(rows: Sequence[Row]) -> str:
     return _table(names, lines)
 
 
+def _as_it_is(rows: Sequence[Row]) -> str:
+    """Rows whose keys are the names of the columns."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    return _table(names, [[_cell(row.get(name)) for name in names] for row in rows])
+
+
+def _cell(value: Any) -> str:
+    """A number with three digits that count."""
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+    return "" if value is None else f"{value:,}" if isinstance(value, int) else str(value)
+
+
 _TABLES: dict[str, Callable[[Sequence[Row]], str]] = {
     "online": _online,
     "update": _online,
@@ -267,4 +282,6 @@ def _pinned() -> Iterator[str]:
 
 if __name__ == "__main__":
     for source in sys.argv[1:]:
-        into_document(json.loads(Path(source).read_text(encoding="utf-8")))
+        found = json.loads(Path(source).read_text(encoding="utf-8"))
+        for measured in found if isinstance(found, list) else [found]:
+            into_document(measured)
