@@ -37,6 +37,30 @@ def test_a_path_has_the_bytes_of_the_serialiser_for_every_length_of_the_frames_n
     )
 
 
+@pytest.mark.parametrize(
+    ("count", "most"), [(0, 5), (1, 5), (2, 2), (5, 5), (6, 5), (9, 5), (10, 5), (999, 2), (999, 64)]
+)
+def test_a_path_is_thinned_to_the_bound_and_keeps_its_first_and_its_last(count, most):
+    kept = results.thinned(count, most)
+    assert len(kept) <= most
+    assert (np.diff(kept) > 0).all()
+    assert {0, count - 1} <= set(kept.tolist()) or count == 0
+    assert count <= most or len(kept) > most // 2, "no more is left out than must be"
+    assert (results.thinned(count, 0) == np.arange(count)).all()
+
+
+def test_as_a_path_grows_the_same_poses_are_kept_until_half_of_them_go():
+    earlier = results.thinned(2, 8)
+    halved = 0
+    for count in range(3, 200):
+        kept = results.thinned(count, 8)
+        gone = set(earlier[:-1].tolist()) - set(kept.tolist())
+        assert set(kept[:-1].tolist()) <= set(range(count)) and (not gone or gone == set(earlier[:-1].tolist()[1::2]))
+        halved += bool(gone)
+        earlier = kept
+    assert halved == 5
+
+
 def test_a_path_keeps_the_stamp_of_each_pose_and_carries_the_newest():
     stamps = [STAMP_NS, STAMP_NS + 1, STAMP_NS + 20_000_000_000]
     path = decode(
@@ -259,6 +283,13 @@ def test_the_published_pose_is_the_paths_last_and_the_correction_leads_there(sol
     (odometry,) = decode(results.odom_to_base(solved), results.TF).transforms
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("start", "body")
     assert odometry.transform.translation.x == 3.5
+
+
+def test_a_thinned_path_has_the_poses_of_the_whole_one_at_their_own_stamps(solved):
+    whole, thin = decode(results.path(solved), results.PATH), decode(results.path(solved, 4), results.PATH)
+    assert len(whole.poses) == 8
+    assert thin.poses == [whole.poses[k] for k in (0, 4, 7)]
+    assert thin.header == whole.header
 
 
 def test_a_landmarks_covariance_is_in_the_axes_of_the_map(solved):

@@ -7,6 +7,7 @@ from graph_slam_ros.ros import to_msg
 from graph_slam_ros.slam import GraphSlam, Odometry
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 Numbers = tuple[float, ...]
 
 PATH, POSE, ODOMETRY, LANDMARKS, TF = (
@@ -24,9 +25,22 @@ def newest_pose(slam: GraphSlam) -> Numbers:
     return out
 
 
-def path(slam: GraphSlam) -> bytes:
-    """The corrected path: every keyframe at its own stamp."""
-    return to_msg.path(slam.config.frames.map, slam.keyframes.stamps_ns, slam.trajectory())
+def path(slam: GraphSlam, most: int = 0) -> bytes:
+    """The corrected path: every keyframe at its own stamp, or so many of them as ``thinned`` chooses."""
+    kept = thinned(len(slam.keyframes), most)
+    return to_msg.path(slam.config.frames.map, slam.keyframes.stamps_ns[kept], slam.trajectory()[kept])
+
+
+def thinned(count: int, most: int) -> Index:
+    """Which of ``count`` to show where no more than ``most`` (two or more; 0: all) may be, the first and last included.
+
+    Every second, every fourth, and so on: as more come the same are chosen until they are too many, then half of them.
+    """
+    stride = 1
+    while most and -(-(count - 1) // stride) + 1 > max(most, 2):
+        stride *= 2
+    kept = np.arange(0, count, stride)
+    return kept if count == 0 or kept[-1] == count - 1 else np.append(kept, count - 1)
 
 
 def pose(slam: GraphSlam) -> bytes:

@@ -185,14 +185,16 @@ def clock(stamp_ns: int) -> bytes:
     return encode(make("rosgraph_msgs/msg/Clock", clock=time(stamp_ns)))
 
 
-def path(frame: str, stamps_ns: ArrayLike, poses: Array) -> bytes:
-    """nav_msgs/Path of poses (n, 3) or (n, 7) and their stamps (n,); its header carries the newest stamp.
+def path(frame: str, stamps_ns: ArrayLike, poses: Array, newest_ns: int | None = None) -> bytes:
+    """nav_msgs/Path of poses (n, 3) or (n, 7) and their stamps (n,); its header carries the newest stamp: the last.
 
     All poses after the first take the same number of bytes; the first is preceded by its own padding.
     """
     stamps = np.asarray(stamps_ns, dtype=np.int64)
     name = frame.encode() + b"\x00"
-    head = _stamp(int(stamps[-1]) if len(stamps) else 0) + np.uint32(len(name)).tobytes() + name
+    if newest_ns is None:
+        newest_ns = int(stamps[-1]) if len(stamps) else 0
+    head = _stamp(newest_ns) + np.uint32(len(name)).tobytes() + name
     head += b"\x00" * (-len(head) % 4) + np.uint32(len(stamps)).tobytes()
     if not len(stamps):
         return _HEADER + head

@@ -1,0 +1,134 @@
+"""The path as it changes: what is sent is what is new or has moved, and all of it together is the path."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.ros import results
+from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.ros.path_updates import PathUpdates
+from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry
+from graph_slam_ros.slam.space import PLANE, SPACE
+
+STAMP_NS = 1_700_000_000_000_000_000
+
+
+def decoded(cdr):
+    """Stamp of the message, and its poses (x, y, z, qx, qy, qz, qw) by stamp."""
+    message = typestore().deserialize_cdr(cdr, results.PATH)
+    poses = {}
+    for stamped in message.poses:
+        p, q = stamped.pose.position, stamped.pose.orientation
+        poses[nanoseconds(stamped.header.stamp)] = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+    assert len(poses) == len(message.poses)
+    return nanoseconds(message.header.stamp), poses
+
+
+def nanoseconds(stamp):
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+def standing_in(space, poses):
+    """What an update reads of a GraphSlam, with poses of our choice."""
+    poses = np.array(poses, dtype=float)
+    return SimpleNamespace(
+        space=space,
+        config=Config(),
+        keyframes=SimpleNamespace(stamps_ns=STAMP_NS + np.arange(len(poses))),
+        trajectory=lambda: poses,
+    )
+
+
+def sent(updates, space, poses):
+    """Which poses an update tells of."""
+    cdr = updates.update(standing_in(space, poses))
+    return None if cdr is None else [stamp - STAMP_NS for stamp in decoded(cdr)[1]]
+
+
+def test_what_is_new_or_has_moved_too_far_is_sent_once():
+    updates = PathUpdates(0.1, 0.2)
+    path = [[0.0, 0.0, 0.0], [1.0, 0.0, 3.1]]
+    assert sent(updates, PLANE, path) == [0, 1]
+    assert sent(updates, PLANE, path) is None
+    path.append([2.0, 0.0, 0.0])
+    assert sent(updates, PLANE, path) == [2]
+    path[0] = [0.08, 0.08, 0.0]
+    assert sent(updates, PLANE, path) == [0]
+    path[1] = [1.0, 0.0, -3.1]  # by 0.08 rad, across pi
+    assert sent(updates, PLANE, path) is None
+    path[1] = [1.0, 0.0, -2.9]
+    assert sent(updates, PLANE, path) == [1]
+    assert updates.version == 4
+
+
+def test_small_movements_add_up_to_one_that_is_sent():
+    updates = PathUpdates(0.1, 0.1)
+    sent(updates, PLANE, [[0.0, 0.0, 0.0]])
+    told = [sent(updates, PLANE, [[0.04 * k, 0.0, 0.0]]) for k in range(1, 7)]
+    assert told == [None, None, [0], None, None, [0]]
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_in_space_a_turn_about_any_axis_is_one_whatever_the_sign_of_the_quaternion(side):
+    rng = np.random.default_rng(2)
+    most = 0.3
+    for _ in range(50):
+        pose, axis = se3.exp(tuple(rng.standard_normal(6))), rng.standard_normal(3)
+        for angle, too_far in ((most - 1e-6, False), (most + 1e-6, True), (np.pi, True)):
+            turned = se3.compose(pose, se3.exp((0.0, 0.0, 0.0, *(angle * axis / np.linalg.norm(axis)))))
+            updates = PathUpdates(0.1, most)
+            sent(updates, SPACE, [pose])
+            assert sent(updates, SPACE, [[*turned[:3], *(side * np.array(turned[3:]))]]) == ([0] if too_far else None)
+        raised = [*pose[:2], pose[2] + 0.11, *pose[3:]]
+        updates = PathUpdates(0.1, most)
+        sent(updates, SPACE, [pose])
+        assert sent(updates, SPACE, [raised]) == [0]
+
+
+def driven():
+    """Twice round a square with odometry that turns a little too far."""
+    at = (0.0, 0.0, 0.0)
+    for k in range(80):
+        yield Odometry(STAMP_NS + k * 10**9, at)
+        at = se2.compose(at, (1.0, 0.0, (np.pi / 2 + 0.03) if k % 5 == 4 else 0.0))
+
+
+def test_updates_put_together_by_stamp_are_the_path_within_the_thresholds():
+    slam, updates, received, told = GraphSlam(), PathUpdates(0.05, 0.01), {}, []
+    closure = (0.0, 0.0, 0.0), tuple((1e-4 * np.eye(3)).ravel().tolist())
+    for k, m in enumerate(driven()):
+        slam.process(m)
+        if k in (45, 65):
+            slam.process(Closure(m.stamp_ns - 10**9, m.stamp_ns - 41 * 10**9, "/closures", *closure))
+        if slam.keyframes and (cdr := updates.update(slam)) is not None:
+            newest, poses = decoded(cdr)
+            assert newest == slam.keyframes[-1].stamp_ns
+            received.update(poses)
+            told.append(len(poses))
+    assert updates.version == len(told)
+    _, path = decoded(results.path(slam))
+    assert received.keys() == path.keys()
+    worst = np.abs(np.array([received[stamp] for stamp in path]) - np.array(list(path.values()))).max()
+    assert 0.0 < worst <= 0.05
+    assert max(told[:40]) == 1 and max(told) > 20, "closures move many, odometry none"
+
+
+def test_after_a_restart_all_is_forgotten_and_all_is_sent():
+    slam, updates = GraphSlam(), PathUpdates(0.05, 0.01)
+    for m in driven():
+        slam.process(m)
+    slam.process(Control("flush"))
+    updates.update(slam)
+    assert updates.update(slam) is None
+    assert decoded(updates.restart(slam)) == (0, {})
+    assert updates.version == 1
+    assert decoded(updates.update(slam)) == decoded(results.path(slam))
+    assert updates.version == 2
+
+
+def test_before_the_first_keyframe_there_is_nothing_to_send():
+    updates = PathUpdates(0.05, 0.01)
+    assert updates.update(GraphSlam()) is None
+    assert updates.version == 0
