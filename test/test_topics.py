@@ -1,0 +1,38 @@
+"""The table of topics and services: what is written of it elsewhere says the same."""
+
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from graph_slam_ros.ros.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS, Interface
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+TABLES = {"out": PUBLICATIONS, "in, beside [other inputs](#inputs)": SUBSCRIPTIONS, "service": SERVICES}
+
+
+def row(one):
+    latched = "latched: " if one.latched else ""
+    return f"| `{one.name}` | {re.sub('/(msg|srv)/', '/', one.type)} | {latched}{one.meaning} |"
+
+
+@pytest.mark.parametrize("head", TABLES)
+def test_the_readme_has_every_row_and_no_other(head):
+    _, _, below = README.partition(f"| {head} | type | |\n|---|---|---|\n")
+    assert below.split("\n\n")[0].splitlines() == [row(one) for one in TABLES[head]]
+
+
+@pytest.mark.parametrize("table", [PUBLICATIONS, SUBSCRIPTIONS, SERVICES])
+def test_each_name_is_there_once_and_each_package_is_a_dependency(table):
+    assert len({one.name for one in table}) == len(table)
+    needed = {one.type.split("/")[0] for one in table}
+    assert needed <= {tag.text for tag in ElementTree.parse(ROOT / "package.xml").iter("exec_depend")}
+
+
+def test_names_are_resolved_as_ros_resolves_them():
+    names = ("~/path", "odom", "/tf")
+    resolved = [Interface(name, "std_msgs/msg/Empty", "").resolved("/robot/graph_slam") for name in names]
+    assert resolved == ["/robot/graph_slam/path", "/robot/odom", "/tf"]
+    assert Interface("odom", "", "").resolved() == "/odom"
