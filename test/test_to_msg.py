@@ -37,30 +37,6 @@ def test_a_path_has_the_bytes_of_the_serialiser_for_every_length_of_the_frames_n
     )
 
 
-@pytest.mark.parametrize(
-    ("count", "most"), [(0, 5), (1, 5), (2, 2), (5, 5), (6, 5), (9, 5), (10, 5), (999, 2), (999, 64)]
-)
-def test_a_path_is_thinned_to_the_bound_and_keeps_its_first_and_its_last(count, most):
-    kept = results.thinned(count, most)
-    assert len(kept) <= most
-    assert (np.diff(kept) > 0).all()
-    assert {0, count - 1} <= set(kept.tolist()) or count == 0
-    assert count <= most or len(kept) > most // 2, "no more is left out than must be"
-    assert (results.thinned(count, 0) == np.arange(count)).all()
-
-
-def test_as_a_path_grows_the_same_poses_are_kept_until_half_of_them_go():
-    earlier = results.thinned(2, 8)
-    halved = 0
-    for count in range(3, 200):
-        kept = results.thinned(count, 8)
-        gone = set(earlier[:-1].tolist()) - set(kept.tolist())
-        assert set(kept[:-1].tolist()) <= set(range(count)) and (not gone or gone == set(earlier[:-1].tolist()[1::2]))
-        halved += bool(gone)
-        earlier = kept
-    assert halved == 5
-
-
 def test_a_path_keeps_the_stamp_of_each_pose_and_carries_the_newest():
     stamps = [STAMP_NS, STAMP_NS + 1, STAMP_NS + 20_000_000_000]
     path = decode(
@@ -187,6 +163,18 @@ def test_of_a_message_that_is_cut_off_there_is_no_twist():
     assert twist_of(slashed, "base_link") == cdr[-336:]
 
 
+@pytest.mark.parametrize("names", [[], ["a"], ["", "abc", "tag 17"]])
+@pytest.mark.parametrize("length", range(1, 9))
+def test_detections_have_the_bytes_of_the_serialiser_for_every_length_of_the_frames_name(length, names):
+    rng, frame = np.random.default_rng(length), "abcdefgh"[:length]
+    poses, covariances = rng.standard_normal((len(names), 7)), rng.standard_normal((len(names), 6, 6))
+    cdr = to_msg.detections(STAMP_NS, frame, names, poses, covariances)
+    message = decode(cdr, results.ESTIMATES)
+    assert cdr == to_msg.encode(message)
+    assert [d.id for d in message.detections] == names
+    assert [d.results[0].pose.covariance.tolist() for d in message.detections] == covariances.reshape(-1, 36).tolist()
+
+
 def test_diagnostics_tell_of_each_status_its_level_its_words_and_its_values():
     statuses = [
         to_msg.Status(to_msg.WARN, "graph_slam: odometry", "silent for 2 s", "robot 1", {"rate_hz": "0", "lost": "3"}),
@@ -213,43 +201,6 @@ def test_diagnostics_tell_of_each_status_its_level_its_words_and_its_values():
 def test_the_clock_is_the_stamp():
     clock = decode(to_msg.clock(STAMP_NS), "rosgraph_msgs/msg/Clock").clock
     assert (clock.sec, clock.nanosec) == (1_700_000_000, 987_654_321)
-
-
-def test_markers_replace_the_former_ones_and_draw_each_landmark_as_its_two_sigma_ellipse():
-    c, s = math.cos(0.3), math.sin(0.3)
-    turn = np.array([[c, -s], [s, c]])
-    covariances = [turn @ np.diag([0.01, 0.09]) @ turn.T, np.zeros((2, 2))]
-    cdr = to_msg.landmark_markers(STAMP_NS, "map", ["a", "b"], np.array([[1.0, 2.0], [3.0, 4.0]]), covariances)
-    clear, *drawn = decode(cdr, "visualization_msgs/msg/MarkerArray").markers
-    assert clear.action == 3
-    assert [(m.ns, m.id, m.action) for m in drawn] == [(ns, k, 0) for k in (0, 1) for ns in ("landmarks", "names")]
-    ellipse, name, exact, _ = drawn
-    assert (ellipse.type, name.type) == (3, 9)
-    assert sorted((ellipse.scale.x, ellipse.scale.y)) == pytest.approx([0.4, 1.2])
-    tilt = 2 * math.atan2(ellipse.pose.orientation.z, ellipse.pose.orientation.w)
-    long_axis = tilt if ellipse.scale.x > ellipse.scale.y else tilt + math.pi / 2
-    assert math.sin(long_axis - (0.3 + math.pi / 2)) == pytest.approx(0.0, abs=1e-9)
-    assert name.text == "a"
-    assert (exact.scale.x, exact.scale.y) == (0.05, 0.05), "never too small to see"
-    assert {m.header.frame_id for m in drawn} == {"map"}
-
-
-def test_in_space_a_landmark_is_drawn_as_its_two_sigma_ellipsoid_or_small_where_that_is_unknown():
-    turn = so3.matrix(so3.exp((0.4, -1.1, 0.7)))
-    covariances = [turn @ np.diag([0.01, 0.09, 0.25]) @ turn.T, np.full((3, 3), np.nan)]
-    positions = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    cdr = to_msg.landmark_markers(STAMP_NS, "map", ["a", "b"], positions, covariances)
-    _, ellipsoid, _, unknown, _ = decode(cdr, results.LANDMARKS).markers
-    p, q, size = ellipsoid.pose.position, ellipsoid.pose.orientation, ellipsoid.scale
-    assert (ellipsoid.type, p.x, p.y, p.z) == (2, 1.0, 2.0, 3.0)
-    axes = so3.matrix((q.x, q.y, q.z, q.w))
-    assert axes @ np.diag(np.square([size.x, size.y, size.z]) / 16) @ axes.T == pytest.approx(covariances[0])
-    assert (unknown.scale.x, unknown.scale.y, unknown.scale.z) == (0.05, 0.05, 0.05)
-
-
-def test_no_landmarks_are_drawn_as_none():
-    cdr = to_msg.landmark_markers(STAMP_NS, "map", [], np.zeros((0, 2)), [])
-    assert [m.action for m in decode(cdr, "visualization_msgs/msg/MarkerArray").markers] == [3]
 
 
 def driven():

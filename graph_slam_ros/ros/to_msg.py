@@ -5,7 +5,6 @@ rosbags' type store, so nothing here needs ROS. A path is written with NumPy: 10
 message objects would cost a tenth of a second each time.
 """
 
-import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -13,19 +12,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.lie import se3
+from graph_slam_ros.ros.cdr import HEADER, NS, CdrWriter, stamp
 from graph_slam_ros.ros.interfaces import typestore
 from graph_slam_ros.slam.space import PLANE, SPACE
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
 
-_NS = 1_000_000_000
 _IN_PLANE = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])  # of the 36 numbers: x, y and yaw
 _OUT_OF_PLANE = np.array([14, 21, 28])  # the variances of z, roll and pitch
-_HEADER = b"\x00\x01\x00\x00"  # CDR, little endian
 
 
 def encode(message: Any) -> bytes:
@@ -40,7 +37,7 @@ def make(name: str, /, **fields: Any) -> Any:
 
 def time(stamp_ns: int) -> Any:
     """builtin_interfaces/Time."""
-    return make("builtin_interfaces/msg/Time", sec=int(stamp_ns // _NS), nanosec=int(stamp_ns % _NS))
+    return make("builtin_interfaces/msg/Time", sec=int(stamp_ns // NS), nanosec=int(stamp_ns % NS))
 
 
 def header(stamp_ns: int, frame: str) -> Any:
@@ -107,7 +104,7 @@ def pose_with_covariance_stamped(stamp_ns: int, frame: str, p: Numbers, covarian
 def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Numbers) -> bytes:
     """tf2_msgs/TFMessage with one transform; quick, for it is sent with every odometry message."""
     one, motion = np.uint32(1).tobytes(), se3.in_space(T_parent_child).tobytes()
-    return b"".join((_HEADER, one, _stamp(stamp_ns), _frames(12, parent, child), motion))
+    return b"".join((HEADER, one, stamp(stamp_ns), _frames(12, parent, child), motion))
 
 
 def odometry(
@@ -124,7 +121,7 @@ def odometry(
     space = PLANE if len(p) == 3 else SPACE
     numbers = se3.in_space(p).tobytes(), covariance6(space.in_parent_axes(p, covariance), unused).tobytes()
     moving = _unknown_twist(unused) if twist is None else twist
-    return b"".join((_HEADER, _stamp(stamp_ns), _frames(8, frame, child), *numbers, moving))
+    return b"".join((HEADER, stamp(stamp_ns), _frames(8, frame, child), *numbers, moving))
 
 
 @cache
@@ -194,16 +191,12 @@ def path(frame: str, stamps_ns: ArrayLike, poses: Array, newest_ns: int | None =
     name = frame.encode() + b"\x00"
     if newest_ns is None:
         newest_ns = int(stamps[-1]) if len(stamps) else 0
-    head = _stamp(newest_ns) + np.uint32(len(name)).tobytes() + name
+    head = stamp(newest_ns) + np.uint32(len(name)).tobytes() + name
     head += b"\x00" * (-len(head) % 4) + np.uint32(len(stamps)).tobytes()
     if not len(stamps):
-        return _HEADER + head
+        return HEADER + head
     first, others = _pose_rows(name, stamps[:1], poses[:1], len(head)), _pose_rows(name, stamps[1:], poses[1:], 0)
-    return b"".join((_HEADER, head, first.data, others.data))  # a megabyte, copied once
-
-
-def _stamp(stamp_ns: int) -> bytes:
-    return struct.pack("<iI", *divmod(stamp_ns, _NS))
+    return b"".join((HEADER, head, first.data, others.data))  # a megabyte, copied once
 
 
 def _pose_rows(name: bytes, stamps: NDArray[np.int64], poses: Array, start: int) -> NDArray[np.uint8]:
@@ -220,73 +213,28 @@ def _pose_rows(name: bytes, stamps: NDArray[np.int64], poses: Array, start: int)
         ]
     )
     rows = np.zeros(len(stamps), dtype=row)
-    rows["sec"], rows["nanosec"] = np.divmod(stamps, _NS)
+    rows["sec"], rows["nanosec"] = np.divmod(stamps, NS)
     rows["length"], rows["frame"] = len(name), name
     rows["values"] = se3.in_space(poses)
     return rows.view(np.uint8)
 
 
-def landmark_markers(
-    stamp_ns: int, frame: str, names: Sequence[str], positions: Array, covariances: Sequence[Array]
-) -> bytes:
-    """visualization_msgs/MarkerArray: all former markers deleted, then a 2-sigma ellipse or ellipsoid and a name each.
+def detections(stamp_ns: int, frame: str, names: Sequence[str], poses: Array, covariances: Array) -> bytes:
+    """vision_msgs/Detection3DArray: things seen, or known, by their identity, each with one hypothesis of no class.
 
     Parameters
     ----------
-    positions : (n, 2) or (n, 3); covariances : n of (2, 2) or (3, 3), both in ``frame``
+    poses : (n, 7); covariances : (n, 6, 6) in the axes of ``frame``
     """
-    markers = [_marker(stamp_ns, frame, "", 0, action=3)]
-    for k, (name, position, covariance) in enumerate(zip(names, positions, covariances, strict=True)):
-        axes, size = _two_sigma(covariance)
-        at = np.concatenate([np.zeros(3), Rotation.from_matrix(axes).as_quat()])
-        at[: len(position)] = position
-        markers.append(_marker(stamp_ns, frame, "landmarks", k, type_=3 if len(position) == 2 else 2, at=at, size=size))
-        markers.append(_marker(stamp_ns, frame, "names", k, type_=9, at=at, size=(0.0, 0.0, 0.25), text=name))
-    return encode(make("visualization_msgs/msg/MarkerArray", markers=markers))
-
-
-def _two_sigma(covariance: Array) -> tuple[Array, Numbers]:
-    """Axes, as the columns of a rotation, and diameters [m]; never too small to see, also where it is unknown."""
-    n = len(covariance)
-    variances, directions = np.linalg.eigh(covariance if np.isfinite(covariance).all() else np.zeros((n, n)))
-    axes, size = np.eye(3), np.zeros(3)
-    axes[:n, :n], size[:n] = directions, 4.0 * np.sqrt(np.maximum(variances, 0.0))
-    axes[:, 0] *= np.sign(np.linalg.det(axes))  # a rotation, not its mirror image
-    return axes, tuple(np.maximum(size, 0.05).tolist())
-
-
-def _marker(
-    stamp_ns: int,
-    frame: str,
-    namespace: str,
-    number: int,
-    *,
-    action: int = 0,
-    type_: int = 0,
-    at: ArrayLike = se3.IDENTITY,
-    size: Numbers = (1.0, 1.0, 1.0),
-    text: str = "",
-) -> Any:
-    zero = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
-    return make(
-        "visualization_msgs/msg/Marker",
-        header=header(stamp_ns, frame),
-        ns=namespace,
-        id=number,
-        type=type_,
-        action=action,
-        pose=pose(at),
-        scale=vector(*size),
-        color=make("std_msgs/msg/ColorRGBA", r=0.9, g=0.5, b=0.1, a=0.8),
-        lifetime=zero,
-        frame_locked=False,
-        points=[],
-        colors=[],
-        texture_resource="",
-        texture=make("sensor_msgs/msg/CompressedImage", header=header(0, ""), format="", data=np.zeros(0, np.uint8)),
-        uv_coordinates=[],
-        text=text,
-        mesh_resource="",
-        mesh_file=make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
-        mesh_use_embedded_materials=False,
-    )
+    certain, size = np.ones((len(names), 1)), np.zeros((len(names), 3))
+    rows = np.concatenate((certain, poses, covariances.reshape(-1, 36), poses, size), axis=1)
+    out = CdrWriter()
+    out.header(stamp_ns, frame)
+    out.numbers("I", len(names))
+    for name, row in zip(names, rows, strict=True):
+        out.header(stamp_ns, frame)
+        out.numbers("I", 1)  # hypothesis
+        out.text("")
+        out.array(row)  # its score, pose and covariance; centre and size of the box
+        out.text(name)
+    return out.message()

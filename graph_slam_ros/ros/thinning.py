@@ -1,0 +1,37 @@
+"""What is shown of too much: the same as more comes, as long as that can be."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def thinned(count: int, most: int) -> Index:
+    """Which of ``count`` to show where no more than ``most`` (two or more; 0: all) may be, the first and last included.
+
+    Every second, every fourth, and so on: as more come the same are chosen until they are too many, then half of them.
+    """
+    stride = 1
+    while most and -(-(count - 1) // stride) + 1 > max(most, 2):
+        stride *= 2
+    kept = np.arange(0, count, stride)
+    return kept if count == 0 or kept[-1] == count - 1 else np.append(kept, count - 1)
+
+
+def worst_and_some(ids: Index, misfit: Array, most: int) -> Index:
+    """Of edges with a misfit (n,) each no more than ``most``, in order of their ids (n,).
+
+    Half of these are the worst; of the others all whose ids divide by a power of two.
+    """
+    if len(ids) <= most:
+        return ids
+    half = most // 2
+    order = np.argpartition(-misfit, half)
+    worst, others = ids[order[:half]], ids[order[half:]]
+    stride = 1
+    while len(others) > most - half:
+        stride *= 2
+        others = others[others % stride == 0]
+    return np.sort(np.concatenate((worst, others)))

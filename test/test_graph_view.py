@@ -1,0 +1,188 @@
+"""The graph as it is drawn: lines between what edges join, coloured by how well they fit, never too many."""
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.graph import POINT_PRIOR, Gaussian
+from graph_slam_ros.ros import results, to_msg
+from graph_slam_ros.ros.graph_view import graph_view
+from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
+
+STAMP_NS = 1_700_000_000_000_000_000
+
+
+def flat(dimensions, variance):
+    return tuple((variance * np.eye(dimensions)).ravel().tolist())
+
+
+@pytest.fixture(scope="module", params=[2, 3])
+def slam(request):
+    """Ten keyframes along a line, seen by everything; the last closure is out, as it does not fit."""
+    n = request.param
+    dof = 3 if n == 2 else 6
+    slam = GraphSlam(Config.from_mapping({"world.dimensions": n, "keyframes.shared_noise": 1.0}))
+    level = (0.0,) if n == 2 else (0.0, 0.0, 0.0, 1.0)
+    for k in range(10):
+        stamp = STAMP_NS + k * 10**9
+        slam.process(Odometry(stamp, (float(k), *[0.0] * (n - 1), *level)))
+        point = Sighting("point", "position", (4.0 - k, 1.0, 0.5)[:n], flat(n, 0.01))
+        tag = Sighting("tag", "pose", (5.0 - k, *[-1.0] * (n - 1), *level), flat(dof, 0.01))
+        slam.process(Sightings(stamp, "/landmarks", (point, tag)))
+    newest = STAMP_NS + 9 * 10**9
+    antenna = (0.5, 0.2, 0.9)[:n]
+    slam.process(Fix(newest, "/gps", "position", (9.7, 0.1, 0.8)[:n], flat(n, 0.04), antenna))
+    one_axis = np.diag([4e6, 0.09, 4e6][:n])
+    slam.process(Fix(newest, "/gps", "position", (50.0, 0.4, 7.0)[:n], tuple(one_axis.ravel().tolist()), antenna))
+    slam.process(Fix(newest, "/pose", "pose", (9.1, *[0.1] * (n - 1), *level), flat(dof, 0.04)))
+    slam.process(Fix(newest, "/compass", "heading", (0.1,), (0.01,)))
+    for far in (5.0, 7.0):
+        slam.process(Closure(newest, newest - 5 * 10**9, "/c", (far, *[0.0] * (n - 1), *level), flat(dof, 0.01)))
+    slam.process(Control("flush"))
+    slam.process(Control("optimize"))
+    survey = slam.space.point
+    where = slam.solver.estimate([slam.landmarks["point"].vertex])[0] + 0.1
+    noise = Gaussian.from_sigmas(*[0.1] * n)
+    slam.graph.add_edge(POINT_PRIOR[survey], [slam.landmarks["point"].vertex], where, noise, "surveyed")
+    slam.solver.set_weight(int(slam.graph.edges_of("closures")[-1]), 0.0)
+    slam.process(Control("optimize"))
+    assert slam.counters.as_dict() == {}
+    return slam
+
+
+def in_space(points):
+    out = np.zeros((len(points), 3))
+    out[:, : np.shape(points)[1]] = points
+    return out
+
+
+def positions(slam):
+    return in_space(slam.trajectory()[:, : slam.space.dimensions])
+
+
+def landmark(slam, name):
+    return in_space(slam.solver.estimate([slam.landmarks[name].vertex])[:, : slam.space.dimensions])[0]
+
+
+def test_vertices_are_where_they_are_estimated(slam):
+    view = graph_view(slam, 100)
+    assert (view.poses == positions(slam)).all()
+    assert sorted(view.landmarks.tolist()) == sorted(landmark(slam, name).tolist() for name in ("point", "tag"))
+
+
+def test_odometry_joins_one_keyframe_to_the_next(slam):
+    lines, path = graph_view(slam, 100).classes["odometry"], positions(slam)
+    assert (lines.start == path[:-1]).all()
+    assert (lines.end == path[1:]).all()
+
+
+def test_sightings_lead_from_the_keyframe_to_the_landmark(slam):
+    lines, path = graph_view(slam, 100).classes["landmarks"], positions(slam)
+    drawn = [(*start, *end) for start, end in zip(lines.start.tolist(), lines.end.tolist(), strict=True)]
+    expected = [(*pose, *landmark(slam, name)) for pose in path.tolist() for name in ("point", "tag")]
+    assert sorted(drawn) == sorted(expected)
+
+
+def test_closures_join_what_they_close_and_those_that_are_out_are_drawn_apart(slam):
+    view, path = graph_view(slam, 100), positions(slam)
+    for lines in (view.classes["closures"], view.rejected):
+        assert lines.start.tolist() == [path[4].tolist()]
+        assert lines.end.tolist() == [path[9].tolist()]
+    assert view.classes["closures"].misfit[0] < 9.0 < view.rejected.misfit[0]
+
+
+def test_a_fix_leads_from_where_it_says_to_the_point_of_the_robot_that_it_is_of_by_as_much_as_it_misses(slam):
+    n, lines = slam.space.dimensions, graph_view(slam, 100).classes["fixes"]
+    by_start = {tuple(start[:n]): (end, q) for start, end, q in zip(lines.start, lines.end, lines.misfit, strict=True)}
+    newest = tuple(slam.trajectory()[-1])
+    antenna = in_space(np.array([slam.space.group.act(newest, (0.5, 0.2, 0.9)[:n])]))[0]
+
+    end, misfit = by_start.pop((9.7, 0.1, 0.8)[:n])
+    assert end == pytest.approx(antenna)
+    assert misfit == pytest.approx(((end - in_space([(9.7, 0.1, 0.8)[:n]])[0]) ** 2).sum() / (n * 0.04), rel=1e-5)
+
+    end, _ = by_start.pop((9.1, 0.1, 0.1)[:n])
+    assert end == pytest.approx(positions(slam)[-1])
+
+    ((start, (end, misfit)),) = by_start.items()  # the compass says nothing of a position
+    assert end == pytest.approx(antenna)
+    assert start == pytest.approx((antenna[0], 0.4, antenna[2])[:n]), "where it would be, were that coordinate right"
+    assert misfit == pytest.approx((antenna[1] - 0.4) ** 2 / 0.09, rel=1e-5)
+
+
+def test_a_surveyed_landmark_is_joined_to_where_it_was_surveyed(slam):
+    lines = graph_view(slam, 100).classes["surveyed"]
+    assert lines.end[0] == pytest.approx(landmark(slam, "point"))
+    n = slam.space.dimensions
+    (table,) = [t for t in slam.graph.tables.values() if t.type is POINT_PRIOR[slam.space.point]]
+    assert lines.start[0] == pytest.approx(in_space(table.measured.values)[0])
+    assert lines.misfit[0] == pytest.approx(((lines.end - lines.start) ** 2).sum() / (n * 0.01), rel=1e-5)
+
+
+def test_what_is_drawn_is_bounded_and_the_worst_is_never_left_out(slam):
+    everything, view = graph_view(slam, 100), graph_view(slam, 6)
+    assert len(view.poses) <= 6
+    assert view.poses[[0, -1]].tolist() == positions(slam)[[0, -1]].tolist()
+    misfits = [lines.misfit for lines in (*view.classes.values(), view.rejected)]
+    assert 3 <= sum(map(len, misfits)) <= 6
+    worst = np.sort(np.concatenate([lines.misfit for lines in (*everything.classes.values(), everything.rejected)]))
+    assert set(worst[-3:].tolist()) <= set(np.concatenate(misfits).tolist())
+    assert len(graph_view(slam, 2).landmarks) == 2
+
+
+def test_the_graph_is_published_in_the_map_at_the_newest_keyframe(slam):
+    cdr = results.graph(slam, 100)
+    drawn = typestore().deserialize_cdr(cdr, results.LANDMARKS).markers
+    names = [m.ns for m in drawn]
+    assert names[1:3] == ["poses", "landmarks"] and names[-1] == "rejected"
+    assert set(names[3:-1]) == {
+        f"edges/{name}" for name in ("anchor", "odometry", "landmarks", "fixes", "closures", "surveyed")
+    }
+    assert {m.header.frame_id for m in drawn} == {"map"}
+    assert {m.header.stamp.sec for m in drawn} == {STAMP_NS // 10**9 + 9}
+
+
+def test_of_nothing_nothing_is_drawn():
+    drawn = typestore().deserialize_cdr(results.graph(GraphSlam(), 100), results.LANDMARKS).markers
+    assert [(m.ns, m.action, len(m.points)) for m in drawn] == [
+        ("", 3, 0),
+        ("poses", 0, 0),
+        ("landmarks", 0, 0),
+        ("rejected", 0, 0),
+    ]
+
+
+def test_landmarks_are_published_with_identity_and_covariance_in_the_axes_of_the_map(slam):
+    n, most = slam.space.dimensions, slam.config.output.pose_covariance_max
+    message = typestore().deserialize_cdr(results.landmarks_estimate(slam), results.ESTIMATES)
+    assert message.header.frame_id == "map"
+    assert message.header.stamp.sec == STAMP_NS // 10**9 + 9
+    by_id = {d.id: d for d in message.detections}
+    known = {name: (value, covariance) for name, value, covariance in results.landmark_estimates(slam)}
+    assert by_id.keys() == known.keys() == {"point", "tag"}
+    for name, detection in by_id.items():
+        (result,) = detection.results
+        assert (result.hypothesis.class_id, result.hypothesis.score) == ("", 1.0)
+        assert detection.header == message.header
+        assert detection.bbox.center == result.pose.pose
+        assert (detection.bbox.size.x, detection.bbox.size.y, detection.bbox.size.z) == (0.0, 0.0, 0.0)
+        p = result.pose.pose.position
+        assert [p.x, p.y, p.z] == pytest.approx(landmark(slam, name))
+    tag = known["tag"][0]
+    assert by_id["tag"].results[0].pose.pose == to_msg.pose(tag)
+    full = by_id["tag"].results[0].pose.covariance
+    assert full == pytest.approx(to_msg.covariance6(known["tag"][1], most))
+    point = by_id["point"].results[0].pose.covariance.reshape(6, 6)
+    assert point[:n, :n] == pytest.approx(known["point"][1])
+    assert np.diag(point)[n:] == pytest.approx(most), "a point has no orientation, and in the plane no height"
+    assert not point[n:, :n].any()
+    q = by_id["point"].results[0].pose.pose.orientation
+    assert (q.x, q.y, q.z, q.w) == (0.0, 0.0, 0.0, 1.0)
+
+
+def test_an_unknown_covariance_is_published_as_a_large_one(slam):
+    size = slam.space.dof
+    unknown = [("tag", slam.space.identity, np.full((size, size), np.nan))]
+    message = typestore().deserialize_cdr(results.landmarks_estimate(slam, unknown), results.ESTIMATES)
+    covariance = message.detections[0].results[0].pose.covariance.reshape(6, 6)
+    assert (covariance == slam.config.output.pose_covariance_max * np.eye(6)).all()

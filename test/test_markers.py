@@ -1,0 +1,136 @@
+"""Markers: their bytes are those of rosbags' serialiser, and what they draw is what there is."""
+
+import math
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.lie import so3
+from graph_slam_ros.ros import markers, to_msg
+from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.ros.markers import Lines
+
+STAMP_NS = 1_700_000_000_987_654_321
+MARKERS = "visualization_msgs/msg/MarkerArray"
+
+
+def decode(cdr):
+    return typestore().deserialize_cdr(cdr, MARKERS)
+
+
+def random_lines(rng, n):
+    return Lines(rng.standard_normal((n, 3)), rng.standard_normal((n, 3)), rng.uniform(0.0, 20.0, n))
+
+
+NONE = random_lines(np.random.default_rng(0), 0)
+
+
+@pytest.mark.parametrize("label", ["", "o", "closures"])
+@pytest.mark.parametrize("n", [0, 1, 3])
+@pytest.mark.parametrize("length", range(1, 17))
+def test_the_graph_has_the_bytes_of_the_serialiser_for_every_length_of_the_frames_name(length, n, label):
+    rng = np.random.default_rng(n)
+    frame = "abcdefghijklmnop"[:length]
+    classes = {label: random_lines(rng, n), "odometry": random_lines(rng, 2)}
+    poses, landmarks = rng.standard_normal((n, 3)), rng.standard_normal((2, 3))
+    cdr = markers.graph_markers(STAMP_NS, frame, poses, landmarks, classes, random_lines(rng, n))
+    assert cdr == to_msg.encode(decode(cdr))
+    assert {m.header.frame_id for m in decode(cdr).markers} == {frame}
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+@pytest.mark.parametrize("length", range(1, 9))
+def test_landmarks_have_the_bytes_of_the_serialiser_for_every_length_of_the_frames_name(length, dimensions):
+    rng = np.random.default_rng(length)
+    names = ["", "a", "tag 17"]
+    covariances = [np.cov(rng.standard_normal((dimensions, 9))) for _ in names]
+    frame, positions = "abcdefghijklmnop"[:length], rng.standard_normal((3, dimensions))
+    cdr = markers.landmark_markers(STAMP_NS, frame, names, positions, covariances)
+    assert cdr == to_msg.encode(decode(cdr))
+
+
+def test_a_graphs_markers_replace_the_former_ones_and_hold_what_they_were_given():
+    poses, landmarks = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.array([[7.0, 8.0, 9.0]])
+    lines = Lines(np.array([[0.0, 0.0, 0.0]]), np.array([[1.0, 2.0, 3.0]]), np.array([1.0]))
+    cdr = markers.graph_markers(STAMP_NS, "world", poses, landmarks, {"odometry": lines, "fixes": NONE}, NONE)
+    clear, *drawn = decode(cdr).markers
+    assert (clear.action, len(clear.points)) == (3, 0)
+    assert [(m.ns, m.id, m.type, m.action) for m in drawn] == [
+        ("poses", 0, 8, 0),
+        ("landmarks", 0, 8, 0),
+        ("edges/odometry", 0, 5, 0),
+        ("rejected", 0, 5, 0),
+    ]
+    assert [[(p.x, p.y, p.z) for p in m.points] for m in drawn] == [
+        [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)],
+        [(7.0, 8.0, 9.0)],
+        [(0.0, 0.0, 0.0), (1.0, 2.0, 3.0)],
+        [],
+    ]
+    assert [len(m.colors) for m in drawn] == [0, 0, 2, 0]
+    assert all(m.color.a > 0.5 and m.scale.x > 0.0 for m in drawn)
+    assert all((m.pose.position.x, m.pose.orientation.w) == (0.0, 1.0) for m in drawn), "points are in the frame itself"
+    for m in decode(cdr).markers:
+        assert (m.header.stamp.sec, m.header.stamp.nanosec, m.header.frame_id) == (*divmod(STAMP_NS, 10**9), "world")
+
+
+def test_an_edge_that_fits_is_green_and_one_of_three_sigmas_is_red_with_yellow_between():
+    red, green, blue, alpha = markers.misfit_colours([0.0, 1.0, 4.0, 9.0, 1e6]).T
+    assert green[0] == green[1] == green.max() and red[0] == red[1] == red.min()
+    assert red[3] == red[4] == red.max() and green[3] == green[4] == green.min()
+    assert red[2] == pytest.approx(0.8) and green[2] == pytest.approx(0.6), "two sigmas are half-way"
+    assert (blue < 0.5).all() and (alpha == 1.0).all()
+    brightness = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+    assert (np.diff(brightness) <= 0.0).all(), "it is told without colours, too"
+
+
+def test_each_line_has_its_own_colour_at_both_ends():
+    lines = Lines(np.zeros((2, 3)), np.ones((2, 3)), np.array([1.0, 9.0]))
+    *_, edges, _ = decode(markers.graph_markers(STAMP_NS, "map", NONE.start, NONE.start, {"a": lines}, NONE)).markers
+    fits, does_not = markers.misfit_colours([1.0, 9.0])
+    given = [(c.r, c.g, c.b, c.a) for c in edges.colors]
+    assert given == [tuple(fits.tolist())] * 2 + [tuple(does_not.tolist())] * 2
+
+
+def test_an_edge_that_is_out_is_dashed_from_end_to_end():
+    lines = Lines(np.array([[1.0, 0.0, 0.0]]), np.array([[10.0, 0.0, 9.0]]), np.array([1.0]))
+    *_, rejected = decode(markers.graph_markers(STAMP_NS, "map", NONE.start, NONE.start, {}, lines)).markers
+    assert rejected.ns == "rejected"
+    assert [(p.x, p.y, p.z) for p in rejected.points] == [pytest.approx((1.0 + k, 0.0, k)) for k in range(10)]
+
+
+def test_markers_replace_the_former_ones_and_draw_each_landmark_as_its_two_sigma_ellipse():
+    c, s = math.cos(0.3), math.sin(0.3)
+    turn = np.array([[c, -s], [s, c]])
+    covariances = [turn @ np.diag([0.01, 0.09]) @ turn.T, np.zeros((2, 2))]
+    cdr = markers.landmark_markers(STAMP_NS, "map", ["a", "b"], np.array([[1.0, 2.0], [3.0, 4.0]]), covariances)
+    clear, *drawn = decode(cdr).markers
+    assert clear.action == 3
+    assert [(m.ns, m.id, m.action) for m in drawn] == [(ns, k, 0) for k in (0, 1) for ns in ("landmarks", "names")]
+    ellipse, name, exact, _ = drawn
+    assert (ellipse.type, name.type) == (3, 9)
+    assert sorted((ellipse.scale.x, ellipse.scale.y)) == pytest.approx([0.4, 1.2])
+    tilt = 2 * math.atan2(ellipse.pose.orientation.z, ellipse.pose.orientation.w)
+    long_axis = tilt if ellipse.scale.x > ellipse.scale.y else tilt + math.pi / 2
+    assert math.sin(long_axis - (0.3 + math.pi / 2)) == pytest.approx(0.0, abs=1e-9)
+    assert name.text == "a"
+    assert (exact.scale.x, exact.scale.y) == (0.05, 0.05), "never too small to see"
+    assert {m.header.frame_id for m in drawn} == {"map"}
+
+
+def test_in_space_a_landmark_is_drawn_as_its_two_sigma_ellipsoid_or_small_where_that_is_unknown():
+    turn = so3.matrix(so3.exp((0.4, -1.1, 0.7)))
+    covariances = [turn @ np.diag([0.01, 0.09, 0.25]) @ turn.T, np.full((3, 3), np.nan)]
+    positions = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    cdr = markers.landmark_markers(STAMP_NS, "map", ["a", "b"], positions, covariances)
+    _, ellipsoid, _, unknown, _ = decode(cdr).markers
+    p, q, size = ellipsoid.pose.position, ellipsoid.pose.orientation, ellipsoid.scale
+    assert (ellipsoid.type, p.x, p.y, p.z) == (2, 1.0, 2.0, 3.0)
+    axes = so3.matrix((q.x, q.y, q.z, q.w))
+    assert axes @ np.diag(np.square([size.x, size.y, size.z]) / 16) @ axes.T == pytest.approx(covariances[0])
+    assert (unknown.scale.x, unknown.scale.y, unknown.scale.z) == (0.05, 0.05, 0.05)
+
+
+def test_no_landmarks_are_drawn_as_none():
+    cdr = markers.landmark_markers(STAMP_NS, "map", [], np.zeros((0, 2)), [])
+    assert [m.action for m in decode(cdr).markers] == [3]

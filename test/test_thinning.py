@@ -1,0 +1,59 @@
+"""What is shown of too much is bounded, and the same as more comes."""
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.ros.thinning import thinned, worst_and_some
+
+
+@pytest.mark.parametrize(
+    ("count", "most"), [(0, 5), (1, 5), (2, 2), (5, 5), (6, 5), (9, 5), (10, 5), (999, 2), (999, 64)]
+)
+def test_a_path_is_thinned_to_the_bound_and_keeps_its_first_and_its_last(count, most):
+    kept = thinned(count, most)
+    assert len(kept) <= most
+    assert (np.diff(kept) > 0).all()
+    assert {0, count - 1} <= set(kept.tolist()) or count == 0
+    assert count <= most or len(kept) > most // 2, "no more is left out than must be"
+    assert (thinned(count, 0) == np.arange(count)).all()
+
+
+def test_as_a_path_grows_the_same_poses_are_kept_until_half_of_them_go():
+    earlier = thinned(2, 8)
+    halved = 0
+    for count in range(3, 200):
+        kept = thinned(count, 8)
+        gone = set(earlier[:-1].tolist()) - set(kept.tolist())
+        assert set(kept[:-1].tolist()) <= set(range(count)) and (not gone or gone == set(earlier[:-1].tolist()[1::2]))
+        halved += bool(gone)
+        earlier = kept
+    assert halved == 5
+
+
+def test_of_few_edges_all_are_shown():
+    ids = np.array([3, 5, 8])
+    assert worst_and_some(ids, np.array([1.0, 2.0, 3.0]), 3).tolist() == [3, 5, 8]
+    assert worst_and_some(ids[:0], np.empty(0), 3).tolist() == []
+
+
+@pytest.mark.parametrize("most", [1, 2, 7, 64, 999])
+def test_of_many_edges_the_worst_are_shown_and_some_of_all(most):
+    rng = np.random.default_rng(most)
+    ids = np.flatnonzero(rng.uniform(size=2000) < 0.7)
+    misfit = rng.exponential(size=len(ids))
+    shown = worst_and_some(ids, misfit, most)
+    assert len(shown) <= most
+    assert (np.diff(shown) > 0).all()
+    worst = ids[np.argsort(misfit)][len(ids) - most // 2 :]
+    assert set(worst.tolist()) <= set(shown.tolist())
+    others, rest = np.setdiff1d(shown, worst), np.setdiff1d(ids, worst)
+    stride = next(2**k for k in range(12) if len(rest[rest % 2**k == 0]) <= most - most // 2)
+    assert others.tolist() == rest[rest % stride == 0].tolist()
+
+
+def test_the_edges_shown_are_the_same_ones_as_more_come():
+    ids, misfit = np.arange(4000), np.ones(4000)
+    misfit[[17, 333]] = 50.0
+    before = set(worst_and_some(ids[:3000], misfit[:3000], 4).tolist())
+    after = set(worst_and_some(ids, misfit, 4).tolist())
+    assert {17, 333, 0} <= before & after
