@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from graph_slam_ros.graph import R2
 from graph_slam_ros.simulation import measurements
 from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
@@ -147,3 +148,29 @@ def test_two_seen_at_once_are_never_one():
     standing(slam, lambda t_s: [(8.0, 2.0), (8.0, 2.6)], 15.0)
     assert len(slam.landmarks) == 2
     assert slam.counters["landmarks", "merged"] == 0
+
+
+@pytest.mark.parametrize("association", ["nearest", "joint"])
+def test_by_range_and_bearing_from_as_far_as_ever_nothing_known_is_taken_for_it(association):
+    """Across it is so vague that along it there is nothing but rounding: a singular matrix."""
+    slam = pipeline(association)
+    standing(slam, lambda t_s: [(8.0, 2.0), (9.0, -3.0)], 10.0)
+    noise = (1e-4, 0.0, 0.0, 1.0)
+    far = [Sighting("", "range_bearing", (6e8, bearing), noise) for bearing in np.linspace(0.0, 3.0, 50).tolist()]
+    slam.process(Sightings(10 * S, "seen", tuple(far)))
+    slam.process(Control("end"))
+    assert slam.counters.as_dict() == {}
+    assert len(slam.landmarks) == 2
+
+
+def test_where_association_asks_of_what_cannot_be_solved_no_covariance_is_known():
+    slam = pipeline("joint")
+    standing(slam, lambda t_s: [(8.0, 2.0)], 10.0)
+    assert np.isfinite(slam.landmark_covariances()).all()
+    slam.graph.add_vertex(R2, [0.0, 0.0])  # nothing determines it
+    slam.process(Sightings(10 * S, "seen", (Sighting("", "position", (8.0, 2.0), POSITION),)))
+    slam.process(Control("flush"))
+    assert slam.counters["seen", "unclear_which"] == 1
+    assert not slam.is_solved
+    assert np.isnan(slam.landmark_covariances()).all()
+    assert np.isnan(slam.keyframe_covariances()).all()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
-from graph_slam_ros.slam.carry import Carried, by_motion
+from graph_slam_ros.slam.carry import ROUNDING, Carried, by_motion
 from graph_slam_ros.slam.space import Numbers, Space
 
 Array = NDArray[np.float64]
@@ -109,7 +109,13 @@ def expected(
         is_pose = len(landmark) == space.pose.size
         jacobian[rows, at : at + n] = turn.T @ space.turn(landmark) if is_pose else turn.T
         at += dof if is_pose else n
-    return Expected(points, jacobian @ joint @ jacobian.T, is_followed)
+    return Expected(points, of_sums(jacobian, joint), is_followed)
+
+
+def of_sums(jacobian: Array, covariance: Array) -> Array:
+    """``J P J'``, and what rounding leaves where large numbers cancel: less is not known of their difference."""
+    largest = np.abs(jacobian) @ np.sqrt(np.diag(covariance))
+    return np.asarray(jacobian @ covariance @ jacobian.T + np.diag(ROUNDING * largest**2))
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from graph_slam_ros.slam.space import Numbers, Space
 
 Array = NDArray[np.float64]
 
+ROUNDING = 100.0 * float(np.finfo(float).eps)  # of the largest variance that was added up to a covariance
 _NEAREST_M = 1e-9  # below this distance a direction is rounding
 _UNKNOWN_M2 = 1e6  # a variance of this or more says that an axis was not measured
 
@@ -205,6 +206,7 @@ def axes_known(covariance: Array) -> list[tuple[Array, float]]:
     if np.diag(covariance).max() < _UNKNOWN_M2:
         return []
     values, vectors = np.linalg.eigh(covariance)
+    values = np.maximum(values, ROUNDING * values[-1])  # of what nearly nothing is known beside, the rest is rounding
     return [(v, float(value)) for value, v in zip(values, vectors.T, strict=True) if value < 0.5 * _UNKNOWN_M2]
 
 

@@ -258,15 +258,16 @@ class GraphSlam:
         What came in after the last solve is unknown until the next, and all is where that failed.
         """
         out = [np.full((dof, dof), np.nan) for dof in (self.graph.kind_of(vertex).dof for vertex in vertices)]
-        known = [k for k, vertex in enumerate(vertices) if vertex < self._solved_vertices]
+        solved = self._solved_vertices if self.is_solved else 0
+        known = [k for k, vertex in enumerate(vertices) if vertex < solved]
         for k, marginal in zip(known, self.solver.marginal([vertices[k] for k in known]), strict=True):
             out[k] = marginal
         return out
 
     @property
     def is_solved(self) -> bool:
-        """Whether the last solve succeeded, so that covariances exist."""
-        return self._solved_vertices > 0
+        """Whether the last solve succeeded, and what association had the solver take in since: covariances exist."""
+        return self._solved_vertices > 0 and self.solver.is_current
 
     @property
     def newest_odometry_ns(self) -> int | None:

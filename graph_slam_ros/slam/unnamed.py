@@ -141,7 +141,8 @@ class Unnamed:
             at = carry.position(self._space, s, where)
         else:
             at = self._by_range_and_bearing(s, where)
-        return Carried(at.measured, at.covariance + self._extent())
+        rounding = carry.ROUNDING * float(np.trace(at.covariance)) * np.eye(self._space.dimensions)
+        return Carried(at.measured, at.covariance + self._extent() + rounding)
 
     def _by_range_and_bearing(self, s: Sighting, where: Where) -> Carried:
         space, T_base_sensor = self._space, s.T_base_sensor or self._space.identity
@@ -309,7 +310,7 @@ class Unnamed:
             for mark, sign in ((a, 1.0), (b, -1.0)):
                 j[k * n : (k + 1) * n, first[id(mark)] : first[id(mark)] + n] = sign * self._axes(mark)
                 r[k * n : (k + 1) * n] += sign * self._positions(np.array([mark.vertex]))[0]
-        return r, j @ joint @ j.T + np.kron(np.eye(len(pairs)), self._extent())
+        return r, association.of_sums(j, joint) + np.kron(np.eye(len(pairs)), self._extent())
 
     def _dof(self, landmark: Landmark) -> int:
         return self._landmarks.kind_of(landmark.vertex).dof

@@ -200,6 +200,11 @@ class Solver:
         self._waiting.vertices = self._waiting.vertices[self._waiting.vertices != vertex]
         self._take_out(one)
 
+    @property
+    def is_current(self) -> bool:
+        """Whether nothing waits: covariances then are of all there is, and asking for them changes nothing."""
+        return self._settled and not self._waiting
+
     def is_fixed(self) -> bool:
         """Whether a held vertex, or the edges on one vertex alone, fix position and heading of the whole."""
         self._grow()
