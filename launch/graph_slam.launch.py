@@ -1,31 +1,79 @@
-"""Start the SLAM node: ``ros2 launch graph_slam_ros graph_slam.launch.py odom:=/wheel/odometry``."""
+"""Start the SLAM node: ``ros2 launch graph_slam_ros graph_slam.launch.py odom:=/wheel/odometry rviz:=true``.
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+A plain node action, not a LifecycleNode: the node brings itself up, or a lifecycle manager does (``autostart:=false``),
+and so this process needs no ROS node of its own.
+"""
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 
-def generate_launch_description() -> LaunchDescription:
-    default_params = PathJoinSubstitution([FindPackageShare("graph_slam_ros"), "config", "planar.yaml"])
-    arguments = [
-        DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node and its topics"),
-        DeclareLaunchArgument("params_file", default_value=default_params, description="YAML file of parameters"),
-        DeclareLaunchArgument("use_sim_time", default_value="false", description="Take the time from /clock"),
-        DeclareLaunchArgument("odom", default_value="odom", description="Topic of nav_msgs/Odometry"),
-        DeclareLaunchArgument("landmarks", default_value="landmarks", description="Topic of Detection3DArray"),
-    ]
-    node = Node(
+def _in_config(name: str) -> PathJoinSubstitution:
+    return PathJoinSubstitution([FindPackageShare("graph_slam_ros"), "config", name])
+
+
+def _flag(name: str) -> ParameterValue:
+    return ParameterValue(LaunchConfiguration(name), value_type=bool)
+
+
+def _frames(context: LaunchContext) -> dict[str, str]:
+    """Nothing without a prefix, so that the frames of params_file stay."""
+    prefix = LaunchConfiguration("frame_prefix").perform(context)
+    names = {"frames.map": "map", "frames.odom": "odom", "frames.base": "base_link"}
+    return {key: prefix + name for key, name in names.items()} if prefix else {}
+
+
+def _start(context: LaunchContext) -> list[Node]:
+    namespace = LaunchConfiguration("namespace")
+    slam = Node(
         package="graph_slam_ros",
         executable="graph_slam_node",
-        namespace=LaunchConfiguration("namespace"),
+        namespace=namespace,
         parameters=[
             LaunchConfiguration("params_file"),
-            {"use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)},
+            {"use_sim_time": _flag("use_sim_time"), "node.autostart": _flag("autostart"), **_frames(context)},
         ],
         remappings=[(topic, LaunchConfiguration(topic)) for topic in ("odom", "landmarks")],
+        ros_arguments=["--log-level", LaunchConfiguration("log_level")],
         output="screen",
     )
-    return LaunchDescription([*arguments, node])
+    # The file's topics are relative, so that RViz in the robot's namespace shows this robot.
+    rviz = Node(
+        package="rviz2",
+        executable="rviz2",
+        namespace=namespace,
+        arguments=["-d", _in_config("graph_slam.rviz"), "-f", [LaunchConfiguration("frame_prefix"), "map"]],
+        parameters=[{"use_sim_time": _flag("use_sim_time")}],
+        condition=IfCondition(LaunchConfiguration("rviz")),
+    )
+    return [slam, rviz]
+
+
+def generate_launch_description() -> LaunchDescription:
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node and its topics"),
+            DeclareLaunchArgument(
+                "params_file", default_value=_in_config("planar.yaml"), description="YAML file of parameters"
+            ),
+            DeclareLaunchArgument(
+                "frame_prefix",
+                default_value="",
+                description="Put before map, odom and base_link, which then are the frames whatever params_file says",
+            ),
+            DeclareLaunchArgument("use_sim_time", default_value="false", description="Take the time from /clock"),
+            DeclareLaunchArgument(
+                "autostart", default_value="true", description="false: a lifecycle manager configures and activates it"
+            ),
+            DeclareLaunchArgument("odom", default_value="odom", description="Topic of nav_msgs/Odometry"),
+            DeclareLaunchArgument("landmarks", default_value="landmarks", description="Topic of Detection3DArray"),
+            DeclareLaunchArgument("rviz", default_value="false", description="Open RViz as well"),
+            DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn, error or fatal"),
+            OpaqueFunction(function=_start),
+        ]
+    )
