@@ -7,6 +7,7 @@ import pytest
 
 from graph_slam_ros.lie import so3
 from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.measurements import InitialPose
 
 S = 1_000_000_000
 LAST_NS = (2**31 - 100) * S
@@ -40,6 +41,7 @@ class Stranger:
             "landmarks.loss": self.pick("none", "huber", "cauchy", "huber_then_cauchy"),
             "keyframes.shared_noise": self.pick(0.0, 0.05, 1e9),
             "odometry.noise": self.pick("twist", "density"),
+            "initialpose.use": self.pick("segment", "prior"),
             "ordering.window_s": self.pick(0.0, 0.05),
             "ordering.late_s": self.pick(0.5, 10.0),
             "ordering.max_waiting": self.pick(2, 1000, 1000),
@@ -143,6 +145,14 @@ class Stranger:
         at = self.any_pose() if self.is_wild() else self.pose(0.5)
         return Closure(self.stamp_ns - self.late_ns(), self.stamp_ns - back_ns, "loops", at, self.pose_covariance())
 
+    def event(self):
+        event = self.pick("flush", "optimize", "end", "clear_closures", "time_jump", "set", "initial_pose", "nonsense")
+        if event == "initial_pose":
+            return InitialPose(self.any_pose() if self.is_wild() else self.pose(1.0), self.pose_covariance())
+        if event == "time_jump" and self.happens(0.5):
+            self.stamp_ns = 5 * S
+        return Control(event, (("solve.every_keyframes", self.pick(1, 3)),) if event == "set" else ())
+
     def measurements(self, count):
         for _ in range(count):
             yield self.odometry()
@@ -152,8 +162,8 @@ class Stranger:
                 yield self.fix()
             if self.happens(0.1):
                 yield self.closure()
-            if self.happens(0.02):
-                yield Control(self.pick("flush", "optimize", "end", "nonsense"))
+            if self.happens(0.05):
+                yield self.event()
         yield from (Control("end"), Control("optimize"))
 
 
