@@ -24,11 +24,19 @@ def test_the_readme_has_every_row_and_no_other(head):
     assert below.split("\n\n")[0].splitlines() == [row(one) for one in TABLES[head]]
 
 
+DEPENDENCIES = {tag.text for tag in ElementTree.parse(ROOT / "package.xml").iter("exec_depend")}
+
+
 @pytest.mark.parametrize("table", [PUBLICATIONS, SUBSCRIPTIONS, SERVICES])
 def test_each_name_is_there_once_and_each_package_is_a_dependency(table):
     assert len({one.name for one in table}) == len(table)
-    needed = {one.type.split("/")[0] for one in table}
-    assert needed <= {tag.text for tag in ElementTree.parse(ROOT / "package.xml").iter("exec_depend")}
+    assert {one.type.split("/")[0] for one in table} <= DEPENDENCIES
+
+
+def test_every_message_package_that_is_imported_is_a_dependency():
+    sources = "".join(path.read_text() for path in (ROOT / "graph_slam_ros").rglob("*.py"))
+    imported = set(re.findall(r"^ *(?:from|import) (\w+_(?:msgs|srvs|interfaces))\b", sources, re.MULTILINE))
+    assert {"rcl_interfaces", "nav_msgs"} <= imported <= DEPENDENCIES
 
 
 def test_names_are_resolved_as_ros_resolves_them():
