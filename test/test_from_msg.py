@@ -262,6 +262,13 @@ def test_A7_zero_covariance_means_unknown_and_the_default_is_used():
     assert counted(b) == {"detections": {"covariance_unknown": 1}}
 
 
+def test_a_covariance_so_small_that_its_products_vanish_gets_a_floor():
+    b = border()
+    m = heard(b, "detections", detections(detection(covariance=np.diag([5e-324, 1e-310]))))
+    assert only(m).covariance == (1e-30, 0.0, 0.0, 1e-30)
+    assert counted(b) == {"detections": {"covariance_floored": 1}}
+
+
 def test_a_detection_without_results_is_the_centre_of_its_box_with_the_default_noise():
     b = border()
     m = heard(b, "detections", detections(detection(results=0, bbox=pose(4.0, -1.0, 0.5))))

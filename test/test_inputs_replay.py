@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign import DEFINITIONS
 from messages import DATUM, LANDMARKS, STAMP_NS, odometry, pose, quaternion, record_drive, recorded
-from test_inputs_landmarks import ROS2_ARUCO
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.formats.ingest import read_ingest
@@ -125,7 +125,7 @@ def test_a_type_that_only_the_recording_defines_is_read_by_its_definition(tmp_pa
     from test_bag import definition, write_mcap
 
     name = "ros2_aruco_interfaces/msg/ArucoMarkers"
-    _, _, encoded = recorded(name, ROS2_ARUCO)
+    _, _, encoded = recorded(name, DEFINITIONS[name])
     sent = []
     for k in range(30):
         stamp_ns, x = STAMP_NS + k * 10**8, 0.1 * k
@@ -137,7 +137,7 @@ def test_a_type_that_only_the_recording_defines_is_read_by_its_definition(tmp_pa
         tmp_path / "a.mcap",
         [type("Sent", (), {"topic": t, "log_ns": s, "cdr": c}) for t, s, c in sent],
         types={"/odom": "nav_msgs/msg/Odometry", "/aruco": name},
-        text=lambda type_name: ROS2_ARUCO if type_name == name else definition(type_name),
+        text=lambda type_name: DEFINITIONS[name] if type_name == name else definition(type_name),
     )
     settings = {"inputs.names": "odom aruco", "aruco": {"type": name, "sigma_m": 0.1, "sigma_rad": 0.1}}
     slam, _ = replayed(file, tmp_path / "run", **settings)

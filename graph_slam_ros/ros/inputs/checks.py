@@ -12,6 +12,7 @@ _NORM_REPAIRED = 0.1  # a quaternion this far from unit length is normalised, be
 _NORM_EXACT = 1e-6
 _ASYMMETRY_REPAIRED, _ASYMMETRY_EXACT = 1e-2, 1e-6
 _DEFICIT_REPAIRED = 1e-9  # negative eigenvalues down to this fraction of the largest are rounding
+_LEAST = 1e-30  # [m^2, rad^2]: products of smaller numbers vanish
 _FARTHEST_M = 1e9
 _MOST_M2, _MOST_RAD2 = 1e6, 1e3  # as good as unknown; drivers send up to 1.8e308
 
@@ -79,7 +80,7 @@ def covariance(block: Array, lengths: int) -> tuple[Array, list[str]]:
         repairs.append("covariance_symmetrized")
     symmetric = 0.5 * block + 0.5 * block.T
     values, vectors = np.linalg.eigh(symmetric)
-    floor = _DEFICIT_REPAIRED * values[-1]
+    floor = max(_DEFICIT_REPAIRED * values[-1], _LEAST)
     if values[0] < -floor or values[-1] <= 0.0:
         raise MessageError("covariance_not_positive_definite")
     if values[0] < 1e-3 * floor:

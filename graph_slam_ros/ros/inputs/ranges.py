@@ -75,6 +75,8 @@ def _points(m: Any) -> np.ndarray[Any, Any]:
     data = bytes(m.data)
     if m.row_step < m.width * m.point_step or len(data) < m.row_step * m.height:
         raise MessageError("cut_off")
+    if not m.width * m.height * m.point_step:  # whatever its layout says
+        return np.empty(0)
     layout = np.dtype(
         {
             "names": list(fields),
@@ -83,8 +85,6 @@ def _points(m: Any) -> np.ndarray[Any, Any]:
             "itemsize": m.point_step,
         }
     )
-    if not m.width * m.height * m.point_step:
-        return np.empty(0, layout)
     return np.concatenate([np.frombuffer(data, layout, m.width, row * m.row_step) for row in range(m.height)])
 
 

@@ -1,0 +1,80 @@
+"""Messages of packages that need not be there, by the definitions that recordings carry."""
+
+_RULE = "=" * 80 + "\n"
+_MRPT = """std_msgs/Header header
+geometry_msgs/Pose sensor_pose_on_robot
+float64 min_sensor_distance
+float64 max_sensor_distance
+"""
+DEFINITIONS = {
+    "apriltag_msgs/msg/AprilTagDetectionArray": f"""std_msgs/Header header
+AprilTagDetection[] detections
+{_RULE}MSG: apriltag_msgs/AprilTagDetection
+string family
+int32 id
+int32 hamming
+float32 goodness
+float32 decision_margin
+Point centre
+Point[4] corners
+float64[9] homography
+{_RULE}MSG: apriltag_msgs/Point
+float64 x
+float64 y
+""",
+    "aruco_msgs/msg/MarkerArray": f"""std_msgs/Header header
+aruco_msgs/Marker[] markers
+{_RULE}MSG: aruco_msgs/Marker
+std_msgs/Header header
+uint32 id
+geometry_msgs/PoseWithCovariance pose
+float64 confidence
+""",
+    "ros2_aruco_interfaces/msg/ArucoMarkers": """std_msgs/Header header
+int64[] marker_ids
+geometry_msgs/Pose[] poses
+""",
+    "aruco_opencv_msgs/msg/ArucoDetection": f"""std_msgs/Header header
+aruco_opencv_msgs/MarkerPose[] markers
+aruco_opencv_msgs/BoardPose[] boards
+{_RULE}MSG: aruco_opencv_msgs/MarkerPose
+uint16 marker_id
+geometry_msgs/Pose pose
+{_RULE}MSG: aruco_opencv_msgs/BoardPose
+string board_name
+geometry_msgs/Pose pose
+""",
+    "rtabmap_msgs/msg/LandmarkDetections": f"""std_msgs/Header header
+LandmarkDetection[] landmarks
+{_RULE}MSG: rtabmap_msgs/LandmarkDetection
+std_msgs/Header header
+string landmark_frame_id
+int32 id
+float32 size
+geometry_msgs/PoseWithCovariance pose
+""",
+    "cartographer_ros_msgs/msg/LandmarkList": f"""std_msgs/Header header
+LandmarkEntry[] landmarks
+{_RULE}MSG: cartographer_ros_msgs/LandmarkEntry
+string id
+geometry_msgs/Pose tracking_from_landmark_transform
+float64 translation_weight
+float64 rotation_weight
+""",
+    "mrpt_msgs/msg/ObservationRangeBearing": f"""{_MRPT}float64 sensor_std_range
+float64 sensor_std_yaw
+float64 sensor_std_pitch
+SingleRangeBearingObservation[] sensed_data
+{_RULE}MSG: mrpt_msgs/SingleRangeBearingObservation
+float64 range
+float64 yaw
+float64 pitch
+int32 id
+""",
+    "mrpt_msgs/msg/ObservationRangeBeacon": f"""{_MRPT}float64 sensor_std_range
+SingleRangeBeaconObservation[] sensed_data
+{_RULE}MSG: mrpt_msgs/SingleRangeBeaconObservation
+float64 range
+int32 id
+""",
+}
