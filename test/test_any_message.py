@@ -1,4 +1,4 @@
-"""Whatever bytes come to an input of any type: nothing is raised, what leaves can be used, and what does not is counted."""
+"""Whatever bytes come to any input: nothing is raised, what leaves can be used, and what does not is counted."""
 
 import math
 from dataclasses import fields
