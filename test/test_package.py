@@ -26,9 +26,9 @@ WITHIN = {
     "formats": {"lie", "graph"},
     "ros/from_msg.py": {"lie", "slam", "ros"},
     "ros/bag.py": {"lie", "slam", "ros", "formats"},
-    "ros/params.py": {"lie", "slam", "ros"},
+    "ros/live": {"slam", "ros", "run", "formats"},
     "ros/to_msg.py": {"lie", "slam", "ros"},
-    "ros/node.py": {"slam", "ros", "run", "warmup"},
+    "ros/node.py": {"slam", "ros", "warmup"},
     "ros/player.py": {"slam", "formats", "ros", "replay"},
     "ros": {"lie", "graph", "solver", "slam", "formats"},
     "simulation": {"lie", "graph", "solver", "slam", "formats", "ros"},
@@ -55,8 +55,8 @@ NEVER = {
     "replay.py": {"matplotlib"},
     "ros": {"matplotlib"},
 }
-SPEAK_RCLPY = {"ros/node.py", "ros/params.py", "ros/player.py"}
-SPEAK_MESSAGES = SPEAK_RCLPY | {"ros/to_msg.py"}
+SPEAK_RCLPY = {"ros/node.py", "ros/player.py"} | {f"ros/live/{name}.py" for name in ("listeners", "outputs", "params")}
+SPEAK_MESSAGES = SPEAK_RCLPY | {"ros/to_msg.py", "ros/live/broadcaster.py", "ros/live/deferred.py"}
 OUTSIDE_THE_SOLVER = {"cli", "report.py"}
 
 
@@ -76,8 +76,8 @@ def imported(name):
 
 
 def rule(table, name):
-    """The rule for a file, else for its folder, else None."""
-    return table.get(name, table.get(name.split("/")[0]))
+    """The rule for a file, else for the nearest of its folders that has one, else None."""
+    return next((table[str(at)] for at in (Path(name), *Path(name).parents) if str(at) in table), None)
 
 
 def test_the_version_number_is_the_same_everywhere():

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.graph import R2
-from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.ros import results, to_msg
 from graph_slam_ros.ros.from_msg import twist_of
 from graph_slam_ros.ros.interfaces import typestore
@@ -265,82 +264,3 @@ def test_every_keyframe_has_its_covariance_or_nothing_that_could_be_mistaken_for
     assert np.isnan(slam.keyframe_covariances()).all()
     assert all(np.isnan(covariance).all() for _, _, covariance in results.landmark_estimates(slam))
     assert GraphSlam().keyframe_covariances().shape == (0, 3, 3)
-
-
-def round_a_curve(dimensions, every_m):
-    """A robot that goes round a curve, with a keyframe after so many metres."""
-    settings = {
-        "world.dimensions": dimensions,
-        "keyframes.min_distance_m": every_m,
-        "keyframes.min_angle_rad": 3.0,
-        "keyframes.max_interval_s": 1e3,
-        "ordering.window_s": 0.0,
-    }
-    slam = GraphSlam(Config.from_mapping(settings))
-    for k in range(20):
-        slam.process(drive(dimensions, k))
-    return slam
-
-
-def drive(dimensions, k, source="odometry"):
-    x, y, turn = 0.5 * k, 0.02 * k * k, 0.04 * k
-    stamp = STAMP_NS + k * 10**8
-    if dimensions == 2:
-        return Odometry(stamp, (x, y, turn), (4e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 9e-4), source)
-    q = so3.exp((0.01 * k, 0.02 * k, turn))
-    return Odometry(
-        stamp, (x, y, 0.1 * k, *map(float, q)), tuple(np.diag([4e-4, 1e-4, 2e-4, 3e-4, 5e-4, 9e-4]).ravel()), source
-    )
-
-
-@pytest.mark.parametrize("dimensions", [2, 3])
-def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_keyframe_there_would_be(dimensions):
-    rare, often = round_a_curve(dimensions, 3.2), round_a_curve(dimensions, 0.4)
-    m = drive(dimensions, 20)
-    at, covariance = rare.pose_at(m)
-    often.process(m)
-    newest = often.keyframes[-1]
-    assert (newest.stamp_ns, len(often.keyframes)) == (m.stamp_ns, 21)
-    assert len(rare.keyframes) < 10
-    assert at == pytest.approx(often.trajectory()[-1], abs=1e-9)
-    group, space = rare.space.group, rare.space
-    assert at == pytest.approx(group.compose(rare.T_map_odom, m.T_odom_base), abs=1e-9)
-    assert covariance == pytest.approx(often.pose_covariance, rel=1e-3, abs=1e-6)  # an edge has a least noise
-
-    message = decode(results.odometry(rare, m, np.arange(42.0).tobytes()), results.ODOMETRY)
-    p, q = message.pose.pose.position, message.pose.pose.orientation
-    assert (p.x, p.y, p.z, q.x, q.y, q.z, q.w) == pytest.approx(se3.in_space(at).tolist())
-    assert (message.header.frame_id, message.child_frame_id) == ("map", "base_link")
-    assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(m.stamp_ns, 10**9)
-    expected = to_msg.covariance6(space.in_parent_axes(at, covariance), 1e6)
-    assert message.pose.covariance == pytest.approx(expected)
-    assert message.twist.twist.linear.y == 1.0
-    assert message.twist.covariance[-1] == 41.0
-
-
-def test_odometry_that_is_not_in_use_is_older_than_what_was_used_or_has_jumped_says_nothing_of_the_robot_in_the_map():
-    slam = round_a_curve(2, 3.2)
-    assert results.odometry(GraphSlam(), drive(2, 20)) is None
-    assert results.odometry(slam, drive(2, 20, "another")) is None
-    assert results.odometry(slam, drive(2, 18)) is None
-    assert results.odometry(slam, drive(2, 19)) is not None
-    jumped = Odometry(drive(2, 20).stamp_ns, (60.0, 0.0, 0.0))
-    assert results.odometry(slam, jumped) is None
-
-
-def test_what_is_told_ahead_of_its_turn_changes_nothing():
-    asked, other = round_a_curve(2, 3.2), round_a_curve(2, 3.2)
-    for k in range(20, 40):
-        m = drive(2, k)
-        assert asked.pose_at(m) is not None
-        asked.process(m)
-        other.process(m)
-    assert (asked.trajectory() == other.trajectory()).all()
-    assert (asked.pose_covariance == other.pose_covariance).all()
-
-
-def test_a_robot_that_stands_becomes_no_more_uncertain_ahead_of_its_turn_either():
-    slam = round_a_curve(2, 3.2)
-    last = drive(2, 19)
-    later = Odometry(last.stamp_ns + 10**9, last.T_odom_base, last.twist_covariance, last.source)
-    assert slam.pose_at(later)[1] == pytest.approx(slam.pose_at(last)[1])

@@ -182,6 +182,14 @@ class Graph:
         """The table and row of an edge."""
         return self._in_order[self.table_of_edge.values[edge_id]], int(self.row_of_edge.values[edge_id])
 
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Numbers measured, without edges of weight 0, less numbers to be estimated."""
+        tables = self.tables.values()
+        measured = sum(table.type.residual_size * int(np.count_nonzero(table.weight.values)) for table in tables)
+        sizes = np.array([kind.dof for kind in self.kinds], dtype=np.int64)
+        return measured - int(sizes[self.kind.values].sum())
+
     def edges_of(self, label: str) -> Index:
         """Ids of the edges of a class, in order."""
         if label not in self.labels:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from graph_slam_ros.ros.inputs import CONVERTERS, Measured, checks, uses
+from graph_slam_ros.ros.inputs import CONVERTERS, Measured, checks, fixes, uses
 from graph_slam_ros.ros.inputs.checks import MessageError
 from graph_slam_ros.ros.inputs.source import NotYet, Source
 from graph_slam_ros.ros.interfaces import typestore
@@ -18,12 +18,12 @@ from graph_slam_ros.ros.transforms import Transforms, pose
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.input_config import InputConfig
-from graph_slam_ros.slam.measurements import Odometry
+from graph_slam_ros.slam.measurements import InitialPose, Odometry
 
 Decoder = Callable[[bytes], Any]
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-TF_STATIC, TF = "tf_static", "tf"
+TF_STATIC, TF, INITIAL_POSE = "tf_static", "tf", "initialpose"
 _POSE_SIZE = 8 * (7 + 36)  # of a geometry_msgs/PoseWithCovariance
 
 
@@ -94,6 +94,7 @@ class Border:
         for name, add in ((TF_STATIC, self._add_static), (TF, self._add_moving)):
             source = self._sources[name] = Source(InputConfig(name), "none", config, self._transforms)
             self._convert[name] = partial(self._transforms_of, source, add)
+        self._add_initial_pose()
         known = typestore().types
         ours = {name: decoder(name) for name in self._types.values() if name in known}
         self._decode = ours | dict(decoders or {})
@@ -123,6 +124,20 @@ class Border:
         self._waiting.clear()
         return out
 
+    def unlinked(self, name: str) -> tuple[str, ...]:
+        """Frames of an input that nothing links to the robot."""
+        return tuple(self._sources[name].unlinked)
+
+    def initial_pose(self, cdr: bytes) -> list[InitialPose]:
+        """What a geometry_msgs/PoseWithCovarianceStamped of ``initialpose`` says, if it can be used."""
+        out: list[Any] = self.take(INITIAL_POSE, cdr)
+        return out
+
+    def forget_time(self) -> None:
+        """Stamps begin anew: what /tf has told of moving joints is of another time."""
+        self._waiting.clear()
+        self._transforms.forget_time()
+
     def _hurried(self, source: Source, message: Any) -> list[Measured]:
         before, source.hurried = source.hurried, True
         out = self._converted(source, message)
@@ -143,6 +158,13 @@ class Border:
             self._counters.count(source.name, why, times)
         source.tally.clear()
         return out
+
+    def _add_initial_pose(self) -> None:
+        said = self._config.initialpose
+        settings = InputConfig(INITIAL_POSE, sigma_m=said.sigma_m, sigma_rad=said.sigma_rad)
+        source = self._sources[INITIAL_POSE] = Source(settings, "none", self._config, self._transforms)
+        self._types[INITIAL_POSE] = "geometry_msgs/msg/PoseWithCovarianceStamped"
+        self._convert[INITIAL_POSE] = partial(fixes.initial_pose, source)
 
     # -- transforms --------------------------------------------------------------------------------------------------
 

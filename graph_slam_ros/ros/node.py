@@ -1,217 +1,481 @@
-"""The ROS node: subscribes, hands every message to the pipeline, publishes what changed."""
+"""The ROS node: hands every message on, and publishes what came of it. Callbacks convert and enqueue, no more.
+
+The main thread has the callbacks, the border and map -> odom; the worker's thread has the pipeline (``Session``) and
+publishes its results. Between them stand a queue one way and ``Session.estimate`` the other.
+"""
 
 import os
+import re
 import signal
 import sys
+import time
+import traceback
+from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import replace
 from functools import partial
-from pathlib import Path as FilePath
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy comes in: threads would reorder sums
 
 import rclpy
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Path
-from rclpy.clock import Clock, ClockType
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.duration import Duration
+from rclpy.exceptions import ParameterNotDeclaredException
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import UInt64
-from std_srvs.srv import Trigger
-from tf2_msgs.msg import TFMessage
-from visualization_msgs.msg import MarkerArray
 
-from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.ros import results
-from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border, Decoder, is_correction
-from graph_slam_ros.ros.inputs import uses
+from graph_slam_ros.errors import ConfigError, GraphSlamError
+from graph_slam_ros.ros import results, to_msg
+from graph_slam_ros.ros.from_msg import Border, Decoder, twist_of
+from graph_slam_ros.ros.inputs import Measured, uses
 from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.ros.live import events, health
+from graph_slam_ros.ros.live.ahead import Ahead
+from graph_slam_ros.ros.live.broadcaster import Broadcaster
+from graph_slam_ros.ros.live.deferred import serve_later
+from graph_slam_ros.ros.live.listeners import Listeners
+from graph_slam_ros.ros.live.outputs import LATCHED, Outputs
+from graph_slam_ros.ros.live.params import changed, declare_parameters
+from graph_slam_ros.ros.live.reckoning import Reckoning
+from graph_slam_ros.ros.live.session import Estimate, Session
+from graph_slam_ros.ros.live.worker import Worker
 from graph_slam_ros.ros.message_class import message_class
-from graph_slam_ros.ros.params import declare_parameters
-from graph_slam_ros.run import RunRecorder, keep_earlier
-from graph_slam_ros.slam import Config, Control, GraphSlam, Measurement, Update
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Update
 from graph_slam_ros.warmup import warmup
 
-_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+_TICK_S = 0.1
+_STOP_S = 2.0  # what a solve may still take when the node is told to stop
+_SWITCH_S = 5e-4  # a callback waits no longer than this for the worker's Python; the default is ten times that
+_ACKNOWLEDGE = 32  # messages
 
 
-class GraphSlamNode(Node):
-    """Online pose-graph SLAM of odometry, landmark sightings, fixes and closures.
+class GraphSlamNode(LifecycleNode):
+    """Online pose-graph SLAM of odometry, landmark sightings, fixes and closures; ``ros/topics.py`` lists the topics.
 
-    Subscribes the configured inputs, ``/tf`` and ``/tf_static``; publishes ``~/path``, ``~/pose``, ``~/landmarks``,
-    ``~/received`` and the transform map -> odom; serves ``~/save``.
+    Configured, it has read its parameters, compiled its kernels, opened its run folder and has its publishers; active,
+    it listens and broadcasts map -> odom.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__("graph_slam", **options)
-        config = declare_parameters(self)
-        if config.output.folder:
-            keep_earlier(FilePath(config.output.folder), config.output.keep_earlier)
-        self._recorder = RunRecorder(config.output.folder, config) if config.output.folder else None
-        self.get_logger().info("compiling kernels (once per installation)")
-        self.get_logger().info(f"kernels ready after {warmup():.1f} s")
-        self._slam = GraphSlam(config, self._recorder.sink if self._recorder else None)
-        self._slam.counters.on_first = self._tell
-        self._border = Border(config, self._slam.counters, _installed(config))
-        self._received = 0
-        self._acknowledged = -1
-        self._has_player = False
-        self._sent_tf_ns = 0
-        self._landmarks_at = 0  # keyframes, or later
-        self._saved = True
-        self._advertise()
-        self._listen()
-
-    def _advertise(self) -> None:
-        self._path = self.create_publisher(Path, "~/path", _LATCHED)
-        self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/pose", _LATCHED)
-        self._landmarks = self.create_publisher(MarkerArray, "~/landmarks", _LATCHED)
-        self._acknowledge = self.create_publisher(UInt64, "~/received", _LATCHED)
-        self._tf = self.create_publisher(TFMessage, "/tf", 100)
-        self.create_service(Trigger, "~/save", self._on_save)
-
-    def _listen(self) -> None:
-        config = self._slam.config
-        kind = ReliabilityPolicy.RELIABLE if config.inputs.reliable else ReliabilityPolicy.BEST_EFFORT
-        qos = QoSProfile(depth=config.inputs.depth, reliability=kind)
-        static = QoSProfile(
-            depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+        self.config = declare_parameters(self)
+        self.add_on_set_parameters_callback(self._on_set)
+        self._run: _Run | None = None
+        self._state = "unconfigured"
+        self._faults: deque[float] = deque(maxlen=1000)
+        self._told: set[str] = set()
+        self._verdict = health.Verdict("UNCONFIGURED")
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # whatever becomes of /clock
+        self._acknowledge = self.create_publisher(UInt64, "~/received", LATCHED)
+        self._diagnostics = self.create_publisher(
+            message_class("diagnostic_msgs/msg/DiagnosticArray"), "/diagnostics", 10
         )
-        self._subscribe(TRANSFORMS, "/tf_static", [TF_STATIC], static)
-        inputs: dict[tuple[str, str], list[str]] = {(TRANSFORMS, "/tf"): [TF]} if config.inputs.tf else {}
-        used = uses(config)
-        for one in config.sources:
-            if one.name in used:
-                inputs.setdefault((one.type, self.resolve_topic_name(one.topic)), []).append(one.name)
-        for (type_name, topic), names in inputs.items():
-            self._subscribe(type_name, topic, names, qos)
-        if config.tf.publish_tf:
-            self.create_timer(config.tf.transform_publish_period, self._guarded(self._publish_tf))
-        # a player with /clock waits for this one, so it must not wait for /clock
-        self.create_timer(0.1, self._guarded(self._look_for_player), clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(_TICK_S, self.guarded(self._tick), clock=steady)
+        self.create_timer(1.0, self.guarded(self._diagnose), clock=steady)
+        for name, start in (
+            ("save", lambda run: run.save()),
+            ("load", lambda run: run.load()),
+            ("reset", lambda run: run.reset()),
+            ("pause", lambda run: run.pause(True)),
+            ("resume", lambda run: run.pause(False)),
+            ("optimize", lambda run: run.control("optimize")),
+            ("clear_closures", lambda run: run.control("clear_closures")),
+        ):
+            serve_later(self, f"~/{name}", partial(self._serve, start))
 
-    # -- messages in -------------------------------------------------------------------------------------------------
+    # -- lifecycle ---------------------------------------------------------------------------------------------------
 
-    def _subscribe(self, type_name: str, topic: str, names: list[str], qos: QoSProfile) -> None:
-        """Hand every message of a topic to the inputs of these names, one after the other."""
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Check the parameters and files, compile, make the publishers."""
+        return self._transition("inactive", self._configure)
 
-        def on_message(cdr: bytes) -> None:
-            for name in names:
-                self._take(self._border.take(name, cdr))
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listen and broadcast."""
+        return self._transition("active", lambda: self._configured().activate())
 
-        received = self._received_by(on_message)
-        if TF in names:
-            received = self._but_our_own(received)
-        self.create_subscription(message_class(type_name), topic, received, qos, raw=True)
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listen no more; what was taken stays."""
+        return self._transition("inactive", lambda: self._configured().deactivate())
 
-    def _but_our_own(self, callback: Callable[[bytes], None]) -> Callable[[bytes], None]:
-        """Of /tf we hear what we say ourselves, too."""
-        map_frame = self._slam.config.frames.map
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Save and forget the run."""
+        return self._transition("unconfigured", self.finish)
 
-        def heard(cdr: bytes) -> None:
-            if not is_correction(cdr, map_frame):
-                callback(cdr)
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Save and end."""
+        return self._transition("finalized", self.finish)
 
-        return heard
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Whatever failed, the node can be configured again."""
+        return self._transition("unconfigured", self.finish)
 
-    def _take(self, measurements: Sequence[Measurement]) -> None:
-        for measurement in measurements:
-            self._saved = False
-            self._process(measurement)
+    def _transition(self, state: str, action: Callable[[], object]) -> TransitionCallbackReturn:
+        try:
+            action()
+        except Exception as error:
+            text = str(error) if isinstance(error, GraphSlamError) else f"a fault of ours, {_said(error)}"
+            self.get_logger().fatal(text)
+            return _FAILURE
+        self._state = state
+        return _SUCCESS
 
-    def _process(self, measurement: Measurement) -> None:
-        update = self._slam.process(measurement)
-        if self._recorder:
-            self._recorder.record(self._slam, update)
-        if update:
-            self._pose.publish(results.pose(self._slam))
-            self._path.publish(results.path(self._slam))
-        if self._landmarks_due(update):
-            self._landmarks_at = len(self._slam.keyframes) + self._slam.config.output.landmarks_every_keyframes
-            self._landmarks.publish(results.landmarks(self._slam))
+    def _configure(self) -> None:
+        if self._run is None:
+            run = _Run(self)  # first what may be refused
+            self.get_logger().info("compiling kernels (once per installation)")
+            self.get_logger().info(f"kernels ready after {warmup():.1f} s")
+            self._run = run
+            if self.config.output.load_at_start:
+                run.load()
 
-    def _landmarks_due(self, update: Update) -> bool:
-        """From the first on regularly, whether or not somebody listens: who joins late gets the last that was sent."""
-        regularly = bool(self._slam.landmarks) and len(self._slam.keyframes) >= self._landmarks_at
-        return update.report is not None or (update.solved and regularly)
+    def _configured(self) -> "_Run":
+        if self._run is None:
+            raise GraphSlamError("not configured")
+        return self._run
 
-    def _tell(self, source: str, reason: str) -> None:
-        self.get_logger().warn(f"{source}: {reason} (told once, counted from now on)")
+    def finish(self) -> None:
+        """Save what was not saved yet, and take everything away."""
+        if self._run is not None:
+            run, self._run = self._run, None
+            run.finish()
 
-    def _received_by(self, callback: Callable[[bytes], None]) -> Callable[[bytes], None]:
-        """A callback whose messages are acknowledged, whatever becomes of them."""
-        guarded = self._guarded(callback)
+    # -- parameters --------------------------------------------------------------------------------------------------
 
-        def received(cdr: bytes) -> None:
-            guarded(cdr)
-            self._received += 1
-            if self._has_player:
-                self._publish_received()
+    def set_parameters_atomically(self, parameter_list: Any) -> SetParametersResult:
+        """As rclpy's; who misspells a name is told the nearest."""
+        try:
+            return super().set_parameters_atomically(parameter_list)
+        except ParameterNotDeclaredException:
+            try:
+                self.config.changed({one.name: one.value for one in parameter_list})
+            except ConfigError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            raise
 
-        return received
+    def _on_set(self, given: Sequence[Any]) -> SetParametersResult:
+        """All of them or none, and what may change at work takes effect at its place among the measurements."""
+        try:
+            config, values = changed(self.config, given, is_configured=self._run is not None)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self.config = config
+        if self._run is not None and values:
+            self._run.set(values)
+        return SetParametersResult(successful=True)
 
-    def _guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Nothing ends the node: what a callback raises is counted and told."""
+    # -- the run -----------------------------------------------------------------------------------------------------
+
+    def _serve(self, start: "Callable[[_Run], Future[str]]") -> "Future[str]":
+        if self._run is None:
+            raise GraphSlamError(f"not active: the node is {self._state}")
+        return start(self._run)
+
+    def acknowledge(self, count: int) -> None:
+        """Tell a player how many messages were taken."""
+        self._acknowledge.publish(UInt64(data=count))
+
+    @property
+    def has_player(self) -> bool:
+        """Whether somebody waits for that."""
+        return self._acknowledge.get_subscription_count() > 0
+
+    @property
+    def now_ns(self) -> int:
+        """ROS time; 0 before the first /clock where that is used."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
+        """Nothing ends the node: what a callback raises is counted, and told with its origin once."""
 
         def guarded(*arguments: Any) -> None:
             try:
                 callback(*arguments)
             except Exception as error:
-                self._slam.counters.count("node", type(error).__name__)
-                self.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=5.0)
+                self._faults.append(time.monotonic())
+                if self._run is not None:
+                    self._run.counters.count("node", type(error).__name__)
+                key = f"{type(error).__name__}: {error}"
+                if key not in self._told and len(self._told) < 1000:
+                    self._told.add(key)
+                    self.get_logger().error("".join(traceback.format_exception(error)))
+                self.get_logger().error(key, throttle_duration_sec=5.0)
 
         return guarded
 
-    # -- results out -------------------------------------------------------------------------------------------------
+    def _tick(self) -> None:
+        if self._run is not None:
+            self._run.tick()
 
-    def _publish_tf(self) -> None:
-        """The correction, at most once per odometry stamp and never before the first."""
-        stamp_ns = self._slam.newest_odometry_ns
-        if stamp_ns is None or stamp_ns <= self._sent_tf_ns:
+    def _diagnose(self) -> None:
+        facts = health.Facts(self._state) if self._run is None else self._run.facts(self._state)
+        since = time.monotonic() - 10.0
+        facts = replace(facts, faults=sum(at > since for at in self._faults))
+        verdict = health.judge(facts, self.config)
+        self._tell(verdict)
+        statuses = health.statuses(facts, verdict, self.get_name())
+        self._diagnostics.publish(to_msg.diagnostics(self.now_ns, statuses))
+
+    def _tell(self, verdict: health.Verdict) -> None:
+        """In the log where it changes; numbers alone are no change."""
+        before, self._verdict = self._verdict, verdict
+        if _without_numbers(before) == _without_numbers(verdict):
             return
-        self._sent_tf_ns = stamp_ns
-        ahead_ns = round(self._slam.config.tf.transform_tolerance * 1e9)
-        self._tf.publish(results.map_to_odom(self._slam, stamp_ns + ahead_ns))
+        said = "; ".join((verdict.state, *verdict.reasons))
+        if verdict.level == to_msg.OK:
+            self.get_logger().info(said)
+        else:
+            self.get_logger().warn(said)
 
-    def _look_for_player(self) -> None:
-        self._has_player = self._acknowledge.get_subscription_count() > 0
-        self._publish_received()
 
-    def _publish_received(self) -> None:
-        if self._received != self._acknowledged:
-            self._acknowledged = self._received
-            self._acknowledge.publish(UInt64(data=self._received))
+class _Run:
+    """What there is from configuration to clean-up."""
 
-    def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            response.message = self.save()
-            response.success = True
-        except Exception as error:
-            response.message = str(error) if isinstance(error, GraphSlamError) else f"{type(error).__name__}: {error}"
-        return response
+    def __init__(self, node: GraphSlamNode) -> None:
+        config = node.config
+        self._node = node
+        self.counters = Counters()  # of the border; those of the pipeline belong to the worker's thread
+        self.counters.on_first = self._tell
+        self._border = Border(config, self.counters, _installed(config))
+        self._ahead = Ahead(config.time.future_s, self._clock_ns, partial(self._refuse, "future"))
+        self._reckoning = Reckoning(config)
+        self._session = Session(config, self.counters, self._on_update, self._tell)
+        self._outputs = Outputs(node, config)
+        self._worker = Worker(config.inputs.queue)
+        self._listeners: Listeners | None = None
+        self._broadcaster: Broadcaster | None = None
+        self._jumps: Any = None
+        self._is_paused = self._is_stopped = False
+        self._sends_odometry = False
+        self._with_twist = {one.name for one in config.sources if one.type == results.ODOMETRY}
+        self._passed = self._done = 0  # messages, by this thread and by the worker's
+        self._acknowledged = -1
+        self._has_player = False
+        self._looked: tuple[int, int] = 0, 0
+        self._since_s = time.monotonic()
+        self._initial = node.create_subscription(
+            message_class(results.POSE),
+            "initialpose",
+            node.guarded(self._on_initial_pose),
+            10,
+            raw=True,
+        )
 
-    def save(self, release: str = "flush") -> str:
-        """Release what waits, solve, and write the run folder; returns its name."""
-        if self._recorder is None:
-            raise GraphSlamError("output.folder is empty: nowhere to save")
-        self._take(self._border.finish())
-        if not self._saved:
-            for event in (release, "optimize"):
-                self._process(Control(event))
-        folder = str(self._recorder.save(self._slam))
-        self._saved = True
-        return folder
+    def activate(self) -> None:
+        """Listen and broadcast; twice is as good as once."""
+        if self._listeners is not None:
+            return
+        node, config = self._node, self._node.config
+        self._broadcaster = Broadcaster(node, config, node.guarded, self._look)
+        self._listeners = Listeners(node, config, self._border, self._take, node.guarded, self._broadcaster.heard)
+        back = Duration(nanoseconds=-round(config.time.jump_back_s * 1e9))
+        threshold = JumpThreshold(min_forward=None, min_backward=back, on_clock_change=True)
+        self._jumps = node.get_clock().create_jump_callback(threshold, post_callback=node.guarded(self._on_jump))
+        self._since_s = time.monotonic()
+
+    def deactivate(self) -> None:
+        """Neither listen nor broadcast."""
+        if self._listeners is None or self._broadcaster is None:
+            return
+        self._listeners.close()
+        self._broadcaster.close()
+        self._jumps.unregister()
+        self._listeners = self._broadcaster = None
 
     def finish(self) -> None:
-        """Save what was not saved yet, and end the recording."""
-        if self._recorder is None:
+        """Save what was not saved yet, and take everything away."""
+        self.deactivate()
+        self._node.destroy_subscription(self._initial)
+        self._hand_over(self._border.finish())
+        if self._worker.stop(_STOP_S):
+            if folder := self._session.finish():
+                self._node.get_logger().info(f"saved {folder}")
+        else:
+            self._session.abandon()
+            self._node.get_logger().error("a solve takes too long to wait for: replay the run folder for its results")
+        self._outputs.close()
+
+    # -- in the main thread: messages --------------------------------------------------------------------------------
+
+    def _take(self, measured: Sequence[Measured], cdr: bytes) -> None:
+        """Pass on what one message has given, or was waiting for it."""
+        for m in measured:
+            if isinstance(m, Odometry) and self._reckoning.hear(m, self._session.estimate) and self._sends_odometry:
+                self._send_odometry(m, cdr)
+        for some in self._ahead.pass_on(measured):
+            self._hand_over(some)
+
+    def _hand_over(self, measured: Sequence[Measured]) -> None:
+        """To the worker; refused before it is accepted where there is no room, or nobody wants it now."""
+        reason = "stopped" if self._is_stopped else "paused" if self._is_paused else ""
+        if measured and not reason:
+            if self._worker.offer(self._node.guarded(partial(self._use, measured))):
+                return
+            reason = "overflow"
+        self._refuse(reason, measured)
+
+    def _refuse(self, reason: str, measured: Sequence[Measured]) -> None:
+        """A message that goes no further: the reason counts for each thing it said."""
+        for m in measured:
+            self.counters.count(m.source if isinstance(m, Odometry) else m.topic, reason)
+        self._passed += 1
+
+    def _clock_ns(self) -> int:
+        """The clock that stamps are judged by: of a recording that is played it is no better than they are."""
+        return 0 if self._node.get_parameter("use_sim_time").value else self._node.now_ns
+
+    def _send_odometry(self, m: Odometry, cdr: bytes) -> None:
+        estimate, config = self._session.estimate, self._node.config
+        if estimate is None or not estimate.is_confirmed:
             return
-        if not self._saved:
-            self.get_logger().info(f"saved {self.save('end')}")
-        self._recorder.close()
+        frames, unused = config.frames, config.output.pose_covariance_max
+        twist = twist_of(cdr, frames.base) if m.source in self._with_twist else None
+        pose, covariance = self._reckoning.pose(estimate)
+        self._outputs.odometry(to_msg.odometry(m.stamp_ns, frames.map, frames.base, pose, covariance, unused, twist))
+
+    def _on_initial_pose(self, cdr: bytes) -> None:
+        for pose in self._border.initial_pose(cdr):
+            self._worker.call(partial(self._session.take, [pose]))
+
+    def _on_jump(self, jump: Any) -> None:
+        """The clock jumped back, or another one is used."""
+        estimate = self._session.estimate
+        self._ahead.forget_time()
+        if estimate is None and not self._worker.waiting:
+            return
+        what = self._node.config.time.on_jump
+        self._tell("clock", f"jumped by {jump.delta.nanoseconds * 1e-9:.3f} s: {what}")
+        self._border.forget_time()
+        self._reckoning.forget()
+        if self._broadcaster is not None:
+            self._broadcaster.forget_time()
+        if what == "stop":
+            self._is_stopped = True
+        elif what == "reset":
+            self.reset()
+        else:
+            self._worker.call(partial(self._session.control, "time_jump"))
+
+    def _look(self) -> tuple[Config, Estimate | None, Odometry | None]:
+        return self._node.config, self._session.estimate, self._reckoning.newest
+
+    def tick(self) -> None:
+        """Ten times a second: what has waited long enough, and what somebody may have begun to listen to."""
+        for some in self._ahead.waited():
+            self._hand_over(some)
+        if self._listeners is not None:
+            self._listeners.tick(self._node.now_ns)
+        self._sends_odometry = self._outputs.has_listeners("odometry")
+        self._has_player = self._node.has_player
+        self._publish_received()
+        if self._worker.waiting < _ACKNOWLEDGE and self._outputs.are_due(self._node.config):
+            self._worker.offer(self._node.guarded(self._publish_due))
+
+    def _publish_received(self) -> None:
+        count = self._passed + self._done
+        if count != self._acknowledged:
+            self._acknowledged = count
+            self._node.acknowledge(count)
+
+    def _tell(self, source: str, reason: str) -> None:
+        self._node.get_logger().warn(f"{source}: {reason} (told once, counted from now on)")
+
+    # -- services: begun here, done by the worker --------------------------------------------------------------------
+
+    def save(self) -> "Future[str]":
+        """Solve everything and write the run folder."""
+        self._hand_over(self._border.finish())
+        return self._worker.call(self._session.save)
+
+    def load(self) -> "Future[str]":
+        """Go on from an earlier run."""
+        return self._anew(partial(self._session.load, self._node.config.output.load))
+
+    def reset(self) -> "Future[str]":
+        """Save, and begin anew."""
+        return self._anew(self._session.reset)
+
+    def _anew(self, job: Callable[[], str]) -> "Future[str]":
+        self._is_stopped = False
+        self._reckoning.forget()
+
+        def begin() -> str:
+            said = job()
+            self._outputs.begin(self._node.config)
+            self._outputs.publish_due(self._session.slam)
+            return said
+
+        return self._worker.call(begin)
+
+    def pause(self, is_paused: bool) -> "Future[str]":
+        """Take nothing more, or again."""
+        self._is_paused = is_paused
+        return self._worker.call(lambda: "paused" if is_paused else "takes measurements")
+
+    def control(self, event: str) -> "Future[str]":
+        """An event of the ingest sequence."""
+        return self._worker.call(partial(self._session.control, event))
+
+    def set(self, values: dict[str, Any]) -> None:
+        """Change parameters at this place of the ingest sequence."""
+        self._worker.call(partial(self._session.take, [Control("set", tuple(values.items()))]))
+
+    # -- in the worker's thread --------------------------------------------------------------------------------------
+
+    def _use(self, measured: Sequence[Measured]) -> None:
+        try:
+            self._session.take(measured)
+        finally:
+            self._done += 1
+            if self._has_player and (not self._worker.waiting or self._done % _ACKNOWLEDGE == 0):
+                self._publish_received()
+
+    def _on_update(self, slam: GraphSlam, update: Update) -> None:
+        estimate, tf = self._session.estimate, slam.config.tf
+        self._outputs.update(slam, update, is_confirmed=estimate is not None and estimate.is_confirmed)
+        moved = update.correction
+        if update.solved and (moved.distance_m > tf.report_jump_m or moved.angle_rad > tf.report_jump_rad):
+            slam.counters.count("tf", "jump")
+            self._node.get_logger().warn(events.correction(slam, update).message)
+
+    def _publish_due(self) -> None:
+        self._outputs.publish_due(self._session.slam)
+
+    # -- facts -------------------------------------------------------------------------------------------------------
+
+    def facts(self, lifecycle: str) -> health.Facts:
+        """For the verdict."""
+        session, node, broadcaster = self._session, self._node, self._broadcaster
+        if not self._worker.waiting and node.now_ns:
+            self._worker.offer(node.guarded(session.evaluate))
+        overflows = sum(of.get("overflow", 0) for of in self.counters.as_dict().values())
+        failures = session.failures
+        before, self._looked = self._looked, (overflows, failures)
+        rivals = broadcaster.candidates() if broadcaster is not None and broadcaster.has_rival else None
+        inputs = self._listeners.facts(node.now_ns, self.counters) if self._listeners is not None else ()
+        return health.Facts(
+            lifecycle,
+            inputs,
+            session.estimate,
+            node.get_parameter("use_sim_time").value and not node.now_ns,
+            self._is_paused,
+            self._is_stopped,
+            self._worker.lag_s,
+            self._worker.waiting,
+            self._worker.is_alive,
+            0,
+            overflows - before[0],
+            failures - before[1],
+            session.recording_fails,
+            rivals is not None,
+            rivals or (),
+            node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1,
+        )
 
 
 def _installed(config: Config) -> dict[str, Decoder]:
@@ -220,26 +484,47 @@ def _installed(config: Config) -> dict[str, Decoder]:
     return {name: partial(deserialize_message, message_type=message_class(name)) for name in names}
 
 
+def _said(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _without_numbers(verdict: health.Verdict) -> tuple[str, ...]:
+    return (verdict.state, *(re.sub(r"\d+(\.\d+)?", "#", reason) for reason in verdict.reasons))
+
+
 class _Told:
-    """Whether Ctrl-C or SIGTERM came: noted, never raised, so that no message is left half-way."""
+    """Whether Ctrl-C or SIGTERM came: noted, never raised, so that no message is left half-way.
+
+    A launch file sends Ctrl-C on to a node that the terminal has told already: what comes twice at once is once.
+    """
 
     def __init__(self) -> None:
-        self.to_stop = False
+        self.at_s = 0.0
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._note)
 
+    @property
+    def to_stop(self) -> bool:
+        """Whether it did."""
+        return self.at_s > 0.0
+
     def _note(self, number: int, frame: Any) -> None:
-        self.to_stop = True
+        if self.to_stop and number == signal.SIGINT and time.monotonic() - self.at_s > 1.0:
+            os._exit(128 + number)  # asked for again: at once
+        self.at_s = self.at_s or time.monotonic()
 
 
 def main() -> int:
     """Run the node until it is told to stop; returns the exit code: 0, 1 our fault, 2 refused to start or save."""
     told = _Told()
+    sys.setswitchinterval(_SWITCH_S)
     try:
         _init()
         node = GraphSlamNode()
-        executor = SingleThreadedExecutor()
+        executor = _executor()
         executor.add_node(node)
+        if node.config.node.autostart and not _started(node, told):
+            return 2
         while not told.to_stop and rclpy.ok():
             executor.spin_once(timeout_sec=0.1)
         node.finish()
@@ -249,11 +534,30 @@ def main() -> int:
         rclpy.logging.get_logger("graph_slam").fatal(str(error))
         return 2
     except Exception as error:
-        rclpy.logging.get_logger("graph_slam").fatal(f"a fault of ours, {type(error).__name__}: {error}")
+        rclpy.logging.get_logger("graph_slam").fatal(f"a fault of ours, {_said(error)}")
         return 1
     finally:
         rclpy.try_shutdown()
     return 0
+
+
+def _started(node: GraphSlamNode, told: _Told) -> bool:
+    """Configure and activate."""
+    for trigger in (node.trigger_configure, node.trigger_activate):
+        if told.to_stop:
+            return True
+        if trigger() != _SUCCESS:
+            return False
+    return True
+
+
+def _executor() -> Any:
+    """The quickest there is: rclpy's events executor takes a fifth of the time per message (docs/benchmarks.md)."""
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:  # Humble
+        from rclpy.executors import SingleThreadedExecutor as EventsExecutor
+    return EventsExecutor()
 
 
 def _init() -> None:

@@ -9,7 +9,7 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.ros import markers, to_msg
 from graph_slam_ros.ros.graph_view import graph_view
 from graph_slam_ros.ros.thinning import thinned
-from graph_slam_ros.slam import GraphSlam, Odometry
+from graph_slam_ros.slam import GraphSlam
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
@@ -51,18 +51,6 @@ def pose(slam: GraphSlam) -> bytes:
 def map_to_odom(slam: GraphSlam, stamp_ns: int) -> bytes:
     """The correction as a transform."""
     return to_msg.transform(stamp_ns, slam.config.frames.map, slam.config.frames.odom, slam.T_map_odom)
-
-
-def odometry(slam: GraphSlam, m: Odometry, twist: bytes | None = None) -> bytes | None:
-    """The robot in the map at an odometry message, as soon as that comes; with ``from_msg.twist_of`` the message.
-
-    None where another odometry is in use, or this one has jumped.
-    """
-    now = slam.pose_at(m)
-    if now is None:
-        return None
-    frames, unused = slam.config.frames, slam.config.output.pose_covariance_max
-    return to_msg.odometry(m.stamp_ns, frames.map, frames.base, *now, unused, twist)
 
 
 def odom_to_base(slam: GraphSlam) -> bytes:

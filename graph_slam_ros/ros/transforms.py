@@ -41,6 +41,11 @@ class Transforms:
             joint = self._moving[child] = _Joint(parent)
         joint.add(stamp_ns, T_parent_child, self._keep_ns)
 
+    def forget_time(self) -> None:
+        """Stamps begin anew; what holds always stays."""
+        self._moving.clear()
+        self.now_ns = None
+
     def knows(self, frame: str) -> bool:
         """Whether the frame has a parent."""
         return frame in self._fixed or frame in self._moving

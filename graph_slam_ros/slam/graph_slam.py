@@ -83,12 +83,14 @@ class Update:
     Attributes
     ----------
     keyframes : indices of new ones
+    edges : ids of new ones that the solver has
     solved : whether it solved
     report : of a solve of everything
     correction : of the last solve
     """
 
     keyframes: tuple[int, ...] = ()
+    edges: range = range(0)
     solved: bool = False
     report: Report | None = None
     correction: Correction = Correction()
@@ -137,6 +139,7 @@ class GraphSlam:
         self._covariance = np.zeros((self.space.dof, self.space.dof))
         self._handed_over = 0, 0  # vertices and edges the solver has
         self._taken_in = 0  # edges of these
+        self._solved_T_map_odom = self.space.identity  # to see how far a solve moves it
         self._solved_vertices = 0  # of these, what the last solve took in: none where it failed
         self._unsolved_keyframes = 0
 
@@ -149,6 +152,7 @@ class GraphSlam:
         if self._sink is not None:
             self._sink(measurement)
         first_new, solves, report = len(self.keyframes), self.solves, self.report
+        first_edge = self._handed_over[1]
         match measurement:
             case Odometry() | Sightings() | Fix() | Closure():
                 self._use(self._order.push(measurement))
@@ -175,7 +179,8 @@ class GraphSlam:
         new = self.report if self.report is not report else None
         solved = self.solves > solves
         correction = self.correction if solved else Correction()
-        return Update(tuple(range(first_new, len(self.keyframes))), solved, new, correction)
+        edges = range(first_edge, self._handed_over[1])
+        return Update(tuple(range(first_new, len(self.keyframes))), edges, solved, new, correction)
 
     # -- what is known now ---------------------------------------------------------------------------------------
 
@@ -219,22 +224,6 @@ class GraphSlam:
         out: Numbers = group.compose(self._pose(newest.vertex), group.inverse(newest.T_odom_base))
         return out
 
-    def pose_at(self, m: Odometry) -> tuple[Numbers, Array] | None:
-        """``T_map_base`` at an odometry message, whether or not its turn has come, and its covariance.
-
-        That is in its tangent space: the newest keyframe's, lengthened by the odometry since. None where the message
-        is not of the odometry in use, is older than what was used, or has jumped.
-        """
-        used, group = self._odometry.used, self.space.group
-        if used is None or m.source != used.source or m.stamp_ns < used.stamp_ns:
-            return None
-        T_used_base = group.between(used.T_odom_base, m.T_odom_base)
-        if self._odometry.jumps(T_used_base, (m.stamp_ns - used.stamp_ns) * 1e-9):
-            return None
-        moved = self._motions[-1].after(Step(m.stamp_ns, T_used_base, m.T_odom_base, m.twist_covariance))
-        T_map_base = group.compose(self._pose(self.keyframes[-1].vertex), moved.T_keyframe_base)
-        return T_map_base, group.propagate(self._covariance, moved.T_keyframe_base, moved.covariance)
-
     @property
     def pose_covariance(self) -> Array:
         """Covariance (3, 3) or (6, 6) of the newest keyframe's pose in its tangent space.
@@ -273,6 +262,11 @@ class GraphSlam:
     def newest_odometry_ns(self) -> int | None:
         """Stamp of the last odometry that was used."""
         return self._odometry.newest_ns
+
+    @property
+    def odometry_source(self) -> str:
+        """The odometry in use, by the name of its input; empty before the first."""
+        return self._odometry.used.source if self._odometry.used else ""
 
     @property
     def _oldest_ns(self) -> int:
@@ -315,6 +309,7 @@ class GraphSlam:
         self.graph.add_edge(self.space.pose_prior, [vertex], step.T_odom_base, Gaussian.from_sigmas(*sigmas), "anchor")
         self.segments.append(0)
         self._append_keyframe(vertex, step)
+        self._solved_T_map_odom = self.T_map_odom
 
     def _next_keyframe(self, step: Step) -> None:
         now = self._motions[-1].now
@@ -531,7 +526,7 @@ class GraphSlam:
             return
         first_new = self._taken_in
         self._hand_over()
-        before, fits = self._pose(self.keyframes[-1].vertex), self._fit_of(range(first_new, self._handed_over[1]))
+        fits = self._fit_of(range(first_new, self._handed_over[1]))
         try:
             if everything is None:
                 self._review_if_due()
@@ -541,7 +536,7 @@ class GraphSlam:
             (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
             self.solves += 1
             self._solved_vertices, self._taken_in = self._handed_over
-            self.correction = self._correction_since(before, fits)
+            self._note_correction(fits)
         except GraphSlamError as error:
             self.counters.count("solver", type(error).__name__)
 
@@ -551,11 +546,14 @@ class GraphSlam:
         fit = chi2 / numbers
         return [(float(fit[k]), edges[k]) for k in np.argsort(-fit, kind="stable")[:_BLAMED].tolist()]
 
-    def _correction_since(self, before: Numbers, fits: list[tuple[float, int]]) -> Correction:
-        moved = self.space.group.between(before, self._pose(self.keyframes[-1].vertex))
+    def _note_correction(self, fits: list[tuple[float, int]]) -> None:
+        """Against where the robot would be by the last solve and its odometry."""
+        group, newest = self.space.group, self.keyframes[-1]
+        before, self._solved_T_map_odom = self._solved_T_map_odom, self.T_map_odom
+        moved = group.between(group.compose(before, newest.T_odom_base), self._pose(newest.vertex))
         distance_m = math.hypot(*moved[: self.space.dimensions])
         chi2, edges = zip(*fits, strict=True) if fits else ((), ())
-        return Correction(distance_m, self.space.angle(moved), edges, chi2)
+        self.correction = Correction(distance_m, float(self.space.angle(moved)), edges, chi2)
 
     def _clear_closures(self) -> None:
         """Take all loop closures out; the next solve goes without them."""
@@ -563,8 +561,8 @@ class GraphSlam:
         closures = self.graph.edges_of("closures").tolist()
         for edge in closures:
             self.solver.set_weight(edge, 0.0)
-        self.counters.count("closures", "cleared", len(closures))
         if closures:
+            self.counters.count("closures", "cleared", len(closures))
             self._solve()
 
     def _review_if_due(self) -> None:

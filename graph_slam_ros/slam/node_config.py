@@ -136,7 +136,9 @@ class TimeConfig:
         live=True,
     )
     jump_back_s: float = setting(0.2, "that is a jump back; less is messages out of order", "s", low=1e-3)
-    future_s: float = setting(1.0, "messages further ahead of the clock are refused; 0: none", "s", low=0.0)
+    future_s: float = setting(
+        1.0, "messages further ahead of the clock, but of one that is played, are refused; 0: none", "s", low=0.0
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,4 +150,6 @@ class HealthConfig:
         60.0, "nothing seen for longer, once something was; 0: no matter", "s", low=0.0, live=True
     )
     lag_s: float = setting(1.0, "the solver is behind by more", "s", low=0.0, live=True)
-    chi2_per_dof: float = setting(10.0, "the measurements contradict each other by more", "", low=0.0, live=True)
+    chi2_per_dof: float = setting(
+        10.0, "the measurements contradict each other by more", "per degree of freedom", low=0.0, live=True
+    )

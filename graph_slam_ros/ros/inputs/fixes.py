@@ -12,7 +12,7 @@ from graph_slam_ros.ros.inputs import checks
 from graph_slam_ros.ros.inputs.checks import MessageError
 from graph_slam_ros.ros.inputs.source import Source, turned
 from graph_slam_ros.ros.transforms import pose
-from graph_slam_ros.slam.measurements import Closure, Fix
+from graph_slam_ros.slam.measurements import Closure, Fix, InitialPose
 
 Array = NDArray[np.float64]
 
@@ -51,6 +51,24 @@ def pose_fix(source: Source, m: Any) -> Iterator[Fix]:
     into_base = se3.adjoint(T_base_sensor)
     tangent = into_base @ turned(se3.inverse(T_map_sensor), covariance) @ into_base.T
     yield Fix(stamp_ns, source.name, "pose", source.projected(T_map_base), source.checked(source.block(tangent), n))
+
+
+def initial_pose(source: Source, m: Any) -> Iterator[InitialPose]:
+    """geometry_msgs/PoseWithCovarianceStamped in the map frame: where somebody says that the base is, now."""
+    frame = source.frame(m.header.frame_id)
+    T_map_frame = source.T_fixed(source.config.frames.map, frame)
+    checks.point(m.pose.pose.position)
+    T_map_base = se3.compose(T_map_frame, pose(m.pose.pose.position, source.unit(m.pose.pose.orientation)))
+    if not source.has_heading(T_map_base):
+        raise MessageError("no_heading")
+    covariance = turned(T_map_frame, source.pose_covariance(m.pose.covariance, 0.0))
+    unknown = np.diag(np.repeat(np.square([source.settings.sigma_m, source.settings.sigma_rad]), 3))
+    for part in (slice(0, 3), slice(3, 6)):
+        if not covariance[part, part].any():
+            covariance[part] = unknown[part]
+            covariance[:, part] = unknown[:, part]
+    block = source.block(turned(se3.inverse(T_map_base), covariance))
+    yield InitialPose(source.projected(T_map_base), source.checked(block, source.space.dimensions))
 
 
 def gnss(source: Source, m: Any) -> Iterator[Fix]:

@@ -1,7 +1,7 @@
 """One input at the border: its settings, where its sensor is, and the noise its messages do not tell."""
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,7 @@ class Source:
     tally : refusals and repairs of the present message by reason
     hurried : whether nothing is waited for any more
     state : what converters have to remember between messages
+    unlinked : frames of the last messages that nothing links to the robot
     """
 
     def __init__(self, settings: InputConfig, use: str, config: Config, transforms: Transforms) -> None:
@@ -50,6 +51,7 @@ class Source:
         self.tally: Counter[str] = Counter()
         self.hurried = not config.inputs.tf
         self.state: dict[str, Any] = {}
+        self.unlinked: deque[str] = deque(maxlen=4)
         self._wait_ns = round(config.inputs.tf_wait_s * 1e9)
         self._mount = _mount(settings)
 
@@ -85,7 +87,7 @@ class Source:
             return self._mount
         now_ns = self.transforms.now_ns
         if self.hurried or (now_ns is not None and now_ns > stamp_ns + self._wait_ns):
-            raise MessageError("frame_unknown")
+            raise self._not_linked("frame_unknown", frame)
         raise NotYet
 
     def T_base_child(self, child: str) -> se3.Pose:
@@ -94,15 +96,20 @@ class Source:
         if found is None:
             found = self._mount if self._mount is not None or child else se3.IDENTITY
         if found is None:
-            raise MessageError("child_frame_unknown")
+            raise self._not_linked("child_frame_unknown", child)
         return found
 
     def T_fixed(self, target: str, frame: str) -> se3.Pose:
         """Between frames that do not move."""
         found = self.transforms.lookup(target, frame)
         if found is None:
-            raise MessageError("frame_unknown")
+            raise self._not_linked("frame_unknown", frame)
         return found
+
+    def _not_linked(self, reason: str, frame: str) -> MessageError:
+        if frame not in self.unlinked:
+            self.unlinked.append(frame)
+        return MessageError(reason)
 
     # -- rotations ---------------------------------------------------------------------------------------------------
 

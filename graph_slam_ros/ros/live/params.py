@@ -1,14 +1,18 @@
-"""ROS parameters from the one configuration tree: declared with description, unit and range, and read back as it."""
+"""ROS parameters from the one configuration tree: declared with description, unit and range, read back as it."""
 
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
+from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.slam.config import Config, flatten, parameters
 from graph_slam_ros.slam.parameter import Parameter
 
 _OTHERS = {"use_sim_time", "start_type_description_service"}  # rclpy's own
+_AT_START = {"inputs.names", "output.folder", "node.autostart"}
+"""Sections are declared by the first; what nobody may point elsewhere from outside is the second."""
 
 
 def declare_parameters(node: Any) -> Config:
@@ -32,10 +36,27 @@ def declare_parameters(node: Any) -> Config:
     return config
 
 
+def changed(config: Config, given: Iterable[Any], *, is_configured: bool) -> tuple[Config, dict[str, Any]]:
+    """The configuration with ROS parameters that are to be set, and those of them that are ours.
+
+    Raises
+    ------
+    ConfigError
+        One of them may not be changed now, or not to that: none is.
+    """
+    values = {one.name: one.value for one in given if one.name not in _OTHERS}
+    live = {p.name for p in parameters(one.name for one in config.sources) if p.live}
+    if is_configured and (fixed := sorted(set(values) - live)):
+        raise ConfigError(f"{fixed[0]}: can be changed only before the node is configured (deactivate, clean up)")
+    return config.changed(values), values
+
+
 def _descriptor(p: Parameter) -> ParameterDescriptor:
     unit = f" [{p.unit}]" if p.unit else ""
     choices = f" One of: {', '.join(p.choices)}." if p.choices else ""
-    descriptor = ParameterDescriptor(description=f"{p.meaning}{unit}.{choices}", read_only=True)
+    when = " May change at any time." if p.live else ""
+    fixed = p.name in _AT_START
+    descriptor = ParameterDescriptor(description=f"{p.meaning}{unit}.{choices}{when}", read_only=fixed)
     if p.type is float and (p.low is not None or p.high is not None):
         largest = sys.float_info.max
         low, high = (-largest if p.low is None else p.low), (largest if p.high is None else p.high)

@@ -1,0 +1,204 @@
+"""Whether all is well, and if not, why: one verdict with its reasons, from facts that the node gathers.
+
+States: UNCONFIGURED and INACTIVE by lifecycle; WAITING for what is missing; OK; DEGRADED, where the estimate goes on
+but is not what it could be; ERROR, where somebody must act.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from graph_slam_ros.ros.live.session import Estimate
+from graph_slam_ros.ros.to_msg import ERROR, OK, WARN, Status
+from graph_slam_ros.slam.config import Config
+
+_LEVELS = {"OK": OK, "WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR, "INACTIVE": OK, "UNCONFIGURED": OK}
+_UNLINKED = ("frame_unknown", "child_frame_unknown")
+
+
+@dataclass(frozen=True, slots=True)
+class InputFacts:
+    """What is known of one input.
+
+    Attributes
+    ----------
+    silent_s : since the last message, by the clock of the node; infinite before the first
+    publishers : names of the nodes that publish it
+    mismatch : what keeps publisher and subscription from connecting, in words; empty where nothing does
+    frames : those of its messages that nothing links to the robot, the last ones
+    """
+
+    name: str
+    topic: str
+    use: str
+    received: int = 0
+    counts: Mapping[str, int] = field(default_factory=dict)
+    silent_s: float = math.inf
+    publishers: tuple[str, ...] = ()
+    mismatch: str = ""
+    frames: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What the verdict is made of.
+
+    Attributes
+    ----------
+    lifecycle : ``unconfigured``, ``inactive`` or ``active``
+    faults : exceptions of callbacks in the last ten seconds
+    overflows, failures : messages refused for want of room, and solves that failed, since the last look
+    authorities : other nodes that broadcast map -> odom, if somebody does
+    """
+
+    lifecycle: str
+    inputs: tuple[InputFacts, ...] = ()
+    estimate: Estimate | None = None
+    waits_for_clock: bool = False
+    is_paused: bool = False
+    is_stopped: bool = False
+    lag_s: float = 0.0
+    waiting: int = 0
+    worker_is_alive: bool = True
+    faults: int = 0
+    overflows: int = 0
+    failures: int = 0
+    recording_fails: bool = False
+    has_other_authority: bool = False
+    authorities: tuple[str, ...] = ()
+    twins: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The state and its reasons, the first the most important."""
+
+    state: str
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def is_healthy(self) -> bool:
+        """Whether nobody need do anything."""
+        return self.state == "OK"
+
+    @property
+    def level(self) -> int:
+        """Of a DiagnosticStatus."""
+        return _LEVELS[self.state]
+
+
+def judge(facts: Facts, config: Config) -> Verdict:
+    """The verdict."""
+    if facts.lifecycle != "active":
+        return Verdict(facts.lifecycle.upper())
+    for state, found in (("ERROR", _errors(facts)), ("WAITING", _missing(facts)), ("DEGRADED", _faults(facts, config))):
+        if reasons := tuple(found):
+            return Verdict(state, reasons)
+    return Verdict("OK")
+
+
+def _errors(facts: Facts) -> Iterator[str]:
+    if not facts.worker_is_alive:
+        yield "the solver's thread has ended"
+    if facts.faults >= 100:
+        yield f"{facts.faults} faults in callbacks in 10 s"
+    if facts.has_other_authority:
+        who = ", ".join(facts.authorities) or "a node that does not tell its name"
+        yield f"somebody else broadcasts map -> odom: {who}"
+    if facts.twins:
+        yield "another node has this node's name"
+    if facts.is_stopped:
+        yield "stopped when the clock jumped back (time.on_jump); ~/reset begins anew"
+    if facts.recording_fails:
+        yield "the run cannot be written"
+
+
+def _missing(facts: Facts) -> Iterator[str]:
+    """What keeps the first estimate from coming; of landmarks, only what is wrong."""
+    if facts.waits_for_clock:
+        yield "use_sim_time is set and nothing comes on /clock"
+    for one in facts.inputs:
+        if facts.estimate is None and one.use == "odometry":
+            yield from _silence(one)
+    if facts.estimate is None and not facts.inputs:
+        yield "no input"
+
+
+def _silence(one: InputFacts) -> Iterator[str]:
+    if one.mismatch:
+        yield f"{one.topic}: {one.mismatch}"
+    elif not one.publishers:
+        yield f"{one.topic}: nobody publishes this {one.use}"
+    elif not one.received:
+        yield f"{one.topic}: {', '.join(one.publishers)} publishes it, but nothing has come yet"
+    elif any(one.counts.get(reason) for reason in _UNLINKED):
+        yield f"{one.topic}: {_unlinked(one)}"
+    elif one.counts:
+        worst = max(one.counts, key=lambda reason: one.counts[reason])
+        yield f"{one.topic}: refused, {worst} {one.counts[worst]} times"
+    else:
+        yield f"{one.topic}: its first messages wait for their turn"
+
+
+def _unlinked(one: InputFacts) -> str:
+    frames = ", ".join(one.frames) or "its frame"
+    return f"no transform links {frames} to the robot (/tf, /tf_static)"
+
+
+def _faults(facts: Facts, config: Config) -> Iterator[str]:
+    health, estimate = config.health, facts.estimate
+    for one in facts.inputs:
+        most_s = health.odometry_silent_s if one.use == "odometry" else health.landmarks_silent_s
+        if one.mismatch:
+            yield f"{one.topic}: {one.mismatch}"
+        elif one.received and most_s and one.silent_s > most_s:
+            yield f"{one.topic}: silent for {one.silent_s:.1f} s"
+        elif one.received and sum(one.counts.get(r, 0) for r in _UNLINKED) >= max(1, one.received // 2):
+            yield f"{one.topic}: {_unlinked(one)}"
+    if facts.is_paused:
+        yield "paused"
+    if facts.failures:
+        yield f"{facts.failures} solves failed: the last good estimate stands"
+    if facts.overflows:
+        yield f"{facts.overflows} messages refused: the queue is full (inputs.queue)"
+    if facts.lag_s > health.lag_s:
+        yield f"the solver is {facts.lag_s:.1f} s behind, {facts.waiting} messages wait"
+    if estimate and not estimate.is_confirmed:
+        yield "where the robot is in the loaded map is not known yet"
+    if estimate and health.chi2_per_dof and estimate.fit > health.chi2_per_dof:
+        yield f"the measurements contradict each other: chi2 per degree of freedom is {estimate.fit:.1f}"
+
+
+def statuses(facts: Facts, verdict: Verdict, node: str) -> Iterator[Status]:
+    """For /diagnostics: the verdict, each input, and the graph."""
+    message = "; ".join((verdict.state, *verdict.reasons))
+    healthy = {"healthy": str(verdict.is_healthy), "state": verdict.state}
+    reasons = {f"reason {k}": reason for k, reason in enumerate(verdict.reasons, 1)}
+    load = {"lag [s]": f"{facts.lag_s:.3f}", "messages waiting": str(facts.waiting)}
+    load |= {"faults in 10 s": str(facts.faults)}
+    yield Status(verdict.level, f"{node}: health", message, node, healthy | reasons | load)
+    for one in facts.inputs:
+        used = one.received - sum(one.counts.values())
+        told = {"topic": one.topic, "use": one.use, "received": str(one.received), "used or waiting": str(max(used, 0))}
+        told |= {"silent [s]": f"{one.silent_s:.1f}", "publishers": ", ".join(one.publishers)}
+        told |= {f"counted: {reason}": str(times) for reason, times in sorted(one.counts.items())}
+        level = WARN if one.mismatch or (one.use == "odometry" and not one.received) else OK
+        yield Status(level, f"{node}: input {one.name}", one.mismatch or f"{one.received} received", node, told)
+    if facts.estimate:
+        yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes", node, _graph(facts.estimate))
+
+
+def _graph(e: Estimate) -> dict[str, str]:
+    return {
+        "keyframes": str(e.keyframes),
+        "landmarks": str(e.landmarks),
+        "edges": str(e.edges),
+        "segments": str(e.segments),
+        "solves": str(e.solves),
+        "chi2 per degree of freedom": f"{e.fit:.4g}",
+        "last update [ms]": f"{1e3 * e.solve_s:.2f}",
+        "slowest update [ms]": f"{1e3 * e.slowest_solve_s:.2f}",
+        "last correction [m]": f"{e.correction.distance_m:.4f}",
+        "last correction [rad]": f"{e.correction.angle_rad:.4f}",
+        "newest keyframe [ns]": str(e.stamp_ns),
+    }

@@ -1,0 +1,142 @@
+"""What the node publishes of a run: at once what is small, the rest when it is due, changed, and somebody listens.
+
+A topic that is latched is sent once more to whom comes late, so that nobody waits for the robot to move.
+"""
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from graph_slam_ros.ros import results, to_msg, topics
+from graph_slam_ros.ros.live import events
+from graph_slam_ros.ros.message_class import message_class
+from graph_slam_ros.ros.path_updates import PathUpdates
+from graph_slam_ros.ros.to_msg import Status
+from graph_slam_ros.slam import Config, GraphSlam, Update
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@dataclass(slots=True)
+class _Topic:
+    """A publisher and what has become of it."""
+
+    publisher: Any
+    listeners: int = 0
+    is_stale: bool = False  # something has changed since it was sent
+    begins_anew: bool = True  # somebody has nothing of it
+    sent_s: float = field(default=-1e9)
+
+
+class Outputs:
+    """Publishers of results, and what is due on them; made by the node, used by the worker's thread.
+
+    Parameters
+    ----------
+    node : the ROS node
+    """
+
+    def __init__(self, node: Any, config: Config) -> None:
+        self._node = node
+        self._topics = {
+            one.name.removeprefix("~/"): _Topic(
+                node.create_publisher(message_class(one.type), one.name, LATCHED if one.latched else 100)
+            )
+            for one in topics.PUBLICATIONS
+            if one.name.startswith("~/") and one.name not in ("~/received", "~/events")
+        }
+        self._events = node.create_publisher(message_class("diagnostic_msgs/msg/DiagnosticArray"), "~/events", 100)
+        self._landmarks_at = 0  # keyframes, or later
+        self._has_something = False
+        self.begin(config)
+
+    def begin(self, config: Config) -> None:
+        """A new run: what was sent is of another."""
+        output = config.output
+        self._updates = PathUpdates(output.path_moved_m, output.path_moved_rad)
+        self._landmarks_at = 0
+        for topic in self._topics.values():
+            topic.is_stale = topic.begins_anew = True
+
+    def close(self) -> None:
+        """Take the publishers away."""
+        for topic in self._topics.values():
+            self._node.destroy_publisher(topic.publisher)
+        self._node.destroy_publisher(self._events)
+
+    # -- at once -----------------------------------------------------------------------------------------------------
+
+    def update(self, slam: GraphSlam, update: Update, *, is_confirmed: bool) -> None:
+        """The pose, what has happened, and a note of what is to be sent."""
+        if is_confirmed:
+            self._send("pose", results.pose(slam))
+        self._has_something = True
+        for name in ("path", "path_updates", "graph"):
+            self._topics[name].is_stale = True
+        if self._landmarks_due(slam, update):
+            self._landmarks_at = len(slam.keyframes) + slam.config.output.landmarks_every_keyframes
+            estimates = results.landmark_estimates(slam)
+            self._send("landmarks", results.landmarks(slam, estimates))
+            self._send("landmarks_estimate", results.landmarks_estimate(slam, estimates))
+        if self._events.get_subscription_count():
+            self.tell(slam.keyframes[-1].stamp_ns, events.of_update(slam, update))
+
+    def tell(self, stamp_ns: int, happened: Iterable[Status]) -> None:
+        """Events, whoever listens."""
+        if statuses := list(happened):
+            self._events.publish(to_msg.diagnostics(stamp_ns, statuses))
+
+    def odometry(self, cdr: bytes) -> None:
+        """The robot in the map."""
+        self._send("odometry", cdr)
+
+    def has_listeners(self, name: str) -> bool:
+        """Whether somebody subscribes to a topic."""
+        return bool(self._topics[name].publisher.get_subscription_count())
+
+    def _send(self, name: str, cdr: bytes) -> None:
+        topic = self._topics[name]
+        topic.publisher.publish(cdr)
+        topic.is_stale, topic.sent_s = False, time.monotonic()
+
+    def _landmarks_due(self, slam: GraphSlam, update: Update) -> bool:
+        """From the first on regularly, whether or not somebody listens: who joins late gets the last that was sent."""
+        regularly = bool(slam.landmarks) and len(slam.keyframes) >= self._landmarks_at
+        return update.report is not None or (update.solved and regularly)
+
+    def _send_updates(self, slam: GraphSlam) -> None:
+        """All again to whom comes late: what was sent before, nobody can send him."""
+        if self._topics["path_updates"].begins_anew:
+            self._topics["path_updates"].begins_anew = False
+            self._send("path_updates", self._updates.restart(slam))
+        if changed := self._updates.update(slam):
+            self._send("path_updates", changed)
+
+    # -- when due ----------------------------------------------------------------------------------------------------
+
+    def are_due(self, config: Config) -> bool:
+        """Whether there is something for ``publish_due``; asked often, from any thread."""
+        now_s = time.monotonic()
+        return any(self._is_due(config, name, now_s) for name in ("path", "path_updates", "graph"))
+
+    def _is_due(self, config: Config, name: str, now_s: float) -> bool:
+        topic, output = self._topics[name], config.output
+        listeners = topic.publisher.get_subscription_count()
+        if listeners > topic.listeners:
+            topic.is_stale = topic.begins_anew = True  # who came late has what was latched, which may be old
+        topic.listeners = listeners
+        period_s = output.graph_period_s if name == "graph" else output.path_period_s
+        return self._has_something and topic.is_stale and bool(listeners) and now_s - topic.sent_s >= period_s
+
+    def publish_due(self, slam: GraphSlam) -> None:
+        """What has changed and somebody waits for."""
+        now_s, output = time.monotonic(), slam.config.output
+        if self._is_due(slam.config, "path", now_s):
+            self._send("path", results.path(slam, output.path_max_poses))
+        if self._is_due(slam.config, "graph", now_s):
+            self._send("graph", results.graph(slam, output.graph_max_edges))
+        if self._is_due(slam.config, "path_updates", now_s):
+            self._send_updates(slam)

@@ -1,0 +1,216 @@
+"""One run of the pipeline in a node, from configuration or reset to the next: its estimate, its recording, its files.
+
+All of it happens in the worker's thread; others see ``estimate``, which is replaced whole.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.ingest import read_ingest
+from graph_slam_ros.run import RunError, RunRecorder, earlier_runs, is_run, keep_earlier, run_config, summarize
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement, Update
+from graph_slam_ros.slam.graph_slam import Correction
+from graph_slam_ros.slam.measurements import from_record
+from graph_slam_ros.slam.space import Numbers
+
+OnUpdate = Callable[[GraphSlam, Update], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What is known after an update, for whoever must not wait for the next.
+
+    Attributes
+    ----------
+    T_map_odom : the correction; of identity before the first keyframe
+    T_odom_keyframe, covariance, stamp_ns : odometry's pose, tangent covariance and stamp of the newest keyframe
+    source : the odometry in use
+    is_confirmed : whether the robot knows where it is in a map that was loaded
+    fit : chi2 per degree of freedom; NaN before it was looked at
+    """
+
+    T_map_odom: Numbers
+    T_odom_keyframe: Numbers
+    covariance: Any
+    stamp_ns: int
+    source: str
+    is_confirmed: bool
+    keyframes: int
+    landmarks: int
+    edges: int
+    segments: int
+    solves: int
+    correction: Correction
+    solve_s: float
+    slowest_solve_s: float
+    fit: float
+
+
+class Session:
+    """The pipeline with its recording.
+
+    Parameters
+    ----------
+    border : counters of what was refused before it came here: they are saved with the run
+    on_update : called with what an update changed
+    """
+
+    def __init__(self, config: Config, border: Counters, on_update: OnUpdate, tell: Callable[[str, str], None]) -> None:
+        self.config = config
+        self._border, self._on_update, self._tell = border, on_update, tell
+        self._folder = Path(config.output.folder) if config.output.folder else None
+        self.estimate: Estimate | None = None
+        self.recording_fails = False
+        self._begin()
+
+    def _begin(self) -> None:
+        self._recorder: RunRecorder | None = None
+        if self._folder is not None:
+            keep_earlier(self._folder, self.config.output.keep_earlier)
+            self._recorder = RunRecorder(self._folder, self.config)
+        self.slam = GraphSlam(self.config, self._recorder.sink if self._recorder else None)
+        self.slam.counters.on_first = self._tell
+        self.estimate = None
+        self._is_saved = True
+        self._is_confirmed, self._loaded = True, 0  # keyframes
+        self._slowest_s = self.fit_took_s = 0.0
+        self._fit, self._fitted_at = float("nan"), 0
+
+    @property
+    def failures(self) -> int:
+        """Solves that failed."""
+        return sum(self.slam.counters.as_dict().get("solver", {}).values())
+
+    # -- measurements ------------------------------------------------------------------------------------------------
+
+    def take(self, measurements: Sequence[Measurement]) -> None:
+        """Hand measurements to the pipeline, in order."""
+        for measurement in measurements:
+            self._is_saved = False
+            self._process(measurement)
+
+    def _process(self, measurement: Measurement) -> None:
+        start = time.perf_counter()
+        update = self.slam.process(measurement)
+        took_s = time.perf_counter() - start
+        if not update:
+            return
+        self._slowest_s = max(self._slowest_s, took_s) if update.solved else self._slowest_s
+        self._look(update, took_s)
+        if self._recorder:
+            self._recorder.record(self.slam, update)
+        self._on_update(self.slam, update)
+
+    def _look(self, update: Update, took_s: float) -> None:
+        slam, newest = self.slam, self.slam.keyframes[-1]
+        covariance = slam.pose_covariance
+        if update.solved and not self._is_confirmed and len(slam.keyframes) > self._loaded:
+            unsure = float(covariance[0, 0] + covariance[1, 1]) ** 0.5
+            self._is_confirmed = unsure < _CONFIRMED * slam.config.odometry.jump_sigma_m
+        self.estimate = Estimate(
+            slam.T_map_odom,
+            newest.T_odom_base,
+            covariance,
+            newest.stamp_ns,
+            slam.odometry_source,
+            self._is_confirmed,
+            len(slam.keyframes),
+            len(slam.landmarks),
+            slam.graph.edge_count,
+            len(slam.segments),
+            slam.solves,
+            update.correction,
+            took_s,
+            self._slowest_s,
+            self._fit,
+        )
+
+    def evaluate(self) -> None:
+        """Look at how well everything fits; at a time when there is nothing else to do."""
+        if self.estimate is None or self._fitted_at == self.slam.solves:
+            return
+        start = time.perf_counter()
+        now, dof = self.slam.solver.evaluate(), self.slam.graph.degrees_of_freedom
+        self._fit = now.chi2_final / dof if dof > 0 else float("nan")
+        self._fitted_at, self.fit_took_s = self.slam.solves, time.perf_counter() - start
+        self.estimate = replace(self.estimate, fit=self._fit)
+
+    # -- services ----------------------------------------------------------------------------------------------------
+
+    def control(self, event: str, **values: Any) -> str:
+        """An event of the ingest sequence."""
+        self.take([Control(event, tuple(values.items()))])
+        return f"{len(self.slam.keyframes)} keyframes"
+
+    def save(self, release: str = "flush") -> str:
+        """Release what waits, solve, and write the run folder; returns its name."""
+        if self._recorder is None:
+            raise GraphSlamError("output.folder is empty: nowhere to save")
+        if not self._is_saved:
+            for event in (release, "optimize"):
+                self._process(Control(event))
+        counters = Counters()
+        for some in (self._border, self.slam.counters):
+            counters.update(some)
+        folder = str(self._recorder.save(self.slam, summarize(self.slam) | {"counters": counters.as_dict()}))
+        self._is_saved = True
+        return folder
+
+    def reset(self) -> str:
+        """Save, keep that, and begin anew."""
+        said = self.finish() or "nothing to save"
+        self._begin()
+        return said
+
+    def load(self, name: str) -> str:
+        """Save, keep that, and go on from an earlier run: in its map, where the robot is now is to be found out."""
+        run = self._earlier(name)
+        loaded = run_config(run)
+        if loaded.world != self.config.world:
+            raise RunError(f"{run.name}: world.dimensions is {loaded.world.dimensions} there")
+        losses: list[str] = []
+        measurements = [from_record(record) for record in read_ingest(run, losses)]
+        if losses:
+            raise RunError(f"{run.name}: {losses[0]}")
+        self.reset()
+        self.take([m for m in measurements if not (isinstance(m, Control) and m.event == "set")])
+        self.take([Control("time_jump")])
+        self._is_confirmed, self._loaded = not self.slam.keyframes, len(self.slam.keyframes)
+        if self.estimate is not None:
+            self._look(Update(), 0.0)
+        return f"{run.name}: {len(self.slam.keyframes)} keyframes"
+
+    def _earlier(self, name: str) -> Path:
+        if self._folder is None:
+            raise GraphSlamError("output.folder is empty: nothing to load")
+        if not name:
+            earlier = earlier_runs(self._folder)
+            if not earlier:
+                raise RunError(f"no earlier run of {self._folder.name}")
+            return earlier[max(earlier)]
+        run = self._folder.parent / name
+        if not is_run(run):
+            raise RunError(f"{name}: not a run")
+        return run
+
+    def finish(self) -> str:
+        """Save what was not saved yet, and end the recording; returns the folder, or nothing."""
+        if self._recorder is None:
+            return ""
+        folder = ""
+        if not self._is_saved:
+            folder = self.save("end")
+        self._recorder.close()
+        return folder
+
+    def abandon(self) -> None:
+        """End the recording as it is: there is no time to save."""
+        if self._recorder is not None:
+            self._recorder.close()
+
+
+_CONFIRMED = 0.2  # of the noise of the motion over a jump: less, and something was recognised

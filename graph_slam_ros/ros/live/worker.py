@@ -1,0 +1,80 @@
+"""The thread that everything goes through which changes the estimate: one thing at a time, in the order it came.
+
+Callbacks only hand over; what takes long never holds them up.
+"""
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
+
+
+class Worker:
+    """A thread with a queue of jobs.
+
+    Parameters
+    ----------
+    most : jobs that may wait; ``offer`` refuses more, ``call`` is always taken
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any] | None, float] | None] = queue.SimpleQueue()
+        self._since: float | None = None
+        self._thread = threading.Thread(target=self._run, name="graph_slam_worker", daemon=True)
+        self._thread.start()
+
+    def offer(self, job: Callable[[], None]) -> bool:
+        """Have a job done that raises nothing; False where too many wait, and nothing is taken."""
+        if self._jobs.qsize() >= self._most:
+            return False
+        self._jobs.put((job, None, time.monotonic()))
+        return True
+
+    def call(self, job: Callable[[], Any]) -> "Future[Any]":
+        """Have a job done, whose result or exception is told."""
+        future: Future[Any] = Future()
+        self._jobs.put((job, future, time.monotonic()))
+        return future
+
+    @property
+    def waiting(self) -> int:
+        """Jobs that wait."""
+        return self._jobs.qsize()
+
+    @property
+    def lag_s(self) -> float:
+        """How long ago the job in hand was handed over."""
+        since = self._since
+        return 0.0 if since is None else time.monotonic() - since
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
+    def stop(self, timeout_s: float | None = None) -> bool:
+        """Do what waits, then end; False if that takes longer."""
+        self._jobs.put(None)
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while (item := self._jobs.get()) is not None:
+            job, future, self._since = item
+            _do(job, future)
+            self._since = None
+
+
+def _do(job: Callable[[], Any], future: "Future[Any] | None") -> None:
+    """What fails must not end the thread; who offered a job that raises finds nothing of it."""
+    try:
+        result = job()
+    except Exception as error:
+        if future is not None:
+            future.set_exception(error)
+        return
+    if future is not None:
+        future.set_result(result)

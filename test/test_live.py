@@ -1,0 +1,271 @@
+"""Parts of the running node that need no ROS: what is told of map -> odom, who is ahead, how it is judged."""
+
+import itertools
+import math
+import threading
+import time
+
+import numpy as np
+import pytest
+from messages import STAMP_NS
+
+from graph_slam_ros.lie import so3
+from graph_slam_ros.ros.live import health
+from graph_slam_ros.ros.live.ahead import Ahead
+from graph_slam_ros.ros.live.health import Facts, InputFacts, judge, statuses
+from graph_slam_ros.ros.live.map_to_odom import MapToOdom
+from graph_slam_ros.ros.live.reckoning import Reckoning
+from graph_slam_ros.ros.live.session import Session
+from graph_slam_ros.ros.live.worker import Worker
+from graph_slam_ros.slam import Config, Counters, Odometry, Sighting, Sightings
+
+NS = 1_000_000_000
+HERE, THERE = (1.0, 2.0, 0.3), (2.0, 2.0, 0.3)
+
+
+# -- map -> odom -------------------------------------------------------------------------------------------------------
+
+
+def policy(**values):
+    config = Config.from_mapping({f"tf.{name}": value for name, value in values.items()})
+    return MapToOdom(config), config.tf
+
+
+def test_each_odometry_stamp_is_told_once_and_never_an_older_one():
+    correction, tf = policy()
+    told = [correction.next(tf, 0, stamp, (0.0, 0.0, 0.0), HERE) for stamp in (5 * NS, 5 * NS, 4 * NS, 6 * NS)]
+    assert told == [(5 * NS + NS // 10, HERE), None, None, (6 * NS + NS // 10, HERE)]
+    correction.forget_time()
+    assert correction.next(tf, 0, NS, (0.0, 0.0, 0.0), HERE) == (NS + NS // 10, HERE)
+
+
+def test_dated_by_the_clock_it_is_silent_with_odometry_and_never_dated_back():
+    correction, tf = policy(stamp="now", transform_tolerance=0.5)
+    assert correction.next(tf, 100 * NS, 5 * NS, (0.0, 0.0, 0.0), HERE) == (100 * NS + NS // 2, HERE)
+    assert correction.next(tf, 101 * NS, 5 * NS, (0.0, 0.0, 0.0), HERE) is None
+    assert correction.next(tf, 99 * NS, 6 * NS, (0.0, 0.0, 0.0), HERE) is None
+    assert correction.next(tf, 101 * NS, 6 * NS, (0.0, 0.0, 0.0), HERE) == (101 * NS + NS // 2, HERE)
+
+
+@pytest.mark.parametrize("T_odom_base", [(0.0, 0.0, 0.0), (-40.0, 70.0, 2.0)])
+def test_a_limited_correction_moves_the_robot_in_the_map_no_faster_and_arrives(T_odom_base):
+    correction, tf = policy(max_speed_m_s=0.5, max_turn_rad_s=0.1)
+    group = Config().space.group
+    target = group.compose((0.7, -0.4, 0.35), HERE)
+    told = [correction.next(tf, 0, k * NS // 10, T_odom_base, HERE if k == 0 else target)[1] for k in range(1200)]
+    robot = [group.compose(T, T_odom_base) for T in told]
+    steps = [group.between(a, b) for a, b in itertools.pairwise(robot)]
+    assert max(math.hypot(*step[:2]) for step in steps) <= 0.05 + 1e-9
+    assert max(abs(step[2]) for step in steps) <= 0.01 + 1e-9
+    assert 0 < next(k for k, T in enumerate(told) if target == T) < 1200
+
+
+# -- reckoning ---------------------------------------------------------------------------------------------------------
+
+
+def round_a_curve(dimensions, every_m):
+    """A robot that goes round a curve, with a keyframe after so many metres."""
+    settings = {
+        "world.dimensions": dimensions,
+        "keyframes.min_distance_m": every_m,
+        "keyframes.min_angle_rad": 3.0,
+        "keyframes.max_interval_s": 1000.0,
+        "ordering.window_s": 0.0,
+        "output.folder": "",
+    }
+    session = Session(Config.from_mapping(settings), Counters(), lambda slam, update: None, lambda *_: None)
+    session.take([drive(dimensions, k) for k in range(20)])
+    return session
+
+
+def drive(dimensions, k, source="odometry"):
+    x, y, turn = 0.5 * k, 0.02 * k * k, 0.04 * k
+    stamp = STAMP_NS + k * 10**8
+    if dimensions == 2:
+        return Odometry(stamp, (x, y, turn), (4e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 9e-4), source)
+    q = so3.exp((0.01 * k, 0.02 * k, turn))
+    return Odometry(
+        stamp, (x, y, 0.1 * k, *map(float, q)), tuple(np.diag([4e-4, 1e-4, 2e-4, 3e-4, 5e-4, 9e-4]).ravel()), source
+    )
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+@pytest.mark.parametrize("heard_from", [0, 19])
+def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_keyframe_there(dimensions, heard_from):
+    rare, often = round_a_curve(dimensions, 3.2), round_a_curve(dimensions, 0.4)
+    reckoning = Reckoning(rare.config)
+    for k in range(heard_from, 21):
+        assert reckoning.hear(drive(dimensions, k), rare.estimate)
+    at, covariance = reckoning.pose(rare.estimate)
+    often.take([drive(dimensions, 20)])
+    slam = often.slam
+    assert (slam.keyframes[-1].stamp_ns, len(slam.keyframes)) == (drive(dimensions, 20).stamp_ns, 21)
+    assert rare.estimate.keyframes < 10
+    assert at == pytest.approx(slam.trajectory()[-1], abs=1e-9)
+    assert at == pytest.approx(
+        rare.slam.space.group.compose(rare.slam.T_map_odom, drive(dimensions, 20).T_odom_base), abs=1e-9
+    )
+    if heard_from == 0:
+        assert covariance == pytest.approx(slam.pose_covariance, rel=1e-3, abs=1e-6)  # an edge has a least noise
+
+
+def test_asking_at_each_message_or_at_the_last_alone_gives_the_same():
+    session = round_a_curve(2, 3.2)
+    often, once = Reckoning(session.config), Reckoning(session.config)
+    for k in range(15, 40):
+        for one in (often, once):
+            one.hear(drive(2, k), session.estimate)
+        asked = often.pose(session.estimate)
+    pose, covariance = once.pose(session.estimate)
+    assert (pose, covariance.tolist()) == (asked[0], asked[1].tolist())
+
+
+def test_another_odometry_or_an_older_message_says_nothing_of_the_robot_in_the_map():
+    session = round_a_curve(2, 3.2)
+    reckoning = Reckoning(session.config)
+    assert reckoning.hear(drive(2, 19), session.estimate)
+    assert not reckoning.hear(drive(2, 20, "another"), session.estimate)
+    assert not reckoning.hear(drive(2, 18), session.estimate)
+    assert not reckoning.hear(drive(2, 19), session.estimate)
+    assert reckoning.newest == drive(2, 19)
+
+
+# -- messages from the future ------------------------------------------------------------------------------------------
+
+
+def seen(stamp_ns):
+    return [Sightings(stamp_ns, "landmarks", (Sighting("a", "position", (1.0, 0.0), (1.0, 0.0, 0.0, 1.0)),))]
+
+
+def test_what_is_ahead_of_the_clock_waits_for_it_and_keeps_its_order(monkeypatch):
+    clock, refused = [10 * NS], []
+    ahead = Ahead(1.0, lambda: clock[0], refused.append)
+    now, soon, then = seen(11 * NS), seen(13 * NS), seen(5 * NS)
+    assert list(ahead.pass_on(now)) == [now]
+    assert list(ahead.pass_on(soon)) == []
+    assert list(ahead.pass_on(then)) == []  # behind the other
+    clock[0] = 12 * NS
+    assert ahead.waited() == [soon, then]
+    assert refused == []
+    assert list(ahead.pass_on(seen(20 * NS))) == []
+    since = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: since + 1.1)
+    assert ahead.waited() == []
+    assert refused == [seen(20 * NS)]
+
+
+def test_where_no_clock_runs_or_nobody_asks_nothing_is_ahead():
+    for ahead in (Ahead(1.0, lambda: 0, pytest.fail), Ahead(0.0, lambda: NS, pytest.fail)):
+        assert list(ahead.pass_on(seen(10**18))) == [seen(10**18)]
+
+
+# -- the worker --------------------------------------------------------------------------------------------------------
+
+
+def test_a_worker_does_everything_in_order_refuses_what_is_too_much_and_survives_what_fails():
+    worker, gate, done = Worker(3), threading.Event(), []
+    first = worker.call(gate.wait)
+    deadline = time.monotonic() + 10.0
+    while worker.waiting and time.monotonic() < deadline:
+        time.sleep(0.001)
+    taken = [worker.offer(lambda k=k: done.append(k)) for k in range(5)]
+    failed, after = worker.call(lambda: 1 / 0), worker.call(lambda: done.append("last"))
+    assert taken == [True, True, True, False, False]
+    assert (worker.waiting, worker.is_alive) == (5, True)
+    gate.set()
+    assert first.result(10.0)
+    assert isinstance(failed.exception(10.0), ZeroDivisionError)
+    after.result(10.0)
+    assert done == [0, 1, 2, "last"]
+    assert worker.stop(10.0)
+    assert not worker.is_alive
+
+
+def test_a_worker_that_is_stopped_does_first_what_waits_and_tells_when_it_cannot_in_time():
+    worker, gate, done = Worker(10), threading.Event(), []
+    worker.offer(lambda: gate.wait(10.0) and None)
+    worker.offer(lambda: done.append(1))
+    assert not worker.stop(0.01)
+    assert worker.lag_s > 0.0
+    gate.set()
+    worker._thread.join(10.0)
+    assert done == [1]
+
+
+# -- health ------------------------------------------------------------------------------------------------------------
+
+
+def odom(**values):
+    return InputFacts(**{"name": "odom", "topic": "/odom", "use": "odometry", "publishers": ("/driver",)} | values)
+
+
+def tags(**values):
+    return InputFacts(**{"name": "tags", "topic": "/tags", "use": "landmarks", "publishers": ("/eye",)} | values)
+
+
+@pytest.mark.parametrize(
+    "facts, state, reason",
+    [
+        (Facts("unconfigured"), "UNCONFIGURED", ""),
+        (Facts("inactive"), "INACTIVE", ""),
+        (Facts("active", (odom(publishers=()),)), "WAITING", "/odom: nobody publishes this odometry"),
+        (Facts("active", (odom(),)), "WAITING", "/odom: /driver publishes it, but nothing has come yet"),
+        (Facts("active", (odom(mismatch="best effort"),)), "WAITING", "/odom: best effort"),
+        (
+            Facts("active", (odom(received=3, counts={"frame_unknown": 3}, frames=("wheels",)),)),
+            "WAITING",
+            "/odom: no transform links wheels to the robot (/tf, /tf_static)",
+        ),
+        (Facts("active", (odom(received=3, counts={"late": 3}),)), "WAITING", "/odom: refused, late 3 times"),
+        (
+            Facts("active", (odom(received=1),), waits_for_clock=True),
+            "WAITING",
+            "use_sim_time is set",
+        ),
+        (Facts("active", (odom(received=1),), worker_is_alive=False), "ERROR", "the solver's thread has ended"),
+        (Facts("active", (odom(),), faults=100), "ERROR", "100 faults in callbacks in 10 s"),
+        (
+            Facts("active", (odom(),), has_other_authority=True, authorities=("/amcl",)),
+            "ERROR",
+            "somebody else broadcasts map -> odom: /amcl",
+        ),
+        (Facts("active", (odom(),), twins=1), "ERROR", "another node has this node's name"),
+        (Facts("active", (odom(),), is_stopped=True), "ERROR", "stopped when the clock jumped back"),
+    ],
+)
+def test_what_is_wrong_before_the_first_estimate_is_named(facts, state, reason):
+    verdict = judge(facts, Config())
+    assert verdict.state == state
+    assert ("; ".join(verdict.reasons)).startswith(reason)
+    assert not verdict.is_healthy
+
+
+@pytest.mark.parametrize(
+    "values, inputs, reason",
+    [
+        ({}, (odom(received=9, silent_s=0.9), tags(received=3, silent_s=59.0)), ""),
+        ({}, (odom(received=9, silent_s=1.1),), "/odom: silent for 1.1 s"),
+        ({}, (odom(received=9, silent_s=0.1), tags(received=3, silent_s=61.0)), "/tags: silent for 61.0 s"),
+        ({}, (odom(received=9, silent_s=0.1), tags()), ""),  # nothing was ever seen: there may be nothing
+        (
+            {},
+            (
+                odom(received=9, silent_s=0.0),
+                tags(received=4, silent_s=0.0, counts={"frame_unknown": 4}, frames=("c",)),
+            ),
+            "/tags: no transform links c to the robot (/tf, /tf_static)",
+        ),
+        ({"is_paused": True}, (), "paused"),
+        ({"failures": 2}, (), "2 solves failed: the last good estimate stands"),
+        ({"overflows": 5}, (), "5 messages refused: the queue is full (inputs.queue)"),
+        ({"lag_s": 1.5, "waiting": 70}, (), "the solver is 1.5 s behind, 70 messages wait"),
+    ],
+)
+def test_at_work_it_is_well_or_degraded_with_the_reason(values, inputs, reason):
+    estimate = round_a_curve(2, 3.2).estimate
+    verdict = judge(Facts("active", inputs or (odom(received=9, silent_s=0.0),), estimate, **values), Config())
+    assert verdict == health.Verdict("DEGRADED", (reason,)) if reason else verdict == health.Verdict("OK")
+    told = list(statuses(Facts("active", inputs, estimate, **values), verdict, "slam"))
+    assert told[0].values["healthy"] == str(not reason)
+    assert told[0].message == "; ".join(("DEGRADED", reason) if reason else ("OK",))
+    assert told[-1].values["keyframes"] == str(estimate.keyframes)
