@@ -11,10 +11,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from benchmarks import options, table
-from benchmarks.live import executors
+from benchmarks.live import cities, drives, executors, paths
 
 FIGURES: dict[str, Callable[[bool], Sequence[table.Row]]] = {
     "executors": executors.measure,
+    **drives.FIGURES,
+    "path": paths.measure,
+    **cities.FIGURES,
 }
 
 

@@ -131,12 +131,13 @@ def _growth(rows: Sequence[Row]) -> str:
 
 
 def _memory(rows: Sequence[Row]) -> str:
-    names = ("poses, edges", "who", "peak MB", "bytes per pose")
+    names = ("world", "poses, edges", "who", "peak MB", "bytes per pose")
     lines = []
     for row in rows:
         peak = _with_ratio(row, _of_ours(row, rows), "peak_bytes", 1e-6, 1)
         who = row["who"] + (f" ({row['fault']})" if row["fault"] else "")
-        lines.append([f"{row['poses']}, {row['edges']}", who, peak, f"{row['peak_bytes'] / row['poses']:.0f}"])
+        sizes = [row["graph"], f"{row['poses']}, {row['edges']}"]
+        lines.append([*sizes, who, peak, f"{row['peak_bytes'] / row['poses']:.0f}"])
     return _table(names, lines)
 
 
