@@ -54,7 +54,7 @@ $(VENV)/venv.stamp:
 	$(PYTHON) -m venv $(if $(SYSTEM_ROS),--system-site-packages) $(VENV)
 	@touch $@
 
-# The lines of requirements.txt that are for ROS alone are those for one kind of machine.
+# The lines of requirements.txt that are for ROS alone are those for one kind of machine; so is the other DDS of the tests.
 without = awk '/^[^ \#]/ {keep = !/$(1)/} keep' requirements.txt > $(VENV)/requirements.txt
 
 $(VENV)/requirements.stamp: requirements.txt $(VENV)/venv.stamp

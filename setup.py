@@ -72,7 +72,15 @@ setup(
     extras_require={
         "evaluate": ["evo>=1.31.1"],  # GPL-3.0: never a requirement of the Apache-2.0 package itself
         "jazzy": [f"{line} ; {WHERE_JAZZY_HAS_WHEELS}" for line in JAZZY],
-        "test": ["hypothesis>=6.82", "mypy>=1.8", "pytest>=7.4", "ruff>=0.6", "types-PyYAML>=6.0", "types-tqdm>=4.60"],
+        "test": [
+            "hypothesis>=6.82",
+            "mypy>=1.8",
+            "pytest>=7.4",
+            "ruff>=0.6",
+            "types-PyYAML>=6.0",
+            "types-tqdm>=4.60",
+            f"cyclonedds>=11.0.1 ; {WHERE_JAZZY_HAS_WHEELS} and python_version < '3.14'",  # a DDS of another vendor
+        ],
     },
     entry_points={
         "console_scripts": [
