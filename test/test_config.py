@@ -76,7 +76,7 @@ def test_the_solvers_defaults_are_those_of_its_settings_but_for_when_the_last_so
 
 def test_what_is_written_is_read_back_as_it_was(tmp_path):
     values = {"frames": {"map": 'a "quoted" \\ näme: {x}\n'}, "solve": {"step_tolerance": 1e-300, "method": "lm"}}
-    config = Config.from_mapping({**values, "tf": {"publish": False}})
+    config = Config.from_mapping({**values, "tf": {"publish_tf": False}})
     assert read(tmp_path, parameters_text(config.as_mapping())) == config
 
 
