@@ -64,7 +64,6 @@ class Session:
         self._border, self._on_update, self._tell = border, on_update, tell
         self._folder = Path(config.output.folder) if config.output.folder else None
         self.estimate: Estimate | None = None
-        self.recording_fails = False
         self._begin()
 
     def _begin(self) -> None:
@@ -72,13 +71,14 @@ class Session:
         if self._folder is not None:
             keep_earlier(self._folder, self.config.output.keep_earlier)
             self._recorder = RunRecorder(self._folder, self.config)
-        self.slam = GraphSlam(self.config, self._recorder.sink if self._recorder else None)
+        self.recording_fails = False
+        self.slam = GraphSlam(self.config, self._sink)
         self.slam.counters.on_first = self._tell
         self.estimate = None
         self._is_saved = True
         self._is_confirmed, self._loaded = True, 0  # keyframes
-        self._slowest_s = self.fit_took_s = 0.0
-        self._fit, self._fitted_at = float("nan"), 0
+        self._slowest_s = 0.0
+        self._fit, self._fitted_at, self._fit_due_s = float("nan"), 0, 0.0
 
     @property
     def failures(self) -> int:
@@ -101,9 +101,21 @@ class Session:
             return
         self._slowest_s = max(self._slowest_s, took_s) if update.solved else self._slowest_s
         self._look(update, took_s)
-        if self._recorder:
-            self._recorder.record(self.slam, update)
+        self._recorded(lambda recorder: recorder.record(self.slam, update))
         self._on_update(self.slam, update)
+
+    def _sink(self, measurement: Measurement) -> None:
+        self._recorded(lambda recorder: recorder.sink(measurement))
+
+    def _recorded(self, write: Callable[[RunRecorder], None]) -> None:
+        """Where the disk fails, the robot goes on; that it is recorded no more is told."""
+        if self._recorder is None or self.recording_fails:
+            return
+        try:
+            write(self._recorder)
+        except OSError as error:
+            self.recording_fails = True
+            self._tell("output.folder", error.strerror or type(error).__name__)
 
     def _look(self, update: Update, took_s: float) -> None:
         slam, newest = self.slam, self.slam.keyframes[-1]
@@ -130,13 +142,14 @@ class Session:
         )
 
     def evaluate(self) -> None:
-        """Look at how well everything fits; at a time when there is nothing else to do."""
-        if self.estimate is None or self._fitted_at == self.slam.solves:
+        """Look at how well everything fits: when there is nothing else to do, and for a fiftieth of the time at most."""
+        if self.estimate is None or self._fitted_at == self.slam.solves or time.perf_counter() < self._fit_due_s:
             return
         start = time.perf_counter()
         now, dof = self.slam.solver.evaluate(), self.slam.graph.degrees_of_freedom
         self._fit = now.chi2_final / dof if dof > 0 else float("nan")
-        self._fitted_at, self.fit_took_s = self.slam.solves, time.perf_counter() - start
+        self._fitted_at = self.slam.solves
+        self._fit_due_s = start + 50.0 * (time.perf_counter() - start)
         self.estimate = replace(self.estimate, fit=self._fit)
 
     # -- services ----------------------------------------------------------------------------------------------------
@@ -163,6 +176,7 @@ class Session:
     def reset(self) -> str:
         """Save, keep that, and begin anew."""
         said = self.finish() or "nothing to save"
+        self.config = self.slam.config
         self._begin()
         return said
 
