@@ -342,6 +342,7 @@ def test_an_order_is_not_guessed_from_units(tmp_path):
         (PLANE, ".g2o", ["--from", "tum"], "argument --from: invalid choice: 'tum'"),
         (PLANE + "EDGE_SE2 1 2\n", ".toro", [], "a.g2o:6: EDGE_SE2 needs 11 fields after the tag, found 2"),
         (SPACE, ".gtsam", [], "GTSAM's text can say no edge of this graph"),
+        (PLANE.replace("4 1 9", "1e-309 0 9"), ".gtsam", [], "EDGE_SE2_XY 11 7: the information is too small to have"),
         ("VERTEX_XY 1 2 3\n", ".tum", [], "a trajectory needs poses of one kind, and this graph has 0 kinds"),
         ("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 2 3 1 0 0 1 0 0 1 0 1\n", ".g2o", [], "no relative poses lead from"),
         (Path("none.g2o"), ".toro", [], "none.g2o: no such file"),

@@ -17,6 +17,7 @@ BAD = {
     "one nan beside the diagonal": (GOOD + np.array([[0, 0, np.nan], [0, 0, 0], [np.nan, 0, 0]]), "not finite"),
     "infinite": (np.diag([1.0, np.inf, 1.0]), "not finite"),
     "asymmetric": (GOOD + np.array([[0, 1e-3, 0], [0, 0, 0], [0, 0, 0]]), "not symmetric"),
+    "huge": ([[1.0, 0.0, 1e308], [0.0, 1.0, 0.0], [1e308, 0.0, 1.0]], "not positive definite"),
     "rank one": (RANK_ONE, "not positive definite"),
     "negative": (-GOOD, "not positive definite"),
     "indefinite": (np.diag([1.0, -1e-9, 1.0]), "not positive definite"),

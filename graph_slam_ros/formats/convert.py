@@ -71,7 +71,10 @@ def _translated(lines: list[str], text: Text) -> tuple[list[str], Counter[str]]:
         words = line.split()
         if words[0] == "#":  # there are readers that give up at a comment, and say nothing
             continue
-        translated = from_g2o_words(words, text)
+        try:
+            translated = from_g2o_words(words, text)
+        except FormatError as error:
+            raise FormatError(f"{' '.join(words[:3])}: {error}") from None
         if translated is None:
             missing[words[0]] += 1
         else:

@@ -58,7 +58,10 @@ def in_g2o_words(words: Words, text: Text) -> Words:
     if text.dialect and tag not in _TAGS[text.dialect] and any(tag in tags for tags in _TAGS.values()):
         raise FormatError(f"{tag} is no line of a {text.dialect} file")
     translate = _READ.get(tag)
-    return words if translate is None else translate(words, text)
+    if translate is None:
+        return words
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is refused with its line
+        return translate(words, text)
 
 
 def from_g2o_words(words: Words, text: Text) -> Words | None:
@@ -238,10 +241,14 @@ def _inverse(upper: list[float], what: str) -> list[float]:
         raise FormatError(f"the {what} is not positive definite")
     scale = 1.0 / np.sqrt(np.diagonal(matrix))
     correlation = matrix * scale[:, None] * scale
-    if np.linalg.det(correlation) <= 0.0:
+    if not np.linalg.det(correlation) > 0.0:
         raise FormatError(f"the {what} is not positive definite")
-    inverse: list[float] = (np.linalg.inv(correlation) * scale[:, None] * scale)[at].tolist()
-    return inverse
+    with np.errstate(over="ignore"):
+        inverse = (np.linalg.inv(correlation) * scale[:, None] * scale)[at]
+    if not np.isfinite(inverse).all():
+        raise FormatError(f"the {what} is too small to have an inverse")
+    out: list[float] = inverse.tolist()
+    return out
 
 
 def _written(values: list[float]) -> Words:

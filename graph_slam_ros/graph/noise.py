@@ -56,7 +56,7 @@ def _cholesky(matrices: ArrayLike, what: str) -> Array:
         asymmetry = np.abs(a - transposed).max(axis=(-1, -2), initial=0.0)
         symmetric = asymmetry <= _ASYMMETRY * np.abs(a).max(axis=(-1, -2), initial=0.0)
     if symmetric.all():  # false for what is not finite, too
-        root = _definite_root(0.5 * (a + transposed))
+        root = _definite_root(0.5 * a + 0.5 * transposed)
         if root is not None:
             return root
     raise NoiseError(_fault(a.reshape(-1, *a.shape[-2:]), what))
@@ -69,7 +69,7 @@ def _fault(stack: Array, what: str) -> str:
             why = "not finite"
         elif np.abs(matrix - matrix.T).max() > _ASYMMETRY * np.abs(matrix).max():
             why = "not symmetric"
-        elif _definite_root(0.5 * (matrix + matrix.T)) is None:
+        elif _definite_root(0.5 * matrix + 0.5 * matrix.T) is None:
             why = "not positive definite"
         else:
             continue
