@@ -142,7 +142,7 @@ class Session:
         )
 
     def evaluate(self) -> None:
-        """Look at how well everything fits: when there is nothing else to do, and for a fiftieth of the time at most."""
+        """Look at how well everything fits, when there is nothing else to do, for a fiftieth of the time at most."""
         if self.estimate is None or self._fitted_at == self.slam.solves or time.perf_counter() < self._fit_due_s:
             return
         start = time.perf_counter()
