@@ -50,6 +50,7 @@ from graph_slam_ros.warmup import warmup
 
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 _TICK_S = 0.1
+_AGAIN_S = 5.0
 _STOP_S = 2.0  # what a solve may still take when the node is told to stop
 _SWITCH_S = 5e-4  # a callback waits no longer than this for the worker's Python; the default is ten times that
 _ACKNOWLEDGE = 32  # messages
@@ -71,6 +72,7 @@ class GraphSlamNode(LifecycleNode):
         self._faults: deque[float] = deque(maxlen=1000)
         self._told: set[str] = set()
         self._verdict = health.Verdict("UNCONFIGURED")
+        self._logged_s = 0.0
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # whatever becomes of /clock
         self._acknowledge = self.create_publisher(UInt64, "~/received", LATCHED)
         self._diagnostics = self.create_publisher(
@@ -132,18 +134,23 @@ class GraphSlamNode(LifecycleNode):
             self.get_logger().info(f"kernels ready after {warmup():.1f} s")
             self._run = run
             if self.config.output.load_at_start:
-                run.load()
+                run.in_passing(run.load())
 
     def _configured(self) -> "_Run":
         if self._run is None:
             raise GraphSlamError("not configured")
         return self._run
 
-    def finish(self) -> None:
-        """Save what was not saved yet, and take everything away."""
+    def finish(self, patience_s: float | None = None) -> None:
+        """Save what was not saved yet, and take everything away.
+
+        Parameters
+        ----------
+        patience_s : how long a solve that goes on may still take; None: as long as it takes
+        """
         if self._run is not None:
             run, self._run = self._run, None
-            run.finish()
+            run.finish(patience_s)
 
     # -- parameters --------------------------------------------------------------------------------------------------
 
@@ -222,10 +229,12 @@ class GraphSlamNode(LifecycleNode):
         self._diagnostics.publish(to_msg.diagnostics(self.now_ns, statuses))
 
     def _tell(self, verdict: health.Verdict) -> None:
-        """In the log where it changes; numbers alone are no change."""
+        """In the log where it changes, numbers apart; what somebody must do something about, every few seconds."""
         before, self._verdict = self._verdict, verdict
-        if _without_numbers(before) == _without_numbers(verdict):
+        urgent = verdict.state in ("WAITING", "ERROR") and time.monotonic() - self._logged_s > _AGAIN_S
+        if _without_numbers(before) == _without_numbers(verdict) and not urgent:
             return
+        self._logged_s = time.monotonic()
         said = "; ".join((verdict.state, *verdict.reasons))
         if verdict.level == to_msg.OK:
             self.get_logger().info(said)
@@ -287,12 +296,12 @@ class _Run:
         self._jumps.unregister()
         self._listeners = self._broadcaster = None
 
-    def finish(self) -> None:
+    def finish(self, patience_s: float | None) -> None:
         """Save what was not saved yet, and take everything away."""
         self.deactivate()
         self._node.destroy_subscription(self._initial)
         self._hand_over(self._border.finish())
-        if self._worker.stop(_STOP_S):
+        if self._worker.stop(patience_s):
             if folder := self._session.finish():
                 self._node.get_logger().info(f"saved {folder}")
         else:
@@ -340,7 +349,7 @@ class _Run:
 
     def _on_initial_pose(self, cdr: bytes) -> None:
         for pose in self._border.initial_pose(cdr):
-            self._worker.call(partial(self._session.take, [pose]))
+            self.in_passing(self._worker.call(partial(self._session.take, [pose])))
 
     def _on_jump(self, jump: Any) -> None:
         """The clock jumped back, or another one is used."""
@@ -357,9 +366,9 @@ class _Run:
         if what == "stop":
             self._is_stopped = True
         elif what == "reset":
-            self.reset()
+            self.in_passing(self.reset())
         else:
-            self._worker.call(partial(self._session.control, "time_jump"))
+            self.in_passing(self.control("time_jump"))
 
     def _look(self) -> tuple[Config, Estimate | None, Odometry | None]:
         return self._node.config, self._session.estimate, self._reckoning.newest
@@ -423,7 +432,16 @@ class _Run:
 
     def set(self, values: dict[str, Any]) -> None:
         """Change parameters at this place of the ingest sequence."""
-        self._worker.call(partial(self._session.take, [Control("set", tuple(values.items()))]))
+        self.in_passing(self._worker.call(partial(self._session.take, [Control("set", tuple(values.items()))])))
+
+    def in_passing(self, future: "Future[Any]") -> None:
+        """Where nobody waits for what was begun, the log says that it failed."""
+
+        def note(done: "Future[Any]") -> None:
+            if (error := done.exception()) is not None:
+                self._node.get_logger().error(str(error) if isinstance(error, GraphSlamError) else _said(error))
+
+        future.add_done_callback(note)
 
     # -- in the worker's thread --------------------------------------------------------------------------------------
 
@@ -453,11 +471,15 @@ class _Run:
         session, node, broadcaster = self._session, self._node, self._broadcaster
         if not self._worker.waiting and node.now_ns:
             self._worker.offer(node.guarded(session.evaluate))
-        overflows = sum(of.get("overflow", 0) for of in self.counters.as_dict().values())
+        counters = Counters()
+        for some in (self.counters, session.slam.counters):
+            counters.update(some)
+        counted = counters.as_dict()
+        overflows = sum(of.get("overflow", 0) for of in counted.values())
         failures = session.failures
         before, self._looked = self._looked, (overflows, failures)
         rivals = broadcaster.candidates() if broadcaster is not None and broadcaster.has_rival else None
-        inputs = self._listeners.facts(node.now_ns, self.counters) if self._listeners is not None else ()
+        inputs = self._listeners.facts(node.now_ns, counted) if self._listeners is not None else ()
         return health.Facts(
             lifecycle,
             inputs,
@@ -527,7 +549,7 @@ def main() -> int:
             return 2
         while not told.to_stop and rclpy.ok():
             executor.spin_once(timeout_sec=0.1)
-        node.finish()
+        node.finish(_STOP_S)
         executor.shutdown()
         node.destroy_node()
     except GraphSlamError as error:

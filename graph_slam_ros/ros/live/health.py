@@ -22,6 +22,8 @@ class InputFacts:
 
     Attributes
     ----------
+    received, used : messages, and what of them was handed on: of a message that holds several things, each
+    counts : of what was refused or repaired, by reason
     silent_s : since the last message, by the clock of the node; infinite before the first
     publishers : names of the nodes that publish it
     mismatch : what keeps publisher and subscription from connecting, in words; empty where nothing does
@@ -32,6 +34,7 @@ class InputFacts:
     topic: str
     use: str
     received: int = 0
+    used: int = 0
     counts: Mapping[str, int] = field(default_factory=dict)
     silent_s: float = math.inf
     publishers: tuple[str, ...] = ()
@@ -178,8 +181,7 @@ def statuses(facts: Facts, verdict: Verdict, node: str) -> Iterator[Status]:
     load |= {"faults in 10 s": str(facts.faults)}
     yield Status(verdict.level, f"{node}: health", message, node, healthy | reasons | load)
     for one in facts.inputs:
-        used = one.received - sum(one.counts.values())
-        told = {"topic": one.topic, "use": one.use, "received": str(one.received), "used or waiting": str(max(used, 0))}
+        told = {"topic": one.topic, "use": one.use, "received": str(one.received), "used": str(one.used)}
         told |= {"silent [s]": f"{one.silent_s:.1f}", "publishers": ", ".join(one.publishers)}
         told |= {f"counted: {reason}": str(times) for reason, times in sorted(one.counts.items())}
         level = WARN if one.mismatch or (one.use == "odometry" and not one.received) else OK

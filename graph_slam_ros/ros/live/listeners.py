@@ -1,7 +1,8 @@
 """The node's subscriptions while it is active: raw bytes in, measurements of the border out, and who has been heard."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border, is_co
 from graph_slam_ros.ros.inputs import Measured, uses
 from graph_slam_ros.ros.live.health import InputFacts
 from graph_slam_ros.ros.message_class import message_class
-from graph_slam_ros.slam import Config, Counters
+from graph_slam_ros.slam import Config
 
 Guard = Callable[[Callable[..., None]], Callable[..., None]]
 Take = Callable[[Sequence[Measured], bytes], None]
@@ -57,6 +58,7 @@ class Listeners:
         self._take, self._guarded, self._on_correction = take, guarded, on_correction
         self._topics: dict[str, _Heard] = {}
         self._of_input: dict[str, str] = {}
+        self._used: Counter[str] = Counter()
         kind = ReliabilityPolicy.RELIABLE if config.inputs.reliable else ReliabilityPolicy.BEST_EFFORT
         qos = QoSProfile(depth=config.inputs.depth, reliability=kind)
         static = QoSProfile(
@@ -88,7 +90,12 @@ class Listeners:
                 self._on_correction(cdr)
                 return
             heard.received += 1
-            self._take([m for name in names for m in border.take(name, cdr)], cdr)
+            measured: list[Measured] = []
+            for name in names:
+                given = border.take(name, cdr)
+                self._used[name] += len(given)
+                measured += given
+            self._take(measured, cdr)
 
         subscription = self._node.create_subscription(
             message_class(type_name), topic, self._guarded(on_message), qos, raw=True
@@ -103,9 +110,9 @@ class Listeners:
             if heard.received != heard.seen:
                 heard.seen, heard.at_ns = heard.received, now_ns
 
-    def facts(self, now_ns: int, counters: Counters) -> tuple[InputFacts, ...]:
-        """Of each input."""
-        counts, used = counters.as_dict(), uses(self._config)
+    def facts(self, now_ns: int, counted: Mapping[str, Mapping[str, int]]) -> tuple[InputFacts, ...]:
+        """Of each input; with what was counted, by its name and reason."""
+        used = uses(self._config)
         out = []
         for one in self._config.sources:
             if one.name not in self._of_input:
@@ -122,7 +129,8 @@ class Listeners:
                     topic,
                     used[one.name],
                     heard.received,
-                    counts.get(one.name, {}),
+                    self._used[one.name],
+                    counted.get(one.name, {}),
                     silent_s,
                     names,
                     "; ".join(filter(None, (self._mismatch(p, one.type) for p in told))),

@@ -13,7 +13,7 @@ from graph_slam_ros.slam.motion import Motion, OdometryNoise
 from graph_slam_ros.slam.odometry_choice import Step
 from graph_slam_ros.slam.space import Numbers
 
-_MOST = 20_000  # messages since the newest keyframe: of a robot that stands there are many
+_MOST = 2_000  # messages since the newest keyframe: of a robot that stands there are many
 
 
 class Reckoning:
