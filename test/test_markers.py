@@ -59,16 +59,14 @@ def test_a_graphs_markers_replace_the_former_ones_and_hold_what_they_were_given(
         ("poses", 0, 8, 0),
         ("landmarks", 0, 8, 0),
         ("edges/odometry", 0, 5, 0),
-        ("rejected", 0, 5, 0),
-    ]
+    ], "RViz calls a marker without points an error"
     assert [[(p.x, p.y, p.z) for p in m.points] for m in drawn] == [
         [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)],
         [(7.0, 8.0, 9.0)],
         [(0.0, 0.0, 0.0), (1.0, 2.0, 3.0)],
-        [],
     ]
-    assert [len(m.colors) for m in drawn] == [0, 0, 2, 0]
-    assert all(m.color.a > 0.5 and m.scale.x > 0.0 for m in drawn)
+    assert [len(m.colors) for m in drawn] == [0, 0, 2]
+    assert all(m.color.a > 0.5 and m.scale.x == m.scale.y > 0.0 for m in drawn)
     assert all((m.pose.position.x, m.pose.orientation.w) == (0.0, 1.0) for m in drawn), "points are in the frame itself"
     for m in decode(cdr).markers:
         assert (m.header.stamp.sec, m.header.stamp.nanosec, m.header.frame_id) == (*divmod(STAMP_NS, 10**9), "world")
@@ -86,7 +84,7 @@ def test_an_edge_that_fits_is_green_and_one_of_three_sigmas_is_red_with_yellow_b
 
 def test_each_line_has_its_own_colour_at_both_ends():
     lines = Lines(np.zeros((2, 3)), np.ones((2, 3)), np.array([1.0, 9.0]))
-    *_, edges, _ = decode(markers.graph_markers(STAMP_NS, "map", NONE.start, NONE.start, {"a": lines}, NONE)).markers
+    *_, edges = decode(markers.graph_markers(STAMP_NS, "map", NONE.start, NONE.start, {"a": lines}, NONE)).markers
     fits, does_not = markers.misfit_colours([1.0, 9.0])
     given = [(c.r, c.g, c.b, c.a) for c in edges.colors]
     assert given == [tuple(fits.tolist())] * 2 + [tuple(does_not.tolist())] * 2

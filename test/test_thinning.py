@@ -7,14 +7,15 @@ from graph_slam_ros.ros.thinning import thinned, worst_and_some
 
 
 @pytest.mark.parametrize(
-    ("count", "most"), [(0, 5), (1, 5), (2, 2), (5, 5), (6, 5), (9, 5), (10, 5), (999, 2), (999, 64)]
+    ("count", "most"), [(0, 5), (1, 5), (2, 2), (5, 5), (6, 5), (9, 5), (10, 5), (12, 3), (999, 2), (999, 64)]
 )
 def test_a_path_is_thinned_to_the_bound_and_keeps_its_first_and_its_last(count, most):
     kept = thinned(count, most)
     assert len(kept) <= most
     assert (np.diff(kept) > 0).all()
     assert {0, count - 1} <= set(kept.tolist()) or count == 0
-    assert count <= most or len(kept) > most // 2, "no more is left out than must be"
+    half_the_stride = np.append(np.arange(0, count - 1, (kept[1] - kept[0]) / 2), count - 1) if count > 1 else []
+    assert len(kept) == count if count <= most else len(half_the_stride) > most, "no more is left out than must be"
     assert (thinned(count, 0) == np.arange(count)).all()
 
 

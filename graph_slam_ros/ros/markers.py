@@ -19,6 +19,7 @@ Numbers = tuple[float, ...]
 _ADD, _DELETE_ALL = 0, 3
 _ARROW, _SPHERE, _CYLINDER, _LINE_LIST, _POINTS, _TEXT = 0, 2, 3, 5, 8, 9
 _NONE = np.empty((0, 3))
+_PLAIN = np.empty((0, 4), dtype=np.float32)  # colours, where points have none of their own
 
 _OF_LANDMARKS, _OF_POSES, _OF_REJECTED = (0.9, 0.5, 0.1, 0.8), (0.3, 0.6, 1.0, 1.0), (0.8, 0.1, 0.1, 0.6)
 # Green over yellow to red in even steps of hue in OKLCH and ever a little darker, for those to whom they are alike.
@@ -61,23 +62,22 @@ def graph_markers(
 ) -> bytes:
     """Vertices as points (n, 3), the edges of each class as lines of the colour of their misfit, those out dashed.
 
-    The namespaces are ``poses``, ``landmarks``, ``edges/CLASS`` and ``rejected``.
+    The namespaces are ``poses``, ``landmarks``, ``edges/CLASS`` and ``rejected``, where there is something to draw:
+    RViz calls a marker without points an error.
     """
-    drawn = {f"edges/{name}": lines for name, lines in classes.items() if len(lines.misfit)}
-    out = _Array(stamp_ns, frame, 2 + len(drawn) + 1)
-    out.add("poses", 0, _POINTS, size=(0.06, 0.06, 0.0), colour=_OF_POSES, points=poses)
-    out.add("landmarks", 0, _POINTS, size=(0.15, 0.15, 0.0), colour=_OF_LANDMARKS, points=landmarks)
-    for name, lines in drawn.items():
+    shapes = [
+        ("poses", _POINTS, 0.06, poses, _OF_POSES, _PLAIN),
+        ("landmarks", _POINTS, 0.15, landmarks, _OF_LANDMARKS, _PLAIN),
+    ]
+    for name, lines in classes.items():
         points = np.stack((lines.start, lines.end), axis=1).reshape(-1, 3)
-        out.add(
-            name,
-            0,
-            _LINE_LIST,
-            size=(0.02, 0.0, 0.0),
-            points=points,
-            colours=np.repeat(misfit_colours(lines.misfit), 2, axis=0),
-        )
-    out.add("rejected", 0, _LINE_LIST, size=(0.01, 0.0, 0.0), colour=_OF_REJECTED, points=_dashed(rejected))
+        colours = np.repeat(misfit_colours(lines.misfit), 2, axis=0)
+        shapes.append((f"edges/{name}", _LINE_LIST, 0.02, points, _OF_LANDMARKS, colours))
+    shapes.append(("rejected", _LINE_LIST, 0.01, _dashed(rejected), _OF_REJECTED, _PLAIN))
+    shapes = [shape for shape in shapes if len(shape[3])]
+    out = _Array(stamp_ns, frame, len(shapes))
+    for name, type_, size, points, colour, colours in shapes:
+        out.add(name, 0, type_, size=(size, size, 0.0), colour=colour, points=points, colours=colours)
     return out.message()
 
 
@@ -133,7 +133,7 @@ class _Array:
         size: Sequence[float] = (1.0, 1.0, 1.0),
         colour: Numbers = _OF_LANDMARKS,
         points: Array = _NONE,
-        colours: ArrayLike = (),
+        colours: NDArray[np.float32] = _PLAIN,
         text: str = "",
     ) -> None:
         """A marker; with ``points`` (n, 3) and, where each has its own, their ``colours`` (n, 4)."""
@@ -148,7 +148,7 @@ class _Array:
         out.numbers("?", False)  # not locked to its frame
         out.numbers("I", len(points))
         out.array(points)
-        out.numbers("I", len(np.asarray(colours)))
+        out.numbers("I", len(colours))
         out.array(colours, "<f4")
         out.text("")  # texture_resource, texture and uv_coordinates
         out.header(0, "")
