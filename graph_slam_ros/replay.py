@@ -11,6 +11,7 @@ from graph_slam_ros.ros.bag import Bag, BagError, open_bag
 from graph_slam_ros.ros.definitions import recorded_decoder
 from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border
 from graph_slam_ros.ros.inputs import Measured, uses
+from graph_slam_ros.ros.survey import with_survey
 from graph_slam_ros.run import RunRecorder, check_room, is_run, run_config, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.input_config import InputConfig, default_input
@@ -148,12 +149,12 @@ def replay(
     counters = Counters()
     check_room(out, source)
     if is_run(source):
-        config = config or run_config(source)
+        config = with_survey(config or run_config(source))
         losses: list[str] = []
         items: Iterable[Sequence[Measurement]] = ([from_record(record)] for record in read_ingest(source, losses))
         total = 0
     else:
-        config = config or Config()
+        config = with_survey(config or Config())
         bag = open_bag(source)
         inputs = choose_inputs(bag, config, odometry, landmarks)
         items = _with_end(measurements(bag, inputs, config, counters))

@@ -4,6 +4,7 @@ A pose is a tuple (x, y, z, qx, qy, qz, qw), metres and a unit quaternion; a com
 ``se2``. Formulas follow J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics", 2018.
 """
 
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -35,6 +36,15 @@ def in_plane(poses: ArrayLike) -> Array:
     """Poses (..., 3) of those of space (..., 7): x, y and the heading of their x axis; height, roll, pitch are lost."""
     x, y, _, qx, qy, qz, qw = np.moveaxis(np.asarray(poses, dtype=np.float64), -1, 0)
     return np.stack([x, y, np.arctan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)], axis=-1)
+
+
+def from_xyz_rpy(numbers: Sequence[float]) -> Pose:
+    """Pose of (x, y, z, roll, pitch, yaw) about fixed axes, as URDF writes it."""
+    x, y, z, *angles = map(float, numbers)
+    q = so3.IDENTITY
+    for axis in (2, 1, 0):  # roll is applied first
+        q = so3.compose(q, so3.exp((*(angles[k] if k == axis else 0.0 for k in range(3)),)))
+    return x, y, z, float(q[0]), float(q[1]), float(q[2]), float(q[3])
 
 
 @jitable

@@ -45,6 +45,7 @@ from graph_slam_ros.ros.live.reckoning import Reckoning
 from graph_slam_ros.ros.live.session import Estimate, Session
 from graph_slam_ros.ros.live.worker import Worker
 from graph_slam_ros.ros.message_class import message_class
+from graph_slam_ros.ros.survey import with_survey
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Update
 from graph_slam_ros.warmup import warmup
 
@@ -246,7 +247,7 @@ class _Run:
     """What there is from configuration to clean-up."""
 
     def __init__(self, node: GraphSlamNode) -> None:
-        config = node.config
+        config = with_survey(node.config)
         self._node = node
         self.counters = Counters()  # of the border; those of the pipeline belong to the worker's thread
         self.counters.on_first = self._tell

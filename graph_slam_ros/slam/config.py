@@ -14,6 +14,7 @@ from typing import Any
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import Loss
+from graph_slam_ros.lie import se3
 from graph_slam_ros.slam.input_config import DEFAULT_INPUTS, InputConfig, default_input
 from graph_slam_ros.slam.node_config import (
     USUAL_INPUTS,
@@ -25,8 +26,9 @@ from graph_slam_ros.slam.node_config import (
     TfConfig,
     TimeConfig,
 )
-from graph_slam_ros.slam.parameter import Parameter, section_parameters, setting
-from graph_slam_ros.slam.space import PLANE, SPACE, Space
+from graph_slam_ros.slam.parameter import Parameter, numbers, section_parameters, setting
+from graph_slam_ros.slam.space import PLANE, SPACE, Numbers, Space
+from graph_slam_ros.slam.survey import Surveyed, surveyed
 from graph_slam_ros.solver import METHODS, Settings
 
 
@@ -171,6 +173,12 @@ class LandmarksConfig:
     mirror_chi2: float = setting(
         12.0, "and until every other place it may be at fits worse by this much", "chi2", low=0.0
     )
+    surveyed: str = setting(
+        "",
+        "landmarks whose place in the map is known: a header id,x,y,sigma or id,x,y,z,sigma and a line for each",
+        "m",
+    )
+    surveyed_file: str = setting("", "file of these lines, read at the start where there are none above")
     range_offset_sigma_m: float = setting(
         0.0,
         "standard deviation of an offset that all ranges of a topic share and that is estimated; 0: there is none",
@@ -187,8 +195,13 @@ class LandmarksConfig:
 
 @dataclass(frozen=True, slots=True)
 class AnchorConfig:
-    """The prior on the first keyframe, which fixes the gauge: map begins where odom begins."""
+    """The prior on the first keyframe, which fixes the gauge: map begins where odom begins, or where it is said to."""
 
+    pose: str = setting(
+        "",
+        "where the robot starts in the map: x y yaw, or in space x y z roll pitch yaw; empty: where odometry begins",
+        "m, rad",
+    )
     sigma_m: float = setting(1e-3, "standard deviation of its position", "m", low=1e-6)
     sigma_rad: float = setting(1e-3, "standard deviation of its heading", "rad", low=1e-6)
 
@@ -289,6 +302,9 @@ class Config:
     node: NodeConfig = NodeConfig()
     sources: tuple[InputConfig, ...] = DEFAULT_INPUTS
 
+    def __post_init__(self) -> None:
+        _ = self.start_pose, self.survey  # what they are made of is refused here, not later
+
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> "Config":
         """From nested or dotted names to values; what is not named keeps its default.
@@ -333,6 +349,23 @@ class Config:
     def space(self) -> Space:
         """The plane or space."""
         return PLANE if self.world.dimensions == 2 else SPACE
+
+    @property
+    def start_pose(self) -> Numbers | None:
+        """``T_map_base`` of the first keyframe; None where odometry says it."""
+        counts = (3,) if self.world.dimensions == 2 else (3, 6)
+        given = numbers("anchor.pose", self.anchor.pose, *counts)
+        if not given or self.world.dimensions == 2:
+            return given or None
+        return se3.from_xyz_rpy(given if len(given) == 6 else (*given[:2], 0.0, 0.0, 0.0, given[2]))
+
+    @property
+    def survey(self) -> dict[str, Surveyed]:
+        """Landmarks whose place is known, by identity."""
+        try:
+            return surveyed(self.landmarks.surveyed, self.world.dimensions)
+        except ConfigError as error:
+            raise ConfigError(f"landmarks.surveyed: {error}") from None
 
     def solver_settings(self) -> Settings:
         """How the solver is to be run, online and at the end."""

@@ -301,12 +301,13 @@ class GraphSlam:
         return far or motion.moving_ns / 1e9 >= due.max_interval_s
 
     def _first_keyframe(self, step: Step) -> None:
-        """Map begins where odom begins: the first pose is anchored at its odometry pose."""
-        vertex = self.graph.add_vertex(self.space.pose, step.T_odom_base)
+        """Map begins where odom begins, or the robot where it is said to: there the first pose is anchored."""
+        T_map_base = self.config.start_pose or step.T_odom_base
+        vertex = self.graph.add_vertex(self.space.pose, T_map_base)
         anchor, n = self.config.anchor, self.space.dimensions
         sigmas = [anchor.sigma_m] * n + [anchor.sigma_rad] * (self.space.dof - n)
         self._covariance = np.diag(np.square(sigmas))
-        self.graph.add_edge(self.space.pose_prior, [vertex], step.T_odom_base, Gaussian.from_sigmas(*sigmas), "anchor")
+        self.graph.add_edge(self.space.pose_prior, [vertex], T_map_base, Gaussian.from_sigmas(*sigmas), "anchor")
         self.segments.append(0)
         self._append_keyframe(vertex, step)
         self._solved_T_map_odom = self.T_map_odom

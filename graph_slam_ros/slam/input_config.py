@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.slam.parameter import setting
+from graph_slam_ros.slam.parameter import numbers, setting
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,14 +57,7 @@ class InputConfig:
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
         """Numbers of a text; none if it is empty. Raises ConfigError for anything else than ``count`` of them."""
-        text = getattr(self, key)
-        try:
-            found = tuple(map(float, text.split()))
-        except ValueError:
-            found = (math.nan,)
-        if len(found) not in (0, count) or not all(map(math.isfinite, found)):
-            raise ConfigError(f"{self.name}.{key}: {text!r} is not {count} numbers")
-        return found
+        return numbers(f"{self.name}.{key}", getattr(self, key), count)
 
 
 DEFAULT_INPUTS = (

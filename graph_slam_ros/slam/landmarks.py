@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian, Graph, VertexKind
 from graph_slam_ros.slam import carry, triangulation
 from graph_slam_ros.slam.carry import Carried, Where
@@ -14,6 +15,7 @@ from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.edge_noise import LEAST_RAD2, edge_noise
 from graph_slam_ros.slam.measurements import Sighting
 from graph_slam_ros.slam.space import Numbers
+from graph_slam_ros.slam.survey import Surveyed
 from graph_slam_ros.slam.triangulation import Glance, Place
 from graph_slam_ros.solver import Solver
 
@@ -79,6 +81,9 @@ class Landmarks:
         self.waiting: dict[str, Waiting] = {}
         self._config, self._space = config, config.space
         self._graph, self._solver, self._counters = graph, solver, counters
+        if config.landmarks.surveyed_file and not config.landmarks.surveyed:
+            raise ConfigError(f"landmarks.surveyed_file: {config.landmarks.surveyed_file} has not been read")
+        self._survey = config.survey
         self._offsets: dict[str, int] = {}
 
     def add(self, topic: str, name: str, s: Sighting, where: Where) -> None:
@@ -93,6 +98,8 @@ class Landmarks:
         elif s.kind == "range_bearing":
             point = carry.point_of(self._space, s.measured)
             self._begin(topic, name, s, where, tuple(self._from_sensor(s, where, point).tolist()))
+        elif name in self._survey:  # there is nothing to wait for
+            self._begin(topic, name, s, where, self._survey[name].position)
         else:
             self._wait(topic, name, s, where)
 
@@ -104,7 +111,18 @@ class Landmarks:
         if s.kind == "pose":
             value = self._space.group.compose(self._pose(where), value)
         landmark = self.known[name] = Landmark(self._graph.add_vertex(kind, value), not s.id, not s.id)
+        if name in self._survey:
+            self._hold(landmark, self._survey[name])
         self._add_edge(topic, landmark, s, where)
+
+    def _hold(self, landmark: Landmark, known: Surveyed) -> None:
+        """A prior on the position; without a loss, what contradicts it is the sightings' fault."""
+        space = self._space
+        is_pose = self._graph.kind_of(landmark.vertex) is space.pose
+        edge_type = space.fixes["position"] if is_pose else POINT_PRIOR[space.point]
+        noise = Gaussian.from_sigmas(*[known.sigma_m] * space.dimensions)
+        measured = edge_type.whole(known.position)
+        self._graph.add_edge(edge_type, [landmark.vertex], measured, noise, "surveyed")
 
     def _add_edge(self, topic: str, landmark: Landmark, s: Sighting, where: Where) -> None:
         space = self._space

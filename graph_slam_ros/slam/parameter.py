@@ -61,6 +61,17 @@ def setting(
     return field(default=default, metadata={"about": (meaning, unit, low, high, choices, live)})
 
 
+def numbers(name: str, text: str, *counts: int) -> tuple[float, ...]:
+    """Numbers of a parameter's text; none if it is empty. Raises ConfigError for other than so many of them."""
+    try:
+        found = tuple(map(float, text.split()))
+    except ValueError:
+        found = (math.nan,)
+    if len(found) not in (0, *counts) or not all(map(math.isfinite, found)):
+        raise ConfigError(f"{name}: {text!r} is not {' or '.join(map(str, counts))} numbers")
+    return found
+
+
 def section_parameters(section: str, members: Any) -> Iterator[Parameter]:
     """The parameters of a section: ``members`` holds their defaults."""
     for key in dataclasses.fields(members):

@@ -193,8 +193,4 @@ def _mount(settings: InputConfig) -> se3.Pose | None:
     given = settings.numbers("mount", 6)
     if not given:
         return None
-    x, y, z, roll, pitch, yaw = given
-    q = so3.IDENTITY
-    for angle, axis in ((yaw, 2), (pitch, 1), (roll, 0)):  # fixed axes: roll is applied first
-        q = so3.compose(q, so3.exp(tuple(angle if k == axis else 0.0 for k in range(3))))
-    return x, y, z, float(q[0]), float(q[1]), float(q[2]), float(q[3])
+    return se3.from_xyz_rpy(given)

@@ -11,7 +11,7 @@ from graph_slam_ros.slam.config import Config, flatten, parameters
 from graph_slam_ros.slam.parameter import Parameter
 
 _OTHERS = {"use_sim_time", "start_type_description_service"}  # rclpy's own
-_AT_START = {"inputs.names", "output.folder", "node.autostart"}
+_AT_START = {"inputs.names", "output.folder", "node.autostart", "landmarks.surveyed_file"}
 """Sections are declared by the first; what nobody may point elsewhere from outside is the second."""
 
 

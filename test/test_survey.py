@@ -1,0 +1,258 @@
+"""Surveyed landmarks and a start pose: the run lies in the frame of the floor plan, not where odometry began."""
+
+import json
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
+from graph_slam_ros.graph import POINT_PRIOR, POSITION_PRIOR, R2, R3, SE2
+from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.replay import replay
+from graph_slam_ros.ros.survey import with_survey
+from graph_slam_ros.run import run_config
+from graph_slam_ros.simulation import measurements, simulate, write_bag
+from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.survey import Surveyed, surveyed
+
+END = (Control("end"), Control("optimize"))
+T_PLAN_WORLD = (12.0, -5.0, 2.0)
+SIGMA_M = 0.02
+SMALL = {"aisles": 2, "laps": 1, "aisle_m": 6.0}
+
+
+def table(rows, header="id,x,y,sigma"):
+    return "\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n"
+
+
+def plan_of(recording, names=None):
+    """The survey of a world's landmarks, in the frame of the floor plan."""
+    names = names or list(recording.landmarks)
+    return table([(name, *se2.act(T_PLAN_WORLD, recording.landmarks[name][:2]), SIGMA_M) for name in names])
+
+
+def driven(recording, **settings):
+    slam = GraphSlam(Config.from_mapping({key.replace("__", "."): value for key, value in settings.items()}))
+    for m in (*measurements(recording), *END):
+        slam.process(m)
+    return slam
+
+
+def errors(slam, recording):
+    """Of position [m] and heading [rad] of every keyframe, in the floor plan's frame: nothing is aligned."""
+    at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns)
+    truth = np.stack(se2.compose(T_PLAN_WORLD, tuple(recording.T_world_base[at].T)), axis=-1)
+    off = slam.trajectory() - truth
+    return np.hypot(off[:, 0], off[:, 1]), np.abs(se2.wrap(off[:, 2]))
+
+
+def start_of(recording, error=(0.0, 0.0, 0.0)):
+    at = se2.compose(T_PLAN_WORLD, tuple(recording.T_world_base[0].tolist()))
+    return " ".join(str(a + e) for a, e in zip(at, error, strict=True))
+
+
+# -- the map lies where it is said to ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sensor", ["pose", "position", "range_bearing", "bearing", "range"])
+def test_a_warehouse_lies_on_its_floor_plan_whatever_is_seen_of_the_surveyed_tags(sensor):
+    recording = simulate("warehouse", 4, **SMALL, sensor=sensor)
+    rough = start_of(recording, (0.3, -0.2, 0.1))
+    text = plan_of(recording)
+    slam = driven(recording, landmarks__surveyed=text, anchor__pose=rough, anchor__sigma_m=0.5, anchor__sigma_rad=0.3)
+    metres, radians = errors(slam, recording)
+    assert metres[0] < 0.1
+    assert metres.max() < 0.2
+    assert radians.max() < (0.1 if sensor == "range" else 0.04), "a range says nothing of the heading"
+    assert slam.report.classes["surveyed"].edges == len(slam.landmarks) > 5
+    assert not slam.waiting
+
+
+def test_three_surveyed_tags_hold_the_whole_map_and_the_others_follow():
+    recording = simulate("warehouse", 4, **SMALL)
+    names = [one.id for seen in (recording.seen[0], recording.seen[150], recording.seen[-1]) for one in seen.sightings]
+    text = plan_of(recording, list(dict.fromkeys(names))[:3])
+    slam = driven(
+        recording, landmarks__surveyed=text, anchor__pose=start_of(recording, (0.3, 0.1, 0.1)), anchor__sigma_m=1.0,
+        anchor__sigma_rad=0.5,
+    )  # fmt: skip
+    assert errors(slam, recording)[0].max() < 0.3
+    assert slam.report.classes["surveyed"].edges == 3 < len(slam.landmarks)
+    (of_surveyed,) = slam.solver.marginal([slam.landmarks[names[0]].vertex])
+    assert np.sqrt(of_surveyed[0, 0]) < SIGMA_M * 1.01
+
+
+def test_without_a_start_pose_a_loose_anchor_turns_into_the_plan_by_what_is_seen():
+    recording = simulate("warehouse", 4, **SMALL)
+    slam = driven(recording, landmarks__surveyed=plan_of(recording), anchor__sigma_m=1e3, anchor__sigma_rad=3.0)
+    metres, radians = errors(slam, recording)
+    assert metres.max() < 0.15
+    assert radians.max() < 0.03
+
+
+def test_a_start_pose_alone_moves_the_map_and_nothing_else():
+    recording = simulate("warehouse", 4, **SMALL)
+    one, other = driven(recording), driven(recording, anchor__pose=start_of(recording))
+    T_plan_odom = se2.compose(T_PLAN_WORLD, tuple(recording.T_world_base[0].tolist()))
+    moved = np.stack(se2.compose(T_plan_odom, tuple(one.trajectory().T)), axis=-1)
+    off = other.trajectory() - moved
+    assert np.abs(off[:, :2]).max() < 1e-4
+    assert np.abs(se2.wrap(off[:, 2])).max() < 1e-4
+    assert other.report.chi2_final == pytest.approx(one.report.chi2_final, rel=1e-6)
+
+
+def test_a_tag_that_was_moved_since_the_survey_does_not_move_the_map():
+    recording = simulate("warehouse", 4, **SMALL)
+    lines = plan_of(recording).splitlines()
+    at_the_end = {one.id for seen in recording.seen[-60:] for one in seen.sightings}
+    moved = next(one.id for one in recording.seen[80].sightings if one.id not in at_the_end)
+    k = next(k for k, line in enumerate(lines) if line.startswith(f"{moved},"))
+    name, x, y, sigma = lines[k].split(",")
+    lines[k] = f"{name},{float(x) + 2.0},{y},{sigma}"
+    slam = driven(recording, landmarks__surveyed="\n".join(lines), anchor__pose=start_of(recording))
+    assert errors(slam, recording)[0].max() < 0.15
+
+
+# -- what becomes of it in the graph ----------------------------------------------------------------------------------
+
+
+def pipeline(**settings):
+    base = {"ordering.window_s": 0.0, "landmarks.added_sigma_m": 0.0}
+    return GraphSlam(Config.from_mapping(base | {key.replace("__", "."): value for key, value in settings.items()}))
+
+
+def test_a_surveyed_point_has_a_prior_of_its_own_from_when_it_is_first_seen():
+    slam = pipeline(landmarks__surveyed=table([("a", 2, 1, 0.5), ("never seen", 9, 9, 0.5)]))
+    slam.process(Odometry(0, se2.IDENTITY))
+    assert POINT_PRIOR[R2] not in slam.graph.tables
+    for _ in range(2):
+        slam.process(Sightings(0, "tags", (Sighting("a", "position", (2.2, 1.0), (0.25, 0, 0, 0.25)),)))
+    priors = slam.graph.tables[POINT_PRIOR[R2]]
+    assert priors.measured.values.tolist() == [[2.0, 1.0]]
+    assert priors.sqrt_information.values[0] == pytest.approx(2.0 * np.eye(2))
+    slam.process(Control("optimize"))
+    assert list(slam.landmarks) == ["a"]
+    # two sightings at 2.2 and the survey at 2.0, all alike
+    assert slam.solver.estimate([slam.landmarks["a"].vertex])[0] == pytest.approx([2.0 + 0.4 / 3, 1.0], abs=1e-3)
+
+
+def test_of_a_surveyed_tag_seen_with_its_heading_the_position_is_known_and_the_heading_found():
+    slam = pipeline(landmarks__surveyed=table([("a", 2, 1, 0.01)]))
+    slam.process(Odometry(0, se2.IDENTITY))
+    noise = tuple((1e-2 * np.eye(3)).ravel())
+    slam.process(Sightings(0, "tags", (Sighting("a", "pose", (2.3, 1.2, 0.4), noise),)))
+    slam.process(Control("optimize"))
+    vertex = slam.landmarks["a"].vertex
+    assert slam.graph.kind_of(vertex) is SE2
+    assert slam.graph.tables[POSITION_PRIOR].measured.values.tolist() == [[2.0, 1.0, 0.0, 0.0]]
+    assert slam.solver.estimate([vertex])[0] == pytest.approx([2.0, 1.0, 0.4], abs=0.01)
+
+
+def test_in_space_start_pose_and_survey_have_all_their_axes():
+    slam = pipeline(
+        world__dimensions=3, anchor__pose="1 2 3 0.1 0.2 0.3", landmarks__surveyed=table([("a", 4, 5, 6, 1)], SPACE)
+    )
+    slam.process(Odometry(0, se3.IDENTITY))
+    q = so3.compose(so3.compose(so3.exp((0, 0, 0.3)), so3.exp((0, 0.2, 0))), so3.exp((0.1, 0, 0)))
+    assert slam.trajectory()[0] == pytest.approx([1, 2, 3, *q])
+    slam.process(Sightings(0, "tags", (Sighting("a", "position", (1, 0, 0), tuple(np.eye(3).ravel())),)))
+    assert slam.graph.tables[POINT_PRIOR[R3]].measured.values.tolist() == [[4.0, 5.0, 6.0]]
+    flat = pipeline(world__dimensions=3, anchor__pose="1 2 0.3")
+    flat.process(Odometry(0, se3.IDENTITY))
+    assert flat.trajectory()[0] == pytest.approx([1, 2, 0, *so3.exp((0, 0, 0.3))])
+
+
+# -- strict reading ---------------------------------------------------------------------------------------------------
+
+SPACE = "id,x,y,z,sigma"
+
+
+def test_a_table_is_read_as_spreadsheets_write_it():
+    text = 'id, x, y, z, sigma\r\n\r\n"door, left", 1.5, -2e0, 0.7, 0.05\r\ntag36h11:5,3,4,1,0.1\r\n'
+    assert surveyed(text, 2) == {
+        "door, left": Surveyed((1.5, -2.0), 0.05),
+        "tag36h11:5": Surveyed((3.0, 4.0), 0.1),
+    }
+    assert surveyed(text, 3)["tag36h11:5"] == Surveyed((3.0, 4.0, 1.0), 0.1)
+    assert surveyed("", 2) == {}
+
+
+@pytest.mark.parametrize(
+    "text, dimensions, said",
+    [
+        ("a,1,2,0.1\n", 2, "line 1: the header is 'a,1,2,0.1', not id,x,y,sigma or id,x,y,z,sigma"),
+        (table([("a", 1, 2, 0.1)]), 3, "line 1: the header is 'id,x,y,sigma', not id,x,y,z,sigma"),
+        (table([("a", 1, 2)]), 2, "line 2: 3 values, not id,x,y,sigma"),
+        (table([("a", 1, 2, 0.1), ("b", 1, "2,5", 0.1)]), 2, "line 3: 5 values, not id,x,y,sigma"),
+        (table([("a", "east", 2, 0.1)]), 2, "line 2: x 'east' is not a finite number"),
+        (table([("a", 1, "nan", 0.1)]), 2, "line 2: y 'nan' is not a finite number"),
+        (table([("a", 1, "1_0", 0.1)]), 2, "line 2: y '1_0' is not a finite number"),
+        (table([("a", 1, 2, 0)]), 2, "line 2: sigma 0 is not above 0: nothing is certain"),
+        (table([("", 1, 2, 0.1)]), 2, "line 2: the id is empty"),
+        (table([("a", 1, 2, 0.1), ("b", 0, 0, 1), ("a", 1, 2, 0.1)]), 2, "line 4: 'a' is given twice"),
+        ('id,x,y,sigma\n"a,1,2,0.1\n', 2, "line 2: unexpected end of data"),
+        ("id,x,y,sigma\n", 2, "a header and no landmark"),
+    ],
+)
+def test_what_is_wrong_with_a_table_is_said_with_its_line(text, dimensions, said):
+    with pytest.raises(ConfigError, match=r"^landmarks\.surveyed: ") as told:
+        Config.from_mapping({"landmarks.surveyed": text, "world.dimensions": dimensions})
+    assert str(told.value).removeprefix("landmarks.surveyed: ") == said
+
+
+@pytest.mark.parametrize(
+    "text, dimensions, said",
+    [
+        ("1 2", 2, "'1 2' is not 3 numbers"),
+        ("1 2 0 0 0 3", 2, "'1 2 0 0 0 3' is not 3 numbers"),
+        ("1 2 north", 3, "'1 2 north' is not 3 or 6 numbers"),
+    ],
+)
+def test_a_start_pose_that_is_none_is_refused(text, dimensions, said):
+    with pytest.raises(ConfigError) as told:
+        Config.from_mapping({"anchor.pose": text, "world.dimensions": dimensions})
+    assert str(told.value) == f"anchor.pose: {said}"
+
+
+def test_a_file_is_read_at_the_border_and_named_where_it_is_wrong(tmp_path):
+    file = tmp_path / "plan.csv"
+    config = Config.from_mapping({"landmarks.surveyed_file": str(file)})
+    with pytest.raises(FormatError, match="no such file"):
+        with_survey(config)
+    with pytest.raises(ConfigError, match="has not been read"):
+        GraphSlam(config)
+    file.write_text("\ufeff" + table([("a", 1, 2, 0.1)]), encoding="utf-8")
+    assert with_survey(config).survey == {"a": Surveyed((1.0, 2.0), 0.1)}
+    for text, said in ((table([("a", 1, 2, -1)]), "line 2: sigma -1 is not above 0"), ("", "no landmark in it")):
+        file.write_text(text)
+        with pytest.raises(ConfigError) as told:
+            with_survey(config)
+        assert str(told.value).startswith(f"{file}: {said}")
+
+
+# -- runs -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_keeps_the_survey_it_was_made_with_and_repeats_without_the_file(tmp_path, capsys):
+    recording = simulate("warehouse", 4, **SMALL)
+    bag, plan = tmp_path / "drive.mcap", tmp_path / "plan.csv"
+    write_bag(recording, bag)
+    plan.write_text(plan_of(recording))
+    words = [f"landmarks.surveyed_file={plan}", f"anchor.pose={start_of(recording)}", "anchor.sigma_m=0.5"]
+    given = [word for one in words for word in ("--set", one)]
+    assert main(["replay", str(bag), "--out", str(tmp_path / "run"), *given]) == 0
+    plan.unlink()
+    assert run_config(tmp_path / "run").landmarks.surveyed == plan_of(recording)
+    again = replay(tmp_path / "run", tmp_path / "again")
+    assert again.summary["classes"]["surveyed"]["edges"] == len(again.slam.landmarks)
+    for name in ("graph.g2o", "path.tum", "landmarks.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["landmarks"] == len(again.slam.landmarks)
+    capsys.readouterr()
+    assert main(["optimize", str(tmp_path / "run" / "graph.g2o"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["chi2_initial"] == pytest.approx(again.summary["chi2"], rel=1e-6)
+    with pytest.raises(GraphSlamError, match=f"{plan}: no such file"):
+        replay(bag, tmp_path / "none", Config.from_mapping({"landmarks.surveyed_file": str(plan)}))
+    assert not (tmp_path / "none" / "run.json").exists()
