@@ -148,11 +148,12 @@ def test_a_value_of_the_wrong_type_or_out_of_range_is_refused_by_name(name, valu
         ("tf:\n  period_s: 2001-99-99\n", "not valid YAML"),
         ("tf: !!python/object:os.system {}\n", "not valid YAML"),
         ("a:\n  ros__parameters: {}\nb:\n  ros__parameters: {}\n", r"several nodes \(a, b\)"),
+        ("graph_slam:\n  ros__parameters: {}\n/**:\n  ros__parameters: {}\n", "several nodes"),
         ("/**:\n  ros__parameters: 3\n", "ros__parameters is not a mapping"),
         ("[" * 20_000, "not valid YAML"),
         ("#" * 2**20 + "#\n", "larger than"),
     ],
-    ids=range(12),
+    ids=range(13),
 )
 def test_a_file_that_is_not_plain_parameters_is_refused_by_name(tmp_path, text, complaint):
     with pytest.raises(ConfigError, match=rf"parameters\.yaml: .*{complaint}") as caught:

@@ -11,6 +11,7 @@ import yaml
 from graph_slam_ros.errors import ConfigError
 
 _MAX_BYTES = 2**20
+_NODE = "graph_slam"
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -37,6 +38,8 @@ _StrictLoader.add_implicit_resolver(
 def read_parameters(path: Path | str) -> dict[str, Any]:
     """Nested values of a parameter file; a ROS wrapper (``/**: ros__parameters: ...``) is taken off.
 
+    Of a file for several nodes, the section of ``graph_slam``.
+
     Raises
     ------
     ConfigError
@@ -61,10 +64,15 @@ def read_parameters(path: Path | str) -> dict[str, Any]:
 
 
 def _unwrapped(path: Path, values: dict[Any, Any]) -> dict[str, Any]:
-    wrapped = [v for v in values.values() if isinstance(v, dict) and "ros__parameters" in v]
+    wrapped = {k: v for k, v in values.items() if isinstance(v, dict) and "ros__parameters" in v}
     if wrapped and len(values) > 1:
-        raise ConfigError(f"{path}: parameters of several nodes ({', '.join(map(str, values))}); give a file of one")
-    inner = wrapped[0]["ros__parameters"] if wrapped else values
+        ours = [name for name in wrapped if str(name).rpartition("/")[2] == _NODE]
+        if len(ours) != 1 or any("*" in str(name) for name in values):
+            raise ConfigError(
+                f"{path}: parameters of several nodes ({', '.join(map(str, values))}); give a file of one"
+            )
+        wrapped = {ours[0]: wrapped[ours[0]]}
+    inner = next(iter(wrapped.values()))["ros__parameters"] if wrapped else values
     if not isinstance(inner, dict):
         raise ConfigError(f"{path}: ros__parameters is not a mapping")
     for key in inner:
