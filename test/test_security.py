@@ -1,7 +1,15 @@
 """The SROS2 policy allows exactly what the node does: by the table of topics, and by a running node."""
 
+import importlib.util
+import os
+import random
+import subprocess
+import sys
+import time
 from pathlib import Path
 from xml.etree import ElementTree
+
+import pytest
 
 from graph_slam_ros.ros.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS, Interface
 
@@ -19,6 +27,7 @@ PARAMETERS = (
     "set_parameters_atomically",
 )
 OWN_SERVICES = {f"/graph_slam/{name}" for name in (*LIFECYCLE, *PARAMETERS, "get_type_description")}
+PATIENCE_S = 10.0
 
 
 def allowed(kind, how):
@@ -41,3 +50,55 @@ def test_the_policy_allows_what_the_table_of_topics_says():
     assert allowed("topic", "publish") == {one.resolved() for one in PUBLICATIONS} | OWN_PUBLICATIONS
     assert allowed("topic", "subscribe") == {one.resolved() for one in SUBSCRIPTIONS}
     assert allowed("service", "reply") == {one.resolved() for one in SERVICES} | OWN_SERVICES
+
+
+@pytest.fixture(scope="module")
+def running():
+    """(publications, subscriptions, services) of a node that runs, by name, each with its types."""
+    rclpy = pytest.importorskip("rclpy")
+    for package in ("vision_msgs", "tf2_msgs"):
+        pytest.importorskip(package)
+    from rclpy.context import Context
+
+    domain = random.randint(1, 100)
+    environment = dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", ROS_DOMAIN_ID=str(domain))
+    words = ("-p", "output.folder:=''", "-p", "use_sim_time:=true")
+    process = subprocess.Popen([sys.executable, "-m", "graph_slam_ros.ros.node", "--ros-args", *words], env=environment)
+    context = Context()
+    context.init(args=[], domain_id=domain)
+    node = rclpy.create_node("auditor", context=context)
+    try:
+        yield lambda want: until_steady(node, want)
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+        process.terminate()
+        process.wait(timeout=PATIENCE_S)
+
+
+def until_steady(node, want):
+    """What is asked for, once it is what is wanted, else as it is when patience ends."""
+    deadline, found = time.monotonic() + PATIENCE_S, None
+    while found != want and time.monotonic() < deadline:
+        time.sleep(0.05)
+        found = interfaces(node)
+    return found
+
+
+def interfaces(node):
+    if ("graph_slam", "/") not in node.get_node_names_and_namespaces():
+        return None
+    ask = (
+        node.get_publisher_names_and_types_by_node,
+        node.get_subscriber_names_and_types_by_node,
+        node.get_service_names_and_types_by_node,
+    )
+    return tuple({name for name, _ in names_and_types("graph_slam", "/")} for names_and_types in ask)
+
+
+def test_the_policy_is_what_a_running_node_does(running):
+    policy = (allowed("topic", "publish"), allowed("topic", "subscribe"), allowed("service", "reply"))
+    if importlib.util.find_spec("rclpy.type_description_service") is None:  # Humble
+        policy[2].discard("/graph_slam/get_type_description")
+    for found, wanted in zip(running(policy), policy, strict=True):
+        assert sorted(found) == sorted(wanted)
