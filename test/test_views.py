@@ -1,5 +1,6 @@
 """The layouts for RViz and Foxglove show what the node publishes, by its names, types and durability."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -12,6 +13,7 @@ from graph_slam_ros.ros.bag import open_bag
 from graph_slam_ros.ros.topics import PUBLICATIONS, SUBSCRIPTIONS
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam.config import FramesConfig
+from graph_slam_ros.slam.graph_slam import Correction
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
 RVIZ = yaml.safe_load((CONFIG / "graph_slam.rviz").read_text())["Visualization Manager"]
@@ -68,6 +70,19 @@ def test_every_topic_of_foxglove_is_the_nodes_or_of_a_runs_recording(tmp_path):
     for panel in panels("Plot"):
         for path in panel["paths"]:
             assert re.match(r"/[\w/]+", path["value"])[0] in PUBLISHED
+
+
+def test_what_foxglove_plots_is_among_the_nodes_diagnostics():
+    health = pytest.importorskip("graph_slam_ros.ros.live.health")
+    given = {field.name: 0 for field in dataclasses.fields(health.Estimate)}
+    estimate = health.Estimate(**given | {"correction": Correction()})
+    facts = health.Facts("active", estimate=estimate)
+    told = {status.name: set(status.values) for status in health.statuses(facts, health.Verdict("OK"), "graph_slam")}
+    plotted = [path["value"] for panel in panels("Plot") for path in panel["paths"] if "diagnostics" in path["value"]]
+    assert len(plotted) == 2
+    for path in plotted:
+        name, key = re.findall(r'=="(.+?)"', path)
+        assert key in told[name]
 
 
 def test_the_layout_of_foxglove_has_every_panel_once():
