@@ -15,6 +15,7 @@ from benchmarks.table import Row
 
 _OUTPUTS = ("path", "pose", "odometry", "tf")
 _WARM_S = 5.0
+_DIAGNOSED_S = 2.5  # diagnostics come once a second
 
 
 def cpu(short: bool) -> list[Row]:
@@ -131,16 +132,22 @@ def overload(short: bool) -> list[Row]:
                     "pose, p99 ms late": 1e3 * percentile(poses, 0.99),
                     "service, p99 ms": 1e3 * percentile(answers, 0.99),
                     "between TFs, p99 ms": 1e3 * percentile(gaps, 0.99),
+                    "solver behind, at most s": max(_told(heard["diagnostics"], "lag [s]"), default=None),
                     "normal after s": None,
                 }
             )
             if name == "usual again":
                 rows[-1]["normal after s"] = _normal_after(told["when"], heard["odometry"], start_ns, usual_s)
         received = robot.ask()
-        for told in ears.ask()["diagnostics"][-1:]:
-            options.say(f"overload: {told}")
-    rows.append({"load": "in all", "sent": sent, "received": received})
+        time.sleep(_DIAGNOSED_S)
+        used = _told(ears.ask()["diagnostics"][-1:], "used or waiting")
+    rows.append({"load": "in all", "sent": sent, "received": received, "used": int(sum(used))})
     return rows
+
+
+def _told(diagnostics: list[Any], key: str) -> list[float]:
+    """What the node says of itself, wherever it has that key."""
+    return [float(status[key]) for _, told in diagnostics for status in told.values() if key in status]
 
 
 def _pose_late(sent: list[Any], heard: list[Any]) -> list[float]:
