@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from graph_slam_ros.graph import POINT_PRIOR, Gaussian
+from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian
 from graph_slam_ros.ros import results, to_msg
 from graph_slam_ros.ros.graph_view import graph_view
 from graph_slam_ros.ros.interfaces import typestore
@@ -43,6 +43,8 @@ def slam(request):
     survey = slam.space.point
     where = slam.solver.estimate([slam.landmarks["point"].vertex])[0] + 0.1
     noise = Gaussian.from_sigmas(*[0.1] * n)
+    offset = slam.graph.add_vertex(R1, [2.0])  # which is nowhere
+    slam.graph.add_edge(POINT_PRIOR[R1], [offset], [0.0], Gaussian.from_sigmas(0.01), "range_offset")
     slam.graph.add_edge(POINT_PRIOR[survey], [slam.landmarks["point"].vertex], where, noise, "surveyed")
     slam.solver.set_weight(int(slam.graph.edges_of("closures")[-1]), 0.0)
     slam.process(Control("optimize"))
@@ -144,7 +146,18 @@ def test_the_graph_is_published_in_the_map_at_the_newest_keyframe(slam):
 
 def test_of_nothing_nothing_is_drawn():
     drawn = typestore().deserialize_cdr(results.graph(GraphSlam(), 100), results.LANDMARKS).markers
-    assert [(m.ns, m.action) for m in drawn] == [("", 3)]
+    assert [(m.ns, m.action, m.header.stamp.sec) for m in drawn] == [("", 3, 0)]
+    assert results.landmarks(GraphSlam()) == results.graph(GraphSlam(), 100)
+
+
+def test_landmarks_are_drawn_where_they_are_with_the_estimates_at_hand_or_without(slam):
+    cdr = results.landmarks(slam)
+    assert cdr == results.landmarks(slam, results.landmark_estimates(slam))
+    drawn = typestore().deserialize_cdr(cdr, results.LANDMARKS).markers
+    at = {m.text: m.pose.position for m in drawn if m.ns == "names"}
+    assert at.keys() == {"point", "tag"}
+    for name, p in at.items():
+        assert [p.x, p.y, p.z] == landmark(slam, name).tolist()
 
 
 def test_landmarks_are_published_with_identity_and_covariance_in_the_axes_of_the_map(slam):

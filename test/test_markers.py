@@ -69,6 +69,7 @@ def test_a_graphs_markers_replace_the_former_ones_and_hold_what_they_were_given(
     assert all(m.color.a > 0.5 and m.scale.x == m.scale.y > 0.0 for m in drawn)
     assert all((m.pose.position.x, m.pose.orientation.w) == (0.0, 1.0) for m in drawn), "points are in the frame itself"
     for m in decode(cdr).markers:
+        assert (m.lifetime.sec, m.lifetime.nanosec) == (0, 0), "it is there until it is deleted"
         assert (m.header.stamp.sec, m.header.stamp.nanosec, m.header.frame_id) == (*divmod(STAMP_NS, 10**9), "world")
 
 
