@@ -165,6 +165,11 @@ REFUSED = {
     "own source": (["replay", "{run}", "--out", "{run}"], "cannot be read from and written to at once"),
     "rate": (["replay", "{bag}", "--ros", "--rate", "-1"], "argument --rate: -1 is not a positive number"),
     "unknown world": (["simulate", "mars", "--out", "{out}"], "no world 'mars'; there are pythonrobotics"),
+    "seed as an option": (["simulate", "manhattan", "--out", "{out}", "--set", "seed=3"], "--set seed: no option of a"),
+    "a huge number": (
+        ["simulate", "manhattan", "--out", "{out}", "--set", f"poses={10**400}"],
+        "is not in [",
+    ),
     "negative seed": (["simulate", "manhattan", "--out", "{out}", "--seed", "-1"], "seed -1 is negative"),
     "simulate nowhere": (["simulate", "manhattan", "--out", "/nowhere/a.mcap"], "/nowhere/a.mcap: No such file"),
     "missing graph": (["optimize", "none.g2o"], "none.g2o: no such file"),

@@ -78,6 +78,8 @@ def simulate(args: argparse.Namespace) -> int:
     from graph_slam_ros.simulation import write_bag
 
     options = dict(parse_setting(text) for text in args.set)
+    if "seed" in options:
+        raise GraphSlamError("--set seed: no option of a world; --seed N")
     if args.as_original:
         options["as_original"] = True
     if args.poses is not None:

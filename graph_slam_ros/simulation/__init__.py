@@ -37,7 +37,7 @@ WORLDS: dict[str, World] = {
 }
 
 
-def simulate(world: str, seed: int, **options: Any) -> Recording:
+def simulate(world: str, /, seed: int, **options: Any) -> Recording:
     """Drive through a world.
 
     Raises

@@ -26,14 +26,14 @@ class Option:
     def check(self, world: str, value: Any) -> Any:
         """The value in the option's type. Raises GraphSlamError naming world, option and what is allowed."""
         kind = type(self.default)
-        if kind is float and type(value) is int:
+        if kind is float and type(value) is int and abs(value) < 2**1000:
             value = float(value)
         if type(value) is not kind:
             raise GraphSlamError(f"{world}: {self.name}: {value!r} is not {_ARTICLE[kind]}")
         if kind is str:
             if value not in self.choices:
                 raise GraphSlamError(f"{world}: {self.name}: {value!r} is not one of {', '.join(self.choices)}")
-        elif kind is not bool and not (math.isfinite(value) and self.low <= value <= self.high):
+        elif kind is not bool and not (self.low <= value <= self.high and value != math.inf):
             raise GraphSlamError(f"{world}: {self.name}: {value!r} is not in [{self.low:g}, {self.high:g}]")
         return value
 

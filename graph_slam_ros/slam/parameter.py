@@ -32,7 +32,7 @@ class Parameter:
         if self.choices and value not in self.choices:
             raise ConfigError(f"{self.name}: {value!r} is not one of {', '.join(self.choices)}")
         if isinstance(value, (int, float)) and not isinstance(value, bool):
-            if not math.isfinite(value):
+            if isinstance(value, float) and not math.isfinite(value):
                 raise ConfigError(f"{self.name}: {value!r} is not finite")
             if (self.low is not None and value < self.low) or (self.high is not None and value > self.high):
                 raise ConfigError(f"{self.name}: {value!r} is not in {self.range_text()}")
@@ -44,6 +44,7 @@ class Parameter:
         return f"[{low}, {'inf' if self.high is None else f'{self.high:g}'}]"
 
 
+_LARGEST = 1e9  # its square, and as many seconds in nanoseconds, can be reckoned with
 _ARTICLE = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
 
 
@@ -58,6 +59,8 @@ def setting(
     live: bool = False,
 ) -> Any:
     """A field of a section: its default, meaning, unit, bounds and choices, and whether it may change at work."""
+    if isinstance(default, float):
+        low, high = -_LARGEST if low is None else low, _LARGEST if high is None else high
     return field(default=default, metadata={"about": (meaning, unit, low, high, choices, live)})
 
 
