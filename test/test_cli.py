@@ -7,17 +7,16 @@ import shlex
 import shutil
 import signal
 import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
+from executables import executable
 
 from graph_slam_ros import __version__, cli
 from graph_slam_ros.ros.bag import BagWriter, open_bag
 
 RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv")
-COMMAND = Path(sys.executable).parent / "graph_slam"
+COMMAND = executable("graph_slam")
 WITH_EVO = pytest.mark.skipif(importlib.util.find_spec("evo") is None, reason="evo is not installed")
 
 

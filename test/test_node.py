@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("vision_msgs")
 pytest.importorskip("tf2_msgs")
 
+from executables import executable  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
 from messages import record_drive  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
@@ -41,7 +41,6 @@ from graph_slam_ros.warmup import warmup  # noqa: E402
 
 RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv")
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-BIN = Path(sys.executable).parent
 PATIENCE_S = 10.0
 ENVIRONMENT = dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", ROS_DOMAIN_ID=str(random.randint(1, 100)))
 
@@ -82,7 +81,7 @@ def replayed(run, tmp_path):
 
 def graph_slam(*words, timeout=60.0, **options):
     return subprocess.run(
-        [BIN / "graph_slam", *map(str, words)],
+        [executable("graph_slam"), *map(str, words)],
         capture_output=True,
         text=True,
         timeout=timeout,
@@ -161,7 +160,7 @@ class Started:
     """A SLAM node in a process of its own."""
 
     def __init__(self, *parameters, module=True, cwd=None):
-        command = [sys.executable, "-m", "graph_slam_ros.ros.node"] if module else [BIN / "graph_slam_node"]
+        command = [sys.executable, "-m", "graph_slam_ros.ros.node"] if module else [executable("graph_slam_node")]
         words = [word for p in parameters for word in ("-p", p)]
         self.process = subprocess.Popen(
             [*command, "--ros-args", *words], env=ENVIRONMENT, cwd=cwd, stderr=subprocess.PIPE, text=True
