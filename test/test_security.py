@@ -54,7 +54,7 @@ def test_the_policy_allows_what_the_table_of_topics_says():
 
 @pytest.fixture(scope="module")
 def running():
-    """(publications, subscriptions, services) of a node that runs, by name, each with its types."""
+    """A node that looks at one of ours, which runs."""
     rclpy = pytest.importorskip("rclpy")
     for package in ("vision_msgs", "tf2_msgs"):
         pytest.importorskip(package)
@@ -68,7 +68,7 @@ def running():
     context.init(args=[], domain_id=domain)
     node = rclpy.create_node("auditor", context=context)
     try:
-        yield lambda want: until_steady(node, want)
+        yield node
     finally:
         node.destroy_node()
         context.try_shutdown()
@@ -77,9 +77,9 @@ def running():
 
 
 def until_steady(node, want):
-    """What is asked for, once it is what is wanted, else as it is when patience ends."""
-    deadline, found = time.monotonic() + PATIENCE_S, None
-    while found != want and time.monotonic() < deadline:
+    """(publications, subscriptions, services) of the running node, once they are as wanted or patience has ended."""
+    deadline, found = time.monotonic() + PATIENCE_S, interfaces(node)
+    while any(w is not None and w != f for w, f in zip(want, found, strict=True)) and time.monotonic() < deadline:
         time.sleep(0.05)
         found = interfaces(node)
     return found
@@ -87,7 +87,7 @@ def until_steady(node, want):
 
 def interfaces(node):
     if ("graph_slam", "/") not in node.get_node_names_and_namespaces():
-        return None
+        return set(), set(), set()
     ask = (
         node.get_publisher_names_and_types_by_node,
         node.get_subscriber_names_and_types_by_node,
@@ -96,9 +96,18 @@ def interfaces(node):
     return tuple({name for name, _ in names_and_types("graph_slam", "/")} for names_and_types in ask)
 
 
+def test_what_a_running_node_publishes_has_type_and_durability_of_the_table(running):
+    until_steady(running, (allowed("topic", "publish"), None, None))
+    for one in PUBLICATIONS:
+        (offered,) = running.get_publishers_info_by_topic(one.resolved())
+        assert offered.topic_type == one.type
+        assert (offered.qos_profile.durability.name == "TRANSIENT_LOCAL") == one.latched, one.name
+        assert offered.qos_profile.reliability.name == "RELIABLE"
+
+
 def test_the_policy_is_what_a_running_node_does(running):
     policy = (allowed("topic", "publish"), allowed("topic", "subscribe"), allowed("service", "reply"))
     if importlib.util.find_spec("rclpy.type_description_service") is None:  # Humble
         policy[2].discard("/graph_slam/get_type_description")
-    for found, wanted in zip(running(policy), policy, strict=True):
+    for found, wanted in zip(until_steady(running, policy), policy, strict=True):
         assert sorted(found) == sorted(wanted)
