@@ -30,10 +30,8 @@ from graph_slam_ros.graph import (
     Loss,
 )
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.lie.jit import CACHE_DIR
+from graph_slam_ros.lie.jit import COMPILED
 from graph_slam_ros.solver import METHODS, Settings, Solver
-
-_DONE = CACHE_DIR / "complete"
 
 
 def warmup() -> float:
@@ -46,7 +44,7 @@ def warmup() -> float:
 
 def ensure_compiled() -> None:
     """Compile the kernels, once per installation, into the cache on disk."""
-    if not _DONE.exists() and not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+    if not COMPILED.exists() and not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         path = os.pathsep.join(filter(None, sys.path))
         subprocess.run([sys.executable, "-m", __name__], check=True, env=os.environ | {"PYTHONPATH": path})
 
@@ -103,4 +101,4 @@ def _edge_types() -> Iterator[EdgeType]:
 
 if __name__ == "__main__":
     _use_all()
-    _DONE.touch()
+    COMPILED.touch()

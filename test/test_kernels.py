@@ -1,6 +1,7 @@
 """Compiled loops: with bounds checked, without compilation, and all compiled by the warm-up."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -59,6 +60,21 @@ def test_code_compiled_without_bounds_checks_is_not_served_where_they_are_asked_
     checked = python("-c", BEYOND.format(at=1), NUMBA_BOUNDSCHECK="1", **cache)
     assert "IndexError" in checked.stderr
     assert checked.stdout != plain.stdout
+
+
+MARK = "from graph_slam_ros.lie.jit import CACHE_DIR, COMPILED; print(CACHE_DIR, COMPILED.name)"
+
+
+def test_what_was_compiled_of_another_copy_of_the_sources_is_compiled_anew_for_this_one(tmp_path):
+    marks = []
+    for place in ("one", "other"):
+        package = tmp_path / place / "graph_slam_ros"
+        shutil.copytree(TEST.parent / "graph_slam_ros", package, ignore=shutil.ignore_patterns("__pycache__"))
+        done = python("-c", MARK, PYTHONPATH=str(package.parent), GRAPH_SLAM_CACHE=str(tmp_path))
+        marks.append(done.stdout.split())
+    (one_cache, one), (other_cache, other) = marks
+    assert one_cache == other_cache
+    assert one != other
 
 
 COMPILED_LATER = """

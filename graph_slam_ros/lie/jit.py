@@ -14,21 +14,29 @@ from typing import Any
 import numba
 from numba.extending import register_jitable
 
-__all__ = ["CACHE_DIR", "jitable", "kernel"]
+__all__ = ["CACHE_DIR", "COMPILED", "jitable", "kernel"]
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _KERNEL_FOLDERS = ("lie", "graph", "solver")
 _SETTINGS = ("BOUNDSCHECK", "OPT")
 
 
+def _sources() -> list[Path]:
+    return [path for folder in _KERNEL_FOLDERS for path in sorted((_PACKAGE / folder).glob("*.py"))]
+
+
 def _digest() -> str:
     settings = [getattr(numba.config, name, None) for name in _SETTINGS]
     sha = hashlib.sha256(f"{numba.__version__} {settings}".encode())
-    for folder in _KERNEL_FOLDERS:
-        for path in sorted((_PACKAGE / folder).glob("*.py")):
-            sha.update(path.name.encode())
-            sha.update(path.read_bytes())
+    for path in _sources():
+        sha.update(path.name.encode())
+        sha.update(path.read_bytes())
     return sha.hexdigest()[:16]
+
+
+def _place() -> str:
+    """Of these files: Numba compiles anew what lies elsewhere, its older versions also what was touched."""
+    return hashlib.sha256(repr([(str(path), int(path.stat().st_mtime)) for path in _sources()]).encode()).hexdigest()
 
 
 def _cache_dir() -> Path:
@@ -47,6 +55,8 @@ def _cache_dir() -> Path:
 
 
 CACHE_DIR = _cache_dir()
+COMPILED = CACHE_DIR / f"complete-{_place()[:16]}"
+"""Is there when all kernels of these files have been compiled into the cache."""
 numba.config.CACHE_DIR = str(CACHE_DIR)  # type: ignore[attr-defined]
 
 
