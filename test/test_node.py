@@ -1,48 +1,24 @@
 """The node, as a robot has it: real processes, a real ROS graph on this machine's loopback."""
 
-import contextlib
 import itertools
 import math
 import os
-import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
+from live_nodes import ENVIRONMENT, graph_slam, lenient, node, replayed, results, robot, until
+from messages import record_drive
+from rclpy.qos import ReliabilityPolicy
 
-rclpy = pytest.importorskip("rclpy")
-pytest.importorskip("vision_msgs")
-pytest.importorskip("tf2_msgs")
-
-from executables import executable  # noqa: E402
-from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
-from messages import record_drive  # noqa: E402
-from nav_msgs.msg import Odometry  # noqa: E402
-from nav_msgs.msg import Path as PathMsg  # noqa: E402
-from rclpy.context import Context  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from rclpy.node import Node  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
-from tf2_msgs.msg import TFMessage  # noqa: E402
-from vision_msgs.msg import Detection3DArray  # noqa: E402
-from visualization_msgs.msg import MarkerArray  # noqa: E402
-
-from graph_slam_ros.cli import main  # noqa: E402
-from graph_slam_ros.replay import replay  # noqa: E402
-from graph_slam_ros.ros.bag import BagWriter, open_bag  # noqa: E402
-from graph_slam_ros.simulation import simulate, write_bag  # noqa: E402
-from graph_slam_ros.slam import Config  # noqa: E402
-from graph_slam_ros.warmup import warmup  # noqa: E402
-
-RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv")
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-PATIENCE_S = 10.0
-ENVIRONMENT = dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", ROS_DOMAIN_ID=str(random.randint(1, 100)))
+from graph_slam_ros.cli import main
+from graph_slam_ros.replay import replay
+from graph_slam_ros.ros.bag import BagWriter, open_bag
+from graph_slam_ros.simulation import simulate, write_bag
+from graph_slam_ros.slam import Config
+from graph_slam_ros.warmup import warmup
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -68,122 +44,6 @@ def offline(bag, tmp_path_factory):
 @pytest.fixture(scope="module")
 def messages(bag):
     return list(open_bag(bag).messages({"/odom", "/landmarks"}))
-
-
-def results(folder):
-    return {name: (folder / name).read_bytes() for name in RESULTS}
-
-
-def replayed(run, tmp_path):
-    replay(run, tmp_path / "replayed")
-    return results(tmp_path / "replayed")
-
-
-def graph_slam(*words, timeout=60.0, **options):
-    return subprocess.run(
-        [executable("graph_slam"), *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        env=ENVIRONMENT,
-        **options,
-    )
-
-
-def until(condition, spin, what):
-    """Poll for what must come to be."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, f"no {what} in {PATIENCE_S} s"
-        spin(0.02)
-
-
-class Robot:
-    """A ROS node of the test's own: publishes what a robot would, and hears what the SLAM node says."""
-
-    def __init__(self, reliability=ReliabilityPolicy.RELIABLE, name="robot"):
-        self.context = Context()
-        self.context.init(args=[], domain_id=int(ENVIRONMENT["ROS_DOMAIN_ID"]))
-        self.node = Node(name, context=self.context)
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(self.node)
-        qos = QoSProfile(depth=1000, reliability=reliability)
-        self.publishers = {
-            "/odom": self.node.create_publisher(Odometry, "/odom", qos),
-            "/landmarks": self.node.create_publisher(Detection3DArray, "/landmarks", qos),
-        }
-        self.heard = {"path": [], "pose": [], "landmarks": [], "tf": []}
-        for topic, kind in (("path", PathMsg), ("pose", PoseWithCovarianceStamped), ("landmarks", MarkerArray)):
-            self.node.create_subscription(kind, f"/graph_slam/{topic}", self.heard[topic].append, LATCHED)
-        self.node.create_subscription(TFMessage, "/tf", self.heard["tf"].append, 1000)
-        self._save = self.node.create_client(Trigger, "/graph_slam/save")
-
-    def spin(self, seconds=0.02):
-        self._executor.spin_once(timeout_sec=seconds)
-
-    def wait_for_node(self):
-        for topic, publisher in self.publishers.items():
-            until(lambda p=publisher: p.get_subscription_count(), self.spin, f"subscriber of {topic}")
-        until(self._save.service_is_ready, self.spin, "service ~/save")
-
-    def send(self, topic, cdr):
-        self.publishers[topic].publish(cdr)
-
-    def drive(self, messages, every=20):
-        """Send recorded messages in step with the node: not more than a few unheard."""
-        for k, m in enumerate(messages):
-            self.send(m.topic, m.cdr)
-            if k % every == 0:
-                self.spin(0.005)
-
-    def save(self):
-        future = self._save.call_async(Trigger.Request())
-        until(future.done, self.spin, "answer of ~/save")
-        return future.result()
-
-    def close(self):
-        self._executor.shutdown()
-        self.node.destroy_node()
-        self.context.try_shutdown()
-
-
-@contextlib.contextmanager
-def robot(**options):
-    r = Robot(**options)
-    try:
-        yield r
-    finally:
-        r.close()
-
-
-class Started:
-    """A SLAM node in a process of its own."""
-
-    def __init__(self, *parameters, module=True, cwd=None):
-        command = [sys.executable, "-m", "graph_slam_ros.ros.node"] if module else [executable("graph_slam_node")]
-        words = [word for p in parameters for word in ("-p", p)]
-        self.process = subprocess.Popen(
-            [*command, "--ros-args", *words], env=ENVIRONMENT, cwd=cwd, stderr=subprocess.PIPE, text=True
-        )
-        self.said = ""
-
-    def stop(self, number=signal.SIGINT):
-        """(exit code, seconds it took)."""
-        start = time.monotonic()
-        self.process.send_signal(number)
-        _, self.said = self.process.communicate(timeout=PATIENCE_S)
-        return self.process.returncode, time.monotonic() - start
-
-
-@contextlib.contextmanager
-def node(*parameters, **options):
-    started = Started(*parameters, **options)
-    try:
-        yield started
-    finally:
-        if started.process.poll() is None:
-            started.process.kill()
-            started.process.communicate()
 
 
 # -- live equals replay ---------------------------------------------------------------------------------------------
@@ -305,8 +165,8 @@ def test_a_running_node_is_played_what_it_listens_to(tmp_path):
 def test_a_node_with_an_input_of_a_package_that_is_not_installed_says_so(tmp_path):
     words = ("inputs.names:=odom tags", "tags.type:=apriltag_msgs/msg/AprilTagDetectionArray", "output.folder:=''")
     with node(*words) as n:
-        _, said = n.process.communicate(timeout=60.0)
-    assert n.process.returncode == 2
+        code, said = n.ended(60.0)
+    assert code == 2
     assert "apriltag_msgs is not installed here" in said
 
 
@@ -382,7 +242,7 @@ def test_save_answers_with_the_folder_and_the_node_ends_in_time(session):
     assert (session["saved"].success, session["saved"].message) == (True, str(session["folder"]))
     code, took_s = session["stopped"]
     assert code == 0
-    assert took_s < 3.0
+    assert took_s < lenient(3.0)
 
 
 def test_the_last_published_path_is_the_saved_one(session):
@@ -469,7 +329,7 @@ def test_garbage_does_not_end_the_node(messages, tmp_path):
         r.drive(messages[:400])
         until(lambda: r.heard["path"], r.spin, "path after garbage")
         assert r.save().success
-        assert n.process.poll() is None
+        assert n.is_alive
         assert n.stop()[0] == 0
     assert "Traceback" not in n.said
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
@@ -486,7 +346,7 @@ def test_a_signal_saves_the_run_and_ends_the_node_with_0_within_3_seconds(messag
         until(lambda: r.heard["path"], r.spin, "path")
         code, took_s = n.stop(number)
     assert code == 0
-    assert took_s < 3.0
+    assert took_s < lenient(3.0)
     assert "Traceback" not in n.said
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
@@ -511,7 +371,7 @@ def test_a_save_that_fails_is_answered_and_the_node_goes_on(messages, tmp_path):
         answer = r.save()
         assert not answer.success
         assert "run" in answer.message
-        assert n.process.poll() is None
+        assert n.is_alive
         (tmp_path / "run").mkdir()
         assert r.save().success
         assert n.stop()[0] == 0
@@ -529,7 +389,7 @@ def test_a_node_that_got_nothing_may_start_again_in_its_folder_with_whole_number
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_during_start_shows_no_traceback(tmp_path, number):
     with node(f"output.folder:={tmp_path / 'run'}", module=False) as n:
-        assert "compiling kernels" in n.process.stderr.readline()
+        until(lambda: "compiling kernels" in n.said, time.sleep, "start")
         assert n.stop(number)[0] == 0
     assert "Traceback" not in n.said
 
@@ -538,7 +398,7 @@ def test_a_signal_during_start_shows_no_traceback(tmp_path, number):
     "parameter, complaint",
     [
         ("keyframes.min_distnce_m:=1.0", "unknown parameter 'keyframes.min_distnce_m'; did you mean"),
-        ("keyframes.min_distance_m:=-1.0", "keyframes.min_distance_m: -1.0 is not in [0.001, inf]"),
+        ("keyframes.min_distance_m:=-1.0", "keyframes.min_distance_m: -1.0 is not in [0.001, 1e+09]"),
         ("frames.map:=3", "frames.map: 3 is not a text"),
         ("output.folder:={foreign}", "{foreign}: not empty and not an earlier run; nothing was written"),
         ("output.folder:={foreign}/file/run", "{foreign}/file/run: Not a directory"),
@@ -549,8 +409,8 @@ def test_a_parameter_that_is_refused_ends_the_node_with_one_line_and_code_2(tmp_
     (tmp_path / "foreign" / "file").write_text("mine")
     names = {"foreign": tmp_path / "foreign"}
     with node(parameter.format(**names), cwd=tmp_path) as n:
-        _, said = n.process.communicate(timeout=PATIENCE_S)
-        assert n.process.returncode == 2
+        code, said = n.ended()
+    assert code == 2
     assert said.count("\n") == 1
     assert complaint.format(**names) in said
     assert (tmp_path / "foreign" / "file").read_text() == "mine"
@@ -558,8 +418,8 @@ def test_a_parameter_that_is_refused_ends_the_node_with_one_line_and_code_2(tmp_
 
 def test_ros_arguments_that_cannot_be_read_are_refused_without_a_traceback(tmp_path):
     with node("nonsense", cwd=tmp_path) as n:
-        _, said = n.process.communicate(timeout=PATIENCE_S)
-        assert n.process.returncode == 2
+        code, said = n.ended()
+    assert code == 2
     assert "Traceback" not in said
     assert "nonsense" in said
 

@@ -1,0 +1,256 @@
+"""For tests of the running node: it in processes of its own, and a robot that talks to it, on this machine's loopback.
+
+Limits of time are those of an idle machine; where it is busy they are as much longer (``lenient``).
+"""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+pytest.importorskip("rclpy")
+pytest.importorskip("vision_msgs")
+pytest.importorskip("tf2_msgs")
+
+from executables import executable
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_srvs.srv import Trigger
+from vision_msgs.msg import Detection3DArray
+
+from graph_slam_ros.replay import replay
+from graph_slam_ros.ros import topics
+from graph_slam_ros.ros.message_class import message_class
+
+RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv")
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+PATIENCE_S = 10.0
+PUBLICATIONS = {one.name.removeprefix("~/"): one for one in topics.PUBLICATIONS}
+_HELD = []
+
+
+def own_domain():
+    """A DDS domain that no other test on this machine has; it is ours as long as this process lives."""
+    for domain in range(1, 101):
+        held = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            held.bind(("127.0.0.1", 23_000 + (domain + 37 * os.getpid()) % 100))
+        except OSError:
+            held.close()
+            continue
+        _HELD.append(held)
+        return str(1 + held.getsockname()[1] - 23_000)
+    raise OSError("no DDS domain is free")
+
+
+ENVIRONMENT = dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", ROS_DOMAIN_ID=own_domain())
+
+
+def lenient(seconds):
+    """So many, or as many more as the machine has more to do than it can."""
+    return seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+def results(folder):
+    return {name: (folder / name).read_bytes() for name in RESULTS}
+
+
+def replayed(run, tmp_path):
+    replay(run, tmp_path / "replayed")
+    return results(tmp_path / "replayed")
+
+
+def graph_slam(*words, timeout=60.0, **options):
+    return subprocess.run(
+        [executable("graph_slam"), *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        env=ENVIRONMENT,
+        **options,
+    )
+
+
+def until(condition, spin, what, patience_s=PATIENCE_S):
+    """Poll for what must come to be."""
+    deadline = time.monotonic() + lenient(patience_s)
+    while not condition():
+        assert time.monotonic() < deadline, f"no {what} in {patience_s} s"
+        spin(0.02)
+
+
+class Robot:
+    """A ROS node of the test's own: publishes what a robot would, and hears what the SLAM node says.
+
+    Parameters
+    ----------
+    of : the SLAM node
+    hears : of what that publishes
+    raw : of these, those whose bytes are kept as they come
+    """
+
+    def __init__(
+        self,
+        reliability=ReliabilityPolicy.RELIABLE,
+        name="robot",
+        of="/graph_slam",
+        hears=("path", "pose", "landmarks", "/tf"),
+        raw=(),
+    ):
+        self.context = Context()
+        self.context.init(args=[], domain_id=int(ENVIRONMENT["ROS_DOMAIN_ID"]))
+        self.node = Node(name, context=self.context, namespace=of.rpartition("/")[0], start_parameter_services=False)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._of, self._clients = of, {}
+        qos = QoSProfile(depth=1000, reliability=reliability)
+        self.publishers = {
+            "/odom": self.node.create_publisher(Odometry, "odom", qos),
+            "/landmarks": self.node.create_publisher(Detection3DArray, "landmarks", qos),
+        }
+        self.heard = {}
+        for topic in hears:
+            self.hear(topic, raw=topic in raw)
+        self._save = self.client("save")
+
+    def hear(self, topic, raw=False):
+        """Keep what the SLAM node publishes there; returns the list it is kept in."""
+        one, kept = PUBLICATIONS[topic], self.heard.setdefault(topic.lstrip("/"), [])
+        qos = LATCHED if one.latched else RELIABLE
+        self.node.create_subscription(message_class(one.type), one.resolved(self._of), kept.append, qos, raw=raw)
+        return kept
+
+    def publisher(self, topic, kind, qos=RELIABLE):
+        """A publisher of what is not odometry and landmarks."""
+        return self.node.create_publisher(kind, topic, qos)
+
+    def client(self, name, kind=Trigger):
+        """Of a service of the SLAM node."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, f"{self._of}/{name}")
+        return self._clients[name]
+
+    def spin(self, seconds=0.02):
+        self._executor.spin_once(timeout_sec=seconds)
+
+    def settle(self, seconds=0.3):
+        """Hear what is on its way: nothing for so long."""
+        before, since = None, time.monotonic()
+        while time.monotonic() - since < lenient(seconds):
+            self.spin()
+            count = sum(map(len, self.heard.values()))
+            if count != before:
+                before, since = count, time.monotonic()
+
+    def wait_for_node(self):
+        for topic, publisher in self.publishers.items():
+            until(lambda p=publisher: p.get_subscription_count(), self.spin, f"subscriber of {topic}")
+        until(self._save.service_is_ready, self.spin, "service ~/save")
+
+    def send(self, topic, cdr):
+        self.publishers[topic].publish(cdr)
+
+    def drive(self, messages, every=20):
+        """Send recorded messages in step with the node: not more than a few unheard."""
+        for k, m in enumerate(messages):
+            self.send(m.topic, m.cdr)
+            if k % every == 0:
+                self.spin(0.005)
+
+    def ask(self, name, kind=Trigger, request=None):
+        """Call a service of the SLAM node: a future."""
+        client = self.client(name, kind)
+        until(client.service_is_ready, self.spin, f"service ~/{name}")
+        return client.call_async(request or kind.Request())
+
+    def call(self, name, kind=Trigger, request=None, patience_s=PATIENCE_S):
+        """Call a service of the SLAM node: its answer."""
+        future = self.ask(name, kind, request)
+        until(future.done, self.spin, f"answer of ~/{name}", patience_s)
+        return future.result()
+
+    def save(self):
+        return self.call("save")
+
+    def close(self):
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+@contextlib.contextmanager
+def robot(**options):
+    r = Robot(**options)
+    try:
+        yield r
+    finally:
+        r.close()
+
+
+class Started:
+    """A SLAM node in a process of its own.
+
+    Parameters
+    ----------
+    parameters : ``name:=value``
+    module : run as a module, else as the installed script
+    remap : further ROS arguments for ``-r``
+    """
+
+    def __init__(self, *parameters, module=True, cwd=None, remap=()):
+        command = [sys.executable, "-m", "graph_slam_ros.ros.node"] if module else [executable("graph_slam_node")]
+        words = [word for p in parameters for word in ("-p", p)] + [word for r in remap for word in ("-r", r)]
+        self.process = subprocess.Popen(
+            [*command, "--ros-args", *words], env=ENVIRONMENT, cwd=cwd, stderr=subprocess.PIPE, text=True
+        )
+        self._lines = []
+        self._reader = threading.Thread(target=self._read, daemon=True)  # a pipe that is full would hold it up
+        self._reader.start()
+
+    def _read(self):
+        for line in self.process.stderr:
+            self._lines.append(line)
+
+    @property
+    def said(self):
+        """What it has logged so far."""
+        return "".join(self._lines)
+
+    @property
+    def is_alive(self):
+        return self.process.poll() is None
+
+    def ended(self, timeout_s=PATIENCE_S):
+        """Wait for its end by itself: (exit code, what it logged)."""
+        code = self.process.wait(timeout=lenient(timeout_s))
+        self._reader.join()
+        self.process.stderr.close()
+        return code, self.said
+
+    def stop(self, number=signal.SIGINT):
+        """(exit code, seconds it took)."""
+        start = time.monotonic()
+        self.process.send_signal(number)
+        code, _ = self.ended()
+        return code, time.monotonic() - start
+
+
+@contextlib.contextmanager
+def node(*parameters, **options):
+    started = Started(*parameters, **options)
+    try:
+        yield started
+    finally:
+        if started.is_alive:
+            started.process.kill()
+            started.ended()
