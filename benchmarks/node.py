@@ -12,6 +12,7 @@ from pathlib import Path
 
 from benchmarks import options, table
 from benchmarks.live import cities, drives, executors, paths
+from graph_slam_ros.warmup import warmup
 
 FIGURES: dict[str, Callable[[bool], Sequence[table.Row]]] = {
     "executors": executors.measure,
@@ -31,6 +32,7 @@ def main() -> None:
     for name in args.names:
         if name not in FIGURES:
             parser.error(f"{name} is none of {', '.join(FIGURES)}")
+    warmup()  # so that nobody waits for compilers
     measured = []
     for name in args.names or FIGURES:
         options.say(f"{name}{', a short look' if args.short else ''}")
