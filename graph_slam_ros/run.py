@@ -27,11 +27,11 @@ from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.ingest import IngestWriter, ingest_files
 from graph_slam_ros.formats.parameters import parameters_text, read_parameters
 from graph_slam_ros.formats.tum import tum_text
-from graph_slam_ros.leverage import leverage
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter
 from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.measurements import to_record
+from graph_slam_ros.solver.leverage import leverage
 
 SUMMARY, COVARIANCES, _CONFIG = "run.json", "covariances.csv", "config.yaml"
 Name = TypeVar("Name")
@@ -170,7 +170,7 @@ class RunRecorder:
         _replace(self.folder / "sightings.tum", tum_text(stamps, slam.sighting_trajectory()))
         _replace(self.folder / "odometry.tum", tum_text(stamps, slam.sighting_odometry()))
         _replace(self.folder / "landmarks.csv", _landmark_table(slam))
-        told = summarize(slam) | (summary or {}) | {"leverage": leverage(slam)}
+        told = summarize(slam) | (summary or {}) | {"leverage": leverage(slam.solver) if slam.is_solved else {}}
         _replace(self.folder / SUMMARY, json.dumps(told, indent=2) + "\n")
         return self.folder
 

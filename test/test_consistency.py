@@ -9,12 +9,12 @@ from scipy.stats import chi2
 from graph_slam_ros.consistency import Nees, class_noise, landmark_nees, pose_nees
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.evaluation import Trajectory, evaluate, interpolated
-from graph_slam_ros.leverage import leverage
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.replay import replay
 from graph_slam_ros.run import RunRecorder
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.solver.leverage import leverage
 from graph_slam_ros.truth import read_covariances
 
 
@@ -137,9 +137,9 @@ def run(recording, folder, settings):
 
 def test_leverages_add_up_to_the_unknowns_and_a_sample_of_edges_tells_them_too(tmp_path, monkeypatch):
     slam = run(simulate("warehouse", 3, aisles=2, laps=1), tmp_path / "run", CLEAN)
-    told = leverage(slam)
-    monkeypatch.setattr("graph_slam_ros.leverage._MOST", 10**6)
-    exact = leverage(slam)
+    told = leverage(slam.solver)
+    monkeypatch.setattr("graph_slam_ros.solver.leverage._MOST", 10**6)
+    exact = leverage(slam.solver)
     assert sum(exact.values()) == pytest.approx(3 * slam.graph.vertex_count, rel=1e-9)
     assert exact["anchor"] == pytest.approx(3.0, rel=1e-6)
     assert told == pytest.approx(exact, rel=0.05)

@@ -201,6 +201,12 @@ class Solver:
         self._take_out(one)
 
     @property
+    def edges(self) -> Index:
+        """Ids of the edges of the problem that have a weight."""
+        self._grow()
+        return self._weighted(np.flatnonzero(self._taken))
+
+    @property
     def is_current(self) -> bool:
         """Whether nothing waits: covariances then are of all there is, and asking for them changes nothing."""
         return self._settled and not self._waiting

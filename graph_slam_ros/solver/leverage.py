@@ -2,36 +2,38 @@
 
 import numpy as np
 
-from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.solver.linearization import Losses, linearize
+from graph_slam_ros.solver.linearization import Losses, linearize, rows_of
+from graph_slam_ros.solver.solver import Solver
 
 _MOST = 200  # edges of a class that are looked at: their joint covariances cost more than all the rest of a report
 
 
-def leverage(slam: GraphSlam) -> dict[str, float]:
-    """Trace of ``J Sigma J'`` of each class of edges, whitened and weighted as in the last stage of the losses.
+def leverage(solver: Solver) -> dict[str, float]:
+    """Trace of ``J Sigma J'`` of the edges of each label, whitened and weighted as in the last stage of the losses.
 
     Over all classes it is the number of unknowns; a class of M residuals has M less this degrees of freedom (Hoaglin,
     Welsch, "The hat matrix in regression and ANOVA", 1978). A class of more than 200 edges of a type is told from
-    every so manieth of them. Empty where the last solve failed.
+    every so manieth of them.
+
+    Raises
+    ------
+    GaugeError, SingularError
+        As for ``Solver.marginal``.
     """
-    graph, solver = slam.graph, slam.solver
+    graph = solver.graph
     x = np.empty(len(graph.initial))
     for code, kind in enumerate(graph.kinds):
         ids = np.flatnonzero(graph.kind.values == code)
         x[graph.offset.values[ids][:, None] + np.arange(kind.size)] = solver.estimate(ids)
-    losses = Losses(graph, slam.config.solver_settings().stages()[-1])
+    losses = Losses(graph, solver.settings.stages()[-1])
     out = dict.fromkeys(graph.labels, 0.0)
-    for table in graph.tables.values():
+    for table, rows in rows_of(graph, solver.edges).items():
         for code, label in enumerate(graph.labels):
-            rows = np.flatnonzero((table.label.values == code) & (table.weight.values != 0.0))
-            looked_at = rows[:: max(1, -(-len(rows) // _MOST))]
+            of_class = rows[table.label.values[rows] == code]
+            looked_at = of_class[:: max(1, -(-len(of_class) // _MOST))]
             for block in linearize(graph, x, {table: looked_at}, losses):
                 for jacobian, ends in zip(block.jacobian, table.vertices.values[block.rows], strict=True):
-                    try:
-                        covariance = solver.joint_marginal(ends)
-                    except GraphSlamError:
-                        return {}
-                    out[label] += float(((jacobian @ covariance) * jacobian).sum()) * len(rows) / len(looked_at)
+                    covariance = solver.joint_marginal(ends)
+                    trace = float(((jacobian @ covariance) * jacobian).sum())
+                    out[label] += trace * len(of_class) / len(looked_at)
     return {label: trace for label, trace in out.items() if trace}
