@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from graph_slam_ros.consistency import Consistency, class_noise, landmark_nees, pose_nees
+from graph_slam_ros.consistency import ClassNoise, Consistency, class_noise, landmark_nees, pose_nees
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3
 from graph_slam_ros.run import COVARIANCES, SUMMARY, is_run, run_config
@@ -204,8 +204,8 @@ def _consistency(run: Path, known: Truth) -> Consistency | None:
         raise GraphSlamError(f"{run / COVARIANCES}: {len(covariances)} covariances of {len(path.stamps_s)} poses")
     truth = known.trajectory if covariances.shape[1] == 6 else known.trajectory.in_plane()
     true = interpolated(truth, path.stamps_s)
-    summary = json.loads((run / SUMMARY).read_text(encoding="utf-8"))
-    if "fixes" in summary["classes"]:  # they hold the map, not the first pose, and nobody says in which frame
+    is_held, noise = _classes(run)
+    if is_held:  # by the fixes, not by the first pose, and nobody says in which frame
         true[:] = np.nan
     landmarks = read_landmarks(run / "landmarks.csv")
     unknown = (np.nan, np.nan, np.nan)
@@ -217,11 +217,16 @@ def _consistency(run: Path, known: Truth) -> Consistency | None:
         true[0],
         covariances[0],
     )
-    return Consistency(
-        *pose_nees(path.poses, true, covariances),
-        of_landmarks,
-        class_noise(summary["classes"], summary["leverage"]),
-    )
+    return Consistency(*pose_nees(path.poses, true, covariances), of_landmarks, noise)
+
+
+def _classes(run: Path) -> tuple[bool, dict[str, ClassNoise]]:
+    """Whether fixes hold the map, and what each class of edges says of its sigmas, by the summary of a run."""
+    try:
+        summary = json.loads((run / SUMMARY).read_text(encoding="utf-8"))
+        return "fixes" in summary["classes"], class_noise(summary["classes"], summary["leverage"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run ({type(error).__name__}: {error})") from None
 
 
 def interpolated(truth: Trajectory, stamps_s: Array) -> Array:

@@ -193,6 +193,19 @@ def test_a_flight_is_scored_in_space_in_words_and_in_plain_values(tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"classes": {"a": {}}, "leverage": {}}', '{"classes": [], "leverage": 1}']
+)
+def test_a_summary_that_is_none_is_refused_by_name(tmp_path, text):
+    pytest.importorskip("evo")
+    recording = simulate("pythonrobotics", 1)
+    run(recording, tmp_path / "run", {})
+    write_bag(recording, tmp_path / "truth.mcap")
+    (tmp_path / "run" / "run.json").write_text(text)
+    with pytest.raises(GraphSlamError, match=r"run\.json: not a summary of a run"):
+        evaluate(tmp_path / "run", tmp_path / "truth.mcap")
+
+
 @pytest.mark.parametrize("text", ["", "stamp_ns,a\n1,2\n", "stamp_ns,a\n1,two\n"])
 def test_a_file_that_is_no_table_of_covariances_is_refused_by_name(tmp_path, text):
     (tmp_path / "covariances.csv").write_text(text)
