@@ -120,7 +120,7 @@ def overload(short: bool) -> list[Row]:
             heard = ears.ask()
             late = _late(told["when"], heard["odometry"])
             poses = _pose_late(told["when"], heard["pose"])
-            usual_s = min(usual_s, 2.0 * percentile(late, 0.99))
+            usual_s = min(usual_s, percentile(late, 0.99))
             answers = [1e-9 * took for _, took in heard["service"]]
             gaps = [1e-9 * (b[0] - a[0]) for a, b in itertools.pairwise(heard["tf"])]
             rows.append(
@@ -160,11 +160,13 @@ def _pose_late(sent: list[Any], heard: list[Any]) -> list[float]:
 
 
 def _normal_after(sent: list[Any], heard: list[Any], start_ns: int, usual_s: float) -> float:
-    """Seconds after which odometry is never again later than usual for two messages in turn."""
+    """Seconds to the end of the last half second in which most odometry was later than it usually is at most."""
     sent_at = {stamp: at for topic, stamp, at in sent if topic == ODOMETRY}
-    late = [(at, at - sent_at[stamp]) for at, stamp, _ in heard if stamp in sent_at]
-    over = [at for (at, a), (_, b) in itertools.pairwise(late) if min(a, b) > usual_s * 1e9]
-    return 1e-9 * (max(over) - start_ns) if over else 0.0
+    parts: dict[int, list[float]] = {}
+    for at, stamp, _ in heard:
+        if stamp in sent_at:
+            parts.setdefault((sent_at[stamp] - start_ns) // 500_000_000, []).append(1e-9 * (at - sent_at[stamp]))
+    return 0.5 * max((part + 1 for part, late in parts.items() if median(late) > usual_s), default=0)
 
 
 FIGURES: dict[str, Callable[[bool], list[Row]]] = {"cpu": cpu, "rate": rate, "overload": overload}
