@@ -44,8 +44,8 @@ def measure(short: bool) -> list[Row]:
 
 def publish(keyframes: str, reps: str) -> None:
     """CPU milliseconds of each step, of each repetition; every path has arrived before the next is sent."""
-    slam = _drive(int(keyframes))
     with ros():
+        slam = _drive(int(keyframes))
         node = Node("publisher")
         publisher = node.create_publisher(Path, "path", _LATCHED)
         heard: list[int] = []

@@ -100,6 +100,7 @@ def until(condition: Callable[[], bool], rest: Callable[[], Any], what: str, pat
 @contextlib.contextmanager
 def ros() -> Iterator[None]:
     """Of a process that is started: ROS until it is told to stop."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # also where whoever started us ignores it
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
         yield
