@@ -362,6 +362,7 @@ class _Run:
         self._tell("clock", f"jumped by {jump.delta.nanoseconds * 1e-9:.3f} s: {what}")
         self._border.forget_time()
         self._reckoning.forget()
+        self._outputs.forget_time()
         if self._broadcaster is not None:
             self._broadcaster.forget_time()
         if what == "stop":
@@ -495,6 +496,7 @@ class _Run:
             overflows - before[0],
             failures - before[1],
             session.recording_fails,
+            self._outputs.path_version,
             rivals is not None,
             rivals or (),
             node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1,

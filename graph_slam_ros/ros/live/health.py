@@ -67,6 +67,7 @@ class Facts:
     overflows: int = 0
     failures: int = 0
     recording_fails: bool = False
+    path_version: int = 0
     has_other_authority: bool = False
     authorities: tuple[str, ...] = ()
     twins: int = 0
@@ -187,7 +188,8 @@ def statuses(facts: Facts, verdict: Verdict, node: str) -> Iterator[Status]:
         level = WARN if one.mismatch or (one.use == "odometry" and not one.received) else OK
         yield Status(level, f"{node}: input {one.name}", one.mismatch or f"{one.received} received", node, told)
     if facts.estimate:
-        yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes", node, _graph(facts.estimate))
+        told = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}
+        yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes", node, told)
 
 
 def _graph(e: Estimate) -> dict[str, str]:

@@ -61,6 +61,15 @@ class Outputs:
         for topic in self._topics.values():
             topic.is_stale = topic.begins_anew = True
 
+    def forget_time(self) -> None:
+        """Stamps begin anew: who knows poses by their stamps needs all again."""
+        self._topics["path_updates"].begins_anew = True
+
+    @property
+    def path_version(self) -> int:
+        """Messages of ``~/path_updates`` since it began anew."""
+        return self._updates.version
+
     def close(self) -> None:
         """Take the publishers away."""
         for topic in self._topics.values():
