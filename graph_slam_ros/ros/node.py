@@ -482,24 +482,24 @@ class _Run:
         before, self._looked = self._looked, (overflows, failures)
         rivals = broadcaster.candidates() if broadcaster is not None and broadcaster.has_rival else None
         inputs = self._listeners.facts(node.now_ns, counted) if self._listeners is not None else ()
+        twins = node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1
         return health.Facts(
             lifecycle,
             inputs,
             session.estimate,
-            node.get_parameter("use_sim_time").value and not node.now_ns,
-            self._is_paused,
-            self._is_stopped,
-            self._worker.lag_s,
-            self._worker.waiting,
-            self._worker.is_alive,
-            0,
-            overflows - before[0],
-            failures - before[1],
-            session.recording_fails,
-            self._outputs.path_version,
-            rivals is not None,
-            rivals or (),
-            node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1,
+            waits_for_clock=node.get_parameter("use_sim_time").value and not node.now_ns,
+            is_paused=self._is_paused,
+            is_stopped=self._is_stopped,
+            lag_s=self._worker.lag_s,
+            waiting=self._worker.waiting,
+            worker_is_alive=self._worker.is_alive,
+            overflows=overflows - before[0],
+            failures=failures - before[1],
+            recording_fails=session.recording_fails,
+            path_version=self._outputs.path_version,
+            has_other_authority=rivals is not None,
+            authorities=rivals or (),
+            twins=twins,
         )
 
 
