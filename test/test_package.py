@@ -55,7 +55,9 @@ NEVER = {
     "replay.py": {"matplotlib"},
     "ros": {"matplotlib"},
 }
-SPEAK_RCLPY = {"ros/node.py", "ros/player.py"} | {f"ros/live/{name}.py" for name in ("listeners", "outputs", "params")}
+SPEAK_RCLPY = {"ros/node.py", "ros/player.py"} | {
+    f"ros/live/{name}.py" for name in ("configured", "listeners", "outputs", "params")
+}
 SPEAK_MESSAGES = SPEAK_RCLPY | {"ros/to_msg.py", "ros/live/broadcaster.py", "ros/live/deferred.py"}
 OUTSIDE_THE_SOLVER = {"cli", "report.py"}
 
