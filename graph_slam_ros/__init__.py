@@ -9,6 +9,7 @@ __version__ = "0.1.0"
 TYPE_CHECKING = False  # type checkers take it for true; typing itself is slow to import
 if TYPE_CHECKING:
     from graph_slam_ros.batch import Solution, optimize
+    from graph_slam_ros.certificate import Certificate, certify
     from graph_slam_ros.formats.g2o import read_g2o
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.graph import Gaussian, Graph
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from graph_slam_ros.solver import Settings, Solver
 
 __all__ = [
+    "Certificate",
     "Config",
     "Control",
     "Gaussian",
@@ -27,6 +29,7 @@ __all__ = [
     "Sightings",
     "Solution",
     "Solver",
+    "certify",
     "optimize",
     "read_g2o",
     "write_g2o",
@@ -34,6 +37,7 @@ __all__ = [
 
 _HOMES = {
     "batch": ("Solution", "optimize"),
+    "certificate": ("Certificate", "certify"),
     "formats.g2o": ("read_g2o",),
     "formats.g2o_writer": ("write_g2o",),
     "graph": ("Gaussian", "Graph"),

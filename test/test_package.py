@@ -24,6 +24,7 @@ WITHIN = {
     "solver": {"lie", "graph"},
     "slam": {"lie", "graph", "solver"},
     "formats": {"lie", "graph"},
+    "certificate": {"lie", "graph", "solver", "batch"},
     "ros/from_msg.py": {"lie", "slam", "ros"},
     "ros/bag.py": {"lie", "slam", "ros", "formats"},
     "ros/live": {"slam", "ros", "run", "formats"},
@@ -41,6 +42,7 @@ THIRD_PARTY = {
     "solver": {"numpy", "numba", "scipy"},
     "slam": {"numpy", "scipy"},
     "formats": {"numpy", "mcap", "yaml"},
+    "certificate": {"numpy", "scipy"},
     "ros/from_msg.py": {"numpy", "rosbags", "mcap"},
     "ros/bag.py": {"numpy", "rosbags", "mcap"},
 }
@@ -50,6 +52,7 @@ NEVER = {
     "solver": BELOW_ROS_NEVER,
     "slam": BELOW_ROS_NEVER | {"datetime", "os", "pathlib"},
     "ros/node.py": {"numpy", "scipy"},
+    "certificate": BELOW_ROS_NEVER | {"matplotlib"},
     "simulation": {"matplotlib"},
     "evaluation.py": {"matplotlib"},
     "replay.py": {"matplotlib"},

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 DONE, FAULT, REFUSED, LOSSES = 0, 1, 2, 3
+NOT_CERTIFIED, NOT_APPLICABLE = 4, 5  # of optimize --certify
 
 
 def say(*lines: str) -> None:

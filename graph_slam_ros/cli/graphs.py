@@ -3,6 +3,7 @@
 import argparse
 import json
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +11,11 @@ from graph_slam_ros.cli import console
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
+    from graph_slam_ros.batch import Solution
+    from graph_slam_ros.certificate import Certificate
     from graph_slam_ros.formats.graph_file import G2oFile
     from graph_slam_ros.graph import Graph, Loss
-    from graph_slam_ros.solver import Report, Solver
+    from graph_slam_ros.solver import Report, Settings, Solver
 
 _START = {
     "file": "the file",
@@ -21,11 +24,12 @@ _START = {
     "online": "the drive, pose after pose",
 }
 _NO_VALUES = "the file has no vertex lines"
+_SAME = 1e-6  # of chi2: what one optimum may differ by from another run to it
 
 
 def optimize(args: argparse.Namespace) -> int:
     """Solve a graph, say how it went, write it and draw it."""
-    from graph_slam_ros.batch import started, take_whole
+    from graph_slam_ros.batch import Solution, started, take_whole
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.solver import Settings
 
@@ -41,17 +45,20 @@ def optimize(args: argparse.Namespace) -> int:
     take_whole(solver, file)
     before = _positions(graph, solver) if args.plot else None
     report = solver.optimize(settings)
+    proof = _certify(Solution(file, solver, report, start), settings) if args.certify else None
     if args.json:
-        console.say(json.dumps(_answer(report, start, args)))
+        answer = _answer(report, start, args)
+        console.say(json.dumps(answer if proof is None else answer | {"certificate": proof.as_dict()}))
     else:
         told_start = _START[start] + ("" if file.has_values else f": {_NO_VALUES}")
         console.say(*_optimize_text(report, told_start, args.loss))
+        console.say(*(proof.text(report.chi2_final) if proof else ()))
     if args.out:
         write_g2o(args.out, file, solver.estimate)
     if args.plot:
         _plot_graph(args.plot, graph, before, _positions(graph, solver))
     _tell_unknown(file)
-    return console.told(file.skipped)
+    return console.told(file.skipped) or (proof.code if proof else console.DONE)
 
 
 def convert(args: argparse.Namespace) -> int:
@@ -90,6 +97,52 @@ def _tell_unknown(file: "G2oFile") -> None:
     tags = sorted({line.split()[0] for line in file.unknown})
     if tags:
         console.tell(f"{len(file.unknown)} lines with unknown tags kept as they are: {', '.join(tags)}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Proof:
+    """The certificate of what was solved, and what came of a second start where it did not do."""
+
+    first: "Certificate"
+    start: str = ""
+    second: "Certificate | None" = None
+    failure: str = ""
+
+    @property
+    def code(self) -> int:
+        from graph_slam_ros.certificate import CERTIFIED, NOT_CERTIFIED
+
+        codes = {CERTIFIED: console.DONE, NOT_CERTIFIED: console.NOT_CERTIFIED}
+        return codes.get(self.first.verdict, console.NOT_APPLICABLE)
+
+    def as_dict(self) -> dict[str, Any]:
+        again = {"start": self.start, "failure": self.failure} | (self.second.as_dict() if self.second else {})
+        return self.first.as_dict() | {"second_start": again if self.start else None}
+
+    def text(self, chi2: float) -> Iterable[str]:
+        yield str(self.first)
+        if self.failure:
+            yield f"a second start, {_START[self.start]}, fails: {self.failure}"
+        elif self.second:
+            lower = self.second.chi2 < chi2 * (1.0 - _SAME)
+            much = f"which is lower: --init {self.start} takes it" if lower else "which is no lower"
+            yield f"a second start, {_START[self.start]}, comes to chi2 {self.second.chi2:.6f}, {much}"
+            yield from ("  " + line for line in str(self.second).splitlines())
+
+
+def _certify(solution: "Solution", settings: "Settings") -> _Proof:
+    """Ask for the certificate; where it is not given, though it could be, try another start."""
+    from graph_slam_ros.batch import optimize
+    from graph_slam_ros.certificate import CERTIFIED, certify, other_start
+
+    first = certify(solution)
+    if first.verdict == CERTIFIED or not first.computed:
+        return _Proof(first)
+    start = other_start(solution.start)
+    try:
+        return _Proof(first, start, certify(optimize(solution.file, settings, init=start)))
+    except GraphSlamError as error:
+        return _Proof(first, start, failure=str(error))
 
 
 def _answer(report: "Report", start: str, args: argparse.Namespace) -> dict[str, Any]:

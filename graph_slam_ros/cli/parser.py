@@ -84,6 +84,7 @@ def _info(sub: argparse.ArgumentParser) -> None:
 
 
 def _optimize(sub: argparse.ArgumentParser) -> None:
+    sub.epilog = f"{_CODES} With --certify: 4 not certified, 5 the certificate does not apply."
     sub.add_argument("graph", type=Path, metavar="GRAPH")
     sub.add_argument(
         "--method",
@@ -110,6 +111,9 @@ def _optimize(sub: argparse.ArgumentParser) -> None:
         help="where to start (file; tree without vertices); online: pose after pose, for what no other start solves",
     )
     sub.add_argument("--error-map", choices=("relative", "seed"), default="relative", help="seed: of the inverse")
+    sub.add_argument(
+        "--certify", action="store_true", help="prove that it is the global optimum, where poses alone are its unknowns"
+    )
     _add_reading(sub)
     sub.add_argument("--json", action="store_true", help="the answer as one line")
     sub.add_argument("--out", type=Path, metavar="FILE.g2o", help="the solved graph")

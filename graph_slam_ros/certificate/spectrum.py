@@ -1,0 +1,70 @@
+"""The smallest eigenvalue of a certificate matrix, which is next to zero where a certificate holds."""
+
+from collections.abc import Callable
+from math import nan
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array, diags_array
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, splu
+
+Array = NDArray[np.float64]
+
+_FACTOR = 10.0
+
+
+def factorize(matrix: csc_array) -> Callable[[Array], Array] | None:
+    """How to solve with a symmetric sparse matrix; None where it is not positive definite.
+
+    Pivots are taken from the diagonal, so the triangular factors are those of ``L D L'`` and the pivots have the signs
+    of the eigenvalues (Sylvester).
+    """
+    try:
+        lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError:  # exactly singular
+        return None
+    if (lu.perm_r != lu.perm_c).any() or not (lu.U.diagonal() > 0.0).all():
+        return None
+    solve: Callable[[Array], Array] = lu.solve
+    return solve
+
+
+def least_eigenvalue(matrix: csc_array, eliminated: int, tolerance: float) -> float:
+    """Smallest eigenvalue of the Schur complement S of a matrix, where its first unknowns are eliminated.
+
+    Lanczos' method on ``(S - s)^-1``, which needs no more than a factorisation of the sparse matrix itself. The shift s
+    is below the whole spectrum (or the factorisation fails, and a lower one is tried), so the eigenvalue sought
+    is the largest of the inverse however many others are near to it: where a certificate holds, d of them are zero, and
+    an iteration without the inverse sees no difference between these and the next ones.
+
+    Parameters
+    ----------
+    matrix : symmetric; its block of the first ``eliminated`` unknowns is positive definite
+    tolerance : the first shift is minus this, > 0
+
+    Returns
+    -------
+    The eigenvalue; where the iteration does not converge, the shift, which is below it; NaN where no shift is enough,
+    since the block of the first unknowns is not positive definite or cannot be told from rounding.
+    """
+    size = matrix.shape[0] - eliminated
+    ones = np.concatenate([np.zeros(eliminated), np.ones(size)])
+    shift, lowest = -tolerance, -_FACTOR * float(abs(matrix).sum(axis=0).max())
+    solve = factorize((matrix - shift * diags_array(ones)).tocsc())
+    while solve is None:
+        if shift < lowest:
+            return nan
+        shift *= _FACTOR
+        solve = factorize((matrix - shift * diags_array(ones)).tocsc())
+    whole = solve
+
+    def inverse(x: Array) -> Array:
+        return whole(np.concatenate([np.zeros(eliminated), x.ravel()]))[eliminated:]
+
+    start = np.cos(np.arange(size))  # like a random one, and the same every time
+    operator = LinearOperator((size, size), matvec=inverse, dtype=np.float64)
+    try:
+        (largest,) = eigsh(operator, k=1, which="LA", v0=start, return_eigenvectors=False)
+    except ArpackNoConvergence:
+        return shift
+    return float(shift + 1.0 / largest)
