@@ -210,7 +210,7 @@ class GraphSlamNode(LifecycleNode):
         facts = replace(facts, faults=sum(at > since for at in self._faults))
         verdict = health.judge(facts, self.config)
         self._tell(verdict)
-        statuses = health.statuses(facts, verdict, self.get_name())
+        statuses = health.statuses(facts, verdict, self.get_fully_qualified_name().lstrip("/"))
         self._diagnostics.publish(to_msg.diagnostics(self.now_ns, statuses))
 
     def _tell(self, verdict: health.Verdict) -> None:
