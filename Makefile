@@ -3,6 +3,7 @@
 # install       .venv with everything of requirements.txt, real ROS 2 included where there is none (default)
 # demo          install, then the demonstration
 # test          install, then style, types and tests
+# soak          what runs nodes and robots again, ten times as often; an hour or more; TESTS= what pytest is given
 # colcon        build and test as ROS does, in a scratch folder; colcon goes into .venv-colcon; TESTS= what pytest is given
 # test-oldest   the tests without ROS, in .venv-oldest with the lowest versions that setup.py allows
 # lint, format  style and types: tell, mend
@@ -26,7 +27,7 @@ ifeq ($(SYSTEM_ROS),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: install demo test colcon test-oldest lint format lock bench clean
+.PHONY: install demo test soak colcon test-oldest lint format lock bench clean
 .DELETE_ON_ERROR:
 
 install: $(VENV)/interfaces.stamp $(VENV)/kernels.stamp
@@ -36,6 +37,9 @@ demo: install
 
 test: install lint
 	$(BIN)/python -m pytest -q
+
+soak: install
+	GRAPH_SLAM_SOAK=10 $(BIN)/python -m pytest -q --durations=20 $(or $(TESTS),$(wildcard test/test_stack*.py))
 
 lint: $(VENV)/package.stamp
 	$(BIN)/ruff check

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import dataclass
 
 import pytest
 
@@ -19,10 +20,13 @@ pytest.importorskip("vision_msgs")
 pytest.importorskip("tf2_msgs")
 
 from executables import executable
+from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 from vision_msgs.msg import Detection3DArray
@@ -36,29 +40,50 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 PATIENCE_S = 10.0
 PUBLICATIONS = {one.name.removeprefix("~/"): one for one in topics.PUBLICATIONS}
-_HELD = []
+_FIRST_PORT, _DOMAINS = 23_000, 100
 
 
+@contextlib.contextmanager
 def own_domain():
-    """A DDS domain that no other test on this machine has; it is ours as long as this process lives."""
-    for domain in range(1, 101):
-        held = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            held.bind(("127.0.0.1", 23_000 + (domain + 37 * os.getpid()) % 100))
-        except OSError:
-            held.close()
-            continue
-        _HELD.append(held)
-        return str(1 + held.getsockname()[1] - 23_000)
+    """A DDS domain that no other test on this machine has: a port of its number is held."""
+    for k in range(_DOMAINS):
+        domain = 1 + (k + 37 * os.getpid()) % _DOMAINS
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
+            try:
+                held.bind(("127.0.0.1", _FIRST_PORT + domain))
+            except OSError:
+                continue
+            yield str(domain)
+            return
     raise OSError("no DDS domain is free")
 
 
-ENVIRONMENT = dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", ROS_DOMAIN_ID=own_domain())
+_HELD = contextlib.ExitStack()
+ENVIRONMENT = dict(
+    os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", ROS_DOMAIN_ID=_HELD.enter_context(own_domain())
+)
+
+
+def often(times):
+    """How many repetitions: ``make soak`` asks for more."""
+    return times * int(os.environ.get("GRAPH_SLAM_SOAK", "1"))
 
 
 def lenient(seconds):
     """So many, or as many more as the machine has more to do than it can."""
     return seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What /diagnostics says of the node's health."""
+
+    level: int
+    state: str
+    reasons: tuple[str, ...]
+
+    def __str__(self):
+        return "; ".join((self.state, *self.reasons))
 
 
 def results(folder):
@@ -97,6 +122,7 @@ class Robot:
     of : the SLAM node
     hears : of what that publishes
     raw : of these, those whose bytes are kept as they come
+    sends : what it publishes
     """
 
     def __init__(
@@ -106,22 +132,28 @@ class Robot:
         of="/graph_slam",
         hears=("path", "pose", "landmarks", "/tf"),
         raw=(),
+        sends=("/odom", "/landmarks"),
     ):
         self.context = Context()
         self.context.init(args=[], domain_id=int(ENVIRONMENT["ROS_DOMAIN_ID"]))
         self.node = Node(name, context=self.context, namespace=of.rpartition("/")[0], start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
+        self._is_closed = False
+        self._hears = threading.Thread(target=self._hear, daemon=True)
         self._of, self._clients = of, {}
         qos = QoSProfile(depth=1000, reliability=reliability)
-        self.publishers = {
-            "/odom": self.node.create_publisher(Odometry, "odom", qos),
-            "/landmarks": self.node.create_publisher(Detection3DArray, "landmarks", qos),
-        }
+        kinds = {"/odom": Odometry, "/landmarks": Detection3DArray}
+        self.publishers = {topic: self.node.create_publisher(kinds[topic], topic.lstrip("/"), qos) for topic in sends}
         self.heard = {}
         for topic in hears:
             self.hear(topic, raw=topic in raw)
         self._save = self.client("save")
+        self._hears.start()
+
+    def _hear(self):
+        while not self._is_closed:
+            self._executor.spin_once(timeout_sec=0.1)
 
     def hear(self, topic, raw=False):
         """Keep what the SLAM node publishes there; returns the list it is kept in."""
@@ -134,6 +166,58 @@ class Robot:
         """A publisher of what is not odometry and landmarks."""
         return self.node.create_publisher(kind, topic, qos)
 
+    def said(self, status="health"):
+        """Of each message of /diagnostics by the SLAM node this status, as (level, values); oldest first."""
+        name = f"{self._of.lstrip('/')}: {status}"
+        found = (s for m in self.heard["diagnostics"] for s in m.status if s.name == name)
+        return [(s.level[0], {one.key: one.value for one in s.values}) for s in found]
+
+    @property
+    def verdict(self):
+        """The last; None before the first."""
+        if not (said := self.said()):
+            return None
+        level, values = said[-1]
+        return Verdict(level, values["state"], tuple(v for k, v in values.items() if k.startswith("reason ")))
+
+    def until_it_says(self, state, *words, spin=None, patience_s=PATIENCE_S):
+        """Wait for a state, with these words among its reasons."""
+        self.heard["diagnostics"].clear()
+
+        def is_said():
+            v = self.verdict
+            return v is not None and v.state == state and all(word in str(v) for word in words)
+
+        try:
+            until(is_said, spin or self.spin, f"{state} {words}", patience_s)
+        except AssertionError as error:
+            raise AssertionError(f"{error}, but {self.verdict}") from None
+
+    def graph(self):
+        """Numbers of the graph by the last of /diagnostics."""
+        said = self.said("graph")
+        return {key: float(value) for key, value in said[-1][1].items()} if said else {}
+
+    def set(self, values, together=True):
+        """Set parameters: whether it was done and why not, of all of them or each."""
+        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        if together:
+            request = SetParametersAtomically.Request(parameters=parameters)
+            one = self.call("set_parameters_atomically", SetParametersAtomically, request).result
+            return one.successful, one.reason
+        answer = self.call("set_parameters", SetParameters, SetParameters.Request(parameters=parameters))
+        return [(one.successful, one.reason) for one in answer.results]
+
+    def change(self, transition, patience_s=PATIENCE_S):
+        """Ask for a transition of the lifecycle by its name; whether it was done."""
+        request = ChangeState.Request()
+        request.transition.label = transition
+        return self.call("change_state", ChangeState, request, patience_s).success
+
+    def state(self):
+        """Of the lifecycle."""
+        return self.call("get_state", GetState).current_state.label
+
     def client(self, name, kind=Trigger):
         """Of a service of the SLAM node."""
         if name not in self._clients:
@@ -141,14 +225,15 @@ class Robot:
         return self._clients[name]
 
     def spin(self, seconds=0.02):
-        self._executor.spin_once(timeout_sec=seconds)
+        """Leave a thread of its own the time to hear."""
+        time.sleep(seconds)
 
     def settle(self, seconds=0.3):
-        """Hear what is on its way: nothing for so long."""
+        """Hear what is on its way: nothing for so long, but for diagnostics, which never end."""
         before, since = None, time.monotonic()
         while time.monotonic() - since < lenient(seconds):
             self.spin()
-            count = sum(map(len, self.heard.values()))
+            count = sum(len(heard) for topic, heard in self.heard.items() if topic != "diagnostics")
             if count != before:
                 before, since = count, time.monotonic()
 
@@ -183,6 +268,8 @@ class Robot:
         return self.call("save")
 
     def close(self):
+        self._is_closed = True
+        self._hears.join()
         self._executor.shutdown()
         self.node.destroy_node()
         self.context.try_shutdown()
