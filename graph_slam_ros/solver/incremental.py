@@ -83,25 +83,33 @@ def append_vertices(t: Tree, first: int, offset: Index, initial: Array, shapes: 
 
 
 @kernel
-def admit(ids: Index, inside: NDArray[np.bool_], count: int) -> int:
-    """Note ids below ``count`` as inside, each once; or nothing, and which is not fit (its place in ``ids``)."""
+def unfit(ids: Index, inside: NDArray[np.bool_], count: int) -> int:
+    """The place in ``ids`` of one that is not below ``count``, is inside or is there twice, or NOTHING."""
+    found, marked = NOTHING, 0
     for k in range(len(ids)):
         if ids[k] < 0 or ids[k] >= count or inside[ids[k]]:
-            for j in range(k):
-                inside[ids[j]] = False
-            return k
+            found = k
+            break
         inside[ids[k]] = True
-    return NOTHING
+        marked += 1
+    for k in range(marked):
+        inside[ids[k]] = False
+    return found
 
 
 @kernel
-def outside(rows: Index, ends: Index, weight: Array, inside: NDArray[np.bool_]) -> int:
-    """A vertex that edges with a weight, rows of a table, need and that is not inside, or NOTHING."""
+def outside(rows: Index, ends: Index, weight: Array, inside: NDArray[np.bool_], new: Index) -> int:
+    """A vertex that edges with a weight, rows of a table, need and that is neither inside nor new, or NOTHING."""
+    found = NOTHING
+    for v in new:
+        inside[v] = True
     for row in rows:
         for s in range(ends.shape[1]):
-            if weight[row] != 0.0 and not inside[ends[row, s]]:
-                return ends[row, s]
-    return NOTHING
+            if found == NOTHING and weight[row] != 0.0 and not inside[ends[row, s]]:
+                found = ends[row, s]
+    for v in new:
+        inside[v] = False
+    return found
 
 
 @kernel

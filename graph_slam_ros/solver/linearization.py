@@ -151,6 +151,21 @@ def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) ->
         add_to_diagonal(vertex, edge, e, block, diagonal)
 
 
+def information(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], free: Index, losses: Losses) -> Array:
+    """H as a dense matrix over some vertices, in this order."""
+    dof = np.array([graph.kind_of(v).dof for v in free.tolist()], dtype=np.int64)
+    first = dict(zip(free.tolist(), (np.cumsum(dof) - dof).tolist(), strict=True))
+    out = np.zeros((int(dof.sum()), int(dof.sum())))
+    for b in linearize(graph, x, rows, losses):
+        slots = np.repeat(np.arange(len(b.table.type.dofs)), b.table.type.dofs)
+        within = np.concatenate([np.arange(d) for d in b.table.type.dofs])
+        for jacobian, ends in zip(b.jacobian, b.table.vertices.values[b.rows], strict=True):
+            mine = np.isin(ends[slots], free)
+            at = [first[v] + d for v, d in zip(ends[slots][mine].tolist(), within[mine].tolist(), strict=True)]
+            out[np.ix_(at, at)] += jacobian[:, mine].T @ jacobian[:, mine]
+    return out
+
+
 def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:
     """Edges, by id, as rows of their tables."""
     rows = graph.row_of_edge.values[edges]

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +13,19 @@ from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.covariance import joint, marginals
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
 from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole, undetermined
-from graph_slam_ros.solver.linearization import Losses, chi2_of, costs, linearize, refuse_nonfinite, rows_of, store
+from graph_slam_ros.solver.linearization import (
+    Losses,
+    chi2_of,
+    costs,
+    information,
+    linearize,
+    refuse_nonfinite,
+    rows_of,
+    store,
+)
 from graph_slam_ros.solver.numeric import keep, settle
 from graph_slam_ros.solver.report import Change, Report
+from graph_slam_ros.solver.schedule import Schedule
 from graph_slam_ros.solver.symbolic import compact
 from graph_slam_ros.solver.tree import (
     ACTIVE,
@@ -32,46 +41,17 @@ from graph_slam_ros.solver.tree import (
     SE3_KIND,
     TAIL_END,
     TAIL_FIRST,
-    TAIL_LEAST,
     VECTOR,
     empty_tree,
     longer,
     with_room,
 )
+from graph_slam_ros.solver.waiting import NONE, Waiting
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
-_NONE = np.empty(0, dtype=np.int64)
 _KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
-
-
-def _nothing() -> Index:
-    return _NONE
-
-
-@dataclass(slots=True)
-class _Waiting:
-    """What has changed since the last update.
-
-    Attributes
-    ----------
-    vertices : that were added
-    edges : that were added or came back, or have another weight or a newly held vertex
-    touched : vertices that lost an edge or a neighbour
-    loose : whether something that held parts together may be gone
-    broken : whether the tree must be made anew
-    """
-
-    vertices: Index = field(default_factory=_nothing)
-    edges: Index = field(default_factory=_nothing)
-    touched: Index = field(default_factory=_nothing)
-    loose: bool = False
-    broken: bool = False
-
-    def __bool__(self) -> bool:
-        return bool(len(self.vertices) or len(self.edges) or len(self.touched) or self.broken)
 
 
 class Solver:
@@ -90,13 +70,12 @@ class Solver:
         self._inside = np.zeros(0, dtype=bool)  # vertices of the problem
         self._held = np.zeros(0, dtype=bool)
         self._taken = np.zeros(0, dtype=bool)  # edges of the problem
-        self._waiting = _Waiting()
+        self._waiting = Waiting()
         self._kept = np.zeros(0)  # the estimate that the last call left
-        self._young = _NONE  # edges that have had but one update, with the first stage of their loss
+        self._young = NONE  # edges that have had but one update, with the first stage of their loss
         self._settled = True  # the tree's numbers are those at its linearisation points
         self._unfinished = False  # a batch stopped before the optimum
-        self._moved_since: list[Index] = []  # large steps were last looked for
-        self._updates_since = 0
+        self._schedule = Schedule()
         self._stages: list[Losses] = []
         self._losses_for = NOTHING, self.settings  # so many labels, and their settings
         self._solved_with: Settings | None = None
@@ -106,29 +85,20 @@ class Solver:
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Take vertices (at their initial values) and edges of the graph into the problem, by id, each once."""
         self._grow()
-        waiting = self._waiting
         new, new_edges = whole_numbers(vertices, "vertex").ravel(), whole_numbers(edges, "edge").ravel()
-        _admit(new, self._inside, self._vertices, "vertex")
-        try:
-            _admit(new_edges, self._taken, self.graph.edge_count, "edge")
-        except BaseException:
-            self._inside[new] = False
-            raise
-        try:
-            rows = rows_of(self.graph, new_edges)
-            for table, chosen in rows.items():
-                missing = incremental.outside(chosen, table.vertices.values, table.weight.values, self._inside)
-                if missing != NOTHING:
-                    raise GraphSlamError(f"an edge needs vertex {missing}, which was not added")
-            for table, chosen in rows.items():
-                self._record(table, chosen)
-            there = (self._tree.vertex[new, KEY] != NOTHING).any()  # removed before: they are in the order still
-        except BaseException:
-            self._inside[new], self._taken[new_edges] = False, False
-            raise
-        waiting.broken |= bool(there)
-        waiting.vertices = np.concatenate((waiting.vertices, new)) if len(waiting.vertices) else new
-        waiting.edges = np.concatenate((waiting.edges, new_edges)) if len(waiting.edges) else new_edges
+        _refuse_unfit(new, self._inside, self._vertices, "vertex")
+        _refuse_unfit(new_edges, self._taken, self.graph.edge_count, "edge")
+        rows = rows_of(self.graph, new_edges)
+        for table, chosen in rows.items():
+            missing = incremental.outside(chosen, table.vertices.values, table.weight.values, self._inside, new)
+            if missing != NOTHING:
+                raise GraphSlamError(f"an edge needs vertex {missing}, which was not added")
+        for table, chosen in rows.items():
+            self._record(table, chosen)
+        there = (self._tree.vertex[new, KEY] != NOTHING).any()  # removed before: they are in the order still
+        self._waiting.broken |= bool(there)
+        self._waiting.add(new, new_edges)
+        self._inside[new], self._taken[new_edges] = True, True
 
     def start_at(self, values: Array) -> None:
         """Begin from other values than the graph's initial ones: the stored numbers of all vertices, end to end."""
@@ -167,12 +137,11 @@ class Solver:
         table.weight.values[row] = weight
         if not self._taken[edge]:
             return
-        waiting = self._waiting
         if weight:
-            waiting.edges = np.union1d(waiting.edges, one)
+            self._waiting.again(one)
         elif self._tree.edge[edge, ACTIVE]:
-            waiting.touched = np.concatenate((waiting.touched, ends))
-            waiting.loose = True
+            self._waiting.touch(ends)
+            self._waiting.loose = True
             incremental.deactivate(self._tree, one)
 
     def hold(self, vertex: int) -> None:
@@ -183,7 +152,7 @@ class Solver:
         if self._tree.vertex[vertex, FREE]:
             on_it = incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
             on_it = on_it[self._tree.edge[on_it, ACTIVE] == 1]  # they are linearised where it is held
-            self._waiting.edges = np.union1d(self._waiting.edges, on_it)
+            self._waiting.again(on_it)
             self._take_out(one)
 
     def remove(self, vertex: int) -> None:
@@ -197,7 +166,7 @@ class Solver:
         if len(there):
             raise GraphSlamError(f"vertex {vertex} is needed by edge {int(there[0])}")
         self._inside[vertex] = self._held[vertex] = False
-        self._waiting.vertices = self._waiting.vertices[self._waiting.vertices != vertex]
+        self._waiting.forget(vertex)
         self._take_out(one)
 
     @property
@@ -216,7 +185,7 @@ class Solver:
         self._grow()
         if (self._inside & self._held).any():
             return True
-        rows = rows_of(self.graph, self._weighted(np.flatnonzero(self._taken)))
+        rows = rows_of(self.graph, self.edges)
         return fix_the_whole(self.graph, self._tree.estimate, rows)
 
     # -- its solution ------------------------------------------------------------------------------------------------
@@ -268,7 +237,7 @@ class Solver:
             else:
                 report = self.evaluate(settings)
         self._kept[:] = self._tree.estimate
-        self._settled, self._young = False, _NONE
+        self._settled, self._young = False, NONE
         self._solved_with = settings if report.converged else None
         self._unfinished = not report.converged
         return report
@@ -349,18 +318,7 @@ class Solver:
         """
         self._grow()
         free = np.flatnonzero(self._inside & ~self._held)
-        dof = np.array([self.graph.kind_of(v).dof for v in free.tolist()], dtype=np.int64)
-        first = dict(zip(free.tolist(), (np.cumsum(dof) - dof).tolist(), strict=True))
-        out = np.zeros((int(dof.sum()), int(dof.sum())))
-        rows = rows_of(self.graph, self._weighted(np.flatnonzero(self._taken)))
-        for b in linearize(self.graph, self._tree.estimate, rows, self._losses()[-1]):
-            slots = np.repeat(np.arange(len(b.table.type.dofs)), b.table.type.dofs)
-            within = np.concatenate([np.arange(d) for d in b.table.type.dofs])
-            for jacobian, ends in zip(b.jacobian, b.table.vertices.values[b.rows], strict=True):
-                mine = np.isin(ends[slots], free)
-                at = [first[v] + d for v, d in zip(ends[slots][mine].tolist(), within[mine].tolist(), strict=True)]
-                out[np.ix_(at, at)] += jacobian[:, mine].T @ jacobian[:, mine]
-        return out
+        return information(self.graph, self._tree.estimate, rows_of(self.graph, self.edges), free, self._losses()[-1])
 
     def compact(self) -> None:
         """Move the fronts in use together, so that what is free lies behind them; memory is not given back.
@@ -411,7 +369,7 @@ class Solver:
                 with self._transaction(*arriving):
                     moved, _ = self._take_in(*arriving)
                 self._keep(moved)
-                self._moved_since.append(moved)
+                self._schedule.note(moved)
             if (self._tree.vertex[wanted[~self._held[wanted]], CLIQUE] == NOTHING).any():
                 raise GraphSlamError("a covariance was asked for within an update")
         return wanted
@@ -467,12 +425,12 @@ class Solver:
             incremental.enter(tree, vertices, edges)
             yield
         except BaseException:
-            waiting.broken, self._young, self._settled = True, _NONE, True
+            waiting.broken, self._young, self._settled = True, NONE, True
             incremental.leave(self._tree, vertices, edges)
             self._set_estimate(self._kept)
             tree.state[TAIL_FIRST] = tree.state[TAIL_END] = 0  # it is filled anew with the tree
             raise
-        self._waiting = _Waiting()
+        self._waiting = Waiting()
 
     def _keep(self, moved: Index) -> None:
         """The estimates of vertices are those to come back to."""
@@ -485,9 +443,9 @@ class Solver:
         if not self._settled and not waiting.broken:
             self._settle()
         if not waiting and not len(self._young):
-            return _NONE, 0
+            return NONE, 0
         fresh = np.union1d(edges, self._young) if len(self._young) else edges
-        self._young = edges if len(self._losses()) > 1 else _NONE
+        self._young = edges if len(self._losses()) > 1 else NONE
         if waiting.broken:
             self._forget_numbers()
             fresh = self._active()
@@ -506,19 +464,14 @@ class Solver:
         failed, moved = incremental.renumber(self._tree, self._active(), settings.tolerance, settings.tolerance_sigmas)
         if failed != NOTHING:
             raise undetermined(failed)
-        self._updates_since = settings.relinearize_every
+        self._schedule.hasten(settings.relinearize_every)
         return moved
 
     def _relinearized(self, moved: Index) -> Iterator[tuple[int, Index]]:
         """Pass after pass: how many edges were linearised anew, and the vertices that this moved."""
         settings = self.settings
-        self._moved_since.append(moved)
-        due = self._is_due(len(moved))
-        if due:
-            moved = np.unique(np.concatenate(self._moved_since))
-            self._moved_since, self._updates_since = [], 0
+        moved, far = self._schedule.after_update(moved, settings.relinearize_every)
         for _ in range(settings.relinearize_passes):
-            far = 1.0 if due else _BY_FAR
             edges = incremental.relinearize(
                 self._tree, moved, far * settings.relinearize_above, far**2 * settings.relinearize_error
             )
@@ -528,14 +481,9 @@ class Solver:
             failed, moved = incremental.renumber(self._tree, edges, settings.tolerance, settings.tolerance_sigmas)
             if failed != NOTHING:
                 raise undetermined(failed)
-            self._moved_since.append(moved)
-            due = True
+            self._schedule.note(moved)
+            far = 1.0
             yield len(edges), moved
-
-    def _is_due(self, moved: int) -> bool:
-        """Whether large steps are looked for among all that moved since they last were; sooner if much moved anyway."""
-        self._updates_since += 1
-        return self._updates_since * (3 if moved > TAIL_LEAST else 2) >= 2 * self.settings.relinearize_every
 
     def _forget_numbers(self) -> None:
         """All edges are about to be linearised: sums begin at zero."""
@@ -583,7 +531,7 @@ class Solver:
         """Make a vertex no unknown any more; it stays at its estimate."""
         settle(self._tree, one)
         if self._tree.vertex[one[0], FREE]:
-            self._waiting.touched = np.concatenate((self._waiting.touched, incremental.leave(self._tree, one, _NONE)))
+            self._waiting.touch(incremental.leave(self._tree, one, NONE))
 
     def _set_estimate(self, values: Array) -> None:
         for array in (self._tree.value, self._tree.estimate, self._kept):
@@ -592,7 +540,7 @@ class Solver:
 
     def _refuse_loose(self) -> None:
         """Raise GaugeError where nothing fixes a part of the problem, with all that waits."""
-        rows = rows_of(self.graph, self._weighted(np.flatnonzero(self._taken)))
+        rows = rows_of(self.graph, self.edges)
         check_gauge(
             self.graph, np.flatnonzero(self._inside & ~self._held), np.flatnonzero(self._inside & self._held), rows
         )
@@ -606,9 +554,9 @@ def _known(ids: ArrayLike, count: int, what: str) -> Index:
     return at
 
 
-def _admit(ids: Index, inside: NDArray[np.bool_], count: int, what: str) -> None:
-    """Note ids as inside, each once; or refuse them all."""
-    unfit = incremental.admit(ids, inside, count)
+def _refuse_unfit(ids: Index, inside: NDArray[np.bool_], count: int, what: str) -> None:
+    """Raise where an id does not exist, is inside or is given twice."""
+    unfit = incremental.unfit(ids, inside, count)
     if unfit != NOTHING:
         _known(ids[unfit], count, what)
         raise GraphSlamError(f"{what} {int(ids[unfit])} was added before")

@@ -1,0 +1,39 @@
+"""When large steps are looked for, which are linearised anew."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.solver.tree import TAIL_LEAST
+
+Index = NDArray[np.int64]
+
+_BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
+
+
+class Schedule:
+    """Counts updates, and keeps what moved in them until large steps are looked for among all of it."""
+
+    def __init__(self) -> None:
+        self._moved: list[Index] = []
+        self._updates = 0
+
+    def note(self, moved: Index) -> None:
+        """Vertices that moved beside what an update takes in."""
+        self._moved.append(moved)
+
+    def hasten(self, every: int) -> None:
+        """Have the present update look among all."""
+        self._updates = every
+
+    def after_update(self, moved: Index, every: int) -> tuple[Index, float]:
+        """Among which vertices to look for large steps now, and beyond how many times the threshold.
+
+        After so many updates among all that moved since, sooner if much moved anyway; else among what this one moved.
+        """
+        self.note(moved)
+        self._updates += 1
+        if self._updates * (3 if len(moved) > TAIL_LEAST else 2) < 2 * every:
+            return moved, _BY_FAR
+        moved = np.unique(np.concatenate(self._moved))
+        self._moved, self._updates = [], 0
+        return moved, 1.0

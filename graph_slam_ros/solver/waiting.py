@@ -1,0 +1,54 @@
+"""What a solver was told since its last update."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Index = NDArray[np.int64]
+
+NONE = np.empty(0, dtype=np.int64)
+
+
+def _none() -> Index:
+    return NONE
+
+
+@dataclass(slots=True)
+class Waiting:
+    """What the next update has to take in.
+
+    Attributes
+    ----------
+    vertices : that were added
+    edges : that were added or came back, or have another weight or a newly held vertex
+    touched : vertices that lost an edge or a neighbour
+    loose : whether something that held parts together may be gone
+    broken : whether the tree must be made anew
+    """
+
+    vertices: Index = field(default_factory=_none)
+    edges: Index = field(default_factory=_none)
+    touched: Index = field(default_factory=_none)
+    loose: bool = False
+    broken: bool = False
+
+    def __bool__(self) -> bool:
+        return bool(len(self.vertices) or len(self.edges) or len(self.touched) or self.broken)
+
+    def add(self, vertices: Index, edges: Index) -> None:
+        """New ones."""
+        self.vertices = np.concatenate((self.vertices, vertices)) if len(self.vertices) else vertices
+        self.edges = np.concatenate((self.edges, edges)) if len(self.edges) else edges
+
+    def again(self, edges: Index) -> None:
+        """Edges that are to be linearised, whether or not they wait already."""
+        self.edges = np.union1d(self.edges, edges)
+
+    def touch(self, vertices: Index) -> None:
+        """Vertices that lost an edge or a neighbour."""
+        self.touched = np.concatenate((self.touched, vertices))
+
+    def forget(self, vertex: int) -> None:
+        """A vertex that is gone again before it was taken in."""
+        self.vertices = self.vertices[self.vertices != vertex]
