@@ -28,7 +28,7 @@ class Ahead:
 
     def pass_on(self, messages: Sequence[Stamped]) -> Iterable[Sequence[Stamped]]:
         """The measurements of messages that may go on now, of this one and of those that waited."""
-        if not self._held and (not self._most_ns or not self._is_ahead(messages)):
+        if not self._held and (not self._most_ns or not self.is_ahead(messages)):
             return (messages,)
         self._held.append((time.monotonic(), messages))
         return self.waited()
@@ -38,7 +38,7 @@ class Ahead:
         out = []
         while self._held:
             since_s, messages = self._held[0]
-            if not self._is_ahead(messages):
+            if not self.is_ahead(messages):
                 out.append(messages)
             elif time.monotonic() - since_s < _PATIENCE_S:
                 break
@@ -47,7 +47,8 @@ class Ahead:
             self._held.popleft()
         return out
 
-    def _is_ahead(self, messages: Sequence[Stamped]) -> bool:
+    def is_ahead(self, messages: Sequence[Stamped]) -> bool:
+        """Whether one of them is too far ahead of the clock."""
         newest_ns = max((m.stamp_ns for m in messages), default=0)
         if newest_ns <= self._until_ns:
             return False

@@ -56,6 +56,7 @@ class Configured:
         self._broadcaster: Broadcaster | None = None
         self._jumps: Any = None
         self._is_paused = self._is_stopped = False
+        self._before_ns = 0  # until the clock is there, what is dated later is of before it jumped back
         self._sends_odometry = False
         self._with_twist = {one.name for one in config.sources if one.type == results.ODOMETRY}
         self._passed = self._done = 0  # messages, by this thread and by the worker's
@@ -110,8 +111,11 @@ class Configured:
 
     def _take(self, measured: Sequence[Measured], cdr: bytes) -> None:
         """Pass on what one message has given, or was waiting for it."""
+        if self._before_ns and self._is_of_before(measured):
+            self._refuse("before_jump", measured)
+            return
         for m in measured:
-            if isinstance(m, Odometry) and self._reckoning.hear(m, self._session.estimate) and self._sends_odometry:
+            if isinstance(m, Odometry) and self._is_newest(m) and self._sends_odometry:
                 self._send_odometry(m, cdr)
         for some in self._ahead.pass_on(measured):
             self._hand_over(some)
@@ -130,6 +134,16 @@ class Configured:
         for m in measured:
             self.counters.count(m.source if isinstance(m, Odometry) else m.topic, reason)
         self._passed += 1
+
+    def _is_newest(self, m: Odometry) -> bool:
+        """Whether odometry tells where the robot is now; what is ahead of the clock would be the newest for long."""
+        return not self._ahead.is_ahead([m]) and self._reckoning.hear(m, self._session.estimate)
+
+    def _is_of_before(self, measured: Sequence[Measured]) -> bool:
+        """Whether it was on its way when the clock jumped back: it is dated nearer to the time before."""
+        if self._node.now_ns >= self._before_ns:
+            self._before_ns = 0
+        return 0 < self._before_ns < max((m.stamp_ns for m in measured), default=0)
 
     def _clock_ns(self) -> int:
         """The clock that stamps are judged by: of a recording that is played it is no better than they are."""
@@ -152,6 +166,7 @@ class Configured:
         """The clock jumped back, or another one is used."""
         estimate = self._session.estimate
         self._ahead.forget_time()
+        self._before_ns = self._node.now_ns - jump.delta.nanoseconds // 2
         if estimate is None and not self._worker.waiting:
             return
         what = self._node.config.time.on_jump

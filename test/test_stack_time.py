@@ -1,0 +1,251 @@
+"""The node with a clock of its own: played, paused, jumping, played again and again."""
+
+import itertools
+import json
+
+import pytest
+from live_drive import TAGS, Drive, distance
+from live_nodes import ENVIRONMENT, node, often, own_domain, replayed, results, robot, until
+from rosgraph_msgs.msg import Clock
+
+NS = 10**9
+HEARS = "/diagnostics", "/tf", "pose"
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch):
+    """Of each test its own: what is left of others says nothing here."""
+    with own_domain() as number:
+        monkeypatch.setitem(ENVIRONMENT, "ROS_DOMAIN_ID", number)
+        yield
+
+
+class Played:
+    """A drive with /clock."""
+
+    def __init__(self, r, start_s=5_000, **options):
+        self.robot, self.drive = r, Drive(start_s * NS, **options)
+        self._clock = r.publisher("/clock", Clock)
+        until(self._clock.get_subscription_count, r.spin, "subscriber of /clock")
+
+    def tell(self, stamp_ns=None):
+        """The time."""
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(self.drive.stamp_ns if stamp_ns is None else stamp_ns, NS)
+        self._clock.publish(message)
+
+    def step(self, seconds=0.02):
+        self.tell()
+        self.drive.step(self.robot)
+        self.robot.spin(seconds)
+
+    def go(self, steps):
+        for _ in range(steps):
+            self.step(0.01)
+
+
+def stamps(r):
+    """Of the transforms heard."""
+    return [t.header.stamp.sec * NS + t.header.stamp.nanosec for m in r.heard["tf"] for t in m.transforms]
+
+
+def is_ascending(numbers):
+    return all(b > a for a, b in itertools.pairwise(numbers))
+
+
+def off_by(r, drive):
+    """How far the newest pose is from where the robot was then, which is where it is but for a step."""
+    at = r.heard["pose"][-1].pose.pose.position
+    return distance((at.x, at.y), drive.truth)
+
+
+def numbers(folder):
+    return json.loads((folder / "run.json").read_text())
+
+
+def simulated(folder, *parameters):
+    return node(f"output.folder:={folder}", "inputs.reliable:=true", "use_sim_time:=true", *parameters)
+
+
+# -- jumps -------------------------------------------------------------------------------------------------------------
+
+
+def test_when_the_clock_jumps_back_the_map_stays_a_segment_begins_and_transforms_go_on(tmp_path):
+    with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
+        r.wait_for_node()
+        played = Played(r)
+        r.until_it_says("OK", spin=played.step)
+        until(lambda: len(r.heard["pose"]) > 20, played.step, "poses")
+        r.settle()
+        before = stamps(r)
+        r.heard["tf"].clear()
+        r.heard["pose"].clear()
+        played.drive.stamp_ns -= 60 * NS
+        begin_ns = played.drive.stamp_ns
+        until(lambda: len(r.heard["pose"]) > 20, played.step, "poses after the jump")
+        r.until_it_says("OK", spin=played.step)
+        assert r.graph()["segments"] == 2
+        assert off_by(r, played.drive) < 1.0, "still in the same map"
+        r.settle()
+        after = stamps(r)
+        assert n.stop()[0] == 0
+    assert is_ascending(before)
+    assert is_ascending(after)
+    assert len(after) > 10
+    assert begin_ns <= after[0] < begin_ns + 2 * NS
+    told = numbers(tmp_path / "run")
+    assert (told["segments"], told["landmarks"]) == (2, len(TAGS))
+    assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
+
+
+def test_messages_of_before_the_jump_that_come_after_it_hold_nothing_up(tmp_path):
+    with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
+        r.wait_for_node()
+        played = Played(r)
+        r.until_it_says("OK", spin=played.step)
+        late = played.drive.odometry()
+        played.drive.stamp_ns -= 60 * NS
+        begin_ns = played.drive.stamp_ns
+        for _ in range(3):
+            played.tell()
+            r.spin(0.1)
+            r.send("/odom", late)
+            played.step()
+        r.heard["pose"].clear()
+        until(lambda: len(r.heard["pose"]) > 10, played.step, "poses after the jump")
+        assert off_by(r, played.drive) < 1.0
+        r.heard["tf"].clear()
+        until(lambda: len(stamps(r)) > 5, played.step, "transforms after the jump")
+        assert played.drive.stamp_ns < begin_ns + 30 * NS, "at once"
+        assert max(stamps(r)) < played.drive.stamp_ns + NS
+        assert n.stop()[0] == 0
+    assert numbers(tmp_path / "run")["segments"] == 2
+    assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
+
+
+def test_a_clock_that_goes_back_a_little_is_no_jump(tmp_path):
+    with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
+        r.wait_for_node()
+        played = Played(r)
+        r.until_it_says("OK", spin=played.step)
+        for _ in range(10):
+            played.tell(played.drive.stamp_ns - NS // 8)
+            played.go(3)
+        r.until_it_says("OK", spin=played.step)
+        assert r.graph()["segments"] == 1
+        assert n.stop()[0] == 0
+    assert "jumped" not in n.said
+
+
+def test_odometry_that_comes_before_the_clock_is_of_the_same_segment(tmp_path):
+    with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
+        r.wait_for_node()
+        played = Played(r)
+        until(lambda: r.heard["pose"], lambda s: (played.drive.step(r), r.spin(s)), "pose")
+        r.until_it_says("WAITING", "nothing comes on /clock")
+        r.until_it_says("OK", spin=played.step)
+        assert r.graph()["segments"] == 1
+        until(lambda: stamps(r), played.step, "transform")
+        assert n.stop()[0] == 0
+
+
+def test_where_that_is_asked_for_a_jump_back_saves_the_run_and_begins_another(tmp_path):
+    with simulated(tmp_path / "run", "time.on_jump:=reset") as n, robot(hears=HEARS) as r:
+        r.wait_for_node()
+        played = Played(r)
+        r.until_it_says("OK", spin=played.step)
+        played.go(60)
+        before = r.graph()["keyframes"]
+        played.drive.stamp_ns -= 60 * NS
+        until(lambda: 0 < r.graph()["keyframes"] < before, played.step, "new run")
+        r.until_it_says("OK", spin=played.step)
+        assert n.stop()[0] == 0
+    earlier, later = numbers(tmp_path / "run-1"), numbers(tmp_path / "run")
+    assert earlier["keyframes"] >= before
+    assert (earlier["segments"], later["segments"]) == (1, 1)
+    for run in ("run-1", "run"):
+        (tmp_path / f"of_{run}").mkdir()
+        assert replayed(tmp_path / run, tmp_path / f"of_{run}") == results(tmp_path / run)
+
+
+def test_where_that_is_asked_for_nothing_is_taken_after_a_jump_until_reset(tmp_path):
+    with simulated(tmp_path / "run", "time.on_jump:=stop") as n, robot(hears=HEARS) as r:
+        r.wait_for_node()
+        played = Played(r)
+        r.until_it_says("OK", spin=played.step)
+        played.drive.stamp_ns -= 60 * NS
+        r.until_it_says("ERROR", "stopped when the clock jumped back", "~/reset begins anew", spin=played.step)
+        before = r.graph()["keyframes"]
+        played.go(60)
+        r.until_it_says("ERROR", spin=played.step)
+        assert r.graph()["keyframes"] == before
+        assert r.call("reset").success
+        r.until_it_says("OK", spin=played.step)
+        assert n.stop()[0] == 0
+    assert before <= numbers(tmp_path / "run-1")["keyframes"] <= before + 1, "what waited for its turn"
+
+
+def test_odometry_from_the_future_is_refused_and_holds_no_transform_up(tmp_path):
+    with (
+        node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n,
+        robot(hears=(*HEARS, "odometry")) as r,
+    ):
+        r.wait_for_node()
+        drive = Drive()
+        r.until_it_says("OK", spin=drive.pace(r))
+        now_ns, drive.stamp_ns = drive.stamp_ns, drive.stamp_ns + 7_200 * NS
+        r.send("/odom", drive.odometry())
+        drive.stamp_ns = now_ns
+        r.spin(0.1)
+        for heard in r.heard.values():
+            heard.clear()
+        until(lambda: len(stamps(r)) > 5 and len(r.heard["odometry"]) > 5, drive.pace(r), "transforms and odometry")
+        assert max(stamps(r)) < drive.stamp_ns + NS
+        r.settle()
+        assert n.stop()[0] == 0
+    told = numbers(tmp_path / "run")
+    assert told["counters"]["odom"] == {"future": 1}
+    assert told["segments"] == 1
+    assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
+
+
+# -- pauses and loops --------------------------------------------------------------------------------------------------
+
+
+def test_while_the_clock_is_paused_nothing_is_silent_and_services_answer(tmp_path):
+    with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
+        r.wait_for_node()
+        played = Played(r)
+        r.until_it_says("OK", spin=played.step)
+        played.go(20)
+        r.settle()
+        r.heard["diagnostics"].clear()
+        until(lambda: len(r.said()) > 3, r.spin, "diagnostics")
+        assert {values["state"] for _, values in r.said()} == {"OK"}
+        assert r.save().success
+        assert r.call("optimize").success
+        played.go(40)
+        r.until_it_says("OK", spin=played.step)
+        assert r.graph()["segments"] == 1
+        assert n.stop()[0] == 0
+
+
+def test_a_recording_that_is_played_again_and_again_adds_segments_to_one_map(tmp_path):
+    loops = often(3)
+    with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
+        r.wait_for_node()
+        played = Played(r)
+        for _ in range(loops):
+            played.drive = Drive(5_000 * NS)
+            played.tell()
+            r.spin(0.1)
+            until(lambda: played.drive.steps >= 120, played.step, "end of the recording")
+            r.until_it_says("OK")
+        r.settle()
+        assert r.graph()["segments"] == loops
+        assert off_by(r, played.drive) < 1.0
+        assert n.stop()[0] == 0
+    told = numbers(tmp_path / "run")
+    assert (told["segments"], told["landmarks"]) == (loops, len(TAGS))
+    assert told["keyframes"] > 30 * loops
+    assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
