@@ -33,7 +33,7 @@ SMALL = [
 def python(*words, **environment):
     inherited = {name: value for name, value in os.environ.items() if name != "PYTEST_ADDOPTS"}  # colcon's own
     return subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, cwd=TEST, env=inherited | environment, timeout=300
+        [sys.executable, *words], capture_output=True, text=True, cwd=TEST, env=inherited | environment, timeout=900
     )
 
 
