@@ -430,7 +430,7 @@ def test_while_everything_is_solved_and_saved_transforms_odometry_and_diagnostic
     until(lambda: all(future.done() for future in futures), step, "solution", 60.0)
     took_s, counts = time.monotonic() - since, {topic: len(heard) for topic, heard in r.heard.items()}
     assert all(future.result().success for future in futures)
-    assert took_s > 1.0, "or nothing is shown"
+    assert took_s > 0.2, "or nothing is shown"
     assert counts["odometry"] >= 0.9 * len(times) - 5, (counts, len(times))
     assert counts["tf"] >= 0.5 * min(len(times), took_s / 0.05) - 5, (counts, len(times), took_s)
     assert counts["diagnostics"] >= 0.5 * took_s - 1, (counts, took_s)

@@ -56,6 +56,17 @@ class Ahead:
         self._until_ns = now_ns + self._most_ns if now_ns else 0
         return bool(now_ns) and newest_ns > self._until_ns
 
+    def give_up(self) -> list[Sequence[Stamped]]:
+        """Nothing is waited for any more: what is ahead now is refused, what was behind it may go on."""
+        out: list[Sequence[Stamped]] = []
+        for _, messages in self._held:
+            if self.is_ahead(messages):
+                self._refuse(messages)
+            else:
+                out.append(messages)
+        self._held.clear()
+        return out
+
     def forget_time(self) -> None:
         """The clock begins anew."""
         self._until_ns = 0

@@ -94,6 +94,8 @@ class Configured:
     def finish(self, patience_s: float | None) -> None:
         """Save what was not saved yet, and take everything away."""
         self.deactivate()
+        for some in self._ahead.give_up():
+            self._hand_over(some)
         self._node.destroy_subscription(self._initial)
         self._hand_over(self._border.finish())
         try:

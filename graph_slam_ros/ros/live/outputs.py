@@ -138,7 +138,8 @@ class Outputs:
         topic, output = self._topics[name], config.output
         listeners = topic.publisher.get_subscription_count()
         if listeners > topic.listeners:
-            topic.is_stale = topic.begins_anew = True  # who came late has what was latched, which may be old
+            topic.begins_anew = True  # who came late has what was latched, and of what is not latched nothing
+            topic.is_stale = topic.is_stale or name == "path_updates"
         topic.listeners = listeners
         period_s = output.graph_period_s if name == "graph" else output.path_period_s
         period_s = max(period_s, _SPARE * topic.took_s)  # what takes long comes seldom
