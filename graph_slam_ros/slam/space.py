@@ -56,6 +56,12 @@ class Space:
             return abs(pose[2])
         return float(2.0 * np.arctan2(np.linalg.norm(pose[3:6]), abs(pose[6])))
 
+    def normalized(self, pose: Numbers) -> Numbers:
+        """With a quaternion of length 1, where there is one."""
+        if self.dimensions == 2:
+            return pose
+        return *pose[:3], *map(float, so3.normalize((pose[3], pose[4], pose[5], pose[6])))
+
     def heading(self, pose: Numbers) -> float:
         """Angle from the parent's x to the pose's x, seen from above."""
         turn = self.turn(pose)
