@@ -346,7 +346,10 @@ def test_where_the_anchor_is_loose_the_map_turns_into_the_frame_of_the_fixes(spa
 
 
 def test_a_path_that_is_cut_at_every_sighting_keeps_its_rotations():
-    pipeline, n = slam(SPACE, keyframes__shared_noise=0.0, keyframes__min_distance_m=0.01), 3
+    pipeline, n = (
+        slam(SPACE, keyframes__shared_noise=0.0, keyframes__min_distance_m=1e3, keyframes__max_interval_s=1e3),
+        3,
+    )
     turned = floats(so3.exp((0.3, -0.2, 0.5)))
     off = tuple(x * (1.0 + 1e-9) for x in turned)  # as drivers round it
     for k in range(400):
@@ -354,6 +357,6 @@ def test_a_path_that_is_cut_at_every_sighting_keeps_its_rotations():
         sighting = Sighting("a", "position", (2.0, 0.1, 0.0), covariance(n, 0.1))
         pipeline.process(Sightings(stamp(k) - S // 200, "l", (sighting,)))
     [pipeline.process(event) for event in END]
-    assert len(pipeline.keyframes) > 350
+    assert len(pipeline.keyframes) > 300
     norms = np.linalg.norm(pipeline.keyframes.poses[:, 3:], axis=1)
     assert norms == pytest.approx(1.0, abs=1e-7)
