@@ -94,7 +94,7 @@ def keep_earlier(folder: Path, most: int) -> None:
     earlier = earlier_runs(folder)
     try:
         folder.rename(folder.with_name(f"{folder.name}-{max(earlier, default=0) + 1}"))
-        for number in sorted(earlier)[: len(earlier) + 1 - most]:
+        for number in sorted(earlier)[: max(0, len(earlier) + 1 - most)]:
             _clear(earlier[number])
             with contextlib.suppress(OSError):  # somebody has put more into it
                 earlier[number].rmdir()

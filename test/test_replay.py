@@ -19,7 +19,7 @@ from graph_slam_ros.replay import replay
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter, open_bag
 from graph_slam_ros.ros.interfaces import typestore
-from graph_slam_ros.run import RunError, RunRecorder, is_run, run_config
+from graph_slam_ros.run import RunError, RunRecorder, earlier_runs, is_run, keep_earlier, run_config
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 from graph_slam_ros.slam.measurements import from_record, to_record
@@ -433,3 +433,23 @@ def test_an_offset_that_ranges_share_is_a_vertex_of_its_own_in_the_saved_graph(t
     vertices = [line.split(",") for line in (tmp_path / "graph_vertices.csv").read_text().splitlines()[1:]]
     assert [row[1] for row in vertices].count("offset") == 1
     assert len(vertices) == slam.graph.vertex_count
+
+
+@pytest.mark.parametrize("most", [0, 1, 2, 5])
+def test_of_earlier_runs_the_last_ones_are_kept_and_no_others(tmp_path, most):
+    for k in range(9):
+        keep_earlier(tmp_path / "run", most)
+        RunRecorder(tmp_path / "run", Config()).close()
+        last = range(max(1, k - most + 1), k + 1) if most else ()
+        assert set(earlier_runs(tmp_path / "run")) == set(last)
+    assert is_run(tmp_path / "run")
+
+
+def test_of_an_earlier_run_that_is_not_kept_what_somebody_has_put_there_stays(tmp_path):
+    for _ in range(3):
+        keep_earlier(tmp_path / "run", 1)
+        RunRecorder(tmp_path / "run", Config()).close()
+        if (tmp_path / "run-1").is_dir():
+            (tmp_path / "run-1" / "notes").write_text("mine")
+    assert [file.name for file in (tmp_path / "run-1").iterdir()] == ["notes"]
+    assert set(earlier_runs(tmp_path / "run")) == {2}
