@@ -228,6 +228,22 @@ def test_a_standing_robot_makes_no_keyframes_and_gathers_no_noise():
     assert covariance_of(p, LANDMARK_POSITION) == pytest.approx(np.reshape(POINT, (2, 2)), rel=1e-5)
 
 
+@pytest.mark.parametrize(("jitter_m", "hz"), [(2e-5, 50), (2e-4, 10), (1e-4, 100)])
+def test_odometry_that_jitters_while_the_robot_stands_is_no_motion(jitter_m, hz):
+    rng = np.random.default_rng(1)
+    p = slam(keyframes={"min_distance_m": 0.5, "max_interval_s": 1.0})
+    count = 900 * hz
+    for k, (x, y, theta) in enumerate((jitter_m * rng.standard_normal((count, 3))).tolist()):
+        p.process(odometry(k / hz, (x, y, theta)))
+    assert len(p.keyframes) == 1
+    for k in range(count, count + 10 * hz):
+        p.process(odometry(k / hz, ((k - count) * 0.1 / hz, 0.0, 0.0)))
+    assert len(p.keyframes) in (10, 11)  # 0.1 m/s for ten seconds, a second each
+    sigma = math.sqrt(float(p.pose_covariance[0, 0]))
+    fresh = run(slam(keyframes={"min_distance_m": 0.5, "max_interval_s": 1.0}), *straight(10, 0.1, hz))
+    assert sigma < 1.5 * math.sqrt(float(fresh.pose_covariance[0, 0]))
+
+
 def test_odometry_edges_are_the_relative_motion_and_not_the_absolute_pose():
     p = run(slam(), odometry(0, (5, 5, math.pi / 2)), odometry(1, (5, 6, math.pi / 2 + 0.2)), odometry(2, (5, 7, 1.0)))
     assert table(p, RELATIVE_POSE).measured.values[0] == pytest.approx([1, 0, 0.2])

@@ -79,7 +79,10 @@ class OdometryConfig:
         low=0.0,
     )
     still_m_s: float = setting(
-        1e-3, "slower than this and the next, the robot stands: no noise is added", "m/s", low=0.0
+        1e-3,
+        "slower than this and the next, or by no more within a second, the robot stands: no noise is added",
+        "m/s",
+        low=0.0,
     )
     still_rad_s: float = setting(1e-3, "see still_m_s", "rad/s", low=0.0)
     timeout_s: float = setting(

@@ -298,7 +298,8 @@ class GraphSlam:
         due, motion, n = self.config.keyframes, self._motions[-1], self.space.dimensions
         at = motion.now.T_keyframe_base
         far = sum(x * x for x in at[:n]) >= due.min_distance_m**2 or self.space.angle(at) >= due.min_angle_rad
-        return far or motion.moving_ns / 1e9 >= due.max_interval_s
+        moving_s = motion.moving_ns / 1e9
+        return far or motion.is_long or (moving_s >= due.max_interval_s and not self._noise.stands(at, moving_s))
 
     def _first_keyframe(self, step: Step) -> None:
         """Map begins where odom begins, or the robot where it is said to: there the first pose is anchored."""

@@ -12,6 +12,10 @@ from graph_slam_ros.slam.space import Numbers, Space
 
 Array = NDArray[np.float64]
 
+_REST_NS = 10**9  # for so long a robot must have stood before what its odometry jitters is no motion
+_MOST = 10_000  # odometry messages that one motion remembers
+_JITTER = 3  # such motion may be so many times as fast as a robot that stands: it leads nowhere
+
 
 @dataclass(frozen=True, slots=True)
 class Moved:
@@ -21,6 +25,7 @@ class Moved:
     T_keyframe_base: Numbers
     covariance: Array
     twist_covariance: Numbers | None = None
+    stands: bool = False  # since the odometry before
 
 
 class OdometryNoise:
@@ -66,14 +71,14 @@ class OdometryNoise:
 class Motion:
     """The motion since a keyframe, remembered odometry by odometry."""
 
-    __slots__ = ("_moved", "_noise", "_space", "_stands", "keyframe", "moving_ns")
+    __slots__ = ("_moved", "_noise", "_rest", "_rests", "_space", "keyframe", "moving_ns")
 
     def __init__(self, noise: OdometryNoise, space: Space, keyframe: int, start_ns: int) -> None:
         self.keyframe = keyframe
         self.moving_ns = 0  # whole numbers: a sum of seconds would round
         self._noise, self._space = noise, space
-        self._stands = False
         self._moved = [Moved(start_ns, space.identity, np.zeros((space.dof, space.dof)))]
+        self._rest, self._rests = self._moved[0], False  # where it was a second ago, or stands since
 
     @property
     def now(self) -> Moved:
@@ -87,17 +92,17 @@ class Motion:
 
     def step(self, step: Step) -> None:
         """Go on by one step of odometry."""
-        stands, elapsed_ns, moved = self._after(step)
-        self.moving_ns += elapsed_ns * (not stands)
-        if self._stands and stands:  # of a robot that stands for hours, only the last is remembered
+        before, moved = self.now, self._after(step)
+        self.moving_ns += (moved.stamp_ns - before.stamp_ns) * (not moved.stands)
+        if before.stands and moved.stands:  # of a robot that stands for hours, only the last is remembered
             self._moved[-1] = moved
         else:
             self._moved.append(moved)
-        self._stands = stands
+        self._look_whether_it_rests()
 
     def after(self, step: Step) -> Moved:
         """Where one more step of odometry would lead; it is not taken."""
-        return self._after(step)[2]
+        return self._after(step)
 
     def at(self, stamp_ns: int) -> Moved:
         """At a stamp from the keyframe's to the newest odometry's, between two odometry messages by interpolation."""
@@ -108,9 +113,7 @@ class Motion:
         b, group = self._moved[k + 1], self._space.group
         fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
         step = group.interpolate(self._space.identity, group.between(a.T_keyframe_base, b.T_keyframe_base), fraction)
-        elapsed_ns = stamp_ns - a.stamp_ns
-        moves = not self._noise.stands(step, elapsed_ns * 1e-9)
-        return self._extended(a, step, elapsed_ns * moves, Step(stamp_ns, step, b.T_keyframe_base, b.twist_covariance))
+        return self._extended(a, stamp_ns, group.compose(a.T_keyframe_base, step), step, b.twist_covariance, b.stands)
 
     def cut(self, stamp_ns: int) -> Step | None:
         """End the motion at a stamp after the last odometry but one; returns the step that is left over, if any."""
@@ -121,24 +124,42 @@ class Motion:
         # the next cut is made of this rest: without a norm of 1 its error would double from cut to cut
         rest = self._space.normalized(group.between(at.T_keyframe_base, last.T_keyframe_base))
         self._moved[-1] = at
-        self._stands = False
         return Step(last.stamp_ns, rest, rest, last.twist_covariance)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether it is time to begin another, for what is remembered grows."""
+        return len(self._moved) >= _MOST
 
     @property
     def before_last_ns(self) -> int:
         """Stamp of the last odometry but one, or of the keyframe."""
         return self._moved[-2].stamp_ns if len(self._moved) > 1 else self.start_ns
 
-    def _after(self, step: Step) -> tuple[bool, int, Moved]:
-        """Whether the robot stands in a step, how long that takes, and where it is then."""
-        elapsed_ns = step.stamp_ns - self.now.stamp_ns
-        stands = self._noise.stands(step.T_last_base, elapsed_ns * 1e-9)
-        return stands, elapsed_ns, self._extended(self.now, step.T_last_base, elapsed_ns * (not stands), step)
+    def _after(self, step: Step) -> Moved:
+        to = self._space.group.compose(self.now.T_keyframe_base, step.T_last_base)
+        stands = self._noise.stands(step.T_last_base, (step.stamp_ns - self.now.stamp_ns) * 1e-9)
+        stands = stands or (self._rests and self._is_near_rest(to, _JITTER * _REST_NS))
+        return self._extended(self.now, step.stamp_ns, to, step.T_last_base, step.twist_covariance, stands)
 
-    def _extended(self, a: Moved, T_a_b: Numbers, moving_ns: int, step: Step) -> Moved:
-        group, noise = self._space.group, self._noise.of(moving_ns * 1e-9, step.twist_covariance)
-        covariance = group.propagate_during(a.covariance, T_a_b, noise)
-        return Moved(step.stamp_ns, group.compose(a.T_keyframe_base, T_a_b), covariance, step.twist_covariance)
+    def _extended(
+        self, a: Moved, stamp_ns: int, to: Numbers, T_a_b: Numbers, twist_covariance: Numbers | None, stands: bool
+    ) -> Moved:
+        moving_ns = (stamp_ns - a.stamp_ns) * (not stands)
+        noise = self._noise.of(moving_ns * 1e-9, twist_covariance)
+        covariance = self._space.group.propagate_during(a.covariance, T_a_b, noise)
+        return Moved(stamp_ns, to, covariance, twist_covariance, stands)
+
+    def _look_whether_it_rests(self) -> None:
+        elapsed_ns = self.now.stamp_ns - self._rest.stamp_ns
+        left = self._rests and not self.now.stands
+        if left or (not self._rests and elapsed_ns >= _REST_NS):
+            self._rests = not left and self._is_near_rest(self.now.T_keyframe_base, elapsed_ns)
+            self._rest = self.now
+
+    def _is_near_rest(self, at: Numbers, elapsed_ns: int) -> bool:
+        """By what came of it, not step by step: jitter of 0.2 mm at 10 Hz is faster than a millimetre a second."""
+        return self._noise.stands(self._space.group.between(self._rest.T_keyframe_base, at), elapsed_ns * 1e-9)
 
 
 def _stamp(moved: Moved) -> int:
