@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from graph_slam_ros import __version__
-from graph_slam_ros.cli import graphs, recordings
+from graph_slam_ros.cli import graphs, recordings, worlds
 from graph_slam_ros.cli.console import REFUSED
 from graph_slam_ros.errors import GraphSlamError
 
@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
     _simulate(
         command(
             "simulate",
-            recordings.simulate,
+            worlds.simulate,
             "record a synthetic world with truth: pythonrobotics, manhattan, warehouse, flight",
         )
     )
@@ -134,12 +134,15 @@ def _convert(sub: argparse.ArgumentParser) -> None:
 
 
 def _simulate(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("scenario", metavar="SCENARIO")
-    sub.add_argument("--out", type=Path, required=True, metavar="BAG.mcap")
+    sub.add_argument("scenario", metavar="SCENARIO", help="a world, or city, which is a graph")
+    sub.add_argument(
+        "--out", type=Path, required=True, metavar="BAG.mcap|GRAPH.g2o", help="a recording, or by its ending a graph"
+    )
     sub.add_argument("--seed", type=int, default=0, metavar="N")
     sub.add_argument("--as-original", action="store_true", help="pythonrobotics: its own, squared noise")
     sub.add_argument("--poses", type=_count, metavar="N", help="length of the drive, where the world has it")
     sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="an option of the world")
+    sub.add_argument("--closures", type=_count, metavar="N", help="so many true loop closures besides, on /closures")
 
 
 def _evaluate(sub: argparse.ArgumentParser) -> None:

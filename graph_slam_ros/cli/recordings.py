@@ -1,4 +1,4 @@
-"""The commands on recordings and runs: ``replay``, ``info``, ``simulate``, ``evaluate``, ``warmup``, ``demo``."""
+"""The commands on recordings and runs: ``replay``, ``info``, ``evaluate``, ``warmup``, ``demo``."""
 
 import argparse
 import json
@@ -69,28 +69,6 @@ def info(args: argparse.Namespace) -> int:
     bag = open_bag(args.bag)
     console.say(*describe(bag, args.bag))
     return console.told(bag.losses)
-
-
-def simulate(args: argparse.Namespace) -> int:
-    """Record a synthetic world."""
-    from graph_slam_ros.formats.parameters import parse_setting
-    from graph_slam_ros.simulation import simulate as recorded
-    from graph_slam_ros.simulation import write_bag
-
-    options = dict(parse_setting(text) for text in args.set)
-    if "seed" in options:
-        raise GraphSlamError("--set seed: no option of a world; --seed N")
-    if args.as_original:
-        options["as_original"] = True
-    if args.poses is not None:
-        options["poses"] = args.poses
-    recording = recorded(args.scenario, args.seed, **options)
-    try:
-        write_bag(recording, args.out)
-    except OSError as error:
-        raise GraphSlamError(f"{args.out}: {error.strerror}") from None
-    console.say(f"wrote {args.out}")
-    return console.DONE
 
 
 def evaluate(args: argparse.Namespace) -> int:

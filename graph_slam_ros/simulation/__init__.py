@@ -11,6 +11,7 @@ from typing import Any
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.simulation import flight, manhattan, pythonrobotics, warehouse
 from graph_slam_ros.simulation.bag import write_bag
+from graph_slam_ros.simulation.closures import with_closures
 from graph_slam_ros.simulation.options import Option, fill, options_of
 from graph_slam_ros.simulation.pose_graph import CityGraph, city_graph, landmark_graph, write_graph
 from graph_slam_ros.simulation.recording import Recording, measurements
@@ -63,6 +64,7 @@ __all__ = [
     "measurements",
     "options_of",
     "simulate",
+    "with_closures",
     "write_bag",
     "write_graph",
 ]

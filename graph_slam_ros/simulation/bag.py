@@ -21,8 +21,8 @@ from graph_slam_ros.ros.to_msg import (
     vector,
 )
 from graph_slam_ros.simulation.motion import space_of
-from graph_slam_ros.simulation.recording import LANDMARKS_TOPIC, Recording
-from graph_slam_ros.slam import Sighting, Sightings
+from graph_slam_ros.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Recording
+from graph_slam_ros.slam import Closure, Sighting, Sightings
 from graph_slam_ros.slam.space import Space
 
 Array = NDArray[np.float64]
@@ -41,7 +41,8 @@ def write_bag(recording: Recording, path: Path | str) -> None:
     """Write a bag in order of stamp.
 
     ``/odom`` nav_msgs/Odometry (odom, base_link), ``/landmarks`` vision_msgs/Detection3DArray (base_link),
-    ``/ground_truth`` geometry_msgs/PoseStamped and, once, ``/landmarks_ground_truth`` Detection3DArray (world).
+    ``/ground_truth`` geometry_msgs/PoseStamped and, once, ``/landmarks_ground_truth`` Detection3DArray (world); where
+    there are closures, ``/closures`` Detection3DArray (base_link), as an input of ``use: closure`` takes them.
 
     Ranges and bearings are sensor_msgs/PointCloud2 instead, with the fields ``id``, ``range``, ``bearing``,
     ``elevation``, ``sigma`` and ``sigma_bearing``, as far as they are measured, in the frame ``sensor`` of
@@ -53,11 +54,10 @@ def write_bag(recording: Recording, path: Path | str) -> None:
         What is seen is of kinds that no one message has.
     """
     space, seen = space_of(recording.T_world_base[0]), {s.stamp_ns: s for s in recording.seen}
-    kinds = {s.kind for one in recording.seen for s in one.sightings}
-    polar = bool(kinds - {"position", "pose"})
+    kinds, polar, names = _kinds(recording), _is_polar(recording), recorded_names(recording)
     if polar and len(kinds) > 1:
         raise GraphSlamError(f"no message holds {' and '.join(sorted(kinds))} together")
-    number = {name: k for k, name in enumerate(recording.landmarks)}
+    closed = recording.closures_at()
     twist_covariance = covariance6(recording.twist_covariance, _UNUSED)
     with BagWriter(path) as bag:
         first_ns = int(recording.stamps_ns[0])
@@ -68,16 +68,31 @@ def write_bag(recording: Recording, path: Path | str) -> None:
                 bag.write("/tf_static", "tf2_msgs/msg/TFMessage", stamp_ns, mounted)
             bag.write(ODOMETRY_TOPIC, "nav_msgs/msg/Odometry", stamp_ns, _odometry(recording, k, twist_covariance))
             if stamp_ns in seen and polar:
-                bag.write(LANDMARKS_TOPIC, _POINTS, stamp_ns, _point_cloud(seen[stamp_ns], number))
+                bag.write(LANDMARKS_TOPIC, _POINTS, stamp_ns, _point_cloud(seen[stamp_ns], names))
             elif stamp_ns in seen:
                 bag.write(LANDMARKS_TOPIC, _DETECTIONS, stamp_ns, _detections(seen[stamp_ns], "base_link", space))
+            if stamp_ns in closed:
+                bag.write(CLOSURES_TOPIC, _DETECTIONS, stamp_ns, _closures(closed[stamp_ns], space))
             truth = pose_stamped(stamp_ns, "world", tuple(recording.T_world_base[k].tolist()))
             bag.write(TRUTH_TOPIC, "geometry_msgs/msg/PoseStamped", stamp_ns, truth)
             if stamp_ns == first_ns:
                 true = _true_landmarks(recording, space)
-                if polar:
-                    true = replace(true, sightings=tuple(replace(s, id=str(number[s.id])) for s in true.sightings))
+                true = replace(true, sightings=tuple(replace(s, id=names[s.id]) for s in true.sightings))
                 bag.write(TRUE_LANDMARKS_TOPIC, _DETECTIONS, stamp_ns, _detections(true, "world", space))
+
+
+def recorded_names(recording: Recording) -> dict[str, str]:
+    """What each landmark goes by in a bag: its id, or where messages hold no names a number."""
+    polar = _is_polar(recording)
+    return {name: str(k) if polar else name for k, name in enumerate(recording.landmarks)}
+
+
+def _kinds(recording: Recording) -> set[str]:
+    return {s.kind for one in recording.seen for s in one.sightings}
+
+
+def _is_polar(recording: Recording) -> bool:
+    return bool(_kinds(recording) - {"position", "pose"})
 
 
 def _odometry(recording: Recording, k: int, twist_covariance: Array) -> bytes:
@@ -109,7 +124,19 @@ def _detections(seen: Sightings, frame: str, space: Space) -> bytes:
     return encode(make(_DETECTIONS, header=head, detections=[_detection(head, s, space) for s in seen.sightings]))
 
 
-def _point_cloud(seen: Sightings, number: Mapping[str, int]) -> bytes:
+def _closures(several: list[Closure], space: Space) -> bytes:
+    """Where the base was earlier, seen from where it is: moving a pose by ``d`` moves its inverse by ``-Ad d``."""
+    head, detections = header(several[0].stamp_ns, "base_link"), []
+    for one in several:
+        back = space.group.adjoint(one.T_from_base)
+        covariance = back @ np.reshape(one.covariance, (space.dof, space.dof)) @ back.T
+        measured = tuple(float(number) for number in space.group.inverse(one.T_from_base))
+        seen = Sighting(str(one.from_stamp_ns), "pose", measured, tuple(covariance.ravel().tolist()))
+        detections.append(_detection(head, seen, space))
+    return encode(make(_DETECTIONS, header=head, detections=detections))
+
+
+def _point_cloud(seen: Sightings, names: Mapping[str, str]) -> bytes:
     """A PointCloud2 of doubles, a point for each sighting; its sigmas are the roots of the variances."""
     kind = seen.sightings[0].kind
     angles = ("bearing", "elevation")[: len(seen.sightings[0].measured) - ("range" in kind)]
@@ -118,7 +145,7 @@ def _point_cloud(seen: Sightings, number: Mapping[str, int]) -> bytes:
     rows = []
     for s in seen.sightings:
         variances = np.reshape(s.covariance, (len(measured), -1)).diagonal()
-        rows.append([number[s.id], *s.measured, *np.sqrt(variances[: len(sigmas)])])
+        rows.append([int(names[s.id]), *s.measured, *np.sqrt(variances[: len(sigmas)])])
     points = np.array(rows, dtype="<f8")
     fields = [
         make("sensor_msgs/msg/PointField", name=name, offset=8 * k, datatype=8, count=1)

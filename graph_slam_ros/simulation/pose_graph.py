@@ -9,14 +9,17 @@ import numpy as np
 from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o_writer import write_g2o
-from graph_slam_ros.formats.graph_file import G2oFile
-from graph_slam_ros.graph import LANDMARK_POSITION, R2, RELATIVE_POSE, SE2, Gaussian, Graph
+from graph_slam_ros.formats.graph_file import G2oFile, Values
+from graph_slam_ros.graph import RELATIVE_POSE, SE2, Gaussian, Graph
 from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.manhattan import STEP_M, stroll
-from graph_slam_ros.simulation.motion import step_covariance
+from graph_slam_ros.simulation.motion import space_of, step_covariance
 from graph_slam_ros.simulation.options import fill, option
-from graph_slam_ros.simulation.recording import Recording
+from graph_slam_ros.simulation.recording import Numbers, Recording
+from graph_slam_ros.slam import Sighting
+from graph_slam_ros.slam.space import Space
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -109,21 +112,26 @@ def _composed(start: Array, steps: Array) -> Array:
 
 
 def landmark_graph(recording: Recording) -> Graph:
-    """A recording of points as a graph: a pose at each stamp of odometry, a vertex for each landmark that was seen.
+    """A recording as a graph: a pose at each stamp of odometry, a vertex for each landmark that was seen.
 
     Poses start at the dead reckoning, landmarks where they were first seen from there. The noise of an odometry edge is
     the twist covariance over the tick, as where each tick's error is its own. No vertex is fixed.
+
+    Raises
+    ------
+    GraphSlamError
+        A landmark is seen by bearing or by range alone: one sighting does not tell where it is.
     """
-    graph = Graph()
-    poses = graph.add_vertices(SE2, recording.T_odom_base)
+    graph, space = Graph(), space_of(recording.T_odom_base[0])
+    poses = graph.add_vertices(space.pose, recording.T_odom_base)
     dt_s = np.diff(recording.stamps_ns) * 1e-9
     noise = [
         step_covariance(twist * dt, recording.twist_covariance * dt**2)
         for twist, dt in zip(recording.twist[1:], dt_s.tolist(), strict=True)
     ]
-    odometry = se2.between(tuple(recording.T_odom_base[:-1].T), tuple(recording.T_odom_base[1:].T))
+    odometry = space.group.between(tuple(recording.T_odom_base[:-1].T), tuple(recording.T_odom_base[1:].T))
     graph.add_edges(
-        RELATIVE_POSE,
+        space.relative_pose,
         np.column_stack([poses[:-1], poses[1:]]),
         np.stack(odometry, axis=1),
         Gaussian.from_covariance(np.array(noise)),
@@ -135,19 +143,57 @@ def landmark_graph(recording: Recording) -> Graph:
         pose = pose_at[seen.stamp_ns]
         for s in seen.sightings:
             if s.id not in vertex_of:
-                vertex_of[s.id] = graph.add_vertex(R2, se2.act(tuple(recording.T_odom_base[pose]), s.measured))
-        pairs = [(pose, vertex_of[s.id]) for s in seen.sightings]
-        measured = [s.measured for s in seen.sightings]
-        covariances = np.reshape([s.covariance for s in seen.sightings], (-1, 2, 2))
-        graph.add_edges(LANDMARK_POSITION, pairs, measured, Gaussian.from_covariance(covariances), "landmarks")
+                vertex_of[s.id] = _first_seen(graph, space, tuple(recording.T_odom_base[pose].tolist()), s)
+        for kind in dict.fromkeys(s.kind for s in seen.sightings):
+            same, edge = [s for s in seen.sightings if s.kind == kind], space.sightings[kind]
+            covariances = np.reshape([s.covariance for s in same], (-1, edge.residual_size, edge.residual_size))
+            graph.add_edges(
+                edge,
+                [(pose, vertex_of[s.id]) for s in same],
+                [edge.whole([*s.measured, *(s.T_base_sensor or ())]) for s in same],
+                Gaussian.from_covariance(covariances),
+                "landmarks",
+            )
+    for c in recording.closures:
+        noise_of = Gaussian.from_covariance(np.reshape(c.covariance, (space.dof, space.dof)))
+        ends = pose_at[c.from_stamp_ns], pose_at[c.stamp_ns]
+        graph.add_edge(space.relative_pose, ends, c.T_from_base, noise_of, "closures")
     return graph
+
+
+def _first_seen(graph: Graph, space: Space, T_odom_base: Numbers, s: Sighting) -> int:
+    """A vertex for a landmark, where a sighting has it."""
+    group, seen = space.group, s.measured
+    if s.kind == "pose":
+        return graph.add_vertex(space.pose, group.compose(T_odom_base, seen))
+    if s.kind == "range_bearing":
+        distance, azimuth, elevation = (*seen, 0.0)[:3]
+        flat = distance * np.cos(elevation)
+        in_sensor = (flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation))
+        seen = group.act(s.T_base_sensor or space.identity, in_sensor[: space.dimensions])
+    elif s.kind != "position":
+        raise GraphSlamError(f"a {s.kind} alone does not tell where a landmark is, and a graph needs a start")
+    return graph.add_vertex(space.point, group.act(T_odom_base, seen))
 
 
 def write_graph(graph: Graph, path: Path | str) -> None:
     """Write a graph as g2o at its initial values, with the first vertex held by a FIX line."""
+    write_g2o(path, G2oFile(graph, list(range(graph.vertex_count)), [0]), values_of(graph, graph.initial.values))
 
-    def initial(ids: Sequence[int]) -> Array:
+
+def values_of(graph: Graph, numbers: Array) -> Values:
+    """The values of vertices by id, of the stored numbers of all of them end to end."""
+
+    def values(ids: Sequence[int]) -> Array:
         size = graph.kind_of(ids[0]).size
-        return np.asarray(graph.initial.values[graph.offset.values[ids][:, None] + np.arange(size)])
+        return np.asarray(numbers[graph.offset.values[ids][:, None] + np.arange(size)])
 
-    write_g2o(path, G2oFile(graph, list(range(graph.vertex_count)), [0]), initial)
+    return values
+
+
+def truth_of(recording: Recording, graph: Graph) -> Array:
+    """The true stored numbers of all vertices of a recording's graph, end to end."""
+    names = list(dict.fromkeys(s.id for seen in recording.seen for s in seen.sightings))
+    true = [recording.landmarks[name] for name in names]
+    size = [graph.kind_of(len(recording.stamps_ns) + k).size for k in range(len(names))]
+    return np.concatenate([recording.T_world_base.ravel(), *(place[:n] for place, n in zip(true, size, strict=True))])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.slam import Odometry, Sightings
+from graph_slam_ros.slam import Closure, Odometry, Sightings
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
@@ -14,6 +14,7 @@ Stamps = NDArray[np.int64]
 
 START_NS = 1_700_000_000 * 10**9  # a plausible date: stamps near zero would hide faults of precision
 LANDMARKS_TOPIC = "/landmarks"
+CLOSURES_TOPIC = "/closures"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +33,7 @@ class Recording:
     seen : in order of stamp, each at a stamp of odometry
     T_world_base : (n, 3) or (n, 7) true poses
     landmarks : true poses in world by id; of points the position alone
+    closures : in order of their later stamp; both are stamps of odometry
     """
 
     stamps_ns: Stamps
@@ -42,13 +44,23 @@ class Recording:
     seen: tuple[Sightings, ...]
     T_world_base: Array
     landmarks: dict[str, Numbers]
+    closures: tuple[Closure, ...] = ()
+
+    def closures_at(self) -> dict[int, list[Closure]]:
+        """Those of each later stamp."""
+        out: dict[int, list[Closure]] = {}
+        for closure in self.closures:
+            out.setdefault(closure.stamp_ns, []).append(closure)
+        return out
 
 
-def measurements(recording: Recording) -> Iterator[Odometry | Sightings]:
+def measurements(recording: Recording) -> Iterator[Odometry | Sightings | Closure]:
     """What ``GraphSlam.process`` takes, in order of stamp, odometry before what was seen at the same stamp."""
     twist_covariance = tuple(recording.twist_covariance.ravel().tolist())
     seen = {s.stamp_ns: s for s in recording.seen}
+    closed = recording.closures_at()
     for stamp_ns, pose in zip(recording.stamps_ns.tolist(), recording.T_odom_base.tolist(), strict=True):
         yield Odometry(stamp_ns, tuple(pose), twist_covariance)
         if stamp_ns in seen:
             yield seen[stamp_ns]
+        yield from closed.get(stamp_ns, ())
