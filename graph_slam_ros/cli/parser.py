@@ -27,8 +27,8 @@ def parser() -> argparse.ArgumentParser:
     whole.add_argument("--version", action="version", version=f"graph_slam_ros {__version__}")
     commands = whole.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
 
-    def command(name: str, run: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=about, description=about)
+    def command(name: str, run: Callable[[argparse.Namespace], int], about: str) -> "_Parser":
+        sub: _Parser = commands.add_parser(name, help=about, description=about)
         sub.set_defaults(run=run)
         return sub
 
@@ -48,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
         command(
             "simulate",
             worlds.simulate,
-            "record a synthetic world with truth: pythonrobotics, manhattan, warehouse, flight",
+            "record a synthetic world with truth: pythonrobotics, manhattan, warehouse, flight; put faults into it",
         )
     )
     _evaluate(command("evaluate", recordings.evaluate, "errors of a run, and whether it knows them; a picture"))
@@ -59,6 +59,14 @@ def parser() -> argparse.ArgumentParser:
 
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line."""
+
+    more: Callable[[], str] | None = None  # what the help ends with, where it takes imports to know it
+
+    def format_help(self) -> str:
+        """The help."""
+        if self.more is not None:
+            self.epilog = f"{self.more()}\n\n{_CODES}"
+        return super().format_help()
 
     def error(self, message: str) -> NoReturn:
         """Refuse the command line."""
@@ -133,8 +141,10 @@ def _convert(sub: argparse.ArgumentParser) -> None:
     _add_reading(sub)
 
 
-def _simulate(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("scenario", metavar="SCENARIO", help="a world, or city, which is a graph")
+def _simulate(sub: "_Parser") -> None:
+    sub.formatter_class = argparse.RawDescriptionHelpFormatter
+    sub.more = _faults
+    sub.add_argument("scenario", metavar="SCENARIO", help="a world, city (a graph), or the file of a graph")
     sub.add_argument(
         "--out", type=Path, required=True, metavar="BAG.mcap|GRAPH.g2o", help="a recording, or by its ending a graph"
     )
@@ -143,6 +153,27 @@ def _simulate(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--poses", type=_count, metavar="N", help="length of the drive, where the world has it")
     sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="an option of the world")
     sub.add_argument("--closures", type=_count, metavar="N", help="so many true loop closures besides, on /closures")
+    sub.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="KIND[:KEY=VALUE,...]",
+        help="see below; several are put in turn",
+    )
+
+
+def _faults() -> str:
+    """Every kind of fault with its options and their defaults."""
+    from graph_slam_ros.simulation.faults import KINDS
+    from graph_slam_ros.simulation.options import options_of
+
+    lines = ["faults, and what of them can be set; what is wrong then is in OUT.faults.csv:"]
+    for name, kind in KINDS.items():
+        lines.append(f"  {name}: {kind.about}")
+        for o in options_of(kind.options):
+            choices = f": {', '.join(o.choices)}" if o.choices else ""
+            lines.append(f"    {o.name}={o.default}  {o.meaning}{choices}")
+    return "\n".join(lines)
 
 
 def _evaluate(sub: argparse.ArgumentParser) -> None:

@@ -12,6 +12,10 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.simulation import flight, manhattan, pythonrobotics, warehouse
 from graph_slam_ros.simulation.bag import write_bag
 from graph_slam_ros.simulation.closures import with_closures
+from graph_slam_ros.simulation.fault_table import WrongLine, WrongMessage, write_table
+from graph_slam_ros.simulation.faults import KINDS, Fault
+from graph_slam_ros.simulation.faulty_graph import faulty_graph
+from graph_slam_ros.simulation.faulty_recording import faulty_recording
 from graph_slam_ros.simulation.options import Option, fill, options_of
 from graph_slam_ros.simulation.pose_graph import CityGraph, city_graph, landmark_graph, write_graph
 from graph_slam_ros.simulation.recording import Recording, measurements
@@ -54,12 +58,18 @@ def simulate(world: str, /, seed: int, **options: Any) -> Recording:
 
 
 __all__ = [
+    "KINDS",
     "WORLDS",
     "CityGraph",
+    "Fault",
     "Option",
     "Recording",
     "World",
+    "WrongLine",
+    "WrongMessage",
     "city_graph",
+    "faulty_graph",
+    "faulty_recording",
     "landmark_graph",
     "measurements",
     "options_of",
@@ -67,4 +77,5 @@ __all__ = [
     "with_closures",
     "write_bag",
     "write_graph",
+    "write_table",
 ]

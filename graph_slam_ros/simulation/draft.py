@@ -1,0 +1,125 @@
+"""What was measured, before it becomes a recording or a graph: what faults are put into, and which of it is wrong then.
+
+Recordings and graphs are made into the same draft, and the draft into either again; a fault knows the draft alone.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.lie import se2
+from graph_slam_ros.simulation.false_closures import Closures
+from graph_slam_ros.slam import Sighting
+from graph_slam_ros.slam.space import Space
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Numbers = tuple[float, ...]
+Measured = Literal["odometry", "sighting", "closure"]
+
+
+@dataclass(frozen=True, slots=True)
+class Wrong:
+    """What is wrong with a measurement.
+
+    Attributes
+    ----------
+    fault : its kind; where several hit one measurement, their kinds with ``+`` between
+    true_id : of a sighting, the landmark that was seen; empty of others
+    """
+
+    fault: str
+    true_id: str = ""
+
+
+@dataclass(slots=True)
+class Draft:
+    """Odometry, sightings and closures of n poses, in order of time.
+
+    Attributes
+    ----------
+    truth : (n, 3) or (n, 7) true poses
+    odometry : the same by dead reckoning
+    twist : (n, d) velocity since the pose before; None where nobody measured it
+    sightings, seen_at : what was seen, and (m,) from which pose
+    landmarks : true places by id
+    closures : of true places; false ones are added
+    places : the poses that closures join
+    wrong : what faults have made wrong, by what was measured and its number; of odometry the later pose's
+    """
+
+    space: Space
+    truth: Array
+    odometry: Array
+    twist: Array | None
+    sightings: list[Sighting]
+    seen_at: Index
+    landmarks: Mapping[str, Numbers]
+    closures: Closures
+    places: Index
+    wrong: dict[tuple[Measured, int], Wrong] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.odometry)
+
+    def pose_at(self, part: float) -> int:
+        """The pose at a part of the whole: 0 the first, 1 the last."""
+        return round(part * (len(self) - 1))
+
+    def true_id(self, number: int) -> str:
+        """The landmark that a sighting is of, whatever it carries by now."""
+        wrong = self.wrong.get(("sighting", number))
+        return wrong.true_id if wrong else self.sightings[number].id
+
+    def spoil(self, number: int, fault: str, sighting: Sighting) -> None:
+        """Put another sighting in the place of one."""
+        before = self.wrong.get(("sighting", number))
+        self.wrong["sighting", number] = Wrong(_both(before, fault), self.true_id(number))
+        self.sightings[number] = sighting
+
+    def spoil_odometry(self, later: Sequence[int], fault: str) -> None:
+        """Say that the motion up to some poses is wrong."""
+        for pose in later:
+            self.wrong["odometry", pose] = Wrong(_both(self.wrong.get(("odometry", pose)), fault))
+
+    def add_closures(self, false: Closures, fault: str) -> None:
+        """Append false closures."""
+        old = self.closures
+        for k in range(len(old), len(old) + len(false)):
+            self.wrong["closure", k] = Wrong(fault)
+        self.closures = Closures(
+            np.concatenate([old.ends, false.ends]),
+            np.concatenate([old.measured, false.measured]),
+            np.concatenate([old.root, false.root]),
+        )
+
+    def seen_from(self, number: int, displaced: Array) -> Sighting:
+        """A sighting as it would have been, noise and all, had the landmark stood elsewhere.
+
+        Parameters
+        ----------
+        displaced : (2,) or (3,) by how much, in world
+        """
+        old, T_world_base = self.sightings[number], self.truth[self.seen_at[number]]
+        n = self.space.dimensions
+        if old.kind in ("position", "pose"):
+            moved = np.array(old.measured)
+            moved[:n] += self.space.turn(tuple(T_world_base)).T @ displaced
+            return replace(old, measured=tuple(moved.tolist()))
+        edge, at = self.space.sightings[old.kind], np.array([[0, len(T_world_base)]])
+        whole = edge.whole(np.array([*old.measured, *(old.T_base_sensor or ())])[None])
+        true = np.array(self.landmarks[self.true_id(number)][:n])
+        before, after = (
+            edge.linearize(np.concatenate([T_world_base, place]), at, whole)[0][0] for place in (true, true + displaced)
+        )
+        moved = old.measured + after - before
+        angles = slice("range" in old.kind, None)
+        moved[angles] = se2.wrap(moved[angles])
+        return replace(old, measured=tuple(moved.tolist()))
+
+
+def _both(before: Wrong | None, fault: str) -> str:
+    return fault if before is None or fault in before.fault.split("+") else f"{before.fault}+{fault}"

@@ -1,0 +1,206 @@
+"""Graphs with faults in them: wrong closures, landmarks that are taken for each other, odometry that slips."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.g2o_writer import graph_lines
+from graph_slam_ros.formats.graph_file import EDGE_TAGS, G2oFile
+from graph_slam_ros.graph import EdgeType, Gaussian, Graph
+from graph_slam_ros.simulation.draft import Draft
+from graph_slam_ros.simulation.false_closures import Closures
+from graph_slam_ros.simulation.fault_table import WrongLine
+from graph_slam_ros.simulation.faults import Fault, put_faults
+from graph_slam_ros.simulation.pose_graph import values_of
+from graph_slam_ros.simulation.recording import Numbers
+from graph_slam_ros.slam import Sighting
+from graph_slam_ros.slam.space import PLANE, SPACE, Space
+
+Array = NDArray[np.float64]
+
+
+def faulty_graph(file: G2oFile, truth: Array, faults: Sequence[Fault], seed: int) -> tuple[G2oFile, list[WrongLine]]:
+    """Put faults into a graph; its initial values stay as they were.
+
+    Poses are taken in order of their ids, as read from a file. Sightings are edges from a pose to a landmark.
+
+    Parameters
+    ----------
+    truth : the stored numbers of all vertices end to end, as ``graph.initial``: of a graph whose truth nobody knows,
+        those of its optimum
+
+    Raises
+    ------
+    GraphSlamError
+        A fault does not fit: it needs closures, odometry or landmarks that are seen often, and there are none.
+    """
+    parts = _Parts(file, truth)
+    draft = parts.draft()
+    put_faults(draft, faults, seed)
+    out, edges = parts.graph_of(draft)
+    text = graph_lines(out, values_of(out.graph, out.graph.initial.values))
+    lines = [number for number, line in enumerate(text, start=1) if line.split()[0] in EDGE_TAGS]
+    labels = np.empty(out.graph.edge_count, dtype=np.int64)
+    for table in out.graph.tables.values():
+        labels[table.id.values] = table.label.values
+    line_of = dict(zip(np.lexsort((np.arange(len(labels)), labels)).tolist(), lines, strict=True))
+    tag_of = {edge: tag for tag, edge in EDGE_TAGS.items()}
+    rows = []
+    for key, wrong in draft.wrong.items():
+        if key in edges:
+            table, row = out.graph.row(edges[key])
+            first, second = (out.ids[v] for v in table.vertices.values[row][:2].tolist())
+            true: int | str = int(wrong.true_id) if wrong.true_id else ""
+            rows.append(WrongLine(line_of[edges[key]], tag_of[table.type], first, second, wrong.fault, true))
+    return out, sorted(rows, key=lambda row: row.line)
+
+
+class _Parts:
+    """A graph's edges by what they are: odometry, sightings, closures, and others, which no fault touches."""
+
+    def __init__(self, file: G2oFile, truth: Array) -> None:
+        graph = file.graph
+        self.file, self.truth = file, truth
+        self.space = space = SPACE if SPACE.pose in graph.kinds else PLANE
+        self.tags = self._landmark_poses()
+        ids = np.asarray(file.ids)
+        is_pose = graph.kind.values == (graph.kinds.index(space.pose) if space.pose in graph.kinds else -1)
+        poses = np.flatnonzero(is_pose & ~np.isin(np.arange(graph.vertex_count), list(self.tags)))
+        self.poses = poses[np.argsort(ids[poses])]
+        if len(self.poses) < 2:
+            raise GraphSlamError("faults: a graph of fewer than two poses")
+        self.place = {vertex: k for k, vertex in enumerate(self.poses.tolist())}
+        self.kinds = {edge: kind for kind, edge in space.sightings.items()} | {space.tag_position: "position"}
+        self.odometry: dict[int, tuple[int, bool]] = {}  # by the later pose: edge, and whether it leads forward
+        self.sightings: list[tuple[int, int, Sighting]] = []  # pose, edge
+        self.closures: list[tuple[int, int, Array, Array]] = []
+        for edge in range(graph.edge_count):
+            self._sort(edge)
+        self.sightings.sort(key=lambda one: one[:2])
+
+    def _landmark_poses(self) -> set[int]:
+        """Vertices that are landmarks though they are poses: what an edge of a class ``landmarks`` leads to."""
+        table = self.file.graph.tables.get(self.space.relative_pose)
+        if table is None or "landmarks" not in self.file.graph.labels:
+            return set()
+        rows = table.label.values == self.file.graph.labels.index("landmarks")
+        return set(table.vertices.values[rows, 1].tolist())
+
+    def _sort(self, edge: int) -> None:
+        table, row = self.file.graph.row(edge)
+        ends, measured = table.vertices.values[row].tolist(), table.measured.values[row]
+        if table.type is self.space.relative_pose and ends[0] in self.place and ends[1] in self.place:
+            first, second = self.place[ends[0]], self.place[ends[1]]
+            if abs(first - second) == 1:
+                self.odometry.setdefault(max(first, second), (edge, first < second))
+            else:
+                self.closures.append((first, second, measured, table.sqrt_information.values[row]))
+        elif table.type in self.kinds and ends[0] in self.place and ends[1] not in self.place:
+            size = table.type.measured_size - len(table.type.tail)
+            on_robot = tuple(measured[size:].tolist()) or None
+            name, covariance = str(self.file.ids[ends[1]]), ()
+            seen = Sighting(name, self.kinds[table.type], tuple(measured[:size].tolist()), covariance, on_robot)
+            self.sightings.append((self.place[ends[0]], edge, seen))
+
+    def draft(self) -> Draft:
+        """What faults are put into: odometry as a chain from the origin, closures so that they lead forward."""
+        space, group = self.space, self.space.group
+        chain: list[Numbers] = [space.identity]
+        for k in range(1, len(self.poses)):
+            step = self._step(k)
+            chain.append(tuple(float(x) for x in group.retract(group.compose(chain[-1], step), (0.0,) * space.dof)))
+        ends = np.array([one[:2] for one in self.closures], dtype=np.int64).reshape(-1, 2)
+        measured = np.reshape([one[2] for one in self.closures], (-1, space.pose.size))
+        root = np.reshape([one[3] for one in self.closures], (-1, space.dof, space.dof))
+        landmarks = {}
+        for vertex, file_id in enumerate(self.file.ids):
+            if vertex not in self.place:
+                landmarks[str(file_id)] = tuple(self._true(vertex).tolist())
+        return Draft(
+            space,
+            np.array([self._true(vertex) for vertex in self.poses.tolist()]),
+            np.array(chain),
+            None,
+            [seen for _, _, seen in self.sightings],
+            np.array([pose for pose, _, _ in self.sightings], dtype=np.int64),
+            landmarks,
+            Closures(ends, measured, root),
+            np.arange(len(self.poses)),
+        )
+
+    def graph_of(self, draft: Draft) -> tuple[G2oFile, dict[tuple[str, int], int]]:
+        """A new graph with the draft's measurements, and its edges by what they measure."""
+        old, group = self.file.graph, self.space.group
+        graph = Graph()
+        for vertex in range(old.vertex_count):
+            kind, at = old.kind_of(vertex), int(old.offset.values[vertex])
+            graph.add_vertex(kind, old.initial.values[at : at + kind.size])
+        vertex_of = {str(file_id): vertex for vertex, file_id in enumerate(self.file.ids)}
+        changed: dict[int, tuple[list[int], Array]] = {}
+        edges: dict[tuple[str, int], int] = {}
+        for k, (edge, forward) in self.odometry.items():
+            edges["odometry", k] = edge
+            if ("odometry", k) in draft.wrong:
+                a, b = (tuple(draft.odometry[p].tolist()) for p in ((k - 1, k) if forward else (k, k - 1)))
+                table, row = old.row(edge)
+                changed[edge] = table.vertices.values[row].tolist(), np.array(group.between(a, b))
+        for k, ((_, edge, _), s) in enumerate(zip(self.sightings, draft.sightings, strict=True)):
+            edges["sighting", k] = edge
+            if ("sighting", k) in draft.wrong:
+                table, row = old.row(edge)
+                ends = table.vertices.values[row].tolist()
+                ends[1] = vertex_of[s.id]
+                changed[edge] = ends, np.array([*s.measured, *(s.T_base_sensor or ())])
+        now: dict[int, int] = {}
+        for edge in range(old.edge_count):
+            table, row = old.row(edge)
+            ends, measured = changed.get(edge, (table.vertices.values[row].tolist(), table.measured.values[row]))
+            now[edge] = graph.add_edge(
+                _fitting(table.type, self.space, graph, ends),
+                ends,
+                measured,
+                Gaussian(table.sqrt_information.values[row]),
+                old.labels[table.label.values[row]],
+            )
+        edges = {key: now[edge] for key, edge in edges.items()}
+        true = len(self.closures)
+        if len(draft.closures) > true:
+            added = graph.add_edges(
+                self.space.relative_pose,
+                self.poses[draft.closures.ends[true:]],
+                draft.closures.measured[true:],
+                Gaussian(draft.closures.root[true:]),
+                "closures",
+            )
+            edges |= {("closure", true + k): edge for k, edge in enumerate(added.tolist())}
+        seen_from = {now[edge]: number for edge, number in self.file.seen_from.items()}
+        return replace(self.file, graph=graph, seen_from=seen_from), edges
+
+    def _true(self, vertex: int) -> Array:
+        graph = self.file.graph
+        at = int(graph.offset.values[vertex])
+        return self.truth[at : at + graph.kind_of(vertex).size]
+
+    def _step(self, later: int) -> Numbers:
+        """Measured by odometry; where there is none, the true one."""
+        group = self.space.group
+        if later not in self.odometry:
+            earlier, this = (tuple(self._true(int(v)).tolist()) for v in self.poses[later - 1 : later + 1])
+            return tuple(float(x) for x in group.between(earlier, this))
+        edge, forward = self.odometry[later]
+        table, row = self.file.graph.row(edge)
+        measured = tuple(table.measured.values[row].tolist())
+        return measured if forward else tuple(float(x) for x in group.inverse(measured))
+
+
+def _fitting(edge: EdgeType, space: Space, graph: Graph, ends: list[int]) -> EdgeType:
+    """The edge's type, unless it leads to another landmark now, of which only points or only poses can be seen so."""
+    if all(graph.kind_of(v) in kinds for v, kinds in zip(ends, edge.accepts, strict=True)):
+        return edge
+    for other in (space.sightings["position"], space.tag_position):
+        if edge in (space.sightings["position"], space.tag_position) and graph.kind_of(ends[1]) in other.accepts[1]:
+            return other
+    raise GraphSlamError(f"{edge.name}: landmarks are points and poses, and cannot be taken for each other")
