@@ -16,7 +16,7 @@ from graph_slam_ros.run import RunRecorder, check_room, is_run, run_config, summ
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.input_config import InputConfig, default_input
 from graph_slam_ros.slam.measurements import from_record
-from graph_slam_ros.warmup import ensure_compiled
+from graph_slam_ros.warmup import warmup
 
 TF_STATIC_TOPIC, TF_TOPIC = "/tf_static", "/tf"
 _OPTIONS = {"odometry": "--odom", "landmarks": "--landmarks"}
@@ -144,7 +144,7 @@ def replay(
     source : a bag, or a run folder: then exactly its events are repeated, nothing is added
     config : default: the run's own, or the defaults
     """
-    ensure_compiled()
+    warmup()
     start, cpu = time.perf_counter(), time.process_time()
     counters = Counters()
     check_room(out, source)

@@ -1,7 +1,9 @@
-"""Compile every kernel once, so that nothing is compiled while a robot drives.
+"""Compile every kernel once, so that nothing is compiled while a robot drives, and load all of them in one order.
 
-They are compiled in a process of their own: a process that compiles a kernel may get other last digits from it than
-those that load it, and a run must repeat byte for byte.
+A run must repeat byte for byte, and last digits depend on what machine code a process has of a formula. So kernels are
+compiled in a process of their own, for one that compiles a kernel may get other digits from it than those that load it.
+And several kernels bring the code of a formula they share, each optimised in its own surroundings: whichever is loaded
+first gives it to all.
 """
 
 import os
@@ -35,7 +37,10 @@ from graph_slam_ros.solver import METHODS, Settings, Solver
 
 
 def warmup() -> float:
-    """Compile what is not compiled yet, and load it; returns the seconds it took."""
+    """Compile what is not compiled yet, and load all; returns the seconds it took.
+
+    Before anything is computed whose bytes are to be repeated.
+    """
     start = time.perf_counter()
     ensure_compiled()
     _use_all()

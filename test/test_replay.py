@@ -5,6 +5,8 @@ import json
 import math
 import re
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -79,6 +81,26 @@ def test_the_same_recording_gives_the_same_bytes_and_another_configuration_other
 
 def test_replay_of_a_runs_own_sequence_gives_its_bytes_again(tmp_path, folder):
     replay(folder, tmp_path / "again")
+    assert contents(tmp_path / "again") == contents(folder)
+
+
+ONE_AFTER_THE_OTHER = """
+import sys
+from pathlib import Path
+from graph_slam_ros.replay import replay
+for source, out in zip(sys.argv[1::2], sys.argv[2::2]):
+    replay(Path(source), Path(out))
+"""
+
+
+def test_what_a_process_has_replayed_before_changes_no_byte(tmp_path, folder):
+    """The short run needs other kernels first."""
+    recorder = RunRecorder(tmp_path / "short", Config())
+    for measurement in (Odometry(10**15, (0.0, 0.0, 0.0), None, "odom"), Control("end"), Control("optimize")):
+        recorder.sink(measurement)
+    recorder.close()
+    runs = [tmp_path / "short", tmp_path / "short_again", folder, tmp_path / "again"]
+    subprocess.run([sys.executable, "-c", ONE_AFTER_THE_OTHER, *map(str, runs)], check=True)
     assert contents(tmp_path / "again") == contents(folder)
 
 
