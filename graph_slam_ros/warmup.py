@@ -6,16 +6,18 @@ And several kernels bring the code of a formula they share, each optimised in it
 first gives it to all.
 """
 
+import contextlib
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numba
 import numpy as np
 
 from graph_slam_ros import graph as graphs
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import (
     HUBER,
     LANDMARK_POSITION,
@@ -36,22 +38,46 @@ from graph_slam_ros.lie.jit import COMPILED
 from graph_slam_ros.solver import METHODS, Settings, Solver
 
 
-def warmup() -> float:
+def warmup(is_told_to_stop: Callable[[], bool] = lambda: False) -> float:
     """Compile what is not compiled yet, and load all; returns the seconds it took.
 
     Before anything is computed whose bytes are to be repeated.
+
+    Parameters
+    ----------
+    is_told_to_stop : asked while kernels are compiled, which may take minutes
+
+    Raises
+    ------
+    GraphSlamError
+        Told to stop; the next warm-up goes on from there.
     """
     start = time.perf_counter()
-    ensure_compiled()
+    if not COMPILED.exists() and not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        _compile(is_told_to_stop)
     _use_all()
     return time.perf_counter() - start
 
 
-def ensure_compiled() -> None:
-    """Compile the kernels, once per installation, into the cache on disk."""
-    if not COMPILED.exists() and not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-        path = os.pathsep.join(filter(None, sys.path))
-        subprocess.run([sys.executable, "-m", __name__], check=True, env=os.environ | {"PYTHONPATH": path})
+def _compile(is_told_to_stop: Callable[[], bool]) -> None:
+    """Once per installation, into the cache on disk."""
+    command, path = [sys.executable, "-m", __name__], os.pathsep.join(filter(None, sys.path))
+    with subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path}, start_new_session=True) as compiler:
+        try:
+            while (code := _ended(compiler)) is None:
+                if is_told_to_stop():
+                    raise GraphSlamError("told to stop before all kernels were compiled")
+        finally:
+            compiler.kill()  # Ctrl-C, which it does not hear itself
+    if code:
+        raise subprocess.CalledProcessError(code, command)
+
+
+def _ended(process: "subprocess.Popen[bytes]") -> int | None:
+    """The exit code, if it ends soon."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        return process.wait(0.1)
+    return None
 
 
 def _use_all() -> None:

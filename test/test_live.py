@@ -208,6 +208,7 @@ def tags(**values):
     [
         (Facts("unconfigured"), "UNCONFIGURED", ""),
         (Facts("inactive"), "INACTIVE", ""),
+        (Facts("finalized"), "FINALIZED", ""),
         (Facts("active", (odom(publishers=()),)), "WAITING", "/odom: nobody publishes this odometry"),
         (Facts("active", (odom(),)), "WAITING", "/odom: /driver publishes it, but nothing has come yet"),
         (Facts("active", (odom(mismatch="best effort"),)), "WAITING", "/odom: best effort"),
@@ -236,6 +237,7 @@ def tags(**values):
 def test_what_is_wrong_before_the_first_estimate_is_named(facts, state, reason):
     verdict = judge(facts, Config())
     assert verdict.state == state
+    assert verdict.level == {"WAITING": health.WARN, "ERROR": health.ERROR}.get(state, health.OK)
     assert ("; ".join(verdict.reasons)).startswith(reason)
     assert not verdict.is_healthy
 

@@ -18,8 +18,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy comes in: thr
 import rclpy
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import UInt64
 
@@ -33,7 +33,7 @@ from graph_slam_ros.ros.live.params import changed, declare_parameters
 from graph_slam_ros.ros.message_class import message_class
 from graph_slam_ros.warmup import warmup
 
-_SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+_SUCCESS, _FAILURE, _ERROR = (getattr(TransitionCallbackReturn, name) for name in ("SUCCESS", "FAILURE", "ERROR"))
 _TICK_S = 0.1
 _AGAIN_S = 5.0
 _STOP_S = 2.0  # what a solve may still take when the node is told to stop
@@ -45,14 +45,18 @@ class GraphSlamNode(LifecycleNode):
 
     Configured, it has read its parameters, compiled its kernels, opened its run folder and has its publishers; active,
     it listens and broadcasts map -> odom.
+
+    Parameters
+    ----------
+    is_told_to_stop : asked while something takes long that may as well not be done
     """
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, is_told_to_stop: Callable[[], bool] = lambda: False, **options: Any) -> None:
         super().__init__("graph_slam", **options)
+        self._is_told_to_stop = is_told_to_stop
         self.config = declare_parameters(self)
         self.add_on_set_parameters_callback(self._on_set)
         self._run: Configured | None = None
-        self._state = "unconfigured"
         self._faults: deque[float] = deque(maxlen=1000)
         self._told: set[str] = set()
         self._verdict = health.Verdict("UNCONFIGURED")
@@ -74,50 +78,57 @@ class GraphSlamNode(LifecycleNode):
             ("clear_closures", lambda run: run.control("clear_closures")),
         ):
             serve_later(self, f"~/{name}", partial(self._serve, start))
+        for service in self.services:
+            service.callback = self._answered(service)
 
     # -- lifecycle ---------------------------------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Check the parameters and files, compile, make the publishers."""
-        return self._transition("inactive", self._configure)
+        return self._transition(self._configure)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listen and broadcast."""
-        return self._transition("active", lambda: self._configured().activate())
+        return self._transition(lambda: self._configured().activate())
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listen no more; what was taken stays."""
-        return self._transition("inactive", lambda: self._configured().deactivate())
+        return self._transition(lambda: self._configured().deactivate())
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Save and forget the run."""
-        return self._transition("unconfigured", self.finish)
+        return self._transition(self.finish)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Save and end."""
-        return self._transition("finalized", self.finish)
+        """Save and end, even where it cannot be saved."""
+        return self._transition(self.finish, _FAILURE)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Whatever failed, the node can be configured again."""
-        return self._transition("unconfigured", self.finish)
+        """Whatever failed, nothing is left of it and the node can be configured again."""
+        return self._transition(self.finish)
 
-    def _transition(self, state: str, action: Callable[[], object]) -> TransitionCallbackReturn:
+    @property
+    def _state(self) -> str:
+        """Of the lifecycle; rclpy has it."""
+        return str(self._state_machine.current_state[1])
+
+    def _transition(
+        self, action: Callable[[], object], failed: TransitionCallbackReturn = _ERROR
+    ) -> TransitionCallbackReturn:
         try:
             action()
         except Exception as error:
             self.get_logger().fatal(
                 said(error) if isinstance(error, GraphSlamError) else f"a fault of ours, {said(error)}"
             )
-            return _FAILURE
-        self._state = state
+            return failed
         return _SUCCESS
 
     def _configure(self) -> None:
         if self._run is None:
-            run = Configured(self)  # first what may be refused
+            self._run = run = Configured(self)  # first what may be refused
             self.get_logger().info("compiling kernels (once per installation)")
-            self.get_logger().info(f"kernels ready after {warmup():.1f} s")
-            self._run = run
+            self.get_logger().info(f"kernels ready after {warmup(self._is_told_to_stop):.1f} s")
             if self.config.output.load_at_start:
                 run.in_passing(run.load())
 
@@ -140,15 +151,17 @@ class GraphSlamNode(LifecycleNode):
     # -- parameters --------------------------------------------------------------------------------------------------
 
     def set_parameters_atomically(self, parameter_list: Any) -> SetParametersResult:
-        """As rclpy's; who misspells a name is told the nearest."""
+        """As rclpy's, but our refusals come first: they name the parameter, and of an unknown one the nearest known.
+
+        A whole number is a number, as it is at the start.
+        """
         try:
-            return super().set_parameters_atomically(parameter_list)
-        except ParameterNotDeclaredException:
-            try:
-                self.config.changed({one.name: one.value for one in parameter_list})
-            except ConfigError as error:
-                return SetParametersResult(successful=False, reason=str(error))
-            raise
+            _, values = changed(self.config, parameter_list, is_configured=self._run is not None)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return super().set_parameters_atomically(
+            [Parameter(one.name, value=values[one.name]) if one.name in values else one for one in parameter_list]
+        )
 
     def _on_set(self, given: Sequence[Any]) -> SetParametersResult:
         """All of them or none, and what may change at work takes effect at its place among the measurements."""
@@ -162,6 +175,23 @@ class GraphSlamNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     # -- the run -----------------------------------------------------------------------------------------------------
+
+    def _answered(self, service: Any) -> Callable[[Any, Any], Any]:
+        """The callback of a service, which answers that nothing was done where it would raise.
+
+        rclpy's own raise where a transition is told by its number and it is not its turn, or where a parameter has a
+        type that there is not; the executor raises that again, and the node would end.
+        """
+        answer = service.callback
+
+        def answered(request: Any, response: Any) -> Any:
+            try:
+                return answer(request, response)
+            except Exception as error:
+                self.get_logger().warn(f"{service.srv_name}: {said(error)}")
+                return service.srv_type.Response()
+
+        return answered
 
     def _serve(self, start: "Callable[[Configured], Future[str]]") -> "Future[str]":
         if self._run is None:
@@ -259,7 +289,7 @@ def main() -> int:
     sys.setswitchinterval(_SWITCH_S)
     try:
         _init()
-        node = GraphSlamNode()
+        node = GraphSlamNode(lambda: told.to_stop)
         executor = _executor()
         executor.add_node(node)
         if node.config.node.autostart and not _started(node, told):
@@ -286,7 +316,7 @@ def _started(node: GraphSlamNode, told: _Told) -> bool:
         if told.to_stop:
             return True
         if trigger() != _SUCCESS:
-            return False
+            return told.to_stop
     return True
 
 

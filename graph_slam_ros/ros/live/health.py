@@ -1,7 +1,7 @@
 """Whether all is well, and if not, why: one verdict with its reasons, from facts that the node gathers.
 
-States: UNCONFIGURED and INACTIVE by lifecycle; WAITING for what is missing; OK; DEGRADED, where the estimate goes on
-but is not what it could be; ERROR, where somebody must act.
+States: UNCONFIGURED, INACTIVE and FINALIZED by lifecycle; WAITING for what is missing; OK; DEGRADED, where the estimate
+goes on but is not what it could be; ERROR, where somebody must act.
 """
 
 import math
@@ -12,7 +12,7 @@ from graph_slam_ros.ros.live.session import Estimate
 from graph_slam_ros.ros.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.slam.config import Config
 
-_LEVELS = {"OK": OK, "WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR, "INACTIVE": OK, "UNCONFIGURED": OK}
+_LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them
 _UNLINKED = ("frame_unknown", "child_frame_unknown")
 
 
@@ -48,7 +48,7 @@ class Facts:
 
     Attributes
     ----------
-    lifecycle : ``unconfigured``, ``inactive`` or ``active``
+    lifecycle : ``unconfigured``, ``inactive``, ``active`` or ``finalized``
     faults : exceptions of callbacks in the last ten seconds
     overflows, failures : messages refused for want of room, and solves that failed, since the last look
     authorities : other nodes that broadcast map -> odom, if somebody does
@@ -88,7 +88,7 @@ class Verdict:
     @property
     def level(self) -> int:
         """Of a DiagnosticStatus."""
-        return _LEVELS[self.state]
+        return _LEVELS.get(self.state, OK)
 
 
 def judge(facts: Facts, config: Config) -> Verdict:

@@ -37,7 +37,7 @@ def declare_parameters(node: Any) -> Config:
 
 
 def changed(config: Config, given: Iterable[Any], *, is_configured: bool) -> tuple[Config, dict[str, Any]]:
-    """The configuration with ROS parameters that are to be set, and those of them that are ours.
+    """The configuration with ROS parameters that are to be set, and those of them that are ours, in their types.
 
     Raises
     ------
@@ -45,10 +45,12 @@ def changed(config: Config, given: Iterable[Any], *, is_configured: bool) -> tup
         One of them may not be changed now, or not to that: none is.
     """
     values = {one.name: one.value for one in given if one.name not in _OTHERS}
+    wanted = config.changed(values)
     live = {p.name for p in parameters(one.name for one in config.sources) if p.live}
     if is_configured and (fixed := sorted(set(values) - live)):
         raise ConfigError(f"{fixed[0]}: can be changed only before the node is configured (deactivate, clean up)")
-    return config.changed(values), values
+    used = dict(flatten(wanted.as_mapping()))
+    return wanted, {name: used[name] for name in values}
 
 
 def _descriptor(p: Parameter) -> ParameterDescriptor:
