@@ -22,11 +22,11 @@ pytest.importorskip("tf2_msgs")
 from executables import executable
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 from vision_msgs.msg import Detection3DArray
@@ -208,10 +208,18 @@ class Robot:
         answer = self.call("set_parameters", SetParameters, SetParameters.Request(parameters=parameters))
         return [(one.successful, one.reason) for one in answer.results]
 
+    def get(self, names):
+        """Values of parameters."""
+        answer = self.call("get_parameters", GetParameters, GetParameters.Request(names=list(names)))
+        return dict(zip(names, map(parameter_value_to_python, answer.values), strict=True))
+
     def change(self, transition, patience_s=PATIENCE_S):
-        """Ask for a transition of the lifecycle by its name; whether it was done."""
+        """Ask for a transition of the lifecycle by its name or number; whether it was done."""
         request = ChangeState.Request()
-        request.transition.label = transition
+        if isinstance(transition, int):
+            request.transition.id = transition
+        else:
+            request.transition.label = transition
         return self.call("change_state", ChangeState, request, patience_s).success
 
     def state(self):

@@ -1,0 +1,507 @@
+"""The node as others handle it: transitions, signals, parameters, services; in turn, out of turn, at any moment."""
+
+import json
+import math
+import random
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from lifecycle_msgs.msg import Transition
+from live_drive import TAGS, Drive, distance, earlier_run
+from live_nodes import ENVIRONMENT, lenient, node, often, own_domain, replayed, results, robot, until
+from messages import detection, detections, pose
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from vision_msgs.msg import Detection3DArray
+
+from graph_slam_ros.formats.ingest import read_ingest
+from graph_slam_ros.run import check_room
+from graph_slam_ros.slam import Control
+from graph_slam_ros.slam.config import parameters
+from graph_slam_ros.slam.measurements import from_record
+
+SERVICES = "save", "load", "reset", "pause", "resume", "optimize", "clear_closures"
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch):
+    """Of each test its own: what is left of others says nothing here."""
+    with own_domain() as number:
+        monkeypatch.setitem(ENVIRONMENT, "ROS_DOMAIN_ID", number)
+        yield
+
+
+def numbers(folder):
+    return json.loads((folder / "run.json").read_text())
+
+
+def accepted(folder):
+    """The ingest sequence of a run."""
+    return [from_record(record) for record in read_ingest(folder, [])]
+
+
+def is_repeated(run, tmp_path):
+    """Whether replay of a run gives its bytes."""
+    place = tmp_path / f"of_{run.name}"
+    place.mkdir()
+    return replayed(run, place) == results(run)
+
+
+def off_by(r, drive):
+    """How far the newest pose is from where the robot was then, which is where it is but for a step."""
+    at = r.heard["pose"][-1].pose.pose.position
+    return distance((at.x, at.y), drive.truth)
+
+
+# -- lifecycle ---------------------------------------------------------------------------------------------------------
+
+TURNS = {
+    "unconfigured": {"configure": "inactive"},
+    "inactive": {"activate": "active", "cleanup": "unconfigured"},
+    "active": {"deactivate": "inactive"},
+}
+NUMBERS = {
+    "configure": Transition.TRANSITION_CONFIGURE,
+    "activate": Transition.TRANSITION_ACTIVATE,
+    "deactivate": Transition.TRANSITION_DEACTIVATE,
+    "cleanup": Transition.TRANSITION_CLEANUP,
+    "dance": 99,
+    "": 0,
+}
+
+
+def managed(folder, *parameters):
+    """A node that waits for its transitions."""
+    return node(f"output.folder:={folder}", "inputs.reliable:=true", "node.autostart:=false", *parameters)
+
+
+def weight(process):
+    """(resident memory in MiB, open files, threads) of a process."""
+    of = Path("/proc") / str(process.pid)
+    status = dict(line.split(":", 1) for line in (of / "status").read_text().splitlines())
+    return int(status["VmRSS"].split()[0]) / 1024.0, len(list((of / "fd").iterdir())), int(status["Threads"])
+
+
+def test_a_life_of_many_transitions_leaves_nothing_behind(tmp_path):
+    times, warm = often(20), 5
+    with managed(tmp_path / "run") as n, robot(hears=("pose", "path", "/tf", "/diagnostics")) as r:
+        drive, weights = Drive(), []
+        for _ in range(warm + times):
+            assert r.change("configure")
+            assert r.change("activate")
+            r.heard["pose"].clear()
+            until(lambda: len(r.heard["pose"]) > 3, drive.pace(r), "poses")
+            assert r.change("deactivate")
+            drive.go(r, 3)
+            assert r.change("cleanup")
+            weights.append(weight(n.process))
+        assert r.state() == "unconfigured"
+        assert n.stop()[0] == 0
+    assert "Traceback" not in n.said
+    memory, files, threads = zip(*weights[warm:], strict=True)
+    assert memory[-1] - memory[0] < 5.0 + 0.05 * times, memory
+    assert max(files) <= files[0], files
+    assert max(threads) <= threads[0], threads
+    last = warm + times - 1
+    assert {run.name for run in tmp_path.iterdir()} == {"run", *(f"run-{last - k}" for k in range(5))}
+
+
+def test_a_transition_out_of_turn_is_refused_by_name_and_by_number_and_the_node_is_as_it_was(tmp_path):
+    with managed(tmp_path / "run") as n, robot(hears=("/diagnostics",)) as r:
+        rng, state = random.Random(5), "unconfigured"
+        for _ in range(often(30)):
+            wanted = rng.choice(list(NUMBERS))
+            done = r.change(wanted if rng.random() < 0.5 else NUMBERS[wanted])
+            assert done == (wanted in TURNS[state]), (state, wanted)
+            state = TURNS[state].get(wanted, state)
+            assert r.state() == state
+            answer = r.call(rng.choice(("pause", "resume", "optimize", "clear_closures")))
+            assert answer.success == (state != "unconfigured"), (state, answer.message)
+        for wanted in {"active": ("deactivate", "cleanup"), "inactive": ("cleanup",)}.get(state, ()):
+            assert r.change(wanted)
+        for name in SERVICES:
+            answer = r.call(name)
+            assert (answer.success, answer.message) == (False, "not active: the node is unconfigured"), name
+        assert r.change("configure")
+        assert r.change("activate")
+        r.until_it_says("OK", spin=Drive().pace(r))
+        assert n.stop()[0] == 0
+    assert "Traceback" not in n.said
+
+
+def test_what_cannot_be_configured_or_activated_leaves_nothing_and_can_be_once_it_is_mended(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "letter").write_text("mine")
+    with managed(tmp_path / "run") as n, robot(hears=("/diagnostics",)) as r:
+
+        def fails(transition):
+            assert not r.change(transition)
+            assert r.state() == "unconfigured"
+
+        fails("configure")
+        (tmp_path / "run" / "letter").unlink()
+        assert r.set({"detections.type": "apriltag_msgs/msg/AprilTagDetectionArray"}) == (True, "")
+        fails("configure")
+        assert r.set({"detections.type": "vision_msgs/msg/Detection3DArray", "odom.topic": "not a/topic"}) == (True, "")
+        assert r.change("configure")
+        fails("activate")
+        assert r.set({"odom.topic": "odom"}) == (True, ""), "it is unconfigured"
+        r.until_it_says("UNCONFIGURED")
+        before = weight(n.process)[1:]
+        assert r.change("configure")
+        assert r.change("activate")
+        r.until_it_says("OK", spin=Drive().pace(r))
+        assert r.change("deactivate")
+        assert r.change("cleanup")
+        assert weight(n.process)[1:] <= before, "open files and threads"
+        assert n.stop()[0] == 0
+    for why in ("not empty and not an earlier run; nothing was written", "apriltag_msgs is not installed here"):
+        assert why in n.said
+    assert "Traceback" not in n.said
+
+
+def test_a_run_that_cannot_be_saved_ends_with_its_cleanup_and_another_may_begin(tmp_path):
+    with managed(tmp_path / "run") as n, robot(hears=("pose", "/diagnostics")) as r:
+        for is_last in (False, True):
+            assert r.change("configure")
+            assert r.change("activate")
+            r.heard["pose"].clear()
+            until(lambda: r.heard["pose"], Drive().pace(r), "pose")
+            if not is_last:
+                shutil.rmtree(tmp_path / "run")
+                (tmp_path / "run").write_text("in its place")
+                assert r.change("deactivate")
+                assert not r.change("cleanup")
+                assert r.state() == "unconfigured"
+                (tmp_path / "run").unlink()
+        assert r.change("shutdown"), "from whatever state"
+        assert numbers(tmp_path / "run")["keyframes"] > 0
+        r.until_it_says("FINALIZED")
+        assert not r.change("configure")
+        assert not r.call("save").success
+        assert n.stop()[0] == 0
+    assert f"{tmp_path / 'run'}/graph.g2o.new: Not a directory" in n.said
+    assert "Traceback" not in n.said
+
+
+# -- signals -----------------------------------------------------------------------------------------------------------
+
+SIGNALS = signal.SIGINT, signal.SIGTERM
+MEANWHILE = "", "save", "optimize", "reset", "clear_closures"
+
+
+@pytest.mark.parametrize("seed", range(often(5)))
+def test_told_to_stop_at_any_moment_of_a_drive_it_saves_what_it_has_and_ends_with_0(tmp_path, seed):
+    rng, meanwhile = random.Random(seed), MEANWHILE[seed % len(MEANWHILE)]
+    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=("pose",)) as r:
+        r.wait_for_node()
+        drive = Drive()
+        until(lambda: r.heard["pose"], drive.pace(r), "pose")
+        drive.go(r, rng.randrange(5, 200), every=3)
+        if meanwhile:
+            r.ask(meanwhile)
+        r.spin(rng.choice((0.0, 0.01, 0.03)))
+        since = time.monotonic()
+        n.process.send_signal(rng.choice(SIGNALS))
+        until(lambda: not n.is_alive, lambda s: (drive.step(r), r.spin(s / 4)), "end")
+        took_s = time.monotonic() - since
+        code, said = n.ended()
+    assert code == 0, said
+    assert took_s < lenient(3.0), (took_s, meanwhile)
+    assert "Traceback" not in said
+    for run in list(tmp_path.glob("run*")):
+        assert not accepted(run) or is_repeated(run, tmp_path), (run.name, meanwhile)
+
+
+def hears_signals(process):
+    """Whether SIGTERM is caught: Python does that only where it is told to."""
+    status = dict(line.split(":", 1) for line in (Path("/proc") / str(process.pid) / "status").read_text().splitlines())
+    return bool(int(status["SigCgt"], 16) >> (signal.SIGTERM - 1) & 1)
+
+
+@pytest.mark.parametrize("seed", range(often(5)))
+def test_told_to_stop_at_any_moment_of_its_start_it_ends_with_0_and_may_begin_again(tmp_path, seed):
+    rng = random.Random(seed)
+    with node(f"output.folder:={tmp_path / 'run'}") as n:
+        until(lambda: hears_signals(n.process), time.sleep, "handler of signals")
+        time.sleep(rng.uniform(0.0, 1.2))
+        code, took_s = n.stop(rng.choice(SIGNALS))
+    assert code == 0, n.said
+    assert took_s < lenient(3.0)
+    assert "Traceback" not in n.said
+    check_room(tmp_path / "run")
+
+
+def test_told_to_stop_while_kernels_are_compiled_it_does_not_wait_for_them(tmp_path, monkeypatch):
+    monkeypatch.setitem(ENVIRONMENT, "GRAPH_SLAM_CACHE", str(tmp_path / "cache"))
+    with node(f"output.folder:={tmp_path / 'run'}") as n:
+        until(lambda: list(tmp_path.glob("cache/**/*.nbi")), time.sleep, "first compiled kernel", 60.0)
+        code, took_s = n.stop(signal.SIGTERM)
+    assert code == 0, n.said
+    assert took_s < lenient(3.0)
+    assert "Traceback" not in n.said
+    check_room(tmp_path / "run")
+
+
+def test_told_to_stop_while_a_long_run_is_loaded_it_leaves_what_was_taken_until_then(tmp_path):
+    earlier_run(tmp_path / "life", 5_000)
+    parameters = f"output.folder:={tmp_path / 'run'}", "output.load:=life", "output.load_at_start:=true"
+    with node(*parameters) as n, robot(hears=("/diagnostics",)) as r:
+        until(lambda: r.graph().get("keyframes", 0) > 20, r.spin, "keyframe of the long run")
+        code, took_s = n.stop()
+    assert code == 0, n.said
+    assert took_s < lenient(3.0)
+    assert "a solve takes too long to wait for: replay the run folder for its results" in n.said
+    assert "Traceback" not in n.said
+    assert 20 < len(accepted(tmp_path / "run")) < 5_000
+
+
+# -- parameters --------------------------------------------------------------------------------------------------------
+
+LIVE = {p.name: p for p in parameters() if p.live}
+FIXED = [p for p in parameters() if not p.live]
+
+
+def valid(p, rng):
+    """Another value."""
+    if p.choices or p.type is bool:
+        return rng.choice(p.choices or (False, True))
+    if p.type is str:
+        return f"run-{rng.randrange(9)}"
+    near = rng.uniform(0.5, 1.5) * (p.default or 1)
+    return max(int(near), int(p.low)) if p.type is int else near
+
+
+def hostile(rng):
+    """(name, value, what the refusal says besides the name)"""
+    p, fixed = rng.choice(list(LIVE.values())), rng.choice(FIXED)
+    number = rng.choice([p for p in LIVE.values() if p.type is float])
+    return rng.choice(
+        [
+            (p.name[:-1], valid(p, rng), f"did you mean '{p.name}'?"),
+            (p.name + "_", valid(p, rng), f"did you mean '{p.name}'?"),
+            (p.name, [1.0, 2.0], "is not"),
+            (p.name, [b"\x00"], "is not"),
+            (number.name, "0.1", "is not a number"),
+            (number.name, True, "is not a number"),
+            (number.name, -1.0, f"is not in {number.range_text()}"),
+            (number.name, 10**10, f"is not in {number.range_text()}"),
+            (number.name, math.nan, "is not finite"),
+            (number.name, math.inf, "is not finite"),
+            (fixed.name, fixed.default, "can be changed only before the node is configured"),
+            ("output.folder", "/elsewhere", "can be changed only before the node is configured"),
+        ]
+    )
+
+
+def test_of_parameters_that_are_set_together_all_or_none_change_and_the_run_repeats_with_them(tmp_path):
+    rng, done = random.Random(3), 0
+    with (
+        node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n,
+        robot(hears=("pose", "/diagnostics")) as r,
+    ):
+        r.wait_for_node()
+        drive, now = Drive(), {name: p.default for name, p in LIVE.items()}
+        until(lambda: r.heard["pose"], drive.pace(r), "pose")
+        for _ in range(often(50)):
+            wanted = {p.name: valid(p, rng) for p in rng.sample(list(LIVE.values()), rng.randrange(1, 5))}
+            culprit, value, why = hostile(rng) if rng.random() < 0.6 else ("", None, "")
+            asked = list((wanted | {culprit: value} if culprit else wanted).items())
+            rng.shuffle(asked)
+            if rng.random() < 0.7:
+                said = r.set(dict(asked))
+                assert said[0] == (not culprit), (asked, said)
+                answers = {culprit: said} if culprit else {}
+                now, done = (now, done) if culprit else (now | wanted, done + 1)
+            else:
+                answers = dict(zip(dict(asked), r.set(dict(asked), together=False), strict=True))
+                assert all(answers[name][0] == (name != culprit) for name in answers), (asked, answers)
+                taken = {name: value for name, value in asked if name != culprit}
+                now, done = now | taken, done + len(taken)
+            if culprit:
+                reason = answers[culprit][1]
+                assert culprit in reason and why in reason, (value, reason)
+            assert r.get(LIVE) == now
+            drive.go(r, 5, every=2)
+        assert r.set({name: p.default for name, p in LIVE.items()}) == (True, "")
+        r.until_it_says("OK", spin=drive.pace(r))
+        r.settle()
+        assert off_by(r, drive) < 1.0
+        assert n.stop()[0] == 0
+    assert "Traceback" not in n.said
+    assert [m.event for m in accepted(tmp_path / "run") if isinstance(m, Control)].count("set") == done + 1
+    assert is_repeated(tmp_path / "run", tmp_path)
+
+
+def test_a_node_that_is_not_configured_takes_what_is_valid_but_neither_folder_nor_inputs(tmp_path):
+    with managed(tmp_path / "run") as n, robot(hears=("pose",)) as r:
+        for name, value in (("output.folder", str(tmp_path / "elsewhere")), ("inputs.names", "odom")):
+            done, why = r.set({"frames.map": "world", name: value})
+            assert (done, name in why) == (False, True), why
+        assert r.set({"frames.map": "world", "tf.max_speed_m_s": 2}) == (True, ""), "a whole number is a number"
+        assert r.get(["frames.map", "tf.max_speed_m_s", "output.folder"]) == {
+            "frames.map": "world",
+            "tf.max_speed_m_s": 2.0,
+            "output.folder": str(tmp_path / "run"),
+        }
+        assert r.change("configure")
+        assert r.change("activate")
+        until(lambda: r.heard["pose"], Drive().pace(r), "pose")
+        assert r.heard["pose"][0].header.frame_id == "world"
+        assert n.stop()[0] == 0
+    assert [run.name for run in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_parameter_without_value_or_of_no_type_is_refused_and_the_node_goes_on():
+    with node("output.folder:=''") as n, robot(hears=("/diagnostics",)) as r:
+        r.wait_for_node()
+        for kind in (0, 42, 255):
+            nothing = [Parameter(name="tf.publish_tf", value=ParameterValue(type=kind))]
+            request = SetParametersAtomically.Request(parameters=nothing)
+            assert not r.call("set_parameters_atomically", SetParametersAtomically, request).result.successful
+            answer = r.call("set_parameters", SetParameters, SetParameters.Request(parameters=nothing))
+            assert not any(one.successful for one in answer.results)
+        assert r.get(["tf.publish_tf"]) == {"tf.publish_tf": True}
+        r.until_it_says("OK", spin=Drive().pace(r))
+        assert n.stop()[0] == 0
+
+
+# -- services ----------------------------------------------------------------------------------------------------------
+
+
+def test_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(tmp_path):
+    hears = "pose", "/tf", "odometry", "/diagnostics", "landmarks"
+    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=hears) as r:
+        r.wait_for_node()
+        drive = Drive()
+        drive.go(r, 120, every=3)
+        assert r.call("reset").success
+        assert r.call("load").success
+        r.settle()
+        assert {m.text for m in r.heard["landmarks"][-1].markers if m.text} == set(TAGS)
+        for heard in r.heard.values():
+            heard.clear()
+        elsewhere = Drive(drive.stamp_ns + 10**9, truth=(1.0, 2.0, 2.5))
+        elsewhere.sees = False
+        unknown = "where the robot is in the loaded map is not known yet"
+        r.until_it_says("DEGRADED", unknown, spin=elsewhere.pace(r))
+        elsewhere.go(r, 40, every=2)
+        r.until_it_says("DEGRADED", unknown, spin=elsewhere.pace(r))
+        assert not (r.heard["pose"] or r.heard["tf"] or r.heard["odometry"])
+        elsewhere.sees = True
+        until(lambda: r.heard["pose"] and r.heard["tf"] and r.heard["odometry"], elsewhere.pace(r), "place in the map")
+        r.until_it_says("OK", spin=elsewhere.pace(r))
+        assert off_by(r, elsewhere) < 0.5
+        assert r.graph()["landmarks"] == len(TAGS)
+        assert n.stop()[0] == 0
+    assert is_repeated(tmp_path / "run", tmp_path)
+
+
+def test_reset_saves_first_and_of_what_it_saved_the_last_five_are_kept(tmp_path):
+    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=("pose",)) as r:
+        r.wait_for_node()
+        drive = Drive()
+        for _ in range(7):
+            r.heard["pose"].clear()
+            drive.go(r, 15, every=3)
+            until(lambda: len(r.heard["pose"]) > 3, drive.pace(r), "poses")
+            answer = r.call("reset")
+            assert (answer.success, answer.message) == (True, str(tmp_path / "run"))
+        assert n.stop()[0] == 0
+    kept = {int(run.name.removeprefix("run-")): run for run in tmp_path.glob("run-*")}
+    assert sorted(kept) == [3, 4, 5, 6, 7]
+    for run in kept.values():
+        assert numbers(run)["keyframes"] > 3
+        assert is_repeated(run, tmp_path)
+
+
+def test_while_it_is_paused_it_takes_nothing_and_its_transform_goes_on(tmp_path):
+    with (
+        node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n,
+        robot(hears=("pose", "/tf", "/diagnostics")) as r,
+    ):
+        r.wait_for_node()
+        drive = Drive()
+        until(lambda: r.heard["pose"] and r.heard["tf"], drive.pace(r), "pose and transform")
+        r.settle()
+        assert r.call("pause").message == "paused"
+        r.until_it_says("DEGRADED", "paused")
+        before = r.graph()["keyframes"]
+        r.heard["tf"].clear()
+        drive.go(r, 30, every=2)
+        until(lambda: len(r.heard["tf"]) > 5, drive.pace(r), "transforms")
+        r.until_it_says("DEGRADED", "paused", spin=drive.pace(r))
+        assert r.graph()["keyframes"] == before
+        assert r.call("optimize").success
+        assert r.call("resume").message == "takes measurements"
+        until(lambda: r.graph()["keyframes"] > before + 5, drive.pace(r), "keyframes")
+        r.until_it_says("OK", spin=drive.pace(r))
+        assert r.graph()["segments"] == 1, "odometry of later tells what was missed"
+        assert n.stop()[0] == 0
+    counted = numbers(tmp_path / "run")["counters"]
+    assert counted["odom"]["paused"] > 30
+    assert counted["detections"]["paused"] > 10
+    assert is_repeated(tmp_path / "run", tmp_path)
+
+
+def closure(stamp_ns, earlier_ns, x):
+    """The base of an earlier time, seen from now so far ahead."""
+    return detections(detection(pose(x), np.eye(6) * 1e-6, str(earlier_ns)), stamp_ns=stamp_ns)
+
+
+def test_closures_bend_the_path_until_they_are_cleared_and_optimize_says_how_much_it_solved(tmp_path):
+    kind = "inputs.names:=odom closures", "closures.type:=vision_msgs/msg/Detection3DArray", "closures.use:=closure"
+    with (
+        node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", *kind) as n,
+        robot(hears=("pose", "/diagnostics"), sends=("/odom",)) as r,
+    ):
+        r.wait_for_node()
+        found = r.publisher("closures", Detection3DArray)
+        until(found.get_subscription_count, r.spin, "subscriber of closures")
+        drive = Drive(turn=0.0)
+        drive.sees = False
+        begin_ns = drive.stamp_ns
+        until(lambda: drive.steps > 60 and r.heard["pose"], drive.pace(r), "drive")
+        r.settle()
+        straight = r.heard["pose"][-1].pose.pose.position.x
+        found.publish(closure(drive.stamp_ns, begin_ns, -straight / 2))
+        until(lambda: r.heard["pose"][-1].pose.pose.position.x < 0.8 * straight, drive.pace(r), "correction")
+        answer = r.call("clear_closures")
+        assert answer.success
+        until(lambda: off_by(r, drive) < 0.2, drive.pace(r), "straight path again")
+        answer = r.call("optimize")
+        r.until_it_says("OK", spin=drive.pace(r))
+        assert answer.success
+        assert 20 <= int(answer.message.removesuffix(" keyframes")) <= r.graph()["keyframes"]
+        assert n.stop()[0] == 0
+    assert is_repeated(tmp_path / "run", tmp_path)
+
+
+@pytest.mark.parametrize("use, segments", [("segment", 2), ("prior", 1)])
+def test_a_pose_that_somebody_gives_begins_a_segment_or_is_weighed(tmp_path, use, segments):
+    with (
+        node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", f"initialpose.use:={use}") as n,
+        robot(hears=("pose", "/diagnostics")) as r,
+    ):
+        r.wait_for_node()
+        given = r.publisher("initialpose", PoseWithCovarianceStamped)
+        until(given.get_subscription_count, r.spin, "subscriber of initialpose")
+        drive = Drive()
+        drive.sees = False
+        until(lambda: r.heard["pose"], drive.pace(r), "pose")
+        said = PoseWithCovarianceStamped()
+        said.header.frame_id = "map"
+        said.pose.pose.position.x, said.pose.pose.position.y, said.pose.pose.orientation.w = 20.0, -7.0, 1.0
+        said.pose.covariance = (1e-4 * np.eye(6)).ravel()
+        drive.truth = 20.0, -7.0, 0.0
+        given.publish(said)
+        until(lambda: off_by(r, drive) < 1.0, drive.pace(r), "pose where it was told to be")
+        r.until_it_says("OK", spin=drive.pace(r))
+        assert r.graph()["segments"] == segments
+        assert n.stop()[0] == 0
+    assert is_repeated(tmp_path / "run", tmp_path)
