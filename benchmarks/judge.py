@@ -55,3 +55,24 @@ def _of_sightings(problem: Problem, poses: Array, landmarks: Array, error_map: s
 
 def _squared(edges: Edges, residuals: Array) -> float:
     return float(np.square(np.einsum("nij,nj->ni", edges.root, residuals)).sum())
+
+
+def position_error(poses: Array, truth: Array) -> float:
+    """Root mean square distance of positions after the rigid motion that fits best, without scale (Umeyama 1991)."""
+    n = 2 if poses.shape[1] == 3 else 3
+    here, there = (at[:, :n] - at[:, :n].mean(axis=0) for at in (poses, truth))
+    u, _, vt = np.linalg.svd(here.T @ there)
+    signs = np.ones(n)
+    signs[-1] = np.sign(np.linalg.det(u @ vt))
+    return float(np.sqrt(np.square(here @ (u * signs) @ vt - there).sum(axis=1).mean()))
+
+
+def fits(edges: Edges, poses: Array) -> Array:
+    """Chi2 (n,) of each relative pose, in our error map."""
+    group = se2 if poses.shape[1] == 3 else se3
+    i, j = (tuple(poses[ends].T) for ends in edges.ends.T)
+    error = group.between(tuple(edges.measured.T), group.between(i, j))
+    if group is se3:
+        error = (*error[:3], *so3.log(se3.rotation(error)))
+    whitened = np.einsum("nij,nj->ni", edges.root, np.stack(error, axis=1))
+    return np.asarray(np.square(whitened).sum(axis=1))

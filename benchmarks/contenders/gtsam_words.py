@@ -6,6 +6,7 @@ the tangent space of a pose in space, we after it.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import gtsam
 import numpy as np
@@ -14,6 +15,8 @@ from benchmarks.problem import Array, Edges, Problem, polar, triangular
 
 _ANCHOR = 1e-3  # sigma [m, rad] of the prior on the first pose, which fixes the gauge and is met exactly
 _ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
+
+Loss: TypeAlias = gtsam.noiseModel.mEstimator.Base
 
 
 def landmark(index: int) -> int:
@@ -38,11 +41,15 @@ def numbers(of: gtsam.Pose2 | gtsam.Pose3) -> Array:
 
 
 def prepared(problem: Problem) -> Problem:
-    """Landmarks by bearing and range, and the noise of poses in space in GTSAM's order, triangular again."""
-    relative = problem.relative
-    if not problem.planar:
-        relative = replace(relative, root=triangular(relative.root[:, :, _ROTATION_FIRST]))
-    return replace(problem, relative=relative, sightings=polar(problem.sightings))
+    """Landmarks by bearing and range, and relative poses as GTSAM takes them."""
+    return replace(problem, relative=prepared_edges(problem.relative), sightings=polar(problem.sightings))
+
+
+def prepared_edges(relative: Edges) -> Edges:
+    """Relative poses with the noise of those in space in GTSAM's order, triangular again."""
+    if relative.measured.shape[1] == 3:
+        return relative
+    return replace(relative, root=triangular(relative.root[:, :, _ROTATION_FIRST]))
 
 
 def add_anchor(graph: gtsam.NonlinearFactorGraph, at: Array) -> None:
@@ -51,18 +58,22 @@ def add_anchor(graph: gtsam.NonlinearFactorGraph, at: Array) -> None:
     graph.add(prior(0, pose(at), gtsam.noiseModel.Isotropic.Sigma(dof, _ANCHOR)))
 
 
-def add_relative(graph: gtsam.NonlinearFactorGraph, relative: Edges) -> None:
-    """Relative poses of a prepared problem."""
+def add_relative(graph: gtsam.NonlinearFactorGraph, relative: Edges, loss: Loss | None = None) -> None:
+    """Relative poses of a prepared problem, all under a robust loss where one is given."""
     between = gtsam.BetweenFactorPose2 if relative.measured.shape[1] == 3 else gtsam.BetweenFactorPose3
     for (i, j), measured, root in zip(relative.ends.tolist(), relative.measured.tolist(), relative.root, strict=True):
-        graph.add(between(i, j, pose(measured), gtsam.noiseModel.Gaussian.SqrtInformation(root)))
+        graph.add(between(i, j, pose(measured), _noise(root, loss)))
 
 
-def add_sightings(graph: gtsam.NonlinearFactorGraph, seen: Edges) -> None:
-    """Sightings of a prepared problem."""
+def add_sightings(graph: gtsam.NonlinearFactorGraph, seen: Edges, loss: Loss | None = None) -> None:
+    """Sightings of a prepared problem, as ``add_relative``."""
     for (i, j), (bearing, distance), root in zip(seen.ends.tolist(), seen.measured.tolist(), seen.root, strict=True):
-        noise = gtsam.noiseModel.Gaussian.SqrtInformation(root)
-        graph.add(gtsam.BearingRangeFactor2D(i, landmark(j), gtsam.Rot2(bearing), distance, noise))
+        graph.add(gtsam.BearingRangeFactor2D(i, landmark(j), gtsam.Rot2(bearing), distance, _noise(root, loss)))
+
+
+def _noise(root: Array, loss: Loss | None) -> gtsam.noiseModel.Base:
+    noise = gtsam.noiseModel.Gaussian.SqrtInformation(root)
+    return noise if loss is None else gtsam.noiseModel.Robust.Create(loss, noise)
 
 
 def estimate(values: gtsam.Values, poses: int, landmarks: int, planar: bool) -> tuple[Array, Array]:
