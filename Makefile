@@ -9,6 +9,7 @@
 # lint, format  style and types: tell, mend
 # lock          write requirements.txt and constraints-oldest.txt from setup.py; LOCK=--upgrade takes newer versions
 # bench         measure ours against GTSAM, g2o and python-graphslam into docs/benchmarks.md and accuracy.md; hours
+# robust        how ours and peers bear false closures and wrong ids, into docs/robustness.md; two hours, resumed where it was
 # clean         remove what these made
 
 PYTHON ?= python3
@@ -27,7 +28,7 @@ ifeq ($(SYSTEM_ROS),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: install demo test soak colcon test-oldest lint format lock bench clean
+.PHONY: install demo test soak colcon test-oldest lint format lock bench robust clean
 .DELETE_ON_ERROR:
 
 install: $(VENV)/interfaces.stamp $(VENV)/kernels.stamp
@@ -126,6 +127,10 @@ $(VENV)-bench-g2o/stamp: benchmarks/requirements-g2o.txt
 
 bench: $(VENV)-bench/stamp $(VENV)-bench-g2o/stamp
 	$(VENV)-bench/bin/python -m benchmarks
+
+robust: $(VENV)-bench/stamp
+	$(VENV)-bench/bin/python -m benchmarks.robust --jobs 2 --keep benchmarks/results/robust --json benchmarks/results/robust.json
+	$(VENV)-bench/bin/python -m benchmarks.table benchmarks/results/robust.json
 
 lock:
 	$(PYTHON) -m venv $(VENV)-lock

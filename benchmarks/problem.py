@@ -220,6 +220,51 @@ def _in_time_order(name: str, file: "G2oFile") -> Problem:
     return Problem(name, stored(poses, kind.size), stored(points, 2), relative, sightings, left_out)
 
 
+def landmark_problem(name: str, graph: "Graph", poses: Array) -> Problem:
+    """What the pipeline made of a drive in the plane, without its anchor; ranges and bearings become positions.
+
+    Parameters
+    ----------
+    poses : (n, 3) of all keyframes
+    """
+    from graph_slam_ros.graph import LANDMARK_POSITION, RANGE_BEARING, RELATIVE_POSE, SE2
+
+    index = np.arange(graph.vertex_count)
+    for is_pose in (True, False):
+        of_kind = (graph.kind.values == graph.kinds.index(SE2)) == is_pose
+        index[of_kind] = np.arange(of_kind.sum())
+    several = [_edges(graph, LANDMARK_POSITION, index)] if LANDMARK_POSITION in graph.tables else []
+    if RANGE_BEARING in graph.tables:
+        several.append(_cartesian(_edges(graph, RANGE_BEARING, index)))
+    seen = joined(*several)
+    relative = _edges(graph, RELATIVE_POSE, index)
+    in_time, seen_in_time = (
+        np.argsort(relative.ends.max(axis=1), kind="stable"),
+        np.argsort(seen.ends[:, 0], kind="stable"),
+    )
+    landmarks = np.zeros((int(seen.ends[:, 1].max(initial=-1)) + 1, 2))
+    return Problem(name, poses, landmarks, relative[in_time], seen[seen_in_time])
+
+
+def _cartesian(seen: Edges) -> Edges:
+    """Sightings by range, bearing and the sensor's pose as positions, their information carried over to first order."""
+    from graph_slam_ros.lie import se2
+
+    distance, bearing, *sensor = seen.measured.T
+    c, s = np.cos(bearing), np.sin(bearing)
+    polar_by_sensor = np.stack([np.stack([c, s], -1), np.stack([-s / distance, c / distance], -1)], axis=1)
+    turn = np.cos(sensor[2]), np.sin(sensor[2])
+    sensor_by_base = np.stack([np.stack([turn[0], turn[1]], -1), np.stack([-turn[1], turn[0]], -1)], axis=1)
+    measured = np.column_stack(se2.act(tuple(sensor), (distance * c, distance * s)))
+    return Edges(seen.ends, measured, triangular(seen.root @ polar_by_sensor @ sensor_by_base))
+
+
+def joined(*several: Edges) -> Edges:
+    """The edges of all."""
+    ends, measured, root = (np.concatenate([getattr(e, key) for e in several]) for key in ("ends", "measured", "root"))
+    return Edges(ends, measured, root)
+
+
 def _edges(graph: "Graph", edge_type: "EdgeType", index: Index) -> Edges:
     table = graph.tables[edge_type]
     columns = (table.vertices, table.measured, table.sqrt_information)

@@ -1,6 +1,6 @@
 """Results as JSON and as Markdown tables; a table has its place in a document between two markers.
 
-``python -m benchmarks.table RESULTS.json ...`` puts earlier results into docs/benchmarks.md or docs/accuracy.md.
+``python -m benchmarks.table RESULTS.json ...`` puts earlier results where they belong, into docs/*.md.
 """
 
 import contextlib
@@ -14,6 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from benchmarks import robust_table
 from benchmarks.contenders import OURS, OURS_AS_G2O
 from benchmarks.fresh import ROOT
 
@@ -21,6 +22,7 @@ Row = dict[str, Any]
 
 DOCUMENT = ROOT / "docs/benchmarks.md"
 _ACCURACY = ROOT / "docs/accuracy.md"
+_OTHER_HOMES = {"consistency": _ACCURACY, "marginals": _ACCURACY, "robust": ROOT / "docs/robustness.md"}
 _LIBRARIES = ("numpy", "scipy", "numba", "gtsam", "graphslam", "ros-jazzy-rclpy")
 
 # The lowest cost that anybody has found, in our error map with the information matrices of the file.
@@ -69,7 +71,7 @@ def markdown(measured: Row) -> str:
 
 def into_document(measured: Row) -> None:
     """Put a table between its markers, in the place of an earlier one."""
-    document = _ACCURACY if measured["programme"] in ("consistency", "marginals") else DOCUMENT
+    document = _OTHER_HOMES.get(measured["programme"], DOCUMENT)
     begin, end = (mark.format(measured["programme"]) for mark in ("<!-- {}: begin -->", "<!-- {}: end -->"))
     text = document.read_text(encoding="utf-8")
     head, rest = text.split(begin)
@@ -179,6 +181,11 @@ def _marginals(rows: Sequence[Row]) -> str:
     return _table(names, lines)
 
 
+def _robust(rows: Sequence[Row]) -> str:
+    lines = _table(robust_table.NAMES, list(robust_table.lines(rows)))
+    return f"{lines}\n\nWhat of ours misses what is asked:\n\n{robust_table.missed(rows)}"
+
+
 def _as_it_is(rows: Sequence[Row]) -> str:
     """Rows whose keys are the names of the columns."""
     names = list(dict.fromkeys(name for row in rows for name in row))
@@ -200,6 +207,7 @@ _TABLES: dict[str, Callable[[Sequence[Row]], str]] = {
     "memory": _memory,
     "consistency": _consistency,
     "marginals": _marginals,
+    "robust": _robust,
 }
 
 

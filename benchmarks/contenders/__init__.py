@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from benchmarks.fresh import ROOT
-from benchmarks.problem import Array, Problem, Step
+from benchmarks.problem import Array, Edges, Problem, Step
 
 OURS, OURS_AS_G2O = "ours", "ours-quaternion"
 TOLERANCE = 1e-6  # converged when the cost changes by a smaller fraction, or no step is larger
@@ -24,7 +24,16 @@ _BATCH = {
     "g2o-lm": "g2o_batch",
     "graphslam": "graphslam_batch",
 }
-ONLINE_PEERS, BATCH_PEERS = tuple(_ONLINE)[1:], tuple(_BATCH)[2:]
+_ROBUST = {
+    OURS: "ours_robust",
+    "gtsam-huber": "gtsam_robust",
+    "gtsam-gm": "gtsam_robust",
+    "gtsam-dcs": "gtsam_robust",
+    "gtsam-gnc": "gtsam_robust",
+    "isam2-dcs": "isam2_robust",
+}
+_WITHOUT_LOSS = {"ours_robust": "ours-plain", "gtsam_robust": "gtsam-lm", "isam2_robust": "isam2"}  # of each module
+ONLINE_PEERS, BATCH_PEERS, ROBUST_PEERS = tuple(_ONLINE)[1:], tuple(_BATCH)[2:], tuple(_ROBUST)[1:]
 
 
 class Online(Protocol):
@@ -82,6 +91,49 @@ def solve(name: str, problem: Problem) -> Solved:
     module.solve(problem.prefix(100), name)  # so that its code is loaded and compiled
     solved: Solved = module.solve(problem, name)
     return solved
+
+
+@dataclass(slots=True)
+class Believed:
+    """What a contender makes of measurements of which some are false.
+
+    Attributes
+    ----------
+    online, batch : poses after the last one came, and after everything was solved; empty where it does not
+    online_weights, weights : what each closure, then each sighting, counts, 0 to 1; empty where it does not say
+    online_s, batch_s : CPU time
+    fault : why there is no path
+    """
+
+    online: Array = field(default_factory=lambda: np.empty(0))
+    batch: Array = field(default_factory=lambda: np.empty(0))
+    online_weights: Array = field(default_factory=lambda: np.empty(0))
+    weights: Array = field(default_factory=lambda: np.empty(0))
+    online_s: float = 0.0
+    batch_s: float = 0.0
+    fault: str = ""
+
+
+def believe(name: str, problem: Problem, closures: Edges) -> Believed:
+    """Find the path from odometry, and from closures and sightings of which nobody knows whether they are true.
+
+    Parameters
+    ----------
+    problem : without closures; its poses are the odometry, composed
+    closures : in order of their later pose
+    """
+    believed: Believed = import_module(f"benchmarks.contenders.{robust_module(name)}").believe(problem, closures, name)
+    return believed
+
+
+def plain(name: str) -> str:
+    """The same contender without a loss: what robustness costs is told by it."""
+    return _WITHOUT_LOSS[_ROBUST[name]]
+
+
+def robust_module(name: str) -> str:
+    """Where a contender's ``believe`` is, with a loss or without."""
+    return _ROBUST.get(name) or next(module for module, without in _WITHOUT_LOSS.items() if without == name)
 
 
 def error_map(name: str, planar: bool) -> str:
