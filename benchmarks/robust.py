@@ -32,6 +32,7 @@ SEEDS = 10
 FEW_SEEDS = 3  # of peers, who take most of the time, and of ours where a run takes longer than
 LONG_S = 300.0  # of CPU time
 PATIENCE_S = 120.0
+SLOW_S = 30.0  # a peer that takes longer has one seed
 USUAL = ("gtsam-huber", "gtsam-gm", "gtsam-gnc", "isam2-dcs")
 
 
@@ -42,7 +43,7 @@ class Race:
     Attributes
     ----------
     seeds : of each cell; peers have the first few
-    patience_s : CPU time after which a peer is called off; in that cell it is not asked again
+    patience_s : CPU time after which a peer is called off
     jobs : seeds at a time, of each of which contenders take turns
     """
 
@@ -100,7 +101,8 @@ class Race:
         scores = [one[stage] for one in list(so_far.values()) for stage in stages(who)]
         if who == OURS:
             return seed < FEW_SEEDS or not any(one.cpu_s > LONG_S for one in scores)
-        return seed < FEW_SEEDS and not any(one.fault.startswith("called off") for one in scores)
+        slow = any(one.cpu_s > SLOW_S or one.fault.startswith("called off") for one in scores)
+        return seed < FEW_SEEDS and not slow
 
 
 def is_clean(policy: str, rate: float) -> bool:
