@@ -148,17 +148,16 @@ def test_what_cannot_be_configured_or_activated_leaves_nothing_and_can_be_once_i
         assert r.set({"detections.type": "apriltag_msgs/msg/AprilTagDetectionArray"}) == (True, "")
         fails("configure")
         assert r.set({"detections.type": "vision_msgs/msg/Detection3DArray", "odom.topic": "not a/topic"}) == (True, "")
-        assert r.change("configure")
-        fails("activate")
+        weights = []
+        for _ in range(10):
+            assert r.change("configure")
+            fails("activate")
+            weights.append(weight(n.process)[1:])
+        assert weights[-1] <= max(weights[:6]), "open files and threads"
         assert r.set({"odom.topic": "odom"}) == (True, ""), "it is unconfigured"
-        r.until_it_says("UNCONFIGURED")
-        before = weight(n.process)[1:]
         assert r.change("configure")
         assert r.change("activate")
         r.until_it_says("OK", spin=Drive().pace(r))
-        assert r.change("deactivate")
-        assert r.change("cleanup")
-        assert weight(n.process)[1:] <= before, "open files and threads"
         assert n.stop()[0] == 0
     for why in ("not empty and not an earlier run; nothing was written", "apriltag_msgs is not installed here"):
         assert why in n.said
@@ -224,7 +223,7 @@ def hears_signals(process):
     return bool(int(status["SigCgt"], 16) >> (signal.SIGTERM - 1) & 1)
 
 
-@pytest.mark.parametrize("seed", range(often(5)))
+@pytest.mark.parametrize("seed", range(often(3)))
 def test_told_to_stop_at_any_moment_of_its_start_it_ends_with_0_and_may_begin_again(tmp_path, seed):
     rng = random.Random(seed)
     with node(f"output.folder:={tmp_path / 'run'}") as n:
@@ -249,7 +248,7 @@ def test_told_to_stop_while_kernels_are_compiled_it_does_not_wait_for_them(tmp_p
 
 
 def test_told_to_stop_while_a_long_run_is_loaded_it_leaves_what_was_taken_until_then(tmp_path):
-    earlier_run(tmp_path / "life", 5_000)
+    earlier_run(tmp_path / "life", 20_000)
     parameters = f"output.folder:={tmp_path / 'run'}", "output.load:=life", "output.load_at_start:=true"
     with node(*parameters) as n, robot(hears=("/diagnostics",)) as r:
         until(lambda: r.graph().get("keyframes", 0) > 20, r.spin, "keyframe of the long run")
@@ -258,7 +257,7 @@ def test_told_to_stop_while_a_long_run_is_loaded_it_leaves_what_was_taken_until_
     assert took_s < lenient(3.0)
     assert "a solve takes too long to wait for: replay the run folder for its results" in n.said
     assert "Traceback" not in n.said
-    assert 20 < len(accepted(tmp_path / "run")) < 5_000
+    assert 20 < len(accepted(tmp_path / "run")) < 20_000
 
 
 # -- parameters --------------------------------------------------------------------------------------------------------
@@ -357,9 +356,8 @@ def test_a_node_that_is_not_configured_takes_what_is_valid_but_neither_folder_no
     assert [run.name for run in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_parameter_without_value_or_of_no_type_is_refused_and_the_node_goes_on():
-    with node("output.folder:=''") as n, robot(hears=("/diagnostics",)) as r:
-        r.wait_for_node()
+def test_a_parameter_without_value_or_of_no_type_is_refused_and_the_node_goes_on(tmp_path):
+    with managed(tmp_path / "run") as n, robot(hears=(), sends=()) as r:
         for kind in (0, 42, 255):
             nothing = [Parameter(name="tf.publish_tf", value=ParameterValue(type=kind))]
             request = SetParametersAtomically.Request(parameters=nothing)
@@ -367,8 +365,9 @@ def test_a_parameter_without_value_or_of_no_type_is_refused_and_the_node_goes_on
             answer = r.call("set_parameters", SetParameters, SetParameters.Request(parameters=nothing))
             assert not any(one.successful for one in answer.results)
         assert r.get(["tf.publish_tf"]) == {"tf.publish_tf": True}
-        r.until_it_says("OK", spin=Drive().pace(r))
+        assert r.change("configure")
         assert n.stop()[0] == 0
+    assert "Traceback" not in n.said
 
 
 # -- services ----------------------------------------------------------------------------------------------------------
@@ -439,8 +438,8 @@ def test_while_it_is_paused_it_takes_nothing_and_its_transform_goes_on(tmp_path)
         assert r.graph()["keyframes"] == before
         assert r.call("optimize").success
         assert r.call("resume").message == "takes measurements"
-        until(lambda: r.graph()["keyframes"] > before + 5, drive.pace(r), "keyframes")
         r.until_it_says("OK", spin=drive.pace(r))
+        assert r.graph()["keyframes"] > before
         assert r.graph()["segments"] == 1, "odometry of later tells what was missed"
         assert n.stop()[0] == 0
     counted = numbers(tmp_path / "run")["counters"]
@@ -496,11 +495,11 @@ def test_a_pose_that_somebody_gives_begins_a_segment_or_is_weighed(tmp_path, use
         until(lambda: r.heard["pose"], drive.pace(r), "pose")
         said = PoseWithCovarianceStamped()
         said.header.frame_id = "map"
-        said.pose.pose.position.x, said.pose.pose.position.y, said.pose.pose.orientation.w = 20.0, -7.0, 1.0
+        said.pose.pose.position.x, said.pose.pose.position.y, said.pose.pose.orientation.w = 2.0, -1.0, 1.0
         said.pose.covariance = (1e-4 * np.eye(6)).ravel()
-        drive.truth = 20.0, -7.0, 0.0
+        drive.truth = 2.0, -1.0, 0.0
         given.publish(said)
-        until(lambda: off_by(r, drive) < 1.0, drive.pace(r), "pose where it was told to be")
+        until(lambda: off_by(r, drive) < 0.4, drive.pace(r), "pose where it was told to be")
         r.until_it_says("OK", spin=drive.pace(r))
         assert r.graph()["segments"] == segments
         assert n.stop()[0] == 0
