@@ -51,6 +51,7 @@ _RESULTS = {
 _TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
 _POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
 _PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
+_TOGETHER = 32  # measurements that are written at once: one by one, as they come, each takes several times as long
 
 
 class RunError(GraphSlamError):
@@ -123,6 +124,7 @@ class RunRecorder:
         self._part = 0
         self._ingest: IngestWriter | None = None
         self._bag: BagWriter | None = None
+        self._accepted: list[Measurement] = []  # and not written yet
         self._next_path_at = 1.0
         _make_room(self.folder)
         try:
@@ -133,9 +135,9 @@ class RunRecorder:
 
     def sink(self, measurement: Measurement) -> None:
         """Append to the ingest sequence: the sink of ``GraphSlam``."""
-        if self._ingest is None:
-            self._ingest = IngestWriter(self._part_of("ingest"))
-        self._ingest.write(to_record(measurement))
+        self._accepted.append(measurement)
+        if len(self._accepted) >= _TOGETHER:
+            self._write_accepted()
 
     def record(self, slam: GraphSlam, update: Update) -> None:
         """Append what an update changed: pose and TF, and the path and the landmarks when they have grown."""
@@ -176,6 +178,7 @@ class RunRecorder:
 
     def close(self) -> None:
         """End the present part of the recording."""
+        self._write_accepted()
         for writer in (self._ingest, self._bag):
             if writer is not None:
                 writer.close()
@@ -187,6 +190,13 @@ class RunRecorder:
         stamp = slam.keyframes[-1].stamp_ns
         self._write("/path", results.PATH, stamp, results.path(slam))
         self._write("/landmarks", results.LANDMARKS, stamp, results.landmarks(slam))
+
+    def _write_accepted(self) -> None:
+        accepted, self._accepted = self._accepted, []
+        for measurement in accepted:
+            if self._ingest is None:
+                self._ingest = IngestWriter(self._part_of("ingest"))
+            self._ingest.write(to_record(measurement))
 
     def _write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
         if self._bag is None:

@@ -235,7 +235,8 @@ def bare(*topics: str) -> None:
             node.create_subscription(message_class(TYPES[topic]), topic, lambda message: None, _DEEP)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        executor.spin()
+        while True:
+            executor.spin_once(timeout_sec=1.0)  # so that it can be told to end
 
 
 def _orders() -> "queue.Queue[Any]":

@@ -69,10 +69,8 @@ class Space:
 
     def in_parent_axes(self, pose: Numbers, covariance: Array) -> Array:
         """Tangent-space covariance of a pose turned into the axes of its parent frame, as ROS publishes it."""
-        turn, n = np.eye(self.dof), self.dimensions
-        turn[:n, :n] = self.turn(pose)
-        if n == 3:  # a rotation in the plane turns with nothing
-            turn[3:, 3:] = turn[:3, :3]
+        n = self.dimensions
+        turn: Array = self.group.adjoint((*self.identity[:n], *pose[n:]))
         return turn @ covariance @ turn.T
 
     def in_tangent(self, pose: Numbers, covariance: Array) -> Array:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.ros.inputs import checks
 from graph_slam_ros.ros.inputs.checks import MessageError
-from graph_slam_ros.ros.inputs.source import Source, turned
+from graph_slam_ros.ros.inputs.source import Source
 from graph_slam_ros.ros.transforms import pose
 from graph_slam_ros.slam.measurements import Closure, Fix, InitialPose
+from graph_slam_ros.slam.space import SPACE
 
 Array = NDArray[np.float64]
 
@@ -34,7 +35,7 @@ def pose_fix(source: Source, m: Any) -> Iterator[Fix]:
     T_map_frame = source.T_fixed(source.config.frames.map, source.frame(m.header.frame_id))
     T_base_sensor = source.T_base_child(getattr(m, "child_frame_id", "").lstrip("/"))
     at, n = checks.point(p.position), source.space.dimensions
-    covariance = turned(T_map_frame, source.pose_covariance(flat, 0.0))
+    covariance = SPACE.in_parent_axes(T_map_frame, source.pose_covariance(flat, 0.0))
     if not source.orientation_known(covariance):
         measured = tuple(map(float, se3.act(T_map_frame, at)))[:n]
         arm = tuple(map(float, se3.position(T_base_sensor)))[:n]
@@ -49,7 +50,7 @@ def pose_fix(source: Source, m: Any) -> Iterator[Fix]:
         source.count("covariance_unknown")
         covariance[:3, :3] = np.eye(3) * source.sigma_m() ** 2
     into_base = se3.adjoint(T_base_sensor)
-    tangent = into_base @ turned(se3.inverse(T_map_sensor), covariance) @ into_base.T
+    tangent = into_base @ SPACE.in_parent_axes(se3.inverse(T_map_sensor), covariance) @ into_base.T
     yield Fix(stamp_ns, source.name, "pose", source.projected(T_map_base), source.checked(source.block(tangent), n))
 
 
@@ -61,13 +62,13 @@ def initial_pose(source: Source, m: Any) -> Iterator[InitialPose]:
     T_map_base = se3.compose(T_map_frame, pose(m.pose.pose.position, source.unit(m.pose.pose.orientation)))
     if not source.has_heading(T_map_base):
         raise MessageError("no_heading")
-    covariance = turned(T_map_frame, source.pose_covariance(m.pose.covariance, 0.0))
+    covariance = SPACE.in_parent_axes(T_map_frame, source.pose_covariance(m.pose.covariance, 0.0))
     unknown = np.diag(np.repeat(np.square([source.settings.sigma_m, source.settings.sigma_rad]), 3))
     for part in (slice(0, 3), slice(3, 6)):
         if not covariance[part, part].any():
             covariance[part] = unknown[part]
             covariance[:, part] = unknown[:, part]
-    block = source.block(turned(se3.inverse(T_map_base), covariance))
+    block = source.block(SPACE.in_parent_axes(se3.inverse(T_map_base), covariance))
     yield InitialPose(source.projected(T_map_base), source.checked(block, source.space.dimensions))
 
 
@@ -178,7 +179,7 @@ def _closure(source: Source, stamp_ns: int, frame: str, one: Any) -> Closure:
     T_base_earlier = se3.compose(T_base_frame, T_frame_earlier)
     # T exp(d) inverted is T^-1 exp(-Ad(T) d)
     into_base = se3.adjoint(T_base_earlier)
-    tangent = into_base @ turned(se3.inverse(T_frame_earlier), covariance) @ into_base.T
+    tangent = into_base @ SPACE.in_parent_axes(se3.inverse(T_frame_earlier), covariance) @ into_base.T
     T_earlier_base = source.projected(se3.inverse(T_base_earlier))
     block = source.checked(source.block(tangent), source.space.dimensions)
     return Closure(stamp_ns, int(one.id), source.name, T_earlier_base, block)

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.ros.inputs import checks
 from graph_slam_ros.ros.inputs.checks import MessageError
-from graph_slam_ros.ros.inputs.source import Numbers, Source, turned
+from graph_slam_ros.ros.inputs.source import Numbers, Source
 from graph_slam_ros.slam.measurements import Sighting, Sightings
+from graph_slam_ros.slam.space import SPACE
 
 Array = NDArray[np.float64]
 
@@ -82,7 +83,7 @@ def _sighting(source: Source, stamp_ns: int, seen: Seen) -> Sighting:
     p = checks.point(seen.position)
     x, y, z = map(float, se3.act(T_base_frame, p))
     distance_m = math.hypot(x, y, z)
-    covariance = turned(T_base_frame, source.pose_covariance(seen.covariance, distance_m))
+    covariance = SPACE.in_parent_axes(T_base_frame, source.pose_covariance(seen.covariance, distance_m))
     n = source.space.dimensions
     if seen.orientation is not None and source.orientation_known(covariance):
         q = so3.compose(se3.rotation(T_base_frame), source.unit(seen.orientation))

@@ -182,13 +182,6 @@ class Source:
         return tuple(covariance.ravel().tolist())
 
 
-def turned(T: se3.Pose, covariance: Array) -> Array:
-    """Covariance (6, 6) of a pose, in the axes of the frame that T puts it into."""
-    both = np.kron(np.eye(2), so3.matrix(se3.rotation(T)))
-    out: Array = both @ covariance @ both.T
-    return out
-
-
 def _mount(settings: InputConfig) -> se3.Pose | None:
     given = settings.numbers("mount", 6)
     if not given:
