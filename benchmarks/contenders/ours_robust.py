@@ -26,7 +26,10 @@ _AS_THE_GRAPH: Mapping[str, Any] = {
     "odometry.max_speed_m_s": 1e6,
     "landmarks.added_sigma_m": 0.0,
 }
-_LOSSES: Mapping[str, Mapping[str, Any]] = {OURS: {}, "ours-plain": {"landmarks.loss": "none"}}
+_LOSSES: Mapping[str, Mapping[str, Any]] = {
+    OURS: {},
+    "ours-plain": {"landmarks.loss": "none", "robust.loss": "none", "robust.decide": False},
+}
 
 
 def believe(problem: Problem, closures: Edges, name: str) -> Believed:

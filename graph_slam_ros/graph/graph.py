@@ -1,5 +1,7 @@
 """The graph: append-only records of vertices and edges, kept as arrays."""
 
+from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
@@ -189,6 +191,27 @@ class Graph:
         measured = sum(table.type.residual_size * int(np.count_nonzero(table.weight.values)) for table in tables)
         sizes = np.array([kind.dof for kind in self.kinds], dtype=np.int64)
         return measured - int(sizes[self.kind.values].sum())
+
+    def set_weights(self, edges: Index, weight: float) -> None:
+        """Of some edges; where a solver has them, they are its to change."""
+        for code, table in enumerate(self._in_order):
+            of_table = edges[self.table_of_edge.values[edges] == code]
+            table.weight.values[self.row_of_edge.values[of_table]] = weight
+
+    def copy(self) -> "Graph":
+        """Another graph with the same records; kinds and types are the same objects."""
+        same = (*self.tables, *self.kinds)
+        return deepcopy(self, {id(one): one for one in same})
+
+    def has_label(self, edges: Index, labels: Sequence[str]) -> NDArray[np.bool_]:
+        """Whether each of some edges is of one of these classes."""
+        wanted = np.array([label in labels for label in self.labels], dtype=bool)
+        out = np.zeros(len(edges), dtype=bool)
+        codes = self.table_of_edge.values[edges]
+        for code, table in enumerate(self.tables.values()):
+            of_table = codes == code
+            out[of_table] = wanted[table.label.values[self.row_of_edge.values[edges[of_table]]]]
+        return out
 
     def edges_of(self, label: str) -> Index:
         """Ids of the edges of a class, in order."""

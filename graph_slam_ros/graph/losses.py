@@ -1,6 +1,8 @@
 """Robust losses rho(s) of the squared whitened residual s = r' Omega r, used as IRLS weights rho'(s).
 
-Huber 1964; Cauchy as in Black and Rangarajan 1996. With loss ``none`` the cost is chi2 itself.
+Huber 1964; Cauchy and Geman-McClure as in Black and Rangarajan 1996; dynamic covariance scaling (DCS), Agarwal et al.,
+ICRA 2013, with Phi = scale^2. The last two redescend: what fits badly enough does not pull at all. With loss ``none``
+the cost is chi2 itself.
 """
 
 from dataclasses import dataclass
@@ -10,8 +12,8 @@ import numpy as np
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie.jit import jitable
 
-NONE, HUBER, CAUCHY = 0, 1, 2
-NAMES = {"none": NONE, "huber": HUBER, "cauchy": CAUCHY}
+NONE, HUBER, CAUCHY, GEMAN_MCCLURE, DCS = range(5)
+NAMES = {"none": NONE, "huber": HUBER, "cauchy": CAUCHY, "geman_mcclure": GEMAN_MCCLURE, "dcs": DCS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +29,7 @@ class Loss:
 
     @classmethod
     def named(cls, name: str, scale: float = 1.0) -> "Loss":
-        """From ``none``, ``huber`` or ``cauchy``."""
+        """From its name, one of ``NAMES``."""
         if name not in NAMES:
             raise GraphSlamError(f"loss {name!r}: choose {', '.join(NAMES)}")
         return cls(NAMES[name], scale)
@@ -42,4 +44,11 @@ def weight_and_cost(kind: int, scale: float, s: float) -> tuple[float, float]:
     if kind == CAUCHY:
         ratio = s / (scale * scale)
         return 1.0 / (1.0 + ratio), scale * scale * np.log1p(ratio)
+    if kind == GEMAN_MCCLURE:
+        root = 1.0 / (1.0 + s / (scale * scale))
+        return root * root, root * s
+    if kind == DCS and s > scale * scale:
+        phi = scale * scale
+        root = 2.0 * phi / (phi + s)
+        return root * root, phi * (3.0 * s - phi) / (phi + s)
     return 1.0, s

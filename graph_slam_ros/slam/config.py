@@ -27,6 +27,7 @@ from graph_slam_ros.slam.node_config import (
     TimeConfig,
 )
 from graph_slam_ros.slam.parameter import Parameter, numbers, section_parameters, setting
+from graph_slam_ros.slam.robust_config import LOSSES, RobustConfig
 from graph_slam_ros.slam.space import PLANE, SPACE, Numbers, Space
 from graph_slam_ros.slam.survey import Surveyed, surveyed
 from graph_slam_ros.solver import METHODS, Settings
@@ -190,8 +191,8 @@ class LandmarksConfig:
     )
     loss: str = setting(
         "huber_then_cauchy",
-        "robust loss; huber_then_cauchy converges with the first, then with the second",
-        choices=("none", "huber", "cauchy", "huber_then_cauchy"),
+        "robust loss of sightings; huber_then_cauchy converges with the first, then with the second",
+        choices=(*LOSSES, "huber_then_cauchy", "huber_then_dcs"),
     )
     loss_scale: float = setting(3.0, "residuals well below this many standard deviations count fully", "sigma", low=0.1)
 
@@ -296,6 +297,7 @@ class Config:
     anchor: AnchorConfig = AnchorConfig()
     ordering: OrderingConfig = OrderingConfig()
     solve: SolveConfig = SolveConfig()
+    robust: RobustConfig = RobustConfig()
     initialpose: InitialPoseConfig = InitialPoseConfig()
     tf: TfConfig = TfConfig()
     inputs: InputsConfig = InputsConfig()
@@ -380,7 +382,7 @@ class Config:
             s.max_iterations,
             s.step_tolerance,
             s.cost_tolerance,
-            {"landmarks": stages, "fixes": stages, "closures": stages},
+            {"landmarks": stages, "fixes": self.robust.stages, "closures": self.robust.stages},
             relinearize_above=s.relinearize_above,
             relinearize_error=s.relinearize_error,
             relinearize_every=s.relinearize_every,

@@ -5,15 +5,17 @@ Its state is a function of the configuration and the sequence of accepted measur
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import Gaussian, Graph
+from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.slam import carry
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.background import Beside, when_asked
 from graph_slam_ros.slam.carry import Where
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
@@ -36,7 +38,7 @@ from graph_slam_ros.slam.space import Numbers
 from graph_slam_ros.slam.stamp_order import StampOrder
 from graph_slam_ros.slam.track import Track
 from graph_slam_ros.slam.unnamed import Unnamed
-from graph_slam_ros.solver import Report, Settings, Solver
+from graph_slam_ros.solver import Report, Settings
 
 Array = NDArray[np.float64]
 
@@ -110,14 +112,20 @@ class GraphSlam:
     ----------
     config : the parameters
     sink : called with every measurement that was accepted, in that order, before it takes effect
+    beside : begins work that may go on beside ``process``; what it returns waits for the result
     """
 
-    def __init__(self, config: Config | None = None, sink: Callable[[Measurement], None] | None = None) -> None:
+    def __init__(
+        self,
+        config: Config | None = None,
+        sink: Callable[[Measurement], None] | None = None,
+        beside: Beside = when_asked,
+    ) -> None:
         self.config = config or Config()
         self.space = self.config.space
         self.counters = Counters()
-        self.graph = Graph()
-        self.solver = Solver(self.graph, self.config.solver_settings())
+        self.backend = Backend(self.config.robust, self.config.solver_settings(), beside)
+        self.graph, self.solver, self.ledger = self.backend.graph, self.backend.solver, self.backend.ledger
         self.keyframes = Track(Keyframe, self.space.pose.size)
         self.sighting_poses = Track(SightingPose, self.space.pose.size)
         self.segments: list[int] = []  # keyframes at which odometry began, or began anew
@@ -130,14 +138,13 @@ class GraphSlam:
             self.config.odometry, self.config.inputs.names.split(), self.space, self.counters
         )
         self._noise = OdometryNoise(self.config.odometry, self.space)
-        self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters)
-        self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self._hand_over)
+        self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
+        self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over)
         self._motions: deque[Motion] = deque()  # since each of the last keyframes, as far back as late ones may reach
         self._waiting: list[Observation] = []
         self._epoch = 0  # the first keyframe since stamps began anew
         self._initial_pose: InitialPose | None = None  # for the next odometry
         self._covariance = np.zeros((self.space.dof, self.space.dof))
-        self._handed_over = 0, 0  # vertices and edges the solver has
         self._taken_in = 0  # edges of these
         self._solved_T_map_odom = self.space.identity  # to see how far a solve moves it
         self._solved_vertices = 0  # of these, what the last solve took in: none where it failed
@@ -152,7 +159,7 @@ class GraphSlam:
         if self._sink is not None:
             self._sink(measurement)
         first_new, solves, report = len(self.keyframes), self.solves, self.report
-        first_edge = self._handed_over[1]
+        first_edge = self.backend.handed_over[1]
         match measurement:
             case Odometry() | Sightings() | Fix() | Closure():
                 self._use(self._order.push(measurement))
@@ -179,7 +186,7 @@ class GraphSlam:
         new = self.report if self.report is not report else None
         solved = self.solves > solves
         correction = self.correction if solved else Correction()
-        edges = range(first_edge, self._handed_over[1])
+        edges = range(first_edge, self.backend.handed_over[1])
         return Update(tuple(range(first_new, len(self.keyframes))), edges, solved, new, correction)
 
     # -- what is known now ---------------------------------------------------------------------------------------
@@ -527,20 +534,23 @@ class GraphSlam:
         if not self.keyframes:
             return
         first_new = self._taken_in
-        self._hand_over()
-        fits = self._fit_of(range(first_new, self._handed_over[1]))
+        self.backend.hand_over()
+        fits = self._fit_of(range(first_new, self.backend.handed_over[1]))
         try:
             if everything is None:
                 self._review_if_due()
-                self.solver.update()
+                self.backend.update(len(self.keyframes) - 1)
             else:
-                self.report = self.solver.optimize(everything)
+                self.report = self.backend.optimize(len(self.keyframes) - 1, everything)
             (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
             self.solves += 1
-            self._solved_vertices, self._taken_in = self._handed_over
+            self._solved_vertices, self._taken_in = self.backend.handed_over
             self._note_correction(fits)
         except GraphSlamError as error:
             self.counters.count("solver", type(error).__name__)
+
+    def _withdraw(self, edges: Sequence[int]) -> None:
+        self.backend.withdraw(edges, len(self.keyframes) - 1)
 
     def _fit_of(self, edges: range) -> list[tuple[float, int]]:
         """(chi2 per number measured, edge) of the new edges that fit least: what may move the map."""
@@ -559,10 +569,9 @@ class GraphSlam:
 
     def _clear_closures(self) -> None:
         """Take all loop closures out; the next solve goes without them."""
-        self._hand_over()
+        self.backend.hand_over()
         closures = self.graph.edges_of("closures").tolist()
-        for edge in closures:
-            self.solver.set_weight(edge, 0.0)
+        self._withdraw(closures)
         if closures:
             self.counters.count("closures", "cleared", len(closures))
             self._solve()
@@ -572,14 +581,6 @@ class GraphSlam:
         due = self.config.landmarks.review_every_keyframes
         if self.config.landmarks.association in ("nearest", "joint") and len(self.keyframes) % due == 0:
             self._unnamed.review(self.keyframes[-1].stamp_ns)
-
-    def _hand_over(self) -> None:
-        """Give the solver what is new in the graph."""
-        vertices, edges = self._handed_over
-        if (vertices, edges) == (self.graph.vertex_count, self.graph.edge_count):
-            return
-        self._handed_over = self.graph.vertex_count, self.graph.edge_count
-        self.solver.add(range(vertices, self.graph.vertex_count), range(edges, self.graph.edge_count))
 
     def _pose(self, vertex: int) -> Numbers:
         return tuple(self.solver.estimate([vertex])[0].tolist())

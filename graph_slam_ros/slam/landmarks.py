@@ -1,6 +1,6 @@
 """Landmarks: from sightings to vertices and edges, and what still waits to be determined, with the reason."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -76,11 +76,18 @@ class Landmarks:
     waiting : those that are not determined yet
     """
 
-    def __init__(self, config: Config, graph: Graph, solver: Solver, counters: Counters) -> None:
+    def __init__(
+        self,
+        config: Config,
+        graph: Graph,
+        solver: Solver,
+        counters: Counters,
+        withdraw: Callable[[Sequence[int]], None],
+    ) -> None:
         self.known: dict[str, Landmark] = {}
         self.waiting: dict[str, Waiting] = {}
         self._config, self._space = config, config.space
-        self._graph, self._solver, self._counters = graph, solver, counters
+        self._graph, self._solver, self._counters, self._withdraw = graph, solver, counters, withdraw
         if config.landmarks.surveyed_file and not config.landmarks.surveyed:
             raise ConfigError(f"landmarks.surveyed_file: {config.landmarks.surveyed_file} has not been read")
         self._survey = config.survey
@@ -203,8 +210,7 @@ class Landmarks:
         self.known[merged].is_tentative = False
 
     def _take_out(self, seen: Sequence[Seen]) -> None:
-        for one in seen:
-            self._solver.set_weight(one.edge, 0.0)
+        self._withdraw([one.edge for one in seen])
 
     def kind_of(self, vertex: int) -> VertexKind:
         """Point or pose."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import Graph, Loss
+from graph_slam_ros.graph import EdgeType, Graph, Loss
 from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.lie.jit import kernel
@@ -116,20 +116,31 @@ def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: L
             yield Block(table, some, residual, jacobian, chi2, cost)
 
 
-def chi2_of(graph: Graph, x: Array, edges: Index) -> tuple[Array, Index]:
-    """Squared whitened residual of each edge at the stored values x, without loss and weight, and its numbers."""
-    chi2, numbers = np.empty(len(edges)), np.empty(len(edges), dtype=np.int64)
+def linearized(graph: Graph, x: Array, edge: EdgeType, vertices: Index, measured: Array) -> tuple[Array, Array]:
+    """Residual (m,) and Jacobian (m, width) of one measurement (p,) between vertices (k,) at the stored values x."""
+    residual, jacobian = edge.linearize(x, graph.offset.values[vertices][None], measured[None])
+    return residual[0], jacobian[0]
+
+
+def residuals_of(graph: Graph, x: Array, edges: Index) -> Iterator[tuple[Index, Array, Array]]:
+    """Places among these edges, their residuals (n, m) at the stored values x, and square root informations."""
     codes = graph.table_of_edge.values[edges]
     for code, table in enumerate(graph.tables.values()):
         of_table = np.flatnonzero(codes == code)
-        numbers[of_table] = table.type.residual_size
         for first in range(0, len(of_table), CHUNK):
             some = of_table[first : first + CHUNK]
             rows = graph.row_of_edge.values[edges[some]]
             at, measured = _take(rows, table.vertices.values, graph.offset.values, table.measured.values)
             residual, _ = table.type.linearize(x, at, measured)
-            white = np.einsum("eab,eb->ea", table.sqrt_information.values[rows], residual)
-            chi2[some] = np.einsum("ea,ea->e", white, white)
+            yield some, residual, table.sqrt_information.values[rows]
+
+
+def chi2_of(graph: Graph, x: Array, edges: Index) -> tuple[Array, Index]:
+    """Squared whitened residual of each edge at the stored values x, without loss and weight, and its numbers."""
+    chi2, numbers = np.empty(len(edges)), np.empty(len(edges), dtype=np.int64)
+    for some, residual, root in residuals_of(graph, x, edges):
+        white = np.einsum("eab,eb->ea", root, residual)
+        chi2[some], numbers[some] = np.einsum("ea,ea->e", white, white), residual.shape[1]
     return chi2, numbers
 
 

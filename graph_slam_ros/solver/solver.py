@@ -20,6 +20,7 @@ from graph_slam_ros.solver.linearization import (
     information,
     linearize,
     refuse_nonfinite,
+    residuals_of,
     rows_of,
     store,
 )
@@ -170,6 +171,12 @@ class Solver:
         self._take_out(one)
 
     @property
+    def vertices(self) -> Index:
+        """Ids of the vertices of the problem."""
+        self._grow()
+        return np.flatnonzero(self._inside)
+
+    @property
     def edges(self) -> Index:
         """Ids of the edges of the problem that have a weight."""
         self._grow()
@@ -259,6 +266,22 @@ class Solver:
         if len(ids):
             _known(ids, self.graph.edge_count, "edge")
         return chi2_of(self.graph, self._tree.estimate, ids)
+
+    def residuals_of(self, edges: ArrayLike) -> Array:
+        """What each edge measured against what the estimate says, in the units of its type, end to end."""
+        self._grow()
+        ids = whole_numbers(edges, "edge").ravel()
+        out: list[list[float]] = [[]] * len(ids)
+        for some, residual, _ in residuals_of(self.graph, self._tree.estimate, ids):
+            for k, of_one in zip(some.tolist(), residual.tolist(), strict=True):
+                out[k] = of_one
+        return np.array([x for of_one in out for x in of_one])
+
+    @property
+    def values(self) -> Array:
+        """The estimates of all vertices, as ``Graph.initial`` has them: what ``start_at`` takes."""
+        self._grow()
+        return self._tree.estimate[: len(self.graph.initial)].copy()
 
     def estimate(self, ids: ArrayLike) -> Array:
         """Values of vertices of one kind, (n, size)."""

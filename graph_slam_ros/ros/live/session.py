@@ -11,6 +11,7 @@ from typing import Any
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.ingest import read_ingest
+from graph_slam_ros.ros.live.beside import in_a_thread
 from graph_slam_ros.run import RunError, RunRecorder, earlier_runs, is_run, keep_earlier, run_config, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.graph_slam import Correction
@@ -72,7 +73,7 @@ class Session:
             keep_earlier(self._folder, self.config.output.keep_earlier)
             self._recorder = RunRecorder(self._folder, self.config)
         self.recording_fails = False
-        self.slam = GraphSlam(self.config, self._sink)
+        self.slam = GraphSlam(self.config, self._sink, in_a_thread)
         self.slam.counters.on_first = self._tell
         self.estimate = None
         self._is_saved = True

@@ -1,0 +1,22 @@
+"""Work beside the worker: a second look at the graph goes on in a thread of its own."""
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from threading import Thread
+from typing import TypeVar
+
+Result = TypeVar("Result")
+
+
+def in_a_thread(work: Callable[[], Result]) -> Callable[[], Result]:
+    """Begin work in a thread that nobody waits for at the end; returns what waits for its result, or its exception."""
+    future: Future[Result] = Future()
+    Thread(target=_run, args=(work, future), name="second look", daemon=True).start()
+    return future.result
+
+
+def _run(work: Callable[[], Result], future: "Future[Result]") -> None:
+    try:
+        future.set_result(work())
+    except BaseException as error:
+        future.set_exception(error)

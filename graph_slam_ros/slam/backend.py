@@ -1,0 +1,113 @@
+"""The back-end: the graph, its solver, and what is believed of its edges, in step with one another."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from graph_slam_ros.graph import Graph, Loss
+from graph_slam_ros.slam.background import Background, Beside, when_asked
+from graph_slam_ros.slam.decisions import Decisions
+from graph_slam_ros.slam.ledger import Ledger
+from graph_slam_ros.slam.robust_config import RobustConfig
+from graph_slam_ros.slam.second_look import Frozen, Outcome, second_look
+from graph_slam_ros.solver import Report, Settings, Solver
+
+
+class Backend:
+    """Whoever adds to ``graph`` has it solved here, keyframe by keyframe.
+
+    Parameters
+    ----------
+    beside : begins the work of a second look; what it returns waits for the result
+
+    Attributes
+    ----------
+    graph, solver, decisions
+    handed_over : vertices and edges of the graph that the solver has
+    """
+
+    def __init__(self, config: RobustConfig, settings: Settings, beside: Beside = when_asked) -> None:
+        self._config = config
+        self.graph = Graph()
+        self.solver = Solver(self.graph, settings)
+        self.decisions = Decisions(config, self.graph, self.solver)
+        self.handed_over = 0, 0
+        self._background = Background(config, beside)
+        self._reviewed = 0  # the keyframe of the last review
+
+    @property
+    def ledger(self) -> Ledger:
+        """What was decided of each edge."""
+        return self.decisions.ledger
+
+    def hand_over(self) -> None:
+        """Give the solver what is new in the graph."""
+        vertices, edges = self.handed_over
+        if (vertices, edges) == (self.graph.vertex_count, self.graph.edge_count):
+            return
+        self.handed_over = self.graph.vertex_count, self.graph.edge_count
+        self.solver.add(range(vertices, self.graph.vertex_count), range(edges, self.graph.edge_count))
+
+    def update(self, keyframe: int) -> None:
+        """Take in what is new and believed, then what is believed of the rest."""
+        self.hand_over()
+        doubtful = self.decisions.take(self.handed_over[1], keyframe)
+        if self._config.decide and keyframe - self._reviewed >= self._config.review_every_keyframes:
+            self._reviewed = keyframe
+            self.decisions.review(keyframe)
+        outcome = self._background.outcome(keyframe)
+        if outcome is not None and self._follow(outcome, keyframe):
+            self.solver.optimize()
+        self.solver.update()
+        admitted = self.decisions.admit(doubtful, keyframe)
+        if admitted:
+            self._make_fit(admitted, keyframe)
+        out = len(self.ledger.outside)
+        if self._config.decide and self._background.is_due(out):
+            self._background.start(self._frozen(keyframe, self.solver.settings), out)
+
+    def optimize(self, keyframe: int, settings: Settings) -> Report:
+        """Solve everything, and have a second look at all that was decided."""
+        self.hand_over()
+        doubtful = self.decisions.take(self.handed_over[1], keyframe)
+        report = self.solver.optimize(settings)
+        if not self._config.decide:
+            return report
+        admitted = self.decisions.admit(doubtful, keyframe)
+        if admitted:
+            self._make_fit(admitted, keyframe)
+        self._background.cancel()
+        outcome = second_look(self._config, self._frozen(keyframe, settings))
+        self.decisions.follow(outcome.ledger, keyframe)
+        self.solver.start_at(outcome.values)
+        return self.solver.optimize(settings)
+
+    def withdraw(self, edges: Sequence[int], keyframe: int) -> None:
+        """Take edges out for good."""
+        self.decisions.withdraw(edges, keyframe)
+
+    def _make_fit(self, admitted: Sequence[int], keyframe: int) -> None:
+        """Solve until what was let in against appearances fits; what does not in the end is out again.
+
+        Its loss lets go of what is far off. Only where nothing has told yet how good odometry is may it pull with all
+        its weight: later that would bend the map for whatever is false and just possible.
+        """
+        self.solver.update()
+        if not self.decisions.fit(admitted):
+            settings = self.solver.settings
+            if not self.decisions.is_calibrated:
+                losses = {label: [Loss(), *stages] for label, stages in settings.losses.items()}
+                settings = replace(settings, losses=losses)
+            self.solver.optimize(settings)
+            if self.decisions.refuse_unfit(admitted, keyframe):
+                self.solver.update()
+
+    def _follow(self, outcome: Outcome, keyframe: int) -> bool:
+        """Take over what a second look has found; whether that is other than what was known."""
+        if not self.decisions.follow(outcome.ledger, keyframe):
+            return False
+        self.solver.start_at(outcome.carried_to(self.graph, self.solver.values))
+        return True
+
+    def _frozen(self, keyframe: int, settings: Settings) -> Frozen:
+        solver = self.solver
+        return Frozen(keyframe, self.graph.copy(), solver.vertices, solver.values, settings, self.ledger.copy())

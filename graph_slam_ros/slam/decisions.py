@@ -1,0 +1,287 @@
+"""Which measurements are believed: closures, sightings and fixes are candidates, odometry is not.
+
+A candidate that would be too unlikely given what was known just before is held back: its innovation is compared with
+the joint covariance of what it is between and its own (Neira and Tardos, "Data association in stochastic mapping using
+the joint compatibility test", 2001, eq. 2). One that does not fit after the solve pulls ever less, by its loss, and is
+taken out below a weight. Nothing is final: all are looked at again, and what fits then comes back.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph import Graph, Loss
+from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.slam.association import quantile
+from graph_slam_ros.slam.innovation import innovation
+from graph_slam_ros.slam.ledger import Ledger, Reason, Verdict
+from graph_slam_ros.slam.robust_config import RobustConfig
+from graph_slam_ros.solver import Solver
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+CANDIDATES = ("landmarks", "fixes", "closures")
+_TYPICAL = 30  # residuals tell what all are like
+_SLACK = 10.0  # times the residuals that are typical of a class its gate may be, where they are small
+_TIGHTEST = 0.1  # part of a gate that is left
+_COMPLETED = 50  # edges that are out and are tried again after everything was solved
+_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
+
+
+class Decisions:
+    """Judge of the candidates among the edges of a graph; what it decides is weights, and stands in its ledger."""
+
+    def __init__(self, config: RobustConfig, graph: Graph, solver: Solver, ledger: Ledger | None = None) -> None:
+        self._config, self._graph, self._solver = config, graph, solver
+        self.ledger = ledger or Ledger()
+        self._holds: dict[int, int] = {}  # of each landmark, edges in the graph of which one alone determines it
+        for edge in self.ledger.inside.tolist():
+            self._count(edge, 1)
+        self._tightness: dict[str, float] = {}  # of each class, by what its gate is smaller
+        self.is_calibrated = False  # whether enough was measured twice to tell how good odometry is
+        self._looseness = config.noise_factor**2  # of the gate of what all else predicts
+        self._next = 0  # of the accepted, where the next review goes on
+        self._next_out = 0  # and of those that are out
+
+    # -- what is new -------------------------------------------------------------------------------------------------
+
+    def take(self, count: int, keyframe: int) -> list[int]:
+        """Look at the edges that are new, up to a count, by their own noise.
+
+        Those that fit are accepted; the others, which are told, wait outside.
+        """
+        ids = np.arange(len(self.ledger), count)
+        chi2, numbers = self._solver.chi2_of(ids)
+        limit, judged = self._limits(ids, numbers), self._graph.has_label(ids, CANDIDATES)
+        self.ledger.enter(keyframe, chi2, numbers, limit, self._solver.residuals_of(ids), judged)
+        for edge in ids[judged].tolist():
+            self._count(edge, 1)
+        waiting = []
+        for edge in ids[judged & (chi2 > limit) & self._config.decide].tolist():
+            if not self._is_needed(edge):
+                self._take_out(edge)
+                self.ledger.verdict.values[edge] = Verdict.PENDING
+                waiting.append(edge)
+        return waiting
+
+    def admit(self, waiting: Sequence[int], keyframe: int) -> list[int]:
+        """Compare with all that is known: the likeliest first, then the others with that; who is let in."""
+        out, admitted = list(waiting), list[int]()
+        while out:
+            innovation = {edge: self._innovation(edge) for edge in out}
+            likely = [edge for edge in out if self._is_likely(edge, innovation[edge])]
+            if not likely:
+                break
+            best = min(likely, key=lambda edge: innovation[edge] / self.ledger.threshold.values[edge])
+            for edge in likely if admitted else [best]:
+                self._readmit(edge, keyframe, innovation[edge])
+                admitted.append(edge)
+            out = [edge for edge in out if not self.ledger.is_inside(edge)]
+            if out:
+                self._solver.update()
+        for edge in out:
+            self.ledger.note(edge, keyframe, Verdict.PENDING, Reason.UNLIKELY, innovation[edge])
+        return admitted
+
+    def fit(self, edges: Sequence[int]) -> bool:
+        """Whether all of some edges fit at the present estimate."""
+        chi2, _ = self._solver.chi2_of(edges)
+        return bool((chi2 <= self.ledger.threshold.values[edges]).all())
+
+    def refuse_unfit(self, edges: Sequence[int], keyframe: int) -> bool:
+        """Take those of some edges out that do not fit after all was done for it; whether there are any."""
+        chi2, _ = self._solver.chi2_of(edges)
+        unfit = np.flatnonzero(chi2 > self.ledger.threshold.values[edges])
+        for k in unfit.tolist():
+            self._reject(edges[k], keyframe, Reason.DOES_NOT_FIT, float(chi2[k]))
+        return len(unfit) > 0
+
+    # -- what was decided ---------------------------------------------------------------------------------------------
+
+    def review(self, keyframe: int) -> bool:
+        """Look again at the newest verdicts and, in turn, at some of the others; whether one has changed."""
+        self._tighten()
+        inside = self.ledger.inside
+        if len(inside) > 2 * _AT_ONCE:
+            self._next = (self._next + _AT_ONCE) % (len(inside) - _AT_ONCE)
+            older = np.arange(self._next, self._next + _AT_ONCE) % (len(inside) - _AT_ONCE)
+            inside = np.concatenate((np.unique(inside[older]), inside[-_AT_ONCE:]))
+        changed = self._weigh(inside, keyframe)
+        outside = self.ledger.outside
+        chi2, _ = self._solver.chi2_of(outside)
+        fits = chi2 <= self.ledger.threshold.values[outside]
+        for edge, fit in zip(outside[fits].tolist(), chi2[fits].tolist(), strict=True):
+            self._readmit(edge, keyframe, fit)
+        others = outside[~fits & (self.ledger.verdict.values[outside] == Verdict.PENDING)].tolist()
+        turn = [others[(self._next_out + k) % len(others)] for k in range(min(self._config.retests, len(others)))]
+        self._next_out += len(turn)
+        likely = [(edge, fit) for edge in turn if self._is_likely(edge, fit := self._innovation(edge))]
+        for edge, fit in likely:
+            self._readmit(edge, keyframe, fit)
+        return changed or bool(likely) or bool(fits.any())
+
+    def settle(self, keyframe: int) -> bool:
+        """After a solve of everything: what fits is in, what does not is out; whether a verdict has changed."""
+        self._tighten()
+        ledger, changed = self.ledger, False
+        inside, outside = ledger.inside, ledger.outside
+        for edges, out in ((inside, True), (outside, False)):
+            chi2, _ = self._solver.chi2_of(edges)
+            other = (chi2 > ledger.threshold.values[edges]) == out
+            for edge, fit in zip(edges[other].tolist(), chi2[other].tolist(), strict=True):
+                if not out:
+                    self._readmit(edge, keyframe, fit)
+                elif self._is_needed(edge):
+                    continue
+                else:
+                    self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
+                changed = True
+        return changed
+
+    def complete(self, keyframe: int) -> bool:
+        """Let in what would fit if it were in, of that which fits least badly without; whether there was any."""
+        outside = self.ledger.outside
+        chi2, _ = self._solver.chi2_of(outside)
+        for edge in outside[np.argsort(chi2, kind="stable")[:_COMPLETED]].tolist():
+            innovation = self._innovation(edge)
+            if innovation <= self.ledger.threshold.values[edge] and self._is_likely(edge, innovation):
+                self._readmit(edge, keyframe, innovation)
+                return True
+        return False
+
+    def withdraw(self, edges: Sequence[int], keyframe: int) -> None:
+        """Take edges out for good: who calls has other reasons than how they fit."""
+        for edge in edges:
+            if edge >= len(self.ledger):
+                self._solver.set_weight(edge, 0.0)
+            elif self.ledger.reason.values[edge] != Reason.WITHDRAWN:
+                self._reject(edge, keyframe, Reason.WITHDRAWN, float(self.ledger.statistic.values[edge]))
+
+    def follow(self, other: Ledger, keyframe: int) -> bool:
+        """Take over verdicts on the same edges from who has had a second look; whether that changed one."""
+        mine, changed = self.ledger, False
+        for edge in np.flatnonzero(np.isin(mine.verdict.values[: len(other)], (*Verdict,)[1:])).tolist():
+            fit = float(other.statistic.values[edge])
+            if mine.reason.values[edge] == Reason.WITHDRAWN or mine.is_inside(edge) == other.is_inside(edge):
+                continue
+            if other.is_inside(edge):
+                self._readmit(edge, keyframe, fit)
+            elif not self._is_needed(edge):
+                self._reject(edge, keyframe, Reason.OUTVOTED, fit)
+            changed = True
+        return changed
+
+    def believe(self, edges: Index, keyframe: int) -> None:
+        """Have these candidates in and no others, to see what comes of it."""
+        wanted = set(edges.tolist())
+        for edge in np.concatenate((self.ledger.inside, self.ledger.outside)).tolist():
+            fit = float(self.ledger.statistic.values[edge])
+            if edge in wanted and not self.ledger.is_inside(edge):
+                self._readmit(edge, keyframe, fit)
+            elif edge not in wanted and self.ledger.is_inside(edge) and not self._is_needed(edge):
+                self._reject(edge, keyframe, Reason.OUTVOTED, fit)
+
+    def _weigh(self, edges: Index, keyframe: int) -> bool:
+        """By what their losses leave of each one's weight."""
+        chi2, _ = self._solver.chi2_of(edges)
+        changed = False
+        for label, stages in self._solver.settings.losses.items():
+            loss, of_label = stages[-1], self._graph.has_label(edges, (label,))
+            for edge, fit in zip(edges[of_label].tolist(), chi2[of_label].tolist(), strict=True):
+                weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
+                fits = fit <= self.ledger.threshold.values[edge]
+                verdict = Verdict.ACCEPTED if fits else Verdict.DOWN_WEIGHTED
+                if weight < self._config.out_below and not self._is_needed(edge):
+                    self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
+                    changed = True
+                elif self.ledger.verdict.values[edge] != verdict:
+                    self.ledger.note(edge, keyframe, verdict, Reason.NONE, fit)
+        return changed
+
+    def _innovation(self, edge: int) -> float:
+        return innovation(self._graph, self._solver, edge)
+
+    def _is_likely(self, edge: int, innovation: float) -> bool:
+        limit = quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
+        return innovation <= self._looseness * limit
+
+    # -- one edge ----------------------------------------------------------------------------------------------------
+
+    def _readmit(self, edge: int, keyframe: int, statistic: float) -> None:
+        self._put_in(edge)
+        self.ledger.note(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, statistic)
+
+    def _reject(self, edge: int, keyframe: int, reason: Reason, statistic: float) -> None:
+        if self.ledger.is_inside(edge):
+            self._take_out(edge)
+        self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, statistic)
+
+    def _put_in(self, edge: int) -> None:
+        self._solver.set_weight(edge, 1.0)
+        self._count(edge, 1)
+
+    def _take_out(self, edge: int) -> None:
+        self._solver.set_weight(edge, 0.0)
+        self._count(edge, -1)
+
+    def _landmark(self, edge: int) -> int | None:
+        """The landmark that one such edge alone would determine; -1: it does so only with others."""
+        table, row = self._graph.row(edge)
+        if self._graph.labels[int(table.label.values[row])] != "landmarks":
+            return None
+        landmark = int(table.vertices.values[row, 1])
+        return landmark if table.type.residual_size >= self._graph.kind_of(landmark).dof else -1
+
+    def _count(self, edge: int, more: int) -> None:
+        landmark = self._landmark(edge)
+        if landmark is not None and landmark >= 0:
+            self._holds[landmark] = self._holds.get(landmark, 0) + more
+
+    def _is_needed(self, edge: int) -> bool:
+        """Whether a landmark may be undetermined without it: its last, or one that determines it only with others."""
+        landmark = self._landmark(edge)
+        return landmark is not None and (landmark < 0 or self._holds.get(landmark, 0) <= 1)
+
+    # -- what is too much --------------------------------------------------------------------------------------------
+
+    def _limits(self, edges: Index, numbers: Index) -> Array:
+        """What chi2 is held against: the gate, or less where residuals of a class are far below their noise."""
+        limit = {int(n): quantile(self._config.gate, int(n)) for n in np.unique(numbers)}
+        out = np.array([limit[n] for n in numbers.tolist()], dtype=float)
+        for label, tightness in self._tightness.items():
+            out[self._graph.has_label(edges, (label,))] *= tightness
+        return out
+
+    def tight_losses(self) -> dict[str, list[Loss]]:
+        """Losses by class under which what is false among candidates lets go by itself: Huber's, then DCS."""
+        scale = {label: self._config.loss_scale * self._tightness.get(label, 1.0) ** 0.5 for label in CANDIDATES}
+        return {label: [Loss.named("huber", s), Loss.named("dcs", s)] for label, s in scale.items()}
+
+    def _tighten(self) -> None:
+        """Follow what residuals are like: whoever gives a noise ten times too large would let in all that is false.
+
+        The median of what is inside is compared with that of chi2; what is false does not move it.
+        """
+        inside, ledger, factor = self.ledger.inside, self.ledger, self._config.noise_factor**2
+        chi2, numbers = self._solver.chi2_of(inside)
+        typical = chi2 / np.array([_median(n) for n in numbers.tolist()])
+        for label in CANDIDATES:
+            of_label = self._graph.has_label(inside, (label,))
+            if np.count_nonzero(of_label) >= _TYPICAL:
+                ratio = float(np.median(typical[of_label]))
+                self._tightness[label] = min(1.0, max(_TIGHTEST, _SLACK * ratio))
+        freedom = self._graph.degrees_of_freedom
+        self.is_calibrated = freedom >= _TYPICAL
+        if self.is_calibrated:
+            as_noise_tells = self._solver.evaluate().chi2_final / freedom
+            self._looseness = min(factor, max(_TIGHTEST, factor * as_noise_tells))
+        edges = np.concatenate((inside, ledger.outside))
+        ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
+
+
+@cache
+def _median(numbers: int) -> float:
+    return quantile(0.5, numbers)

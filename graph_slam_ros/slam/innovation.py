@@ -1,0 +1,68 @@
+"""How far a measurement is from what all else predicts of it, in units of both their uncertainties."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from graph_slam_ros.graph import LANDMARK_POSITION, LANDMARK_POSITION_3D, R2, R3, SE2, SE3, Graph
+from graph_slam_ros.solver import Solver
+from graph_slam_ros.solver.linearization import linearized
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_ANGLES = {SE2: 1, SE3: 3}  # of a pose, its last coordinates
+_SIGHTING = {(SE2, R2): LANDMARK_POSITION, (SE3, R3): LANDMARK_POSITION_3D}
+_LINEAR_RAD2 = 0.1  # of a direction: beyond, a linear prediction is none
+
+
+def innovation(graph: Graph, solver: Solver, edge: int) -> float:
+    """The least that believing an edge would cost: its own residual and what must give way for it, squared, in sigmas.
+
+    With Sigma the joint covariance of its vertices, the least over a step d of ``d' Sigma^-1 d`` and the edge's chi2 at
+    the estimate moved by d: ``r' (Omega^-1 + J Sigma J')^-1 r`` where the residual is linear. Where so little is known
+    of a direction that it is not, the least is searched for. The edge must not be part of the problem at present.
+
+    Raises
+    ------
+    GaugeError, SingularError
+        As for ``Solver.marginal``.
+    """
+    table, row = graph.row(edge)
+    vertices, measured = table.vertices.values[row], table.measured.values[row]
+    joint, x, root = solver.joint_marginal(vertices), solver.values, table.sqrt_information.values[row]
+    residual, jacobian = linearized(graph, x, table.type, vertices, measured)
+    predicted = jacobian @ joint @ jacobian.T
+    white = root @ residual
+    if _spread(graph, x, vertices, joint, predicted) <= _LINEAR_RAD2:
+        spread = root @ predicted @ root.T + np.eye(len(white))
+        least = float(white @ np.linalg.lstsq(spread, white, rcond=None)[0])
+        return least if np.isfinite(least) else np.inf
+    variances, axes = np.linalg.eigh(joint)
+    sigmas = axes * np.sqrt(np.maximum(variances, 0.0))
+    kinds = [graph.kind_of(v) for v in vertices.tolist()]
+    first = np.cumsum([0] + [kind.dof for kind in kinds])
+
+    def cost(units: Array) -> Array:
+        step, moved = sigmas @ units, x.copy()
+        for kind, at, k in zip(kinds, graph.offset.values[vertices].tolist(), first.tolist(), strict=False):
+            here = slice(at, at + kind.size)
+            moved[here] = kind.retract(x[here][None], step[k : k + kind.dof][None])[0]
+        return np.concatenate((units, root @ linearized(graph, moved, table.type, vertices, measured)[0]))
+
+    return float(2.0 * least_squares(cost, np.zeros(len(sigmas)), method="lm").cost)
+
+
+def _spread(graph: Graph, x: Array, vertices: Index, joint: Array, predicted: Array) -> float:
+    """Variance [rad^2] of the directions in which the vertices of an edge see one another."""
+    kinds = [graph.kind_of(v) for v in vertices.tolist()]
+    pose = kinds[0]
+    if pose not in _ANGLES:
+        return 0.0
+    if len(kinds) > 1 and (pose, kinds[1]) in _SIGHTING:
+        dof = pose.dof + kinds[1].dof
+        at, jacobian = linearized(graph, x, _SIGHTING[pose, kinds[1]], vertices[:2], np.zeros(kinds[1].dof))
+        across = jacobian @ joint[:dof, :dof] @ jacobian.T
+        return float(np.trace(across) / max(float(at @ at), 1e-12))
+    of_poses = len(predicted) == pose.dof
+    return float(np.diag(predicted)[-_ANGLES[pose] :].max()) if of_poses else 0.0

@@ -1,0 +1,130 @@
+"""The ledger: of every measurement that may be wrong, what was decided about it, when, by what, and what before."""
+
+from copy import copy, deepcopy
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph.graph import Column
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class Verdict(IntEnum):
+    """What is believed of an edge."""
+
+    NOT_EVALUATED = 0  # it is odometry, or another edge that nobody doubts
+    ACCEPTED = 1
+    DOWN_WEIGHTED = 2  # it is in, but fits so badly that its loss leaves it little weight
+    PENDING = 3  # held back since it came
+    REJECTED = 4  # taken out after it was in
+
+
+class Reason(IntEnum):
+    """Why a verdict is not, or no longer, ``ACCEPTED``."""
+
+    NONE = 0
+    UNLIKELY = 1  # too far from what all else predicts, by their joint covariance
+    DOES_NOT_FIT = 2  # after the solve its residual is too large
+    OUTVOTED = 3  # a second look at everything found a better explanation without it
+    WITHDRAWN = 4  # somebody, or association, took it out
+
+
+INSIDE = (Verdict.ACCEPTED, Verdict.DOWN_WEIGHTED)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A verdict that changed: at which keyframe, to what and why, and the statistic with its threshold."""
+
+    edge: int
+    keyframe: int
+    verdict: Verdict
+    reason: Reason
+    statistic: float
+    threshold: float
+
+
+class Ledger:
+    """Verdicts of all edges of a graph, by edge.
+
+    Attributes
+    ----------
+    verdict, reason : codes of ``Verdict`` and ``Reason``
+    statistic, threshold : chi2 that was last judged, and what it was held against
+    numbers : how many numbers were measured, the statistic's degrees of freedom
+    keyframe : at which it was judged first
+    history : every change after the first verdict, and first verdicts that are not ``ACCEPTED``, in order
+    """
+
+    def __init__(self) -> None:
+        self.verdict, self.reason = Column(np.int64), Column(np.int64)
+        self.statistic, self.threshold = Column(np.float64), Column(np.float64)
+        self.numbers, self.keyframe = Column(np.int64), Column(np.int64)
+        self._residual, self._residual_at = Column(np.float64), Column(np.int64)
+        self.history: list[Change] = []
+
+    def __len__(self) -> int:
+        return len(self.verdict)
+
+    def copy(self) -> "Ledger":
+        """Another with the same records; its history begins empty."""
+        out = copy(self)
+        for name, column in vars(self).items():
+            if isinstance(column, Column):
+                setattr(out, name, deepcopy(column))
+        out.history = []
+        return out
+
+    def enter(
+        self, keyframe: int, statistic: Array, numbers: Index, threshold: Array, residuals: Array, judged: NDArray[Any]
+    ) -> Index:
+        """Open a record for each new edge, accepted where it is to be judged at all; returns their ids.
+
+        Parameters
+        ----------
+        residuals : what each measured differs from what was expected of it then, end to end
+        """
+        count = len(statistic)
+        ids = np.arange(len(self), len(self) + count)
+        self.verdict.extend(np.where(judged, Verdict.ACCEPTED, Verdict.NOT_EVALUATED), count)
+        self.reason.extend(Reason.NONE, count)
+        self.keyframe.extend(keyframe, count)
+        self.statistic.extend(statistic, count)
+        self.threshold.extend(threshold, count)
+        self.numbers.extend(numbers, count)
+        self._residual_at.extend(len(self._residual) + np.cumsum(numbers) - numbers, count)
+        self._residual.extend(residuals, len(residuals))
+        return ids
+
+    def note(self, edge: int, keyframe: int, verdict: Verdict, reason: Reason, statistic: float) -> None:
+        """Write a verdict down, and that it was changed."""
+        self.verdict.values[edge], self.reason.values[edge] = verdict, reason
+        self.statistic.values[edge] = statistic
+        limit = float(self.threshold.values[edge])
+        self.history.append(Change(edge, keyframe, verdict, reason, float(statistic), limit))
+
+    def residual(self, edge: int) -> Array:
+        """How the measurement differed from what was expected when it came, in its units."""
+        first = int(self._residual_at.values[edge])
+        out: Array = self._residual.values[first : first + int(self.numbers.values[edge])]
+        return out
+
+    def is_inside(self, edge: int) -> bool:
+        """Whether an edge pulls."""
+        return self.verdict.values[edge] in INSIDE
+
+    @property
+    def inside(self) -> Index:
+        """Edges that were judged and pull."""
+        return np.flatnonzero(np.isin(self.verdict.values, INSIDE))
+
+    @property
+    def outside(self) -> Index:
+        """Edges that are out and may come back."""
+        out = np.isin(self.verdict.values, (Verdict.PENDING, Verdict.REJECTED))
+        return np.flatnonzero(out & (self.reason.values != Reason.WITHDRAWN))

@@ -1,0 +1,98 @@
+"""Which loop closures agree with a neighbour: two that join the same two stretches of the path, nearly in one place.
+
+Odometry between near poses is good, so such a pair and the two short ways between their ends make a loop that must
+close: pairwise consistency (Mangelson et al., "Pairwise consistent measurement set maximization", ICRA 2018, eq. 3),
+between neighbours only, where the odometry tells something.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from graph_slam_ros.graph import RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Graph
+from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.lie import se2, se3
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_NEAR = 5.0  # poses between the ends of neighbours
+
+
+def agreeing(graph: Graph, values: Array, closures: Index, limits: Array) -> Index:
+    """Those of some closures that agree with at least one of their neighbours.
+
+    Parameters
+    ----------
+    values : stored numbers of all vertices, the poses by odometry alone
+    limits : of each closure, what chi2 its loops may have
+    """
+    kind, edge_type = (SE2, RELATIVE_POSE) if SE2 in graph.kinds else (SE3, RELATIVE_POSE_3D)
+    table = graph.tables.get(edge_type)
+    if table is None:
+        return closures[:0]
+    of_table = graph.table_of_edge.values[closures] == table.code
+    closures, limits = closures[of_table], limits[of_table]
+    rows = graph.row_of_edge.values[closures]
+    ends, measured = table.vertices.values[rows], table.measured.values[rows]
+    order = np.cumsum(graph.kind.values == graph.kinds.index(kind)) - 1  # of poses in time, by vertex
+    pairs = cKDTree(order[ends]).query_pairs(_NEAR, p=np.inf, output_type="ndarray") if len(ends) else ends
+    if not len(pairs):
+        return closures[:0]
+    a, b = pairs.T
+    at = graph.offset.values[ends][:, :, None] + np.arange(kind.size)
+    path = values[at]  # (n, 2, size)
+    group = se2 if kind is SE2 else se3
+    before = _between(group, path[b, 0], path[a, 0])
+    after = _between(group, path[a, 1], path[b, 1])
+    onwards = _compose(group, measured[a], after)
+    error = _columns(group.log, _between(group, measured[b], _compose(group, before, onwards)))
+
+    noise = np.linalg.inv(table.sqrt_information.values[rows])
+    noise = noise @ noise.transpose(0, 2, 1)
+    step = _odometry_noise(graph, table)
+    steps = np.abs(order[ends[a]] - order[ends[b]])
+    covariance = noise[b] + _carried(group, after, noise[a])
+    covariance += _carried(group, onwards, _walked(group, before, steps[:, 0], step))
+    covariance += _walked(group, after, steps[:, 1], step)
+    distance = np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    agree = distance <= np.minimum(limits[a], limits[b])
+    return closures[np.unique(pairs[agree])]
+
+
+def _odometry_noise(graph: Graph, table: EdgeTable) -> Array:
+    """Covariance of a step of odometry, on average."""
+    code = graph.labels.index("odometry") if "odometry" in graph.labels else -1
+    root = table.sqrt_information.values[table.label.values == code]
+    if not len(root):
+        return np.zeros(table.sqrt_information.values.shape[1:])
+    inverse = np.linalg.inv(root)
+    mean: Array = (inverse @ inverse.transpose(0, 2, 1)).mean(axis=0)
+    return mean
+
+
+def _walked(group: Any, motion: Array, steps: Index, step: Array) -> Array:
+    """Covariance of the steps of a motion, as if all had erred half way, where turns weigh as they do on average."""
+    half = _columns(group.exp, 0.5 * _columns(group.log, motion))
+    return _carried(group, half, steps[:, None, None] * step)
+
+
+def _carried(group: Any, motion: Array, covariance: Array) -> Array:
+    """The covariance, in right tangent coordinates, of what is followed by a motion."""
+    adjoint = np.array([group.adjoint(tuple(one)) for one in _columns(group.inverse, motion).tolist()])
+    return adjoint @ covariance @ adjoint.transpose(0, 2, 1)
+
+
+def _compose(group: Any, a: Array, b: Array) -> Array:
+    return np.stack(group.compose(tuple(a.T), tuple(b.T)), axis=-1)
+
+
+def _between(group: Any, a: Array, b: Array) -> Array:
+    return np.stack(group.between(tuple(a.T), tuple(b.T)), axis=-1)
+
+
+def _columns(function: Callable[[tuple[Array, ...]], tuple[Array, ...]], rows: Array) -> Array:
+    return np.stack(function(tuple(rows.T)), axis=-1)

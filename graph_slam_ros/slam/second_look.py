@@ -1,0 +1,154 @@
+"""A second look at everything: solve, judge, solve again, from more than one start; the best explanation wins.
+
+What an online run believed first may rest on a false closure that came before the true ones. So the whole is explained
+twice: from the online estimate and what is believed there; and from odometry alone with the candidates that agree with
+a neighbour. In each, all is solved and every candidate judged by how it fits, in turn, until no verdict changes; what
+is out then costs as much as the gate would have let it cost (truncated least squares). The lower cost wins.
+"""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.errors import GaugeError, SingularError
+from graph_slam_ros.graph import SE2, SE3, Graph
+from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.slam.decisions import Decisions
+from graph_slam_ros.slam.ledger import Ledger
+from graph_slam_ros.slam.neighbours import agreeing
+from graph_slam_ros.slam.robust_config import RobustConfig
+from graph_slam_ros.solver import Settings, Solver
+from graph_slam_ros.solver.initialization import initial_values
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_ITERATIONS = 20  # of each stage of the losses, from another start
+_HOPELESS = 1.5  # times the cost from the online estimate: another start is given up
+_GROUP = {SE2: se2, SE3: se3}
+
+
+@dataclass(frozen=True, slots=True)
+class Frozen:
+    """What a second look begins with: copies, which nobody else changes.
+
+    Attributes
+    ----------
+    vertices : of the graph, that are part of the problem
+    values : the online estimate, the stored numbers of all vertices
+    ledger : what is believed online
+    """
+
+    keyframe: int
+    graph: Graph
+    vertices: Index
+    values: Array
+    settings: Settings
+    ledger: Ledger
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """An explanation: from which start, what is believed, the stored numbers of all vertices, its truncated cost."""
+
+    start: str
+    ledger: Ledger
+    values: Array
+    cost: float
+    frozen: Frozen
+
+    def carried_to(self, graph: Graph, values: Array) -> Array:
+        """Stored numbers of a graph that has grown since: what is new moves with the newest pose that was there."""
+        out, known, old = values.copy(), len(self.values), self.frozen.graph
+        poses = [v for v in range(old.vertex_count) if old.kind_of(v) in _GROUP]
+        if known == len(values) or not poses:
+            out[:known] = self.values
+            return out
+        newest, kind = poses[-1], old.kind_of(poses[-1])
+        at = int(graph.offset.values[newest])
+        group, here = _GROUP[kind], slice(at, at + kind.size)
+        moved = group.compose(tuple(self.values[here]), group.inverse(tuple(values[here])))
+        for vertex in range(old.vertex_count, graph.vertex_count):
+            at, of = int(graph.offset.values[vertex]), graph.kind_of(vertex)
+            numbers = tuple(values[at : at + of.size])
+            if of is kind:
+                out[at : at + of.size] = group.compose(moved, numbers)
+            elif of.size == (2 if kind is SE2 else 3):
+                out[at : at + of.size] = group.act(moved, numbers)
+        out[:known] = self.values
+        return out
+
+
+def second_look(config: RobustConfig, frozen: Frozen) -> Outcome:
+    """Explain a graph anew, from each start; the least cost wins."""
+    best = _explained("online", config, frozen, frozen.values, None, np.inf)
+    if len(best.ledger.outside):
+        for name, start, believed in _other_starts(config, frozen):
+            with suppress(GaugeError, SingularError):  # what is believed there does not hold together
+                other = _explained(name, config, frozen, start, believed, _HOPELESS * best.cost)
+                best = min(best, other, key=lambda outcome: outcome.cost)
+    return best
+
+
+def _other_starts(config: RobustConfig, frozen: Frozen) -> Iterator[tuple[str, Array, Index]]:
+    """Closures that agree with a neighbour, and no others, from the online estimate and from odometry alone."""
+    ledger, graph = frozen.ledger, frozen.graph.copy()
+    candidates = np.sort(np.concatenate((ledger.inside, ledger.outside)))
+    is_closure = graph.has_label(candidates, ("closures",))
+    closures, others = candidates[is_closure], candidates[~is_closure]
+    if not len(closures):
+        yield "all", frozen.values, candidates
+        return
+    graph.set_weights(candidates, 0.0)
+    odometry = initial_values(graph, "tree", _root(graph))
+    believed = np.union1d(others, agreeing(graph, odometry, closures, ledger.threshold.values[closures]))
+    yield "neighbours", frozen.values, believed
+    yield "odometry", np.where(_of_poses(graph), odometry, frozen.values), believed
+
+
+def _explained(
+    name: str, config: RobustConfig, frozen: Frozen, start: Array, believed: Index | None, hopeless: float
+) -> Outcome:
+    """Solve and judge in turn, beginning with what is believed in the ledger, or with these candidates instead.
+
+    It ends when no verdict changes, or when the cost is hopeless after the first.
+    """
+    graph, mine = frozen.graph.copy(), frozen.ledger.copy()
+    solver = Solver(graph, frozen.settings)
+    solver.add(frozen.vertices, range(len(mine)))
+    solver.start_at(start)
+    decisions = Decisions(config, graph, solver, mine)
+    if believed is not None:
+        decisions.believe(believed, frozen.keyframe)
+        solver.optimize(replace(frozen.settings, losses=decisions.tight_losses(), max_iterations=_ITERATIONS))
+        decisions.settle(frozen.keyframe)
+    solver.optimize()
+    for _ in range(config.rounds):
+        if _cost(solver, mine) > hopeless:
+            break
+        if not decisions.settle(frozen.keyframe) and not decisions.complete(frozen.keyframe):
+            break
+        solver.optimize()
+    return Outcome(name, mine, solver.values, _cost(solver, mine), frozen)
+
+
+def _cost(solver: Solver, ledger: Ledger) -> float:
+    """Chi2 of all that is in, but of no candidate more than what it costs to be out."""
+    inside, limits = ledger.inside, ledger.threshold.values
+    chi2, _ = solver.chi2_of(inside)
+    doubted = float(np.minimum(chi2, limits[inside]).sum() + limits[ledger.outside].sum())
+    return solver.evaluate().chi2_final - float(chi2.sum()) + doubted
+
+
+def _root(graph: Graph) -> int:
+    return next(v for v in range(graph.vertex_count) if graph.kind_of(v) in _GROUP)
+
+
+def _of_poses(graph: Graph) -> NDArray[np.bool_]:
+    """Which of the stored numbers are of poses."""
+    sizes = np.array([kind.size for kind in graph.kinds])
+    poses = np.array([kind in _GROUP for kind in graph.kinds])
+    return np.repeat(poses[graph.kind.values], sizes[graph.kind.values])
