@@ -140,7 +140,7 @@ def overload(short: bool) -> list[Row]:
                 rows[-1]["normal after s"] = _normal_after(told["when"], heard["odometry"], start_ns, usual_s)
         received = robot.ask()
         time.sleep(_DIAGNOSED_S)
-        used = _told(ears.ask()["diagnostics"][-1:], "used or waiting")
+        used = _told(ears.ask()["diagnostics"][-1:], "used")
     rows.append({"load": "in all", "sent": sent, "received": received, "used": int(sum(used))})
     return rows
 
