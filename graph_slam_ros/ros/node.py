@@ -1,6 +1,5 @@
 """The ROS node: its lifecycle, parameters, services and state. What it does with messages is in ``live/configured``."""
 
-import gc
 import os
 import re
 import signal
@@ -130,7 +129,6 @@ class GraphSlamNode(LifecycleNode):
             self._run = run = Configured(self)  # first what may be refused
             self.get_logger().info("compiling kernels (once per installation)")
             self.get_logger().info(f"kernels ready after {warmup(self._is_told_to_stop):.1f} s")
-            _set_apart()
             if self.config.output.load_at_start:
                 run.in_passing(run.load())
 
@@ -310,13 +308,6 @@ def main() -> int:
     finally:
         rclpy.try_shutdown()
     return 0
-
-
-def _set_apart() -> None:
-    """What is loaded and compiled stays: to look through it for garbage stops every thread for a tenth of a second."""
-    if not gc.get_freeze_count():
-        gc.collect()
-        gc.freeze()
 
 
 def _started(node: GraphSlamNode, told: _Told) -> bool:
