@@ -61,7 +61,7 @@ class Backend:
         admitted = self.decisions.admit(doubtful, keyframe)
         if admitted:
             self._make_fit(admitted, keyframe)
-        out = len(self.ledger.outside)
+        out = self.ledger.outside_count
         if self._config.decide and self._background.is_due(out):
             self._background.start(self._frozen(keyframe, self.solver.settings), out)
 

@@ -63,7 +63,7 @@ class Decisions:
         for edge in ids[judged & (chi2 > limit) & self._config.decide].tolist():
             if not self._is_needed(edge):
                 self._take_out(edge)
-                self.ledger.verdict.values[edge] = Verdict.PENDING
+                self.ledger.hold_back(edge)
                 waiting.append(edge)
         return waiting
 
@@ -186,19 +186,20 @@ class Decisions:
 
     def _weigh(self, edges: Index, keyframe: int) -> bool:
         """By what their losses leave of each one's weight."""
+        ledger, changed = self.ledger, False
         chi2, _ = self._solver.chi2_of(edges)
-        changed = False
-        for label, stages in self._solver.settings.losses.items():
-            loss, of_label = stages[-1], self._graph.has_label(edges, (label,))
-            for edge, fit in zip(edges[of_label].tolist(), chi2[of_label].tolist(), strict=True):
-                weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
-                fits = fit <= self.ledger.threshold.values[edge]
-                verdict = Verdict.ACCEPTED if fits else Verdict.DOWN_WEIGHTED
-                if weight < self._config.out_below and not self._is_needed(edge):
-                    self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
-                    changed = True
-                elif self.ledger.verdict.values[edge] != verdict:
-                    self.ledger.note(edge, keyframe, verdict, Reason.NONE, fit)
+        unfit = chi2 > ledger.threshold.values[edges]
+        again = ~unfit & (ledger.verdict.values[edges] == Verdict.DOWN_WEIGHTED)
+        for edge, fit in zip(edges[again].tolist(), chi2[again].tolist(), strict=True):
+            ledger.note(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, fit)
+        for edge, fit in zip(edges[unfit].tolist(), chi2[unfit].tolist(), strict=True):
+            loss = self._solver.settings.losses[self._label(edge)][-1]
+            weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
+            if weight < self._config.out_below and not self._is_needed(edge):
+                self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
+                changed = True
+            elif ledger.verdict.values[edge] == Verdict.ACCEPTED:
+                ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)
         return changed
 
     def _innovation(self, edge: int) -> float:
@@ -227,11 +228,15 @@ class Decisions:
         self._solver.set_weight(edge, 0.0)
         self._count(edge, -1)
 
+    def _label(self, edge: int) -> str:
+        table, row = self._graph.row(edge)
+        return self._graph.labels[int(table.label.values[row])]
+
     def _landmark(self, edge: int) -> int | None:
         """The landmark that one such edge alone would determine; -1: it does so only with others."""
-        table, row = self._graph.row(edge)
-        if self._graph.labels[int(table.label.values[row])] != "landmarks":
+        if self._label(edge) != "landmarks":
             return None
+        table, row = self._graph.row(edge)
         landmark = int(table.vertices.values[row, 1])
         return landmark if table.type.residual_size >= self._graph.kind_of(landmark).dof else -1
 

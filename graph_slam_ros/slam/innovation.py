@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from graph_slam_ros.graph import LANDMARK_POSITION, LANDMARK_POSITION_3D, R2, R3, SE2, SE3, Graph
+from graph_slam_ros.graph import LANDMARK_POSITION, LANDMARK_POSITION_3D, R2, R3, SE2, SE3, EdgeType, Graph
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import linearized
 
@@ -38,17 +38,28 @@ def innovation(graph: Graph, solver: Solver, edge: int) -> float:
         spread = root @ predicted @ root.T + np.eye(len(white))
         least = float(white @ np.linalg.lstsq(spread, white, rcond=None)[0])
         return least if np.isfinite(least) else np.inf
+    return _least_cost(graph, x, table.type, vertices, measured, root, joint)
+
+
+def _least_cost(
+    graph: Graph, x: Array, edge: EdgeType, vertices: Index, measured: Array, root: Array, joint: Array
+) -> float:
+    """The least of ``|u|^2 + |R r|^2`` over steps ``d = L u`` of the vertices, with ``L L' = Sigma``, by search."""
     variances, axes = np.linalg.eigh(joint)
     sigmas = axes * np.sqrt(np.maximum(variances, 0.0))
     kinds = [graph.kind_of(v) for v in vertices.tolist()]
+    at = np.cumsum([0] + [kind.size for kind in kinds])
     first = np.cumsum([0] + [kind.dof for kind in kinds])
+    before = [x[o : o + kind.size][None] for o, kind in zip(graph.offset.values[vertices].tolist(), kinds, strict=True)]
 
     def cost(units: Array) -> Array:
-        step, moved = sigmas @ units, x.copy()
-        for kind, at, k in zip(kinds, graph.offset.values[vertices].tolist(), first.tolist(), strict=False):
-            here = slice(at, at + kind.size)
-            moved[here] = kind.retract(x[here][None], step[k : k + kind.dof][None])[0]
-        return np.concatenate((units, root @ linearized(graph, moved, table.type, vertices, measured)[0]))
+        step = sigmas @ units
+        moved = [
+            kind.retract(value, step[None, k : k + kind.dof])[0]
+            for kind, value, k in zip(kinds, before, first.tolist(), strict=False)
+        ]
+        residual, _ = edge.linearize(np.concatenate(moved), at[None, :-1], measured[None])
+        return np.concatenate((units, root @ residual[0]))
 
     return float(2.0 * least_squares(cost, np.zeros(len(sigmas)), method="lm").cost)
 

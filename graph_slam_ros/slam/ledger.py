@@ -35,6 +35,7 @@ class Reason(IntEnum):
 
 
 INSIDE = (Verdict.ACCEPTED, Verdict.DOWN_WEIGHTED)
+_ACCEPTED, _DOWN_WEIGHTED = _INSIDE = tuple(map(int, INSIDE))  # comparing with members of an enumeration is slow
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +68,7 @@ class Ledger:
         self.numbers, self.keyframe = Column(np.int64), Column(np.int64)
         self._residual, self._residual_at = Column(np.float64), Column(np.int64)
         self.history: list[Change] = []
+        self._out: set[int] = set()
 
     def __len__(self) -> int:
         return len(self.verdict)
@@ -77,7 +79,7 @@ class Ledger:
         for name, column in vars(self).items():
             if isinstance(column, Column):
                 setattr(out, name, deepcopy(column))
-        out.history = []
+        out.history, out._out = [], set(self._out)
         return out
 
     def enter(
@@ -101,10 +103,19 @@ class Ledger:
         self._residual.extend(residuals, len(residuals))
         return ids
 
+    def hold_back(self, edge: int) -> None:
+        """An edge that has just come is out until it is compared with all else."""
+        self.verdict.values[edge] = Verdict.PENDING
+        self._out.add(edge)
+
     def note(self, edge: int, keyframe: int, verdict: Verdict, reason: Reason, statistic: float) -> None:
         """Write a verdict down, and that it was changed."""
         self.verdict.values[edge], self.reason.values[edge] = verdict, reason
         self.statistic.values[edge] = statistic
+        if verdict in INSIDE or reason == Reason.WITHDRAWN:
+            self._out.discard(edge)
+        else:
+            self._out.add(edge)
         limit = float(self.threshold.values[edge])
         self.history.append(Change(edge, keyframe, verdict, reason, float(statistic), limit))
 
@@ -116,15 +127,20 @@ class Ledger:
 
     def is_inside(self, edge: int) -> bool:
         """Whether an edge pulls."""
-        return self.verdict.values[edge] in INSIDE
+        return int(self.verdict.values[edge]) in _INSIDE
 
     @property
     def inside(self) -> Index:
         """Edges that were judged and pull."""
-        return np.flatnonzero(np.isin(self.verdict.values, INSIDE))
+        verdict = self.verdict.values
+        return np.flatnonzero((verdict == _ACCEPTED) | (verdict == _DOWN_WEIGHTED))
 
     @property
     def outside(self) -> Index:
         """Edges that are out and may come back."""
-        out = np.isin(self.verdict.values, (Verdict.PENDING, Verdict.REJECTED))
-        return np.flatnonzero(out & (self.reason.values != Reason.WITHDRAWN))
+        return np.array(sorted(self._out), dtype=np.int64)
+
+    @property
+    def outside_count(self) -> int:
+        """Number of these."""
+        return len(self._out)
