@@ -8,7 +8,7 @@ from graph_slam_ros.slam.background import Background, Beside, when_asked
 from graph_slam_ros.slam.decisions import Decisions
 from graph_slam_ros.slam.ledger import Ledger
 from graph_slam_ros.slam.robust_config import RobustConfig
-from graph_slam_ros.slam.second_look import Frozen, Outcome, second_look
+from graph_slam_ros.slam.second_look import Frozen, Outcome, Rival, second_look
 from graph_slam_ros.solver import Report, Settings, Solver
 
 
@@ -23,6 +23,7 @@ class Backend:
     ----------
     graph, solver, decisions
     handed_over : vertices and edges of the graph that the solver has
+    rivals : other explanations of the same measurements that the last second look could not rule out
     """
 
     def __init__(self, config: RobustConfig, settings: Settings, beside: Beside = when_asked) -> None:
@@ -32,6 +33,7 @@ class Backend:
         self.decisions = Decisions(config, self.graph, self.solver)
         self.handed_over = 0, 0
         self._background = Background(config, beside)
+        self.rivals: tuple[Rival, ...] = ()
         self._reviewed = 0  # the keyframe of the last review
 
     @property
@@ -77,6 +79,7 @@ class Backend:
             self._make_fit(admitted, keyframe)
         self._background.cancel()
         outcome = second_look(self._config, self._frozen(keyframe, settings))
+        self.rivals = outcome.rivals
         self.decisions.follow(outcome.ledger, keyframe)
         self.solver.start_at(outcome.values)
         return self.solver.optimize(settings)
@@ -103,6 +106,7 @@ class Backend:
 
     def _follow(self, outcome: Outcome, keyframe: int) -> bool:
         """Take over what a second look has found; whether that is other than what was known."""
+        self.rivals = outcome.rivals
         if not self.decisions.follow(outcome.ledger, keyframe):
             return False
         self.solver.start_at(outcome.carried_to(self.graph, self.solver.values))

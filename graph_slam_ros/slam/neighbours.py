@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from graph_slam_ros.graph import RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Graph
@@ -22,8 +24,8 @@ Index = NDArray[np.int64]
 _NEAR = 5.0  # poses between the ends of neighbours
 
 
-def agreeing(graph: Graph, values: Array, closures: Index, limits: Array) -> Index:
-    """Those of some closures that agree with at least one of their neighbours.
+def agreeing(graph: Graph, values: Array, closures: Index, limits: Array) -> list[Index]:
+    """Groups of closures each of which agrees with a neighbour of its group; without those that agree with none.
 
     Parameters
     ----------
@@ -33,7 +35,7 @@ def agreeing(graph: Graph, values: Array, closures: Index, limits: Array) -> Ind
     kind, edge_type = (SE2, RELATIVE_POSE) if SE2 in graph.kinds else (SE3, RELATIVE_POSE_3D)
     table = graph.tables.get(edge_type)
     if table is None:
-        return closures[:0]
+        return []
     of_table = graph.table_of_edge.values[closures] == table.code
     closures, limits = closures[of_table], limits[of_table]
     rows = graph.row_of_edge.values[closures]
@@ -41,7 +43,7 @@ def agreeing(graph: Graph, values: Array, closures: Index, limits: Array) -> Ind
     order = np.cumsum(graph.kind.values == graph.kinds.index(kind)) - 1  # of poses in time, by vertex
     pairs = cKDTree(order[ends]).query_pairs(_NEAR, p=np.inf, output_type="ndarray") if len(ends) else ends
     if not len(pairs):
-        return closures[:0]
+        return []
     a, b = pairs.T
     at = graph.offset.values[ends][:, :, None] + np.arange(kind.size)
     path = values[at]  # (n, 2, size)
@@ -60,7 +62,10 @@ def agreeing(graph: Graph, values: Array, closures: Index, limits: Array) -> Ind
     covariance += _walked(group, after, steps[:, 1], step)
     distance = np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
     agree = distance <= np.minimum(limits[a], limits[b])
-    return closures[np.unique(pairs[agree])]
+    joined = coo_array((np.ones(np.count_nonzero(agree)), (a[agree], b[agree])), shape=(len(ends), len(ends)))
+    _, group_of = connected_components(joined, directed=False)
+    some = np.unique(pairs[agree])
+    return [closures[some[group_of[some] == one]] for one in np.unique(group_of[some])]
 
 
 def _odometry_noise(graph: Graph, table: EdgeTable) -> Array:

@@ -27,7 +27,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _ITERATIONS = 20  # of each stage of the losses, from another start
-_HOPELESS = 1.5  # times the cost from the online estimate: another start is given up
+_HOPELESS = 2.0  # times the least cost that was found: another explanation is none
+_STORY = 5  # closures that agree with one another and not with the map
 _GROUP = {SE2: se2, SE3: se3}
 
 
@@ -51,6 +52,22 @@ class Frozen:
 
 
 @dataclass(frozen=True, slots=True)
+class Rival:
+    """Another explanation that holds together, too, and costs not much more: who sees both cannot tell by this graph.
+
+    Attributes
+    ----------
+    cost, best_cost : truncated cost of this one, and of the one that is believed
+    only_here, only_there : closures that this one believes and the other does not, and the other way round
+    """
+
+    cost: float
+    best_cost: float
+    only_here: tuple[int, ...]
+    only_there: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """An explanation: from which start, what is believed, the stored numbers of all vertices, its truncated cost."""
 
@@ -59,6 +76,7 @@ class Outcome:
     values: Array
     cost: float
     frozen: Frozen
+    rivals: tuple[Rival, ...] = ()
 
     def carried_to(self, graph: Graph, values: Array) -> Array:
         """Stored numbers of a graph that has grown since: what is new moves with the newest pose that was there."""
@@ -84,17 +102,33 @@ class Outcome:
 
 def second_look(config: RobustConfig, frozen: Frozen) -> Outcome:
     """Explain a graph anew, from each start; the least cost wins."""
-    best = _explained("online", config, frozen, frozen.values, None, np.inf)
-    if len(best.ledger.outside):
+    found = [_explained("online", config, frozen, frozen.values, None, np.inf)]
+    if len(found[0].ledger.outside):
         for name, start, believed in _other_starts(config, frozen):
             with suppress(GaugeError, SingularError):  # what is believed there does not hold together
-                other = _explained(name, config, frozen, start, believed, _HOPELESS * best.cost)
-                best = min(best, other, key=lambda outcome: outcome.cost)
-    return best
+                hopeless = _HOPELESS * min(outcome.cost for outcome in found)
+                found.append(_explained(name, config, frozen, start, believed, hopeless))
+    best = min(found, key=lambda outcome: outcome.cost)
+    rivals = {rival.only_here: rival for rival in (_rival(one, best) for one in found) if rival is not None}
+    return replace(best, rivals=tuple(rivals.values()))
+
+
+def _rival(one: Outcome, best: Outcome) -> Rival | None:
+    """What another explanation believes against the best, where that is a whole story and not a few edges more."""
+    graph = best.frozen.graph
+    here, there = (outcome.ledger.inside for outcome in (one, best))
+    only_here, only_there = np.setdiff1d(here, there), np.setdiff1d(there, here)
+    is_story = np.count_nonzero(graph.has_label(only_here, ("closures",))) >= _STORY
+    if not is_story or one.cost > _HOPELESS * best.cost:
+        return None
+    return Rival(one.cost, best.cost, tuple(only_here.tolist()), tuple(only_there.tolist()))
 
 
 def _other_starts(config: RobustConfig, frozen: Frozen) -> Iterator[tuple[str, Array, Index]]:
-    """Closures that agree with a neighbour, and no others, from the online estimate and from odometry alone."""
+    """Closures that agree with a neighbour, and no others, from the online estimate and from odometry alone.
+
+    And the largest group that is out, as if it alone were true.
+    """
     ledger, graph = frozen.ledger, frozen.graph.copy()
     candidates = np.sort(np.concatenate((ledger.inside, ledger.outside)))
     is_closure = graph.has_label(candidates, ("closures",))
@@ -104,9 +138,15 @@ def _other_starts(config: RobustConfig, frozen: Frozen) -> Iterator[tuple[str, A
         return
     graph.set_weights(candidates, 0.0)
     odometry = initial_values(graph, "tree", _root(graph))
-    believed = np.union1d(others, agreeing(graph, odometry, closures, ledger.threshold.values[closures]))
+    odometry = np.where(_of_poses(graph), odometry, frozen.values)
+    groups = agreeing(graph, odometry, closures, ledger.threshold.values[closures])
+    believed = np.concatenate((others, *groups))
     yield "neighbours", frozen.values, believed
-    yield "odometry", np.where(_of_poses(graph), odometry, frozen.values), believed
+    yield "odometry", odometry, believed
+    out = [group[~np.isin(group, ledger.inside)] for group in groups]
+    largest = max(out, key=len, default=closures[:0])
+    if len(largest) >= _STORY:
+        yield "rejected", odometry, np.concatenate((others, largest))
 
 
 def _explained(

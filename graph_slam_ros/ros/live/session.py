@@ -32,6 +32,7 @@ class Estimate:
     source : the odometry in use
     is_confirmed : whether the robot knows where it is in a map that was loaded
     fit : chi2 per degree of freedom; NaN before it was looked at
+    rivals : loop closures of other explanations that could not be ruled out
     """
 
     T_map_odom: Numbers
@@ -49,6 +50,7 @@ class Estimate:
     solve_s: float
     slowest_solve_s: float
     fit: float
+    rivals: int
 
 
 class Session:
@@ -140,6 +142,7 @@ class Session:
             took_s,
             self._slowest_s,
             self._fit,
+            sum(len(rival.only_here) for rival in slam.backend.rivals),
         )
 
     def evaluate(self) -> None:
