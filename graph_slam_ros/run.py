@@ -1,6 +1,7 @@
 """The run folder: everything a run leaves behind, written the same way by the node and by replay.
 
-``graph.g2o`` and ``graph_vertices.csv`` (stamp and name of each vertex), ``path.tum``, ``covariances.csv``,
+``graph.g2o`` and ``graph_vertices.csv`` (stamp and name of each vertex), ``ledger.csv`` and ``ledger_changes.csv``
+(each edge, what is believed of it, and how that came: ``ledger_file``), ``path.tum``, ``covariances.csv``,
 ``sightings.tum``, ``odometry.tum``, ``landmarks.csv``, ``run.mcap``, ``ingest.mcap``, ``config.yaml``, ``run.json``.
 
 Covariances are written as their upper triangle, row by row. Those of ``covariances.csv``, of each pose of ``path.tum``,
@@ -27,6 +28,7 @@ from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.ingest import IngestWriter, ingest_files
 from graph_slam_ros.formats.parameters import parameters_text, read_parameters
 from graph_slam_ros.formats.tum import tum_text
+from graph_slam_ros.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter
 from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
@@ -34,13 +36,16 @@ from graph_slam_ros.slam.measurements import to_record
 from graph_slam_ros.solver.leverage import leverage
 
 SUMMARY, COVARIANCES, _CONFIG = "run.json", "covariances.csv", "config.yaml"
+GRAPH, VERTICES = "graph.g2o", "graph_vertices.csv"
 Name = TypeVar("Name")
 _RECORDED = re.compile(r"(ingest|run)(_\d+)?\.mcap")
 
 _RESULTS = {
     SUMMARY,
-    "graph.g2o",
-    "graph_vertices.csv",
+    GRAPH,
+    VERTICES,
+    LEDGER,
+    CHANGES,
     "path.tum",
     COVARIANCES,
     "sightings.tum",
@@ -163,9 +168,11 @@ class RunRecorder:
             if slam.keyframes:
                 self._record_map(slam)
             self.close()
-            _write_graph(self.folder, slam)
+            ids = _write_graph(self.folder, slam)
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
+        _replace(self.folder / LEDGER, ledger_text(slam, ids))
+        _replace(self.folder / CHANGES, changes_text(slam))
         _replace(self.folder / "path.tum", tum_text(slam.keyframes.stamps_ns.tolist(), slam.trajectory()))
         _replace(self.folder / COVARIANCES, _covariance_table(slam))
         stamps = slam.sighting_poses.stamps_ns.tolist()
@@ -229,10 +236,10 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
     }
 
 
-def _write_graph(folder: Path, slam: GraphSlam) -> None:
+def _write_graph(folder: Path, slam: GraphSlam) -> list[int]:
     """Poses are numbered from 0 in order of time, landmarks after them: other tools read odometry from that.
 
-    What is neither is an offset that the ranges of a sensor share.
+    What is neither is an offset that the ranges of a sensor share. Returns the number of each vertex.
     """
     names: list[tuple[int, str, int | str, str]] = []
     for k, keyframe in enumerate(slam.keyframes):
@@ -246,10 +253,11 @@ def _write_graph(folder: Path, slam: GraphSlam) -> None:
     for file_id, (vertex, what, stamp, name) in enumerate(names):
         ids[vertex] = file_id
         rows.append(f"{file_id},{what},{stamp},{_csv(name)}")
-    target = folder / "graph.g2o"
+    target = folder / GRAPH
     write_g2o(_temporary(target), G2oFile(slam.graph, ids), slam.solver.estimate)
     os.replace(_temporary(target), target)
-    _replace(folder / "graph_vertices.csv", "\n".join(rows) + "\n")
+    _replace(folder / VERTICES, "\n".join(rows) + "\n")
+    return ids
 
 
 def _covariance_table(slam: GraphSlam) -> str:

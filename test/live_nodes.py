@@ -35,7 +35,7 @@ from graph_slam_ros.replay import replay
 from graph_slam_ros.ros import topics
 from graph_slam_ros.ros.message_class import message_class
 
-RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv")
+RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv", "ledger.csv", "ledger_changes.csv")
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 PATIENCE_S = 10.0

@@ -15,7 +15,7 @@ from executables import executable
 from graph_slam_ros import __version__, cli
 from graph_slam_ros.ros.bag import BagWriter, open_bag
 
-RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv")
+RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv", "ledger.csv", "ledger_changes.csv")
 COMMAND = executable("graph_slam")
 WITH_EVO = pytest.mark.skipif(importlib.util.find_spec("evo") is None, reason="evo is not installed")
 

@@ -26,7 +26,15 @@ from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 from graph_slam_ros.slam.measurements import from_record, to_record
 
-RESULTS = ("graph.g2o", "path.tum", "covariances.csv", "sightings.tum", "landmarks.csv")
+RESULTS = (
+    "graph.g2o",
+    "path.tum",
+    "covariances.csv",
+    "sightings.tum",
+    "landmarks.csv",
+    "ledger.csv",
+    "ledger_changes.csv",
+)
 ALL = {*RESULTS, "graph_vertices.csv", "odometry.tum", "run.mcap", "ingest.mcap", "config.yaml", "run.json"}
 
 

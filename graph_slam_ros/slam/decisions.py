@@ -43,6 +43,7 @@ class Decisions:
         self._tightness: dict[str, float] = {}  # of each class, by what its gate is smaller
         self.is_calibrated = False  # whether enough was measured twice to tell how good odometry is
         self._looseness = config.noise_factor**2  # of the gate of what all else predicts
+        self._withdrawn: list[int] = []  # before they were taken
         self._next = 0  # of the accepted, where the next review goes on
         self._next_out = 0  # and of those that are out
 
@@ -56,9 +57,13 @@ class Decisions:
         ids = np.arange(len(self.ledger), count)
         chi2, numbers = self._solver.chi2_of(ids)
         limit, judged = self._limits(ids, numbers), self._graph.has_label(ids, CANDIDATES)
+        judged &= ~np.isin(ids, self._withdrawn)
         self.ledger.enter(keyframe, chi2, numbers, limit, self._solver.residuals_of(ids), judged)
         for edge in ids[judged].tolist():
             self._count(edge, 1)
+        for edge in self._withdrawn:
+            self.ledger.note(edge, keyframe, Verdict.REJECTED, Reason.WITHDRAWN, self.ledger.statistic.values[edge])
+        self._withdrawn.clear()
         waiting = []
         for edge in ids[judged & (chi2 > limit) & self._config.decide].tolist():
             if not self._is_needed(edge):
@@ -77,13 +82,13 @@ class Decisions:
                 break
             best = min(likely, key=lambda edge: innovation[edge] / self.ledger.threshold.values[edge])
             for edge in likely if admitted else [best]:
-                self._readmit(edge, keyframe, innovation[edge])
+                self._readmit(edge, keyframe, innovation[edge], self._widest(edge))
                 admitted.append(edge)
             out = [edge for edge in out if not self.ledger.is_inside(edge)]
             if out:
                 self._solver.update()
         for edge in out:
-            self.ledger.note(edge, keyframe, Verdict.PENDING, Reason.UNLIKELY, innovation[edge])
+            self.ledger.note(edge, keyframe, Verdict.PENDING, Reason.UNLIKELY, innovation[edge], self._widest(edge))
         return admitted
 
     def fit(self, edges: Sequence[int]) -> bool:
@@ -120,7 +125,7 @@ class Decisions:
         self._next_out += len(turn)
         likely = [(edge, fit) for edge in turn if self._is_likely(edge, fit := self._innovation(edge))]
         for edge, fit in likely:
-            self._readmit(edge, keyframe, fit)
+            self._readmit(edge, keyframe, fit, self._widest(edge))
         return changed or bool(likely) or bool(fits.any())
 
     def settle(self, keyframe: int) -> bool:
@@ -157,6 +162,7 @@ class Decisions:
         for edge in edges:
             if edge >= len(self.ledger):
                 self._solver.set_weight(edge, 0.0)
+                self._withdrawn.append(edge)
             elif self.ledger.reason.values[edge] != Reason.WITHDRAWN:
                 self._reject(edge, keyframe, Reason.WITHDRAWN, float(self.ledger.statistic.values[edge]))
 
@@ -164,13 +170,13 @@ class Decisions:
         """Take over verdicts on the same edges from who has had a second look; whether that changed one."""
         mine, changed = self.ledger, False
         for edge in np.flatnonzero(np.isin(mine.verdict.values[: len(other)], (*Verdict,)[1:])).tolist():
-            fit = float(other.statistic.values[edge])
+            fit, limit = float(other.statistic.values[edge]), float(other.threshold.values[edge])
             if mine.reason.values[edge] == Reason.WITHDRAWN or mine.is_inside(edge) == other.is_inside(edge):
                 continue
             if other.is_inside(edge):
-                self._readmit(edge, keyframe, fit)
+                self._readmit(edge, keyframe, fit, limit)
             elif not self._is_needed(edge):
-                self._reject(edge, keyframe, Reason.OUTVOTED, fit)
+                self._reject(edge, keyframe, Reason.OUTVOTED, fit, limit)
             changed = True
         return changed
 
@@ -206,19 +212,24 @@ class Decisions:
         return innovation(self._graph, self._solver, edge)
 
     def _is_likely(self, edge: int, innovation: float) -> bool:
-        limit = quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
-        return innovation <= self._looseness * limit
+        return innovation <= self._widest(edge)
+
+    def _widest(self, edge: int) -> float:
+        """What an innovation is held against."""
+        return self._looseness * quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
 
     # -- one edge ----------------------------------------------------------------------------------------------------
 
-    def _readmit(self, edge: int, keyframe: int, statistic: float) -> None:
+    def _readmit(self, edge: int, keyframe: int, statistic: float, threshold: float | None = None) -> None:
         self._put_in(edge)
-        self.ledger.note(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, statistic)
+        self.ledger.note(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, statistic, threshold)
 
-    def _reject(self, edge: int, keyframe: int, reason: Reason, statistic: float) -> None:
+    def _reject(
+        self, edge: int, keyframe: int, reason: Reason, statistic: float, threshold: float | None = None
+    ) -> None:
         if self.ledger.is_inside(edge):
             self._take_out(edge)
-        self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, statistic)
+        self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, statistic, threshold)
 
     def _put_in(self, edge: int) -> None:
         self._solver.set_weight(edge, 1.0)

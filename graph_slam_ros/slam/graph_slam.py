@@ -21,6 +21,7 @@ from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.edge_noise import edge_noise
 from graph_slam_ros.slam.landmarks import Landmark, Landmarks
+from graph_slam_ros.slam.ledger import Change
 from graph_slam_ros.slam.measurements import (
     Closure,
     Control,
@@ -89,6 +90,7 @@ class Update:
     solved : whether it solved
     report : of a solve of everything
     correction : of the last solve
+    changes : of verdicts, since the last update that told any
     """
 
     keyframes: tuple[int, ...] = ()
@@ -96,6 +98,7 @@ class Update:
     solved: bool = False
     report: Report | None = None
     correction: Correction = Correction()
+    changes: tuple[Change, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.keyframes) or self.solved
@@ -138,7 +141,9 @@ class GraphSlam:
             self.config.odometry, self.config.inputs.names.split(), self.space, self.counters
         )
         self._noise = OdometryNoise(self.config.odometry, self.space)
-        self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
+        self._landmarks = Landmarks(
+            self.config, self.graph, self.solver, self.counters, self._withdraw, self.ledger.source
+        )
         self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over)
         self._motions: deque[Motion] = deque()  # since each of the last keyframes, as far back as late ones may reach
         self._waiting: list[Observation] = []
@@ -146,6 +151,7 @@ class GraphSlam:
         self._initial_pose: InitialPose | None = None  # for the next odometry
         self._covariance = np.zeros((self.space.dof, self.space.dof))
         self._taken_in = 0  # edges of these
+        self._told = 0  # changes of verdicts that updates have told
         self._solved_T_map_odom = self.space.identity  # to see how far a solve moves it
         self._solved_vertices = 0  # of these, what the last solve took in: none where it failed
         self._unsolved_keyframes = 0
@@ -187,7 +193,8 @@ class GraphSlam:
         solved = self.solves > solves
         correction = self.correction if solved else Correction()
         edges = range(first_edge, self.backend.handed_over[1])
-        return Update(tuple(range(first_new, len(self.keyframes))), edges, solved, new, correction)
+        changes, self._told = tuple(self.ledger.history[self._told :]), len(self.ledger.history)
+        return Update(tuple(range(first_new, len(self.keyframes))), edges, solved, new, correction, changes)
 
     # -- what is known now ---------------------------------------------------------------------------------------
 
@@ -330,7 +337,8 @@ class GraphSlam:
         space, last = self.space, self.keyframes[-1]
         noise = edge_noise(self.counters, "odometry", covariance, space.dimensions)
         vertex = self.graph.add_vertex(space.pose, at or space.group.compose(self._pose(last.vertex), T_last_now))
-        self.graph.add_edge(space.relative_pose, [last.vertex, vertex], T_last_now, noise, "odometry")
+        edge = self.graph.add_edge(space.relative_pose, [last.vertex, vertex], T_last_now, noise, "odometry")
+        self.ledger.source[edge] = self.odometry_source
         self._covariance = space.group.propagate(self._covariance, T_last_now, covariance)
         self._append_keyframe(vertex, step)
         self._unsolved_keyframes += 1
@@ -503,11 +511,13 @@ class GraphSlam:
             noise = edge_noise(self.counters, m.topic, np.array([[variance]]), 1)
             along = float(axis @ carried.measured[:n])
             measured = (*axis.tolist(), along, *carried.measured[n:])
-            self.graph.add_edge(space.coordinate_prior, [where.vertex], measured, noise, "fixes")
+            edge = self.graph.add_edge(space.coordinate_prior, [where.vertex], measured, noise, "fixes")
+            self.ledger.source[edge] = m.topic
         if not axes:
             metres = n if m.kind in ("pose", "position") else 0
             noise = edge_noise(self.counters, m.topic, carried.covariance, metres)
-            self.graph.add_edge(space.fixes[m.kind], [where.vertex], carried.measured, noise, "fixes")
+            edge = self.graph.add_edge(space.fixes[m.kind], [where.vertex], carried.measured, noise, "fixes")
+            self.ledger.source[edge] = m.topic
 
     def _add_closure(self, m: Closure, where: Where) -> None:
         if not self._oldest_ns <= m.from_stamp_ns <= (self.newest_odometry_ns or 0):
@@ -520,7 +530,8 @@ class GraphSlam:
         carried = carry.closure(self.space, m, earlier, where)
         noise = edge_noise(self.counters, m.topic, carried.covariance, self.space.dimensions)
         vertices = [earlier.vertex, where.vertex]
-        self.graph.add_edge(self.space.relative_pose, vertices, carried.measured, noise, "closures")
+        edge = self.graph.add_edge(self.space.relative_pose, vertices, carried.measured, noise, "closures")
+        self.ledger.source[edge] = m.topic
 
     # -- solving -------------------------------------------------------------------------------------------------
 

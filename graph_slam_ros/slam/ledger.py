@@ -58,6 +58,7 @@ class Ledger:
     verdict, reason : codes of ``Verdict`` and ``Reason``
     statistic, threshold : chi2 that was last judged, and what it was held against
     numbers : how many numbers were measured, the statistic's degrees of freedom
+    source : the name of the input that an edge is of, told by who adds it
     keyframe : at which it was judged first
     history : every change after the first verdict, and first verdicts that are not ``ACCEPTED``, in order
     """
@@ -67,6 +68,7 @@ class Ledger:
         self.statistic, self.threshold = Column(np.float64), Column(np.float64)
         self.numbers, self.keyframe = Column(np.int64), Column(np.int64)
         self._residual, self._residual_at = Column(np.float64), Column(np.int64)
+        self.source: dict[int, str] = {}
         self.history: list[Change] = []
         self._out: set[int] = set()
 
@@ -108,15 +110,23 @@ class Ledger:
         self.verdict.values[edge] = Verdict.PENDING
         self._out.add(edge)
 
-    def note(self, edge: int, keyframe: int, verdict: Verdict, reason: Reason, statistic: float) -> None:
-        """Write a verdict down, and that it was changed."""
+    def note(
+        self,
+        edge: int,
+        keyframe: int,
+        verdict: Verdict,
+        reason: Reason,
+        statistic: float,
+        threshold: float | None = None,
+    ) -> None:
+        """Write a verdict down, and that it was changed; without a threshold it was held against the edge's own."""
         self.verdict.values[edge], self.reason.values[edge] = verdict, reason
         self.statistic.values[edge] = statistic
         if verdict in INSIDE or reason == Reason.WITHDRAWN:
             self._out.discard(edge)
         else:
             self._out.add(edge)
-        limit = float(self.threshold.values[edge])
+        limit = float(self.threshold.values[edge]) if threshold is None else threshold
         self.history.append(Change(edge, keyframe, verdict, reason, float(statistic), limit))
 
     def residual(self, edge: int) -> Array:
@@ -124,6 +134,10 @@ class Ledger:
         first = int(self._residual_at.values[edge])
         out: Array = self._residual.values[first : first + int(self.numbers.values[edge])]
         return out
+
+    def verdict_of(self, edge: int) -> Verdict:
+        """On one edge, also where it is too new to have a record."""
+        return Verdict(int(self.verdict.values[edge])) if edge < len(self) else Verdict.NOT_EVALUATED
 
     def is_inside(self, edge: int) -> bool:
         """Whether an edge pulls."""

@@ -172,6 +172,8 @@ def _explained(
         if not decisions.settle(frozen.keyframe) and not decisions.complete(frozen.keyframe):
             break
         solver.optimize()
+    judged = np.concatenate((mine.inside, mine.outside))
+    mine.statistic.values[judged], _ = solver.chi2_of(judged)
     return Outcome(name, mine, solver.values, _cost(solver, mine), frozen)
 
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 from graph_slam_ros.ros.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.slam import GraphSlam, Update
+from graph_slam_ros.slam.ledger import Change, Verdict
 
 _EDGES = 1000  # of one update that are told one by one
 
@@ -14,7 +15,7 @@ def happened(what: str, message: str, level: int = OK, **values: object) -> Stat
 
 
 def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
-    """New vertices, edges and segments, and the correction, if there was one."""
+    """New vertices, edges and segments, verdicts that changed, and the correction, if there was one."""
     graph = slam.graph
     for k in update.keyframes:
         keyframe = slam.keyframes[k]
@@ -26,12 +27,31 @@ def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
         table, row = graph.row(edge)
         vertices = table.vertices.values[row].tolist()
         label = graph.labels[int(table.label.values[row])]
-        what = "closure" if label == "closures" else "edge"
+        what, verdict = "closure" if label == "closures" else "edge", slam.ledger.verdict_of(edge).name.lower()
         yield happened(
-            what, f"edge {edge}: {label} of {vertices}", edge=edge, label=label, vertices=vertices, verdict="accepted"
+            what, f"edge {edge}: {label} of {vertices}", edge=edge, label=label, vertices=vertices, verdict=verdict
         )
+    for change in update.changes[:_EDGES]:
+        yield _verdict(slam, change)
     if update.solved and update.correction.distance_m + update.correction.angle_rad > 0.0:
         yield correction(slam, update)
+
+
+def _verdict(slam: GraphSlam, change: Change) -> Status:
+    verdict, reason = change.verdict.name.lower(), change.reason.name.lower()
+    why = f": {reason.replace('_', ' ')}" if change.reason else ""
+    return happened(
+        "verdict",
+        f"edge {change.edge} ({name_of(slam, change.edge)}) {verdict.replace('_', ' ')}{why},"
+        f" chi2 {change.statistic:.3g} against {change.threshold:.3g}",
+        OK if change.verdict is Verdict.ACCEPTED else WARN,
+        edge=change.edge,
+        keyframe=change.keyframe,
+        verdict=verdict,
+        reason=reason,
+        statistic=f"{change.statistic:.6g}",
+        threshold=f"{change.threshold:.6g}",
+    )
 
 
 def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:

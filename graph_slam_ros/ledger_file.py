@@ -1,0 +1,165 @@
+"""The ledger of a saved run: ``ledger.csv``, a row for each edge, and ``ledger_changes.csv``, of each changed verdict.
+
+Rows are in order of the edges' ids. A list of numbers is one field, with spaces between them.
+"""
+
+import csv
+import io
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+import numpy as np
+
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.ledger import Change, Reason, Verdict
+
+LEDGER, CHANGES = "ledger.csv", "ledger_changes.csv"
+Numbers = tuple[float, ...]
+Ids = tuple[int, ...]
+Row = TypeVar("Row")
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """An edge: what was measured, what was decided about it, and how it stands now.
+
+    Attributes
+    ----------
+    edge : id, the same in events
+    label : its class
+    tag : its type, as ``graph.g2o`` calls it
+    source : the input that told it; empty where nobody did
+    landmark : the name of the landmark it is about; empty where there is none
+    vertices : as ``graph.g2o`` numbers them
+    keyframe, stamp_ns : at which it was judged first
+    measured : with the sensor's place on the robot where the type has one
+    information : of the measurement, the upper triangle row by row
+    residual : how the measurement differed from what was expected when it was judged first, in its units
+    statistic, threshold : chi2 that was last judged, and what it was held against
+    dof : how many numbers were measured
+    chi2 : how it fits now, without loss
+    weight : what is left of its information now, by its loss; 0 where it is out
+    """
+
+    edge: int
+    label: str
+    tag: str
+    source: str
+    landmark: str
+    vertices: Ids
+    keyframe: int
+    stamp_ns: int
+    measured: Numbers
+    information: Numbers
+    residual: Numbers
+    statistic: float
+    dof: int
+    threshold: float
+    chi2: float
+    weight: float
+    verdict: Verdict
+    reason: Reason
+
+    @property
+    def is_in(self) -> bool:
+        """Whether it is part of the problem."""
+        return self.verdict not in (Verdict.PENDING, Verdict.REJECTED)
+
+
+def ledger_text(slam: GraphSlam, ids: list[int]) -> str:
+    """All edges that were judged or taken for granted; ``ids`` are the numbers of the vertices in the file."""
+    return _text(Entry, _entries(slam, ids))
+
+
+def changes_text(slam: GraphSlam) -> str:
+    """The history of all verdicts."""
+    return _text(Change, slam.ledger.history)
+
+
+def read_ledger(folder: Path) -> list[Entry]:
+    """The entries of a run, by edge. Raises FormatError."""
+    return _read(Entry, folder / LEDGER)
+
+
+def read_changes(folder: Path) -> list[Change]:
+    """The history of a run, in order. Raises FormatError."""
+    return _read(Change, folder / CHANGES)
+
+
+def _entries(slam: GraphSlam, ids: list[int]) -> Iterable[Entry]:
+    graph, ledger = slam.graph, slam.ledger
+    tags = {edge: tag for tag, edge in EDGE_TAGS.items()}
+    names = {mark.vertex: name for name, mark in slam.landmarks.items()}
+    chi2, _ = slam.solver.chi2_of(np.arange(len(ledger)))
+    losses = slam.solver.settings.stages()[-1]
+    judged = {change.edge: change.threshold for change in ledger.history}
+    for edge in range(len(ledger)):
+        table, row = graph.row(edge)
+        label, vertices = graph.labels[int(table.label.values[row])], table.vertices.values[row].tolist()
+        root, loss, keyframe = table.sqrt_information.values[row], losses.get(label), int(ledger.keyframe.values[edge])
+        left = weight_and_cost(loss.kind, loss.scale, float(chi2[edge]))[0] if loss else 1.0
+        yield Entry(
+            edge,
+            label,
+            tags[table.type],
+            ledger.source.get(edge, ""),
+            next((names[v] for v in vertices if v in names), ""),
+            tuple(ids[v] for v in vertices),
+            keyframe,
+            int(slam.keyframes.stamps_ns[keyframe]),
+            tuple(table.measured.values[row].tolist()),
+            tuple((root.T @ root)[np.triu_indices(len(root))].tolist()),
+            tuple(ledger.residual(edge).tolist()),
+            float(ledger.statistic.values[edge]),
+            int(ledger.numbers.values[edge]),
+            judged.get(edge, float(ledger.threshold.values[edge])),
+            float(chi2[edge]),
+            float(left * table.weight.values[row]),
+            Verdict(int(ledger.verdict.values[edge])),
+            Reason(int(ledger.reason.values[edge])),
+        )
+
+
+# -- rows of a dataclass -----------------------------------------------------------------------------------------------
+
+_PARSED: dict[Any, Callable[[str], Any]] = {
+    int: int,
+    float: float,
+    str: str,
+    Ids: lambda text: tuple(map(int, text.split())),
+    Numbers: lambda text: tuple(map(float, text.split())),
+    Verdict: lambda text: Verdict[text.upper()],
+    Reason: lambda text: Reason[text.upper()],
+}
+
+
+def _text(kind: type, rows: Iterable[Any]) -> str:
+    names = [field.name for field in fields(kind)]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows([_word(getattr(row, name)) for name in names] for row in rows)
+    return out.getvalue()
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, Verdict | Reason):
+        return value.name.lower()
+    return " ".join(map(repr, value)) if isinstance(value, tuple) else str(value)
+
+
+def _read(kind: type[Row], file: Path) -> list[Row]:
+    hints = get_type_hints(kind)
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            rows = csv.DictReader(stream)
+            return [kind(**{name: _PARSED[hint](row[name]) for name, hint in hints.items()}) for row in rows]
+    except OSError as error:
+        raise FormatError(f"{file}: {error.strerror}: is it a run, and saved by this version?") from None
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise FormatError(f"{file}: not a ledger: {error!r}") from None

@@ -1,0 +1,92 @@
+"""The ledger of a saved run: what it says is what was decided, and what was put wrong is told."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from graph_slam_ros import cli
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.ingest import read_ingest
+from graph_slam_ros.ledger_file import LEDGER, read_changes, read_ledger
+from graph_slam_ros.replay import replay
+from graph_slam_ros.ros.live.events import of_update
+from graph_slam_ros.slam import Config, GraphSlam, Update
+from graph_slam_ros.slam.ledger import Reason, Verdict
+from graph_slam_ros.slam.measurements import from_record
+
+CONFIG = Config.from_mapping(
+    {
+        "inputs.names": "odom detections closures",
+        "closures.type": "vision_msgs/msg/Detection3DArray",
+        "closures.use": "closure",
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory):
+    """A drive with false closures and wrong ids among the true ones, its faults, and its run."""
+    folder = tmp_path_factory.mktemp("faulty")
+    bag = folder / "drive.mcap"
+    city = ["--poses", "100", "--set", "blocks=4", "--seed", "4", "--closures", "20"]
+    faults = ["--fault", "false_closures:rate=0.3", "--fault", "wrong_ids:rate=0.03"]
+    assert cli.main(["simulate", "manhattan", "--out", str(bag), *city, *faults]) == 0
+    with bag.with_suffix(".faults.csv").open(newline="") as stream:
+        wrong = list(csv.DictReader(stream))
+    return wrong, folder / "run", replay(bag, folder / "run", CONFIG)
+
+
+def test_what_is_wrong_and_nothing_else_is_out_and_who_told_it_is_named(replayed):
+    wrong, folder, _ = replayed
+    out = [entry for entry in read_ledger(folder) if entry.weight == 0.0]
+    assert {entry.verdict for entry in out} <= {Verdict.PENDING, Verdict.REJECTED}
+    told = [("closures", "")] * sum(row["fault"] == "false_closures" for row in wrong)
+    told += [("detections", row["id"]) for row in wrong if row["fault"] == "wrong_ids"]
+    assert sorted((entry.source, entry.landmark) for entry in out) == sorted(told)
+
+
+def test_what_is_read_is_what_was_decided(replayed):
+    _, folder, done = replayed
+    slam, entries = done.slam, read_ledger(folder)
+    assert [entry.edge for entry in entries] == list(range(slam.graph.edge_count))
+    assert [entry.verdict for entry in entries] == slam.ledger.verdict.values.tolist()
+    assert read_changes(folder) == slam.ledger.history
+    chi2, numbers = slam.solver.chi2_of(np.arange(len(entries)))
+    assert [entry.chi2 for entry in entries] == chi2.tolist()
+    assert [entry.dof for entry in entries] == numbers.tolist()
+    stamps = slam.keyframes.stamps_ns
+    assert all(entry.stamp_ns == stamps[entry.keyframe] for entry in entries)
+
+
+def test_each_change_is_against_the_threshold_that_it_was_held_against(replayed):
+    _, folder, _ = replayed
+    for change in read_changes(folder):
+        is_in = change.verdict is Verdict.ACCEPTED
+        assert is_in == (change.statistic <= change.threshold)
+        assert is_in == (change.reason is Reason.NONE)
+
+
+def test_an_update_tells_each_change_once_and_events_have_it(replayed):
+    _, folder, done = replayed
+    updates: list[Update] = []
+    slam = GraphSlam(CONFIG)
+    statuses = []
+    for record in read_ingest(folder, []):
+        updates.append(slam.process(from_record(record)))
+        statuses += of_update(slam, updates[-1])
+    told = [change for update in updates for change in update.changes]
+    assert told == done.slam.ledger.history
+    events = [dict(status.values) for status in statuses if status.name == "graph_slam: verdict"]
+    assert [int(event["edge"]) for event in events] == [change.edge for change in told]
+    edges = [dict(status.values) for status in statuses if "edge" in status.values and "label" in status.values]
+    held_back = {change.edge for change in told if change.verdict is Verdict.PENDING}
+    assert {int(e["edge"]) for e in edges if e["verdict"] == "pending"} == held_back
+
+
+def test_what_is_no_ledger_is_refused_by_name(replayed, tmp_path):
+    with pytest.raises(FormatError, match=r"ledger\.csv: No such file"):
+        read_ledger(tmp_path)
+    (tmp_path / LEDGER).write_text("edge,label\n0,odometry\n")
+    with pytest.raises(FormatError, match="not a ledger"):
+        read_ledger(tmp_path)
