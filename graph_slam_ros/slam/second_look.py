@@ -154,7 +154,7 @@ def _explained(
 ) -> Outcome:
     """Solve and judge in turn, beginning with what is believed in the ledger, or with these candidates instead.
 
-    It ends when no verdict changes, or when the cost is hopeless after the first.
+    It ends when no verdict changes, or when the cost is hopeless.
     """
     graph, mine = frozen.graph.copy(), frozen.ledger.copy()
     solver = Solver(graph, frozen.settings)
@@ -165,13 +165,12 @@ def _explained(
         decisions.believe(believed, frozen.keyframe)
         solver.optimize(replace(frozen.settings, losses=decisions.tight_losses(), max_iterations=_ITERATIONS))
         decisions.settle(frozen.keyframe)
-    solver.optimize()
-    for _ in range(config.rounds):
+    for _ in range(config.rounds if _cost(solver, mine) <= 2.0 * hopeless else 0):
+        solver.optimize()
         if _cost(solver, mine) > hopeless:
             break
         if not decisions.settle(frozen.keyframe) and not decisions.complete(frozen.keyframe):
             break
-        solver.optimize()
     judged = np.concatenate((mine.inside, mine.outside))
     mine.statistic.values[judged], _ = solver.chi2_of(judged)
     return Outcome(name, mine, solver.values, _cost(solver, mine), frozen)
