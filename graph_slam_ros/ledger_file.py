@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
@@ -69,6 +70,13 @@ class Entry:
     def is_in(self) -> bool:
         """Whether it is part of the problem."""
         return self.verdict not in (Verdict.PENDING, Verdict.REJECTED)
+
+    @property
+    def information_matrix(self) -> NDArray[np.float64]:
+        """The whole of it, (dof, dof)."""
+        upper = np.zeros((self.dof, self.dof))
+        upper[np.triu_indices(self.dof)] = self.information
+        return upper + np.triu(upper, 1).T
 
 
 def ledger_text(slam: GraphSlam, ids: list[int]) -> str:

@@ -231,6 +231,7 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
         "converged": last.converged if last else True,
         "stop": last.stop if last else "nothing_to_do",
         "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
+        "rivals": [asdict(rival) for rival in slam.backend.rivals],
         "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
         "counters": slam.counters.as_dict(),
     }

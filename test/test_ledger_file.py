@@ -1,40 +1,21 @@
 """The ledger of a saved run: what it says is what was decided, and what was put wrong is told."""
 
-import csv
-
 import numpy as np
 import pytest
+from faulty import CONFIG, faulty_run
 
-from graph_slam_ros import cli
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.ingest import read_ingest
 from graph_slam_ros.ledger_file import LEDGER, read_changes, read_ledger
-from graph_slam_ros.replay import replay
 from graph_slam_ros.ros.live.events import of_update
-from graph_slam_ros.slam import Config, GraphSlam, Update
+from graph_slam_ros.slam import GraphSlam, Update
 from graph_slam_ros.slam.ledger import Reason, Verdict
 from graph_slam_ros.slam.measurements import from_record
-
-CONFIG = Config.from_mapping(
-    {
-        "inputs.names": "odom detections closures",
-        "closures.type": "vision_msgs/msg/Detection3DArray",
-        "closures.use": "closure",
-    }
-)
 
 
 @pytest.fixture(scope="module")
 def replayed(tmp_path_factory):
-    """A drive with false closures and wrong ids among the true ones, its faults, and its run."""
-    folder = tmp_path_factory.mktemp("faulty")
-    bag = folder / "drive.mcap"
-    city = ["--poses", "100", "--set", "blocks=4", "--seed", "4", "--closures", "20"]
-    faults = ["--fault", "false_closures:rate=0.3", "--fault", "wrong_ids:rate=0.03"]
-    assert cli.main(["simulate", "manhattan", "--out", str(bag), *city, *faults]) == 0
-    with bag.with_suffix(".faults.csv").open(newline="") as stream:
-        wrong = list(csv.DictReader(stream))
-    return wrong, folder / "run", replay(bag, folder / "run", CONFIG)
+    return faulty_run(tmp_path_factory.mktemp("faulty"))
 
 
 def test_what_is_wrong_and_nothing_else_is_out_and_who_told_it_is_named(replayed):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from graph_slam_ros import __version__
-from graph_slam_ros.cli import graphs, recordings, worlds
+from graph_slam_ros.cli import decided, graphs, recordings, worlds
 from graph_slam_ros.cli.console import REFUSED
 from graph_slam_ros.errors import GraphSlamError
 
@@ -52,6 +52,7 @@ def parser() -> argparse.ArgumentParser:
         )
     )
     _evaluate(command("evaluate", recordings.evaluate, "errors of a run, and whether it knows them; a picture"))
+    _explain(command("explain", decided.explain, "why: what a run believed and what not, or all about one edge of it"))
     command("warmup", recordings.warmup, "compile the kernels")
     _demo(command("demo", recordings.demo, "replay the recording that comes with the source through a live ROS graph"))
     return whole
@@ -184,11 +185,25 @@ def _evaluate(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--plot", type=Path, metavar="FILE.png", help="default: path.png in the run folder")
 
 
+def _explain(sub: argparse.ArgumentParser) -> None:
+    _of_run(sub)
+    sub.add_argument(
+        "edge",
+        nargs="?",
+        metavar="EDGE",
+        help="id of an edge, or the name of a landmark (landmark:7 where that is a number); default: the whole",
+    )
+
+
 def _demo(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--out", type=Path, default=Path("runs/demo"), metavar="DIR")
 
 
 # -- what they share ---------------------------------------------------------------------------------------------------
+
+
+def _of_run(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("run_folder", type=Path, metavar="RUN", help="run folder")
 
 
 def _add_config(sub: argparse.ArgumentParser) -> None:

@@ -1,0 +1,181 @@
+"""What if: the graph of a saved run, solved again with edges taken out or let in or under another loss; what moves.
+
+All is from ``graph.g2o`` and ``ledger.csv``: nothing is decided again, the drive is not repeated.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.graph import Gaussian, Graph, Loss
+from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.ledger_file import Entry, read_ledger
+from graph_slam_ros.run import GRAPH, run_config
+from graph_slam_ros.solver import Report, Solver
+from graph_slam_ros.solver.linearization import linearized
+
+Array = NDArray[np.float64]
+
+_BELIEVED = "believed"  # the class of what is let in: it has no loss
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """What moves between two solutions of one run.
+
+    Attributes
+    ----------
+    before, after : chi2, cost and classes of all that is in
+    final : how far the last keyframe moves, in metres and in radians
+    most : the keyframe that moves farthest, and how far, in metres
+    worse : edges that fit worse after, with their chi2 before and after; the one that has lost most first
+    """
+
+    before: Report
+    after: Report
+    final: tuple[float, float]
+    most: tuple[int, float]
+    worse: list[tuple[int, float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Influence:
+    """How far the last keyframe moves, in metres, when an edge is taken out: to first order, and solved again."""
+
+    edge: int
+    first_order_m: float
+    exact_m: float
+
+
+class SavedGraph:
+    """The graph of a run: vertices as ``graph.g2o`` numbers them, edges as ``ledger.csv`` does, those that are out too.
+
+    Raises
+    ------
+    FormatError
+        A file is missing, or is not what it should be.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        config = run_config(folder)
+        self.space, self._settings = config.space, config.solver_settings()
+        self.entries = read_ledger(folder)
+        self.graph = _graph(folder, self.entries)
+        self.keyframes = [k for e in self.entries if e.label in ("anchor", "odometry") for k in e.vertices[-1:]]
+        self._numbers = {vertex: k for k, vertex in enumerate(self.keyframes)}
+        self._was = self.solve()
+
+    def keyframe(self, vertex: int) -> int | None:
+        """The number of the keyframe that a vertex is, if it is one."""
+        return self._numbers.get(vertex)
+
+    def edge(self, edge: int) -> Entry:
+        """One of them. Raises GraphSlamError."""
+        if not 0 <= edge < len(self.entries):
+            raise GraphSlamError(f"no edge {edge}: their ids are below {len(self.entries)}")
+        return self.entries[edge]
+
+    def solve(self, without: Iterable[int] = (), let_in: Sequence[int] = (), loss: Loss | None = None) -> Solver:
+        """Solve what is in, but for some edges, and with others, which then count fully; from the saved estimate.
+
+        Parameters
+        ----------
+        loss : of everything that may be wrong, instead of the run's
+
+        Raises
+        ------
+        GaugeError, SingularError
+            What is left does not determine a vertex.
+        """
+        gone = {self.edge(e).edge for e in without}
+        edges = [e.edge for e in self.entries if e.is_in and e.edge not in gone]
+        graph, settings = self.graph, self._settings
+        if let_in:
+            graph = graph.copy()
+            edges += [_add(graph, self.edge(e), _BELIEVED) for e in let_in]
+            edges = [e for e in edges if e not in set(let_in)]
+        if loss is not None:
+            settings = replace(settings, losses={label: [loss] for label in settings.losses})
+        solver = Solver(graph, settings)
+        solver.add(np.unique([v for e in edges for v in _ends(graph, e)]), edges)
+        solver.optimize()
+        return solver
+
+    def moved(self, solver: Solver) -> Moved:
+        """Compare a solution with that of the run."""
+        known = [k for k in self.keyframes if k in set(solver.vertices.tolist())]
+        a, b = self._was.estimate(known), solver.estimate(known)
+        distance = np.linalg.norm(b[:, : self.space.dimensions] - a[:, : self.space.dimensions], axis=1)
+        turned = self.space.angle(self.space.group.between(tuple(a[-1]), tuple(b[-1])))
+        inside = np.array([e.edge for e in self.entries if e.is_in], dtype=np.int64)
+        before, after = self._was.chi2_of(inside)[0], solver.chi2_of(inside)[0]
+        worse = [k for k in np.argsort(before - after, kind="stable").tolist() if after[k] > before[k]]
+        return Moved(
+            self._was.evaluate(),
+            solver.evaluate(),
+            (float(distance[-1]), float(turned)),
+            (known[int(distance.argmax())], float(distance.max())),
+            [(int(inside[k]), float(before[k]), float(after[k])) for k in worse],
+        )
+
+    def influences(self, count: int) -> list[Influence]:
+        """The judged edges whose absence would move the last keyframe most, of all of them to first order."""
+        judged = [e for e in self.entries if e.is_in and e.verdict]
+        first = np.array([np.linalg.norm(self.first_order(e.edge)[: self.space.dimensions]) for e in judged])
+        out = []
+        for k in np.argsort(-first, kind="stable")[:count].tolist():
+            edge = judged[k].edge
+            out.append(Influence(edge, float(first[k]), self.moved(self.solve([edge])).final[0]))
+        return sorted(out, key=lambda one: -one.exact_m)
+
+    def first_order(self, edge: int) -> Array:
+        """The step (dof,) of the last keyframe, in its tangent space, that taking an edge out would cause.
+
+        With A and r its whitened Jacobian and residual at the optimum and Sigma the joint covariance of its vertices, a
+        Gauss-Newton step without it is ``Sigma A' (I - A Sigma A')^-1 r``, by the matrix inversion lemma.
+        """
+        solver, graph, last = self._was, self.graph, self.keyframes[-1]
+        table, row = graph.row(edge)
+        ends, values = table.vertices.values[row], solver.values
+        residual, jacobian = linearized(graph, values, table.type, ends, table.measured.values[row])
+        loss = solver.settings.stages()[-1].get(graph.labels[int(table.label.values[row])], Loss())
+        root = table.sqrt_information.values[row]
+        white = root @ residual
+        share = weight_and_cost(loss.kind, loss.scale, float(white @ white))[0] ** 0.5
+        white, a = share * white, share * root @ jacobian
+        among = [*ends.tolist(), *([] if last in ends else [last])]
+        joint = solver.joint_marginal(among)
+        first = np.cumsum([0, *(graph.kind_of(v).dof for v in among)])
+        of_last = slice(first[k := among.index(last)], first[k + 1])
+        of_ends = slice(0, int(first[len(ends)]))
+        left = np.eye(len(white)) - a @ joint[of_ends, of_ends] @ a.T
+        step: Array = joint[of_last, of_ends] @ a.T @ np.linalg.lstsq(left, white, rcond=1e-9)[0]
+        return step
+
+
+def _graph(folder: Path, entries: Sequence[Entry]) -> Graph:
+    file, out = read_g2o(folder / GRAPH), Graph()
+    at, initial = file.graph.offset.values.tolist(), file.graph.initial.values
+    for vertex in np.argsort(file.ids).tolist():
+        kind = file.graph.kind_of(vertex)
+        out.add_vertex(kind, initial[at[vertex] : at[vertex] + kind.size])
+    for entry in entries:
+        _add(out, entry, entry.label)
+    return out
+
+
+def _add(graph: Graph, entry: Entry, label: str) -> int:
+    noise = Gaussian.from_information(entry.information_matrix)
+    return graph.add_edge(EDGE_TAGS[entry.tag], entry.vertices, entry.measured, noise, label)
+
+
+def _ends(graph: Graph, edge: int) -> list[int]:
+    table, row = graph.row(edge)
+    ends: list[int] = table.vertices.values[row].tolist()
+    return ends

@@ -1,0 +1,25 @@
+"""A drive with false closures and wrong ids among the true ones, replayed."""
+
+import csv
+
+from graph_slam_ros import cli
+from graph_slam_ros.replay import replay
+from graph_slam_ros.slam import Config
+
+CONFIG = Config.from_mapping(
+    {
+        "inputs.names": "odom detections closures",
+        "closures.type": "vision_msgs/msg/Detection3DArray",
+        "closures.use": "closure",
+    }
+)
+
+
+def faulty_run(folder):
+    """What was put wrong in it, its run folder, and what came of the replay."""
+    bag, run = folder / "drive.mcap", folder / "run"
+    city = ["--poses", "100", "--set", "blocks=4", "--seed", "4", "--closures", "20"]
+    faults = ["--fault", "false_closures:rate=0.3", "--fault", "wrong_ids:rate=0.03"]
+    assert cli.main(["simulate", "manhattan", "--out", str(bag), *city, *faults]) == 0
+    with bag.with_suffix(".faults.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream)), run, replay(bag, run, CONFIG)

@@ -1,0 +1,132 @@
+"""``graph_slam explain``: whoever reads it learns why, in numbers that are those of the run."""
+
+import csv
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+from faulty import faulty_run
+
+from graph_slam_ros import cli, quantities
+from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.ledger_file import LEDGER, Entry, read_changes, read_ledger
+from graph_slam_ros.slam.ledger import Reason, Verdict
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return faulty_run(tmp_path_factory.mktemp("faulty"))[1]
+
+
+def told(capsys, *words):
+    code = cli.main(["explain", *map(str, words)])
+    out, err = capsys.readouterr()
+    return code, " ".join(out.split()), err
+
+
+def first(run, **wanted):
+    return next(e for e in read_ledger(run) if all(getattr(e, k) == v for k, v in wanted.items()))
+
+
+def test_the_summary_counts_what_the_ledger_has(run, capsys):
+    code, out, err = told(capsys, run)
+    entries = read_ledger(run)
+    assert (code, err) == (0, "")
+    assert f"{len(entries)} edges, {sum(e.verdict > 0 for e in entries)} of them judged" in out
+    in_and_out = [sum(e.label == "closures" and e.is_in is which for e in entries) for which in (True, False)]
+    assert re.search(rf"closures {in_and_out[0]} {in_and_out[1]}\b", out)
+    worst = max((e for e in entries if not e.is_in), key=lambda e: e.statistic / e.threshold)
+    assert f"edge {worst.edge}" in out
+    assert "inert" not in out
+
+
+def test_a_stranger_learns_why_a_closure_was_rejected(run, capsys):
+    false = first(run, label="closures", verdict=Verdict.PENDING)
+    _, out, _ = told(capsys, run, false.edge)
+    assert f"edge {false.edge}: a loop closure by closures: held back: unlikely" in out
+    assert f"keyframe {false.vertices[0]} and keyframe {false.vertices[1]}" in out
+    assert f"chi2 {false.statistic:.4g} with 3 degrees of freedom" in out
+    assert f"up to {false.threshold:.4g} would have been let pass (noise alone exceeds 21.11 once in 10000 times" in out
+    assert re.search(r"what if it were in and fully believed: chi2 \+\d", out)
+    strained = [int(edge) for edge in re.findall(r"against edge (\d+)", out)]
+    assert strained
+    assert all(read_ledger(run)[edge].is_in for edge in strained)
+
+
+def test_what_was_expected_is_what_the_map_says(run):
+    """Of a false closure: the relative pose of the two keyframes, as far as the map is right."""
+    false = first(run, label="closures", verdict=Verdict.PENDING)
+    rows = np.loadtxt(run / "path.tum")
+    a, b = (rows[vertex] for vertex in false.vertices)
+    heading = 2.0 * np.arctan2(a[6], a[7])
+    turn = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
+    assert quantities.expected(false)[:2] == pytest.approx(turn @ (b[1:3] - a[1:3]), abs=0.5)
+
+
+def test_a_landmark_is_explained_by_name_and_an_unknown_one_is_refused(run, capsys):
+    wrong = next(e for e in read_ledger(run) if e.landmark and not e.is_in)
+    _, out, _ = told(capsys, run, wrong.landmark)
+    assert f"landmark {wrong.landmark}:" in out
+    assert f"edge {wrong.edge}" in out
+    code, _, err = told(capsys, run, "landmark:7")
+    assert code == 2
+    assert "7: neither the id of an edge nor a landmark; there are 0/0" in err
+    code, _, err = told(capsys, run, "99999")
+    assert (code, "no edge 99999: their ids are below" in err) == (2, True)
+
+
+def test_each_verdict_is_explained_in_its_words(run, tmp_path, capsys):
+    entry = first(run, label="closures", verdict=Verdict.ACCEPTED)
+    copy = tmp_path / "run"
+    copy.mkdir()
+    for name in ("graph.g2o", "config.yaml", "ledger_changes.csv", "run.json", "ingest.mcap"):
+        (copy / name).write_bytes((run / name).read_bytes())
+    rows = (run / LEDGER).read_text().splitlines()
+    for verdict, reason, words in (
+        ("rejected", "does_not_fit", "with everything solved it was off by"),
+        ("rejected", "outvoted", "in the cheapest explanation of everything"),
+        ("rejected", "withdrawn", "what was withdrawn stays out"),
+        ("down_weighted", "none", "it stays in, but its loss leaves it little"),
+    ):
+        changed = rows[entry.edge + 1].removesuffix("accepted,none") + f"{verdict},{reason}"
+        (copy / LEDGER).write_text("\n".join([*rows[: entry.edge + 1], changed, *rows[entry.edge + 2 :]]) + "\n")
+        assert words in told(capsys, copy, entry.edge)[1]
+
+
+def test_a_gate_that_decides_nothing_and_a_rival_are_warned_of(run, tmp_path, capsys):
+    copy = tmp_path / "run"
+    copy.mkdir()
+    for name in ("graph.g2o", "config.yaml", "ledger_changes.csv", "run.json", "ingest.mcap"):
+        (copy / name).write_bytes((run / name).read_bytes())
+    header, *rows = csv.reader((run / LEDGER).open(newline=""))
+    threshold, out = header.index("threshold"), {change.edge for change in read_changes(run)}
+    for row in rows:
+        row[threshold] = "1e9" if int(row[0]) not in out else row[threshold]
+    kept = [row for row in rows if int(row[0]) not in out]
+    with (copy / LEDGER).open("w", newline="") as stream:
+        csv.writer(stream).writerows([header, *kept])
+    rival = {"cost": 120.0, "best_cost": 100.0, "only_here": [5, 6], "only_there": [7]}
+    summary = json.loads((run / "run.json").read_text()) | {"rivals": [rival]}
+    (copy / "run.json").write_text(json.dumps(summary))
+    _, text, _ = told(capsys, copy)
+    assert "warning: the gate of landmarks is inert" in text
+    assert "another explanation costs 120, this one 100; it believes 5 6 instead of 7" in text
+
+
+@pytest.mark.parametrize("tag", EDGE_TAGS)
+def test_every_type_of_edge_can_be_told(tag):
+    edge = EDGE_TAGS[tag]
+    m, sizes = edge.residual_size, edge.measured_size
+    measured = np.zeros(sizes)
+    if m == 6 or "attitude" in edge.name:
+        measured[-1] = 1.0
+    information = np.eye(m)[np.triu_indices(m)]
+    entry = dataclasses.replace(_ENTRY, tag=tag, measured=tuple(measured), information=tuple(information), dof=m)
+    entry = dataclasses.replace(entry, residual=tuple(np.full(m, 0.25)))
+    assert quantities.expected(entry) == pytest.approx([0.25] * m)
+    assert len(quantities.told(entry, quantities.sigmas(entry)).split(", ")) == m
+
+
+_ENTRY = Entry(0, "", "", "", "", (0,), 0, 0, (), (), (), 0.0, 0, 1.0, 0.0, 1.0, Verdict.ACCEPTED, Reason.NONE)
