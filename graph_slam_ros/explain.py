@@ -86,7 +86,7 @@ def _least(entries: Iterable[Entry]) -> Iterator[str]:
 
 
 def _row(e: Entry, numbers: str) -> str:
-    return f"  edge {e.edge:<7d} {_of(e):24s} keyframe {e.keyframe:<6d} {numbers}   {_state(e.verdict, e.reason)}"
+    return f"  edge {e.edge:<7d} {e.about:24s} keyframe {e.keyframe:<6d} {numbers}   {_state(e.verdict, e.reason)}"
 
 
 def _gates(entries: Sequence[Entry], changes: Sequence[Change], config: Config) -> Iterator[str]:
@@ -115,10 +115,9 @@ def _rivals(folder: Path) -> Iterator[str]:
         raise GraphSlamError(f"{folder / SUMMARY}: {error}") from None
     for rival in told:
         here, there = (" ".join(map(str, rival[which])) for which in ("only_here", "only_there"))
-        yield (
-            f"warning: ambiguous: another explanation costs {rival['cost']:.4g}, this one {rival['best_cost']:.4g};"
-            f" it believes {here}" + (f" instead of {there}" if there else "")
-        )
+        tried = f"graph_slam solve {folder} --with {here}" + (f" --without {there}" if there else "")
+        costs = f"this explanation costs {rival['best_cost']:.4g}, another {rival['cost']:.4g}"
+        yield f"warning: ambiguous: {costs}: {tried}"
 
 
 # -- one edge, or a landmark's -----------------------------------------------------------------------------------------
@@ -220,7 +219,7 @@ def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
     yield from _line("what if", f"{text}, keyframe {run.keyframe(most)} the most, by {most_m:.3f} m")
     if not e.is_in:
         for edge, before, after in [w for w in moved.worse if w[0] != e.edge][:_SHOWN]:
-            other = f"edge {edge} ({_of(run.edge(edge))})"
+            other = f"edge {edge} ({run.edge(edge).about})"
             yield from _line("against", f"{other}, whose chi2 would go from {before:.3g} to {after:.3g}")
 
 
@@ -240,10 +239,6 @@ def _remedy(e: Entry) -> str:
 
 def _state(verdict: Verdict, reason: Reason) -> str:
     return f"{_STATE[verdict]}: {_WHY[reason]}" if reason else _STATE[verdict]
-
-
-def _of(e: Entry) -> str:
-    return f"{e.label} {e.landmark}".strip()
 
 
 def _line(what: str, text: str) -> Iterator[str]:

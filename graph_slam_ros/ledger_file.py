@@ -72,6 +72,11 @@ class Entry:
         return self.verdict not in (Verdict.PENDING, Verdict.REJECTED)
 
     @property
+    def about(self) -> str:
+        """Its class, and the landmark it is about."""
+        return f"{self.label} {self.landmark}".strip()
+
+    @property
     def information_matrix(self) -> NDArray[np.float64]:
         """The whole of it, (dof, dof)."""
         upper = np.zeros((self.dof, self.dof))

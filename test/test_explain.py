@@ -112,7 +112,7 @@ def test_a_gate_that_decides_nothing_and_a_rival_are_warned_of(run, tmp_path, ca
     (copy / "run.json").write_text(json.dumps(summary))
     _, text, _ = told(capsys, copy)
     assert "warning: the gate of landmarks is inert" in text
-    assert "another explanation costs 120, this one 100; it believes 5 6 instead of 7" in text
+    assert f"this explanation costs 100, another 120: graph_slam solve {copy} --with 5 6 --without 7" in text
 
 
 @pytest.mark.parametrize("tag", EDGE_TAGS)

@@ -53,6 +53,10 @@ def parser() -> argparse.ArgumentParser:
     )
     _evaluate(command("evaluate", recordings.evaluate, "errors of a run, and whether it knows them; a picture"))
     _explain(command("explain", decided.explain, "why: what a run believed and what not, or all about one edge of it"))
+    _solve(
+        command("solve", decided.solve, "what if: a run's graph without some edges, with others, under another loss")
+    )
+    _influence(command("influence", decided.influence, "the edges of a run that its last pose hangs on most"))
     command("warmup", recordings.warmup, "compile the kernels")
     _demo(command("demo", recordings.demo, "replay the recording that comes with the source through a live ROS graph"))
     return whole
@@ -195,6 +199,33 @@ def _explain(sub: argparse.ArgumentParser) -> None:
     )
 
 
+def _solve(sub: argparse.ArgumentParser) -> None:
+    sub.epilog = f"Edges have the ids of explain and of the run's ledger. {_CODES}"
+    _of_run(sub)
+    sub.add_argument("--without", nargs="+", action="extend", type=_edge, default=[], metavar="EDGE", help="taken out")
+    sub.add_argument(
+        "--with",
+        dest="let_in",
+        nargs="+",
+        action="extend",
+        type=_edge,
+        default=[],
+        metavar="EDGE",
+        help="let in, and fully believed: no loss lets go of it",
+    )
+    sub.add_argument(
+        "--loss",
+        type=_loss,
+        metavar="none|huber|cauchy|geman_mcclure|dcs[:SCALE]",
+        help=f"of all that may be wrong, instead of the run's; scale in standard deviations ({_LOSS_SCALE:g})",
+    )
+
+
+def _influence(sub: argparse.ArgumentParser) -> None:
+    _of_run(sub)
+    sub.add_argument("--count", type=_count, default=10, metavar="N", help="edges that are solved without (10)")
+
+
 def _demo(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--out", type=Path, default=Path("runs/demo"), metavar="DIR")
 
@@ -231,6 +262,12 @@ def _positive(text: str) -> float:
 def _count(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive integer")
+    return int(text)
+
+
+def _edge(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text} is not the id of an edge")
     return int(text)
 
 

@@ -1,0 +1,114 @@
+"""``solve`` and ``influence``: the graph of a saved run solved otherwise is what a graph made otherwise is."""
+
+import json
+
+import numpy as np
+import pytest
+from faulty import faulty_run
+
+from graph_slam_ros import cli
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph import Loss
+from graph_slam_ros.ledger_file import read_ledger
+from graph_slam_ros.what_if import SavedGraph
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory):
+    return faulty_run(tmp_path_factory.mktemp("faulty"))
+
+
+@pytest.fixture(scope="module")
+def saved(replayed):
+    return SavedGraph(replayed[1])
+
+
+def told(capsys, *words):
+    code = cli.main([*map(str, words)])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_the_saved_graph_is_that_of_the_run_edge_by_edge(replayed, saved):
+    """Those that are out as well; and it is at its optimum."""
+    slam = replayed[2].slam
+    assert saved.graph.edge_count == slam.graph.edge_count
+    for edge in range(slam.graph.edge_count):
+        (a, i), (b, k) = slam.graph.row(edge), saved.graph.row(edge)
+        assert a.type is b.type
+        assert a.measured.values[i] == pytest.approx(b.measured.values[k], abs=0.0)
+        one, other = (root.T @ root for root in (a.sqrt_information.values[i], b.sqrt_information.values[k]))
+        assert one == pytest.approx(other, rel=1e-9, abs=1e-9 * np.abs(one).max())
+    moved = saved.moved(saved.solve())
+    assert moved.most[1] < 1e-6
+    summary = json.loads((replayed[1] / "run.json").read_text())
+    assert moved.before.chi2_final == pytest.approx(summary["chi2"], rel=1e-6)
+
+
+def test_what_is_taken_out_and_let_in_is_as_if_it_had_been_decided_so(replayed, saved):
+    """The run's own solver, told the same weights, comes to the same poses."""
+    slam, entries = replayed[2].slam, saved.entries
+    closure = next(e.edge for e in entries if e.label == "closures" and e.is_in)
+    solver = saved.solve(without=[closure])
+    slam.solver.set_weight(closure, 0.0)
+    slam.solver.optimize()
+    assert solver.estimate(saved.keyframes) == pytest.approx(slam.trajectory(), abs=1e-5)
+    slam.solver.set_weight(closure, 1.0)
+    slam.solver.optimize()
+    back = saved.moved(saved.solve(let_in=[closure]))
+    assert back.after.classes["believed"].edges == 1
+    assert back.most[1] < 0.01
+
+
+def test_what_is_false_bends_the_map_when_it_is_let_in_and_not_under_a_loss_that_lets_go(saved):
+    false = [e.edge for e in saved.entries if not e.is_in and e.label == "closures"]
+    believed = saved.moved(saved.solve(let_in=false[:1]))
+    assert believed.most[1] > 0.1
+    assert believed.after.chi2_final > believed.before.chi2_final + 100.0
+    assert not {edge for edge, *_ in believed.worse} & set(false)
+    assert all(after > before for _, before, after in believed.worse)
+    gain = [after - before for _, before, after in believed.worse]
+    assert gain == sorted(gain, reverse=True)
+
+
+def test_another_loss_is_that_of_all_that_may_be_wrong(saved):
+    plain = saved.moved(saved.solve(loss=Loss()))
+    assert plain.after.cost_final == pytest.approx(plain.after.chi2_final)
+    assert plain.after.chi2_final <= plain.before.chi2_final
+
+
+def test_influence_to_first_order_is_that_of_solving_again(saved):
+    """For edges that fit: the largest, within a fifth; the whole step, not its length alone, for the first of them."""
+    found = saved.influences(8)
+    assert [one.exact_m for one in found] == sorted((one.exact_m for one in found), reverse=True)
+    assert all(one.exact_m == pytest.approx(one.first_order_m, rel=0.2) for one in found)
+    last, edge = saved.keyframes[-1:], found[0].edge
+    before, after = saved.solve().estimate(last)[0], saved.solve([edge]).estimate(last)[0]
+    step = saved.space.group.local(tuple(after), tuple(before))
+    assert step == pytest.approx(saved.first_order(edge), abs=0.2 * float(np.linalg.norm(step)))
+
+
+def test_a_landmark_without_its_sightings_is_left_out_and_what_determines_nothing_is_refused(saved):
+    landmark = next(e.landmark for e in saved.entries if e.landmark)
+    seen = [e.edge for e in saved.entries if e.landmark == landmark and e.is_in]
+    assert saved.moved(saved.solve(without=seen)).most[1] < 1.0
+    with pytest.raises(GraphSlamError, match="no edge 99999"):
+        saved.solve(without=[99999])
+    with pytest.raises(GraphSlamError, match=r"gauge|position"):
+        saved.solve(without=[e.edge for e in saved.entries if e.label == "anchor"])
+
+
+def test_the_commands_say_what_moves(replayed, saved, capsys):
+    run = replayed[1]
+    false = next(e for e in read_ledger(run) if not e.is_in and e.label == "closures")
+    code, out, _ = told(capsys, "solve", run, "--with", false.edge)
+    moved = saved.moved(saved.solve(let_in=[false.edge]))
+    assert code == 0
+    assert f"{moved.before.chi2_final:.4f}  ->  " in out
+    assert f"last pose  moves by {moved.final[0]:.4f} m" in out
+    assert f"edge {moved.worse[0][0]} (" in out
+    code, out, _ = told(capsys, "influence", run, "--count", "3")
+    assert code == 0
+    assert [int(line.split()[0]) for line in out.splitlines()[2:]] == [one.edge for one in saved.influences(3)]
+    code, _, err = told(capsys, "solve", run)
+    assert (code, "solve needs --without EDGE, --with EDGE or --loss NAME" in err) == (2, True)
