@@ -190,3 +190,18 @@ def test_a_second_look_decides_the_same_whether_it_is_taken_in_a_thread_or_when_
     assert histories[0] == histories[1]
     poses = [run.backend.solver.estimate(range(100)) for run in runs]
     assert poses[0].tobytes() == poses[1].tobytes()
+
+
+def test_a_second_look_starts_from_odometry_where_landmarks_are_poses_too():
+    """Which no odometry leads to."""
+    drive = Drive().go(60)
+    graph = drive.backend.graph
+    tag = graph.add_vertex(SE2, (5.0, 5.0, 0.0))
+    for k in (57, 58, 59):
+        measured = se2.between(tuple(drive.backend.solver.estimate([k])[0]), (5.0, 5.0, 0.0))
+        graph.add_edge(RELATIVE_POSE, [k, tag], measured, NOISE, "landmarks")
+    false = drive.close(5, 59, (4.0, 4.0, 1.0))
+    drive.backend.update(60)
+    drive.solve()
+    assert drive.verdicts([false]) == {Verdict.PENDING}
+    assert tuple(drive.backend.solver.estimate([tag])[0]) == pytest.approx((5.0, 5.0, 0.0), abs=0.3)

@@ -21,7 +21,6 @@ from graph_slam_ros.slam.ledger import Ledger
 from graph_slam_ros.slam.neighbours import agreeing
 from graph_slam_ros.slam.robust_config import RobustConfig
 from graph_slam_ros.solver import Settings, Solver
-from graph_slam_ros.solver.initialization import initial_values
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -129,16 +128,14 @@ def _other_starts(config: RobustConfig, frozen: Frozen) -> Iterator[tuple[str, A
 
     And the largest group that is out, as if it alone were true.
     """
-    ledger, graph = frozen.ledger, frozen.graph.copy()
+    ledger, graph = frozen.ledger, frozen.graph
     candidates = np.sort(np.concatenate((ledger.inside, ledger.outside)))
     is_closure = graph.has_label(candidates, ("closures",))
     closures, others = candidates[is_closure], candidates[~is_closure]
     if not len(closures):
         yield "all", frozen.values, candidates
         return
-    graph.set_weights(candidates, 0.0)
-    odometry = initial_values(graph, "tree", _root(graph))
-    odometry = np.where(_of_poses(graph), odometry, frozen.values)
+    odometry = _along_odometry(graph, frozen.values)
     groups = agreeing(graph, odometry, closures, ledger.threshold.values[closures])
     believed = np.concatenate((others, *groups))
     yield "neighbours", frozen.values, believed
@@ -184,12 +181,14 @@ def _cost(solver: Solver, ledger: Ledger) -> float:
     return solver.evaluate().chi2_final - float(chi2.sum()) + doubted
 
 
-def _root(graph: Graph) -> int:
-    return next(v for v in range(graph.vertex_count) if graph.kind_of(v) in _GROUP)
-
-
-def _of_poses(graph: Graph) -> NDArray[np.bool_]:
-    """Which of the stored numbers are of poses."""
-    sizes = np.array([kind.size for kind in graph.kinds])
-    poses = np.array([kind in _GROUP for kind in graph.kinds])
-    return np.repeat(poses[graph.kind.values], sizes[graph.kind.values])
+def _along_odometry(graph: Graph, values: Array) -> Array:
+    """Where odometry alone says that the robot was; landmarks stay where they are, as points or as poses."""
+    out = values.copy()
+    for edge in graph.edges_of("odometry").tolist():
+        table, row = graph.row(edge)
+        last, new = table.vertices.values[row].tolist()
+        a, b = graph.offset.values[[last, new]].tolist()
+        kind = graph.kind_of(new)
+        pose, step = tuple(out[a : a + kind.size]), tuple(table.measured.values[row])
+        out[b : b + kind.size] = _GROUP[kind].compose(pose, step)
+    return out
