@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import SE2, SE3, Graph
 from graph_slam_ros.graph.graph import EdgeTable, whole_numbers
+from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.covariance import joint, marginals
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
@@ -478,8 +479,23 @@ class Solver:
         if failed != NOTHING:
             self._refuse_loose()
             raise undetermined(failed)
+        self._young = self._that_mature(self._young)
         self._solved_with, self._settled = None, True
         return moved, len(fresh)
+
+    def _that_mature(self, edges: Index) -> Index:
+        """Those of edges that have arrived which the last stage of their loss weighs otherwise than the first."""
+        if not len(edges):
+            return NONE
+        stages = self._losses()
+        chi2, _ = chi2_of(self.graph, self._tree.value, edges)
+        changes = []
+        for edge, fit in zip(edges.tolist(), chi2.tolist(), strict=True):
+            table, row = self.graph.row(edge)
+            label, s = int(table.label.values[row]), fit * float(table.weight.values[row])
+            first, last = (weight_and_cost(one.kind[label], one.scale[label], s)[0] for one in (stages[0], stages[-1]))
+            changes.append(first != last)
+        return edges[changes]
 
     def _go_on(self) -> Index:
         """Step from where a batch stopped before the optimum; the vertices that moved."""
