@@ -7,6 +7,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from scipy.special import gammainc
+
 from graph_slam_ros import quantities
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.ledger_file import Entry, read_changes, read_ledger
@@ -34,8 +36,8 @@ _KIND = {"closures": "a loop closure", "landmarks": "a sighting", "fixes": "a fi
 _SHOWN = 5
 _WIDTH = 110
 _SAME = 0.99
-_INERT = 0.1  # of its threshold is the largest statistic that was ever seen: the gate decides nothing
-_ENOUGH = 30  # edges of a class to say so
+_FAR = 0.5  # of the gate is the largest statistic that was ever seen
+_CHANCE = 1e-4  # that so many would all stay below that, were their noise as it is told
 
 
 # -- the whole ---------------------------------------------------------------------------------------------------------
@@ -52,7 +54,8 @@ def explain_run(folder: Path) -> Iterator[str]:
     entries, changes, config = read_ledger(folder), read_changes(folder), run_config(folder)
     judged = [entry for entry in entries if entry.verdict]
     yield f"{len(entries)} edges, {len(judged)} of them judged; {len(entries) - len(judged)} are taken for granted"
-    yield from _table(judged)
+    if judged:
+        yield from _table(judged)
     yield from _worst(e for e in judged if not e.is_in and e.reason is not Reason.WITHDRAWN)
     yield from _least(e for e in judged if e.is_in)
     yield from _gates(judged, changes, config)
@@ -90,20 +93,23 @@ def _row(e: Entry, numbers: str) -> str:
 
 
 def _gates(entries: Sequence[Entry], changes: Sequence[Change], config: Config) -> Iterator[str]:
-    """Whether a gate decides anything."""
+    """Gates that decide nothing: all that was ever seen is far below them, more so than noise that is told right."""
     if not config.robust.decide:
         yield "warning: robust.decide is false: nothing was held back or taken out, whatever it said"
         return
-    ratio = {e.edge: e.statistic / e.threshold for e in entries}
+    gate = {e.edge: quantile(config.robust.gate, e.dof) for e in entries}
+    seen = {e.edge: e.statistic for e in entries}
     for change in changes:
-        if change.edge in ratio:
-            ratio[change.edge] = max(ratio[change.edge], change.statistic / change.threshold)
+        if change.edge in seen:
+            seen[change.edge] = max(seen[change.edge], change.statistic)
     for label in dict.fromkeys(e.label for e in entries):
-        of_label = [ratio[e.edge] for e in entries if e.label == label]
-        if len(of_label) >= _ENOUGH and max(of_label) < _INERT:
+        of_label = [e for e in entries if e.label == label]
+        largest = max(seen[e.edge] / gate[e.edge] for e in of_label)
+        below = gammainc([0.5 * e.dof for e in of_label], [0.5 * largest * gate[e.edge] for e in of_label])
+        if largest < _FAR and below.prod() < _CHANCE:
             yield (
-                f"warning: the gate of {label} is inert: of {len(of_label)} the largest statistic ever seen is"
-                f" {max(of_label):.2g} of its threshold; their noise is told too large, and what is false may pass"
+                f"warning: the gate of {label} is inert: of {len(of_label)} the largest chi2 ever seen is"
+                f" {largest:.2g} of it; their noise is told too large, and what is false may pass"
             )
 
 

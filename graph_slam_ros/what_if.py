@@ -109,7 +109,8 @@ class SavedGraph:
 
     def moved(self, solver: Solver) -> Moved:
         """Compare a solution with that of the run."""
-        known = [k for k in self.keyframes if k in set(solver.vertices.tolist())]
+        there = set(solver.vertices.tolist())
+        known = [vertex for vertex in self.keyframes if vertex in there]
         a, b = self._was.estimate(known), solver.estimate(known)
         distance = np.linalg.norm(b[:, : self.space.dimensions] - a[:, : self.space.dimensions], axis=1)
         turned = self.space.angle(self.space.group.between(tuple(a[-1]), tuple(b[-1])))
