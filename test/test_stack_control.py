@@ -455,8 +455,9 @@ def closure(stamp_ns, earlier_ns, x):
 
 def test_closures_bend_the_path_until_they_are_cleared_and_optimize_says_how_much_it_solved(tmp_path):
     kind = "inputs.names:=odom closures", "closures.type:=vision_msgs/msg/Detection3DArray", "closures.use:=closure"
+    believed = "robust.decide:=false", "robust.loss:=none"  # what it says is wrong, and shall bend the path
     with (
-        node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", *kind) as n,
+        node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", *kind, *believed) as n,
         robot(hears=("pose", "/diagnostics"), sends=("/odom",)) as r,
     ):
         r.wait_for_node()
