@@ -113,14 +113,14 @@ def _entries(slam: GraphSlam, ids: list[int]) -> Iterable[Entry]:
     judged = {change.edge: change.threshold for change in ledger.history}
     for edge in range(len(ledger)):
         table, row = graph.row(edge)
-        label, vertices = graph.labels[int(table.label.values[row])], table.vertices.values[row].tolist()
+        label, vertices = graph.label_of(edge), table.vertices.values[row].tolist()
         root, loss, keyframe = table.sqrt_information.values[row], losses.get(label), int(ledger.keyframe.values[edge])
         left = weight_and_cost(loss.kind, loss.scale, float(chi2[edge]))[0] if loss else 1.0
         yield Entry(
             edge,
             label,
             tags[table.type],
-            ledger.source.get(edge, ""),
+            graph.source_of(edge),
             next((names[v] for v in vertices if v in names), ""),
             tuple(ids[v] for v in vertices),
             keyframe,

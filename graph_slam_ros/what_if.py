@@ -145,7 +145,7 @@ class SavedGraph:
         table, row = graph.row(edge)
         ends, values = table.vertices.values[row], solver.values
         residual, jacobian = linearized(graph, values, table.type, ends, table.measured.values[row])
-        loss = solver.settings.stages()[-1].get(graph.labels[int(table.label.values[row])], Loss())
+        loss = solver.settings.stages()[-1].get(graph.label_of(edge), Loss())
         root = table.sqrt_information.values[row]
         white = root @ residual
         share = weight_and_cost(loss.kind, loss.scale, float(white @ white))[0] ** 0.5

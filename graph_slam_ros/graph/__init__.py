@@ -34,7 +34,10 @@ from graph_slam_ros.graph.sensors import (
     RANGE_WITH_OFFSET,
     RANGE_WITH_OFFSET_3D,
 )
-from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, SE3, VertexKind
+from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3, VertexKind
+
+POINT_SEEN_FROM = {SE2: LANDMARK_POSITION, SE3: LANDMARK_POSITION_3D}
+"""The edge type by which a pose of a kind sees where a point is."""
 
 __all__ = [
     "ATTITUDE_PRIOR_3D",
@@ -44,6 +47,7 @@ __all__ = [
     "COORDINATE_PRIOR",
     "COORDINATE_PRIOR_3D",
     "DIFFERENCE",
+    "GROUPS",
     "HEADING_PRIOR",
     "HEADING_PRIOR_3D",
     "HUBER",
@@ -52,6 +56,7 @@ __all__ = [
     "LANDMARK_POSITION_3D",
     "NONE",
     "POINT_PRIOR",
+    "POINT_SEEN_FROM",
     "POSE_PRIOR",
     "POSE_PRIOR_3D",
     "POSITION_PRIOR",

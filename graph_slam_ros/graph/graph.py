@@ -62,7 +62,8 @@ class EdgeTable:
     ----------
     code : its place among the graph's tables
     id : edge ids; vertices : (n, k) vertex ids; measured : (n, p); sqrt_information : (n, m, m)
-    label : codes into ``Graph.labels``; weight : a factor on the information, 0 = out of the problem
+    label, source : codes into ``Graph.labels`` and ``Graph.sources``
+    weight : a factor on the information, 0 = out of the problem
     """
 
     type: EdgeType
@@ -72,6 +73,7 @@ class EdgeTable:
     measured: Column = field(init=False)
     sqrt_information: Column = field(init=False)
     label: Column = field(init=False)
+    source: Column = field(init=False)
     weight: Column = field(init=False)
 
     def __post_init__(self) -> None:
@@ -80,7 +82,7 @@ class EdgeTable:
         self.vertices = Column(np.int64, len(self.type.accepts))
         self.measured = Column(np.float64, self.type.measured_size)
         self.sqrt_information = Column(np.float64, m, m)
-        self.label = Column(np.int64)
+        self.label, self.source = Column(np.int64), Column(np.int64)
         self.weight = Column(np.float64)
 
     def __len__(self) -> int:
@@ -107,6 +109,7 @@ class Graph:
         self.tables: dict[EdgeType, EdgeTable] = {}
         self._in_order: list[EdgeTable] = []
         self.labels: list[str] = []
+        self.sources: list[str] = []
         self.table_of_edge = Column(np.int64)
         self.row_of_edge = Column(np.int64)
 
@@ -144,7 +147,15 @@ class Graph:
         """Add one vertex with its initial value (size,); returns its id."""
         return int(self.add_vertices(kind, np.asarray(value, dtype=float)[None])[0])
 
-    def add_edges(self, edge: EdgeType, vertices: ArrayLike, measured: ArrayLike, noise: Gaussian, label: str) -> Index:
+    def add_edges(
+        self,
+        edge: EdgeType,
+        vertices: ArrayLike,
+        measured: ArrayLike,
+        noise: Gaussian,
+        label: str,
+        source: str = "",
+    ) -> Index:
         """Add n edges of one type; returns their ids.
 
         Parameters
@@ -153,6 +164,7 @@ class Graph:
         measured : (n, p), finite; its tail may be left out
         noise : one for all, or n
         label : the class an edge is counted under, e.g. ``odometry``
+        source : the input that measured it
         """
         at, z = whole_numbers(vertices, edge.name), edge.whole(measured)
         self._check(edge, at, z, noise)
@@ -167,14 +179,23 @@ class Graph:
         table.vertices.extend(at, count)
         table.measured.extend(z, count)
         table.sqrt_information.extend(noise.sqrt_information, count)
-        table.label.extend(self._label_code(label), count)
+        table.label.extend(_code(self.labels, label), count)
+        table.source.extend(_code(self.sources, source), count)
         table.weight.extend(1.0, count)
         return ids
 
-    def add_edge(self, edge: EdgeType, vertices: ArrayLike, measured: ArrayLike, noise: Gaussian, label: str) -> int:
+    def add_edge(
+        self,
+        edge: EdgeType,
+        vertices: ArrayLike,
+        measured: ArrayLike,
+        noise: Gaussian,
+        label: str,
+        source: str = "",
+    ) -> int:
         """Add one edge, of (k,) vertices and what was measured (p,); returns its id."""
         one = np.asarray(vertices)[None], np.asarray(measured, dtype=float)[None]
-        return int(self.add_edges(edge, *one, noise, label)[0])
+        return int(self.add_edges(edge, *one, noise, label, source)[0])
 
     def kind_of(self, vertex: int) -> VertexKind:
         """The kind of one vertex."""
@@ -183,6 +204,16 @@ class Graph:
     def row(self, edge_id: int) -> tuple[EdgeTable, int]:
         """The table and row of an edge."""
         return self._in_order[self.table_of_edge.values[edge_id]], int(self.row_of_edge.values[edge_id])
+
+    def label_of(self, edge_id: int) -> str:
+        """The class of an edge."""
+        table, row = self.row(edge_id)
+        return self.labels[int(table.label.values[row])]
+
+    def source_of(self, edge_id: int) -> str:
+        """The input that measured an edge; empty where none did."""
+        table, row = self.row(edge_id)
+        return self.sources[int(table.source.values[row])]
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -221,11 +252,6 @@ class Graph:
         found = [table.id.values[table.label.values == code] for table in self.tables.values()]
         return np.sort(np.concatenate(found))
 
-    def _label_code(self, label: str) -> int:
-        if label not in self.labels:
-            self.labels.append(label)
-        return self.labels.index(label)
-
     def _check(self, edge: EdgeType, at: Index, measured: Array, noise: Gaussian) -> None:
         for what, given, size in (("vertices", at, len(edge.accepts)), ("measurements", measured, edge.measured_size)):
             if given.ndim != 2 or given.shape[1] != size:
@@ -256,3 +282,10 @@ class Graph:
                 raise GraphSlamError(
                     f"{edge.name}: vertex {vertex} is {self.kind_of(vertex).name}, not {kinds[0].name}"
                 )
+
+
+def _code(names: list[str], name: str) -> int:
+    """Its place among the names, the last if it is new."""
+    if name not in names:
+        names.append(name)
+    return names.index(name)

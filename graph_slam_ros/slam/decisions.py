@@ -199,7 +199,7 @@ class Decisions:
         for edge, fit in zip(edges[again].tolist(), chi2[again].tolist(), strict=True):
             ledger.note(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, fit)
         for edge, fit in zip(edges[unfit].tolist(), chi2[unfit].tolist(), strict=True):
-            loss = self._solver.settings.losses[self._label(edge)][-1]
+            loss = self._solver.settings.losses[self._graph.label_of(edge)][-1]
             weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
             if weight < self._config.out_below and not self._is_needed(edge):
                 self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
@@ -239,13 +239,9 @@ class Decisions:
         self._solver.set_weight(edge, 0.0)
         self._count(edge, -1)
 
-    def _label(self, edge: int) -> str:
-        table, row = self._graph.row(edge)
-        return self._graph.labels[int(table.label.values[row])]
-
     def _landmark(self, edge: int) -> int | None:
         """The landmark that one such edge alone would determine; -1: it does so only with others."""
-        if self._label(edge) != "landmarks":
+        if self._graph.label_of(edge) != "landmarks":
             return None
         table, row = self._graph.row(edge)
         landmark = int(table.vertices.values[row, 1])

@@ -4,7 +4,6 @@ Its state is a function of the configuration and the sequence of accepted measur
 """
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -12,14 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.slam import carry
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import Beside, when_asked
 from graph_slam_ros.slam.carry import Where
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
-from graph_slam_ros.slam.edge_noise import edge_noise
 from graph_slam_ros.slam.landmarks import Landmark, Landmarks
 from graph_slam_ros.slam.ledger import Change
 from graph_slam_ros.slam.measurements import (
@@ -35,22 +32,15 @@ from graph_slam_ros.slam.measurements import (
 )
 from graph_slam_ros.slam.motion import Motion, OdometryNoise
 from graph_slam_ros.slam.odometry_choice import OdometryChoice, Step
+from graph_slam_ros.slam.pose_edges import PoseEdges
 from graph_slam_ros.slam.space import Numbers
 from graph_slam_ros.slam.stamp_order import StampOrder
 from graph_slam_ros.slam.track import Track
+from graph_slam_ros.slam.trail import Trail
 from graph_slam_ros.slam.unnamed import Unnamed
 from graph_slam_ros.solver import Report, Settings
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Keyframe:
-    """A selected instant: its vertex, its stamp, and where odometry put it. No estimate: the solver owns that."""
-
-    vertex: int
-    stamp_ns: int
-    T_odom_base: Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,9 +119,7 @@ class GraphSlam:
         self.counters = Counters()
         self.backend = Backend(self.config.robust, self.config.solver_settings(), beside)
         self.graph, self.solver, self.ledger = self.backend.graph, self.backend.solver, self.backend.ledger
-        self.keyframes = Track(Keyframe, self.space.pose.size)
         self.sighting_poses = Track(SightingPose, self.space.pose.size)
-        self.segments: list[int] = []  # keyframes at which odometry began, or began anew
         self.solves = 0
         self.report: Report | None = None  # of the last solve of everything
         self.correction = Correction()  # of the last solve
@@ -141,19 +129,18 @@ class GraphSlam:
             self.config.odometry, self.config.inputs.names.split(), self.space, self.counters
         )
         self._noise = OdometryNoise(self.config.odometry, self.space)
-        self._landmarks = Landmarks(
-            self.config, self.graph, self.solver, self.counters, self._withdraw, self.ledger.source
-        )
+        self._trail = Trail(self._noise, self.space)
+        self.keyframes, self.segments = self._trail.keyframes, self._trail.segments
+        self._edges = PoseEdges(self.space, self.graph, self.counters)
+        self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
         self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over)
-        self._motions: deque[Motion] = deque()  # since each of the last keyframes, as far back as late ones may reach
         self._waiting: list[Observation] = []
-        self._epoch = 0  # the first keyframe since stamps began anew
         self._initial_pose: InitialPose | None = None  # for the next odometry
         self._covariance = np.zeros((self.space.dof, self.space.dof))
-        self._taken_in = 0  # edges of these
+        self._taken_in = 0  # edges, by the last solve that succeeded
         self._told = 0  # changes of verdicts that updates have told
         self._solved_T_map_odom = self.space.identity  # to see how far a solve moves it
-        self._solved_vertices = 0  # of these, what the last solve took in: none where it failed
+        self._solved_vertices = 0  # that the last solve took in: none where it failed
         self._unsolved_keyframes = 0
 
     # -- the door ------------------------------------------------------------------------------------------------
@@ -282,11 +269,6 @@ class GraphSlam:
         """The odometry in use, by the name of its input; empty before the first."""
         return self._odometry.used.source if self._odometry.used else ""
 
-    @property
-    def _oldest_ns(self) -> int:
-        """Stamp of the first keyframe, of those whose stamps are of the present time."""
-        return int(self.keyframes.stamps_ns[self._epoch])
-
     # -- odometry ------------------------------------------------------------------------------------------------
 
     def _use(self, released: list[Odometry | Observation]) -> None:
@@ -300,16 +282,17 @@ class GraphSlam:
     def _on_step(self, step: Step) -> None:
         if not self.keyframes:
             self._first_keyframe(step)
-        elif step.broken or not self._motions or self._initial_pose:
+        elif (motion := self._trail.motion) is None or step.broken or self._initial_pose:
             self._begin_segment(step)
         else:
-            self._motions[-1].step(step)
+            motion.step(step)
             self._use_waiting(step.stamp_ns)
-            if self._keyframe_due():
-                self._next_keyframe(step)
+            if self._keyframe_due(motion):
+                self._add_keyframe(step, motion.now.T_keyframe_base, motion.now.covariance)
+                self._solve_if_due()
 
-    def _keyframe_due(self) -> bool:
-        due, motion, n = self.config.keyframes, self._motions[-1], self.space.dimensions
+    def _keyframe_due(self, motion: Motion) -> bool:
+        due, n = self.config.keyframes, self.space.dimensions
         at = motion.now.T_keyframe_base
         far = sum(x * x for x in at[:n]) >= due.min_distance_m**2 or self.space.angle(at) >= due.min_angle_rad
         moving_s = motion.moving_ns / 1e9
@@ -319,28 +302,19 @@ class GraphSlam:
         """Map begins where odom begins, or the robot where it is said to: there the first pose is anchored."""
         T_map_base = self.config.start_pose or step.T_odom_base
         vertex = self.graph.add_vertex(self.space.pose, T_map_base)
-        anchor, n = self.config.anchor, self.space.dimensions
-        sigmas = [anchor.sigma_m] * n + [anchor.sigma_rad] * (self.space.dof - n)
-        self._covariance = np.diag(np.square(sigmas))
-        self.graph.add_edge(self.space.pose_prior, [vertex], T_map_base, Gaussian.from_sigmas(*sigmas), "anchor")
+        anchor = self.config.anchor
+        self._covariance = self._edges.anchor(vertex, T_map_base, anchor.sigma_m, anchor.sigma_rad)
         self.segments.append(0)
-        self._append_keyframe(vertex, step)
+        self._trail.append(vertex, step, self.config.ordering.late_s)
         self._solved_T_map_odom = self.T_map_odom
-
-    def _next_keyframe(self, step: Step) -> None:
-        now = self._motions[-1].now
-        self._add_keyframe(step, now.T_keyframe_base, now.covariance)
-        self._solve_if_due()
 
     def _add_keyframe(self, step: Step, T_last_now: Numbers, covariance: Array, at: Numbers | None = None) -> None:
         """A vertex where odometry is now, or where it is said to be, and the motion to it from the last as an edge."""
-        space, last = self.space, self.keyframes[-1]
-        noise = edge_noise(self.counters, "odometry", covariance, space.dimensions)
-        vertex = self.graph.add_vertex(space.pose, at or space.group.compose(self._pose(last.vertex), T_last_now))
-        edge = self.graph.add_edge(space.relative_pose, [last.vertex, vertex], T_last_now, noise, "odometry")
-        self.ledger.source[edge] = self.odometry_source
-        self._covariance = space.group.propagate(self._covariance, T_last_now, covariance)
-        self._append_keyframe(vertex, step)
+        group, last = self.space.group, self.keyframes[-1].vertex
+        vertex = self.graph.add_vertex(self.space.pose, at or group.compose(self._pose(last), T_last_now))
+        self._edges.odometry([last, vertex], T_last_now, covariance, self.odometry_source)
+        self._covariance = group.propagate(self._covariance, T_last_now, covariance)
+        self._trail.append(vertex, step, self.config.ordering.late_s)
         self._unsolved_keyframes += 1
 
     def _begin_segment(self, step: Step) -> None:
@@ -350,30 +324,26 @@ class GraphSlam:
         """
         said, self._initial_pose = self._initial_pose, None
         T_last_now, covariance = self._motion_into(step)
-        loose, n = self._loose(said), self.space.dimensions
         if said is None or self.config.initialpose.use == "segment":
             self.segments.append(len(self.keyframes))
-        sigmas = [loose[0]] * n + [loose[1]] * (self.space.dof - n)
-        covariance = covariance + np.diag(np.square(sigmas))
+        covariance = covariance + np.diag(np.square(self.space.sigmas(*self._loose(said))))
         self._add_keyframe(step, T_last_now, covariance, said.T_map_base if said else None)
         if said:
-            noise = edge_noise(self.counters, "initialpose", carry.square(said.covariance), n)
-            self.graph.add_edge(
-                self.space.pose_prior, [self.keyframes[-1].vertex], said.T_map_base, noise, "initialpose"
-            )
+            self._edges.initial_pose(self.keyframes[-1].vertex, said)
             self._solve()
         self._solve_if_due()
         self._use_waiting(step.stamp_ns)
 
     def _motion_into(self, step: Step) -> tuple[Numbers, Array]:
         """From the last keyframe, as far as odometry tells: after a jump of time what it says is all there is."""
-        if not self._motions:
+        motion = self._trail.motion
+        if motion is None:
             T_last_now = self.space.group.between(self.keyframes[-1].T_odom_base, step.T_odom_base)
             return T_last_now, np.zeros((self.space.dof, self.space.dof))
         if not step.broken:
-            self._motions[-1].step(step)
-        self._use_waiting(self._motions[-1].now.stamp_ns)
-        now = self._motions[-1].now
+            motion.step(step)
+        self._use_waiting(motion.now.stamp_ns)
+        now = (self._trail.motion or motion).now  # of another keyframe, where one of these deserved it
         return now.T_keyframe_base, now.covariance
 
     def _loose(self, said: InitialPose | None) -> tuple[float, float]:
@@ -388,24 +358,16 @@ class GraphSlam:
         self._drop_unreached()
         self._order.forget()
         self._odometry.forget()
-        self._motions.clear()
-        self._epoch = len(self.keyframes)
-
-    def _append_keyframe(self, vertex: int, step: Step) -> None:
-        self.keyframes.append(vertex, step.stamp_ns, step.T_odom_base)
-        self._motions.append(Motion(self._noise, self.space, len(self.keyframes) - 1, step.stamp_ns))
-        oldest_ns = step.stamp_ns - round(self.config.ordering.late_s * 1e9)
-        while len(self._motions) > 2 and self._motions[1].start_ns <= oldest_ns:
-            self._motions.popleft()
+        self._trail.forget_time()
 
     # -- observations --------------------------------------------------------------------------------------------
 
     def _on_observation(self, m: Observation) -> None:
         """Use what is not too late; what is newer than all odometry waits for the next."""
         newest_ns = self.newest_odometry_ns
-        if newest_ns is None or m.stamp_ns < self._oldest_ns:
+        if newest_ns is None or m.stamp_ns < self._trail.oldest_ns:
             self._count(m, "before_odometry")
-        elif m.stamp_ns < self._motions[0].start_ns:
+        elif m.stamp_ns < self._trail.remembered_ns:
             self._count(m, "late")
         elif m.stamp_ns <= newest_ns:
             self._observe(m)
@@ -431,37 +393,38 @@ class GraphSlam:
         self.counters.count(m.topic, reason, len(m.sightings) if isinstance(m, Sightings) else 1)
 
     def _observe(self, m: Observation) -> None:
-        where = self._where(m.stamp_ns)
-        if self._deserves_keyframe(m, where):
-            where = self._keyframe_at(where)
+        where = self._trail.where(m.stamp_ns)
+        motion = self._trail.motion
+        if motion is not None and self._deserves_keyframe(m, where, motion):
+            where = self._keyframe_at(where, motion)
         match m:
             case Sightings():
                 self.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
                 for name, sighting in self._identified(m, where):
                     self._landmarks.add(m.topic, name, sighting, where)
             case Fix():
-                self._add_fix(m, where)
+                self._edges.fix(m, where, self._pose(where.vertex))
             case Closure():
                 self._add_closure(m, where)
         self._solve_if_due()
 
-    def _deserves_keyframe(self, m: Observation, where: Where) -> bool:
+    def _deserves_keyframe(self, m: Observation, where: Where, newest: Motion) -> bool:
         """Where the motion since the keyframe would be too much of the noise of what was measured."""
-        newest = self._motions[-1]
         if where.keyframe != newest.keyframe or not newest.before_last_ns < where.stamp_ns:
             return False
         most, added_sigma_m = self.config.keyframes.shared_noise, self.config.landmarks.added_sigma_m
         return carry.is_shared(self.space, m, where, most, added_sigma_m)
 
-    def _keyframe_at(self, where: Where) -> Where:
+    def _keyframe_at(self, where: Where, motion: Motion) -> Where:
         """A keyframe at a stamp within the last step of odometry, which is cut in two."""
         group, size = self.space.group, self.space.dof
         T_odom_base = group.compose(self.keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
-        rest, now = self._motions[-1].cut(where.stamp_ns), self._motions[-1].now
+        rest = motion.cut(where.stamp_ns)
         step = Step(where.stamp_ns, self.space.identity, T_odom_base)
-        self._add_keyframe(step, now.T_keyframe_base, where.covariance)
-        if rest is not None:
-            self._motions[-1].step(rest)
+        self._add_keyframe(step, motion.now.T_keyframe_base, where.covariance)
+        begun = self._trail.motion
+        if rest is not None and begun is not None:
+            begun.step(rest)
         vertex = self.keyframes[-1].vertex
         return Where(len(self.keyframes) - 1, vertex, where.stamp_ns, self.space.identity, np.zeros((size, size)))
 
@@ -478,60 +441,11 @@ class GraphSlam:
             return named
         return self._unnamed.identified(m, where)
 
-    def _where(self, stamp_ns: int) -> Where:
-        """Where the robot was, by the keyframe before and the odometry in between."""
-        motion = next((m for m in reversed(self._motions) if m.start_ns <= stamp_ns), None)
-        if motion is None:
-            return self._where_long_ago(stamp_ns)
-        moved = motion.at(stamp_ns)
-        vertex = int(self.keyframes.ids[motion.keyframe])
-        return Where(motion.keyframe, vertex, stamp_ns, moved.T_keyframe_base, moved.covariance)
-
-    def _where_long_ago(self, stamp_ns: int) -> Where:
-        """Between two keyframes whose odometry is forgotten: evenly from one to the next."""
-        present = self.keyframes.stamps_ns[self._epoch :]
-        k = self._epoch + int(np.searchsorted(present, stamp_ns, side="right")) - 1
-        group, (a, b) = self.space.group, (self.keyframes[k], self.keyframes[k + 1])
-        T_a_b = self.space.identity if k + 1 in self.segments else group.between(a.T_odom_base, b.T_odom_base)
-        fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
-        moved = group.interpolate(self.space.identity, T_a_b, fraction)
-        noise = self._noise.of((stamp_ns - a.stamp_ns) * 1e-9, None)
-        return Where(k, a.vertex, stamp_ns, moved, group.noise_during(moved, noise))
-
-    def _add_fix(self, m: Fix, where: Where) -> None:
-        """A prior on a keyframe; of a position that lacks some axes, one on each principal axis that is known."""
-        space = self.space
-        if m.kind not in space.fixes:
-            self.counters.count(m.topic, f"{m.kind}_not_in_the_plane")
-            return
-        carried = carry.fix(space, m, where, self._pose(where.vertex))
-        n = space.dimensions
-        axes = carry.axes_known(carried.covariance) if m.kind == "position" else []
-        for axis, variance in axes:
-            noise = edge_noise(self.counters, m.topic, np.array([[variance]]), 1)
-            along = float(axis @ carried.measured[:n])
-            measured = (*axis.tolist(), along, *carried.measured[n:])
-            edge = self.graph.add_edge(space.coordinate_prior, [where.vertex], measured, noise, "fixes")
-            self.ledger.source[edge] = m.topic
-        if not axes:
-            metres = n if m.kind in ("pose", "position") else 0
-            noise = edge_noise(self.counters, m.topic, carried.covariance, metres)
-            edge = self.graph.add_edge(space.fixes[m.kind], [where.vertex], carried.measured, noise, "fixes")
-            self.ledger.source[edge] = m.topic
-
     def _add_closure(self, m: Closure, where: Where) -> None:
-        if not self._oldest_ns <= m.from_stamp_ns <= (self.newest_odometry_ns or 0):
+        if not self._trail.oldest_ns <= m.from_stamp_ns <= (self.newest_odometry_ns or 0):
             self.counters.count(m.topic, "from_where_there_was_no_odometry")
             return
-        earlier = self._where(m.from_stamp_ns)
-        if earlier.keyframe == where.keyframe:
-            self.counters.count(m.topic, "within_one_keyframe")
-            return
-        carried = carry.closure(self.space, m, earlier, where)
-        noise = edge_noise(self.counters, m.topic, carried.covariance, self.space.dimensions)
-        vertices = [earlier.vertex, where.vertex]
-        edge = self.graph.add_edge(self.space.relative_pose, vertices, carried.measured, noise, "closures")
-        self.ledger.source[edge] = m.topic
+        self._edges.closure(m, self._trail.where(m.from_stamp_ns), where)
 
     # -- solving -------------------------------------------------------------------------------------------------
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from graph_slam_ros.graph import LANDMARK_POSITION, LANDMARK_POSITION_3D, R2, R3, SE2, SE3, EdgeType, Graph
+from graph_slam_ros.graph import POINT_SEEN_FROM, SE2, SE3, EdgeType, Graph
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import linearized
 
@@ -12,7 +12,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _ANGLES = {SE2: 1, SE3: 3}  # of a pose, its last coordinates
-_SIGHTING = {(SE2, R2): LANDMARK_POSITION, (SE3, R3): LANDMARK_POSITION_3D}
 _LINEAR_RAD2 = 0.1  # of a direction: beyond, a linear prediction is none
 
 
@@ -70,9 +69,10 @@ def _spread(graph: Graph, x: Array, vertices: Index, joint: Array, predicted: Ar
     pose = kinds[0]
     if pose not in _ANGLES:
         return 0.0
-    if len(kinds) > 1 and (pose, kinds[1]) in _SIGHTING:
+    sighting = POINT_SEEN_FROM[pose]
+    if len(kinds) > 1 and kinds[1] in sighting.accepts[1]:
         dof = pose.dof + kinds[1].dof
-        at, jacobian = linearized(graph, x, _SIGHTING[pose, kinds[1]], vertices[:2], np.zeros(kinds[1].dof))
+        at, jacobian = linearized(graph, x, sighting, vertices[:2], np.zeros(kinds[1].dof))
         across = jacobian @ joint[:dof, :dof] @ jacobian.T
         return float(np.trace(across) / max(float(at @ at), 1e-12))
     of_poses = len(predicted) == pose.dof

@@ -70,10 +70,6 @@ class Waiting:
 class Landmarks:
     """Landmarks with identity.
 
-    Parameters
-    ----------
-    sources : where the input of each edge is noted
-
     Attributes
     ----------
     known : those in the graph, by identity
@@ -87,13 +83,11 @@ class Landmarks:
         solver: Solver,
         counters: Counters,
         withdraw: Callable[[Sequence[int]], None],
-        sources: dict[int, str],
     ) -> None:
         self.known: dict[str, Landmark] = {}
         self.waiting: dict[str, Waiting] = {}
         self._config, self._space = config, config.space
         self._graph, self._solver, self._counters, self._withdraw = graph, solver, counters, withdraw
-        self._sources = sources
         if config.landmarks.surveyed_file and not config.landmarks.surveyed:
             raise ConfigError(f"landmarks.surveyed_file: {config.landmarks.surveyed_file} has not been read")
         self._survey = config.survey
@@ -156,8 +150,7 @@ class Landmarks:
                 edge_type = space.range_with_offset
                 vertices.append(self._offset(topic))
         noise = edge_noise(self._counters, topic, self._blurred(s, carried), metres)
-        edge = self._graph.add_edge(edge_type, vertices, carried.measured, noise, LABEL)
-        self._sources[edge] = topic
+        edge = self._graph.add_edge(edge_type, vertices, carried.measured, noise, LABEL, topic)
         if not s.id:
             landmark.seen.append(Seen(edge, topic, s, where))
             landmark.stamps.add(where.stamp_ns)

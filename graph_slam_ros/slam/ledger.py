@@ -58,7 +58,6 @@ class Ledger:
     verdict, reason : codes of ``Verdict`` and ``Reason``
     statistic, threshold : chi2 that was last judged, and what it was held against
     numbers : how many numbers were measured, the statistic's degrees of freedom
-    source : the name of the input that an edge is of, told by who adds it
     keyframe : at which it was judged first
     history : every change after the first verdict, and first verdicts that are not ``ACCEPTED``, in order
     """
@@ -68,7 +67,6 @@ class Ledger:
         self.statistic, self.threshold = Column(np.float64), Column(np.float64)
         self.numbers, self.keyframe = Column(np.int64), Column(np.int64)
         self._residual, self._residual_at = Column(np.float64), Column(np.int64)
-        self.source: dict[int, str] = {}
         self.history: list[Change] = []
         self._out: set[int] = set()
 

@@ -14,9 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from graph_slam_ros.graph import RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Graph
+from graph_slam_ros.graph import GROUPS, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Graph
 from graph_slam_ros.graph.graph import EdgeTable
-from graph_slam_ros.lie import se2, se3
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -47,7 +46,7 @@ def agreeing(graph: Graph, values: Array, closures: Index, limits: Array) -> lis
     a, b = pairs.T
     at = graph.offset.values[ends][:, :, None] + np.arange(kind.size)
     path = values[at]  # (n, 2, size)
-    group = se2 if kind is SE2 else se3
+    group = GROUPS[kind]
     before = _between(group, path[b, 0], path[a, 0])
     after = _between(group, path[a, 1], path[b, 1])
     onwards = _compose(group, measured[a], after)

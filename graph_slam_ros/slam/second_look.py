@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GaugeError, SingularError
-from graph_slam_ros.graph import SE2, SE3, Graph
-from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.graph import GROUPS, SE2, Graph
 from graph_slam_ros.slam.decisions import Decisions
 from graph_slam_ros.slam.ledger import Ledger
 from graph_slam_ros.slam.neighbours import agreeing
@@ -28,7 +27,6 @@ Index = NDArray[np.int64]
 _ITERATIONS = 20  # of each stage of the losses, from another start
 _HOPELESS = 2.0  # times the least cost that was found: another explanation is none
 _STORY = 5  # closures that agree with one another and not with the map
-_GROUP = {SE2: se2, SE3: se3}
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +78,13 @@ class Outcome:
     def carried_to(self, graph: Graph, values: Array) -> Array:
         """Stored numbers of a graph that has grown since: what is new moves with the newest pose that was there."""
         out, known, old = values.copy(), len(self.values), self.frozen.graph
-        poses = [v for v in range(old.vertex_count) if old.kind_of(v) in _GROUP]
+        poses = [v for v in range(old.vertex_count) if old.kind_of(v) in GROUPS]
         if known == len(values) or not poses:
             out[:known] = self.values
             return out
         newest, kind = poses[-1], old.kind_of(poses[-1])
         at = int(graph.offset.values[newest])
-        group, here = _GROUP[kind], slice(at, at + kind.size)
+        group, here = GROUPS[kind], slice(at, at + kind.size)
         moved = group.compose(tuple(self.values[here]), group.inverse(tuple(values[here])))
         for vertex in range(old.vertex_count, graph.vertex_count):
             at, of = int(graph.offset.values[vertex]), graph.kind_of(vertex)
@@ -190,5 +188,5 @@ def _along_odometry(graph: Graph, values: Array) -> Array:
         a, b = graph.offset.values[[last, new]].tolist()
         kind = graph.kind_of(new)
         pose, step = tuple(out[a : a + kind.size]), tuple(table.measured.values[row])
-        out[b : b + kind.size] = _GROUP[kind].compose(pose, step)
+        out[b : b + kind.size] = GROUPS[kind].compose(pose, step)
     return out

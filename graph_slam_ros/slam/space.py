@@ -50,6 +50,10 @@ class Space:
         """Of a pose: 3 or 6."""
         return self.pose.dof
 
+    def sigmas(self, sigma_m: float, sigma_rad: float) -> list[float]:
+        """Of a pose, (dof,), the same for all lengths and for all angles."""
+        return [sigma_m] * self.dimensions + [sigma_rad] * (self.dof - self.dimensions)
+
     def angle(self, pose: Numbers) -> float:
         """How far a pose is turned, about whatever axis."""
         if self.dimensions == 2:

@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import (
+    GROUPS,
     INVERSE_RELATIVE_POSE,
-    LANDMARK_POSITION,
-    LANDMARK_POSITION_3D,
+    POINT_SEEN_FROM,
     RELATIVE_POSE,
     RELATIVE_POSE_3D,
     SE2,
@@ -32,7 +32,7 @@ from graph_slam_ros.graph import (
     VertexKind,
 )
 from graph_slam_ros.graph.graph import EdgeTable
-from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.lie import so3
 from graph_slam_ros.solver.replayed_start import replayed_values
 
 Array = NDArray[np.float64]
@@ -44,8 +44,6 @@ _RELATIVE: dict[VertexKind, tuple[EdgeType, ...]] = {
     SE2: (RELATIVE_POSE, INVERSE_RELATIVE_POSE),
     SE3: (RELATIVE_POSE_3D,),
 }
-_SIGHTING = {SE2: LANDMARK_POSITION, SE3: LANDMARK_POSITION_3D}
-_GROUP = {SE2: se2, SE3: se3}
 
 
 def initial_values(graph: Graph, method: str, root: int, in_time: Sequence[int] | None = None) -> Array:
@@ -68,13 +66,13 @@ def initial_values(graph: Graph, method: str, root: int, in_time: Sequence[int] 
     if method == "file":
         return values
     kind = graph.kind_of(root)
-    if kind not in _GROUP:
+    if kind not in GROUPS:
         raise GraphSlamError(f"init {method}: vertex {root} is {kind.name}, not a pose")
     poses = np.flatnonzero(graph.kind.values == graph.kinds.index(kind))
     if method == "online":
         of_kind = set(poses.tolist())
         others = [v for v in (range(graph.vertex_count) if in_time is None else in_time) if v in of_kind and v != root]
-        return replayed_values(graph, values, [root, *others], _RELATIVE[kind], _SIGHTING[kind])
+        return replayed_values(graph, values, [root, *others], _RELATIVE[kind], POINT_SEEN_FROM[kind])
     ends, measured = _relative_edges(graph, kind)
     _along_tree(graph, values, kind, root, poses, ends, measured)
     if method == "chordal" and len(poses) > 1:
@@ -109,7 +107,7 @@ def _along_tree(
     graph: Graph, values: Array, kind: VertexKind, root: int, poses: Index, ends: Index, measured: Array
 ) -> None:
     """Breadth first: each pose is as few relative poses from the root as can be."""
-    group = _GROUP[kind]
+    group = GROUPS[kind]
     neighbours: dict[int, list[tuple[int, int, bool]]] = {}
     for row, (i, j) in enumerate(ends.tolist()):
         neighbours.setdefault(i, []).append((j, row, True))
@@ -180,14 +178,14 @@ def _linear(i: Index, j: Index, a: Array, b: Array, fixed: int, value: Array, co
 
 
 def _place_landmarks(graph: Graph, values: Array, kind: VertexKind) -> None:
-    table = graph.tables.get(_SIGHTING[kind])
+    table = graph.tables.get(POINT_SEEN_FROM[kind])
     if table is None:
         return
     rows = _weighted(table)
     vertices, first = np.unique(table.vertices.values[rows, 1], return_index=True)
     first = rows[first]
     poses = values[_slots(graph, table.vertices.values[first, 0], kind.size)]
-    points = _GROUP[kind].act(tuple(poses.T), tuple(table.measured.values[first].T))
+    points = GROUPS[kind].act(tuple(poses.T), tuple(table.measured.values[first].T))
     values[_slots(graph, vertices, len(points))] = np.stack(points, axis=-1)
 
 

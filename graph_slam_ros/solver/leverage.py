@@ -1,7 +1,5 @@
 """How many unknowns each class of edges determines."""
 
-import numpy as np
-
 from graph_slam_ros.solver.linearization import Losses, linearize, rows_of
 from graph_slam_ros.solver.solver import Solver
 
@@ -21,17 +19,13 @@ def leverage(solver: Solver) -> dict[str, float]:
         As for ``Solver.marginal``.
     """
     graph = solver.graph
-    x = np.empty(len(graph.initial))
-    for code, kind in enumerate(graph.kinds):
-        ids = np.flatnonzero(graph.kind.values == code)
-        x[graph.offset.values[ids][:, None] + np.arange(kind.size)] = solver.estimate(ids)
     losses = Losses(graph, solver.settings.stages()[-1])
     out = dict.fromkeys(graph.labels, 0.0)
     for table, rows in rows_of(graph, solver.edges).items():
         for code, label in enumerate(graph.labels):
             of_class = rows[table.label.values[rows] == code]
             looked_at = of_class[:: max(1, -(-len(of_class) // _MOST))]
-            for block in linearize(graph, x, {table: looked_at}, losses):
+            for block in linearize(graph, solver.values, {table: looked_at}, losses):
                 for jacobian, ends in zip(block.jacobian, table.vertices.values[block.rows], strict=True):
                     covariance = solver.joint_marginal(ends)
                     trace = float(((jacobian @ covariance) * jacobian).sum())

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import SE2, SE3, Graph
 from graph_slam_ros.graph.graph import EdgeTable, whole_numbers
-from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.solver import incremental
 from graph_slam_ros.solver.covariance import joint, marginals
 from graph_slam_ros.solver.descent import Problem, Settings, minimise
@@ -28,6 +27,7 @@ from graph_slam_ros.solver.linearization import (
 from graph_slam_ros.solver.numeric import keep, settle
 from graph_slam_ros.solver.report import Change, Report
 from graph_slam_ros.solver.schedule import Schedule
+from graph_slam_ros.solver.stages import Stages
 from graph_slam_ros.solver.symbolic import compact
 from graph_slam_ros.solver.tree import (
     ACTIVE,
@@ -74,12 +74,10 @@ class Solver:
         self._taken = np.zeros(0, dtype=bool)  # edges of the problem
         self._waiting = Waiting()
         self._kept = np.zeros(0)  # the estimate that the last call left
-        self._young = NONE  # edges that have had but one update, with the first stage of their loss
+        self._stages = Stages(graph)
         self._settled = True  # the tree's numbers are those at its linearisation points
         self._unfinished = False  # a batch stopped before the optimum
         self._schedule = Schedule()
-        self._stages: list[Losses] = []
-        self._losses_for = NOTHING, self.settings  # so many labels, and their settings
         self._solved_with: Settings | None = None
 
     # -- what the problem is -----------------------------------------------------------------------------------------
@@ -245,7 +243,7 @@ class Solver:
             else:
                 report = self.evaluate(settings)
         self._kept[:] = self._tree.estimate
-        self._settled, self._young = False, NONE
+        self._settled, self._stages.young = False, NONE
         self._solved_with = settings if report.converged else None
         self._unfinished = not report.converged
         return report
@@ -342,7 +340,8 @@ class Solver:
         """
         self._grow()
         free = np.flatnonzero(self._inside & ~self._held)
-        return information(self.graph, self._tree.estimate, rows_of(self.graph, self.edges), free, self._losses()[-1])
+        losses = self._stages.losses(self.settings)[-1]
+        return information(self.graph, self._tree.estimate, rows_of(self.graph, self.edges), free, losses)
 
     def compact(self) -> None:
         """Move the fronts in use together, so that what is free lies behind them; memory is not given back.
@@ -449,7 +448,7 @@ class Solver:
             incremental.enter(tree, vertices, edges)
             yield
         except BaseException:
-            waiting.broken, self._young, self._settled = True, NONE, True
+            waiting.broken, self._stages.young, self._settled = True, NONE, True
             incremental.leave(self._tree, vertices, edges)
             self._set_estimate(self._kept)
             tree.state[TAIL_FIRST] = tree.state[TAIL_END] = 0  # it is filled anew with the tree
@@ -466,10 +465,11 @@ class Solver:
         waiting, settings = self._waiting, self.settings
         if not self._settled and not waiting.broken:
             self._settle()
-        if not waiting and not len(self._young):
+        young = self._stages.young
+        if not waiting and not len(young):
             return NONE, 0
-        fresh = np.union1d(edges, self._young) if len(self._young) else edges
-        self._young = edges if len(self._losses()) > 1 else NONE
+        fresh = np.union1d(edges, young) if len(young) else edges
+        self._stages.begin(edges, settings)
         if waiting.broken:
             self._forget_numbers()
             fresh = self._active()
@@ -479,23 +479,9 @@ class Solver:
         if failed != NOTHING:
             self._refuse_loose()
             raise undetermined(failed)
-        self._young = self._that_mature(self._young)
+        self._stages.mature(self._tree.value, settings)
         self._solved_with, self._settled = None, True
         return moved, len(fresh)
-
-    def _that_mature(self, edges: Index) -> Index:
-        """Those of edges that have arrived which the last stage of their loss weighs otherwise than the first."""
-        if not len(edges):
-            return NONE
-        stages = self._losses()
-        chi2, _ = chi2_of(self.graph, self._tree.value, edges)
-        changes = []
-        for edge, fit in zip(edges.tolist(), chi2.tolist(), strict=True):
-            table, row = self.graph.row(edge)
-            label, s = int(table.label.values[row]), fit * float(table.weight.values[row])
-            first, last = (weight_and_cost(one.kind[label], one.scale[label], s)[0] for one in (stages[0], stages[-1]))
-            changes.append(first != last)
-        return edges[changes]
 
     def _go_on(self) -> Index:
         """Step from where a batch stopped before the optimum; the vertices that moved."""
@@ -546,22 +532,9 @@ class Solver:
             self._waiting.broken = True
         self._settled = True
 
-    def _losses(self) -> list[Losses]:
-        """Of each stage."""
-        count, settings = self._losses_for
-        if count != len(self.graph.labels) or settings is not self.settings:
-            self._losses_for = len(self.graph.labels), self.settings
-            self._stages = [Losses(self.graph, by_label) for by_label in self.settings.stages()]
-        return self._stages
-
     def _linearize(self, edges: Index) -> None:
         """Put the blocks of edges at the linearisation points into the tree."""
-        stages = self._losses()
-        parts = [(edges, stages[-1])]
-        if len(self._young):
-            young = np.isin(edges, self._young)
-            parts = [(edges[young], stages[0]), (edges[~young], stages[-1])]
-        for ids, losses in parts:
+        for ids, losses in self._stages.of(edges, self.settings):
             for b in linearize(self.graph, self._tree.value, rows_of(self.graph, ids), losses):
                 refuse_nonfinite(b)
                 store(self._tree, b.rows, b.table.id.values, b.residual, b.jacobian)

@@ -18,5 +18,5 @@ def in_a_thread(work: Callable[[], Result]) -> Callable[[], Result]:
 def _run(work: Callable[[], Result], future: "Future[Result]") -> None:
     try:
         future.set_result(work())
-    except BaseException as error:
+    except BaseException as error:  # whoever waits would wait for ever
         future.set_exception(error)

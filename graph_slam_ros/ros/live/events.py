@@ -26,7 +26,7 @@ def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
     for edge in list(update.edges)[:_EDGES]:
         table, row = graph.row(edge)
         vertices = table.vertices.values[row].tolist()
-        label = graph.labels[int(table.label.values[row])]
+        label = graph.label_of(edge)
         what, verdict = "closure" if label == "closures" else "edge", slam.ledger.verdict_of(edge).name.lower()
         yield happened(
             what, f"edge {edge}: {label} of {vertices}", edge=edge, label=label, vertices=vertices, verdict=verdict
@@ -73,10 +73,9 @@ def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:
 def name_of(slam: GraphSlam, edge: int) -> str:
     """What an edge is of: its class, and the landmark it is about."""
     table, row = slam.graph.row(edge)
-    label = slam.graph.labels[int(table.label.values[row])]
     vertices = set(table.vertices.values[row].tolist())
     of = next((name for name, mark in slam.landmarks.items() if mark.vertex in vertices), "")
-    return f"{label} {of}".strip()
+    return f"{slam.graph.label_of(edge)} {of}".strip()
 
 
 __all__ = ["ERROR", "OK", "WARN", "correction", "happened", "name_of", "of_update"]

@@ -1,0 +1,85 @@
+"""Where the robot was: its keyframes, and the odometry in between as far back as late measurements may reach."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph_slam_ros.slam.carry import Where
+from graph_slam_ros.slam.motion import Motion, OdometryNoise
+from graph_slam_ros.slam.odometry_choice import Step
+from graph_slam_ros.slam.space import Numbers, Space
+from graph_slam_ros.slam.track import Track
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A selected instant: its vertex, its stamp, and where odometry put it. No estimate: the solver owns that."""
+
+    vertex: int
+    stamp_ns: int
+    T_odom_base: Numbers
+
+
+class Trail:
+    """Keyframes in order of time, and the motion since each of the last.
+
+    Attributes
+    ----------
+    segments : keyframes at which odometry began, or began anew
+    """
+
+    def __init__(self, noise: OdometryNoise, space: Space) -> None:
+        self.keyframes = Track(Keyframe, space.pose.size)
+        self.segments: list[int] = []
+        self._noise, self._space = noise, space
+        self._motions: deque[Motion] = deque()
+        self._epoch = 0  # the first keyframe since stamps began anew
+
+    @property
+    def motion(self) -> Motion | None:
+        """Since the newest keyframe; none where stamps have begun anew since."""
+        return self._motions[-1] if self._motions else None
+
+    @property
+    def oldest_ns(self) -> int:
+        """Stamp of the first keyframe, of those whose stamps are of the present time."""
+        return int(self.keyframes.stamps_ns[self._epoch])
+
+    @property
+    def remembered_ns(self) -> int:
+        """From this stamp on odometry is remembered, message by message."""
+        return self._motions[0].start_ns
+
+    def append(self, vertex: int, step: Step, late_s: float) -> None:
+        """Add a keyframe where odometry is; motions are forgotten that ended more than ``late_s`` ago."""
+        self.keyframes.append(vertex, step.stamp_ns, step.T_odom_base)
+        self._motions.append(Motion(self._noise, self._space, len(self.keyframes) - 1, step.stamp_ns))
+        oldest_ns = step.stamp_ns - round(late_s * 1e9)
+        while len(self._motions) > 2 and self._motions[1].start_ns <= oldest_ns:
+            self._motions.popleft()
+
+    def forget_time(self) -> None:
+        """Stamps begin anew: none before can be told from them."""
+        self._motions.clear()
+        self._epoch = len(self.keyframes)
+
+    def where(self, stamp_ns: int) -> Where:
+        """Where the robot was, by the keyframe before and the odometry in between."""
+        motion = next((m for m in reversed(self._motions) if m.start_ns <= stamp_ns), None)
+        if motion is None:
+            return self._where_long_ago(stamp_ns)
+        moved = motion.at(stamp_ns)
+        vertex = int(self.keyframes.ids[motion.keyframe])
+        return Where(motion.keyframe, vertex, stamp_ns, moved.T_keyframe_base, moved.covariance)
+
+    def _where_long_ago(self, stamp_ns: int) -> Where:
+        """Between two keyframes whose odometry is forgotten: evenly from one to the next."""
+        present = self.keyframes.stamps_ns[self._epoch :]
+        k = self._epoch + int(np.searchsorted(present, stamp_ns, side="right")) - 1
+        group, (a, b) = self._space.group, (self.keyframes[k], self.keyframes[k + 1])
+        T_a_b = self._space.identity if k + 1 in self.segments else group.between(a.T_odom_base, b.T_odom_base)
+        fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+        moved = group.interpolate(self._space.identity, T_a_b, fraction)
+        noise = self._noise.of((stamp_ns - a.stamp_ns) * 1e-9, None)
+        return Where(k, a.vertex, stamp_ns, moved, group.noise_during(moved, noise))
