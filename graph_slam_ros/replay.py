@@ -42,11 +42,12 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """What came of a replay: the pipeline at its end, numbers, and what of the recording could not be read."""
+    """What came of a replay: the pipeline at its end, numbers, what could not be read, and what to beware of."""
 
     slam: GraphSlam
     summary: dict[str, Any]
     losses: list[str]
+    warnings: list[str]
 
 
 def choose_inputs(bag: Bag, config: Config, odometry: str | None = None, landmarks: str | None = None) -> Inputs:
@@ -150,7 +151,7 @@ def replay(
     check_room(out, source)
     if is_run(source):
         config = with_survey(config or run_config(source))
-        losses: list[str] = []
+        losses, warnings = list[str](), list[str]()
         items: Iterable[Sequence[Measurement]] = ([from_record(record)] for record in read_ingest(source, losses))
         total = 0
     else:
@@ -159,7 +160,7 @@ def replay(
         inputs = choose_inputs(bag, config, odometry, landmarks)
         items = _with_end(measurements(bag, inputs, config, counters))
         total = sum(bag.topics[topic].count for topic in inputs.by_topic()) + 3
-        losses = bag.losses
+        losses, warnings = bag.losses, bag.warnings
     recorder = RunRecorder(out, config)
     slam = GraphSlam(config, recorder.sink)
     try:
@@ -172,7 +173,7 @@ def replay(
         recorder.save(slam, summary)
     finally:
         recorder.close()
-    return Replayed(slam, summary, summary["losses"])
+    return Replayed(slam, summary, summary["losses"], warnings)
 
 
 def _with_end(items: Iterable[Sequence[Measurement]]) -> Iterator[Sequence[Measurement]]:

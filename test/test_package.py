@@ -41,7 +41,7 @@ THIRD_PARTY = {
     "graph": {"numpy", "numba"},
     "solver": {"numpy", "numba", "scipy"},
     "slam": {"numpy", "scipy"},
-    "formats": {"numpy", "mcap", "yaml"},
+    "formats": {"numpy", "mcap", "yaml", "lz4", "zstandard"},  # the last two are mcap's own
     "certificate": {"numpy", "scipy"},
     "ros/from_msg.py": {"numpy", "rosbags", "mcap"},
     "ros/bag.py": {"numpy", "rosbags", "mcap"},

@@ -21,8 +21,10 @@ def tell(what: str, programme: str = "graph_slam") -> None:
     print(f"{programme}: {what}", file=sys.stderr)
 
 
-def told(losses: Sequence[str]) -> int:
-    """Tell what was lost; returns the exit code."""
+def told(losses: Sequence[str], warnings: Sequence[str] = ()) -> int:
+    """Tell what was lost, and what to beware of; returns the exit code."""
+    for warning in warnings:
+        tell(f"beware: {warning}")
     for loss in losses:
         tell(f"lost: {loss}")
     return LOSSES if losses else DONE

@@ -29,7 +29,7 @@ def replay(args: argparse.Namespace) -> int:
     )
     _say_run(args.bag, done.summary)
     console.say(f"results in {args.out}")
-    return console.told(done.losses)
+    return console.told(done.losses, done.warnings)
 
 
 def _replay_live(args: argparse.Namespace, config: "Config") -> int:
@@ -54,7 +54,8 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
             played = play(bag, inputs, own=own, **options)
         _say_run(args.bag, json.loads((args.out / "run.json").read_text()))
     console.say(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
-    return console.told(bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else []))
+    losses = bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else [])
+    return console.told(losses, bag.warnings)
 
 
 def info(args: argparse.Namespace) -> int:
@@ -68,7 +69,7 @@ def info(args: argparse.Namespace) -> int:
         return console.DONE
     bag = open_bag(args.bag)
     console.say(*describe(bag, args.bag))
-    return console.told(bag.losses)
+    return console.told(bag.losses, bag.warnings)
 
 
 def evaluate(args: argparse.Namespace) -> int:

@@ -1,92 +1,230 @@
 """The records of an mcap file in order: one way to read whole, damaged and truncated files.
 
-The summary at the end is used where it is whole; the records themselves always come through the stream reader.
+Records are parsed by the library. Walking from one to the next is ours: the library's readers end at the first damage,
+believe every length, and decompress whatever comes of it.
 """
 
+import io
+import os
+import re
+import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema
+from mcap.stream_reader import MAGIC_SIZE
 
-_MAGIC = b"\x89MCAP0\r\n"
-_MAX_CHUNK_BYTES = 256 * 2**20  # declared size, checked before anything is decompressed
-_MAX_RECORD_BYTES = 2**30
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.decompression import MOST_BYTES, decompressed
+
+MAGIC = b"\x89MCAP0\r\n"
+_HEAD = struct.Struct("<BQ")  # opcode and length of a record
+_READ: dict[Opcode, Any] = {
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.MESSAGE: Message,
+    Opcode.CHUNK: Chunk,
+    Opcode.DATA_END: DataEnd,
+}
+_MOST_PADDING = 64  # a later version may add fields; after a damaged length there is more
+_BLOCK = 2**20
+# A chunk's head: opcode, length, two times, size, checksum, codec; then the length of its data.
+_CHUNK = re.compile(rb"\x06(?=(.{8}).{28}(?:\0{4}|\x04\0{3}zstd|\x03\0{3}lz4)(.{8}))", re.DOTALL)
+_CHUNK_HEAD = 57
 
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What a file holds: schemas and channels by id, messages by channel id."""
+    """What a file holds: schemas and channels by id, messages by channel id, and the time of the first message."""
 
     schemas: dict[int, Schema]
     channels: dict[int, Channel]
     counts: dict[int, int]
+    first_ns: int = 0
 
 
-def is_mcap(path: Path) -> bool:
-    """Whether the file begins as an mcap file does. Raises OSError."""
-    with path.open("rb") as stream:
-        return stream.read(len(_MAGIC)) == _MAGIC
+class _Stream(io.BufferedReader):
+    """A file that is never asked for more than there is, up to ``end``: a length in a damaged file may be 2^60."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self.size = self.end = os.fstat(self.fileno()).st_size
+
+    def go(self, at: int, end: int | None = None) -> None:
+        self.end = self.size if end is None else end
+        self.seek(at)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = self.end - self.tell()
+        if size is not None and size > left:
+            raise EndOfFile()
+        return super().read(left if size is None or size < 0 else size)
 
 
 def contents(path: Path) -> Contents:
     """From the summary, or by reading everything where there is no whole one."""
     try:
-        with path.open("rb") as stream:
-            summary = make_reader(stream).get_summary()
+        with _Stream(path) as stream:
+            summary = make_reader(stream).get_summary() if _has_whole_summary(stream) else None
     except Exception:  # of a damaged file the library raises almost anything
         summary = None
     if summary is not None and summary.statistics is not None and summary.channels:
-        return Contents(summary.schemas, summary.channels, summary.statistics.channel_message_counts)
-    found = Contents({}, {}, {})
+        told = summary.statistics
+        return Contents(summary.schemas, summary.channels, told.channel_message_counts, told.message_start_time)
+    schemas, channels, counts, first_ns = dict[int, Schema](), dict[int, Channel](), dict[int, int](), 2**64
     for record in records(path, []):
         if isinstance(record, Message):
-            found.counts[record.channel_id] = found.counts.get(record.channel_id, 0) + 1
+            counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
+            first_ns = min(first_ns, record.log_time)
         elif isinstance(record, Schema):
-            found.schemas[record.id] = record
+            schemas[record.id] = record
         elif isinstance(record, Channel):
-            found.channels[record.id] = record
-    return found
+            channels[record.id] = record
+    return Contents(schemas, channels, counts, first_ns)
 
 
-def records(path: Path, losses: list[str]) -> Iterator[McapRecord]:
+def records(path: Path, losses: list[str], warnings: list[str] | None = None) -> Iterator[McapRecord]:
     """Schemas, channels and messages in order of the file.
 
-    A damaged chunk is passed over and a cut tail ends it; each adds a line to ``losses``.
+    What is damaged is passed over up to the next chunk; a cut tail ends it. Each adds a line to ``losses``; one in
+    ``warnings`` says where no checksum would tell of damage.
     """
-    read = 0
-    with path.open("rb") as stream:
-        reader = StreamReader(stream, emit_chunks=True, record_size_limit=_MAX_RECORD_BYTES).records
+    read, unchecked, loose = 0, False, False
+    with _Stream(path) as stream:
+        at = MAGIC_SIZE
         while True:
             try:
-                record = next(reader)
-            except StopIteration:
-                return
+                record, after = _record(stream, at)
             except Exception as error:  # see contents
-                at, size = stream.tell(), path.stat().st_size
-                losses.append(
-                    f"{path.name}: cut off after {read} messages ({type(error).__name__} at {at} of {size} bytes)"
-                )
-                return
+                next_chunk = _next_chunk(stream, at + 1)
+                losses.append(f"{path.name}: {_lost(error, read, at, next_chunk, stream.size)}")
+                if next_chunk is None:
+                    break
+                at = next_chunk
+                continue
             if isinstance(record, Chunk):
-                for inner in _unpacked(path, record, losses):
-                    read += isinstance(inner, Message)
-                    yield inner
-            elif isinstance(record, Statistics):  # the summary repeats schemas and channels
-                return
-            else:
+                unchecked |= not record.uncompressed_crc
+                try:
+                    for inner in _inside(record):
+                        read += isinstance(inner, Message)
+                        yield inner
+                except Exception as error:  # see contents
+                    losses.append(
+                        f"{path.name}: a damaged chunk of {after - at} bytes was passed over ({_what(error)})"
+                    )
+            elif isinstance(record, DataEnd):
+                if loose and record.data_section_crc not in (0, _checksum(stream, at)):
+                    losses.append(f"{path.name}: damaged: its data do not agree with their checksum")
+                unchecked |= loose and not record.data_section_crc
+                if not _ends_whole(stream):
+                    losses.append(f"{path.name}: cut off after {read} messages, in the summary behind them")
+                break
+            elif record is not None:
+                loose |= isinstance(record, Message)
                 read += isinstance(record, Message)
                 yield record
+            at = after
+    if unchecked and warnings is not None:
+        warnings.append(f"{path.name}: carries no checksums: a damaged byte in it may go unnoticed")
 
 
-def _unpacked(path: Path, chunk: Chunk, losses: list[str]) -> list[McapRecord]:
-    if chunk.uncompressed_size > _MAX_CHUNK_BYTES:
-        losses.append(f"{path.name}: a chunk of {chunk.uncompressed_size} bytes is over the limit and was passed over")
-        return []
-    try:
-        return breakup_chunk(chunk, validate_crc=True)
-    except Exception as error:  # see contents
-        losses.append(f"{path.name}: a damaged chunk was passed over ({type(error).__name__})")
-        return []
+def _record(stream: _Stream, at: int) -> tuple[McapRecord | None, int]:
+    """The record that begins there, or nothing for one of no interest, and where the next begins.
+
+    Raises almost anything where it is damaged.
+    """
+    stream.go(at)
+    opcode, length = _HEAD.unpack(stream.read(_HEAD.size))
+    after = at + _HEAD.size + length
+    if after > stream.size:
+        raise EndOfFile()
+    if opcode not in _READ:
+        return None, after
+    if length > MOST_BYTES:
+        raise FormatError(f"a record of {length} bytes; {MOST_BYTES} is the limit")
+    stream.end = after
+    return _parsed(opcode, ReadDataStream(stream), length), after
+
+
+def _parsed(opcode: int, stream: ReadDataStream, length: int) -> McapRecord:
+    start = stream.count
+    kind = _READ[Opcode(opcode)]
+    record: McapRecord = Message.read(stream, length) if kind is Message else kind.read(stream)
+    padding = length - (stream.count - start)
+    if not 0 <= padding <= _MOST_PADDING:
+        raise FormatError(f"a record of {length} bytes with {length - padding} in it")
+    stream.read(padding)
+    return record
+
+
+def _inside(chunk: Chunk) -> Iterator[McapRecord]:
+    """One after another: a list of them all would take the chunk's memory a second time."""
+    plain = decompressed(chunk.data, chunk.compression, chunk.uncompressed_size)
+    if chunk.uncompressed_crc not in (0, zlib.crc32(plain)):
+        raise FormatError("its checksum is another")
+    stream = ReadDataStream(io.BytesIO(plain))
+    while stream.count < len(plain):
+        opcode, length = _HEAD.unpack(stream.read(_HEAD.size))
+        if length > len(plain) - stream.count:
+            raise EndOfFile()
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            yield _parsed(opcode, stream, length)
+        else:
+            stream.read(length)
+
+
+def _next_chunk(stream: _Stream, at: int) -> int | None:
+    """Where the next chunk begins that is whole: its head agrees with itself, and its end is in the file."""
+    while at < stream.size:
+        stream.go(at)
+        block = stream.read(min(_BLOCK + _CHUNK_HEAD, stream.size - at))
+        for found in _CHUNK.finditer(block):
+            if found.start() >= _BLOCK:
+                break
+            length, within = (int.from_bytes(group, "little") for group in found.groups())
+            begins = at + found.start()
+            if 0 <= length - within - 40 <= 4 and begins + _HEAD.size + length <= stream.size:
+                return begins
+        at += _BLOCK
+    return None
+
+
+def _lost(error: Exception, read: int, at: int, next_chunk: int | None, size: int) -> str:
+    if next_chunk is None:
+        return f"cut off after {read} messages, {size - at} of {size} bytes are lost ({_what(error)})"
+    return f"damaged at {at}: {next_chunk - at} bytes were passed over ({_what(error)})"
+
+
+def _what(error: Exception) -> str:
+    return str(error) if isinstance(error, FormatError) else type(error).__name__
+
+
+def _has_whole_summary(stream: _Stream) -> bool:
+    """The footer: where the summary begins, and its checksum, 0 where there is none."""
+    end = stream.size - MAGIC_SIZE - 4
+    stream.go(end - 16)
+    summary, _, crc = struct.unpack("<QQI", stream.read(20))
+    is_whole = 0 < summary < end and crc in (0, _checksum(stream, end, summary))
+    stream.go(0)
+    return is_whole
+
+
+def _ends_whole(stream: _Stream) -> bool:
+    stream.go(stream.size - MAGIC_SIZE)
+    return stream.read(MAGIC_SIZE) == MAGIC
+
+
+def _checksum(stream: _Stream, end: int, start: int = 0) -> int:
+    stream.go(start, end)
+    crc = 0
+    while block := stream.read(min(_BLOCK, end - stream.tell())):
+        crc = zlib.crc32(block, crc)
+    stream.end = stream.size
+    return crc
