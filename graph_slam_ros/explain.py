@@ -3,14 +3,15 @@
 import json
 import textwrap
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from scipy.special import gammainc
 
 from graph_slam_ros import quantities
-from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
+from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
+from graph_slam_ros.formats.strict import integer, lines
 from graph_slam_ros.ledger_file import Entry, read_changes, read_ledger
 from graph_slam_ros.run import SUMMARY, run_config
 from graph_slam_ros.slam import Config
@@ -51,7 +52,8 @@ def explain_run(folder: Path) -> Iterator[str]:
     FormatError
         A file of the run is missing, or is not what it should be.
     """
-    entries, changes, config = read_ledger(folder), read_changes(folder), run_config(folder)
+    entries, config = read_ledger(folder), run_config(folder)
+    changes = read_changes(folder, len(entries))
     judged = [entry for entry in entries if entry.verdict]
     yield f"{len(entries)} edges, {len(judged)} of them judged; {len(entries) - len(judged)} are taken for granted"
     if judged:
@@ -115,15 +117,19 @@ def _gates(entries: Sequence[Entry], changes: Sequence[Change], config: Config) 
 
 def _rivals(folder: Path) -> Iterator[str]:
     """What the last second look could not rule out."""
+    file = folder / SUMMARY
     try:
-        told: list[dict[str, Any]] = json.loads((folder / SUMMARY).read_text()).get("rivals", [])
-    except (OSError, ValueError) as error:
-        raise GraphSlamError(f"{folder / SUMMARY}: {error}") from None
-    for rival in told:
-        here, there = (" ".join(map(str, rival[which])) for which in ("only_here", "only_there"))
-        tried = f"graph_slam solve {folder} --with {here}" + (f" --without {there}" if there else "")
-        costs = f"this explanation costs {rival['best_cost']:.4g}, another {rival['cost']:.4g}"
-        yield f"warning: ambiguous: {costs}: {tried}"
+        told = [_rival(folder, rival) for rival in json.loads("".join(text for _, text in lines(file)))["rivals"]]
+    except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise FormatError(f"{file}: not the summary of a run: {error!r}") from None
+    yield from told
+
+
+def _rival(folder: Path, rival: Mapping[str, Any]) -> str:
+    here, there = (" ".join(f"{edge:d}" for edge in rival[which]) for which in ("only_here", "only_there"))
+    tried = f"graph_slam solve {folder} --with {here}" + (f" --without {there}" if there else "")
+    costs = f"this explanation costs {rival['best_cost']:.4g}, another {rival['cost']:.4g}"
+    return f"warning: ambiguous: {costs}: {tried}"
 
 
 # -- one edge, or a landmark's -----------------------------------------------------------------------------------------
@@ -142,7 +148,8 @@ def explain_edge(folder: Path, which: str) -> Iterator[str]:
         There is no such edge or landmark.
     """
     if which.isdecimal():
-        return _edge(SavedGraph(folder), int(which), read_changes(folder), run_config(folder))
+        run = SavedGraph(folder)
+        return _edge(run, integer(which), read_changes(folder, len(run.entries)), run_config(folder))
     return _landmark(folder, which.removeprefix("landmark:"))
 
 

@@ -5,16 +5,19 @@ Rows are in order of the edges' ids. A list of numbers is one field, with spaces
 
 import csv
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
+from enum import IntEnum
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from reprlib import repr as shortened
+from typing import Any, NewType, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.formats.strict import integer, lines, numbers, stamp
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.ledger import Change, Reason, Verdict
@@ -22,7 +25,9 @@ from graph_slam_ros.slam.ledger import Change, Reason, Verdict
 LEDGER, CHANGES = "ledger.csv", "ledger_changes.csv"
 Numbers = tuple[float, ...]
 Ids = tuple[int, ...]
+Stamp = NewType("Stamp", int)
 Row = TypeVar("Row")
+_ROUNDING = 1e-6  # of a statistic, which is then below 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +59,7 @@ class Entry:
     landmark: str
     vertices: Ids
     keyframe: int
-    stamp_ns: int
+    stamp_ns: Stamp
     measured: Numbers
     information: Numbers
     residual: Numbers
@@ -95,13 +100,45 @@ def changes_text(slam: GraphSlam) -> str:
 
 
 def read_ledger(folder: Path) -> list[Entry]:
-    """The entries of a run, by edge. Raises FormatError."""
-    return _read(Entry, folder / LEDGER)
+    """The entries of a run, by edge. Raises FormatError naming the line."""
+    entries = list[Entry]()
+    for line, entry in _read(Entry, folder / LEDGER):
+        fault = f"edge {entry.edge} where {len(entries)} is due" if entry.edge != len(entries) else _fault(entry)
+        if fault:
+            raise FormatError(f"{folder / LEDGER}:{line}: {fault}")
+        entries.append(entry)
+    return entries
 
 
-def read_changes(folder: Path) -> list[Change]:
-    """The history of a run, in order. Raises FormatError."""
-    return _read(Change, folder / CHANGES)
+def read_changes(folder: Path, edges: int) -> list[Change]:
+    """The history of a run of so many edges, in order. Raises FormatError naming the line."""
+    changes = list[Change]()
+    for line, change in _read(Change, folder / CHANGES):
+        if not 0 <= change.edge < edges:
+            raise FormatError(f"{folder / CHANGES}:{line}: edge {change.edge} is none of the {edges} of {LEDGER}")
+        changes.append(change)
+    return changes
+
+
+def _fault(entry: Entry) -> str:
+    """What of an edge does not go together."""
+    edge = EDGE_TAGS.get(entry.tag)
+    if edge is None:
+        return f"tag {shortened(entry.tag)} is none of a graph"
+    m = edge.residual_size
+    sizes = {
+        "vertices": (len(entry.vertices), len(edge.accepts)),
+        "measured": (len(entry.measured), edge.measured_size),
+        "information": (len(entry.information), m * (m + 1) // 2),
+        "residual": (len(entry.residual), m),
+    }
+    for name, (found, wanted) in sizes.items():
+        if found != wanted:
+            return f"{name}: {found} numbers, where {entry.tag} has {wanted}"
+    if entry.dof != m:
+        return f"dof: {entry.dof}, where {entry.tag} has {m}"
+    least = {"statistic": -_ROUNDING, "threshold": np.finfo(float).tiny, "chi2": 0.0, "weight": 0.0}
+    return next((f"{name}: {n} is too small" for name, low in least.items() if (n := getattr(entry, name)) < low), "")
 
 
 def _entries(slam: GraphSlam, ids: list[int]) -> Iterable[Entry]:
@@ -124,7 +161,7 @@ def _entries(slam: GraphSlam, ids: list[int]) -> Iterable[Entry]:
             next((names[v] for v in vertices if v in names), ""),
             tuple(ids[v] for v in vertices),
             keyframe,
-            int(slam.keyframes.stamps_ns[keyframe]),
+            Stamp(int(slam.keyframes.stamps_ns[keyframe])),
             tuple(table.measured.values[row].tolist()),
             tuple((root.T @ root)[np.triu_indices(len(root))].tolist()),
             tuple(ledger.residual(edge).tolist()),
@@ -141,14 +178,22 @@ def _entries(slam: GraphSlam, ids: list[int]) -> Iterable[Entry]:
 # -- rows of a dataclass -----------------------------------------------------------------------------------------------
 
 _PARSED: dict[Any, Callable[[str], Any]] = {
-    int: int,
-    float: float,
+    int: integer,
+    Stamp: stamp,
+    float: lambda text: np.inf if text == "inf" else numbers([text])[0],  # no bound on what a statistic is
     str: str,
-    Ids: lambda text: tuple(map(int, text.split())),
-    Numbers: lambda text: tuple(map(float, text.split())),
-    Verdict: lambda text: Verdict[text.upper()],
-    Reason: lambda text: Reason[text.upper()],
+    Ids: lambda text: tuple(map(integer, text.split())),
+    Numbers: lambda text: tuple(numbers(text.split())),
+    Verdict: lambda text: _member(Verdict, text),
+    Reason: lambda text: _member(Reason, text),
 }
+
+
+def _member(kind: type[IntEnum], word: str) -> IntEnum:
+    names = [member.name.lower() for member in kind]
+    if word not in names:
+        raise FormatError(f"{shortened(word)} is none of {', '.join(names)}")
+    return kind[word.upper()]
 
 
 def _text(kind: type, rows: Iterable[Any]) -> str:
@@ -166,13 +211,29 @@ def _word(value: Any) -> str:
     return " ".join(map(repr, value)) if isinstance(value, tuple) else str(value)
 
 
-def _read(kind: type[Row], file: Path) -> list[Row]:
+def _read(kind: type[Row], file: Path) -> Iterator[tuple[int, Row]]:
+    """Each row with the line it ends on."""
     hints = get_type_hints(kind)
+    if not file.exists():
+        raise FormatError(f"{file}: no such file: is it a run, and saved by this version?")
+    rows = csv.reader((text for _, text in lines(file)), strict=True)
     try:
-        with file.open(newline="", encoding="utf-8") as stream:
-            rows = csv.DictReader(stream)
-            return [kind(**{name: _PARSED[hint](row[name]) for name, hint in hints.items()}) for row in rows]
-    except OSError as error:
-        raise FormatError(f"{file}: {error.strerror}: is it a run, and saved by this version?") from None
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise FormatError(f"{file}: not a ledger: {error!r}") from None
+        if next(rows, None) != list(hints):
+            raise FormatError(f"{file}: not a ledger: its first line is not {','.join(hints)}")
+        for row in rows:
+            if len(row) != len(hints):
+                raise FormatError(f"{file}:{rows.line_num}: {len(row)} columns, not {len(hints)}")
+            try:
+                yield rows.line_num, kind(*map(_parsed, hints.items(), row))
+            except FormatError as error:
+                raise FormatError(f"{file}:{rows.line_num}: {error}") from None
+    except csv.Error as error:
+        raise FormatError(f"{file}:{rows.line_num}: {error}") from None
+
+
+def _parsed(column: tuple[str, Any], word: str) -> Any:
+    name, kind = column
+    try:
+        return _PARSED[kind](word)
+    except FormatError as error:
+        raise FormatError(f"{name}: {error}") from None

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from graph_slam_ros import __version__
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import ConfigError, GraphSlamError
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.ingest import IngestWriter, ingest_files
@@ -69,8 +69,12 @@ def is_run(folder: Path) -> bool:
 
 
 def run_config(folder: Path) -> Config:
-    """The configuration a run was made with."""
-    return Config.from_mapping(read_parameters(folder / _CONFIG))
+    """The configuration a run was made with. Raises ConfigError naming the file."""
+    values = read_parameters(folder / _CONFIG)
+    try:
+        return Config.from_mapping(values)
+    except GraphSlamError as error:
+        raise ConfigError(f"{folder / _CONFIG}: {error}") from None
 
 
 def check_room(folder: Path, source: Path | None = None) -> None:

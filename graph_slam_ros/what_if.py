@@ -3,6 +3,7 @@
 All is from ``graph.g2o`` and ``ledger.csv``: nothing is decided again, the drive is not repeated.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.formats.graph_file import EDGE_TAGS, G2oFile
 from graph_slam_ros.graph import Gaussian, Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
-from graph_slam_ros.ledger_file import Entry, read_ledger
+from graph_slam_ros.ledger_file import LEDGER, Entry, read_ledger
 from graph_slam_ros.run import GRAPH, run_config
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.solver.linearization import linearized
@@ -68,6 +69,12 @@ class SavedGraph:
         self.entries = read_ledger(folder)
         self.graph = _graph(folder, self.entries)
         self.keyframes = [k for e in self.entries if e.label in ("anchor", "odometry") for k in e.vertices[-1:]]
+        for vertex in self.keyframes:
+            if self.graph.kind_of(vertex) is not self.space.pose:
+                kind, wanted = self.graph.kind_of(vertex).name, self.space.pose.name
+                raise FormatError(f"{folder / GRAPH}: vertex {vertex} is {kind}, where {LEDGER} has a pose, {wanted}")
+        if not self.keyframes:
+            raise GraphSlamError(f"{folder}: no keyframe in it, so there is nothing to solve")
         self._numbers = {vertex: k for k, vertex in enumerate(self.keyframes)}
         self._was = self.solve()
 
@@ -90,10 +97,14 @@ class SavedGraph:
 
         Raises
         ------
+        GraphSlamError
+            There is no such edge, or one is both taken out and let in.
         GaugeError, SingularError
             What is left does not determine a vertex.
         """
-        gone = {self.edge(e).edge for e in without}
+        gone, let_in = {self.edge(e).edge for e in without}, list(dict.fromkeys(let_in))
+        if gone & set(let_in):
+            raise GraphSlamError(f"edge {min(gone & set(let_in))}: cannot be taken out and let in at once")
         edges = [e.edge for e in self.entries if e.is_in and e.edge not in gone]
         graph, settings = self.graph, self._settings
         if let_in:
@@ -162,13 +173,32 @@ class SavedGraph:
 
 def _graph(folder: Path, entries: Sequence[Entry]) -> Graph:
     file, out = read_g2o(folder / GRAPH), Graph()
+    if sorted(file.ids) != list(range(len(file.ids))):
+        raise FormatError(f"{folder / GRAPH}: vertices are not numbered one after another from 0: is it of a run?")
     at, initial = file.graph.offset.values.tolist(), file.graph.initial.values
     for vertex in np.argsort(file.ids).tolist():
         kind = file.graph.kind_of(vertex)
         out.add_vertex(kind, initial[at[vertex] : at[vertex] + kind.size])
     for entry in entries:
-        _add(out, entry, entry.label)
+        try:
+            _add(out, entry, entry.label)
+        except GraphSlamError as error:
+            raise FormatError(f"{folder / LEDGER}: edge {entry.edge}: {error}") from None
+    _check_same_run(folder, file, entries)
     return out
+
+
+def _check_same_run(folder: Path, file: G2oFile, entries: Iterable[Entry]) -> None:
+    """The graph has the edges that are in, and none that the ledger does not know."""
+    told: Counter[tuple[str, ...]] = Counter()
+    tags = {edge: tag for tag, edge in EDGE_TAGS.items()}
+    for table in file.graph.tables.values():
+        told.update((tags[table.type], *(str(file.ids[v]) for v in ends)) for ends in table.vertices.values.tolist())
+    known = [((e.tag, *map(str, e.vertices)), e.is_in) for e in entries]
+    strange = told - Counter(edge for edge, _ in known) or Counter(edge for edge, is_in in known if is_in) - told
+    if strange:
+        edge = " ".join(min(strange))
+        raise FormatError(f"{folder}: {GRAPH} and {LEDGER} are not of one run, or not whole: {edge} is in one alone")
 
 
 def _add(graph: Graph, entry: Entry, label: str) -> int:

@@ -2,10 +2,12 @@
 
 import importlib.util
 import os
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 DONE, FAULT, REFUSED, LOSSES = 0, 1, 2, 3
 NOT_CERTIFIED, NOT_APPLICABLE = 4, 5  # of optimize --certify
 
@@ -17,8 +19,9 @@ def say(*lines: str) -> None:
 
 
 def tell(what: str, programme: str = "graph_slam") -> None:
-    """What stands beside the answer, on standard error."""
-    print(f"{programme}: {what}", file=sys.stderr)
+    """What stands beside the answer, on standard error: a line, whatever is in the names that it tells."""
+    line = _CONTROL.sub(lambda found: repr(found[0])[1:-1], what)
+    print(f"{programme}: {line}", file=sys.stderr)
 
 
 def told(losses: Sequence[str], warnings: Sequence[str] = ()) -> int:

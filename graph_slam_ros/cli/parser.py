@@ -266,9 +266,12 @@ def _count(text: str) -> int:
 
 
 def _edge(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text} is not the id of an edge")
-    return int(text)
+    from graph_slam_ros.formats.strict import integer
+
+    try:
+        return integer(text)
+    except GraphSlamError:
+        raise argparse.ArgumentTypeError(f"{text} is not the id of an edge") from None
 
 
 def _method(text: str) -> str:

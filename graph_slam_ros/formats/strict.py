@@ -5,6 +5,7 @@ import re
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from reprlib import repr as shortened
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from graph_slam_ros.errors import FormatError
 # float() also accepts 1_0, inf, nan and digits of other scripts
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _ID = re.compile(r"[+-]?\d{1,18}", re.ASCII)
+_STAMP = re.compile(r"\d{1,18}|[1-8]\d{18}", re.ASCII)
 
 
 def lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -20,7 +22,8 @@ def lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
         if not path.is_file():
             raise FormatError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
-        with (gzip.open if is_gzipped(path) else open)(path, "rt", encoding="utf-8") as stream:
+        opened = gzip.open if is_gzipped(path) else open
+        with opened(path, "rt", encoding="utf-8", newline="") as stream:  # a quoted field may have any
             yield from enumerate(stream, start=1)
     except (gzip.BadGzipFile, zlib.error, EOFError):
         raise FormatError(f"{path.name}: damaged, or not a gzip file") from None
@@ -49,7 +52,14 @@ def expect(words: list[str], count: int) -> None:
 def integer(word: str) -> int:
     """An id. Raises FormatError."""
     if not _ID.fullmatch(word):
-        raise FormatError(f"{word!r} is not an id")
+        raise FormatError(f"{shortened(word)} is not an id")
+    return int(word)
+
+
+def stamp(word: str) -> int:
+    """Nanoseconds that fit into 64 bits. Raises FormatError."""
+    if not _STAMP.fullmatch(word):
+        raise FormatError(f"{shortened(word)} is not a stamp")
     return int(word)
 
 
@@ -57,5 +67,5 @@ def numbers(words: list[str]) -> list[float]:
     """Finite numbers. Raises FormatError naming the first that is none."""
     for word in words:
         if not _NUMBER.fullmatch(word) or float(word) in (np.inf, -np.inf):
-            raise FormatError(f"{word!r} is not a finite number")
+            raise FormatError(f"{shortened(word)} is not a finite number")
     return [float(word) for word in words]
