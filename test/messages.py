@@ -16,6 +16,8 @@ from graph_slam_ros.slam import Config, Counters
 STAMP_NS = 1_700_000_000_123_456_789
 TWIST = np.diag([0.04, 0.01, 0.02])
 DETECTIONS = "vision_msgs/msg/Detection3DArray"
+CLOUD = "sensor_msgs/msg/PointCloud2"
+DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}  # of a PointField
 
 
 def quaternion(roll=0.0, pitch=0.0, yaw=0.0, norm=1.0):
@@ -113,6 +115,21 @@ def border(*links, decoders=None, **sections):
     return out
 
 
+def scanner(dimensions=2, *links, **settings):
+    """A border that hears a point cloud."""
+    return listening("scan", CLOUD, *links, dimensions=dimensions, settings=settings)
+
+
+def receiver(dimensions=3, *links, **settings):
+    """A border that hears a receiver of satellites."""
+    return listening("gps", "sensor_msgs/msg/NavSatFix", *links, dimensions=dimensions, settings=settings)
+
+
+def compass(dimensions, *links, **settings):
+    """A border that hears an IMU."""
+    return listening("imu", "sensor_msgs/msg/Imu", *links, dimensions=dimensions, settings=settings)
+
+
 def listening(name, type_name, *links, dimensions=2, decoders=None, settings=None, **sections):
     """A border with one input more."""
     inputs = {"names": f"odom detections {name}", **(sections.pop("inputs", None) or {})}
@@ -208,3 +225,52 @@ def gnss(latitude=48.0, longitude=11.0, altitude=500.0, covariance=None, kind=2,
         position_covariance_type=kind,
     )
     return encode(message)
+
+
+def imu(q, covariance, frame="base_link"):
+    """sensor_msgs/Imu."""
+    zero = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    return encode(
+        make(
+            "sensor_msgs/msg/Imu",
+            header=header(STAMP_NS, frame),
+            orientation=q,
+            orientation_covariance=np.asarray(covariance, dtype=float).ravel(),
+            angular_velocity=zero,
+            angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=zero,
+            linear_acceleration_covariance=np.zeros(9),
+        )
+    )
+
+
+def cloud(layout, *points, padding=3, big=False, height=1, row_padding=0, frame="base_link", **changes):
+    """Points of (name, kind) fields with unused bytes between them, at the end of each and of each row."""
+    order, offset, fields, formats, offsets = ">" if big else "<", 0, [], [], []
+    for name, kind in layout:
+        offset += padding
+        field = {"name": name, "offset": offset, "datatype": DATATYPES[kind], "count": 1}
+        fields.append(typestore().types["sensor_msgs/msg/PointField"](**field))
+        formats.append(order + kind)
+        offsets.append(offset)
+        offset += int(kind[1])
+    step = offset + padding
+    dtype = np.dtype({"names": [name for name, _ in layout], "formats": formats, "offsets": offsets, "itemsize": step})
+    width = len(points) // height
+    rows = [np.array(list(points[k * width : (k + 1) * width]), dtype=dtype).tobytes() for k in range(height)]
+    values = {
+        "height": height,
+        "width": width,
+        "fields": fields,
+        "is_bigendian": big,
+        "point_step": step,
+        "row_step": width * step + row_padding,
+        "data": np.frombuffer(b"".join(row + b"\xff" * row_padding for row in rows), dtype=np.uint8),
+        "is_dense": True,
+    }
+    return encode(make(CLOUD, header=header(STAMP_NS, frame), **(values | changes)))
+
+
+def closing(dimensions, *links):
+    """A border that hears of closures."""
+    return listening("loops", DETECTIONS, *links, dimensions=dimensions, settings={"use": "closure"})

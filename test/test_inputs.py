@@ -10,24 +10,28 @@ from hypothesis import strategies as st
 from messages import (
     STAMP_NS,
     border,
+    closing,
+    compass,
     counted,
     detection,
     detections,
     gnss,
     heard,
+    imu,
     listening,
     odometry,
     only,
     pose,
     posed,
     quaternion,
+    receiver,
     transforms,
 )
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.ros.inputs.fixes import east_north_up
-from graph_slam_ros.ros.to_msg import encode, header, make
+from graph_slam_ros.ros.to_msg import make
 from graph_slam_ros.slam.measurements import Closure, Fix, Odometry, to_record
 
 IN_SPACE = {"world": {"dimensions": 3}}
@@ -163,11 +167,6 @@ def test_configured_noise_goes_before_the_messages_where_that_is_told_and_grows_
     assert only(heard(border(detections=rest), "detections", found)).covariance == pytest.approx((0.01, 0, 0, 0.04))
 
 
-def test_identities_of_two_inputs_are_kept_apart_by_a_prefix():
-    b = border(detections={"id_prefix": "left/"})
-    assert only(heard(b, "detections", detections(detection(name="7")))).id == "left/7"
-
-
 @pytest.mark.parametrize("association", ["id", "none", "joint"])
 def test_landmarks_without_identity_are_passed_on_one_by_one_whatever_becomes_of_them(association):
     b = border(landmarks={"association": association})
@@ -262,10 +261,6 @@ def test_a_pose_may_be_a_landmark_of_configured_identity_or_odometry():
 # -- satellites -----------------------------------------------------------------------------------------------------
 
 
-def receiver(dimensions=3, *links, **settings):
-    return listening("gps", "sensor_msgs/msg/NavSatFix", *links, dimensions=dimensions, settings=settings)
-
-
 def test_east_north_up_of_a_published_pair_of_points_is_the_published_range_azimuth_and_elevation():
     here = 42.002581974253744, -81.997751960067460, 1139.701799575106
     azimuth, elevation = math.radians(33.0), math.radians(70.0)  # of 1000 m, from 42 N, 82 W, 200 m
@@ -292,57 +287,7 @@ def test_the_covariance_of_a_fix_and_where_its_antenna_sits_are_kept():
     assert (matrix(m.covariance, 2), m.point) == (pytest.approx(covariance[:2, :2]), (0.2, -0.3))
 
 
-def test_without_an_altitude_the_height_of_a_fix_is_not_known():
-    m = heard(receiver(3), "gps", gnss(altitude=math.nan, covariance=spread(3, 4)))
-    assert m.measured == (0.0, 0.0, 0.0)
-    assert matrix(m.covariance, 3)[2].tolist() == [0.0, 0.0, 1e6]
-
-
-def test_a_fix_of_unknown_covariance_needs_configured_noise():
-    b = receiver()
-    assert heard(b, "gps", gnss(kind=0)) is None
-    assert counted(b) == {"gps": {"covariance_unknown": 1}}
-    assert heard(receiver(sigma_m=3.0), "gps", gnss(kind=0)).covariance == pytest.approx(tuple(9 * np.eye(3).ravel()))
-
-
-@pytest.mark.parametrize(
-    "fields, reason",
-    [
-        ({"status": -1}, "no_fix"),
-        ({"latitude": math.nan}, "nonfinite"),
-        ({"latitude": 91.0}, "not_on_earth"),
-        ({"frame": "roof"}, "frame_unknown"),
-        ({"covariance": np.diag([1.0, -1.0, 1.0])}, "covariance_not_positive_definite"),
-        ({"latitude": 50.0}, "far_from_datum"),
-    ],
-)
-def test_a_fix_that_cannot_be_used_is_refused_and_counted_under_its_reason(fields, reason):
-    b = receiver(datum="48 11 500")
-    assert heard(b, "gps", gnss(**fields)) is None
-    assert counted(b) == {"gps": {reason: 1}}
-
-
 # -- attitude -------------------------------------------------------------------------------------------------------
-
-
-def imu(q, covariance, frame="base_link"):
-    zero = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    return encode(
-        make(
-            "sensor_msgs/msg/Imu",
-            header=header(STAMP_NS, frame),
-            orientation=q,
-            orientation_covariance=np.asarray(covariance, dtype=float).ravel(),
-            angular_velocity=zero,
-            angular_velocity_covariance=np.zeros(9),
-            linear_acceleration=zero,
-            linear_acceleration_covariance=np.zeros(9),
-        )
-    )
-
-
-def compass(dimensions, *links, **settings):
-    return listening("imu", "sensor_msgs/msg/Imu", *links, dimensions=dimensions, settings=settings)
 
 
 def test_an_imu_gives_the_attitude_of_the_base_in_space_and_its_heading_in_the_plane():
@@ -362,22 +307,7 @@ def test_an_imu_gives_the_attitude_of_the_base_in_space_and_its_heading_in_the_p
     assert m.covariance == pytest.approx((0.091,))
 
 
-def test_an_imu_without_orientation_is_refused_and_one_of_unknown_noise_takes_the_configured():
-    b = compass(3)
-    for covariance in (np.diag([-1.0, 0.0, 0.0]), np.zeros((3, 3))):
-        assert heard(b, "imu", imu(quaternion(), covariance)) is None
-    assert counted(b) == {"imu": {"no_orientation": 1, "covariance_unknown": 1}}
-    m = heard(compass(2, sigma_rad=0.1), "imu", imu(quaternion(), np.zeros((3, 3))))
-    assert m.covariance == pytest.approx((0.01,))
-
-
 # -- closures -------------------------------------------------------------------------------------------------------
-
-
-def closing(dimensions, *links):
-    return listening(
-        "loops", "vision_msgs/msg/Detection3DArray", *links, dimensions=dimensions, settings={"use": "closure"}
-    )
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
@@ -401,23 +331,6 @@ def test_a_detection_of_where_the_robot_was_is_a_closure_and_so_are_samples_of_i
     drawn = robot(samples_of((2.0, -1.0, 0.2, *numbers(q)), covariance))
     tangent = np.cov(np.stack(group.local(drawn, m.T_from_base)))
     assert matrix(m.covariance, len(tangent)) == pytest.approx(tangent, abs=0.03 * tangent.max())
-
-
-@pytest.mark.parametrize(
-    "found, reason",
-    [
-        ({"name": "dock"}, "id_not_a_stamp"),
-        ({"name": ""}, "id_not_a_stamp"),
-        ({"name": str(STAMP_NS)}, "closure_with_itself"),
-        ({"name": "5", "results": 0}, "no_result"),
-        ({"name": "5", "covariance": np.zeros((6, 6))}, "covariance_unknown"),
-    ],
-)
-def test_a_closure_that_cannot_be_used_is_refused_and_the_others_of_its_message_are_not(found, reason):
-    b = closing(2)
-    m = heard(b, "loops", detections(detection(**found), detection(covariance=np.eye(6), name="7")))
-    assert m.from_stamp_ns == 7
-    assert counted(b) == {"loops": {reason: 1}}
 
 
 # -- transforms -----------------------------------------------------------------------------------------------------

@@ -9,48 +9,28 @@ import pytest
 from foreign import DEFINITIONS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from messages import STAMP_NS, counted, heard, listening, only, pose, quaternion, recorded, transforms
+from messages import (
+    CLOUD,
+    STAMP_NS,
+    cloud,
+    counted,
+    heard,
+    listening,
+    only,
+    pose,
+    quaternion,
+    recorded,
+    scanner,
+    transforms,
+)
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import so3
 from graph_slam_ros.ros.bag import BagError, Topic
 from graph_slam_ros.ros.definitions import recorded_decoder
-from graph_slam_ros.ros.interfaces import typestore
 from graph_slam_ros.ros.to_msg import encode, header, make, vector
 
-CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
-DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-
-
-def cloud(layout, *points, padding=3, big=False, height=1, row_padding=0, frame="base_link", **changes):
-    """Points of (name, kind) fields with unused bytes between them, at the end of each and of each row."""
-    order, offset, fields, formats, offsets = ">" if big else "<", 0, [], [], []
-    for name, kind in layout:
-        offset += padding
-        field = {"name": name, "offset": offset, "datatype": DATATYPES[kind], "count": 1}
-        fields.append(typestore().types["sensor_msgs/msg/PointField"](**field))
-        formats.append(order + kind)
-        offsets.append(offset)
-        offset += int(kind[1])
-    step = offset + padding
-    dtype = np.dtype({"names": [name for name, _ in layout], "formats": formats, "offsets": offsets, "itemsize": step})
-    width = len(points) // height
-    rows = [np.array(list(points[k * width : (k + 1) * width]), dtype=dtype).tobytes() for k in range(height)]
-    values = {
-        "height": height,
-        "width": width,
-        "fields": fields,
-        "is_bigendian": big,
-        "point_step": step,
-        "row_step": width * step + row_padding,
-        "data": np.frombuffer(b"".join(row + b"\xff" * row_padding for row in rows), dtype=np.uint8),
-        "is_dense": True,
-    }
-    return encode(make(CLOUD, header=header(STAMP_NS, frame), **(values | changes)))
-
-
-def scanner(dimensions=2, *links, **settings):
-    return listening("scan", CLOUD, *links, dimensions=dimensions, settings=settings)
+MARKERS = "visualization_msgs/msg/MarkerArray"
 
 
 XYZ = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("id", "u4"), ("sigma", "f8")]
@@ -194,7 +174,7 @@ def markers(*several):
     return encode(make(MARKERS, markers=list(several)))
 
 
-def test_markers_that_are_added_are_landmarks_by_namespace_and_number_and_deleted_ones_are_not():
+def test_A21_markers_that_are_added_are_landmarks_by_namespace_and_number_and_deleted_ones_are_not():
     b = listening("cones", MARKERS)
     sent = markers(marker(0, 3), marker(1), marker(2, 2), marker(3, ns=""), marker(4, 7))
     m = heard(b, "cones", sent)
@@ -281,7 +261,7 @@ def test_aruco_markers_have_headers_of_their_own():
     assert (second.stamp_ns, only(second).id) == (STAMP_NS + 7, "13")
 
 
-def test_arrays_of_marker_numbers_and_poses_must_be_of_one_length():
+def test_A29_arrays_of_marker_numbers_and_poses_must_be_of_one_length():
     b, _, encoded = foreign("ros2_aruco_interfaces/msg/ArucoMarkers", sigma_m=0.2, sigma_rad=0.1)
     at = pose(2.0, 1.0, 0.0, quaternion(yaw=0.3))
     m = heard(b, "seen", encoded(header=HEAD, marker_ids=np.array([5], np.int64), poses=[at]))

@@ -264,7 +264,7 @@ def test_a_loop_closure_between_any_two_stamps_closes_the_loop(space):
 
 
 @BOTH
-def test_where_odometry_is_set_anew_a_segment_begins_and_the_map_stays_straight(space):
+def test_A27_where_odometry_begins_anew_at_zero_a_segment_begins_and_the_map_stays_straight(space):
     true, odom = drive(space, 20.0)
     world = landmarks(space)
     pipeline = slam(space)
@@ -276,7 +276,7 @@ def test_where_odometry_is_set_anew_a_segment_begins_and_the_map_stays_straight(
             seen = tuple(sighting(space, "position", name, true[k], p, 0.01) for name, p in world.items())
             pipeline.process(Sightings(stamp(k), "seen", seen))
     [pipeline.process(event) for event in END]
-    assert pipeline.counters.as_dict() == {"odometry": {"jump": 1}}
+    assert pipeline.counters.as_dict() == {"odometry": {"reset_to_zero": 1}}
     assert len(pipeline.segments) == 2
     assert errors(space, pipeline, true).max() < 0.02
 

@@ -174,6 +174,8 @@ class Border:
                 checks.point(t.transform.translation)
                 q = source.unit(t.transform.rotation)
                 parent, child = source.frame(t.header.frame_id), source.frame(t.child_frame_id)
+                if parent == child:
+                    raise MessageError("frame_in_itself")
                 add(t, parent, child, pose(t.transform.translation, q))
             except MessageError as reason:
                 source.count(str(reason))

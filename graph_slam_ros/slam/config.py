@@ -129,6 +129,9 @@ class LandmarksConfig:
     added_sigma_m: float = setting(
         0.05, "position noise added to every sighting for what messages leave out: clocks, mounting, size", "m", low=0.0
     )
+    max_per_message: int = setting(
+        1000, "of more in one message the nearest are taken and the others counted", "landmarks", low=1
+    )
     orientation_known_below_rad: float = setting(
         0.5, "a landmark is a full pose where its heading's standard deviation is below this", "rad", low=0.0
     )

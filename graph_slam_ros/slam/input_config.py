@@ -38,6 +38,13 @@ class InputConfig:
     )
     sigma_per_m: float = setting(0.0, "added to sigma_m for each metre of distance", "m/m", low=0.0)
     sigma_rad: float = setting(0.0, "noise of an orientation or bearing; 0: unknown", "rad", low=0.0, high=math.pi)
+    offset_s: float = setting(
+        0.0,
+        "added to the stamps of its messages: how far its clock is behind",
+        "s",
+        low=-3600.0,
+        high=3600.0,
+    )
     id: str = setting("", "identity of the landmark in messages that carry none")
     id_prefix: str = setting("", "put before every identity, where two inputs have the same for different landmarks")
     frame_prefix: str = setting("", "of transforms as landmarks: what the names of their frames begin with")

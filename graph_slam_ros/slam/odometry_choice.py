@@ -1,5 +1,6 @@
 """One odometry out of several: the first in priority that is alive, told as steps; and where it does not hold."""
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,6 +44,7 @@ class OdometryChoice:
         self._order = list(priority)
         self._past: dict[str, deque[Odometry]] = {}
         self._used: Odometry | None = None
+        self._last_step = space.identity
 
     @property
     def used(self) -> Odometry | None:
@@ -58,6 +60,7 @@ class OdometryChoice:
         """Begin anew with stamps of another time."""
         self._past.clear()
         self._used = None
+        self._last_step = self._space.identity
 
     def take(self, m: Odometry) -> list[Step]:
         """The steps that a message leads to: none where it is not the odometry in use."""
@@ -70,7 +73,7 @@ class OdometryChoice:
             return []
         past.append(m)
         if used is None:
-            return [self._use(m, self._space.identity, broken=False)]
+            return [self._use(m, self._space.identity, broken="")]
         if m.source == used.source:
             return [self._follow(used, m)]
         if self._takes_over(m, used):
@@ -94,7 +97,7 @@ class OdometryChoice:
                 self._counters.count(source, "not_in_use")
                 return []
             self._counters.count(source, "switched_to_unlinked")
-            return [self._use(newer[-1], self._space.identity, broken=True)]
+            return [self._use(newer[-1], self._space.identity, broken="jump")]
         self._counters.count(source, "switched_to")
         if not newer:  # of the very stamp that was used last
             self._used = older[-1]
@@ -110,18 +113,36 @@ class OdometryChoice:
 
     def _follow(self, a: Odometry, b: Odometry) -> Step:
         step = self._space.group.between(a.T_odom_base, b.T_odom_base)
-        return self._use(b, step, broken=self.jumps(step, (b.stamp_ns - a.stamp_ns) * 1e-9))
+        if self._is_reset(step, b):
+            return self._use(b, step, broken="reset_to_zero")
+        return self._use(b, step, broken="jump" if self._jumps(step, (b.stamp_ns - a.stamp_ns) * 1e-9) else "")
 
-    def _use(self, m: Odometry, step: Numbers, *, broken: bool) -> Step:
+    def _use(self, m: Odometry, step: Numbers, *, broken: str) -> Step:
         if broken:
-            self._counters.count(m.source, "jump")
-        self._used = m
-        return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, broken)
+            self._counters.count(m.source, broken)
+        self._used, self._last_step = m, self._space.identity if broken else step
+        return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken))
 
-    def jumps(self, step: Numbers, dt: float) -> bool:
+    def _is_reset(self, step: Numbers, to: Odometry) -> bool:
+        """Its driver began anew: exactly where odometry begins, and by more than robots move from message to message.
+
+        However long it took: while a driver starts, nothing comes.
+        """
+        if max(self._size(to.T_odom_base)) > _AT_ZERO:
+            return False
+        (far_m, far_rad), (usual_m, usual_rad) = self._size(step), self._size(self._last_step)
+        return far_m > max(_RESET_M, _UNUSUAL * usual_m) or far_rad > max(_RESET_RAD, _UNUSUAL * usual_rad)
+
+    def _size(self, pose: Numbers) -> tuple[float, float]:
+        """In metres and radians."""
+        return math.hypot(*pose[: self._space.dimensions]), self._space.angle(pose)
+
+    def _jumps(self, step: Numbers, dt: float) -> bool:
         """No robot moves like this: odometry was set anew, or has slipped by a lap."""
         n = self._space.dimensions
         return sum(x * x for x in step[:n]) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
 
 
+_AT_ZERO = 1e-9  # [m, rad]
+_RESET_M, _RESET_RAD, _UNUSUAL = 0.1, 0.1, 3.0
 _LEAST_S = 0.02  # stamps of some drivers crowd together: a pair of them says nothing of speed

@@ -11,6 +11,7 @@ from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.measurements import Observation, Odometry, Sightings
 
 NS = 1_000_000_000
+_REMEMBERED = 100  # messages of each topic, by which one that comes again is known
 
 
 class StampOrder:
@@ -21,20 +22,22 @@ class StampOrder:
         self._max_waiting = config.max_waiting
         self._counters = counters
         self._heap: list[tuple[int, int, str, int, Odometry | Observation]] = []
+        self._recent: dict[str, dict[Observation, None]] = {}  # in the order they came
         self._arrivals = 0
         self._newest_odometry_ns: int | None = None
         self._released_ns: int | None = None
 
     def accepts(self, m: Odometry | Observation) -> bool:
-        """Whether there is room, and an odometry message is not older than what was released; else it is counted.
+        """Whether there is room for it, odometry is not older than what was released, and all else is new; or counted.
 
         Odometry newer than all before always has room: it is what makes others leave.
         """
         full = len(self._heap) >= self._max_waiting
         if not isinstance(m, Odometry):
-            if full:
-                self._counters.count(m.topic, "overflow", len(m.sightings) if isinstance(m, Sightings) else 1)
-            return not full
+            reason = "overflow" if full else "duplicate" if self._is_repeated(m) else ""
+            if reason:
+                self._counters.count(m.topic, reason, len(m.sightings) if isinstance(m, Sightings) else 1)
+            return not reason
         if self._released_ns is not None and m.stamp_ns < self._released_ns:
             self._counters.count(m.source, "late")
             return False
@@ -42,6 +45,16 @@ class StampOrder:
             self._counters.count(m.source, "overflow")
             return False
         return True
+
+    def _is_repeated(self, m: Observation) -> bool:
+        """Whether the very same has come before; what comes for the first time is remembered."""
+        recent = self._recent.setdefault(m.topic, {})
+        if m in recent:
+            return True
+        recent[m] = None
+        if len(recent) > _REMEMBERED:
+            del recent[next(iter(recent))]
+        return False
 
     def push(self, m: Odometry | Observation) -> list[Odometry | Observation]:
         """Take one measurement; returns those whose turn has come."""
@@ -61,6 +74,7 @@ class StampOrder:
     def forget(self) -> None:
         """Begin anew with stamps of another time."""
         self._heap.clear()
+        self._recent.clear()
         self._newest_odometry_ns = self._released_ns = None
 
     def _release(self, until_ns: int) -> list[Odometry | Observation]:

@@ -6,15 +6,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.lie import se2
+from graph_slam_ros.slam.edge_noise import LEAST_M2, LEAST_RAD2
+
 Array = NDArray[np.float64]
 
 _NORM_REPAIRED = 0.1  # a quaternion this far from unit length is normalised, beyond it is refused
 _NORM_EXACT = 1e-6
 _ASYMMETRY_REPAIRED, _ASYMMETRY_EXACT = 1e-2, 1e-6
 _DEFICIT_REPAIRED = 1e-9  # negative eigenvalues down to this fraction of the largest are rounding
-_LEAST = 1e-30  # [m^2, rad^2]: products of smaller numbers vanish
 _FARTHEST_M = 1e9
 _MOST_M2, _MOST_RAD2 = 1e6, 1e3  # as good as unknown; drivers send up to 1.8e308
+_MOST_TURNED_RAD = 4.0 * math.pi  # a bearing that is farther from zero is no count of turns
 
 
 class MessageError(Exception):
@@ -68,11 +71,16 @@ def covariance(block: Array, lengths: int) -> tuple[Array, list[str]]:
         raise MessageError("covariance_not_positive_definite")
     repairs = []
     variances = np.diag(block)
-    most = np.where(np.arange(len(block)) < lengths, _MOST_M2, _MOST_RAD2)
+    most, least = (
+        np.where(np.arange(len(block)) < lengths, *bounds)
+        for bounds in ((_MOST_M2, _MOST_RAD2), (LEAST_M2, LEAST_RAD2))
+    )
     if (variances > most).any():
         repairs.append("covariance_clamped")
         scale = np.sqrt(most / np.maximum(variances, most))
         block = scale[:, None] * block * scale
+    is_tiny = (variances >= 0.0) & (variances < least)
+    block = block + np.diag(np.where(is_tiny, least - variances, 0.0))
     asymmetry = np.abs(block - block.T).max() / np.abs(block).max()
     if asymmetry > _ASYMMETRY_REPAIRED:
         raise MessageError("covariance_asymmetric")
@@ -80,10 +88,21 @@ def covariance(block: Array, lengths: int) -> tuple[Array, list[str]]:
         repairs.append("covariance_symmetrized")
     symmetric = 0.5 * block + 0.5 * block.T
     values, vectors = np.linalg.eigh(symmetric)
-    floor = max(_DEFICIT_REPAIRED * values[-1], _LEAST)
+    floor = _DEFICIT_REPAIRED * values[-1]
     if values[0] < -floor or values[-1] <= 0.0:
         raise MessageError("covariance_not_positive_definite")
-    if values[0] < 1e-3 * floor:
-        repairs.append("covariance_floored")
+    is_flat = values[0] < 1e-3 * floor
+    if is_flat:
         symmetric = (vectors * np.maximum(values, floor)) @ vectors.T
-    return symmetric, repairs
+    return symmetric, repairs + ["covariance_floored"] * bool(is_flat or is_tiny.any())
+
+
+def direction(azimuth: float, elevation: float = 0.0) -> tuple[tuple[float, float], bool]:
+    """Angles within half a turn, and whether they had to be brought there."""
+    if max(abs(azimuth), abs(elevation)) > _MOST_TURNED_RAD:
+        raise MessageError("bearing_out_of_range")
+    wrapped = float(se2.wrap(azimuth)), float(se2.wrap(elevation))
+    if abs(wrapped[1]) > 0.5 * math.pi:
+        raise MessageError("bearing_out_of_range")
+    is_wrapped = max(abs(azimuth), abs(elevation)) > math.pi
+    return (wrapped if is_wrapped else (azimuth, elevation)), is_wrapped

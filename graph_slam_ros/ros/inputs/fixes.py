@@ -30,7 +30,7 @@ def pose_fix(source: Source, m: Any) -> Iterator[Fix]:
 
     It is that of the base, or of the configured mount; where its orientation is not known, a position.
     """
-    stamp_ns = checks.stamp_ns(m.header.stamp)
+    stamp_ns = source.stamp_ns(m.header.stamp)
     p, flat = (m.pose.pose, m.pose.covariance) if hasattr(m.pose, "covariance") else (m.pose, None)
     T_map_frame = source.T_fixed(source.config.frames.map, source.frame(m.header.frame_id))
     T_base_sensor = source.T_base_child(getattr(m, "child_frame_id", "").lstrip("/"))
@@ -47,11 +47,11 @@ def pose_fix(source: Source, m: Any) -> Iterator[Fix]:
     if not source.has_heading(T_map_base):
         raise MessageError("no_heading")
     if not covariance[:n, :n].any():
-        source.count("covariance_unknown")
         covariance[:3, :3] = np.eye(3) * source.sigma_m() ** 2
+        source.count("covariance_unknown")
     into_base = se3.adjoint(T_base_sensor)
     tangent = into_base @ SPACE.in_parent_axes(se3.inverse(T_map_sensor), covariance) @ into_base.T
-    yield Fix(stamp_ns, source.name, "pose", source.projected(T_map_base), source.checked(source.block(tangent), n))
+    yield Fix(stamp_ns, source.name, "pose", source.of_robot(T_map_base), source.checked(source.block(tangent), n))
 
 
 def initial_pose(source: Source, m: Any) -> Iterator[InitialPose]:
@@ -74,19 +74,22 @@ def initial_pose(source: Source, m: Any) -> Iterator[InitialPose]:
 
 def gnss(source: Source, m: Any) -> Iterator[Fix]:
     """sensor_msgs/NavSatFix: the antenna's position, east, north and up of the datum."""
-    stamp_ns = checks.stamp_ns(m.header.stamp)
+    stamp_ns = source.stamp_ns(m.header.stamp)
     if m.status.status <= _NO_FIX:
         raise MessageError("no_fix")
     if not (math.isfinite(m.latitude) and math.isfinite(m.longitude)):
         raise MessageError("nonfinite")
     if abs(m.latitude) > 90.0 or abs(m.longitude) > 360.0:
         raise MessageError("not_on_earth")
+    if m.latitude == m.longitude == 0.0:  # off Africa: nobody drives there, and drivers without a position say so
+        raise MessageError("no_position")
     n = source.space.dimensions
     has_altitude = math.isfinite(m.altitude)
     covariance = np.array(m.position_covariance, dtype=float).reshape(3, 3)
     if m.position_covariance_type == _UNKNOWN or source.settings.noise == "sigmas":
         covariance = np.eye(3) * source.sigma_m() ** 2
     if n == 3 and not has_altitude:
+        source.count("no_altitude")
         covariance[2, :] = covariance[:, 2] = 0.0
         covariance[2, 2] = _NOT_KNOWN_M2
     arm = tuple(map(float, se3.position(source.T_base(source.frame(m.header.frame_id), stamp_ns))))[:n]
@@ -123,17 +126,17 @@ def _earth_centred(latitude_deg: float, longitude_deg: float, height_m: float) -
 
 def imu(source: Source, m: Any) -> Iterator[Fix]:
     """sensor_msgs/Imu: the attitude in space, the heading in the plane; an orientation in ENU is assumed."""
-    stamp_ns = checks.stamp_ns(m.header.stamp)
+    stamp_ns = source.stamp_ns(m.header.stamp)
     covariance = np.array(m.orientation_covariance, dtype=float).reshape(3, 3)
     if covariance[0, 0] == -1.0:
         raise MessageError("no_orientation")
-    if not np.isfinite(covariance).all():
-        raise MessageError("nonfinite_covariance")
     plane = source.space.dimensions == 2
     if source.settings.noise == "sigmas" or not (covariance[2:, 2:] if plane else covariance).any():
         if source.settings.sigma_rad == 0.0:
             raise MessageError("covariance_unknown")
         covariance = np.eye(3) * source.settings.sigma_rad**2
+    if not np.isfinite(covariance).all():
+        raise MessageError("nonfinite_covariance")
     T_base_imu = source.T_base(source.frame(m.header.frame_id), stamp_ns)
     q = so3.compose(source.unit(m.orientation), so3.inverse(se3.rotation(T_base_imu)))
     T_map_base = 0.0, 0.0, 0.0, float(q[0]), float(q[1]), float(q[2]), float(q[3])
@@ -154,7 +157,7 @@ def closures(source: Source, m: Any) -> Iterator[Closure]:
     Its pose in the header's frame at the header's stamp, with its covariance; ``id`` is the earlier stamp in
     nanoseconds. Of the standard messages only this one holds two stamps, a pose and a covariance.
     """
-    stamp_ns = checks.stamp_ns(m.header.stamp)
+    stamp_ns = source.stamp_ns(m.header.stamp)
     for one in m.detections:
         try:
             yield _closure(source, stamp_ns, m.header.frame_id, one)

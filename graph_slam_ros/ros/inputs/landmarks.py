@@ -55,11 +55,11 @@ class Seen:
 def sightings(source: Source, found: Iterable[Seen]) -> Iterator[Sightings]:
     """One measurement for each stamp of a message; what cannot be used of it is counted."""
     by_stamp: dict[tuple[int, int], list[Seen]] = {}
-    for one in found:
+    for one in _nearest(source, list(found)):
         by_stamp.setdefault((one.stamp.sec, one.stamp.nanosec), []).append(one)
     for same in by_stamp.values():
         try:
-            stamp_ns = checks.stamp_ns(same[0].stamp)
+            stamp_ns = source.stamp_ns(same[0].stamp)
         except MessageError as reason:
             source.count(str(reason))
             continue
@@ -72,6 +72,23 @@ def sightings(source: Source, found: Iterable[Seen]) -> Iterator[Sightings]:
         usable = _agreed(source, seen)
         if usable:
             yield Sightings(stamp_ns, source.name, tuple(usable))
+
+
+def _nearest(source: Source, found: list[Seen]) -> list[Seen]:
+    """Of a message's landmarks, as many as are taken."""
+    if len(found) <= (most := source.config.landmarks.max_per_message):
+        return found
+    source.count("too_many", len(found) - most)
+    nearest = np.argsort([_reach(one) for one in found], kind="stable")[:most]  # no number sorts last
+    return [found[k] for k in sorted(nearest.tolist())]
+
+
+def _reach(seen: Seen) -> float:
+    """From the frame it is told in; a bearing alone is as good as near."""
+    if seen.polar is None:
+        return math.hypot(seen.position.x, seen.position.y, seen.position.z)
+    kind, measured = seen.polar
+    return 0.0 if kind == "bearing" else abs(measured[0])
 
 
 def _sighting(source: Source, stamp_ns: int, seen: Seen) -> Sighting:
@@ -116,6 +133,11 @@ def _polar(
     has_range = kind != "bearing"
     if has_range and not 0.0 < measured[0] < 1e9:
         raise MessageError("range_not_positive")
+    if kind != "range":
+        angles, is_wrapped = checks.direction(*measured[int(has_range) :])
+        if is_wrapped:
+            source.count("bearing_wrapped")
+        measured = (*measured[: int(has_range)], *angles[: len(measured) - int(has_range)])
     told = sigmas is not None and source.settings.noise == "message"
     out = [float(s) for s in sigmas] if told and sigmas is not None else [0.0] * len(measured)
     for k, sigma in enumerate(out):

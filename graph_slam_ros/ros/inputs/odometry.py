@@ -17,7 +17,7 @@ _UNUSED = 1e6  # [m^2/s^2, rad^2/s^2]: what drivers of wheels write for what the
 
 def odometry(source: Source, m: Any) -> Iterator[Odometry]:
     """nav_msgs/Odometry."""
-    stamp_ns = checks.stamp_ns(m.header.stamp)
+    stamp_ns = source.stamp_ns(m.header.stamp)
     p, parent = m.pose.pose, source.frame(m.header.frame_id)
     at = _in_odom(source, parent, _named(source, m.child_frame_id), p.position, p.orientation)
     twist = None
@@ -28,7 +28,7 @@ def odometry(source: Source, m: Any) -> Iterator[Odometry]:
 
 def pose_stamped(source: Source, m: Any) -> Iterator[Odometry]:
     """geometry_msgs/PoseStamped and PoseWithCovarianceStamped: of the base, or of the configured mount."""
-    stamp_ns = checks.stamp_ns(m.header.stamp)
+    stamp_ns = source.stamp_ns(m.header.stamp)
     p = m.pose.pose if hasattr(m.pose, "pose") else m.pose
     parent = source.frame(m.header.frame_id)
     yield Odometry(stamp_ns, _in_odom(source, parent, "", p.position, p.orientation), None, source.name)
@@ -43,7 +43,7 @@ def transforms(source: Source, m: Any) -> Iterator[Odometry]:
         if t.header.frame_id.lstrip("/") != parent or source.transforms.lookup(frames.base, child) is None:
             continue  # /tf tells of everything
         try:
-            stamp_ns = checks.stamp_ns(t.header.stamp)
+            stamp_ns = source.stamp_ns(t.header.stamp)
             at = _in_odom(source, frames.odom, child, t.transform.translation, t.transform.rotation)
             yield Odometry(stamp_ns, at, None, source.name)
         except MessageError as reason:
@@ -52,14 +52,16 @@ def transforms(source: Source, m: Any) -> Iterator[Odometry]:
 
 def _in_odom(source: Source, parent: str, child: str, position: Any, orientation: Any) -> Numbers:
     """T_odom_base from the pose of a child frame in its parent."""
+    if parent == child:
+        raise MessageError("frame_in_itself")
     checks.point(position)
     q = source.unit(orientation)
     frames = source.config.frames
     if parent == frames.odom and child == frames.base:
-        return source.projected(pose(position, q))
+        return source.of_robot(pose(position, q))
     T_odom_parent = source.T_fixed(frames.odom, parent)
     T_child_base = se3.inverse(source.T_base_child(child))
-    return source.projected(se3.compose(se3.compose(T_odom_parent, pose(position, q)), T_child_base))
+    return source.of_robot(se3.compose(se3.compose(T_odom_parent, pose(position, q)), T_child_base))
 
 
 def _named(source: Source, child: str) -> str:

@@ -20,6 +20,7 @@ Numbers = tuple[float, ...]
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BEYOND_MEANING = 1e12  # [m^2, rad^2]: larger numbers could not be turned into other axes
 _FLAT = 0.5  # the horizontal part of an x axis that is too short to have a heading
+_LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # of a robot that moves in a plane
 
 
 class NotYet(Exception):
@@ -52,12 +53,20 @@ class Source:
         self.hurried = not config.inputs.tf
         self.state: dict[str, Any] = {}
         self.unlinked: deque[str] = deque(maxlen=4)
+        self._offset_ns = round(settings.offset_s * 1e9)
         self._wait_ns = round(config.inputs.tf_wait_s * 1e9)
         self._mount = _mount(settings)
 
     def count(self, reason: str, times: int = 1) -> None:
         """A refusal or a repair."""
         self.tally[reason] += times
+
+    def stamp_ns(self, stamp: Any) -> int:
+        """Of a header, by the clock of the robot."""
+        out = checks.stamp_ns(stamp) + self._offset_ns
+        if out <= 0:
+            raise MessageError("bad_stamp")
+        return out
 
     # -- frames ------------------------------------------------------------------------------------------------------
 
@@ -127,6 +136,14 @@ class Source:
         ahead = so3.act(se3.rotation(T), (1.0, 0.0, 0.0))
         return float(T[0]), float(T[1]), math.atan2(ahead[1], ahead[0])
 
+    def of_robot(self, T: se3.Pose) -> Numbers:
+        """A pose of the robot; in the plane it is counted where it leaves that."""
+        if self.space.dimensions == 2:
+            up = so3.act(se3.rotation(T), (0.0, 0.0, 1.0))
+            if abs(T[2]) > _LEVEL_M or up[2] < _UPRIGHT:
+                self.count("out_of_plane")
+        return self.projected(T)
+
     def has_heading(self, T: se3.Pose) -> bool:
         """In space always; in the plane where the x axis does not point up."""
         ahead = so3.act(se3.rotation(T), (1.0, 0.0, 0.0))
@@ -171,9 +188,9 @@ class Source:
         block : (n, n), the first ``lengths`` in m^2, the others in rad^2
         """
         if lengths and not block[:lengths, :lengths].any():
-            self.count("covariance_unknown")
             filled = np.zeros_like(block)
             filled[:lengths, :lengths] = np.eye(lengths) * self.sigma_m(distance_m) ** 2
+            self.count("covariance_unknown")
             filled[lengths:, lengths:] = block[lengths:, lengths:]
             block = filled
         covariance, repairs = checks.covariance(block, lengths)
