@@ -12,9 +12,11 @@ those of ``landmarks.csv`` are in the axes of map. What is not known is nan; wha
 import contextlib
 import itertools
 import json
-import os
 import re
+import time
+import zlib
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,9 +25,10 @@ import numpy as np
 
 from graph_slam_ros import __version__
 from graph_slam_ros.errors import ConfigError, GraphSlamError
-from graph_slam_ros.formats.g2o_writer import write_g2o
+from graph_slam_ros.formats.durable import NEW, replaced
+from graph_slam_ros.formats.g2o_writer import g2o_text
 from graph_slam_ros.formats.graph_file import G2oFile
-from graph_slam_ros.formats.ingest import IngestWriter, ingest_files
+from graph_slam_ros.formats.ingest import IngestWriter, ingest_files, part_name
 from graph_slam_ros.formats.parameters import parameters_text, read_parameters
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
@@ -56,7 +59,7 @@ _RESULTS = {
 _TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
 _POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
 _PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
-_TOGETHER = 32  # measurements that are written at once: one by one, as they come, each takes several times as long
+_TOGETHER = 256  # measurements that are written at once: one by one, as they come, each takes several times as long
 
 
 class RunError(GraphSlamError):
@@ -123,13 +126,20 @@ def earlier_runs(folder: Path) -> dict[int, Path]:
 class RunRecorder:
     """Records a run while it goes on, and saves its results.
 
+    What was accepted is in the journal once ``flush`` has returned. A disk that is full loses nothing: what could not
+    be written is written when there is room.
+
     Parameters
     ----------
     folder : made if it is not there; an earlier run in it is replaced, other contents are refused
+    sync_s : so often at most the disk is asked to take the journal, in a thread of its own; 0: at the end
     """
 
-    def __init__(self, folder: Path | str, config: Config) -> None:
+    def __init__(self, folder: Path | str, config: Config, sync_s: float = 0.0) -> None:
         self.folder = Path(folder)
+        self._sync_s, self._due_s = sync_s, 0.0
+        self._disk = ThreadPoolExecutor(1, "journal") if sync_s else None
+        self._syncing: Future[None] | None = None
         self._part = 0
         self._ingest: IngestWriter | None = None
         self._bag: BagWriter | None = None
@@ -138,15 +148,48 @@ class RunRecorder:
         _make_room(self.folder)
         try:
             self._ingest = IngestWriter(self._part_of("ingest"))  # from the start: it makes the folder a run
+            self._put(_CONFIG, parameters_text(config.as_mapping()))
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
-        _replace(self.folder / _CONFIG, parameters_text(config.as_mapping()))
 
     def sink(self, measurement: Measurement) -> None:
-        """Append to the ingest sequence: the sink of ``GraphSlam``."""
+        """Append to the journal: the sink of ``GraphSlam``. Raises OSError as ``flush`` does."""
         self._accepted.append(measurement)
-        if len(self._accepted) >= _TOGETHER:
-            self._write_accepted()
+        if len(self._accepted) >= _TOGETHER or (self._sync_s and time.monotonic() >= self._due_s):
+            self.flush()
+
+    def flush(self) -> None:
+        """Bring to the journal what was accepted: before any of what came of it is told to anybody.
+
+        Raises
+        ------
+        OSError
+            It is kept, and written by the next call that can; or the disk did not take what was flushed before.
+        """
+        accepted, self._accepted = self._accepted, []
+        if accepted and self._ingest is None:
+            self._ingest = IngestWriter(self._part_of("ingest"))
+        if self._ingest is not None:
+            if accepted:
+                self._ingest.write(map(to_record, accepted))
+            else:
+                self._ingest.file.flush()
+            self._sync_if_due(self._ingest)
+
+    @property
+    def unwritten(self) -> int:
+        """Bytes of the journal that wait for room on the disk."""
+        return self._ingest.file.waiting if self._ingest is not None else 0
+
+    def _sync_if_due(self, ingest: IngestWriter) -> None:
+        """The disk may take long: nobody waits for it, but the next that would ask it again."""
+        now = time.monotonic()
+        if self._disk is None or now < self._due_s or (self._syncing is not None and not self._syncing.done()):
+            return
+        before, self._syncing = self._syncing, self._disk.submit(ingest.file.sync)
+        self._due_s = now + self._sync_s
+        if before is not None:
+            before.result()
 
     def record(self, slam: GraphSlam, update: Update) -> None:
         """Append what an update changed: pose and TF, and the path and the landmarks when they have grown."""
@@ -172,42 +215,54 @@ class RunRecorder:
             if slam.keyframes:
                 self._record_map(slam)
             self.close()
-            ids = _write_graph(self.folder, slam)
+            self._save_results(slam, summary or {})
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
-        _replace(self.folder / LEDGER, ledger_text(slam, ids))
-        _replace(self.folder / CHANGES, changes_text(slam))
-        _replace(self.folder / "path.tum", tum_text(slam.keyframes.stamps_ns.tolist(), slam.trajectory()))
-        _replace(self.folder / COVARIANCES, _covariance_table(slam))
-        stamps = slam.sighting_poses.stamps_ns.tolist()
-        _replace(self.folder / "sightings.tum", tum_text(stamps, slam.sighting_trajectory()))
-        _replace(self.folder / "odometry.tum", tum_text(stamps, slam.sighting_odometry()))
-        _replace(self.folder / "landmarks.csv", _landmark_table(slam))
-        told = summarize(slam) | (summary or {}) | {"leverage": leverage(slam.solver) if slam.is_solved else {}}
-        _replace(self.folder / SUMMARY, json.dumps(told, indent=2) + "\n")
         return self.folder
 
+    def _save_results(self, slam: GraphSlam, summary: dict[str, Any]) -> None:
+        """All that can be computed first, then file by file; the summary, the last, tells which belong together."""
+        stamps = slam.sighting_poses.stamps_ns.tolist()
+        ids, vertices = _numbered(slam)
+        texts = {
+            GRAPH: g2o_text(G2oFile(slam.graph, ids), slam.solver.estimate),
+            VERTICES: vertices,
+            LEDGER: ledger_text(slam, ids),
+            CHANGES: changes_text(slam),
+            "path.tum": tum_text(slam.keyframes.stamps_ns.tolist(), slam.trajectory()),
+            COVARIANCES: _covariance_table(slam),
+            "sightings.tum": tum_text(stamps, slam.sighting_trajectory()),
+            "odometry.tum": tum_text(stamps, slam.sighting_odometry()),
+            "landmarks.csv": _landmark_table(slam),
+        }
+        files = {name: self._put(name, text) for name, text in texts.items()}
+        told = summarize(slam) | summary | {"leverage": leverage(slam.solver) if slam.is_solved else {}, "files": files}
+        self._put(SUMMARY, json.dumps(told, indent=2) + "\n")
+
+    def _put(self, name: str, text: str) -> str:
+        """Write a file whole or not at all; returns its CRC-32."""
+        data = text.encode()
+        with replaced(self.folder / name) as new:
+            new.write_bytes(data)
+        return f"{zlib.crc32(data):08x}"
+
     def close(self) -> None:
-        """End the present part of the recording."""
-        self._write_accepted()
-        for writer in (self._ingest, self._bag):
-            if writer is not None:
+        """End the present part of the recording. Raises OSError: what the disk does not take any more is lost."""
+        try:
+            self.flush()
+            if self._syncing is not None:
+                self._syncing.result()
+        finally:
+            ending = [writer for writer in (self._ingest, self._bag) if writer is not None]
+            self._part += bool(ending)
+            self._ingest = self._bag = self._syncing = None
+            for writer in ending:
                 writer.close()
-        if self._ingest is not None or self._bag is not None:
-            self._part += 1
-        self._ingest = self._bag = None
 
     def _record_map(self, slam: GraphSlam) -> None:
         stamp = slam.keyframes[-1].stamp_ns
         self._write("/path", results.PATH, stamp, results.path(slam))
         self._write("/landmarks", results.LANDMARKS, stamp, results.landmarks(slam))
-
-    def _write_accepted(self) -> None:
-        accepted, self._accepted = self._accepted, []
-        for measurement in accepted:
-            if self._ingest is None:
-                self._ingest = IngestWriter(self._part_of("ingest"))
-            self._ingest.write(to_record(measurement))
 
     def _write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
         if self._bag is None:
@@ -215,7 +270,7 @@ class RunRecorder:
         self._bag.write(topic, type_name, stamp_ns, cdr)
 
     def _part_of(self, name: str) -> Path:
-        return self.folder / (f"{name}_{self._part}.mcap" if self._part else f"{name}.mcap")
+        return self.folder / part_name(name, self._part)
 
 
 def summarize(slam: GraphSlam) -> dict[str, Any]:
@@ -241,10 +296,11 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
     }
 
 
-def _write_graph(folder: Path, slam: GraphSlam) -> list[int]:
-    """Poses are numbered from 0 in order of time, landmarks after them: other tools read odometry from that.
+def _numbered(slam: GraphSlam) -> tuple[list[int], str]:
+    """The number of each vertex, and the table of them.
 
-    What is neither is an offset that the ranges of a sensor share. Returns the number of each vertex.
+    Poses are numbered from 0 in order of time, landmarks after them: other tools read odometry from that. What is
+    neither is an offset that the ranges of a sensor share.
     """
     names: list[tuple[int, str, int | str, str]] = []
     for k, keyframe in enumerate(slam.keyframes):
@@ -258,11 +314,7 @@ def _write_graph(folder: Path, slam: GraphSlam) -> list[int]:
     for file_id, (vertex, what, stamp, name) in enumerate(names):
         ids[vertex] = file_id
         rows.append(f"{file_id},{what},{stamp},{_csv(name)}")
-    target = folder / GRAPH
-    write_g2o(_temporary(target), G2oFile(slam.graph, ids), slam.solver.estimate)
-    os.replace(_temporary(target), target)
-    _replace(folder / VERTICES, "\n".join(rows) + "\n")
-    return ids
+    return ids, "\n".join(rows) + "\n"
 
 
 def _covariance_table(slam: GraphSlam) -> str:
@@ -295,7 +347,7 @@ def _csv(text: str) -> str:
 
 def _is_of_a_start(file: Path) -> bool:
     """What a run that was stopped as it began may have left, before its folder can be told for a run."""
-    return file.name.removesuffix(".new") == _CONFIG or _RECORDED.fullmatch(file.name) is not None
+    return file.name.removesuffix(NEW) == _CONFIG or _RECORDED.fullmatch(file.name) is not None
 
 
 def _make_room(folder: Path) -> None:
@@ -311,16 +363,3 @@ def _clear(folder: Path) -> None:
     for file in folder.iterdir():
         if file.name in _RESULTS or _is_of_a_start(file):
             file.unlink()
-
-
-def _temporary(path: Path) -> Path:
-    return path.with_name(path.name + ".new")
-
-
-def _replace(path: Path, text: str) -> None:
-    """Write whole or not at all."""
-    try:
-        _temporary(path).write_text(text, encoding="utf-8")
-        os.replace(_temporary(path), path)
-    except OSError as error:
-        raise RunError(f"{path}: {error.strerror}") from None

@@ -399,7 +399,7 @@ def test_a_run_that_ended_without_data_is_a_run_that_may_be_replaced(tmp_path):
 def test_a_run_that_was_never_closed_is_a_run(tmp_path):
     recorder = RunRecorder(tmp_path / "run", Config())
     recorder.sink(Odometry(1, (0.0, 0.0, 0.0)))
-    recorder._ingest._stream.flush()
+    recorder.flush()
     assert is_run(tmp_path / "run")
     assert replay(tmp_path / "run", tmp_path / "again").losses
     recorder.close()

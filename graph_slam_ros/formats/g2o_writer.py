@@ -29,8 +29,13 @@ def write_g2o(path: Path | str, file: G2oFile, values: Values) -> int:
     17 significant digits: what is read back is what was written. The information of an edge is multiplied by its
     weight; one of weight 0 is out of the problem, and left out. Returns how many were.
     """
-    write_text(path, "\n".join(graph_lines(file, values)) + "\n")
+    write_text(path, g2o_text(file, values))
     return weightless(file.graph)
+
+
+def g2o_text(file: G2oFile, values: Values) -> str:
+    """What ``write_g2o`` writes."""
+    return "\n".join(graph_lines(file, values)) + "\n"
 
 
 def weightless(graph: Graph) -> int:

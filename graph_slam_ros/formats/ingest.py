@@ -1,12 +1,13 @@
-"""The ingest sequence on disk: what the pipeline accepted, in that order, as JSON records in mcap.
+"""The journal: what the pipeline accepted, in that order, as JSON records in mcap, on disk as it goes.
 
-One channel per kind of record; the order of the file is the order of acceptance. A sequence may be split over several
-files, ``ingest.mcap``, ``ingest_1.mcap``, ...
+One channel per kind of record; the order of the file is the order of acceptance, and ``sequence`` counts it. Each flush
+writes one chunk, which carries its CRC. A sequence may be split over several files, ``ingest.mcap``,
+``ingest_1.mcap``, ...
 """
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from mcap.records import Channel, Message
 from mcap.writer import CompressionType, Writer
 
 from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.mcap_records import records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
@@ -22,19 +24,33 @@ _SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}},
 
 
 class IngestWriter:
-    """Appends records to one file."""
+    """Appends records to one new file.
+
+    What could not be written, since the disk is full, waits: the next ``flush`` writes it.
+    """
 
     def __init__(self, path: Path) -> None:
-        self._stream = path.open("wb")
-        self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
+        self.file = AppendedFile(path)
+        self._chunk = _Chunk()
+        self._writer = Writer(self.file, chunk_size=self._chunk, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
         self._writer.start(profile="", library="graph_slam_ros")
         self._schema = self._writer.register_schema("graph_slam_ros.Measurement", "jsonschema", _SCHEMA)
         self._channels: dict[str, int] = {}
         self._sequence = 0
         self._stamp_ns = 0
+        self.file.flush()
 
-    def write(self, record: Mapping[str, Any]) -> None:
-        """Append one record; one without a stamp is filed under the last."""
+    def write(self, several: Iterable[Mapping[str, Any]]) -> None:
+        """Append records, as one chunk; one without a stamp is filed under the last. Raises OSError, and keeps them."""
+        *others, last = several
+        for record in others:
+            self._add(record)
+        self._chunk.is_full = True
+        self._add(last)
+        self._chunk.is_full = False
+        self.file.flush()
+
+    def _add(self, record: Mapping[str, Any]) -> None:
         kind = record["type"]
         if kind not in self._channels:
             self._channels[kind] = self._writer.register_channel(kind, "json", self._schema)
@@ -46,7 +62,21 @@ class IngestWriter:
     def close(self) -> None:
         """Write the index and close the file."""
         self._writer.finish()  # type: ignore[no-untyped-call]
-        self._stream.close()
+        self.file.close()
+
+
+class _Chunk(int):
+    """The size beyond which the library ends a chunk: none, until the last record of a flush comes."""
+
+    is_full = False
+
+    def __lt__(self, size: int) -> bool:
+        return self.is_full
+
+
+def part_name(name: str, part: int) -> str:
+    """Of the files that a recording is split over."""
+    return f"{name}_{part}.mcap" if part else f"{name}.mcap"
 
 
 def ingest_files(folder: Path) -> list[Path]:
@@ -57,15 +87,25 @@ def ingest_files(folder: Path) -> list[Path]:
 
 
 def read_ingest(folder: Path, losses: list[str]) -> Iterator[dict[str, Any]]:
-    """Records in order of acceptance; what could not be read adds to ``losses``."""
-    for file in ingest_files(folder):
+    """Records in order of acceptance, up to the first that cannot be read; what is lost adds to ``losses``."""
+    lost = len(losses)
+    for part, file in enumerate(ingest_files(folder)):
+        if file.name != (due := part_name("ingest", part)):
+            losses.append(f"{due}: not there; what came after was not read")
+        if len(losses) > lost:  # what came after would be out of place
+            return
         known: set[int] = set()
+        expected = 0
         for record in records(file, losses):
             if isinstance(record, Channel):
                 if record.message_encoding != "json":
                     raise FormatError(f"{file.name}: channel {record.topic} is {record.message_encoding}, not json")
                 known.add(record.id)
             elif isinstance(record, Message) and record.channel_id in known:
+                if record.sequence != expected:
+                    losses.append(f"{file.name}: record {expected} is missing; what came after was not read")
+                    return
+                expected += 1
                 try:
                     yield json.loads(record.data)
                 except ValueError:

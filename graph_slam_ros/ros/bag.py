@@ -19,6 +19,7 @@ from rosbags.typesys import get_types_from_msg
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats import mcap_records, ros1_records, sqlite_records
 from graph_slam_ros.formats.decompression import ZSTD_MAGIC, zstd_message
+from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.ros.interfaces import typestore
 
 _SUFFIXES = (".mcap", ".db3", ".bag", ".bag.active", ".mcap.zstd", ".db3.zstd")
@@ -328,18 +329,21 @@ def _plain(message: BagMessage) -> BagMessage:
 
 
 class BagWriter:
-    """Writes CDR messages into one mcap file that Foxglove and ``ros2 bag`` open; every chunk carries its CRC."""
+    """Writes CDR messages into one mcap file that Foxglove and ``ros2 bag`` open; every chunk carries its CRC.
+
+    What could not be written, since the disk is full, waits: the next ``write`` tries again.
+    """
 
     def __init__(self, path: Path | str) -> None:
-        self._stream = Path(path).open("wb")  # noqa: SIM115 - closed by close()
-        self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
+        self._file = AppendedFile(Path(path))
+        self._writer = Writer(self._file, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
         self._writer.start(profile="ros2", library="graph_slam_ros")
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
 
     def write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
-        """Append one message, received at ``stamp_ns``."""
+        """Append one message, received at ``stamp_ns``. Raises OSError, and keeps it."""
         if topic not in self._channels:
             if type_name not in self._schemas:
                 text, _ = typestore().generate_msgdef(type_name, ros_version=2)
@@ -349,11 +353,12 @@ class BagWriter:
             )
         sequence = self._sequence[topic] = self._sequence.get(topic, -1) + 1
         self._writer.add_message(self._channels[topic], stamp_ns, cdr, stamp_ns, sequence)
+        self._file.flush()
 
     def close(self) -> None:
         """Write the index and close the file."""
         self._writer.finish()
-        self._stream.close()
+        self._file.close()
 
     def __enter__(self) -> "BagWriter":
         return self

@@ -21,6 +21,7 @@ from graph_slam_ros.slam.node_config import (
     HealthConfig,
     InitialPoseConfig,
     InputsConfig,
+    JournalConfig,
     NodeConfig,
     OutputConfig,
     TfConfig,
@@ -305,6 +306,7 @@ class Config:
     tf: TfConfig = TfConfig()
     inputs: InputsConfig = InputsConfig()
     output: OutputConfig = OutputConfig()
+    journal: JournalConfig = JournalConfig()
     time: TimeConfig = TimeConfig()
     health: HealthConfig = HealthConfig()
     node: NodeConfig = NodeConfig()

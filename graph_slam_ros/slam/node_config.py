@@ -125,6 +125,20 @@ class OutputConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class JournalConfig:
+    """What of a run outlives whatever ends it."""
+
+    sync_s: float = setting(
+        1.0,
+        "have the disk take the journal so often at most: what a power cut may lose; the end of the process loses"
+        " nothing that was published",
+        "s",
+        low=0.05,
+        high=3600.0,
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class TimeConfig:
     """What the clock may do."""
 

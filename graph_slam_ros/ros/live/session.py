@@ -73,7 +73,7 @@ class Session:
         self._recorder: RunRecorder | None = None
         if self._folder is not None:
             keep_earlier(self._folder, self.config.output.keep_earlier)
-            self._recorder = RunRecorder(self._folder, self.config)
+            self._recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s)
         self.recording_fails = False
         self.slam = GraphSlam(self.config, self._sink, in_a_thread)
         self.slam.counters.on_first = self._tell
@@ -103,6 +103,8 @@ class Session:
         if not update:
             return
         self._slowest_s = max(self._slowest_s, took_s) if update.solved else self._slowest_s
+        if self._recorded(RunRecorder.flush):  # nobody is told of anything that a restart would not know
+            self.recording_fails = False
         self._look(update, took_s)
         self._recorded(lambda recorder: recorder.record(self.slam, update))
         self._on_update(self.slam, update)
@@ -110,15 +112,21 @@ class Session:
     def _sink(self, measurement: Measurement) -> None:
         self._recorded(lambda recorder: recorder.sink(measurement))
 
-    def _recorded(self, write: Callable[[RunRecorder], None]) -> None:
-        """Where the disk fails, the robot goes on; that it is recorded no more is told."""
-        if self._recorder is None or self.recording_fails:
-            return
+    def _recorded(self, write: Callable[[RunRecorder], None]) -> bool:
+        """Where the disk fails, the robot goes on; that nothing is recorded is told, and tried again and again."""
+        if self._recorder is None:
+            return False
         try:
             write(self._recorder)
         except OSError as error:
+            if not self.recording_fails:
+                self._tell("output.folder", error.strerror or type(error).__name__)
             self.recording_fails = True
-            self._tell("output.folder", error.strerror or type(error).__name__)
+            if self._recorder.unwritten > _MOST_UNWRITTEN:
+                self._recorder = None
+                self._tell("output.folder", "recording was given up: too much waits for room")
+            return False
+        return True
 
     def _look(self, update: Update, took_s: float) -> None:
         slam, newest = self.slam, self.slam.keyframes[-1]
@@ -231,4 +239,5 @@ class Session:
             self._recorder.close()
 
 
+_MOST_UNWRITTEN = 256 * 2**20  # bytes of the journal: hours of a robot's measurements
 _CONFIRMED = 0.2  # of the noise of the motion over a jump: less, and something was recognised

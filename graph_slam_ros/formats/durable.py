@@ -1,0 +1,84 @@
+"""Files that outlive whoever writes them: one that only grows, and one that is replaced whole or not at all."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+
+class AppendedFile:
+    """A file that is begun anew and only grows; what cannot be written is kept, and written the next time.
+
+    What was flushed outlives the process, what was synced a power cut. There are no holes: a process that dies in the
+    middle leaves the first part of what it had to say.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        self._end = 0
+        self._waiting = bytearray()
+        sync_folder(path.parent)
+
+    def write(self, data: bytes) -> int:
+        """Append; it is in the file after the next flush."""
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        """Where the next byte goes."""
+        return self._end + len(self._waiting)
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that are not in the file yet."""
+        return len(self._waiting)
+
+    def flush(self) -> None:
+        """Write what waits. Raises OSError: then some of it waits still."""
+        while self._waiting:
+            written = os.pwrite(self._fd, self._waiting, self._end)
+            self._end += written
+            del self._waiting[:written]
+
+    def sync(self) -> None:
+        """Have the disk take what was flushed. May be called from another thread; raises OSError."""
+        os.fsync(self._fd)
+
+    def close(self) -> None:
+        """Flush, sync and close; what the disk does not take is lost, and raises OSError."""
+        try:
+            self.flush()
+            self.sync()
+        finally:
+            os.close(self._fd)
+
+
+@contextlib.contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """A new file to be written in its place; a reader sees the old one or the new one, whatever happens in between."""
+    new = path.with_name(path.name + NEW)
+    try:
+        yield new
+        fd = os.open(new, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+        os.replace(new, path)
+    except BaseException:  # an interrupt, too, leaves nothing behind
+        new.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the disk know the names that were made or changed in a folder."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+NEW = ".new"
+"""How the name of a file ends that is still being written."""
