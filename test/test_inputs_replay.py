@@ -122,7 +122,7 @@ def test_info_takes_odometry_from_tf_where_it_is_nowhere_else(tmp_path, capsys):
 
 
 def test_a_type_that_only_the_recording_defines_is_read_by_its_definition(tmp_path):
-    from test_bag import definition, write_mcap
+    from recordings import definition, write_mcap
 
     name = "ros2_aruco_interfaces/msg/ArucoMarkers"
     _, _, encoded = recorded(name, DEFINITIONS[name])

@@ -29,6 +29,8 @@ def decompressed(data: bytes, codec: str, size: int) -> bytes:
         raise FormatError(f"it says to be {size} bytes of {len(data)} compressed; {MOST_RATIO} to 1 is the limit")
     try:
         plain = _at_most(data, codec, size + 1)
+    except MemoryError:
+        raise FormatError(f"it says to be {size} bytes, and there is no memory for it") from None
     except (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError) as error:  # lz4, then bz2
         raise FormatError(f"{codec}: {' '.join(str(error).split())}") from None
     if len(plain) != size:

@@ -81,6 +81,7 @@ def _connection(path: Path) -> sqlite3.Connection:
     if sys.version_info >= (3, 11):
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_BYTES)
     database.execute("PRAGMA trusted_schema = OFF")
+    database.execute("PRAGMA writable_schema = ON")  # else a file that is cut is not opened at all; it is read only
     return database
 
 

@@ -1,0 +1,721 @@
+"""Files of every kind of fault: all that is whole is read, what is lost is told, and the rest is refused by name."""
+
+import bz2
+import gzip
+import os
+import re
+import resource
+import shutil
+import sqlite3
+import struct
+from contextlib import closing
+from dataclasses import replace
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from confined import confined
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk, Footer, SummaryOffset
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+from recordings import (
+    CONTAINERS,
+    ODOMETRY,
+    RESULTS,
+    TOPICS,
+    chunks,
+    definition,
+    read,
+    short_drive,
+    to_ros1,
+    to_sqlite,
+    write_mcap,
+)
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.formats import mcap_records
+from graph_slam_ros.replay import choose_inputs, replay
+from graph_slam_ros.ros.bag import BagError, Topic, open_bag
+from graph_slam_ros.ros.definitions import recorded_decoder
+from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.slam import Config
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    return short_drive(tmp_path_factory.mktemp("bag") / "drive.mcap")
+
+
+@pytest.fixture(scope="module")
+def messages(recorded):
+    return list(open_bag(recorded).messages(TOPICS))
+
+
+@pytest.fixture(scope="module")
+def reference(recorded, tmp_path_factory):
+    out = tmp_path_factory.mktemp("reference") / "run"
+    replay(recorded, out)
+    return {name: (out / name).read_bytes() for name in RESULTS}
+
+
+@pytest.mark.parametrize("compression", list(CompressionType), ids=lambda c: c.name)
+def test_F5_mcap_is_read_whatever_its_compression(tmp_path, messages, compression):
+    file = write_mcap(tmp_path / "a.mcap", messages, compression=compression, chunk_size=20_000)
+    assert len(chunks(file)) > 3
+    assert read(file) == (messages, [])
+
+
+@pytest.mark.parametrize("chunking", [True, False])
+def test_F2_mcap_without_index_or_summary_is_read_whole(tmp_path, messages, chunking):
+    from mcap.writer import IndexType
+
+    file = write_mcap(
+        tmp_path / "a.mcap",
+        messages,
+        index_types=IndexType.NONE,
+        repeat_channels=False,
+        repeat_schemas=False,
+        use_statistics=False,
+        use_summary_offsets=False,
+        use_chunking=chunking,
+    )
+    bag = open_bag(file)
+    assert {t.name: t.count for t in bag.topics.values()} == {
+        name: sum(m.topic == name for m in messages) for name in TOPICS
+    }
+    assert read(file) == (messages, [])
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_F8_every_container_gives_the_same_results_with_and_without_metadata(tmp_path, messages, reference, container):
+    done = replay(CONTAINERS[container](tmp_path, messages), tmp_path / "run")
+    assert done.losses == []
+    assert {name: (tmp_path / "run" / name).read_bytes() for name in RESULTS} == reference
+
+
+@pytest.mark.parametrize("fraction", [0.15, 0.4, 0.77, 0.95])
+@pytest.mark.parametrize("compression", list(CompressionType), ids=lambda c: c.name)
+def test_F1_of_a_truncated_file_every_whole_chunk_is_read_and_the_loss_is_told(
+    tmp_path, messages, compression, fraction
+):
+    whole = write_mcap(tmp_path / "whole.mcap", messages, compression=compression, chunk_size=20_000)
+    cut = int(whole.stat().st_size * fraction)
+    bounds = chunks(whole)
+    (tmp_path / "cut.mcap").write_bytes(whole.read_bytes()[:cut])
+    got, losses = read(tmp_path / "cut.mcap")
+    assert got == messages[: len(got)]
+    in_whole_chunks = sum(end <= cut for _, end in bounds) / len(bounds)
+    assert len(got) / len(messages) == pytest.approx(in_whole_chunks, abs=1.5 / len(bounds))
+    assert len(losses) == 1
+    assert losses[0].startswith(f"cut.mcap: cut off after {len(got)} messages")
+
+
+@pytest.mark.parametrize("fraction", [0.3, 0.8])
+def test_F1_of_a_truncated_file_without_chunks_every_whole_message_is_read(tmp_path, messages, fraction):
+    whole = write_mcap(tmp_path / "whole.mcap", messages, use_chunking=False)
+    data = whole.read_bytes()
+    cut = int(len(data) * fraction)
+    (tmp_path / "cut.mcap").write_bytes(data[:cut])
+    got, losses = read(tmp_path / "cut.mcap")
+    ends = [data.index(m.cdr) + len(m.cdr) for m in messages]
+    assert got == messages[: sum(end <= cut for end in ends)]
+    assert len(losses) == 1
+
+
+def test_F1_cut_at_every_one_of_many_places_nothing_but_a_loss_or_a_refusal_comes_of_it(tmp_path, messages):
+    whole = write_mcap(tmp_path / "whole.mcap", messages, chunk_size=20_000).read_bytes()
+    file = tmp_path / "cut.mcap"
+    refused = 0
+    for cut in [*range(1, 400, 23), *range(400, len(whole), len(whole) // 60), *range(len(whole) - 40, len(whole))]:
+        file.write_bytes(whole[:cut])
+        try:
+            got, losses = read(file)
+        except BagError as error:
+            refused += 1
+            assert "\n" not in str(error)
+            continue
+        assert got == messages[: len(got)]
+        assert losses or got == messages, "cut in the summary, after the last message"
+    assert 0 < refused < 40
+
+
+def test_F3_a_flipped_bit_in_a_chunk_costs_that_chunk_alone_and_is_told(tmp_path, messages):
+    whole = write_mcap(tmp_path / "a.mcap", messages, compression=CompressionType.NONE, chunk_size=20_000)
+    data, bounds = whole.read_bytes(), chunks(whole)
+    for first, last in (bounds[0], bounds[len(bounds) // 2], bounds[-1]):
+        damaged = bytearray(data)
+        damaged[(first + last) // 2] ^= 0x10
+        whole.write_bytes(damaged)
+        got, losses = read(whole)
+        missing = [m for m in messages if m not in got]
+        assert got == [m for m in messages if m in got]
+        assert 0 < len(missing) < 2.5 * len(messages) / len(bounds)
+        assert losses == [
+            f"a.mcap: a damaged chunk of {last - first + 49} bytes was passed over (its checksum is another)",
+            f"a.mcap: {len(missing)} of its messages could not be read",
+        ]
+
+
+def test_F1_a_loss_is_told_once_however_often_the_file_is_read(tmp_path, recorded):
+    (tmp_path / "cut.mcap").write_bytes(recorded.read_bytes()[:-1000])
+    bag = open_bag(tmp_path / "cut.mcap")
+    for _ in range(3):
+        list(bag.messages(TOPICS))
+    assert len(bag.losses) == 1
+
+
+def test_F3_whatever_byte_of_a_file_is_wrong_it_is_read_or_refused_in_one_line(tmp_path, messages):
+    whole = write_mcap(tmp_path / "a.mcap", messages[:60], compression=CompressionType.LZ4, chunk_size=8_000)
+    data, rng = whole.read_bytes(), np.random.default_rng(0)
+    intact = messages[:60]
+    for at in [*range(0, 100, 5), *rng.integers(0, len(data), 150), *range(len(data) - 300, len(data), 7)]:
+        damaged = bytearray(data)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        whole.write_bytes(damaged)
+        try:
+            got, losses = read(whole)
+        except BagError as error:
+            assert "\n" not in str(error)
+            continue
+        wrong = [m for m in got if (m.topic, m.cdr) not in {(i.topic, i.cdr) for i in intact}]
+        assert not wrong or losses or at < 1000, "a header outside of a chunk has no checksum"
+        assert len(got) == len(intact) or losses
+
+
+def make_fifo(path):
+    os.mkfifo(path)
+    return path
+
+
+def make_file(path, content):
+    path.write_bytes(content)
+    return path
+
+
+NO_RECORDINGS = {
+    "empty file": (lambda p: make_file(p / "a.mcap", b""), "a.mcap: the file is empty"),
+    "wrong magic": (lambda p: make_file(p / "a.mcap", b"hello, world, this is no recording"), "a.mcap: not a readable"),
+    "wrong magic, no suffix": (
+        lambda p: make_file(p / "a", b"hello, world, this is no recording"),
+        "a: not a readable",
+    ),
+    "wrong magic in db3": (lambda p: make_file(p / "a.db3", b"hello, world" * 100), "a.db3: not a readable"),
+    "wrong magic in bag": (lambda p: make_file(p / "a.bag", b"hello, world" * 100), "a.bag: not a readable"),
+    "magic alone": (lambda p: make_file(p / "a.mcap", b"\x89MCAP0\r\n"), "a.mcap: no topic in it"),
+    "folder without recording": (lambda p: p, "no recording"),
+    "missing": (lambda p: p / "a.mcap", "a.mcap: no such file or folder"),
+    "fifo": (lambda p: make_fifo(p / "a.mcap"), "a.mcap: neither a file nor a folder"),
+    "folder with a fifo": (lambda p: make_fifo(p / "a.mcap").parent, "no recording"),
+    "folder with an empty part": (lambda p: make_file(p / "a.mcap", b"").parent, "a.mcap: the file is empty"),
+    "device": (lambda p: type(p)("/dev/zero"), "neither a file nor a folder"),
+}
+
+
+@pytest.mark.parametrize("kind", NO_RECORDINGS)
+def test_F7_what_is_no_recording_is_refused_in_one_line(tmp_path, kind):
+    path, complaint = NO_RECORDINGS[kind]
+    with pytest.raises(BagError, match=complaint) as caught:
+        open_bag(path(tmp_path))
+    assert "\n" not in str(caught.value)
+
+
+def replay_with(tmp_path, messages, **options):
+    file = write_mcap(tmp_path / "a.mcap", messages, **options)
+    return replay(file, tmp_path / "run", odometry="/odom", landmarks="/landmarks")
+
+
+def edited(old, new):
+    def text(name):
+        whole = definition(name)
+        assert name != ODOMETRY or old in whole
+        return whole.replace(old, new)
+
+    return text
+
+
+def test_F11_without_a_schema_the_refusal_says_so(tmp_path, messages):
+    with pytest.raises(BagError, match="/odom has no type: the recording lacks its schema"):
+        replay_with(tmp_path, messages, schemas=False)
+    with pytest.raises(BagError, match=r"no topic of type nav_msgs/msg/Odometry .* /odom \(no type\)"):
+        choose_inputs(open_bag(tmp_path / "a.mcap"), Config())
+
+
+def test_F11_a_schema_without_text_is_decoded_by_our_own_definition(tmp_path, messages, reference):
+    replay_with(tmp_path, messages, text=lambda name: "")
+    assert (tmp_path / "run" / "graph.g2o").read_bytes() == reference["graph.g2o"]
+
+
+@pytest.mark.parametrize(
+    "old, new, complaint",
+    [
+        ("string child_frame_id\n", "", "nav_msgs/msg/Odometry of this recording has no field 'child_frame_id'"),
+        ("float64[36] covariance\n", "float64[36] spread\n", "has no field 'covariance'"),
+        ("float64 w\n", "", "geometry_msgs/msg/Quaternion of this recording has no field 'w'"),
+        ("uint32 nanosec", "uint64 nanosec", "field 'nanosec' of builtin_interfaces/msg/Time has another type"),
+        (
+            "string child_frame_id\n",
+            "int32 child_frame_id\n",
+            "field 'child_frame_id' of nav_msgs/msg/Odometry has another",
+        ),
+        (
+            "string child_frame_id\n",
+            "= ] [ =\n",
+            "the recorded definition of nav_msgs/msg/Odometry is not",
+        ),
+    ],
+)
+def test_F11_a_schema_that_lacks_what_we_need_is_refused_by_field_and_nothing_is_touched(
+    tmp_path, messages, old, new, complaint
+):
+    with pytest.raises(BagError, match=f"topic /odom: .*{complaint}"):
+        replay_with(tmp_path, messages, text=edited(old, new))
+    assert not (tmp_path / "run").exists()
+
+
+def test_F11_a_schema_with_more_fields_is_decoded_by_itself(tmp_path, messages, reference):
+    text = definition(ODOMETRY).replace("string child_frame_id\n", "string child_frame_id\nint8[] extra\nint64 more\n")
+    theirs = get_typestore(Stores.EMPTY)
+    theirs.register({**typestore().fielddefs, **get_types_from_msg(text, ODOMETRY)})
+    longer = []
+    for m in messages:
+        if m.topic == "/odom":
+            ours = typestore().deserialize_cdr(m.cdr, ODOMETRY)
+            message = theirs.types[ODOMETRY](
+                header=ours.header,
+                child_frame_id=ours.child_frame_id,
+                extra=np.array([1, 2, 3], dtype=np.int8),
+                more=7,
+                pose=ours.pose,
+                twist=ours.twist,
+            )
+            m = type(m)(m.topic, m.log_ns, bytes(theirs.serialize_cdr(message, ODOMETRY)))
+        longer.append(m)
+    done = replay_with(tmp_path, longer, text=lambda name: text if name == ODOMETRY else definition(name))
+    assert done.summary["counters"] == {}
+    assert (tmp_path / "run" / "graph.g2o").read_bytes() == reference["graph.g2o"]
+
+
+def test_F12_another_encoding_is_refused_by_name(tmp_path, messages):
+    with pytest.raises(BagError, match="topic /odom: messages are encoded as 'json', not cdr"):
+        replay_with(tmp_path, messages, encoding="json")
+
+
+def test_F12_big_endian_messages_are_read(messages):
+    decode = recorded_decoder(Topic("/odom", ODOMETRY, 1))
+    m = next(m for m in messages if m.topic == "/odom")
+    ours = typestore().deserialize_cdr(m.cdr, ODOMETRY)
+    big = bytes(typestore().serialize_cdr(ours, ODOMETRY, little_endian=False))
+    assert struct.unpack_from(">i", big, 4)[0] == ours.header.stamp.sec
+    assert decode(big).pose.pose == ours.pose.pose
+
+
+# -- chunks ---------------------------------------------------------------------------------------------------------
+
+
+def head_of_chunk(file, number):
+    """Where a chunk's record begins: its opcode; 9 bytes on its fields."""
+    codec = {b"\0" * 4: 0, b"\4\0\0\0zstd": 4, b"\3\0\0\0lz4": 3}
+    first = chunks(file)[number][0]
+    data = file.read_bytes()
+    return next(first - 49 - size for text, size in codec.items() if data[first - 8 - size - 4 : first - 8] == text)
+
+
+@pytest.mark.parametrize("offset", [0, 1, 8, 25, 37, 41, 45], ids=str)
+@pytest.mark.parametrize("summary", [True, False], ids=["summary", "no summary"])
+def test_F3_a_damaged_head_of_a_chunk_costs_that_chunk_alone(tmp_path, messages, offset, summary):
+    """Its opcode, length, size, checksum, codec, the length of its data: after each the next chunk is found again."""
+    options = {} if summary else {"use_summary_offsets": False, "use_statistics": False, "repeat_channels": False}
+    file = write_mcap(tmp_path / "a.mcap", messages, compression=CompressionType.ZSTD, chunk_size=20_000, **options)
+    number = len(chunks(file)) // 2
+    data = bytearray(file.read_bytes())
+    data[head_of_chunk(file, number) + offset] ^= 0x40
+    file.write_bytes(data)
+    got, losses = read(file)
+    assert got == [m for m in messages if m in got]
+    assert 0 < len(messages) - len(got) < 3 * len(messages) / len(chunks_before(messages, 20_000))
+    assert losses or (offset == 0 and not summary), "a record of an unknown kind is passed over, as the format says"
+    assert all("bytes" in loss or "messages could not be read" in loss for loss in losses)
+
+
+def chunks_before(messages, size):
+    return range(sum(len(m.cdr) for m in messages) // size)
+
+
+def test_F3_of_a_recording_without_checksums_one_is_warned(tmp_path, messages, capsys):
+    bare = CONTAINERS["mcap by rosbags"](tmp_path, messages)
+    checked = write_mcap(tmp_path / "a.mcap", messages)
+    loose = write_mcap(tmp_path / "b.mcap", messages, use_chunking=False)
+    summed = write_mcap(tmp_path / "c.mcap", messages, use_chunking=False, enable_data_crcs=True)
+    for file, warned in ((bare, True), (checked, False), (loose, True), (summed, False)):
+        bag = open_bag(file)
+        assert len(list(bag.messages(TOPICS))) == len(messages)
+        assert [("carries no checksums" in warning) for warning in bag.warnings] == [True] * warned
+    assert main(["info", str(bare)]) == 0
+    assert "graph_slam: beware: bag.mcap: carries no checksums" in capsys.readouterr().err
+
+
+def test_F3_a_flipped_bit_outside_of_chunks_is_found_by_the_sum_over_all(tmp_path, messages):
+    file = write_mcap(tmp_path / "a.mcap", messages, use_chunking=False, enable_data_crcs=True)
+    data = bytearray(file.read_bytes())
+    data[data.index(messages[40].cdr) + 60] ^= 1
+    file.write_bytes(data)
+    got, losses = read(file)
+    assert len(got) == len(messages)
+    assert losses == ["a.mcap: damaged: its data do not agree with their checksum"]
+
+
+def test_F3_a_summary_that_is_damaged_is_not_believed(tmp_path, messages):
+    file = write_mcap(tmp_path / "a.mcap", messages, chunk_size=20_000)
+    data = bytearray(file.read_bytes())
+    at = data.rindex(b"/landmarks")  # the channel, as the summary repeats it
+    data[at + 3] ^= 1
+    file.write_bytes(data)
+    bag = open_bag(file)
+    assert set(bag.topics) == set(TOPICS)
+    assert list(bag.messages(TOPICS)) == messages
+
+
+def test_F4_what_is_read_of_a_damaged_file_is_what_a_second_reading_of_the_rest_gives(tmp_path, messages):
+    """No file is mended: what could be read of one, written anew, is whole and gives the same again."""
+    file = write_mcap(tmp_path / "a.mcap", messages, chunk_size=20_000)
+    data = bytearray(file.read_bytes())
+    data[sum(chunks(file)[2]) // 2] ^= 8
+    file.write_bytes(data[: len(data) * 3 // 4])
+    rest, losses = read(file)
+    assert losses
+    assert read(write_mcap(tmp_path / "b.mcap", rest)) == (rest, [])
+
+
+# -- codecs and sizes -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("codec", ["BZ2", "LZ4", None])
+def test_F5_ros_1_chunks_of_every_codec_are_read(tmp_path, messages, codec):
+    from rosbags.rosbag1 import Writer
+
+    file = to_ros1(tmp_path / "a.bag", messages, codec and Writer.CompressionFormat[codec])
+    assert read(file) == (messages, [])
+
+
+def rewritten(file, changes):
+    """With fields of each mcap chunk changed."""
+    with file.open("rb") as stream:
+        parts = list(StreamReader(stream, emit_chunks=True).records)
+    out = RecordBuilder()
+    out.write(mcap_records.MAGIC)
+    for record in parts:
+        if isinstance(record, Chunk):
+            for name, value in changes(record).items():
+                setattr(record, name, value)
+        if not isinstance(record, Footer | SummaryOffset):
+            record.write(out)
+    Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(out)
+    out.write(mcap_records.MAGIC)
+    file.write_bytes(out.end())
+    return file
+
+
+def test_F5_an_unknown_codec_is_named(tmp_path, messages):
+    file = rewritten(write_mcap(tmp_path / "a.mcap", messages), lambda chunk: {"compression": "brotli"})
+    got, losses = read_of(file)
+    assert (got, len(losses)) == ([], 1)
+    assert "it is compressed as 'brotli': only zstd, lz4 and bz2 are read" in losses[0]
+
+
+def read_of(file):
+    """Also where not even a topic is left."""
+    try:
+        return read(file)
+    except BagError as error:
+        return [], [str(error)]
+
+
+@pytest.mark.parametrize("name", ["a.mcap.gz", "a.bag", "a.db3.zstd", "a.mcap.bz2", "a.lz4"])
+def test_F5_a_file_that_is_compressed_as_a_whole_is_refused_and_the_codec_named(tmp_path, recorded, name):
+    pack = {"gz": gzip.compress, "bag": gzip.compress, "zstd": zstandard.compress, "bz2": bz2.compress}
+    codec = {"gz": "gzip", "bag": "gzip", "zstd": "zstd", "bz2": "bzip2", "lz4": "lz4"}[name.split(".")[-1]]
+    packed = pack.get(name.split(".")[-1], lz4.frame.compress)(recorded.read_bytes())
+    (tmp_path / name).write_bytes(packed)
+    with pytest.raises(BagError, match=rf"{name}: the whole file is compressed with {codec}: unpack it first"):
+        open_bag(tmp_path / name)
+
+
+def test_F5_messages_that_rosbag2_compressed_one_by_one_are_read(tmp_path, messages):
+    packed = [replace(m, cdr=zstandard.compress(m.cdr)) for m in messages]
+    assert read(to_sqlite(tmp_path / "bag", packed)) == (messages, [])
+
+
+ZEROS = bytes(64 * 2**20)  # 64 MiB of nothing
+
+
+def chunk_of(codec, plain, said):
+    pack = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "": bytes}
+    return {"compression": codec, "data": pack[codec](plain), "uncompressed_size": said, "uncompressed_crc": 0}
+
+
+BOMBS = {
+    "too large": (lambda: chunk_of("zstd", ZEROS, 2**29), "536870912 bytes; 268435456 is the limit"),
+    "2^60": (lambda: chunk_of("lz4", b"x", 2**60), "is the limit"),
+    "ratio": (lambda: chunk_of("zstd", ZEROS, len(ZEROS)), "1000 to 1 is the limit"),
+    "more than it says, zstd": (lambda: chunk_of("zstd", ZEROS, 1000), "says to be 1000 bytes and is more"),
+    "more than it says, lz4": (lambda: chunk_of("lz4", ZEROS, 1000), "says to be 1000 bytes and is more"),
+    "less than it says": (lambda: chunk_of("zstd", b"x" * 500, 1000), "says to be 1000 bytes and is 500"),
+    "a size of its own in zstd": (
+        lambda: chunk_of("", b"", 1000) | {"compression": "zstd", "data": huge_frame()},
+        "says to be 1000 bytes|zstd: ",
+    ),
+}
+
+
+def huge_frame():
+    """A zstd frame that says to be 2^60 bytes: the frame's head with a content size of eight bytes."""
+    return b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 2**60) + zstandard.compress(b"x" * 50)[6:]
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_F6_a_bomb_in_an_mcap_chunk_is_passed_over_and_nothing_is_allocated_for_it(tmp_path, messages, bomb):
+    changes, complaint = BOMBS[bomb]
+    file = write_mcap(tmp_path / "a.mcap", messages, chunk_size=20_000)
+    second = list(range(len(chunks(file))))[1]
+    seen = iter(range(1000))
+    wanted = changes()
+    rewritten(file, lambda chunk: wanted if next(seen) == second else {})
+    got, losses = confined(read, file, mib=64)
+    assert 0 < len(got) < len(messages)
+    assert re.search(complaint, "; ".join(losses))
+
+
+@pytest.mark.parametrize("codec", ["bz2", "lz4"])
+@pytest.mark.parametrize("said", [1000, 2**31, len(ZEROS)])
+def test_F6_a_bomb_in_a_ros_1_chunk_is_passed_over_and_nothing_is_allocated_for_it(tmp_path, messages, codec, said):
+    file = to_ros1(tmp_path / "a.bag", messages)
+    pack = {"bz2": bz2.compress, "lz4": lz4.frame.compress}[codec]
+    chunk = ros1_record(pack(ZEROS), op=b"\5", compression=codec.encode(), size=struct.pack("<I", said))
+    at = 13 + 4096  # after the magic and the bag's own record
+    data = file.read_bytes()
+    file.write_bytes(data[:at] + chunk + data[at:])
+    got, losses = confined(read, file, mib=64)
+    assert got == messages
+    assert "a damaged chunk" in losses[0]
+
+
+def test_F6_a_bomb_in_a_message_of_rosbag2_is_passed_over(tmp_path, messages):
+    bombs = [zstandard.compress(ZEROS), huge_frame()]
+    spoiled = [replace(messages[k], cdr=bombs[k - 5]) if k in (5, 6) else messages[k] for k in range(len(messages))]
+    got, losses = confined(read, to_sqlite(tmp_path / "bag", spoiled), mib=64)
+    assert got == messages[:5] + messages[7:]
+    assert len(losses) == 2
+    assert all("was passed over (it says to be" in loss for loss in losses)
+
+
+def ros1_record(data, **fields):
+    parts = [name.encode() + b"=" + value for name, value in fields.items()]
+    header = b"".join(struct.pack("<I", len(part)) + part for part in parts)
+    return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
+
+
+@pytest.mark.parametrize("length", [2**31, 2**40, 2**60, 2**64 - 1], ids=lambda n: f"2^{n.bit_length() - 1}")
+def test_F19_a_length_that_cannot_be_is_refused_before_anything_is_allocated(tmp_path, messages, length):
+    whole = write_mcap(tmp_path / "a.mcap", messages, chunk_size=20_000)
+    data = whole.read_bytes()
+    at = head_of_chunk(whole, 1)
+    places = {
+        "record": at + 1,
+        "data of the chunk": chunks(whole)[1][0] - 8,
+        "first record": 9,
+        "summary": len(data) - 28,
+    }
+    for place in places.values():
+        whole.write_bytes(data[:place] + struct.pack("<Q", length) + data[place + 8 :])
+        got, losses = confined(read_of, whole, mib=64)
+        assert losses or got == messages
+        assert len(got) >= len(messages) // 2 or place == 9
+
+
+@pytest.mark.parametrize("length", [2**31 - 1, 2**32 - 1])
+def test_F19_lengths_within_records_and_in_ros_1_bags_too(tmp_path, messages, length):
+    said = struct.pack("<I", length)
+    plain = write_mcap(tmp_path / "a.mcap", messages, use_chunking=False)
+    data = plain.read_bytes()
+    place = data.index(b"ros2msg") - 4  # of a schema's encoding
+    plain.write_bytes(data[:place] + said + data[place + 4 :])
+    assert confined(read_of, plain, mib=64)[1]
+    bag = to_ros1(tmp_path / "a.bag", messages)
+    data = bag.read_bytes()
+    for place in (13, data.index(b"op=\5") - 8, data.index(b"op=\7") - 8):
+        bag.write_bytes(data[:place] + said + data[place + 4 :])
+        assert confined(read_of, bag, mib=64)[1] or place == 13
+
+
+# -- sqlite3 and ROS 1 ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fraction", [0.02, 0.3, 0.6, 0.95])
+def test_F9_a_sqlite3_file_that_is_cut_is_read_up_to_there(tmp_path, messages, fraction):
+    folder = to_sqlite(tmp_path / "bag", messages)
+    (file,) = folder.glob("*.db3")
+    data = file.read_bytes()
+    file.write_bytes(data[: int(fraction * len(data))])
+    got, losses = read_of(folder)
+    assert got == messages[: len(got)]
+    assert len(got) >= 0.7 * fraction * len(messages) or fraction < 0.1
+    assert losses
+    assert all("\n" not in loss for loss in losses)
+
+
+def test_F9_a_damaged_page_is_told_and_what_is_before_it_is_read(tmp_path, messages):
+    folder = to_sqlite(tmp_path / "bag", messages)
+    (file,) = folder.glob("*.db3")
+    data = bytearray(file.read_bytes())
+    size = struct.unpack_from(">H", data, 16)[0]
+    for page in range(1, len(data) // size):
+        spoiled = data.copy()
+        spoiled[page * size : page * size + 100] = b"\xff" * 100
+        file.write_bytes(spoiled)
+        got, losses = read_of(folder)
+        if len(got) < len(messages):
+            assert losses
+        assert [(m.topic, m.log_ns) for m in got] == [(m.topic, m.log_ns) for m in messages[: len(got)]]
+
+
+def test_F9_what_is_still_in_the_log_of_writes_is_read_too_and_the_files_stay_as_they_are(tmp_path, messages):
+    folder = to_sqlite(tmp_path / "bag", messages)
+    (file,) = folder.glob("*.db3")
+    with closing(sqlite3.connect(file)) as database:
+        database.execute("PRAGMA journal_mode = WAL")
+        database.execute("UPDATE messages SET timestamp = timestamp + 1")
+        database.commit()
+        copy = tmp_path / "copy"
+        shutil.copytree(folder, copy)  # as a recorder that was killed leaves it
+    (copied,) = copy.glob("*.db3")
+    before = copied.read_bytes()
+    assert (copy / f"{copied.name}-wal").stat().st_size
+    assert read(copy) == ([replace(m, log_ns=m.log_ns + 1) for m in messages], [])
+    assert copied.read_bytes() == before
+
+
+def test_F9_what_is_no_recording_though_a_database_is_refused(tmp_path):
+    file = tmp_path / "a.db3"
+    with closing(sqlite3.connect(file)) as database:
+        database.execute("CREATE TABLE topics (id INTEGER)")
+        database.execute(
+            "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i FROM n"
+        )
+        database.commit()
+    with pytest.raises(BagError, match=r"a\.db3: not a readable recording: no tables of rosbag2 in it"):
+        open_bag(file)
+
+
+@pytest.mark.parametrize("fraction", [0.3, 0.7, 0.9, 0.99])
+def test_F10_a_ros_1_bag_without_index_is_read_up_to_where_it_is_cut(tmp_path, messages, fraction):
+    file = to_ros1(tmp_path / "a.bag", messages, chunk_bytes=8_000)
+    data = file.read_bytes()
+    active = tmp_path / "drive.bag.active"
+    active.write_bytes(data[: int(fraction * len(data))])
+    got, losses = read(tmp_path / "drive.bag.active")
+    assert got == messages[: len(got)]
+    assert len(got) > 0.6 * fraction * len(messages)
+    assert len(losses) == (len(got) < len(messages) or fraction < 1)
+    assert losses[0].startswith(f"drive.bag.active: cut off after {len(got)} messages, ")
+
+
+def test_F10_a_folder_with_an_active_bag_is_one(tmp_path, messages):
+    to_ros1(tmp_path / "drive.bag", messages).rename(tmp_path / "drive.bag.active")
+    assert read(tmp_path) == (messages, [])
+
+
+def test_F10_a_damaged_chunk_of_a_ros_1_bag_is_passed_over(tmp_path, messages):
+    from rosbags.rosbag1 import Writer
+
+    file = to_ros1(tmp_path / "a.bag", messages, Writer.CompressionFormat.BZ2, chunk_bytes=8_000)
+    data = bytearray(file.read_bytes())
+    places = [found.end() for found in re.finditer(b"BZh9", data)]
+    assert len(places) > 4
+    data[places[2] + 40] ^= 1
+    file.write_bytes(data)
+    got, losses = read(file)
+    assert 0 < len(messages) - len(got) < 2 * len(messages) / len(places)
+    assert len(losses) == 1
+    assert "a damaged chunk" in losses[0]
+
+
+# -- order and size -------------------------------------------------------------------------------------------------
+
+
+def test_F13_messages_that_were_written_out_of_order_are_put_in_order_and_ties_stay_as_they_were(tmp_path, messages):
+    """Of one time they stay as they came: numbers of channels are the recorder's, and many write no sequence."""
+    rng = np.random.default_rng(3)
+    shuffled = [messages[k] for k in np.argsort(np.arange(len(messages)) + rng.uniform(0, 30, len(messages)))]
+    same = [replace(m, log_ns=m.log_ns // 10**9 * 10**9) for m in shuffled]
+    ordered = sorted(same, key=lambda m: m.log_ns)
+    assert same != ordered
+    for container in (lambda folder: write_mcap(folder / "a.mcap", same), lambda folder: to_sqlite(folder / "b", same)):
+        assert read(container(tmp_path)) == (ordered, [])
+    got, losses = read(write_mcap(tmp_path / "c.mcap", shuffled))
+    assert (sorted(got, key=messages.index), losses) == (messages, [])
+    assert [m.log_ns for m in got] == sorted(m.log_ns for m in messages)
+
+
+def test_F14_a_recording_larger_than_memory_is_streamed(tmp_path):
+    """768 MiB, in chunks of 4 MiB, with a quarter of that to spare."""
+    file = tmp_path / "large.mcap"
+    payload = np.random.default_rng(0).bytes(2**14) * 16
+    with file.open("wb") as stream:
+        writer = Writer(stream, chunk_size=2**22, compression=CompressionType.ZSTD)
+        writer.start()
+        channel = writer.register_channel("/scan", "cdr", 0)
+        for k in range(768 * 4):
+            writer.add_message(channel, k, payload, k, k)
+        writer.finish()
+    assert file.stat().st_size < 16 * 2**20
+    assert confined(count_of, file, mib=192) == (3072, 3072 * len(payload), [])
+
+
+def count_of(path):
+    bag, count, size = open_bag(path), 0, 0
+    for message in bag.messages(set(bag.topics)):
+        count, size = count + 1, size + len(message.cdr)
+    return count, size, bag.losses
+
+
+def test_F14_of_many_parts_few_are_open_at_once(tmp_path, messages):
+    for k in range(0, len(messages), 2):
+        write_mcap(tmp_path / f"drive_{k // 2}.mcap", messages[k : k + 2])
+    parts = len(list(tmp_path.glob("*.mcap")))
+    assert parts > 60
+    got, losses = confined(with_few_descriptors, tmp_path)
+    assert (got, losses) == (messages, [])
+
+
+def with_few_descriptors(path):
+    most = len(os.listdir("/proc/self/fd")) + 10
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    return read(path)
+
+
+def test_F15_of_a_file_that_is_still_being_written_what_is_whole_is_read(tmp_path, messages):
+    file = tmp_path / "growing.mcap"
+    with file.open("wb") as stream:
+        writer = Writer(stream, chunk_size=5_000)
+        writer.start(profile="ros2")
+        channels = {
+            topic: writer.register_channel(
+                topic, "cdr", writer.register_schema(name, "ros2msg", definition(name).encode())
+            )
+            for topic, name in TOPICS.items()
+        }
+        seen = 0
+        for k, m in enumerate(messages):
+            writer.add_message(channels[m.topic], m.log_ns, m.cdr, m.log_ns, k)
+            if k % 30 == 29:
+                stream.flush()
+                got, losses = read(file)
+                assert got == messages[: len(got)]
+                assert seen < len(got) <= k + 1
+                assert len(losses) == 1
+                seen = len(got)
+        writer.finish()
+    assert read(file) == (messages, [])
