@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.graph_file import EDGE_TAGS, G2oFile
 from graph_slam_ros.graph import Gaussian, Graph, Loss
@@ -47,7 +47,10 @@ class Moved:
 
 @dataclass(frozen=True, slots=True)
 class Influence:
-    """How far the last keyframe moves, in metres, when an edge is taken out: to first order, and solved again."""
+    """How far the last keyframe moves, in metres, when an edge is taken out: to first order, and solved again.
+
+    The latter is inf where a vertex is undetermined without the edge.
+    """
 
     edge: int
     first_order_m: float
@@ -91,6 +94,8 @@ class SavedGraph:
     def solve(self, without: Iterable[int] = (), let_in: Sequence[int] = (), loss: Loss | None = None) -> Solver:
         """Solve what is in, but for some edges, and with others, which then count fully; from the saved estimate.
 
+        A landmark that is left without edges is left out; a keyframe is not.
+
         Parameters
         ----------
         loss : of everything that may be wrong, instead of the run's
@@ -114,15 +119,13 @@ class SavedGraph:
         if loss is not None:
             settings = replace(settings, losses={label: [loss] for label in settings.losses})
         solver = Solver(graph, settings)
-        solver.add(np.unique([v for e in edges for v in _ends(graph, e)]), edges)
+        solver.add(np.unique([*self.keyframes, *(v for e in edges for v in _ends(graph, e))]), edges)
         solver.optimize()
         return solver
 
     def moved(self, solver: Solver) -> Moved:
         """Compare a solution with that of the run."""
-        there = set(solver.vertices.tolist())
-        known = [vertex for vertex in self.keyframes if vertex in there]
-        a, b = self._was.estimate(known), solver.estimate(known)
+        a, b = self._was.estimate(self.keyframes), solver.estimate(self.keyframes)
         distance = np.linalg.norm(b[:, : self.space.dimensions] - a[:, : self.space.dimensions], axis=1)
         turned = self.space.angle(self.space.group.between(tuple(a[-1]), tuple(b[-1])))
         inside = np.array([e.edge for e in self.entries if e.is_in], dtype=np.int64)
@@ -132,7 +135,7 @@ class SavedGraph:
             self._was.evaluate(),
             solver.evaluate(),
             (float(distance[-1]), float(turned)),
-            (known[int(distance.argmax())], float(distance.max())),
+            (self.keyframes[int(distance.argmax())], float(distance.max())),
             [(int(inside[k]), float(before[k]), float(after[k])) for k in worse],
         )
 
@@ -143,7 +146,11 @@ class SavedGraph:
         out = []
         for k in np.argsort(-first, kind="stable")[:count].tolist():
             edge = judged[k].edge
-            out.append(Influence(edge, float(first[k]), self.moved(self.solve([edge])).final[0]))
+            try:
+                exact_m = self.moved(self.solve([edge])).final[0]
+            except (GaugeError, SingularError):
+                exact_m = np.inf
+            out.append(Influence(edge, float(first[k]), exact_m))
         return sorted(out, key=lambda one: -one.exact_m)
 
     def first_order(self, edge: int) -> Array:

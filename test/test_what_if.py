@@ -10,6 +10,8 @@ from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.ledger_file import read_ledger
+from graph_slam_ros.run import RunRecorder
+from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.what_if import SavedGraph
 
 
@@ -96,6 +98,33 @@ def test_a_landmark_without_its_sightings_is_left_out_and_what_determines_nothin
         saved.solve(without=[99999])
     with pytest.raises(GraphSlamError, match=r"gauge|position"):
         saved.solve(without=[e.edge for e in saved.entries if e.label == "anchor"])
+
+
+def test_what_leaves_a_keyframe_without_edges_is_refused(replayed, saved, capsys):
+    last = saved.keyframes[-1]
+    for without in ([e.edge for e in saved.entries], [e.edge for e in saved.entries if last in e.vertices]):
+        code, out, err = told(capsys, "solve", replayed[1], "--without", *without)
+        assert (code, out, "nothing fixes the gauge of vertex" in err, err.count("\n")) == (2, "", True, 1)
+
+
+def test_influence_tells_which_edges_cannot_be_done_without(tmp_path, capsys):
+    """Two bearings determine a landmark, one does not."""
+    recorder = RunRecorder(tmp_path / "run", Config())
+    slam = GraphSlam(Config(), sink=recorder.sink)
+    for k in range(30):
+        slam.process(Odometry(1_000_000_000 + k * 100_000_000, (0.1 * k, 0.0, 0.0)))
+        if k in (5, 25):
+            bearing = float(np.arctan2(2.0, 1.5 - 0.1 * k))
+            seen = (Sighting("a", "bearing", (bearing,), (1e-4,)),)
+            slam.process(Sightings(1_000_000_000 + k * 100_000_000, "seen", seen))
+    slam.process(Control("end"))
+    slam.process(Control("optimize"))
+    run = recorder.save(slam)
+    landmarks = {e.edge for e in read_ledger(run) if e.label == "landmarks"}
+    assert {one.edge for one in SavedGraph(run).influences(5) if one.exact_m == np.inf} == landmarks
+    assert len(landmarks) == 2
+    code, out, err = told(capsys, "influence", run)
+    assert (code, out.count("undetermined"), err) == (0, 2, "")
 
 
 def test_the_commands_say_what_moves(replayed, saved, capsys):

@@ -47,7 +47,8 @@ def influence(args: argparse.Namespace) -> int:
         f"  {'edge':<8s} {'':24s} {'first order':>12s} {'solved again':>12s}",
     )
     for one in run.influences(args.count):
-        told = f"{one.first_order_m:10.4f} m {one.exact_m:10.4f} m"
+        exact = f"{one.exact_m:10.4f} m" if math.isfinite(one.exact_m) else "undetermined"
+        told = f"{one.first_order_m:10.4f} m {exact}"
         console.say(f"  {one.edge:<8d} {run.edge(one.edge).about:24s} {told}")
     return console.DONE
 
