@@ -142,12 +142,18 @@ def main() -> None:
     parser.add_argument("--recordings", action="store_true", help="recorded drives among landmarks alone")
     parser.add_argument("--policy", type=_policies, metavar="NAME,...", help=f"of {', '.join(POLICIES)}")
     parser.add_argument("--rate", type=_rates, default=[0.3], metavar="R,...", help="false ones of all (0.3)")
-    parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help=f"default: {SEEDS}; peers: {FEW_SEEDS}")
-    parser.add_argument("--patience", type=float, default=PATIENCE_S, metavar="S", help="CPU seconds for a peer's run")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="seeds at a time")
-    parser.add_argument("--poses", type=int, metavar="N", help="the first N poses of each graph only")
+    parser.add_argument(
+        "--seeds", type=options.count, default=SEEDS, metavar="N", help=f"default: {SEEDS}; peers: {FEW_SEEDS}"
+    )
+    parser.add_argument(
+        "--patience", type=options.seconds, default=PATIENCE_S, metavar="S", help="CPU seconds for a peer's run"
+    )
+    parser.add_argument("--jobs", type=options.count, default=1, metavar="N", help="seeds at a time")
+    parser.add_argument("--poses", type=options.count, metavar="N", help="the first N poses of each graph only")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="of what was run; what is there is not run again")
     args = parser.parse_args()
+    if args.keep is not None and args.keep.exists() and not args.keep.is_dir():
+        parser.error(f"argument --keep: {args.keep} is not a folder")
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         race = Race(args.peers, args.seeds, args.patience, args.jobs, Kept(args.keep or Path(folder)))
@@ -158,6 +164,8 @@ def main() -> None:
                         rows += race.cell(course, policy, rate)
                     except GraphSlamError as error:
                         options.say(f"skipped: {error}")
+    if not rows:
+        sys.exit(2)  # why has been said
     about = f"seeds: {args.seeds}, of peers at most {FEW_SEEDS}; {args.patience:g} s of patience with each of these"
     table.finish(table.results("robust", rows, about), args.json)
 

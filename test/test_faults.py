@@ -244,6 +244,7 @@ def test_a_measurement_that_two_faults_hit_stands_once_with_both_and_with_what_w
         ("slip:fast=2", "slip: no option 'fast'; it has at, lasting, factor"),
         ("slip:at=1.5", r"slip: at: 1.5 is not in \[0, 1\]"),
         ("slip:at", "'at' is not key=value"),
+        ("slip:at=0.1,factor=2,at=0.2", "slip: at is given twice"),
         ("slip:at=1.0", "nothing is driven any more"),
         ("swapped_ids:at=0.0", r"swapped_ids: needs 2 landmarks that are seen often enough; there are 0"),
         ("reused_ids:pairs=40", "needs 80 landmarks"),
@@ -389,6 +390,7 @@ def test_a_recording_with_faults_has_their_table_beside_it(tmp_path, capsys):
         (["{graph}", "--set", "blocks=4", "--out", "{out}.g2o"], "no use for --set: it is no world"),
         (["{graph}", "--out", "{graph}"], "cannot be read from and written to at once"),
         (["{graph}", "--fault", "swapped_ids", "--out", "{out}.g2o"], "swapped_ids: needs 2 landmarks"),
+        (["{graph}", "--fault", "outliers", "--out", "{out}.g2o"], "outliers: no landmark is seen"),
         (["none.g2o", "--out", "{out}.g2o"], "no world 'none.g2o'"),
     ],
 )

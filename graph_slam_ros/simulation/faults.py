@@ -144,6 +144,8 @@ def _moved_landmarks(draft: Draft, fault: MovedLandmarks, rng: Generator) -> Non
 
 def _outliers(draft: Draft, fault: Outliers, rng: Generator) -> None:
     n = draft.space.dimensions
+    if not draft.sightings:
+        raise GraphSlamError("outliers: no landmark is seen")
     for k in _part(rng, len(draft.sightings), fault.rate):
         s, longer = draft.sightings[k], float(rng.uniform(0.2, 1.0)) * fault.most_m
         if s.kind == "bearing":
@@ -272,7 +274,13 @@ class Fault:
     def parsed(cls, text: str) -> "Fault":
         """From ``KIND`` or ``KIND:KEY=VALUE,...``; as ``named``."""
         kind, separator, options = text.partition(":")
-        return cls.named(kind, **dict(parse_setting(one) for one in options.split(",") if separator))
+        values: dict[str, Any] = {}
+        for one in options.split(",") if separator else ():
+            name, value = parse_setting(one)
+            if name in values:
+                raise GraphSlamError(f"{kind}: {name} is given twice")
+            values[name] = value
+        return cls.named(kind, **values)
 
 
 def put_faults(draft: Draft, faults: Sequence[Fault], seed: int) -> None:
