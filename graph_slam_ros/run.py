@@ -25,7 +25,7 @@ import numpy as np
 
 from graph_slam_ros import __version__
 from graph_slam_ros.errors import ConfigError, GraphSlamError
-from graph_slam_ros.formats.durable import NEW, replaced
+from graph_slam_ros.formats.durable import NEW, AppendedFile, replaced, sync_folder
 from graph_slam_ros.formats.g2o_writer import g2o_text
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.ingest import IngestWriter, ingest_files, part_name
@@ -144,12 +144,16 @@ class RunRecorder:
         self._ingest: IngestWriter | None = None
         self._bag: BagWriter | None = None
         self._accepted: list[Measurement] = []  # and not written yet
+        self._ended_journals: list[AppendedFile] = []  # earlier parts that wait for the disk
+        self._ended_bags: list[AppendedFile] = []
         self._next_path_at = 1.0
         _make_room(self.folder)
+        self._ingest = IngestWriter(self._part_of("ingest"))  # from the start: it makes the folder a run
         try:
-            self._ingest = IngestWriter(self._part_of("ingest"))  # from the start: it makes the folder a run
+            self._ingest.file.flush()
             self._put(_CONFIG, parameters_text(config.as_mapping()))
         except OSError as error:
+            self._ingest.file.abandon()
             raise RunError(f"{self.folder}: {error.strerror}") from None
 
     def sink(self, measurement: Measurement) -> None:
@@ -166,20 +170,24 @@ class RunRecorder:
         OSError
             It is kept, and written by the next call that can; or the disk did not take what was flushed before.
         """
-        accepted, self._accepted = self._accepted, []
-        if accepted and self._ingest is None:
-            self._ingest = IngestWriter(self._part_of("ingest"))
+        self._fill()
+        _close_all(self._ended_journals)
         if self._ingest is not None:
-            if accepted:
-                self._ingest.write(map(to_record, accepted))
-            else:
-                self._ingest.file.flush()
+            self._ingest.file.flush()
             self._sync_if_due(self._ingest)
+
+    def _fill(self) -> None:
+        accepted, self._accepted = self._accepted, []
+        if accepted:
+            if self._ingest is None:
+                self._ingest = IngestWriter(self._part_of("ingest"))
+            self._ingest.write(map(to_record, accepted))
 
     @property
     def unwritten(self) -> int:
         """Bytes of the journal that wait for room on the disk."""
-        return self._ingest.file.waiting if self._ingest is not None else 0
+        present = [self._ingest.file] if self._ingest is not None else []
+        return sum(file.waiting for file in self._ended_journals + present)
 
     def _sync_if_due(self, ingest: IngestWriter) -> None:
         """The disk may take long: nobody waits for it, but the next that would ask it again."""
@@ -247,17 +255,25 @@ class RunRecorder:
         return f"{zlib.crc32(data):08x}"
 
     def close(self) -> None:
-        """End the present part of the recording. Raises OSError: what the disk does not take any more is lost."""
-        try:
-            self.flush()
-            if self._syncing is not None:
-                self._syncing.result()
-        finally:
-            ending = [writer for writer in (self._ingest, self._bag) if writer is not None]
-            self._part += bool(ending)
-            self._ingest = self._bag = self._syncing = None
-            for writer in ending:
-                writer.close()
+        """End the present part of the recording.
+
+        Raises
+        ------
+        OSError
+            What the disk did not take is kept: the next ``flush`` or ``close`` tries again.
+        """
+        self._fill()
+        failed = self._syncing.exception() if self._syncing is not None else None
+        self._part += self._ingest is not None or self._bag is not None
+        if self._ingest is not None:
+            self._ended_journals.append(self._ingest.end())
+        if self._bag is not None:
+            self._ended_bags.append(self._bag.end())
+        self._ingest = self._bag = self._syncing = None
+        _close_all(self._ended_journals)
+        _close_all(self._ended_bags)
+        if failed is not None:
+            raise failed
 
     def _record_map(self, slam: GraphSlam) -> None:
         stamp = slam.keyframes[-1].stamp_ns
@@ -353,13 +369,24 @@ def _is_of_a_start(file: Path) -> bool:
 def _make_room(folder: Path) -> None:
     check_room(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        if not folder.exists():
+            folder.mkdir(parents=True)
+            sync_folder(folder.parent)
         _clear(folder)
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None
 
 
 def _clear(folder: Path) -> None:
-    for file in folder.iterdir():
-        if file.name in _RESULTS or _is_of_a_start(file):
-            file.unlink()
+    """What makes it a run goes last: who is stopped half-way leaves a folder that may be cleared again."""
+    there = sorted(folder.iterdir(), reverse=True)
+    results = [file for file in there if file.name.removesuffix(NEW) in _RESULTS]
+    for file in results + [file for file in there if _is_of_a_start(file)]:
+        file.unlink()
+
+
+def _close_all(files: list[AppendedFile]) -> None:
+    """One after another; those that are closed are taken out."""
+    while files:
+        files[0].close()
+        del files[0]

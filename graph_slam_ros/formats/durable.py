@@ -10,14 +10,14 @@ class AppendedFile:
     """A file that is begun anew and only grows; what cannot be written is kept, and written the next time.
 
     What was flushed outlives the process, what was synced a power cut. There are no holes: a process that dies in the
-    middle leaves the first part of what it had to say.
+    middle leaves the first part of what it had to say. The first flush makes the file.
     """
 
     def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        self._path = path
+        self._fd = _NOT_MADE
         self._end = 0
         self._waiting = bytearray()
-        sync_folder(path.parent)
 
     def write(self, data: bytes) -> int:
         """Append; it is in the file after the next flush."""
@@ -35,6 +35,8 @@ class AppendedFile:
 
     def flush(self) -> None:
         """Write what waits. Raises OSError: then some of it waits still."""
+        if self._fd == _NOT_MADE:
+            self._fd = _made(self._path)
         while self._waiting:
             written = os.pwrite(self._fd, self._waiting, self._end)
             self._end += written
@@ -45,12 +47,30 @@ class AppendedFile:
         os.fsync(self._fd)
 
     def close(self) -> None:
-        """Flush, sync and close; what the disk does not take is lost, and raises OSError."""
-        try:
+        """Flush, sync and close. Raises OSError: then it is open still, and may be closed again."""
+        if self._fd != _CLOSED:
             self.flush()
             self.sync()
-        finally:
-            os.close(self._fd)
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close it as it is on the disk: what waits is lost."""
+        fd, self._fd = self._fd, _CLOSED
+        if fd >= 0:
+            os.close(fd)
+
+
+_NOT_MADE, _CLOSED = -1, -2
+
+
+def _made(path: Path) -> int:
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+    try:
+        sync_folder(path.parent)
+    except OSError:
+        os.close(fd)
+        raise
+    return fd
 
 
 @contextlib.contextmanager

@@ -24,10 +24,7 @@ _SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}},
 
 
 class IngestWriter:
-    """Appends records to one new file.
-
-    What could not be written, since the disk is full, waits: the next ``flush`` writes it.
-    """
+    """Appends records to one new file: they wait in memory for the next ``flush`` of that."""
 
     def __init__(self, path: Path) -> None:
         self.file = AppendedFile(path)
@@ -38,17 +35,15 @@ class IngestWriter:
         self._channels: dict[str, int] = {}
         self._sequence = 0
         self._stamp_ns = 0
-        self.file.flush()
 
     def write(self, several: Iterable[Mapping[str, Any]]) -> None:
-        """Append records, as one chunk; one without a stamp is filed under the last. Raises OSError, and keeps them."""
+        """Append records, as one chunk; one without a stamp is filed under the last."""
         *others, last = several
         for record in others:
             self._add(record)
         self._chunk.is_full = True
         self._add(last)
         self._chunk.is_full = False
-        self.file.flush()
 
     def _add(self, record: Mapping[str, Any]) -> None:
         kind = record["type"]
@@ -59,10 +54,14 @@ class IngestWriter:
         self._writer.add_message(self._channels[kind], self._stamp_ns, data, self._stamp_ns, self._sequence)
         self._sequence += 1
 
+    def end(self) -> AppendedFile:
+        """Append the index; returns the file, which is to be closed."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        return self.file
+
     def close(self) -> None:
         """Write the index and close the file."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self.file.close()
+        self.end().close()
 
 
 class _Chunk(int):

@@ -355,10 +355,14 @@ class BagWriter:
         self._writer.add_message(self._channels[topic], stamp_ns, cdr, stamp_ns, sequence)
         self._file.flush()
 
+    def end(self) -> AppendedFile:
+        """Append the index; returns the file, which is to be closed."""
+        self._writer.finish()
+        return self._file
+
     def close(self) -> None:
         """Write the index and close the file."""
-        self._writer.finish()
-        self._file.close()
+        self.end().close()
 
     def __enter__(self) -> "BagWriter":
         return self
