@@ -137,7 +137,7 @@ def seen(stamp_ns):
     return [Sightings(stamp_ns, "landmarks", (Sighting("a", "position", (1.0, 0.0), (1.0, 0.0, 0.0, 1.0)),))]
 
 
-def test_what_is_ahead_of_the_clock_waits_for_it_and_keeps_its_order(monkeypatch):
+def test_B6_what_is_ahead_of_the_clock_waits_for_it_and_keeps_its_order(monkeypatch):
     clock, refused = [10 * NS], []
     ahead = Ahead(1.0, lambda: clock[0], refused.append)
     now, soon, then = seen(11 * NS), seen(13 * NS), seen(5 * NS)

@@ -92,7 +92,7 @@ def test_who_joins_after_the_drive_gets_path_pose_landmarks_and_graph_and_the_wh
 # -- what does not fit -------------------------------------------------------------------------------------------------
 
 
-def test_what_keeps_odometry_from_coming_is_named_within_two_seconds(tmp_path):
+def test_B23_a_qos_that_does_not_match_and_all_else_that_keeps_odometry_from_coming_is_named(tmp_path):
     parameters = "output.folder:=''", "inputs.reliable:=true"
     with node(*parameters) as n, robot(hears=("/diagnostics",), sends=()) as other:
         other.until_it_says("WAITING", "/odom: nobody publishes this odometry")
@@ -147,7 +147,7 @@ def test_it_waits_is_well_is_degraded_while_odometry_is_silent_and_well_again():
     assert [s for s in ("WAITING", "OK", "DEGRADED") if s in n.said] == ["WAITING", "OK", "DEGRADED"], "the log, too"
 
 
-def test_a_clock_that_does_not_come_is_named_where_simulated_time_is_used():
+def test_B13_a_clock_that_does_not_come_is_named_where_simulated_time_is_used():
     with node("output.folder:=''", "use_sim_time:=true") as n, robot(hears=("/diagnostics", "/tf", "path")) as r:
         r.wait_for_node()
         drive = Drive()

@@ -2,11 +2,21 @@
 
 import itertools
 import json
+import time
 
 import pytest
 from live_drive import TAGS, Drive, distance
 from live_nodes import ENVIRONMENT, node, often, own_domain, replayed, results, robot, until
+from rclpy.clock import ClockType, JumpThreshold
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.parameter import Parameter
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
+
+from graph_slam_ros.ros.live.reckoning import Reckoning
+from graph_slam_ros.ros.node import GraphSlamNode
+from graph_slam_ros.slam import Odometry
 
 NS = 10**9
 HEARS = "/diagnostics", "/tf", "pose"
@@ -70,7 +80,7 @@ def simulated(folder, *parameters):
 # -- jumps -------------------------------------------------------------------------------------------------------------
 
 
-def test_when_the_clock_jumps_back_the_map_stays_a_segment_begins_and_transforms_go_on(tmp_path):
+def test_B7_when_the_clock_jumps_back_the_map_stays_a_segment_begins_and_transforms_go_on(tmp_path):
     with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
         r.wait_for_node()
         played = Played(r)
@@ -123,7 +133,7 @@ def test_messages_of_before_the_jump_that_come_after_it_hold_nothing_up(tmp_path
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
 
-def test_a_clock_that_goes_back_a_little_is_no_jump(tmp_path):
+def test_B8_a_clock_that_goes_back_a_little_is_no_jump(tmp_path):
     with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
         r.wait_for_node()
         played = Played(r)
@@ -137,7 +147,7 @@ def test_a_clock_that_goes_back_a_little_is_no_jump(tmp_path):
     assert "jumped" not in n.said
 
 
-def test_odometry_that_comes_before_the_clock_is_of_the_same_segment(tmp_path):
+def test_B14_odometry_that_comes_before_the_clock_is_of_the_same_segment(tmp_path):
     with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
         r.wait_for_node()
         played = Played(r)
@@ -149,7 +159,51 @@ def test_odometry_that_comes_before_the_clock_is_of_the_same_segment(tmp_path):
         assert n.stop()[0] == 0
 
 
-def test_where_that_is_asked_for_a_jump_back_saves_the_run_and_begins_another(tmp_path):
+def test_B14_where_another_clock_is_used_a_segment_begins_and_the_map_stays(tmp_path):
+    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=HEARS) as r:
+        r.wait_for_node()
+        drive = Drive()
+        r.until_it_says("OK", spin=drive.pace(r))
+        r.settle()
+        assert r.set({"use_sim_time": True}) == (True, "")
+        played = Played(r)
+        played.drive.truth, played.drive.odom = drive.truth, drive.odom
+        r.heard["pose"].clear()
+        r.until_it_says("OK", spin=played.step)
+        until(lambda: len(r.heard["pose"]) > 10, played.step, "poses by the other clock")
+        assert r.graph()["segments"] == 2
+        assert off_by(r, played.drive) < 1.0, "still in the same map"
+        assert n.stop()[0] == 0
+    assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
+
+
+def test_B15_what_is_raised_after_a_jump_reaches_nobody_and_is_counted(monkeypatch):
+    context = Context()
+    context.init(args=[], domain_id=int(ENVIRONMENT["ROS_DOMAIN_ID"]))
+    monkeypatch.setattr(Reckoning, "forget", lambda self: 1 // 0)
+    parameters = [Parameter("output.folder", value=""), Parameter("use_sim_time", value=True)]
+    slam = GraphSlamNode(context=context, parameter_overrides=parameters)
+    called = []
+    try:
+        slam.trigger_configure()
+        slam.trigger_activate()
+        back = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+        after = slam.get_clock().create_jump_callback(back, post_callback=called.append)
+        for seconds in (100, 40):
+            slam.get_clock().set_ros_time_override(Time(seconds=seconds, clock_type=ClockType.ROS_TIME))
+            for k in range(2):
+                slam._run._take([Odometry((seconds + k) * NS, (float(k), 0.0, 0.0), None, "odom")], b"")
+            until(lambda: slam._run._session.estimate is not None, time.sleep, "estimate")
+        assert len(called) == 1, "those who come after it are called"
+        assert slam._run.counters["node", "ZeroDivisionError"] == 1
+        after.unregister()
+    finally:
+        slam.finish(1.0)
+        slam.destroy_node()
+        context.try_shutdown()
+
+
+def test_B7_where_that_is_asked_for_a_jump_back_saves_the_run_and_begins_another(tmp_path):
     with simulated(tmp_path / "run", "time.on_jump:=reset") as n, robot(hears=HEARS) as r:
         r.wait_for_node()
         played = Played(r)
@@ -168,7 +222,7 @@ def test_where_that_is_asked_for_a_jump_back_saves_the_run_and_begins_another(tm
         assert replayed(tmp_path / run, tmp_path / f"of_{run}") == results(tmp_path / run)
 
 
-def test_where_that_is_asked_for_nothing_is_taken_after_a_jump_until_reset(tmp_path):
+def test_B7_where_that_is_asked_for_nothing_is_taken_after_a_jump_until_reset(tmp_path):
     with simulated(tmp_path / "run", "time.on_jump:=stop") as n, robot(hears=HEARS) as r:
         r.wait_for_node()
         played = Played(r)
@@ -185,7 +239,7 @@ def test_where_that_is_asked_for_nothing_is_taken_after_a_jump_until_reset(tmp_p
     assert before <= numbers(tmp_path / "run-1")["keyframes"] <= before + 1, "what waited for its turn"
 
 
-def test_odometry_from_the_future_is_refused_and_holds_no_transform_up(tmp_path):
+def test_B6_odometry_from_the_future_is_refused_and_holds_no_transform_up(tmp_path):
     with (
         node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n,
         robot(hears=(*HEARS, "odometry")) as r,
@@ -212,7 +266,7 @@ def test_odometry_from_the_future_is_refused_and_holds_no_transform_up(tmp_path)
 # -- pauses and loops --------------------------------------------------------------------------------------------------
 
 
-def test_while_the_clock_is_paused_nothing_is_silent_and_services_answer(tmp_path):
+def test_B12_while_the_clock_is_paused_nothing_is_silent_and_services_answer(tmp_path):
     with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
         r.wait_for_node()
         played = Played(r)
@@ -230,7 +284,7 @@ def test_while_the_clock_is_paused_nothing_is_silent_and_services_answer(tmp_pat
         assert n.stop()[0] == 0
 
 
-def test_a_recording_that_is_played_again_and_again_adds_segments_to_one_map(tmp_path):
+def test_B11_a_recording_that_is_played_again_and_again_adds_segments_to_one_map(tmp_path):
     loops = often(3)
     with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
         r.wait_for_node()

@@ -69,13 +69,13 @@ def test_what_is_older_than_the_window_is_released_by_odometry_and_not_by_landma
     assert queue.flush() == [odometry(200), seen(500)]
 
 
-def test_landmarks_wait_for_the_first_odometry():
+def test_B16_landmarks_wait_for_the_first_odometry():
     queue = order()
     assert queue.push(seen(10)) == []
     assert queue.push(odometry(100)) == [seen(10)]
 
 
-def test_odometry_older_than_what_was_released_is_late_and_counted():
+def test_B2_odometry_older_than_what_was_released_is_late_and_counted():
     queue = order()
     through(queue, [odometry(0), odometry(100)])
     assert not queue.accepts(odometry(99))
@@ -101,7 +101,7 @@ def test_a_landmark_message_of_the_future_makes_no_odometry_late():
     assert queue.accepts(odometry(20))
 
 
-def test_a_full_queue_refuses_landmarks_and_counts_their_sightings():
+def test_B16_a_full_queue_refuses_landmarks_and_counts_their_sightings():
     queue = order(max_waiting=3)
     for m in (seen(k, "/tags") for k in range(5)):
         assert not queue.accepts(m) or queue.push(m) == []
@@ -110,7 +110,7 @@ def test_a_full_queue_refuses_landmarks_and_counts_their_sightings():
     assert len(queue.push(odometry(100))) == 3
 
 
-def test_odometry_that_repeats_one_stamp_for_ever_fills_no_memory():
+def test_B22_odometry_that_repeats_one_stamp_for_ever_fills_no_memory():
     queue = order(max_waiting=3)
     released = through(queue, [odometry(7, x) for x in range(10)])
     assert len(released) == 3

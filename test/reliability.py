@@ -1,0 +1,29 @@
+"""How often what may fail was tried, and how often it failed: told at the end of a session, a line for each test.
+
+``make soak`` tries more (``GRAPH_SLAM_SOAK``).
+"""
+
+import os
+from collections import Counter, defaultdict
+
+_TOLD = defaultdict(Counter)
+_WORST = defaultdict(dict)
+
+
+def times(quick, long):
+    """How often to try: so often in ``make test``, and in ``make soak``."""
+    return long if os.environ.get("GRAPH_SLAM_SOAK") else quick
+
+
+def tell(name, *, worst=None, **numbers):
+    """Add to the numbers of a line; of ``worst`` the largest is told."""
+    _TOLD[name].update(numbers)
+    for key, value in (worst or {}).items():
+        _WORST[name][key] = max(value, _WORST[name].get(key, value))
+
+
+def lines():
+    """What was told."""
+    for name, numbers in _TOLD.items():
+        worst = [f"worst_{key}={value:.3g}" for key, value in _WORST[name].items()]
+        yield " ".join(["RELIABILITY", name, *(f"{key}={number}" for key, number in numbers.items()), *worst])
