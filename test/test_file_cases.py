@@ -2,12 +2,15 @@
 
 import bz2
 import gzip
+import itertools
 import os
+import pickle
 import re
 import resource
 import shutil
 import sqlite3
 import struct
+import time
 from contextlib import closing
 from dataclasses import replace
 
@@ -35,8 +38,12 @@ from recordings import (
 )
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from graph_slam_ros.batch import optimize
 from graph_slam_ros.cli import main
+from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
 from graph_slam_ros.formats import mcap_records
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.formats.parameters import parse_setting, read_parameters
 from graph_slam_ros.replay import choose_inputs, replay
 from graph_slam_ros.ros.bag import BagError, Topic, open_bag
 from graph_slam_ros.ros.definitions import recorded_decoder
@@ -719,3 +726,225 @@ def test_F15_of_a_file_that_is_still_being_written_what_is_whole_is_read(tmp_pat
                 seen = len(got)
         writer.finish()
     assert read(file) == (messages, [])
+
+
+# -- parameters -----------------------------------------------------------------------------------------------------
+
+
+def parameters(folder, text):
+    file = folder / "parameters.yaml"
+    file.write_text(text)
+    return read_parameters(file)
+
+
+@pytest.mark.parametrize(
+    "text, hint",
+    [
+        ("0123", "0123 is 83 to YAML: write 83, or '0123' for a text"),
+        ("12:30:45", "12:30:45 is 45045 to YAML: write 45045, or '12:30:45' for a text"),
+        ("1:30.5", "1:30.5 is 90.5 to YAML"),
+        ("1_000", "1_000 is 1000 to YAML"),
+        ("0b11", "0b11 is 3 to YAML"),
+        ("yes", "yes is true to YAML: write true, or 'yes' for a text"),
+        ("Off", "Off is false to YAML: write false, or 'Off' for a text"),
+    ],
+)
+def test_F29_what_yaml_reads_in_its_own_way_is_refused_with_a_hint(tmp_path, text, hint):
+    with pytest.raises(ConfigError, match=re.escape(f"parameters.yaml: line 2: {hint}")):
+        parameters(tmp_path, f"tf:\n  stamp: {text}\n")
+    with pytest.raises(ConfigError, match=re.escape(f"tf.stamp: {hint}")):
+        parse_setting(f"tf.stamp={text}")
+    assert parameters(tmp_path, f"tf:\n  stamp: '{text}'\n") == {"tf": {"stamp": text}}
+
+
+def test_F29_numbers_and_truth_values_are_read_as_everybody_does(tmp_path):
+    texts = {"1e5": 1e5, "-2.5E-3": -0.0025, ".5": 0.5, "0": 0, "-7": -7, "0x1f": 31, "True": True, "false": False}
+    values = parameters(tmp_path, "".join(f"k{k}: {text}\n" for k, text in enumerate(texts)))
+    assert [(value, type(value)) for value in values.values()] == [(value, type(value)) for value in texts.values()]
+
+
+def test_F30_a_key_given_twice_is_refused_with_its_line(tmp_path):
+    with pytest.raises(ConfigError, match=r"parameters\.yaml: line 3: 'stamp' is given twice"):
+        parameters(tmp_path, "tf:\n  stamp: now\n  stamp: now\n")
+
+
+DEEP, SHORT = "[" * 5000, "- " * 3000
+BILLION_LAUGHS = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in itertools.pairwise("abcdefghij"))
+MERGED = "a: &a {x: 1}\nb: {<<: *a}\n"
+HOSTILE = {
+    "python/object": ("tf: !!python/object/apply:os.system [id]", "line 1: the tag .*python/object.* is not read"),
+    "tag that cannot be": ("tf: !!int ''", "line 1: the tag tag:yaml.org,2002:int is not read"),
+    "alias bomb": (BILLION_LAUGHS, "line 2: aliases are not read"),
+    "alias of itself": ("a: &a [*a]", "line 1: aliases are not read"),
+    "merge": (MERGED, "line 2: aliases are not read"),
+    "nested lists": (DEEP, "line 1: more than 50 levels"),
+    "nested blocks": (SHORT, "line 1: more than 50 levels"),
+    "nested maps": ("{a: " * 3000, "line 1: more than 50 levels"),
+    "many values": ("a: [" + "1," * 500_000 + "]", "line 1: more than 50 levels, or than 20000 values"),
+    "large": ("#" * 2**20 + "#", "larger than 1048576 bytes"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_F31_hostile_yaml_is_refused_at_once(tmp_path, name):
+    text, complaint = HOSTILE[name]
+    begun = time.process_time()
+    with pytest.raises(ConfigError, match=rf"parameters\.yaml: {complaint}"):
+        parameters(tmp_path, text)
+    assert time.process_time() - begun < 5.0
+
+
+def test_F31_50_levels_and_the_tag_of_a_text_are_read(tmp_path):
+    assert str(parameters(tmp_path, "a: " + "[" * 49 + "]" * 49)).count("[") == 49
+    assert parameters(tmp_path, "a: !!str 012") == {"a": "012"}
+
+
+def test_F31_what_is_no_file_of_parameters_is_refused_and_not_waited_for(tmp_path):
+    make_fifo(tmp_path / "fifo.yaml")
+    for path, why in ((tmp_path / "fifo.yaml", "not a file"), (tmp_path, "not a file"), (tmp_path / "none", "No such")):
+        with pytest.raises(ConfigError, match=f"{re.escape(str(path))}: {why}"):
+            read_parameters(path)
+
+
+@pytest.mark.parametrize(
+    "content", [pickle.dumps({"tf": 1}), b"\x93NUMPY\x01\x00v\x00{'descr': '|O'}"], ids=["pickle", "npy"]
+)
+def test_F32_pickles_and_arrays_of_objects_are_no_file_of_ours(tmp_path, content):
+    for name, read_it in (("a.yaml", read_parameters), ("a.g2o", read_g2o), ("a.mcap", open_bag)):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(GraphSlamError, match=re.escape(name)):
+            read_it(tmp_path / name)
+
+
+# -- graphs ---------------------------------------------------------------------------------------------------------
+
+GRAPH = """\
+# two poses and a landmark
+VERTEX_SE2 10 0 0 0
+VERTEX_SE2 11 1.5 -2e-3 .25
+VERTEX_XY 7 3. +4
+EDGE_SE2 10 11 1 0 0.1 10 1 -2 20 3 30
+"""
+
+
+def graph_of(folder, text, **options):
+    file = folder / "graph.g2o"
+    file.write_text(text, encoding="utf-8")
+    return read_g2o(file, **options)
+
+
+def refused_and_left_out(folder, line, why):
+    """A bad line is named; lenient reading leaves it out, lists it, and reads the rest."""
+    text = f"{GRAPH}{line}\nFIX 11\n"
+    with pytest.raises(FormatError) as refusal:
+        graph_of(folder, text)
+    assert str(refusal.value).startswith(f"graph.g2o:{len(GRAPH.splitlines()) + 1}: ")
+    assert why in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+    file = graph_of(folder, text, lenient=True)
+    assert (file.ids[:3], file.graph.edge_count, file.fixed) == ([10, 11, 7], 1, [1])
+    assert file.graph.initial.values[3:6].tolist() == [1.5, -2e-3, 0.25]
+    assert file.skipped == [str(refusal.value)]
+
+
+@pytest.mark.parametrize(
+    "line, why",
+    [
+        ("VERTEX_SE2 12 1 2", "VERTEX_SE2 needs 4 fields after the tag, found 3"),
+        ("VERTEX_XY 12 1 2 3", "VERTEX_XY needs 3 fields after the tag, found 4"),
+        ("VERTEX_SE2", "needs 4 fields after the tag, found 0"),
+        ("EDGE_SE2 10 11 1 0 0.1 10 1 -2 20 3", "EDGE_SE2 needs 11 fields after the tag, found 10"),
+        ("EDGE_SE2 10 7 1 0 0.1 10 1 -2 20 3 30", "EDGE_SE2 to vertex 7, which is a VERTEX_XY"),
+        ("EDGE_SE2_XY 10 11 1 2 1 0 1", "EDGE_SE2_XY to vertex 11, which is a VERTEX_SE2"),
+        ("EDGE_SE2 11 11 1 0 0.1 10 1 -2 20 3 30", "edge from vertex 11 to itself"),
+        ("FIX", "FIX names no vertex"),
+    ],
+)
+def test_F20_a_bad_line_is_named_and_in_lenient_reading_left_out(tmp_path, line, why):
+    refused_and_left_out(tmp_path, line, why)
+
+
+@pytest.mark.parametrize(
+    "line, why",
+    [
+        ("VERTEX_SE2 11 1.5 -2e-3 .26", "vertex 11 was declared before, with other values"),
+        ("VERTEX_XY 11 1.5 -2e-3", "vertex 11 was declared before"),
+    ],
+)
+def test_F21_a_vertex_declared_otherwise_before_is_refused(tmp_path, line, why):
+    refused_and_left_out(tmp_path, line, why)
+
+
+@pytest.mark.parametrize(
+    "line, why",
+    [
+        ("VERTEX_SE2 12 1 2 nan", "'nan' is not a finite number"),
+        ("VERTEX_SE2 12 inf 2 3", "'inf' is not a finite number"),
+        ("VERTEX_SE2 12 1 -Infinity 3", "'-Infinity' is not a finite number"),
+        ("VERTEX_SE2 12 1e999 2 3", "'1e999' is not a finite number"),
+        ("VERTEX_SE2 12 1_0 2 3", "'1_0' is not a finite number"),
+        ("VERTEX_SE2 12 \u0661 2 3", "'\u0661' is not a finite number"),
+        ("VERTEX_SE2 12 0x10 2 3", "'0x10' is not a finite number"),
+        ("VERTEX_SE2 12 1,5 2 3", "'1,5' is not a finite number"),
+        ("VERTEX_SE2 12 . 2 3", "'.' is not a finite number"),
+        ("VERTEX_SE2 1.0 1 2 3", "'1.0' is not an id"),
+        ("VERTEX_SE2 \u0661 1 2 3", "'\u0661' is not an id"),
+        ("VERTEX_SE2 1_0 1 2 3", "'1_0' is not an id"),
+        ("VERTEX_SE2 99999999999999999999 1 2 3", "is not an id"),
+        ("EDGE_SE2 10 11 1 0 0.1 10 1 -2 20 3 nan", "'nan' is not a finite number"),
+        ("FIX x", "'x' is not an id"),
+    ],
+)
+def test_F23_what_is_no_plain_finite_number_or_id_is_refused(tmp_path, line, why):
+    refused_and_left_out(tmp_path, line, why)
+
+
+@pytest.mark.parametrize(
+    "line, why",
+    [
+        ("EDGE_SE2 10 12 1 0 0.1 10 1 -2 20 3 30", "edge to vertex 12, which is not declared"),
+        ("FIX 12", "FIX names vertex 12, which is not declared"),
+    ],
+)
+def test_F24_what_names_a_vertex_that_is_not_there_is_refused(tmp_path, line, why):
+    refused_and_left_out(tmp_path, line, why)
+
+
+@pytest.mark.parametrize(
+    "line, why",
+    [
+        ("EDGE_SE2 10 11 1 0 0.1 0 0 0 0 0 0", "information is not positive definite"),
+        ("EDGE_SE2 10 11 1 0 0.1 1 1 1 1 1 1", "information is not positive definite"),
+        ("EDGE_SE2 10 11 1 0 0.1 1 2 0 1 0 1", "information is not positive definite"),
+        ("EDGE_PRIOR_SE2 11 0 0 0 -1 0 0 1 0 1", "information is not positive definite"),
+        ("VERTEX_SE3:QUAT 12 0 0 0 0 0 0 0", "the quaternion is zero"),
+    ],
+)
+def test_F25_a_zero_quaternion_and_information_that_is_not_definite_are_refused(tmp_path, line, why):
+    refused_and_left_out(tmp_path, line, why)
+
+
+def test_F20_a_lenient_reading_ends_with_3_and_a_strict_one_with_2(tmp_path, capsys):
+    (tmp_path / "a.g2o").write_text(f"{GRAPH}EDGE_SE2 10\nFIX 10\nEDGE_SE2_XY 10 7 1 2 1 0 1\n")
+    assert main(["optimize", str(tmp_path / "a.g2o")]) == 2
+    assert "a.g2o:6: EDGE_SE2 needs 11 fields" in capsys.readouterr().err
+    assert main(["optimize", str(tmp_path / "a.g2o"), "--lenient"]) == 3
+    assert "lost: a.g2o:6: EDGE_SE2 needs 11 fields" in capsys.readouterr().err
+
+
+def test_F22_unknown_tags_are_counted_and_told_once_each_and_written_back(tmp_path, capsys):
+    odd = ["WHAT 1", "EDGE_SE2_LOTSOFXY 10 7  0.5 1e3", "WHAT nan inf 1_0"]
+    (tmp_path / "a.g2o").write_text("\n".join([odd[0], GRAPH + odd[1], odd[2], "EDGE_SE2_XY 10 7 1 2 1 0 1\n"]))
+    assert main(["optimize", str(tmp_path / "a.g2o"), "--out", str(tmp_path / "b.g2o")]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["graph_slam: 3 lines with unknown tags kept as they are: EDGE_SE2_LOTSOFXY, WHAT"]
+    lines = (tmp_path / "b.g2o").read_text().splitlines()
+    assert [line for line in lines if line in odd] == odd
+
+
+def test_F26_without_fix_the_pose_of_the_least_id_is_held(tmp_path):
+    text = GRAPH.replace("VERTEX_XY 7 3. +4\n", "VERTEX_SE2 5 9 8 0.5\n") + "EDGE_SE2 11 5 1 0 0 1 0 0 1 0 1\n"
+    solved = optimize(graph_of(tmp_path, text))
+    assert solved.file.ids == [10, 11, 5]
+    assert solved.solver.estimate([2]).tolist() == [[9.0, 8.0, 0.5]]
+    assert solved.report.chi2_final < 1e-12

@@ -10,28 +10,76 @@ import yaml
 
 from graph_slam_ros.errors import ConfigError
 
-_MAX_BYTES = 2**20
+_MAX_BYTES, _MAX_DEPTH, _MAX_NODES = 2**20, 50, 20_000
 _NODE = "graph_slam"
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Refuses a key given twice, of which YAML would silently keep the last."""
+    """Refuses what YAML would silently read as something else, and what is made to exhaust its reader.
+
+    A key given twice, of which the last would be kept; numbers and words that YAML 1.1 reads in its own way; aliases,
+    which ROS does not read either, and by which a few lines may grow without end.
+    """
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._depth = self._nodes = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        event = self.peek_event()  # type: ignore[no-untyped-call]
+        self._nodes += 1
+        if isinstance(event, yaml.AliasEvent):
+            raise _fault(event, "aliases are not read")
+        if event.tag not in _TAGS:
+            raise _fault(event, f"the tag {event.tag} is not read")
+        if self._depth == _MAX_DEPTH or self._nodes > _MAX_NODES:
+            raise _fault(event, f"more than {_MAX_DEPTH} levels, or than {_MAX_NODES} values")
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
             if not isinstance(key, Hashable):
-                raise ConfigError(f"line {key_node.start_mark.line + 1}: a key is not a name")
+                raise _fault(key_node, "a key is not a name")
             if key in seen:
-                raise ConfigError(f"line {key_node.start_mark.line + 1}: {key!r} is given twice")
+                raise _fault(key_node, f"{key!r} is given twice")
             seen.add(key)
         return super().construct_mapping(node, deep)
 
+    def construct_plain(self, node: yaml.ScalarNode) -> Any:
+        """A number or a truth value, as everybody reads it."""
+        value = _CONSTRUCT[node.tag](self, node)
+        if not _AS_EVERYBODY[node.tag].fullmatch(node.value):
+            usual = repr(value).lower() if isinstance(value, bool) else repr(value)
+            raise _fault(node, f"{node.value} is {usual} to YAML: write {usual}, or '{node.value}' for a text")
+        return value
 
+
+def _fault(at: Any, what: str) -> ConfigError:
+    return ConfigError(f"line {at.start_mark.line + 1}: {what}")
+
+
+_TAGS = (None, "tag:yaml.org,2002:str")  # the others have ways of their own to fail
+_FLOAT, _INT, _BOOL = (f"tag:yaml.org,2002:{kind}" for kind in ("float", "int", "bool"))
+_CONSTRUCT: dict[str, Any] = {
+    _FLOAT: yaml.SafeLoader.construct_yaml_float,
+    _INT: yaml.SafeLoader.construct_yaml_int,
+    _BOOL: yaml.SafeLoader.construct_yaml_bool,
+}
+_AS_EVERYBODY = {
+    _FLOAT: re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)", re.ASCII),
+    _INT: re.compile(r"[-+]?(?:0|[1-9]\d*)|0x[0-9a-fA-F]+", re.ASCII),
+    _BOOL: re.compile("true|false", re.IGNORECASE),
+}
+for _tag in _CONSTRUCT:
+    _StrictLoader.add_constructor(_tag, _StrictLoader.construct_plain)
 # YAML 1.1 reads 1e-3 as a text; ROS and people read a number
 _StrictLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(?:\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+    _FLOAT, re.compile(r"^[-+]?(?:\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
 )
 
 
@@ -47,8 +95,10 @@ def read_parameters(path: Path | str) -> dict[str, Any]:
     """
     path = Path(path)
     try:
+        if path.exists() and not path.is_file():
+            raise ConfigError("not a file")
         if path.stat().st_size > _MAX_BYTES:
-            raise ConfigError(f"{path}: larger than {_MAX_BYTES} bytes")
+            raise ConfigError(f"larger than {_MAX_BYTES} bytes")
         values = yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
@@ -88,6 +138,8 @@ def parse_setting(text: str) -> tuple[str, Any]:
         raise ConfigError(f"{text!r} is not key=value")
     try:
         return key, yaml.load(value, Loader=_StrictLoader)
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {str(error).removeprefix('line 1: ')}") from None
     except (yaml.YAMLError, ValueError, RecursionError):
         raise ConfigError(f"{key}: {value!r} is not a valid value") from None
 
