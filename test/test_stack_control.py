@@ -401,7 +401,7 @@ def test_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(tmp_p
     assert is_repeated(tmp_path / "run", tmp_path)
 
 
-def test_reset_saves_first_and_of_what_it_saved_the_last_five_are_kept(tmp_path):
+def test_X9_reset_saves_first_and_of_what_it_saved_the_last_five_are_kept(tmp_path):
     with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=("pose",)) as r:
         r.wait_for_node()
         drive = Drive()

@@ -7,6 +7,7 @@ publishes its results. Between them stand a queue one way and ``Session.estimate
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from rclpy.clock import JumpThreshold
@@ -105,7 +106,7 @@ class Configured:
                     "a solve takes too long to wait for: replay the run folder for its results"
                 )
             elif folder := self._session.finish():
-                self._node.get_logger().info(f"saved {folder}")
+                self._node.get_logger().info(f"saved {Path(folder).name}")
         finally:
             self._outputs.close()
 

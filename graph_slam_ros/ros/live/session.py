@@ -219,7 +219,7 @@ class Session:
                 raise RunError(f"no earlier run of {self._folder.name}")
             return earlier[max(earlier)]
         run = self._folder.parent / name
-        if not is_run(run):
+        if run.is_symlink() or not is_run(run):  # a link may lead anywhere
             raise RunError(f"{name}: not a run")
         return run
 
