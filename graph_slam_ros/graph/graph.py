@@ -215,14 +215,6 @@ class Graph:
         table, row = self.row(edge_id)
         return self.sources[int(table.source.values[row])]
 
-    @property
-    def degrees_of_freedom(self) -> int:
-        """Numbers measured, without edges of weight 0, less numbers to be estimated."""
-        tables = self.tables.values()
-        measured = sum(table.type.residual_size * int(np.count_nonzero(table.weight.values)) for table in tables)
-        sizes = np.array([kind.dof for kind in self.kinds], dtype=np.int64)
-        return measured - int(sizes[self.kind.values].sum())
-
     def set_weights(self, edges: Index, weight: float) -> None:
         """Of some edges; where a solver has them, they are its to change."""
         for code, table in enumerate(self._in_order):

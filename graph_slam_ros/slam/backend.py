@@ -6,10 +6,12 @@ from dataclasses import replace
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.slam.background import Background, Beside, when_asked
 from graph_slam_ros.slam.decisions import Decisions
-from graph_slam_ros.slam.ledger import Ledger
+from graph_slam_ros.slam.ledger import Ledger, Reason
 from graph_slam_ros.slam.robust_config import RobustConfig
 from graph_slam_ros.slam.second_look import Frozen, Outcome, Rival, second_look
 from graph_slam_ros.solver import Report, Settings, Solver
+
+_UPDATES = 6  # until what was let in fits, before everything is solved for it
 
 
 class Backend:
@@ -35,6 +37,7 @@ class Backend:
         self._background = Background(config, beside)
         self.rivals: tuple[Rival, ...] = ()
         self._reviewed = 0  # the keyframe of the last review
+        self._doubtful: list[int] = []  # edges that have come and do not fit by themselves
 
     @property
     def ledger(self) -> Ledger:
@@ -52,7 +55,7 @@ class Backend:
     def update(self, keyframe: int) -> None:
         """Take in what is new and believed, then what is believed of the rest."""
         self.hand_over()
-        doubtful = self.decisions.take(self.handed_over[1], keyframe)
+        self._doubtful += self.decisions.take(self.handed_over[1], keyframe)
         if self._config.decide and keyframe - self._reviewed >= self._config.review_every_keyframes:
             self._reviewed = keyframe
             self.decisions.review(keyframe)
@@ -60,9 +63,7 @@ class Backend:
         if outcome is not None and self._follow(outcome, keyframe):
             self.solver.optimize()
         self.solver.update()
-        admitted = self.decisions.admit(doubtful, keyframe)
-        if admitted:
-            self._make_fit(admitted, keyframe)
+        self._admit(keyframe)
         out = self.ledger.outside_count
         if self._config.decide and self._background.is_due(out):
             self._background.start(self._frozen(keyframe, self.solver.settings), out)
@@ -70,23 +71,33 @@ class Backend:
     def optimize(self, keyframe: int, settings: Settings) -> Report:
         """Solve everything, and have a second look at all that was decided."""
         self.hand_over()
-        doubtful = self.decisions.take(self.handed_over[1], keyframe)
+        self._doubtful += self.decisions.take(self.handed_over[1], keyframe)
         report = self.solver.optimize(settings)
         if not self._config.decide:
             return report
-        admitted = self.decisions.admit(doubtful, keyframe)
-        if admitted:
-            self._make_fit(admitted, keyframe)
-        self._background.cancel()
+        self._admit(keyframe)
         outcome = second_look(self._config, self._frozen(keyframe, settings))
-        self.rivals = outcome.rivals
-        self.decisions.follow(outcome.ledger, keyframe)
-        self.solver.start_at(outcome.values)
-        return self.solver.optimize(settings)
+        if outcome is not None:
+            self.rivals = self._standing(outcome.rivals)
+            self.decisions.follow(outcome.ledger, keyframe)
+            self.solver.start_at(outcome.values)
+            report = self.solver.optimize(settings)
+        self._background.cancel(self.ledger.outside_count)
+        return report
 
     def withdraw(self, edges: Sequence[int], keyframe: int) -> None:
         """Take edges out for good."""
         self.decisions.withdraw(edges, keyframe)
+        self._doubtful = [edge for edge in self._doubtful if edge not in edges]
+        self.rivals = self._standing(self.rivals)
+
+    def _admit(self, keyframe: int) -> None:
+        """Compare with all that is known what has come and does not fit by itself."""
+        waiting = [edge for edge in self._doubtful if not self.ledger.is_inside(edge)]
+        admitted = self.decisions.admit(waiting, keyframe)
+        self._doubtful = []
+        if admitted:
+            self._make_fit(admitted, keyframe)
 
     def _make_fit(self, admitted: Sequence[int], keyframe: int) -> None:
         """Solve until what was let in against appearances fits; what does not in the end is out again.
@@ -94,23 +105,29 @@ class Backend:
         Its loss lets go of what is far off. Only where nothing has told yet how good odometry is may it pull with all
         its weight: later that would bend the map for whatever is false and just possible.
         """
-        self.solver.update()
-        if not self.decisions.fit(admitted):
-            settings = self.solver.settings
-            if not self.decisions.is_calibrated:
-                losses = {label: [Loss(), *stages] for label, stages in settings.losses.items()}
-                settings = replace(settings, losses=losses)
-            self.solver.optimize(settings)
-            if self.decisions.refuse_unfit(admitted, keyframe):
-                self.solver.update()
+        for _ in range(_UPDATES):
+            self.solver.update()
+            if self.decisions.fit(admitted):
+                return
+        settings = self.solver.settings
+        pulling = [] if self.decisions.is_calibrated else [Loss()]
+        losses = {label: [*pulling, stages[-1]] for label, stages in settings.losses.items()}
+        self.solver.optimize(replace(settings, losses=losses))
+        if self.decisions.refuse_unfit(admitted, keyframe):
+            self.solver.update()
 
     def _follow(self, outcome: Outcome, keyframe: int) -> bool:
         """Take over what a second look has found; whether that is other than what was known."""
-        self.rivals = outcome.rivals
+        self.rivals = self._standing(outcome.rivals)
         if not self.decisions.follow(outcome.ledger, keyframe):
             return False
         self.solver.start_at(outcome.carried_to(self.graph, self.solver.values))
         return True
+
+    def _standing(self, rivals: Sequence[Rival]) -> tuple[Rival, ...]:
+        """Explanations of which nothing was withdrawn."""
+        reason = self.ledger.reason.values
+        return tuple(one for one in rivals if not (reason[list(one.only_here)] == Reason.WITHDRAWN).any())
 
     def _frozen(self, keyframe: int, settings: Settings) -> Frozen:
         solver = self.solver

@@ -8,13 +8,12 @@ done, in a thread or at the end, changes nothing.
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from graph_slam_ros.errors import GaugeError, SingularError
 from graph_slam_ros.slam.robust_config import RobustConfig
-from graph_slam_ros.slam.second_look import Frozen, Outcome, second_look
+from graph_slam_ros.slam.second_look import Frozen, Outcome, Wanted, second_look
 
 _MORE = 1.5  # times as many out as at the last look: looks become rarer as their cost grows
 
-Work = Callable[[], Outcome]
+Work = Callable[[], Outcome | None]
 Beside = Callable[[Work], Work]
 """Begins work and returns what waits for its result."""
 
@@ -28,6 +27,7 @@ def when_asked(work: Work) -> Work:
 class _Look:
     apply_at: int
     outcome: Work
+    wanted: Wanted
 
 
 class Background:
@@ -40,25 +40,25 @@ class Background:
 
     def is_due(self, out: int) -> bool:
         """Whether so many candidates that are out deserve a look."""
-        after = self._config.second_look_after
+        after, self._out = self._config.second_look_after, min(self._out, out)
         return self._look is None and after > 0 and out >= max(self._out + after, _MORE * self._out)
 
     def start(self, frozen: Frozen, out: int) -> None:
         """Begin with what there is now."""
         self._out = out
-        outcome = self._beside(lambda: second_look(self._config, frozen))
-        self._look = _Look(frozen.keyframe + self._config.apply_after_keyframes, outcome)
+        wanted = Wanted()
+        outcome = self._beside(lambda: second_look(self._config, frozen, wanted))
+        self._look = _Look(frozen.keyframe + self._config.apply_after_keyframes, outcome, wanted)
 
     def outcome(self, keyframe: int) -> Outcome | None:
         """What was found, at the keyframe it is for; waits for it. None, too, where nothing could be."""
         if self._look is None or keyframe < self._look.apply_at:
             return None
         look, self._look = self._look, None
-        try:
-            return look.outcome()
-        except (GaugeError, SingularError):
-            return None
+        return look.outcome()
 
-    def cancel(self) -> None:
-        """What is under way is for nobody."""
-        self._look = None
+    def cancel(self, out: int) -> None:
+        """What is under way is for nobody: all was looked at, and so many are out."""
+        if self._look is not None:
+            self._look.wanted.still = False
+        self._look, self._out = None, out

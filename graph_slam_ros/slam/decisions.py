@@ -27,6 +27,7 @@ CANDIDATES = ("landmarks", "fixes", "closures")
 _TYPICAL = 30  # residuals tell what all are like
 _SLACK = 10.0  # times the residuals that are typical of a class its gate may be, where they are small
 _TIGHTEST = 0.1  # part of a gate that is left
+_TOGETHER = 8  # sightings that tell but a part each determine a landmark, wherever they are from
 _COMPLETED = 50  # edges that are out and are tried again after everything was solved
 _AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
 
@@ -36,8 +37,9 @@ class Decisions:
 
     def __init__(self, config: RobustConfig, graph: Graph, solver: Solver, ledger: Ledger | None = None) -> None:
         self._config, self._graph, self._solver = config, graph, solver
-        self.ledger = ledger or Ledger()
-        self._holds: dict[int, int] = {}  # of each landmark, edges in the graph of which one alone determines it
+        self.ledger = Ledger() if ledger is None else ledger
+        self._holds: dict[int, int] = {}  # of each landmark, edges that are in of which one alone determines it
+        self._helps: dict[int, int] = {}  # and those that do so only with others
         for edge in self.ledger.inside.tolist():
             self._count(edge, 1)
         self._tightness: dict[str, float] = {}  # of each class, by what its gate is smaller
@@ -106,15 +108,15 @@ class Decisions:
 
     # -- what was decided ---------------------------------------------------------------------------------------------
 
-    def review(self, keyframe: int) -> bool:
-        """Look again at the newest verdicts and, in turn, at some of the others; whether one has changed."""
+    def review(self, keyframe: int) -> None:
+        """Look again at the newest verdicts and, in turn, at some of the others."""
         self._tighten()
         inside = self.ledger.inside
         if len(inside) > 2 * _AT_ONCE:
             self._next = (self._next + _AT_ONCE) % (len(inside) - _AT_ONCE)
             older = np.arange(self._next, self._next + _AT_ONCE) % (len(inside) - _AT_ONCE)
             inside = np.concatenate((np.unique(inside[older]), inside[-_AT_ONCE:]))
-        changed = self._weigh(inside, keyframe)
+        self._weigh(inside, keyframe)
         outside = self.ledger.outside
         chi2, _ = self._solver.chi2_of(outside)
         fits = chi2 <= self.ledger.threshold.values[outside]
@@ -126,7 +128,6 @@ class Decisions:
         likely = [(edge, fit) for edge in turn if self._is_likely(edge, fit := self._innovation(edge))]
         for edge, fit in likely:
             self._readmit(edge, keyframe, fit, self._widest(edge))
-        return changed or bool(likely) or bool(fits.any())
 
     def settle(self, keyframe: int) -> bool:
         """After a solve of everything: what fits is in, what does not is out; whether a verdict has changed."""
@@ -168,31 +169,33 @@ class Decisions:
 
     def follow(self, other: Ledger, keyframe: int) -> bool:
         """Take over verdicts on the same edges from who has had a second look; whether that changed one."""
-        mine, changed = self.ledger, False
-        for edge in np.flatnonzero(np.isin(mine.verdict.values[: len(other)], (*Verdict,)[1:])).tolist():
-            fit, limit = float(other.statistic.values[edge]), float(other.threshold.values[edge])
-            if mine.reason.values[edge] == Reason.WITHDRAWN or mine.is_inside(edge) == other.is_inside(edge):
-                continue
-            if other.is_inside(edge):
-                self._readmit(edge, keyframe, fit, limit)
-            elif not self._is_needed(edge):
-                self._reject(edge, keyframe, Reason.OUTVOTED, fit, limit)
-            changed = True
-        return changed
+        mine, known = self.ledger, len(other)
+        judged = np.flatnonzero(mine.verdict.values[:known] != Verdict.NOT_EVALUATED)
+        standing = judged[mine.reason.values[judged] != Reason.WITHDRAWN]
+        return self._have_in(standing, np.isin(standing, other.inside), keyframe, other)
 
     def believe(self, edges: Index, keyframe: int) -> None:
         """Have these candidates in and no others, to see what comes of it."""
-        wanted = set(edges.tolist())
-        for edge in np.concatenate((self.ledger.inside, self.ledger.outside)).tolist():
-            fit = float(self.ledger.statistic.values[edge])
-            if edge in wanted and not self.ledger.is_inside(edge):
-                self._readmit(edge, keyframe, fit)
-            elif edge not in wanted and self.ledger.is_inside(edge) and not self._is_needed(edge):
-                self._reject(edge, keyframe, Reason.OUTVOTED, fit)
+        candidates = np.sort(np.concatenate((self.ledger.inside, self.ledger.outside)))
+        self._have_in(candidates, np.isin(candidates, edges), keyframe, self.ledger)
 
-    def _weigh(self, edges: Index, keyframe: int) -> bool:
+    def _have_in(self, edges: Index, wanted: NDArray[np.bool_], keyframe: int, judge: Ledger) -> bool:
+        """Those in that are wanted, then the others out, by who judged them; whether a verdict has changed."""
+        inside = np.isin(edges, self.ledger.inside)
+        changed = 0
+        for edge in edges[wanted & ~inside].tolist():
+            self._readmit(edge, keyframe, *_judged(judge, edge))
+            changed += 1
+        for edge in edges[~wanted & inside].tolist():
+            if not self._is_needed(edge):
+                statistic, threshold = _judged(judge, edge)
+                self._reject(edge, keyframe, Reason.OUTVOTED, statistic, threshold)
+                changed += 1
+        return changed > 0
+
+    def _weigh(self, edges: Index, keyframe: int) -> None:
         """By what their losses leave of each one's weight."""
-        ledger, changed = self.ledger, False
+        ledger = self.ledger
         chi2, _ = self._solver.chi2_of(edges)
         unfit = chi2 > ledger.threshold.values[edges]
         again = ~unfit & (ledger.verdict.values[edges] == Verdict.DOWN_WEIGHTED)
@@ -203,10 +206,8 @@ class Decisions:
             weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
             if weight < self._config.out_below and not self._is_needed(edge):
                 self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
-                changed = True
-            elif ledger.verdict.values[edge] == Verdict.ACCEPTED:
+            elif weight < 1.0 and ledger.verdict.values[edge] == Verdict.ACCEPTED:
                 ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)
-        return changed
 
     def _innovation(self, edge: int) -> float:
         return innovation(self._graph, self._solver, edge)
@@ -239,23 +240,30 @@ class Decisions:
         self._solver.set_weight(edge, 0.0)
         self._count(edge, -1)
 
-    def _landmark(self, edge: int) -> int | None:
-        """The landmark that one such edge alone would determine; -1: it does so only with others."""
+    def _landmark(self, edge: int) -> tuple[int, dict[int, int]] | None:
+        """The landmark that an edge is of, and among which of its edges it counts."""
         if self._graph.label_of(edge) != "landmarks":
             return None
         table, row = self._graph.row(edge)
         landmark = int(table.vertices.values[row, 1])
-        return landmark if table.type.residual_size >= self._graph.kind_of(landmark).dof else -1
+        alone = table.type.residual_size >= self._graph.kind_of(landmark).dof
+        return landmark, self._holds if alone else self._helps
 
     def _count(self, edge: int, more: int) -> None:
-        landmark = self._landmark(edge)
-        if landmark is not None and landmark >= 0:
-            self._holds[landmark] = self._holds.get(landmark, 0) + more
+        found = self._landmark(edge)
+        if found is not None:
+            landmark, among = found
+            among[landmark] = among.get(landmark, 0) + more
 
     def _is_needed(self, edge: int) -> bool:
-        """Whether a landmark may be undetermined without it: its last, or one that determines it only with others."""
-        landmark = self._landmark(edge)
-        return landmark is not None and (landmark < 0 or self._holds.get(landmark, 0) <= 1)
+        """Whether a landmark may be undetermined without it: its last, or one of the few that do so together."""
+        found = self._landmark(edge)
+        if found is None:
+            return False
+        landmark, among = found
+        holds = self._holds.get(landmark, 0) - (among is self._holds)
+        helps = self._helps.get(landmark, 0) - (among is self._helps)
+        return holds < 1 and helps < _TOGETHER
 
     # -- what is too much --------------------------------------------------------------------------------------------
 
@@ -267,10 +275,10 @@ class Decisions:
             out[self._graph.has_label(edges, (label,))] *= tightness
         return out
 
-    def tight_losses(self) -> dict[str, list[Loss]]:
+    def cautious_losses(self) -> dict[str, list[Loss]]:
         """Losses by class under which what is false among candidates lets go by itself: Huber's, then DCS."""
-        scale = {label: self._config.loss_scale * self._tightness.get(label, 1.0) ** 0.5 for label in CANDIDATES}
-        return {label: [Loss.named("huber", s), Loss.named("dcs", s)] for label, s in scale.items()}
+        stages = [Loss.named(name, self._config.loss_scale) for name in ("huber", "dcs")]
+        return dict.fromkeys(CANDIDATES, stages)
 
     def _tighten(self) -> None:
         """Follow what residuals are like: whoever gives a noise ten times too large would let in all that is false.
@@ -285,13 +293,18 @@ class Decisions:
             if np.count_nonzero(of_label) >= _TYPICAL:
                 ratio = float(np.median(typical[of_label]))
                 self._tightness[label] = min(1.0, max(_TIGHTEST, _SLACK * ratio))
-        freedom = self._graph.degrees_of_freedom
+        freedom = self._solver.degrees_of_freedom
         self.is_calibrated = freedom >= _TYPICAL
         if self.is_calibrated:
             as_noise_tells = self._solver.evaluate().chi2_final / freedom
             self._looseness = min(factor, max(_TIGHTEST, factor * as_noise_tells))
         edges = np.concatenate((inside, ledger.outside))
         ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
+
+
+def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:
+    """The statistic and what it was held against."""
+    return float(ledger.statistic.values[edge]), float(ledger.threshold.values[edge])
 
 
 @cache

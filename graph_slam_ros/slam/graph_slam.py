@@ -471,7 +471,7 @@ class GraphSlam:
             self.solves += 1
             self._solved_vertices, self._taken_in = self.backend.handed_over
             self._note_correction(fits)
-        except GraphSlamError as error:
+        except (GraphSlamError, np.linalg.LinAlgError) as error:
             self.counters.count("solver", type(error).__name__)
 
     def _withdraw(self, edges: Sequence[int]) -> None:

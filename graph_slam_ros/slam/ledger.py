@@ -105,7 +105,7 @@ class Ledger:
 
     def hold_back(self, edge: int) -> None:
         """An edge that has just come is out until it is compared with all else."""
-        self.verdict.values[edge] = Verdict.PENDING
+        self.verdict.values[edge], self.reason.values[edge] = Verdict.PENDING, Reason.UNLIKELY
         self._out.add(edge)
 
     def note(

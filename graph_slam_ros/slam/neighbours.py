@@ -39,7 +39,9 @@ def agreeing(graph: Graph, values: Array, closures: Index, limits: Array) -> lis
     closures, limits = closures[of_table], limits[of_table]
     rows = graph.row_of_edge.values[closures]
     ends, measured = table.vertices.values[rows], table.measured.values[rows]
-    order = np.cumsum(graph.kind.values == graph.kinds.index(kind)) - 1  # of poses in time, by vertex
+    order, walked = _along_odometry(graph, table)
+    on_path = (order[ends] >= 0).all(axis=1)
+    closures, limits, rows, ends, measured = (each[on_path] for each in (closures, limits, rows, ends, measured))
     pairs = cKDTree(order[ends]).query_pairs(_NEAR, p=np.inf, output_type="ndarray") if len(ends) else ends
     if not len(pairs):
         return []
@@ -54,11 +56,10 @@ def agreeing(graph: Graph, values: Array, closures: Index, limits: Array) -> lis
 
     noise = np.linalg.inv(table.sqrt_information.values[rows])
     noise = noise @ noise.transpose(0, 2, 1)
-    step = _odometry_noise(graph, table)
-    steps = np.abs(order[ends[a]] - order[ends[b]])
+    steps = np.abs(walked[order[ends[a]]] - walked[order[ends[b]]])
     covariance = noise[b] + _carried(group, after, noise[a])
-    covariance += _carried(group, onwards, _walked(group, before, steps[:, 0], step))
-    covariance += _walked(group, after, steps[:, 1], step)
+    covariance += _carried(group, onwards, _walked(group, before, steps[:, 0]))
+    covariance += _walked(group, after, steps[:, 1])
     distance = np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
     agree = distance <= np.minimum(limits[a], limits[b])
     joined = coo_array((np.ones(np.count_nonzero(agree)), (a[agree], b[agree])), shape=(len(ends), len(ends)))
@@ -67,21 +68,23 @@ def agreeing(graph: Graph, values: Array, closures: Index, limits: Array) -> lis
     return [closures[some[group_of[some] == one]] for one in np.unique(group_of[some])]
 
 
-def _odometry_noise(graph: Graph, table: EdgeTable) -> Array:
-    """Covariance of a step of odometry, on average."""
+def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
+    """Of each vertex, its place along odometry, -1 if it has none; and of each place, the noise of all steps before."""
     code = graph.labels.index("odometry") if "odometry" in graph.labels else -1
-    root = table.sqrt_information.values[table.label.values == code]
-    if not len(root):
-        return np.zeros(table.sqrt_information.values.shape[1:])
-    inverse = np.linalg.inv(root)
-    mean: Array = (inverse @ inverse.transpose(0, 2, 1)).mean(axis=0)
-    return mean
+    rows = np.flatnonzero(table.label.values == code)
+    order = np.full(graph.vertex_count, -1)
+    vertices = table.vertices.values[rows]
+    order[vertices[:, 0]] = np.arange(len(rows))
+    order[vertices[:, 1]] = np.arange(1, len(rows) + 1)
+    inverse = np.linalg.inv(table.sqrt_information.values[rows])
+    steps = inverse @ inverse.transpose(0, 2, 1)
+    return order, np.concatenate((np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)))
 
 
-def _walked(group: Any, motion: Array, steps: Index, step: Array) -> Array:
+def _walked(group: Any, motion: Array, noise: Array) -> Array:
     """Covariance of the steps of a motion, as if all had erred half way, where turns weigh as they do on average."""
     half = _columns(group.exp, 0.5 * _columns(group.log, motion))
-    return _carried(group, half, steps[:, None, None] * step)
+    return _carried(group, half, noise)
 
 
 def _carried(group: Any, motion: Array, covariance: Array) -> Array:

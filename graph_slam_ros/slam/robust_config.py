@@ -39,7 +39,11 @@ class RobustConfig:
         high=1.0,
     )
     review_every_keyframes: int = setting(
-        20, "all verdicts are looked at again after this many keyframes", "keyframes", low=1, high=1_000_000
+        20,
+        "verdicts, the newest and others in turn, are looked at again after this many keyframes",
+        "keyframes",
+        low=1,
+        high=1_000_000,
     )
     retests: int = setting(
         10, "held back, so many are compared with what is known then, in turn", "edges", low=0, high=1_000_000

@@ -1,9 +1,10 @@
 """A second look at everything: solve, judge, solve again, from more than one start; the best explanation wins.
 
 What an online run believed first may rest on a false closure that came before the true ones. So the whole is explained
-twice: from the online estimate and what is believed there; and from odometry alone with the candidates that agree with
-a neighbour. In each, all is solved and every candidate judged by how it fits, in turn, until no verdict changes; what
-is out then costs as much as the gate would have let it cost (truncated least squares). The lower cost wins.
+from the online estimate and what is believed there; from the candidates that agree with a neighbour, there and along
+odometry alone; and from the largest group that is out. In each, all is solved and every candidate judged by how it
+fits, in turn, until no verdict changes; what is out then costs as much as the gate would have let it cost (truncated
+least squares). The lowest cost wins.
 """
 
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.errors import GaugeError, SingularError
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import GROUPS, SE2, Graph
 from graph_slam_ros.slam.decisions import Decisions
 from graph_slam_ros.slam.ledger import Ledger
@@ -78,11 +79,12 @@ class Outcome:
     def carried_to(self, graph: Graph, values: Array) -> Array:
         """Stored numbers of a graph that has grown since: what is new moves with the newest pose that was there."""
         out, known, old = values.copy(), len(self.values), self.frozen.graph
-        poses = [v for v in range(old.vertex_count) if old.kind_of(v) in GROUPS]
-        if known == len(values) or not poses:
+        odometry = old.edges_of("odometry")
+        if known == len(values) or not len(odometry):
             out[:known] = self.values
             return out
-        newest, kind = poses[-1], old.kind_of(poses[-1])
+        table, row = old.row(int(odometry[-1]))
+        newest, kind = int(table.vertices.values[row, 1]), table.type.accepts[1][0]
         at = int(graph.offset.values[newest])
         group, here = GROUPS[kind], slice(at, at + kind.size)
         moved = group.compose(tuple(self.values[here]), group.inverse(tuple(values[here])))
@@ -97,14 +99,26 @@ class Outcome:
         return out
 
 
-def second_look(config: RobustConfig, frozen: Frozen) -> Outcome:
-    """Explain a graph anew, from each start; the least cost wins."""
-    found = [_explained("online", config, frozen, frozen.values, None, np.inf)]
-    if len(found[0].ledger.outside):
-        for name, start, believed in _other_starts(config, frozen):
-            with suppress(GaugeError, SingularError):  # what is believed there does not hold together
-                hopeless = _HOPELESS * min(outcome.cost for outcome in found)
-                found.append(_explained(name, config, frozen, start, believed, hopeless))
+@dataclass(slots=True)
+class Wanted:
+    """Whether anybody still waits for an outcome."""
+
+    still: bool = True
+
+
+def second_look(config: RobustConfig, frozen: Frozen, wanted: Wanted | None = None) -> Outcome | None:
+    """Explain a graph anew, from each start; the least cost wins. None where nothing can be solved, or nobody waits."""
+    found: list[Outcome] = []
+    for name, start, believed in _starts(frozen):
+        if wanted is not None and not wanted.still:
+            return None
+        with suppress(GraphSlamError, np.linalg.LinAlgError):  # what is believed there does not hold together
+            hopeless = _HOPELESS * min((outcome.cost for outcome in found), default=np.inf)
+            found.append(_explained(name, config, frozen, start, believed, hopeless))
+        if name == "online" and found and not len(found[0].ledger.outside):
+            break
+    if not found:
+        return None
     best = min(found, key=lambda outcome: outcome.cost)
     rivals = {rival.only_here: rival for rival in (_rival(one, best) for one in found) if rival is not None}
     return replace(best, rivals=tuple(rivals.values()))
@@ -121,11 +135,12 @@ def _rival(one: Outcome, best: Outcome) -> Rival | None:
     return Rival(one.cost, best.cost, tuple(only_here.tolist()), tuple(only_there.tolist()))
 
 
-def _other_starts(config: RobustConfig, frozen: Frozen) -> Iterator[tuple[str, Array, Index]]:
-    """Closures that agree with a neighbour, and no others, from the online estimate and from odometry alone.
+def _starts(frozen: Frozen) -> Iterator[tuple[str, Array, Index | None]]:
+    """The online estimate with what is believed; closures that agree with a neighbour, there and along odometry alone.
 
     And the largest group that is out, as if it alone were true.
     """
+    yield "online", frozen.values, None
     ledger, graph = frozen.ledger, frozen.graph
     candidates = np.sort(np.concatenate((ledger.inside, ledger.outside)))
     is_closure = graph.has_label(candidates, ("closures",))
@@ -158,13 +173,13 @@ def _explained(
     decisions = Decisions(config, graph, solver, mine)
     if believed is not None:
         decisions.believe(believed, frozen.keyframe)
-        solver.optimize(replace(frozen.settings, losses=decisions.tight_losses(), max_iterations=_ITERATIONS))
+        solver.optimize(replace(frozen.settings, losses=decisions.cautious_losses(), max_iterations=_ITERATIONS))
         decisions.settle(frozen.keyframe)
-    for _ in range(config.rounds if _cost(solver, mine) <= 2.0 * hopeless else 0):
+    rounds = config.rounds if _cost(solver, mine) <= 2.0 * hopeless else 0
+    for k in range(rounds):
         solver.optimize()
-        if _cost(solver, mine) > hopeless:
-            break
-        if not decisions.settle(frozen.keyframe) and not decisions.complete(frozen.keyframe):
+        is_last = k + 1 == rounds or _cost(solver, mine) > hopeless
+        if is_last or not (decisions.settle(frozen.keyframe) or decisions.complete(frozen.keyframe)):
             break
     judged = np.concatenate((mine.inside, mine.outside))
     mine.statistic.values[judged], _ = solver.chi2_of(judged)

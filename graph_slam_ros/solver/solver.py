@@ -176,6 +176,15 @@ class Solver:
         return np.flatnonzero(self._inside)
 
     @property
+    def degrees_of_freedom(self) -> int:
+        """Numbers measured, without edges of weight 0, less numbers to be estimated."""
+        self._grow()
+        graph, tables = self.graph, self.graph.tables.values()
+        measured = sum(table.type.residual_size * int(np.count_nonzero(table.weight.values)) for table in tables)
+        sizes = np.array([kind.dof for kind in graph.kinds], dtype=np.int64)
+        return measured - int(sizes[graph.kind.values[self._unknowns()]].sum())
+
+    @property
     def edges(self) -> Index:
         """Ids of the edges of the problem that have a weight."""
         self._grow()

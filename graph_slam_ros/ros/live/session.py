@@ -158,7 +158,7 @@ class Session:
         if self.estimate is None or self._fitted_at == self.slam.solves or time.perf_counter() < self._fit_due_s:
             return
         start = time.perf_counter()
-        now, dof = self.slam.solver.evaluate(), self.slam.graph.degrees_of_freedom
+        now, dof = self.slam.solver.evaluate(), self.slam.solver.degrees_of_freedom
         self._fit = now.chi2_final / dof if dof > 0 else float("nan")
         self._fitted_at = self.slam.solves
         self._fit_due_s = start + 50.0 * (time.perf_counter() - start)
