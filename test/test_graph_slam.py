@@ -231,6 +231,18 @@ def test_odometry_edges_are_the_relative_motion_and_not_the_absolute_pose():
     assert p.T_map_odom == pytest.approx((0, 0, 0), abs=1e-12)
 
 
+def test_a_keyframe_between_two_odometry_messages_cuts_the_motion_and_adds_none():
+    p, rng = slam(keyframes={"shared_noise": 0.05, "min_distance_m": 0.21}), np.random.default_rng(1)
+    for k in range(300):
+        p.process(odometry(0.1 * k, se2.exp((0.08 * k, 0.0, 0.002 * k))))
+        if rng.random() < 0.3:
+            p.process(seen(0.1 * k + float(rng.integers(1, 100)) / 1e3, point(covariance=(1e-6, 0.0, 0.0, 1e-6))))
+    seconds = (p.keyframes.stamps_ns - T0) / S
+    assert 30 < np.count_nonzero(np.abs(seconds * 10 - np.rint(seconds * 10)) > 1e-3) < len(seconds) - 30
+    expected = [se2.exp((0.8 * dt, 0.0, 0.02 * dt)) for dt in np.diff(seconds)]
+    assert table(p, RELATIVE_POSE).measured.values == pytest.approx(np.array(expected), abs=1e-9)
+
+
 def monte_carlo(steps, covariance_of_step, samples=20_000, seed=3):
     """Covariance at the end of noisy steps, in the tangent space there."""
     rng = np.random.default_rng(seed)

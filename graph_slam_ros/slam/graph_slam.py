@@ -287,6 +287,7 @@ class GraphSlam:
         else:
             motion.step(step)
             self._use_waiting(step.stamp_ns)
+            motion = self._trail.motion or motion  # since another keyframe, where something seen deserved one
             if self._keyframe_due(motion):
                 self._add_keyframe(step, motion.now.T_keyframe_base, motion.now.covariance)
                 self._solve_if_due()
