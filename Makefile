@@ -125,6 +125,12 @@ $(VENV)-bench-g2o/stamp: benchmarks/requirements-g2o.txt
 	$(VENV)-bench-g2o/bin/pip install --quiet -r benchmarks/requirements-g2o.txt
 	@touch $@
 
+# What test/guided_fuzzing.py runs with: atheris has wheels for some versions of Python, and is a compiler's work for others.
+$(VENV)-fuzz/stamp: setup.py setup.cfg pyproject.toml
+	$(PYTHON) -m venv $(VENV)-fuzz
+	$(VENV)-fuzz/bin/pip install --quiet atheris==3.1.0 -e .
+	@touch $@
+
 bench: $(VENV)-bench/stamp $(VENV)-bench-g2o/stamp
 	$(VENV)-bench/bin/python -m benchmarks
 
@@ -142,4 +148,4 @@ COMPILE = $(VENV)-lock/bin/uv pip compile --quiet --universal --python-version 3
   --no-emit-index-url --no-annotate --custom-compile-command 'make lock' $(LOCK)
 
 clean:
-	rm -rf $(VENV) $(VENV)-oldest $(VENV)-lock $(VENV)-bench $(VENV)-bench-g2o build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-oldest $(VENV)-lock $(VENV)-bench $(VENV)-bench-g2o $(VENV)-fuzz build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

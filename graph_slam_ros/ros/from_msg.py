@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from graph_slam_ros.ros.inputs import CONVERTERS, Measured, checks, fixes, uses
 from graph_slam_ros.ros.inputs.checks import MessageError
 from graph_slam_ros.ros.inputs.source import NotYet, Source
@@ -147,7 +149,8 @@ class Border:
     def _converted(self, source: Source, message: Any) -> list[Measured]:
         out: list[Measured] = []
         try:
-            out += self._convert[source.name](message)
+            with np.errstate(invalid="ignore"):  # a signalling NaN warns where it is compared; it is refused by name
+                out += self._convert[source.name](message)
         except NotYet:
             source.tally.clear()
             self._waiting.append((source, message))
