@@ -11,6 +11,7 @@ from graph_slam_ros.ros.bag import Bag, BagError, open_bag
 from graph_slam_ros.ros.definitions import recorded_decoder
 from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border
 from graph_slam_ros.ros.inputs import Measured, uses
+from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.ros.survey import with_survey
 from graph_slam_ros.run import RunRecorder, check_room, is_run, run_config, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
@@ -105,10 +106,11 @@ def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> 
     return ""
 
 
-def measurements(bag: Bag, inputs: Inputs, config: Config, counters: Counters) -> Iterator[list[Measured]]:
+def measurements(bag: Bag, inputs: Inputs, config: Config, counters: Counters) -> Iterator[list[Measured | Control]]:
     """What the border makes of each recorded message, in order, and at the end of what has waited.
 
-    Static transforms are read first: they hold for the whole recording.
+    Where the stamps of odometry begin anew, a segment does. Static transforms are read first: they hold for the whole
+    recording.
 
     Raises
     ------
@@ -116,17 +118,24 @@ def measurements(bag: Bag, inputs: Inputs, config: Config, counters: Counters) -
         At once, before anything is read: a recorded definition is not what we can use.
     """
     used = [bag.topics[topic] for topic in inputs.topics.values()]
-    return _through(Border(config, counters, {topic.type: recorded_decoder(topic) for topic in used}), bag, inputs)
+    border = Border(config, counters, {topic.type: recorded_decoder(topic) for topic in used})
+    return _through(border, bag, inputs, StampJump(config.time.jump_back_s))
 
 
-def _through(border: Border, bag: Bag, inputs: Inputs) -> Iterator[list[Measured]]:
+def _through(border: Border, bag: Bag, inputs: Inputs, jump: StampJump) -> Iterator[list[Measured | Control]]:
     if TF_STATIC in inputs.topics:
         for message in bag.messages({inputs.topics[TF_STATIC]}):
             border.take(TF_STATIC, message.cdr)
     by_topic = inputs.by_topic()
     for message in bag.messages(set(by_topic)):
-        yield [m for name in by_topic[message.topic] for m in border.take(name, message.cdr)]
-    yield border.finish()
+        measured = [m for name in by_topic[message.topic] for m in border.take(name, message.cdr)]
+        if jump.hear(measured):
+            border.forget_time()
+            jump.forget()
+            yield [Control("time_jump"), *measured]
+        else:
+            yield [*measured]
+    yield [*border.finish()]
 
 
 def replay(

@@ -159,6 +159,27 @@ def test_B14_odometry_that_comes_before_the_clock_is_of_the_same_segment(tmp_pat
         assert n.stop()[0] == 0
 
 
+def test_B7_where_no_clock_tells_that_stamps_have_gone_back_odometry_does(tmp_path):
+    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=HEARS) as r:
+        r.wait_for_node()
+        drive = Drive()
+        r.until_it_says("OK", spin=drive.pace(r))
+        drive.stamp_ns -= 600 * NS
+        begin_ns = drive.stamp_ns
+        until(lambda: "odometry has gone back in time" in n.said, drive.pace(r), "word of it")
+        r.settle()
+        for heard in r.heard.values():
+            heard.clear()
+        until(lambda: len(r.heard["pose"]) > 10 and len(stamps(r)) > 5, drive.pace(r), "poses and transforms")
+        r.until_it_says("OK", spin=drive.pace(r))
+        assert r.graph()["segments"] == 2
+        assert off_by(r, drive) < 1.0, "still in the same map"
+        assert is_ascending(stamps(r))
+        assert begin_ns < min(stamps(r)) < max(stamps(r)) < drive.stamp_ns + NS
+        assert n.stop()[0] == 0
+    assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
+
+
 def test_B14_where_another_clock_is_used_a_segment_begins_and_the_map_stays(tmp_path):
     with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=HEARS) as r:
         r.wait_for_node()

@@ -24,6 +24,7 @@ from messages import (
 from reliability import tell, times
 
 from graph_slam_ros.graph import RELATIVE_POSE
+from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.run import RunRecorder, summarize
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
@@ -185,6 +186,31 @@ def test_B18_a_short_drop_out_of_odometry_is_a_longer_step_of_more_noise():
     longest = [sigma_of_edges(p)[:, 2].max() for p in (whole, lossy)]
     assert longest == pytest.approx([0.05 * math.sqrt(0.3), 0.05 * math.sqrt(2.1)], rel=0.1)
     assert lossy.trajectory()[-1] == pytest.approx(whole.trajectory()[-1], abs=0.3)
+
+
+def begins_anew(*stamps_s, source="odom"):
+    """Whether stamps of odometry begin anew, message by message."""
+    jump = StampJump(0.2)
+    told = (s if isinstance(s, tuple) else (s, source) for s in stamps_s)
+    return [jump.hear([Odometry(T0 + round(s * S), (0.0, 0.0, 0.0), None, name)]) for s, name in told]
+
+
+def test_B7_stamps_of_odometry_that_go_back_for_a_second_and_stay_there_begin_anew():
+    before, after = [0.1 * k for k in range(100)], [-60.0 + 0.1 * k for k in range(11)]
+    told = begins_anew(*before, *after)
+    assert told.index(True) == len(told) - 1
+    assert not any(begins_anew(*before, *after[:10]))
+    assert begins_anew(*before, -60.0, -59.0, -58.0)[-1], "of odometry once a second, the third"
+
+
+def test_B10_what_was_held_up_or_comes_again_or_of_one_source_of_two_begins_nothing_anew():
+    before, late = [0.1 * k for k in range(100)], [5.0 + 0.1 * k for k in range(30)]
+    assert not any(begins_anew(*before, *late[:9], 10.0, *late[9:18], 10.1)), "bursts of less than a second"
+    assert not any(begins_anew(*before, *(s for k in range(30) for s in (late[k], 10.0 + 0.1 * k)))), "told twice"
+    assert not any(begins_anew(*before, *[5.0] * 100)), "it stands"
+    assert not any(begins_anew(*(9.9 - 0.15 * (k % 2) + 0.01 * k for k in range(100)))), "less than 0.2 s"
+    two = [(s, name) for k in range(100) for s, name in ((0.1 * k, "wheels"), (0.1 * k - 60.0 * (k > 50), "camera"))]
+    assert not any(begins_anew(*two)), "the wheels go on"
 
 
 def test_B10_a_single_late_message_is_no_jump_back():

@@ -28,6 +28,7 @@ from graph_slam_ros.ros.live.reckoning import Reckoning
 from graph_slam_ros.ros.live.session import Estimate, Session
 from graph_slam_ros.ros.live.worker import Worker
 from graph_slam_ros.ros.message_class import message_class
+from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.ros.survey import with_survey
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Update
 
@@ -49,6 +50,7 @@ class Configured:
         self.counters.on_first = self._tell
         self._border = Border(config, self.counters, _installed(config))
         self._ahead = Ahead(config.time.future_s, self._clock_ns, partial(self._refuse, "future"))
+        self._stamp_jump = StampJump(config.time.jump_back_s)
         self._reckoning = Reckoning(config)
         self._session = Session(config, self.counters, self._on_update, self._tell)
         self._outputs = Outputs(node, config)
@@ -125,6 +127,8 @@ class Configured:
 
     def _hand_over(self, measured: Sequence[Measured]) -> None:
         """To the worker; refused before it is accepted where there is no room, or nobody wants it now."""
+        if self._stamp_jump.hear(measured):
+            self._begin_anew("stamps", "odometry has gone back in time and stays there")
         reason = "stopped" if self._is_stopped else "paused" if self._is_paused else ""
         if measured and not reason:
             if self._worker.offer(self._node.guarded(partial(self._use, measured))):
@@ -172,8 +176,13 @@ class Configured:
         self._before_ns = self._node.now_ns - jump.delta.nanoseconds // 2
         if estimate is None and not self._worker.waiting:
             return
+        self._begin_anew("clock", f"jumped by {jump.delta.nanoseconds * 1e-9:.3f} s")
+
+    def _begin_anew(self, who: str, why: str) -> None:
+        """What comes now is of another time."""
         what = self._node.config.time.on_jump
-        self._tell("clock", f"jumped by {jump.delta.nanoseconds * 1e-9:.3f} s: {what}")
+        self._tell(who, f"{why}: {what}")
+        self._stamp_jump.forget()
         self._border.forget_time()
         self._reckoning.forget()
         self._outputs.forget_time()
