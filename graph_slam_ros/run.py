@@ -28,20 +28,22 @@ from graph_slam_ros.errors import ConfigError, GraphSlamError
 from graph_slam_ros.formats.durable import NEW, AppendedFile, replaced, sync_folder
 from graph_slam_ros.formats.g2o_writer import g2o_text
 from graph_slam_ros.formats.graph_file import G2oFile
-from graph_slam_ros.formats.ingest import IngestWriter, ingest_files, part_name
+from graph_slam_ros.formats.ingest import INGEST, MEASUREMENT, Parts, close_all, part_name, parts_of, read_ingest
 from graph_slam_ros.formats.parameters import parameters_text, read_parameters
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
+from graph_slam_ros.map_log import GROWTH, MAP, Growth, has_map, read_map, state_of
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter
 from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
-from graph_slam_ros.slam.measurements import to_record
+from graph_slam_ros.slam.map_state import MapState
+from graph_slam_ros.slam.measurements import from_record, to_record
 from graph_slam_ros.solver.leverage import leverage
 
 SUMMARY, COVARIANCES, _CONFIG = "run.json", "covariances.csv", "config.yaml"
 GRAPH, VERTICES = "graph.g2o", "graph_vertices.csv"
 Name = TypeVar("Name")
-_RECORDED = re.compile(r"(ingest|run)(_\d+)?\.mcap")
+_RECORDED = re.compile(r"(ingest|map|run)(_\d+)?\.mcap")
 
 _RESULTS = {
     SUMMARY,
@@ -68,7 +70,44 @@ class RunError(GraphSlamError):
 
 def is_run(folder: Path) -> bool:
     """Whether a folder holds a run: an ingest sequence and the configuration it was taken with."""
-    return folder.is_dir() and (folder / _CONFIG).is_file() and bool(ingest_files(folder))
+    return folder.is_dir() and (folder / _CONFIG).is_file() and bool(parts_of(folder))
+
+
+def is_cut_off(folder: Path) -> bool:
+    """Whether the newest run, there or moved out of its way, holds something and was never ended."""
+    earlier = earlier_runs(folder)
+    newest = folder if _holds_something(folder) else earlier[max(earlier)] if earlier else folder
+    if not _holds_something(newest):
+        return False
+    try:
+        return not json.loads((newest / SUMMARY).read_text(encoding="utf-8"))["ended"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return True
+
+
+def _holds_something(folder: Path) -> bool:
+    return is_run(folder) and next(read_ingest(folder, []), None) is not None
+
+
+def map_of(folder: Path, losses: list[str]) -> MapState:
+    """The map of a run: as it was written down, or where it was not, by repeating the drive.
+
+    Raises
+    ------
+    RunError, FormatError
+        There is none, or it cannot be read.
+    """
+    state = read_map(folder, losses) if has_map(folder) else _repeated(folder, losses)
+    if state is None or not state.keyframes:
+        raise RunError(f"{folder.name}: no keyframe, so there is no map")
+    return state
+
+
+def _repeated(folder: Path, losses: list[str]) -> MapState:
+    slam = GraphSlam(run_config(folder), start=read_map(folder, losses, start_only=True))
+    for record in read_ingest(folder, losses):
+        slam.process(from_record(record))
+    return state_of(slam)
 
 
 def run_config(folder: Path) -> Config:
@@ -100,9 +139,11 @@ def check_room(folder: Path, source: Path | None = None) -> None:
 def keep_earlier(folder: Path, most: int) -> None:
     """Move an earlier run out of the way: to ``folder-1``, or one more than the last; so many of them are kept.
 
-    Of older ones the files that a run has are removed, and nothing else.
+    One that holds nothing is not kept; one that was never ended is in any case. Of older ones the files that a run has
+    are removed, and nothing else.
     """
-    if not is_run(folder) or not most:
+    most = max(most, is_cut_off(folder))
+    if not _holds_something(folder) or not most:
         return
     earlier = earlier_runs(folder)
     try:
@@ -133,27 +174,30 @@ class RunRecorder:
     ----------
     folder : made if it is not there; an earlier run in it is replaced, other contents are refused
     sync_s : so often at most the disk is asked to take the journal, in a thread of its own; 0: at the end
+    start : the map that the run goes on in
     """
 
-    def __init__(self, folder: Path | str, config: Config, sync_s: float = 0.0) -> None:
+    def __init__(self, folder: Path | str, config: Config, sync_s: float = 0.0, start: MapState | None = None) -> None:
         self.folder = Path(folder)
         self._sync_s, self._due_s = sync_s, 0.0
         self._disk = ThreadPoolExecutor(1, "journal") if sync_s else None
         self._syncing: Future[None] | None = None
-        self._part = 0
-        self._ingest: IngestWriter | None = None
-        self._bag: BagWriter | None = None
+        self._journal = Parts(self.folder, INGEST, MEASUREMENT)
+        self._map = Parts(self.folder, MAP, GROWTH)
         self._accepted: list[Measurement] = []  # and not written yet
-        self._ended_journals: list[AppendedFile] = []  # earlier parts that wait for the disk
+        self._growth = Growth(start)
+        self._grown = self._growth.first
+        self._bag: BagWriter | None = None
+        self._bags = 0
         self._ended_bags: list[AppendedFile] = []
         self._next_path_at = 1.0
         _make_room(self.folder)
-        self._ingest = IngestWriter(self._part_of("ingest"))  # from the start: it makes the folder a run
+        self._journal.begin()  # from the start: it makes the folder a run
         try:
-            self._ingest.file.flush()
+            self._journal.flush()
             self._put(_CONFIG, parameters_text(config.as_mapping()))
         except OSError as error:
-            self._ingest.file.abandon()
+            self._journal.abandon()
             raise RunError(f"{self.folder}: {error.strerror}") from None
 
     def sink(self, measurement: Measurement) -> None:
@@ -163,7 +207,7 @@ class RunRecorder:
             self.flush()
 
     def flush(self) -> None:
-        """Bring to the journal what was accepted: before any of what came of it is told to anybody.
+        """Bring to the disk what was accepted and what came of it: before any of that is told to anybody.
 
         Raises
         ------
@@ -171,38 +215,40 @@ class RunRecorder:
             It is kept, and written by the next call that can; or the disk did not take what was flushed before.
         """
         self._fill()
-        _close_all(self._ended_journals)
-        if self._ingest is not None:
-            self._ingest.file.flush()
-            self._sync_if_due(self._ingest)
+        self._journal.flush()
+        self._map.flush()  # last: it is never ahead of what it came of
+        self._sync_if_due()
 
     def _fill(self) -> None:
         accepted, self._accepted = self._accepted, []
-        if accepted:
-            if self._ingest is None:
-                self._ingest = IngestWriter(self._part_of("ingest"))
-            self._ingest.write(map(to_record, accepted))
+        self._journal.write([to_record(measurement) for measurement in accepted])
+        grown, self._grown = self._grown, []
+        self._map.write(grown)
 
     @property
     def unwritten(self) -> int:
         """Bytes of the journal that wait for room on the disk."""
-        present = [self._ingest.file] if self._ingest is not None else []
-        return sum(file.waiting for file in self._ended_journals + present)
+        return self._journal.waiting + self._map.waiting
 
-    def _sync_if_due(self, ingest: IngestWriter) -> None:
+    def _sync_if_due(self) -> None:
         """The disk may take long: nobody waits for it, but the next that would ask it again."""
         now = time.monotonic()
         if self._disk is None or now < self._due_s or (self._syncing is not None and not self._syncing.done()):
             return
-        before, self._syncing = self._syncing, self._disk.submit(ingest.file.sync)
+        before, self._syncing = self._syncing, self._disk.submit(self._sync)
         self._due_s = now + self._sync_s
         if before is not None:
             before.result()
 
+    def _sync(self) -> None:
+        self._journal.sync()
+        self._map.sync()
+
     def record(self, slam: GraphSlam, update: Update) -> None:
-        """Append what an update changed: pose and TF, and the path and the landmarks when they have grown."""
+        """Append what an update changed: the map, pose and TF, and the path and the landmarks when they have grown."""
         if not update or not slam.keyframes:
             return
+        self._grown += self._growth.of(slam)
         stamp = slam.keyframes[-1].stamp_ns
         self._write("/tf", results.TF, stamp, results.map_to_odom(slam, stamp))
         self._write("/tf", results.TF, stamp, results.odom_to_base(slam))
@@ -264,14 +310,13 @@ class RunRecorder:
         """
         self._fill()
         failed = self._syncing.exception() if self._syncing is not None else None
-        self._part += self._ingest is not None or self._bag is not None
-        if self._ingest is not None:
-            self._ended_journals.append(self._ingest.end())
+        self._syncing = None
         if self._bag is not None:
             self._ended_bags.append(self._bag.end())
-        self._ingest = self._bag = self._syncing = None
-        _close_all(self._ended_journals)
-        _close_all(self._ended_bags)
+            self._bag, self._bags = None, self._bags + 1
+        self._journal.end()
+        self._map.end()
+        close_all(self._ended_bags)
         if failed is not None:
             raise failed
 
@@ -282,11 +327,8 @@ class RunRecorder:
 
     def _write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
         if self._bag is None:
-            self._bag = BagWriter(self._part_of("run"))
+            self._bag = BagWriter(self.folder / part_name("run", self._bags))
         self._bag.write(topic, type_name, stamp_ns, cdr)
-
-    def _part_of(self, name: str) -> Path:
-        return self.folder / part_name(name, self._part)
 
 
 def summarize(slam: GraphSlam) -> dict[str, Any]:
@@ -303,6 +345,7 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
         "solves": slam.solves,
         "chi2": last.chi2_final if last else 0.0,
         "cost": last.cost_final if last else 0.0,
+        "ended": True,
         "converged": last.converged if last else True,
         "stop": last.stop if last else "nothing_to_do",
         "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
@@ -383,10 +426,3 @@ def _clear(folder: Path) -> None:
     results = [file for file in there if file.name.removesuffix(NEW) in _RESULTS]
     for file in results + [file for file in there if _is_of_a_start(file)]:
         file.unlink()
-
-
-def _close_all(files: list[AppendedFile]) -> None:
-    """One after another; those that are closed are taken out."""
-    while files:
-        files[0].close()
-        del files[0]

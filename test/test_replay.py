@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.evaluation import read_tum
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.formats.ingest import IngestWriter, ingest_files, read_ingest
+from graph_slam_ros.formats.ingest import IngestWriter, parts_of, read_ingest
 from graph_slam_ros.replay import replay
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter, open_bag
@@ -35,7 +35,7 @@ RESULTS = (
     "ledger.csv",
     "ledger_changes.csv",
 )
-ALL = {*RESULTS, "graph_vertices.csv", "odometry.tum", "run.mcap", "ingest.mcap", "config.yaml", "run.json"}
+ALL = {*RESULTS, "graph_vertices.csv", "odometry.tum", "run.mcap", "ingest.mcap", "map.mcap", "config.yaml", "run.json"}
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_a_run_in_several_parts_is_replayed_as_one(tmp_path, world):
     for event in ("flush", "optimize"):
         slam.process(Control(event))
     recorder.save(slam)
-    assert len(ingest_files(tmp_path / "run")) > 10
+    assert len(parts_of(tmp_path / "run")) > 10
     replay(tmp_path / "run", tmp_path / "again")
     assert contents(tmp_path / "again") == contents(tmp_path / "run")
 
@@ -465,11 +465,18 @@ def test_an_offset_that_ranges_share_is_a_vertex_of_its_own_in_the_saved_graph(t
     assert len(vertices) == slam.graph.vertex_count
 
 
+def a_run(folder):
+    recorder = RunRecorder(folder, Config())
+    slam = GraphSlam(sink=recorder.sink)
+    slam.process(Odometry(1, (0.0, 0.0, 0.0)))
+    recorder.save(slam)
+
+
 @pytest.mark.parametrize("most", [0, 1, 2, 5])
 def test_of_earlier_runs_the_last_ones_are_kept_and_no_others(tmp_path, most):
     for k in range(9):
         keep_earlier(tmp_path / "run", most)
-        RunRecorder(tmp_path / "run", Config()).close()
+        a_run(tmp_path / "run")
         last = range(max(1, k - most + 1), k + 1) if most else ()
         assert set(earlier_runs(tmp_path / "run")) == set(last)
     assert is_run(tmp_path / "run")
@@ -478,7 +485,7 @@ def test_of_earlier_runs_the_last_ones_are_kept_and_no_others(tmp_path, most):
 def test_of_an_earlier_run_that_is_not_kept_what_somebody_has_put_there_stays(tmp_path):
     for _ in range(3):
         keep_earlier(tmp_path / "run", 1)
-        RunRecorder(tmp_path / "run", Config()).close()
+        a_run(tmp_path / "run")
         if (tmp_path / "run-1").is_dir():
             (tmp_path / "run-1" / "notes").write_text("mine")
     assert [file.name for file in (tmp_path / "run-1").iterdir()] == ["notes"]

@@ -38,6 +38,9 @@ def parser() -> argparse.ArgumentParser:
             "replay", recordings.replay, "run a recording (mcap, db3, ROS 1) or an earlier run through the pipeline"
         )
     )
+    _recover(
+        command("recover", recordings.recover, "the results of a run that was cut off, without repeating the drive")
+    )
     _info(
         command("info", recordings.info, "topics, types, rates, frames and span of a recording, and how to replay it")
     )
@@ -91,6 +94,11 @@ def _replay(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--ros", action="store_true", help="publish into a live ROS graph: a node of its own with --out")
     sub.add_argument("--rate", type=_positive, metavar="X", help="with --ros: times real time (default: all it takes)")
     sub.add_argument("--node", metavar="NAME", help="with --ros and no --out: the running node")
+
+
+def _recover(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("run_folder", type=Path, metavar="RUN")
+    sub.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder for the results")
 
 
 def _info(sub: argparse.ArgumentParser) -> None:

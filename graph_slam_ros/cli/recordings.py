@@ -58,6 +58,16 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
     return console.told(losses, bag.warnings)
 
 
+def recover(args: argparse.Namespace) -> int:
+    """Write the results of a run that was never ended."""
+    from graph_slam_ros.replay import recover as recovered
+
+    done = recovered(args.run_folder, args.out)
+    _say_run(args.run_folder, done.summary)
+    console.say(f"results in {args.out}")
+    return console.told(done.losses)
+
+
 def info(args: argparse.Namespace) -> int:
     """Say what a recording holds."""
     from graph_slam_ros.info import describe

@@ -7,7 +7,7 @@ writes one chunk, which carries its CRC. A sequence may be split over several fi
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +19,20 @@ from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.mcap_records import records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
-_PART = re.compile(r"ingest(?:_(\d+))?\.mcap")
+INGEST = "ingest"
+MEASUREMENT = "graph_slam_ros.Measurement"
 _SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}}, "required": ["type"]}).encode()
 
 
 class IngestWriter:
     """Appends records to one new file: they wait in memory for the next ``flush`` of that."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, schema: str = MEASUREMENT) -> None:
         self.file = AppendedFile(path)
         self._chunk = _Chunk()
         self._writer = Writer(self.file, chunk_size=self._chunk, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
         self._writer.start(profile="", library="graph_slam_ros")
-        self._schema = self._writer.register_schema("graph_slam_ros.Measurement", "jsonschema", _SCHEMA)
+        self._schema = self._writer.register_schema(schema, "jsonschema", _SCHEMA)
         self._channels: dict[str, int] = {}
         self._sequence = 0
         self._stamp_ns = 0
@@ -64,6 +65,71 @@ class IngestWriter:
         self.end().close()
 
 
+class Parts:
+    """What is recorded under one name in a folder, part after part, each a file of its own.
+
+    What the disk does not take waits, of parts that were ended as of the present one, and is written in that order.
+    """
+
+    def __init__(self, folder: Path, name: str, schema: str) -> None:
+        self._folder, self._name, self._schema = folder, name, schema
+        self._part = 0
+        self._present: IngestWriter | None = None
+        self._ended: list[AppendedFile] = []
+
+    def begin(self) -> None:
+        """Have the present part, also where nothing is to be written yet."""
+        if self._present is None:
+            self._present = IngestWriter(self._folder / part_name(self._name, self._part), self._schema)
+
+    def write(self, several: Sequence[Mapping[str, Any]]) -> None:
+        """Append records: they wait for ``flush``."""
+        if several:
+            self.begin()
+            assert self._present is not None
+            self._present.write(several)
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that are not in files yet."""
+        return sum(file.waiting for file in self._files())
+
+    def flush(self) -> None:
+        """Write what waits. Raises OSError: then some of it waits still."""
+        close_all(self._ended)
+        for file in self._files():
+            file.flush()
+
+    def sync(self) -> None:
+        """Have the disk take what was flushed. May be called from another thread; raises OSError."""
+        present = self._present
+        if present is not None:
+            present.file.sync()
+
+    def end(self) -> None:
+        """End the present part: what comes is of the next. Raises OSError as ``flush`` does."""
+        if self._present is not None:
+            self._ended.append(self._present.end())
+            self._present = None
+            self._part += 1
+        close_all(self._ended)
+
+    def abandon(self) -> None:
+        """Leave everything as it is on the disk."""
+        for file in self._files():
+            file.abandon()
+
+    def _files(self) -> list[AppendedFile]:
+        return self._ended + ([self._present.file] if self._present is not None else [])
+
+
+def close_all(files: list[AppendedFile]) -> None:
+    """Close files in order; those that were are out of the list. Raises OSError of the first that could not be."""
+    while files:
+        files[0].close()
+        del files[0]
+
+
 class _Chunk(int):
     """The size beyond which the library ends a chunk: none, until the last record of a flush comes."""
 
@@ -78,18 +144,24 @@ def part_name(name: str, part: int) -> str:
     return f"{name}_{part}.mcap" if part else f"{name}.mcap"
 
 
-def ingest_files(folder: Path) -> list[Path]:
-    """The files of a run's sequence, in order."""
-    parts = {file: _PART.fullmatch(file.name) for file in folder.glob("ingest*.mcap")}
+def parts_of(folder: Path, name: str = INGEST) -> list[Path]:
+    """The files of a recording in a run folder, in order."""
+    pattern = re.compile(rf"{name}(?:_(\d+))?\.mcap")
+    parts = {file: pattern.fullmatch(file.name) for file in folder.glob(f"{name}*.mcap")}
     numbered = {file: int(part[1] or 0) for file, part in parts.items() if part and file.is_file()}
     return sorted(numbered, key=lambda file: numbered[file])
 
 
 def read_ingest(folder: Path, losses: list[str]) -> Iterator[dict[str, Any]]:
-    """Records in order of acceptance, up to the first that cannot be read; what is lost adds to ``losses``."""
+    """The measurements of a run folder in order of acceptance, as ``read_records`` reads them."""
+    return read_records(folder, INGEST, losses)
+
+
+def read_records(folder: Path, name: str, losses: list[str]) -> Iterator[dict[str, Any]]:
+    """In the order they were written, up to the first that cannot be read; what is lost adds to ``losses``."""
     lost = len(losses)
-    for part, file in enumerate(ingest_files(folder)):
-        if file.name != (due := part_name("ingest", part)):
+    for part, file in enumerate(parts_of(folder, name)):
+        if file.name != (due := part_name(name, part)):
             losses.append(f"{due}: not there; what came after was not read")
         if len(losses) > lost:  # what came after would be out of place
             return

@@ -129,7 +129,10 @@ class GraphSlamNode(LifecycleNode):
             self._run = run = Configured(self)  # first what may be refused
             self.get_logger().info("compiling kernels (once per installation)")
             self.get_logger().info(f"kernels ready after {warmup(self._is_told_to_stop):.1f} s")
-            if self.config.output.load_at_start:
+            resumes = self.config.journal.resume and run.was_cut_off
+            if resumes:
+                self.get_logger().warn("the last run was never ended: going on in its map")
+            if resumes or self.config.output.load_at_start:
                 run.in_passing(run.load())
 
     def _configured(self) -> "Configured":

@@ -3,13 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from graph_slam_ros.graph import Graph, Loss
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph import Loss
 from graph_slam_ros.slam.background import Background, Beside, when_asked
 from graph_slam_ros.slam.decisions import Decisions
 from graph_slam_ros.slam.ledger import Ledger, Reason
+from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.robust_config import RobustConfig
 from graph_slam_ros.slam.second_look import Frozen, Outcome, Rival, second_look
 from graph_slam_ros.solver import Report, Settings, Solver
+
+Array = NDArray[np.float64]
 
 _UPDATES = 6  # until what was let in fits, before everything is solved for it
 
@@ -20,6 +26,7 @@ class Backend:
     Parameters
     ----------
     beside : begins the work of a second look; what it returns waits for the result
+    start : whose graph and ledger to go on with
 
     Attributes
     ----------
@@ -28,11 +35,14 @@ class Backend:
     rivals : other explanations of the same measurements that the last second look could not rule out
     """
 
-    def __init__(self, config: RobustConfig, settings: Settings, beside: Beside = when_asked) -> None:
+    def __init__(
+        self, config: RobustConfig, settings: Settings, beside: Beside = when_asked, start: MapState | None = None
+    ) -> None:
         self._config = config
-        self.graph = Graph()
+        start = start or MapState()
+        self.graph = start.graph
         self.solver = Solver(self.graph, settings)
-        self.decisions = Decisions(config, self.graph, self.solver)
+        self.decisions = Decisions(config, self.graph, self.solver, start.ledger)
         self.handed_over = 0, 0
         self._background = Background(config, beside)
         self.rivals: tuple[Rival, ...] = ()
@@ -43,6 +53,16 @@ class Backend:
     def ledger(self) -> Ledger:
         """What was decided of each edge."""
         return self.decisions.ledger
+
+    def take_up(self, vertices: Sequence[int], values: Array) -> Report:
+        """Solve all that is believed in a graph that was taken over: some of its vertices, from some values."""
+        self.solver.add(vertices, range(self.graph.edge_count))
+        self.solver.start_at(values)
+        self.handed_over = self.graph.vertex_count, self.graph.edge_count
+        report = self.solver.optimize()
+        self.decisions.tighten()
+        self._background.cancel(self.ledger.outside_count)
+        return report
 
     def hand_over(self) -> None:
         """Give the solver what is new in the graph."""

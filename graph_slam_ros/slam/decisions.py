@@ -110,7 +110,7 @@ class Decisions:
 
     def review(self, keyframe: int) -> None:
         """Look again at the newest verdicts and, in turn, at some of the others."""
-        self._tighten()
+        self.tighten()
         inside = self.ledger.inside
         if len(inside) > 2 * _AT_ONCE:
             self._next = (self._next + _AT_ONCE) % (len(inside) - _AT_ONCE)
@@ -131,7 +131,7 @@ class Decisions:
 
     def settle(self, keyframe: int) -> bool:
         """After a solve of everything: what fits is in, what does not is out; whether a verdict has changed."""
-        self._tighten()
+        self.tighten()
         ledger, changed = self.ledger, False
         inside, outside = ledger.inside, ledger.outside
         for edges, out in ((inside, True), (outside, False)):
@@ -280,7 +280,7 @@ class Decisions:
         stages = [Loss.named(name, self._config.loss_scale) for name in ("huber", "dcs")]
         return dict.fromkeys(CANDIDATES, stages)
 
-    def _tighten(self) -> None:
+    def tighten(self) -> None:
         """Follow what residuals are like: whoever gives a noise ten times too large would let in all that is false.
 
         The median of what is inside is compared with that of chi2; what is false does not move it.

@@ -19,6 +19,7 @@ from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.landmarks import Landmark, Landmarks
 from graph_slam_ros.slam.ledger import Change
+from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.measurements import (
     Closure,
     Control,
@@ -36,20 +37,11 @@ from graph_slam_ros.slam.pose_edges import PoseEdges
 from graph_slam_ros.slam.space import Numbers
 from graph_slam_ros.slam.stamp_order import StampOrder
 from graph_slam_ros.slam.track import Track
-from graph_slam_ros.slam.trail import Trail
+from graph_slam_ros.slam.trail import SightingPose, Trail
 from graph_slam_ros.slam.unnamed import Unnamed
 from graph_slam_ros.solver import Report, Settings
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class SightingPose:
-    """Where the robot was when it saw something: a keyframe, by its index, and the motion since."""
-
-    keyframe: int
-    stamp_ns: int
-    T_keyframe_base: Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +98,7 @@ class GraphSlam:
     config : the parameters
     sink : called with every measurement that was accepted, in that order, before it takes effect
     beside : begins work that may go on beside ``process``; what it returns waits for the result
+    start : the map to go on in, which is then this object's; the next odometry begins a segment
     """
 
     def __init__(
@@ -113,11 +106,12 @@ class GraphSlam:
         config: Config | None = None,
         sink: Callable[[Measurement], None] | None = None,
         beside: Beside = when_asked,
+        start: MapState | None = None,
     ) -> None:
         self.config = config or Config()
         self.space = self.config.space
         self.counters = Counters()
-        self.backend = Backend(self.config.robust, self.config.solver_settings(), beside)
+        self.backend = Backend(self.config.robust, self.config.solver_settings(), beside, start)
         self.graph, self.solver, self.ledger = self.backend.graph, self.backend.solver, self.backend.ledger
         self.sighting_poses = Track(SightingPose, self.space.pose.size)
         self.solves = 0
@@ -142,6 +136,8 @@ class GraphSlam:
         self._solved_T_map_odom = self.space.identity  # to see how far a solve moves it
         self._solved_vertices = 0  # that the last solve took in: none where it failed
         self._unsolved_keyframes = 0
+        if start is not None and start.keyframes:
+            self._take_up(start)
 
     # -- the door ------------------------------------------------------------------------------------------------
 
@@ -268,6 +264,33 @@ class GraphSlam:
     def odometry_source(self) -> str:
         """The odometry in use, by the name of its input; empty before the first."""
         return self._odometry.used.source if self._odometry.used else ""
+
+    @property
+    def range_offsets(self) -> dict[str, int]:
+        """By input, the vertex of what all its ranges have in common."""
+        return self._landmarks.offsets
+
+    def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
+        """Those that have changed, tentative ones included, but for the first so many changes; None: given up."""
+        return {name: self._landmarks.known.get(name) for name in self._landmarks.touched[first:]}
+
+    @property
+    def landmark_changes(self) -> int:
+        """How often one has changed."""
+        return len(self._landmarks.touched)
+
+    def _take_up(self, start: MapState) -> None:
+        """Solve a map anew, and be nowhere in it yet."""
+        self._trail.take_up(start.keyframes, start.segments)
+        for pose in start.sighting_poses:
+            self.sighting_poses.append(pose.keyframe, pose.stamp_ns, pose.T_keyframe_base)
+        self._landmarks.take_up(start.landmarks, start.range_offsets)
+        self._unnamed.take_up()
+        self.report = self.backend.take_up(start.vertices, start.values)
+        (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
+        self._solved_vertices, self._taken_in = self.backend.handed_over
+        self._told = len(self.ledger.history)
+        self._solved_T_map_odom = self.T_map_odom
 
     # -- odometry ------------------------------------------------------------------------------------------------
 

@@ -47,6 +47,7 @@ class Landmark:
     stamps : of these; a landmark is never seen twice at once
     """
 
+    name: str
     vertex: int
     is_unnamed: bool = False
     is_tentative: bool = False
@@ -74,6 +75,8 @@ class Landmarks:
     ----------
     known : those in the graph, by identity
     waiting : those that are not determined yet
+    offsets : by input, the vertex of what all its ranges have in common
+    touched : the name of a landmark of the graph for each change of it, in order
     """
 
     def __init__(
@@ -91,7 +94,8 @@ class Landmarks:
         if config.landmarks.surveyed_file and not config.landmarks.surveyed:
             raise ConfigError(f"landmarks.surveyed_file: {config.landmarks.surveyed_file} has not been read")
         self._survey = config.survey
-        self._offsets: dict[str, int] = {}
+        self.offsets: dict[str, int] = {}
+        self.touched: list[str] = []
 
     def add(self, topic: str, name: str, s: Sighting, where: Where) -> None:
         """Take a sighting of a landmark with this identity."""
@@ -110,6 +114,12 @@ class Landmarks:
         else:
             self._wait(topic, name, s, where)
 
+    def take_up(self, known: dict[str, Landmark], offsets: dict[str, int]) -> None:
+        """Go on with these, whose vertices and edges are in the graph."""
+        self.known.update(known)
+        self.offsets.update(offsets)
+        self.touched += known
+
     # -- in the graph --------------------------------------------------------------------------------------------
 
     def _begin(self, topic: str, name: str, s: Sighting, where: Where, value: Numbers) -> None:
@@ -117,7 +127,7 @@ class Landmarks:
         kind = self._space.pose if s.kind == "pose" else self._space.point
         if s.kind == "pose":
             value = self._space.group.compose(self._pose(where), value)
-        landmark = self.known[name] = Landmark(self._graph.add_vertex(kind, value), not s.id, not s.id)
+        landmark = self.known[name] = Landmark(name, self._graph.add_vertex(kind, value), not s.id, not s.id)
         if name in self._survey:
             self._hold(landmark, self._survey[name])
         self._add_edge(topic, landmark, s, where)
@@ -155,6 +165,7 @@ class Landmarks:
             landmark.seen.append(Seen(edge, topic, s, where))
             landmark.stamps.add(where.stamp_ns)
         landmark.sightings += 1
+        self.touched.append(landmark.name)
         landmark.first_seen_ns = min(landmark.first_seen_ns or where.stamp_ns, where.stamp_ns)
         landmark.last_seen_ns = max(landmark.last_seen_ns, where.stamp_ns)
 
@@ -176,17 +187,18 @@ class Landmarks:
 
     def _offset(self, topic: str) -> int:
         """The vertex of what all ranges of a topic have in common."""
-        if topic not in self._offsets:
-            vertex = self._offsets[topic] = self._graph.add_vertex(R1, [0.0])
+        if topic not in self.offsets:
+            vertex = self.offsets[topic] = self._graph.add_vertex(R1, [0.0])
             noise = Gaussian.from_sigmas(self._config.landmarks.range_offset_sigma_m)
             self._graph.add_edge(POINT_PRIOR[R1], [vertex], [0.0], noise, "range_offset")
-        return self._offsets[topic]
+        return self.offsets[topic]
 
     # -- taken back ----------------------------------------------------------------------------------------------
 
     def give_up(self, name: str) -> None:
         """Take a landmark and its edges out of the problem."""
         landmark = self.known.pop(name)
+        self.touched.append(name)
         self._take_out(landmark.seen)
         self._solver.remove(landmark.vertex)
 
@@ -207,7 +219,13 @@ class Landmarks:
         self._take_out(moved)
         for one in moved:
             self.add(one.topic, merged, one.sighting, one.where)
-        self.known[merged].is_tentative = False
+        self.touched.append(kept)
+        self.believe(merged)
+
+    def believe(self, name: str) -> None:
+        """It is tentative no more."""
+        self.known[name].is_tentative = False
+        self.touched.append(name)
 
     def _take_out(self, seen: Sequence[Seen]) -> None:
         self._withdraw([one.edge for one in seen])
@@ -240,7 +258,7 @@ class Landmarks:
         if not waiting.reason:
             del self.waiting[name]
             at = tuple(waiting.places[0].position.tolist())
-            landmark = self.known[name] = Landmark(self._graph.add_vertex(self._space.point, at))
+            landmark = self.known[name] = Landmark(name, self._graph.add_vertex(self._space.point, at))
             for where, s in waiting.seen:
                 self._add_edge(waiting.topic, landmark, s, where)
 

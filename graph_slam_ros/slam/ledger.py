@@ -83,7 +83,13 @@ class Ledger:
         return out
 
     def enter(
-        self, keyframe: int, statistic: Array, numbers: Index, threshold: Array, residuals: Array, judged: NDArray[Any]
+        self,
+        keyframe: int | Index,
+        statistic: Array,
+        numbers: Index,
+        threshold: Array,
+        residuals: Array,
+        judged: NDArray[Any],
     ) -> Index:
         """Open a record for each new edge, accepted where it is to be judged at all; returns their ids.
 
@@ -105,8 +111,15 @@ class Ledger:
 
     def hold_back(self, edge: int) -> None:
         """An edge that has just come is out until it is compared with all else."""
-        self.verdict.values[edge], self.reason.values[edge] = Verdict.PENDING, Reason.UNLIKELY
-        self._out.add(edge)
+        self.put(edge, Verdict.PENDING, Reason.UNLIKELY)
+
+    def put(self, edge: int, verdict: Verdict, reason: Reason) -> None:
+        """A verdict, without a word of how it came."""
+        self.verdict.values[edge], self.reason.values[edge] = verdict, reason
+        if verdict in (Verdict.PENDING, Verdict.REJECTED) and reason != Reason.WITHDRAWN:
+            self._out.add(edge)
+        else:
+            self._out.discard(edge)
 
     def note(
         self,
@@ -118,12 +131,8 @@ class Ledger:
         threshold: float | None = None,
     ) -> None:
         """Write a verdict down, and that it was changed; without a threshold it was held against the edge's own."""
-        self.verdict.values[edge], self.reason.values[edge] = verdict, reason
+        self.put(edge, verdict, reason)
         self.statistic.values[edge] = statistic
-        if verdict in INSIDE or reason == Reason.WITHDRAWN:
-            self._out.discard(edge)
-        else:
-            self._out.add(edge)
         limit = float(self.threshold.values[edge]) if threshold is None else threshold
         self.history.append(Change(edge, keyframe, verdict, reason, float(statistic), limit))
 
@@ -140,6 +149,10 @@ class Ledger:
     def is_inside(self, edge: int) -> bool:
         """Whether an edge pulls."""
         return int(self.verdict.values[edge]) in _INSIDE
+
+    def is_withdrawn(self, edge: int) -> bool:
+        """Whether an edge was taken out for good."""
+        return edge < len(self) and int(self.reason.values[edge]) == Reason.WITHDRAWN
 
     @property
     def inside(self) -> Index:

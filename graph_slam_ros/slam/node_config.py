@@ -128,6 +128,9 @@ class OutputConfig:
 class JournalConfig:
     """What of a run outlives whatever ends it."""
 
+    resume: bool = setting(
+        True, "when configured, go on in the map of the last run where that was not ended, as if it were loaded"
+    )
     sync_s: float = setting(
         1.0,
         "have the disk take the journal so often at most: what a power cut may lose; the end of the process loses"

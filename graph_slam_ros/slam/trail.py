@@ -1,6 +1,7 @@
 """Where the robot was: its keyframes, and the odometry in between as far back as late measurements may reach."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,15 @@ class Keyframe:
     vertex: int
     stamp_ns: int
     T_odom_base: Numbers
+
+
+@dataclass(frozen=True, slots=True)
+class SightingPose:
+    """Where the robot was when it saw something: a keyframe, by its index, and the motion since."""
+
+    keyframe: int
+    stamp_ns: int
+    T_keyframe_base: Numbers
 
 
 class Trail:
@@ -58,6 +68,13 @@ class Trail:
         oldest_ns = step.stamp_ns - round(late_s * 1e9)
         while len(self._motions) > 2 and self._motions[1].start_ns <= oldest_ns:
             self._motions.popleft()
+
+    def take_up(self, keyframes: Sequence[Keyframe], segments: Sequence[int]) -> None:
+        """Go on after these; how the robot came from the last of them to where it is, nobody knows."""
+        for one in keyframes:
+            self.keyframes.append(one.vertex, one.stamp_ns, one.T_odom_base)
+        self.segments += segments
+        self.forget_time()
 
     def forget_time(self) -> None:
         """Stamps begin anew: none before can be told from them."""

@@ -31,6 +31,7 @@ _MOST_CANDIDATES = 24  # landmarks that one message is compared with: the neares
 _MOST_AT_ONCE = 8  # new landmarks whose pairings are weighed together: the latest
 _MOST_OPTIONS = 12  # older ones that each may be: the nearest
 _REACH_SIGMA = 5.0
+_NAME = "unnamed"
 _POSITIONED = ("position", "pose", "range_bearing")
 
 
@@ -79,6 +80,11 @@ class Unnamed:
         self._begun = 0
         self._mergers: deque[Merger] = deque(maxlen=100)
         self._parted: set[tuple[str, str]] = set()
+
+    def take_up(self) -> None:
+        """New names are other than those that there are."""
+        numbers = [name.removeprefix(_NAME) for name, mark in self._landmarks.known.items() if mark.is_unnamed]
+        self._begun = max((int(number) for number in numbers if number.isdecimal()), default=self._begun)
 
     def identified(self, m: Sightings, where: Where) -> list[tuple[str, Sighting]]:
         """The sightings of a message that can be used, each with an identity; the others are counted."""
@@ -132,7 +138,7 @@ class Unnamed:
 
     def _new_name(self) -> str:
         self._begun += 1
-        name = f"unnamed{self._begun}"
+        name = f"{_NAME}{self._begun}"
         return name if name not in self._landmarks.known else self._new_name()
 
     def _position(self, s: Sighting, where: Where) -> Carried:
@@ -331,7 +337,7 @@ class Unnamed:
         """Believe a tentative landmark that is none of the others; give up what was not seen for long."""
         landmark = self._landmarks.known[name]
         if self._is_sure(landmark) and not self._candidates([name], weighed)[0]:
-            landmark.is_tentative = False
+            self._landmarks.believe(name)
         elif now_ns - landmark.last_seen_ns > round(self._config.give_up_s * 1e9):
             self._landmarks.give_up(name)
             self._counters.count("landmarks", "given_up")

@@ -226,6 +226,11 @@ class Configured:
         self._hand_over(self._border.finish())
         return self._worker.call(self._session.save)
 
+    @property
+    def was_cut_off(self) -> bool:
+        """Whether the last run was never ended: its map can be loaded."""
+        return self._session.was_cut_off
+
     def load(self) -> "Future[str]":
         """Go on from an earlier run."""
         return self._anew(partial(self._session.load, self._node.config.output.load))

@@ -10,12 +10,21 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.ingest import read_ingest
 from graph_slam_ros.ros.live.beside import in_a_thread
-from graph_slam_ros.run import RunError, RunRecorder, earlier_runs, is_run, keep_earlier, run_config, summarize
+from graph_slam_ros.run import (
+    RunError,
+    RunRecorder,
+    earlier_runs,
+    is_cut_off,
+    is_run,
+    keep_earlier,
+    map_of,
+    run_config,
+    summarize,
+)
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.graph_slam import Correction
-from graph_slam_ros.slam.measurements import from_record
+from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.space import Numbers
 
 OnUpdate = Callable[[GraphSlam, Update], None]
@@ -67,19 +76,21 @@ class Session:
         self._border, self._on_update, self._tell = border, on_update, tell
         self._folder = Path(config.output.folder) if config.output.folder else None
         self.estimate: Estimate | None = None
+        self.was_cut_off = self._folder is not None and is_cut_off(self._folder)
         self._begin()
 
-    def _begin(self) -> None:
+    def _begin(self, start: MapState | None = None) -> None:
         self._recorder: RunRecorder | None = None
         if self._folder is not None:
             keep_earlier(self._folder, self.config.output.keep_earlier)
-            self._recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s)
+            self._recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start)
         self.recording_fails = False
-        self.slam = GraphSlam(self.config, self._sink, in_a_thread)
+        self.slam = GraphSlam(self.config, self._sink, in_a_thread, start)
         self.slam.counters.on_first = self._tell
         self.estimate = None
-        self._is_saved = True
-        self._is_confirmed, self._loaded = True, 0  # keyframes
+        self._is_saved, self._is_ended = True, False
+        self._loaded = len(self.slam.keyframes)
+        self._is_confirmed = not self._loaded
         self._slowest_s = 0.0
         self._fit, self._fitted_at, self._fit_due_s = float("nan"), 0, 0.0
 
@@ -103,10 +114,10 @@ class Session:
         if not update:
             return
         self._slowest_s = max(self._slowest_s, took_s) if update.solved else self._slowest_s
-        if self._recorded(RunRecorder.flush):  # nobody is told of anything that a restart would not know
+        recorded = self._recorded(lambda recorder: recorder.record(self.slam, update))
+        if self._recorded(RunRecorder.flush) and recorded:  # nobody is told of anything that a restart would not know
             self.recording_fails = False
         self._look(update, took_s)
-        self._recorded(lambda recorder: recorder.record(self.slam, update))
         self._on_update(self.slam, update)
 
     def _sink(self, measurement: Measurement) -> None:
@@ -181,8 +192,10 @@ class Session:
         counters = Counters()
         for some in (self._border, self.slam.counters):
             counters.update(some)
-        folder = str(self._recorder.save(self.slam, summarize(self.slam) | {"counters": counters.as_dict()}))
-        self._is_saved = True
+        ended = release == "end"
+        summary = summarize(self.slam) | {"counters": counters.as_dict(), "ended": ended}
+        folder = str(self._recorder.save(self.slam, summary))
+        self._is_saved, self._is_ended = True, ended
         return folder
 
     def reset(self) -> str:
@@ -199,16 +212,17 @@ class Session:
         if loaded.world != self.config.world:
             raise RunError(f"{run.name}: world.dimensions is {loaded.world.dimensions} there")
         losses: list[str] = []
-        measurements = [from_record(record) for record in read_ingest(run, losses)]
-        if losses:
-            raise RunError(f"{run.name}: {losses[0]}")
-        self.reset()
-        self.take([m for m in measurements if not (isinstance(m, Control) and m.event == "set")])
-        self.take([Control("time_jump")])
-        self._is_confirmed, self._loaded = not self.slam.keyframes, len(self.slam.keyframes)
-        if self.estimate is not None:
-            self._look(Update(), 0.0)
-        return f"{run.name}: {len(self.slam.keyframes)} keyframes"
+        start = map_of(run, losses)
+        self.finish()
+        self.config = self.slam.config
+        try:
+            self._begin(start)
+        except GraphSlamError:
+            self._begin()
+            raise
+        self._recorded(RunRecorder.flush)
+        self._look(Update(), 0.0)
+        return ": ".join([run.name, f"{len(self.slam.keyframes)} keyframes", *losses[:1]])
 
     def _earlier(self, name: str) -> Path:
         if self._folder is None:
@@ -228,7 +242,7 @@ class Session:
         if self._recorder is None:
             return ""
         folder = ""
-        if not self._is_saved:
+        if not self._is_saved or (self.slam.keyframes and not self._is_ended):
             folder = self.save("end")
         self._recorder.close()
         return folder

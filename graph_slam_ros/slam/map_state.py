@@ -1,0 +1,48 @@
+"""A map that can be taken up again: all of a run but what was on its way."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.slam.landmarks import Landmark
+from graph_slam_ros.slam.ledger import Ledger
+from graph_slam_ros.slam.trail import Keyframe, SightingPose
+
+Array = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class MapState:
+    """What there is, what is believed of it, and where it is thought to be; named as in ``GraphSlam``.
+
+    Attributes
+    ----------
+    values : stored numbers of all vertices, as ``Graph.initial``: where solving begins
+    """
+
+    graph: Graph = field(default_factory=Graph)
+    ledger: Ledger = field(default_factory=Ledger)
+    values: Array = field(default_factory=lambda: np.zeros(0))
+    keyframes: list[Keyframe] = field(default_factory=list)
+    segments: list[int] = field(default_factory=list)
+    sighting_poses: list[SightingPose] = field(default_factory=list)
+    landmarks: dict[str, Landmark] = field(default_factory=dict)
+    range_offsets: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def vertices(self) -> list[int]:
+        """Those of the problem; the others were of landmarks that were given up."""
+        poses = {one.vertex for one in self.keyframes}
+        points = {mark.vertex for mark in self.landmarks.values()}
+        return sorted(poses | points | {*self.range_offsets.values()})
+
+    def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
+        """All of them, but for the first so many."""
+        return dict(list(self.landmarks.items())[first:])
+
+    @property
+    def landmark_changes(self) -> int:
+        """Each is one."""
+        return len(self.landmarks)
