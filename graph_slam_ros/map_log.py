@@ -253,10 +253,13 @@ def _verdict(verdict: str, reason: str) -> tuple[Verdict, Reason]:
 
 def _know(state: MapState, record: Mapping[str, Any]) -> None:
     for name, told in record.get("landmarks", {}).items():
-        before = state.landmarks.pop(name, None)
+        before = state.landmarks.get(name)
+        if before is not None and (told is None or told[0] != before.vertex):  # it was given up: another comes last
+            del state.landmarks[name]
+            before = None
         if told is not None:
             now = state.landmarks[name] = Landmark(name, *told)
-            now.seen = before.seen if before and before.vertex == now.vertex else []
+            now.seen = before.seen if before is not None else []
     by_vertex = {mark.vertex: mark for mark in state.landmarks.values()} if record.get("seen") else {}
     for edge, topic, sighting, keyframe, vertex, stamp, pose, covariance in record.get("seen", ()):
         lists = {name: tuple(value) for name, value in sighting.items() if isinstance(value, list)}
