@@ -374,6 +374,16 @@ def test_F3_a_flipped_bit_outside_of_chunks_is_found_by_the_sum_over_all(tmp_pat
     assert losses == ["a.mcap: damaged: its data do not agree with their checksum"]
 
 
+def test_F3_an_index_that_a_flipped_bit_turns_into_a_message_is_told(tmp_path, messages):
+    file = write_mcap(tmp_path / "a.mcap", messages, chunk_size=20_000)
+    data = bytearray(file.read_bytes())
+    at = chunks(file)[1][1]
+    assert data[at] == 7
+    data[at] = 5
+    file.write_bytes(data)
+    assert read(file)[1] == ["a.mcap: 1 messages too many"]
+
+
 def test_F3_a_summary_that_is_damaged_is_not_believed(tmp_path, messages):
     file = write_mcap(tmp_path / "a.mcap", messages, chunk_size=20_000)
     data = bytearray(file.read_bytes())

@@ -57,7 +57,6 @@ def messages(path: Path, topics: Sequence[int], losses: list[str]) -> Iterator[t
         losses.append(f"{path.name}: its recorder was stopped while it wrote; what it wrote last may be lost")
     read = 0
     with closing(_connection(path)) as database:
-        damage = _damage(database)
         marks = ", ".join("?" * len(topics))
         try:
             for topic, stamp, data in database.execute(f"{_ROWS} WHERE topic_id IN ({marks}) ORDER BY id", topics):
@@ -68,9 +67,16 @@ def messages(path: Path, topics: Sequence[int], losses: list[str]) -> Iterator[t
                     losses.append(f"{path.name}: a message without time or content was passed over")
         except sqlite3.Error as error:
             losses.append(f"{path.name}: cut off after {read} messages ({error})")
-            return
-    if damage:
-        losses.append(f"{path.name}: damaged ({damage})")
+
+
+def damage(path: Path) -> str:
+    """What sqlite finds wrong with the file, or nothing: rows may be missing that nobody misses while reading."""
+    try:
+        with closing(_connection(path)) as database:
+            (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
+    except sqlite3.Error as error:
+        found = error
+    return "" if found == "ok" else " ".join(str(found).split())
 
 
 def _connection(path: Path) -> sqlite3.Connection:
@@ -92,12 +98,3 @@ def _beside(path: Path, ending: str) -> bool:
 
 def _text(raw: bytes) -> str:
     return raw.decode(errors="replace")
-
-
-def _damage(database: sqlite3.Connection) -> str:
-    """What sqlite finds wrong with the file, or nothing."""
-    try:
-        (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
-    except sqlite3.Error as error:
-        found = error
-    return "" if found == "ok" else " ".join(str(found).split())

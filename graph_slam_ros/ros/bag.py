@@ -208,8 +208,9 @@ class _McapPart:
             elif isinstance(record, Channel):
                 names[record.id] = record.topic
         missing = sum(self._contents.counts.values()) - read
-        if missing > 0:
-            losses.append(f"{self.file.name}: {missing} of its messages could not be read")
+        if missing:
+            what = f"{missing} of its messages could not be read" if missing > 0 else f"{-missing} messages too many"
+            losses.append(f"{self.file.name}: {what}")
 
     def _topic(self, channel: Channel, schema: Schema | None, count: int) -> Topic:
         type_name = schema.name if schema else ""
@@ -223,6 +224,7 @@ class _SqlitePart:
     def __init__(self, file: Path) -> None:
         self.file = file
         self._contents = found = sqlite_records.contents(file)
+        self._damage: str | None = None  # not looked for yet: it takes as long as reading
         self.first_ns = found.first_ns
         self.topics = [
             Topic(name, type_name, found.counts.get(number, 0), found.definitions.get(type_name, ""), encoding)
@@ -233,6 +235,10 @@ class _SqlitePart:
         names = {number: name for number, (name, _, _) in self._contents.topics.items() if name in topics}
         for number, log_ns, cdr in sqlite_records.messages(self.file, list(names), losses):
             yield BagMessage(names[number], log_ns, cdr)
+        if self._damage is None:
+            self._damage = sqlite_records.damage(self.file)
+        if self._damage and not losses:
+            losses.append(f"{self.file.name}: damaged ({self._damage})")
 
 
 class _Ros1Part:
