@@ -20,7 +20,7 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from vision_msgs.msg import Detection3DArray
 
 from graph_slam_ros.formats.ingest import read_ingest
-from graph_slam_ros.run import check_room
+from graph_slam_ros.run import check_room, is_cut_off
 from graph_slam_ros.slam import Control
 from graph_slam_ros.slam.config import parameters
 from graph_slam_ros.slam.measurements import from_record
@@ -247,17 +247,51 @@ def test_told_to_stop_while_kernels_are_compiled_it_does_not_wait_for_them(tmp_p
     check_room(tmp_path / "run")
 
 
-def test_told_to_stop_while_a_long_run_is_loaded_it_leaves_what_was_taken_until_then(tmp_path):
-    earlier_run(tmp_path / "life", 20_000)
+def test_told_to_stop_while_a_long_run_is_loaded_it_does_not_wait_for_it(tmp_path):
+    earlier_run(tmp_path / "life", 20_000)  # without its map: the drive is repeated, which takes long
     parameters = f"output.folder:={tmp_path / 'run'}", "output.load:=life", "output.load_at_start:=true"
     with node(*parameters) as n, robot(hears=("/diagnostics",)) as r:
-        until(lambda: r.graph().get("keyframes", 0) > 20, r.spin, "keyframe of the long run")
+        until(lambda: "kernels ready" in n.said, r.spin, "configured node", 120.0)
         code, took_s = n.stop()
     assert code == 0, n.said
     assert took_s < lenient(3.0)
-    assert "a solve takes too long to wait for: replay the run folder for its results" in n.said
     assert "Traceback" not in n.said
-    assert 20 < len(accepted(tmp_path / "run")) < 20_000
+    assert len(accepted(tmp_path / "life")) == 20_000 + 1_000
+    assert not accepted(tmp_path / "run")
+
+
+# -- what outlives it --------------------------------------------------------------------------------------------------
+
+
+def test_P2_P12_killed_it_goes_on_in_its_map_and_claims_no_pose_until_a_landmark_is_recognised(tmp_path):
+    hears = "pose", "/tf", "path", "/diagnostics", "landmarks"
+    parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true"
+    drive = Drive()
+    with node(*parameters) as n, robot(hears=hears) as r:
+        r.wait_for_node()
+        drive.go(r, 120, every=3)
+        r.settle()
+        known = [pose.header.stamp for pose in r.heard["path"][-1].poses]
+        n.process.kill()
+        assert n.ended()[0] == -signal.SIGKILL
+    assert is_cut_off(tmp_path / "run")
+    with node(*parameters) as n, robot(hears=hears) as r:
+        r.wait_for_node()
+        drive.sees = False
+        drive.stamp_ns += 10**9
+        r.until_it_says("DEGRADED", "where the robot is in the loaded map is not known yet", spin=drive.pace(r))
+        until(lambda: r.heard["path"], drive.pace(r), "path")
+        stamps = [pose.header.stamp for pose in r.heard["path"][-1].poses]
+        assert stamps[: len(known)] == known, "what was published before is there"
+        assert {m.text for m in r.heard["landmarks"][-1].markers if m.text} == set(TAGS)
+        assert not (r.heard["pose"] or r.heard["tf"])
+        drive.sees = True
+        until(lambda: r.heard["pose"] and r.heard["tf"], drive.pace(r), "place in the map")
+        assert off_by(r, drive) < 0.5
+        assert n.stop()[0] == 0
+    assert "the last run was never ended: going on in its map" in n.said
+    assert is_repeated(tmp_path / "run", tmp_path)
+    assert not is_cut_off(tmp_path / "run")
 
 
 # -- parameters --------------------------------------------------------------------------------------------------------
