@@ -17,6 +17,10 @@ class SingularError(GraphSlamError):
     """The edges do not determine a vertex."""
 
 
+class DivergedError(GraphSlamError):
+    """A solve whose result is not finite, or cannot be."""
+
+
 class FormatError(GraphSlamError):
     """A file that cannot be read as what it claims to be."""
 

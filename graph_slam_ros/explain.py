@@ -16,7 +16,7 @@ from graph_slam_ros.ledger_file import Entry, read_changes, read_ledger
 from graph_slam_ros.run import SUMMARY, run_config
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.association import quantile
-from graph_slam_ros.slam.ledger import Change, Reason, Verdict
+from graph_slam_ros.slam.ledger import FINAL, Change, Reason, Verdict
 from graph_slam_ros.what_if import SavedGraph
 
 _STATE = {
@@ -32,6 +32,7 @@ _WHY = {
     Reason.DOES_NOT_FIT: "does not fit",
     Reason.OUTVOTED: "outvoted",
     Reason.WITHDRAWN: "withdrawn",
+    Reason.QUARANTINED: "quarantined",
 }
 _KIND = {"closures": "a loop closure", "landmarks": "a sighting", "fixes": "a fix", "odometry": "odometry"}
 _SHOWN = 5
@@ -58,7 +59,7 @@ def explain_run(folder: Path) -> Iterator[str]:
     yield f"{len(entries)} edges, {len(judged)} of them judged; {len(entries) - len(judged)} are taken for granted"
     if judged:
         yield from _table(judged)
-    yield from _worst(e for e in judged if not e.is_in and e.reason is not Reason.WITHDRAWN)
+    yield from _worst(e for e in judged if not e.is_in and e.reason not in FINAL)
     yield from _least(e for e in judged if e.is_in)
     yield from _gates(judged, changes, config)
     yield from _rivals(folder)
@@ -188,7 +189,7 @@ def _edge(run: SavedGraph, edge: int, changes: Iterable[Change], config: Config)
             f"at keyframe {c.keyframe}: {_state(c.verdict, c.reason)}, chi2 {c.statistic:.4g} against {c.threshold:.4g}"
         )
         yield from _line("changed", text)
-    if e.reason is not Reason.WITHDRAWN:
+    if e.reason not in FINAL:
         yield from _what_if(run, e)
     if not e.is_in:
         yield from _line("to change", _remedy(e))
@@ -214,6 +215,8 @@ def _decided(e: Entry, history: Sequence[Change], config: Config) -> str:
             return f"in the cheapest explanation of everything it is off by {numbers}; {allowed}"
         case Reason.WITHDRAWN:
             return "not by how it fits: it was cleared, or association took it from its landmark"
+        case Reason.QUARANTINED:
+            return "not by how it fits: solves failed with it, again and again, and succeeded without"
     if e.verdict is Verdict.DOWN_WEIGHTED:
         return f"it stays in, but its loss leaves it little: {numbers}, above {e.threshold:.4g} ({chance})"
     return f"{'it came in later' if history else 'it fits as it came'}: {numbers}; {allowed}"
@@ -237,8 +240,8 @@ def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
 
 
 def _remedy(e: Entry) -> str:
-    if e.reason is Reason.WITHDRAWN:
-        return "nothing: what was withdrawn stays out; replay the run with another configuration"
+    if e.reason in FINAL:
+        return f"nothing: what was {_WHY[e.reason]} stays out; replay the run with another configuration"
     factor = (e.statistic / e.threshold) ** 0.5
     return (
         "it comes back by itself once the map agrees with it. If you know that it is true, noise is told too small,"

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.graph import Loss
-from graph_slam_ros.slam.background import Background, Beside, when_asked
+from graph_slam_ros.slam.background import Background, Beside, Work, when_asked
+from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.decisions import Decisions
-from graph_slam_ros.slam.ledger import Ledger, Reason
+from graph_slam_ros.slam.ledger import FINAL, Ledger, Reason
 from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.robust_config import RobustConfig
 from graph_slam_ros.slam.second_look import Frozen, Outcome, Rival, second_look
@@ -36,9 +37,14 @@ class Backend:
     """
 
     def __init__(
-        self, config: RobustConfig, settings: Settings, beside: Beside = when_asked, start: MapState | None = None
+        self,
+        config: RobustConfig,
+        settings: Settings,
+        beside: Beside = when_asked,
+        start: MapState | None = None,
+        counters: Counters | None = None,
     ) -> None:
-        self._config = config
+        self._config, self._counters = config, counters or Counters()
         start = start or MapState()
         self.graph = start.graph
         self.solver = Solver(self.graph, settings)
@@ -69,8 +75,8 @@ class Backend:
         vertices, edges = self.handed_over
         if (vertices, edges) == (self.graph.vertex_count, self.graph.edge_count):
             return
-        self.handed_over = self.graph.vertex_count, self.graph.edge_count
         self.solver.add(range(vertices, self.graph.vertex_count), range(edges, self.graph.edge_count))
+        self.handed_over = self.graph.vertex_count, self.graph.edge_count
 
     def update(self, keyframe: int) -> None:
         """Take in what is new and believed, then what is believed of the rest."""
@@ -79,7 +85,7 @@ class Backend:
         if self._config.decide and keyframe - self._reviewed >= self._config.review_every_keyframes:
             self._reviewed = keyframe
             self.decisions.review(keyframe)
-        outcome = self._background.outcome(keyframe)
+        outcome = self._looked(lambda: self._background.outcome(keyframe))
         if outcome is not None and self._follow(outcome, keyframe):
             self.solver.optimize()
         self.solver.update()
@@ -96,7 +102,7 @@ class Backend:
         if not self._config.decide:
             return report
         self._admit(keyframe)
-        outcome = second_look(self._config, self._frozen(keyframe, settings))
+        outcome = self._looked(lambda: second_look(self._config, self._frozen(keyframe, settings)))
         if outcome is not None:
             self.rivals = self._standing(outcome.rivals)
             self.decisions.follow(outcome.ledger, keyframe)
@@ -105,9 +111,9 @@ class Backend:
         self._background.cancel(self.ledger.outside_count)
         return report
 
-    def withdraw(self, edges: Sequence[int], keyframe: int) -> None:
+    def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
         """Take edges out for good."""
-        self.decisions.withdraw(edges, keyframe)
+        self.decisions.withdraw(edges, keyframe, reason)
         self._doubtful = [edge for edge in self._doubtful if edge not in edges]
         self.rivals = self._standing(self.rivals)
 
@@ -136,6 +142,14 @@ class Backend:
         if self.decisions.refuse_unfit(admitted, keyframe):
             self.solver.update()
 
+    def _looked(self, look: Work) -> Outcome | None:
+        """What a second look has found; nothing where it failed, which changes nothing."""
+        try:
+            return look()
+        except Exception as error:
+            self._counters.count("second_look", type(error).__name__)
+            return None
+
     def _follow(self, outcome: Outcome, keyframe: int) -> bool:
         """Take over what a second look has found; whether that is other than what was known."""
         self.rivals = self._standing(outcome.rivals)
@@ -147,7 +161,7 @@ class Backend:
     def _standing(self, rivals: Sequence[Rival]) -> tuple[Rival, ...]:
         """Explanations of which nothing was withdrawn."""
         reason = self.ledger.reason.values
-        return tuple(one for one in rivals if not (reason[list(one.only_here)] == Reason.WITHDRAWN).any())
+        return tuple(one for one in rivals if not np.isin(reason[list(one.only_here)], FINAL).any())
 
     def _frozen(self, keyframe: int, settings: Settings) -> Frozen:
         solver = self.solver

@@ -16,7 +16,7 @@ from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.association import quantile
 from graph_slam_ros.slam.innovation import innovation
-from graph_slam_ros.slam.ledger import Ledger, Reason, Verdict
+from graph_slam_ros.slam.ledger import FINAL, Ledger, Reason, Verdict
 from graph_slam_ros.slam.robust_config import RobustConfig
 from graph_slam_ros.solver import Solver
 
@@ -45,7 +45,7 @@ class Decisions:
         self._tightness: dict[str, float] = {}  # of each class, by what its gate is smaller
         self.is_calibrated = False  # whether enough was measured twice to tell how good odometry is
         self._looseness = config.noise_factor**2  # of the gate of what all else predicts
-        self._withdrawn: list[int] = []  # before they were taken
+        self._withdrawn: dict[int, Reason] = {}  # before they were taken
         self._next = 0  # of the accepted, where the next review goes on
         self._next_out = 0  # and of those that are out
 
@@ -59,12 +59,12 @@ class Decisions:
         ids = np.arange(len(self.ledger), count)
         chi2, numbers = self._solver.chi2_of(ids)
         limit, judged = self._limits(ids, numbers), self._graph.has_label(ids, CANDIDATES)
-        judged &= ~np.isin(ids, self._withdrawn)
+        judged &= ~np.isin(ids, list(self._withdrawn))
         self.ledger.enter(keyframe, chi2, numbers, limit, self._solver.residuals_of(ids), judged)
         for edge in ids[judged].tolist():
             self._count(edge, 1)
-        for edge in self._withdrawn:
-            self.ledger.note(edge, keyframe, Verdict.REJECTED, Reason.WITHDRAWN, self.ledger.statistic.values[edge])
+        for edge, reason in self._withdrawn.items():
+            self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, self.ledger.statistic.values[edge])
         self._withdrawn.clear()
         waiting = []
         for edge in ids[judged & (chi2 > limit) & self._config.decide].tolist():
@@ -158,20 +158,20 @@ class Decisions:
                 return True
         return False
 
-    def withdraw(self, edges: Sequence[int], keyframe: int) -> None:
+    def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
         """Take edges out for good: who calls has other reasons than how they fit."""
         for edge in edges:
             if edge >= len(self.ledger):
                 self._solver.set_weight(edge, 0.0)
-                self._withdrawn.append(edge)
-            elif self.ledger.reason.values[edge] != Reason.WITHDRAWN:
-                self._reject(edge, keyframe, Reason.WITHDRAWN, float(self.ledger.statistic.values[edge]))
+                self._withdrawn[edge] = reason
+            elif self.ledger.reason.values[edge] not in FINAL:
+                self._reject(edge, keyframe, reason, float(self.ledger.statistic.values[edge]))
 
     def follow(self, other: Ledger, keyframe: int) -> bool:
         """Take over verdicts on the same edges from who has had a second look; whether that changed one."""
         mine, known = self.ledger, len(other)
         judged = np.flatnonzero(mine.verdict.values[:known] != Verdict.NOT_EVALUATED)
-        standing = judged[mine.reason.values[judged] != Reason.WITHDRAWN]
+        standing = judged[~np.isin(mine.reason.values[judged], FINAL)]
         return self._have_in(standing, np.isin(standing, other.inside), keyframe, other)
 
     def believe(self, edges: Index, keyframe: int) -> None:
@@ -210,7 +210,11 @@ class Decisions:
                 ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)
 
     def _innovation(self, edge: int) -> float:
-        return innovation(self._graph, self._solver, edge)
+        """What believing an edge would cost; infinite where no number comes of it."""
+        try:
+            return innovation(self._graph, self._solver, edge)
+        except (np.linalg.LinAlgError, ValueError):
+            return np.inf
 
     def _is_likely(self, edge: int, innovation: float) -> bool:
         return innovation <= self._widest(edge)
@@ -242,10 +246,10 @@ class Decisions:
 
     def _landmark(self, edge: int) -> tuple[int, dict[int, int]] | None:
         """The landmark that an edge is of, and among which of its edges it counts."""
-        if self._graph.label_of(edge) != "landmarks":
+        landmark = landmark_of(self._graph, edge)
+        if landmark is None:
             return None
-        table, row = self._graph.row(edge)
-        landmark = int(table.vertices.values[row, 1])
+        table, _ = self._graph.row(edge)
         alone = table.type.residual_size >= self._graph.kind_of(landmark).dof
         return landmark, self._holds if alone else self._helps
 
@@ -300,6 +304,14 @@ class Decisions:
             self._looseness = min(factor, max(_TIGHTEST, factor * as_noise_tells))
         edges = np.concatenate((inside, ledger.outside))
         ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
+
+
+def landmark_of(graph: Graph, edge: int) -> int | None:
+    """The vertex of the landmark that an edge is of."""
+    if graph.label_of(edge) != "landmarks":
+        return None
+    table, row = graph.row(edge)
+    return int(table.vertices.values[row, 1])
 
 
 def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:

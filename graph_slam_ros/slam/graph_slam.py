@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import DivergedError
 from graph_slam_ros.slam import carry
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import Beside, when_asked
@@ -34,6 +34,7 @@ from graph_slam_ros.slam.measurements import (
 from graph_slam_ros.slam.motion import Motion, OdometryNoise
 from graph_slam_ros.slam.odometry_choice import OdometryChoice, Step
 from graph_slam_ros.slam.pose_edges import PoseEdges
+from graph_slam_ros.slam.safeguard import Safeguard
 from graph_slam_ros.slam.space import Numbers
 from graph_slam_ros.slam.stamp_order import StampOrder
 from graph_slam_ros.slam.track import Track
@@ -111,7 +112,7 @@ class GraphSlam:
         self.config = config or Config()
         self.space = self.config.space
         self.counters = Counters()
-        self.backend = Backend(self.config.robust, self.config.solver_settings(), beside, start)
+        self.backend = Backend(self.config.robust, self.config.solver_settings(), beside, start, self.counters)
         self.graph, self.solver, self.ledger = self.backend.graph, self.backend.solver, self.backend.ledger
         self.sighting_poses = Track(SightingPose, self.space.pose.size)
         self.solves = 0
@@ -128,6 +129,7 @@ class GraphSlam:
         self._edges = PoseEdges(self.space, self.graph, self.counters)
         self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
         self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over)
+        self._safeguard = Safeguard(self.backend, self.counters, self._landmarks.forget)
         self._waiting: list[Observation] = []
         self._initial_pose: InitialPose | None = None  # for the next odometry
         self._covariance = np.zeros((self.space.dof, self.space.dof))
@@ -256,6 +258,11 @@ class GraphSlam:
         return self._solved_vertices > 0 and self.solver.is_current
 
     @property
+    def failing(self) -> str:
+        """Why the last solve failed; empty where it did not."""
+        return self._safeguard.failing
+
+    @property
     def newest_odometry_ns(self) -> int | None:
         """Stamp of the last odometry that was used."""
         return self._odometry.newest_ns
@@ -287,6 +294,7 @@ class GraphSlam:
         self._landmarks.take_up(start.landmarks, start.range_offsets)
         self._unnamed.take_up()
         self.report = self.backend.take_up(start.vertices, start.values)
+        self._safeguard.note_good()
         (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
         self._solved_vertices, self._taken_in = self.backend.handed_over
         self._told = len(self.ledger.history)
@@ -482,21 +490,31 @@ class GraphSlam:
         self._unsolved_keyframes = self._solved_vertices = 0
         if not self.keyframes:
             return
-        first_new = self._taken_in
+        keyframe = len(self.keyframes) - 1
+        solved = self._safeguard.solve(lambda: self._solved(keyframe, everything), keyframe)
+        if solved is None:
+            return
+        fits, report, self._covariance = solved
+        self.report = report or self.report
+        self.solves += 1
+        self._solved_vertices, self._taken_in = self.backend.handed_over
+        self._note_correction(fits)
+
+    def _solved(
+        self, keyframe: int, everything: Settings | None
+    ) -> tuple[list[tuple[float, int]], Report | None, Array]:
+        """How new edges fitted before, the report of a solve of everything, and the newest pose's covariance."""
         self.backend.hand_over()
-        fits = self._fit_of(range(first_new, self.backend.handed_over[1]))
-        try:
-            if everything is None:
-                self._review_if_due()
-                self.backend.update(len(self.keyframes) - 1)
-            else:
-                self.report = self.backend.optimize(len(self.keyframes) - 1, everything)
-            (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
-            self.solves += 1
-            self._solved_vertices, self._taken_in = self.backend.handed_over
-            self._note_correction(fits)
-        except (GraphSlamError, np.linalg.LinAlgError) as error:
-            self.counters.count("solver", type(error).__name__)
+        fits, report = self._fit_of(range(self._taken_in, self.backend.handed_over[1])), None
+        if everything is None:
+            self._review_if_due()
+            self.backend.update(keyframe)
+        else:
+            report = self.backend.optimize(keyframe, everything)
+        (covariance,) = self.solver.marginal([self.keyframes[keyframe].vertex])
+        if not np.isfinite(covariance).all():
+            raise DivergedError("the covariance is not finite")
+        return fits, report, covariance
 
     def _withdraw(self, edges: Sequence[int]) -> None:
         self.backend.withdraw(edges, len(self.keyframes) - 1)

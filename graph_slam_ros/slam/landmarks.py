@@ -202,6 +202,12 @@ class Landmarks:
         self._take_out(landmark.seen)
         self._solver.remove(landmark.vertex)
 
+    def forget(self, vertices: set[int]) -> None:
+        """These are out of the problem already; whatever is seen of them begins others."""
+        for name in [name for name, landmark in self.known.items() if landmark.vertex in vertices]:
+            self.touched.append(name)
+            del self.known[name]
+
     def merge(self, kept: str, merged: str) -> None:
         """Give the sightings of one landmark to another."""
         a, b = self.known[kept], self.known[merged]

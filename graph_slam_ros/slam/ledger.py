@@ -32,8 +32,10 @@ class Reason(IntEnum):
     DOES_NOT_FIT = 2  # after the solve its residual is too large
     OUTVOTED = 3  # a second look at everything found a better explanation without it
     WITHDRAWN = 4  # somebody, or association, took it out
+    QUARANTINED = 5  # nothing could be solved with it
 
 
+FINAL = (Reason.WITHDRAWN, Reason.QUARANTINED)  # it is out for good
 INSIDE = (Verdict.ACCEPTED, Verdict.DOWN_WEIGHTED)
 _ACCEPTED, _DOWN_WEIGHTED = _INSIDE = tuple(map(int, INSIDE))  # comparing with members of an enumeration is slow
 
@@ -116,7 +118,7 @@ class Ledger:
     def put(self, edge: int, verdict: Verdict, reason: Reason) -> None:
         """A verdict, without a word of how it came."""
         self.verdict.values[edge], self.reason.values[edge] = verdict, reason
-        if verdict in (Verdict.PENDING, Verdict.REJECTED) and reason != Reason.WITHDRAWN:
+        if verdict in (Verdict.PENDING, Verdict.REJECTED) and reason not in FINAL:
             self._out.add(edge)
         else:
             self._out.discard(edge)
@@ -152,7 +154,7 @@ class Ledger:
 
     def is_withdrawn(self, edge: int) -> bool:
         """Whether an edge was taken out for good."""
-        return edge < len(self) and int(self.reason.values[edge]) == Reason.WITHDRAWN
+        return edge < len(self) and int(self.reason.values[edge]) in FINAL
 
     @property
     def inside(self) -> Index:

@@ -117,6 +117,7 @@ def second_look(config: RobustConfig, frozen: Frozen, wanted: Wanted | None = No
             found.append(_explained(name, config, frozen, start, believed, hopeless))
         if name == "online" and found and not len(found[0].ledger.outside):
             break
+    found = [outcome for outcome in found if np.isfinite(outcome.cost)]
     if not found:
         return None
     best = min(found, key=lambda outcome: outcome.cost)

@@ -257,14 +257,15 @@ class Solver:
         self._unfinished = not report.converged
         return report
 
-    def evaluate(self, settings: Settings | None = None) -> Report:
-        """Chi2 and cost of the present estimate, with the last stage of the losses.
+    def evaluate(self, settings: Settings | None = None, at: Array | None = None) -> Report:
+        """Chi2 and cost of the present estimate, or at other ``values``, with the last stage of the losses.
 
         Edges that wait for an update do not count yet.
         """
         self._grow()
         losses = Losses(self.graph, (settings or self.settings).stages()[-1])
-        now = costs(self.graph, linearize(self.graph, self._tree.estimate, self._active_rows(), losses))
+        where = self._tree.estimate if at is None else at
+        now = costs(self.graph, linearize(self.graph, where, self._active_rows(), losses))
         return Report("gn", "nothing_to_do", now.chi2, now.chi2, now.cost, now.cost, (), now.classes)
 
     def chi2_of(self, edges: ArrayLike) -> tuple[Array, Index]:
@@ -358,6 +359,19 @@ class Solver:
         It is done by itself before more memory is asked for.
         """
         compact(self._tree)
+
+    def rebuild(self) -> None:
+        """Make everything anew from the graph, at the present estimate; what fails leaves all as it was.
+
+        For after a fault that nobody foresaw: whatever it left behind in the tree is gone.
+        """
+        values, vertices, taken = self.values, self.vertices, np.flatnonzero(self._taken)
+        fresh = Solver(self.graph, self.settings)
+        fresh.start_at(values)
+        fresh.add(vertices, taken)
+        for vertex in np.flatnonzero(self._held).tolist():
+            fresh.hold(vertex)
+        vars(self).update(vars(fresh))
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
