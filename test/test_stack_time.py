@@ -280,6 +280,7 @@ def test_B6_odometry_from_the_future_is_refused_and_holds_no_transform_up(tmp_pa
         assert n.stop()[0] == 0
     told = numbers(tmp_path / "run")
     assert told["counters"]["odom"] == {"future": 1}
+    assert "odom: future, ahead of the clock: is use_sim_time to be set" in n.said
     assert told["segments"] == 1
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 

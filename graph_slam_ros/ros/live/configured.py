@@ -33,6 +33,7 @@ from graph_slam_ros.ros.survey import with_survey
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Update
 
 _ACKNOWLEDGE = 32  # messages
+_HINTS = {"future": ", ahead of the clock: is use_sim_time to be set, or does a clock differ?"}
 
 
 class Configured:
@@ -217,7 +218,7 @@ class Configured:
             self._node.acknowledge(count)
 
     def _tell(self, source: str, reason: str) -> None:
-        self._node.get_logger().warn(f"{source}: {reason} (told once, counted from now on)")
+        self._node.get_logger().warn(f"{source}: {reason}{_HINTS.get(reason, '')} (told once, counted from now on)")
 
     # -- services: begun here, done by the worker --------------------------------------------------------------------
 
