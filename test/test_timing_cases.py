@@ -204,10 +204,12 @@ def test_B7_stamps_of_odometry_that_go_back_for_a_second_and_stay_there_begin_an
 
 
 def test_B10_what_was_held_up_or_comes_again_or_of_one_source_of_two_begins_nothing_anew():
-    before, late = [0.1 * k for k in range(100)], [5.0 + 0.1 * k for k in range(30)]
+    before, late = [0.1 * k for k in range(100)], [5.05 + 0.1 * k for k in range(30)]
     assert not any(begins_anew(*before, *late[:9], 10.0, *late[9:18], 10.1)), "bursts of less than a second"
     assert not any(begins_anew(*before, *(s for k in range(30) for s in (late[k], 10.0 + 0.1 * k)))), "told twice"
-    assert not any(begins_anew(*before, *[5.0] * 100)), "it stands"
+    assert not any(begins_anew(*before, *before[60:90])), "told again while nothing new comes"
+    assert any(begins_anew(*(0.1 * (k % 300) for k in range(600)))), "but what was told long ago is played again"
+    assert not any(begins_anew(*before, *[5.05] * 100)), "it stands"
     assert not any(begins_anew(*(9.9 - 0.15 * (k % 2) + 0.01 * k for k in range(100)))), "less than 0.2 s"
     two = [(s, name) for k in range(100) for s, name in ((0.1 * k, "wheels"), (0.1 * k - 60.0 * (k > 50), "camera"))]
     assert not any(begins_anew(*two)), "the wheels go on"
