@@ -305,6 +305,30 @@ def test_F11_a_schema_with_more_fields_is_decoded_by_itself(tmp_path, messages, 
     assert (tmp_path / "run" / "graph.g2o").read_bytes() == reference["graph.g2o"]
 
 
+def type_of_types(count, *fields):
+    """Types that each have fields of the next one's type."""
+    texts = [f"MSG: my/A{k}\n" + "".join(f"my/A{k + 1} {field}\n" for field in fields) for k in range(count)]
+    return ("=" * 80 + "\n").join(["my/A0 first\n" + definition(ODOMETRY), *texts, f"MSG: my/A{count}\nint8 last\n"])
+
+
+ITSELF = definition(ODOMETRY).replace("string child_frame_id\n", "string child_frame_id\nnav_msgs/Odometry again\n")
+ENDLESS = {
+    "too long": ("\n" * 2_000_000 + definition(ODOMETRY), "is longer than 65536 bytes"),
+    "array of types": ("geometry_msgs/Pose[1000000000] poses\n" + definition(ODOMETRY), "has more than 10000 values"),
+    "of itself": (ITSELF, "has more than 10000 values"),
+    "two of two of two": (type_of_types(40, "left", "right"), "has more than 10000 values"),
+}
+
+
+@pytest.mark.parametrize("kind", ENDLESS)
+def test_F11_a_schema_that_would_take_for_ever_is_refused_at_once(tmp_path, messages, kind):
+    text, complaint = ENDLESS[kind]
+    begun = time.process_time()
+    with pytest.raises(BagError, match=f"topic /odom: the recorded .*{complaint}"):
+        replay_with(tmp_path, messages, text=lambda name: text if name == ODOMETRY else definition(name))
+    assert time.process_time() - begun < 5.0
+
+
 def test_F12_another_encoding_is_refused_by_name(tmp_path, messages):
     with pytest.raises(BagError, match="topic /odom: messages are encoded as 'json', not cdr"):
         replay_with(tmp_path, messages, encoding="json")

@@ -25,6 +25,8 @@ from graph_slam_ros.ros.interfaces import typestore
 _SUFFIXES = (".mcap", ".db3", ".bag", ".bag.active", ".mcap.zstd", ".db3.zstd")
 _PACKED = {b"\x1f\x8b": "gzip", ZSTD_MAGIC: "zstd", b"BZh": "bzip2", b"\x04\x22\x4d\x18": "lz4"}
 _OF_ROS1 = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")  # words of its language
+MOST_TEXT = 2**16
+"""Of a recorded definition; rosbags' parser takes a minute for two megabytes of blank lines."""
 _WINDOW_BYTES, _OVERHEAD = 64 * 2**20, 256
 
 
@@ -284,6 +286,8 @@ class _Ros1Part:
 
 def _is_ours(type_name: str, definition: str) -> bool:
     """Whether a recorded ROS 1 type, and all it is made of, has our fields (a header's ``seq`` aside)."""
+    if len(definition) > MOST_TEXT:
+        return False
     try:
         recorded = get_types_from_msg(definition, type_name)
     except Exception:  # rosbags' parser raises errors of its own grammar library

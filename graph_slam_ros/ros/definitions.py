@@ -2,12 +2,15 @@
 
 from typing import Any
 
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from graph_slam_ros.ros.bag import BagError, Topic
+from graph_slam_ros.ros.bag import MOST_TEXT, BagError, Topic
 from graph_slam_ros.ros.from_msg import Decoder, decoder
 from graph_slam_ros.ros.interfaces import typestore
+
+_MOST_VALUES = 10_000
 
 _NEEDED: dict[str, tuple[str, ...]] = {
     "nav_msgs/msg/Odometry": ("header", "child_frame_id", "pose", "twist"),
@@ -99,6 +102,8 @@ def recorded_decoder(topic: Topic) -> Decoder:
         if topic.type not in typestore().types:
             raise BagError(f"topic {topic.name}: no definition of {topic.type} in the recording")
         return decoder(topic.type)
+    if len(topic.definition) > MOST_TEXT:
+        raise BagError(f"topic {topic.name}: the recorded definition of {topic.type} is longer than {MOST_TEXT} bytes")
     try:
         recorded = get_types_from_msg(topic.definition, topic.type)
     except Exception as error:  # rosbags' parser raises errors of its own grammar library
@@ -114,8 +119,27 @@ def recorded_decoder(topic: Topic) -> Decoder:
                 raise BagError(f"topic {topic.name}: {name} of this recording has no field {field!r}")
             if there[field] != known[field]:
                 raise BagError(f"topic {topic.name}: field {field!r} of {name} has another type in this recording")
+    if not _length({**ours, **recorded}, topic.type, {}) <= _MOST_VALUES:
+        raise BagError(f"topic {topic.name}: the recorded {topic.type} has more than {_MOST_VALUES} values")
     store = _store(recorded)
     return lambda cdr: store.deserialize_cdr(cdr, topic.type)
+
+
+def _length(types: Any, name: str, known: dict[str, float]) -> float:
+    """How many values a message has at least, each sequence with one: rosbags' decoder is as long as that."""
+    known[name] = float("inf")  # of a type that holds itself, there is no end
+    total = 0.0
+    for _, (kind, of) in types[name][1]:
+        count = 1
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            (inner, of), count = of[0], of[1] if kind == Nodetype.ARRAY else 1
+            kind, count = inner, count if inner == Nodetype.NAME else 1
+        if kind == Nodetype.NAME and of in types:
+            total += count * (known[of] if of in known else _length(types, of, known))
+        else:
+            total += 1
+    known[name] = total
+    return total
 
 
 def _store(recorded: Any) -> Typestore:
