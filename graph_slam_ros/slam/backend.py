@@ -33,6 +33,7 @@ class Backend:
     ----------
     graph, solver, decisions
     handed_over : vertices and edges of the graph that the solver has
+    spares_memory : whether no second look is begun
     rivals : other explanations of the same measurements that the last second look could not rule out
     """
 
@@ -52,6 +53,7 @@ class Backend:
         self.handed_over = 0, 0
         self._background = Background(config, beside)
         self.rivals: tuple[Rival, ...] = ()
+        self.spares_memory = False
         self._reviewed = 0  # the keyframe of the last review
         self._doubtful: list[int] = []  # edges that have come and do not fit by themselves
 
@@ -91,7 +93,7 @@ class Backend:
         self.solver.update()
         self._admit(keyframe)
         out = self.ledger.outside_count
-        if self._config.decide and self._background.is_due(out):
+        if self._config.decide and not self.spares_memory and self._background.is_due(out):
             self._background.start(self._frozen(keyframe, self.solver.settings), out)
 
     def optimize(self, keyframe: int, settings: Settings) -> Report:

@@ -167,6 +167,11 @@ class GraphSlam:
                 self._clear_closures()
             case Control("time_jump"):
                 self._forget_time()
+            case Control("restart"):
+                self._safeguard.go_back()
+                self._solved_vertices = 0
+            case Control("memory", values):
+                self.backend.spares_memory = bool(dict(values)["is_short"])
             case Control("set", values):
                 self.config = self.config.changed(dict(values))
                 self.solver.settings = self.config.solver_settings()

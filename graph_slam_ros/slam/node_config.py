@@ -167,6 +167,14 @@ class HealthConfig:
         60.0, "nothing seen for longer, once something was; 0: no matter", "s", low=0.0, live=True
     )
     lag_s: float = setting(1.0, "the solver is behind by more", "s", low=0.0, live=True)
+    stuck_s: float = setting(10.0, "the solver has been at one thing for longer", "s", low=0.0, live=True)
+    memory_mib: float = setting(
+        0.0,
+        "the process has more memory: loop closures are refused and no second look is begun; 0: no matter",
+        "MiB",
+        low=0.0,
+        live=True,
+    )
     chi2_per_dof: float = setting(
         10.0, "the measurements contradict each other by more", "per degree of freedom", low=0.0, live=True
     )

@@ -23,6 +23,7 @@ from graph_slam_ros.ros.live import events, health
 from graph_slam_ros.ros.live.ahead import Ahead
 from graph_slam_ros.ros.live.broadcaster import Broadcaster
 from graph_slam_ros.ros.live.listeners import Listeners
+from graph_slam_ros.ros.live.memory import is_short
 from graph_slam_ros.ros.live.outputs import Outputs
 from graph_slam_ros.ros.live.reckoning import Reckoning
 from graph_slam_ros.ros.live.session import Estimate, Session
@@ -31,6 +32,7 @@ from graph_slam_ros.ros.message_class import message_class
 from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.ros.survey import with_survey
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Update
+from graph_slam_ros.slam.measurements import Closure
 
 _ACKNOWLEDGE = 32  # messages
 _HINTS = {"future": ", ahead of the clock: is use_sim_time to be set, or does a clock differ?"}
@@ -66,7 +68,8 @@ class Configured:
         self._passed = self._done = 0  # messages, by this thread and by the worker's
         self._acknowledged = -1
         self._has_player = False
-        self._looked: tuple[int, int] = 0, 0
+        self._looked: tuple[int, int, int] = 0, 0, 0
+        self._memory_is_short = False
         self._initial = node.create_subscription(
             message_class(results.POSE),
             "initialpose",
@@ -98,6 +101,7 @@ class Configured:
     def finish(self, patience_s: float | None) -> None:
         """Save what was not saved yet, and take everything away."""
         self.deactivate()
+        self._watch()
         for some in self._ahead.give_up():
             self._hand_over(some)
         self._node.destroy_subscription(self._initial)
@@ -123,8 +127,16 @@ class Configured:
         for m in measured:
             if isinstance(m, Odometry) and self._is_newest(m) and self._sends_odometry:
                 self._send_odometry(m, cdr)
+        if self._memory_is_short:
+            measured = self._without_closures(measured)
         for some in self._ahead.pass_on(measured):
             self._hand_over(some)
+
+    def _without_closures(self, measured: Sequence[Measured]) -> list[Measured]:
+        for m in measured:
+            if isinstance(m, Closure):
+                self.counters.count(m.topic, "memory")
+        return [m for m in measured if not isinstance(m, Closure)]
 
     def _hand_over(self, measured: Sequence[Measured]) -> None:
         """To the worker; refused before it is accepted where there is no room, or nobody wants it now."""
@@ -201,6 +213,7 @@ class Configured:
 
     def tick(self) -> None:
         """Ten times a second: what has waited long enough, and what somebody may have begun to listen to."""
+        self._watch()
         for some in self._ahead.waited():
             self._hand_over(some)
         if self._listeners is not None:
@@ -210,6 +223,16 @@ class Configured:
         self._publish_received()
         if self._worker.waiting < _ACKNOWLEDGE and self._outputs.are_due(self._node.config):
             self._worker.offer(self._node.guarded(self._publish_due))
+
+    def _watch(self) -> None:
+        """Over the worker's thread and the memory of the process."""
+        if self._worker.revive(partial(self._session.control, "restart")):
+            self.counters.count("node", "worker_restarted")
+            self._node.get_logger().error("the solver's thread has died; another goes on with the graph that there is")
+        limit, before = self._node.config.health.memory_mib, self._memory_is_short
+        self._memory_is_short = is_short(limit, was_short=before)
+        if self._memory_is_short != before:
+            self.in_passing(self._worker.call(partial(self._session.control, "memory", is_short=not before)))
 
     def _publish_received(self) -> None:
         count = self._passed + self._done
@@ -309,8 +332,8 @@ class Configured:
             counters.update(some)
         counted = counters.as_dict()
         overflows = sum(of.get("overflow", 0) for of in counted.values())
-        failures = session.failures
-        before, self._looked = self._looked, (overflows, failures)
+        failures, restarts = session.failures, self.counters["node", "worker_restarted"]
+        before, self._looked = self._looked, (overflows, failures, restarts)
         rivals = broadcaster.candidates() if broadcaster is not None and broadcaster.has_rival else None
         inputs = self._listeners.facts(node.now_ns, counted) if self._listeners is not None else ()
         twins = node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1
@@ -323,7 +346,11 @@ class Configured:
             is_stopped=self._is_stopped,
             lag_s=self._worker.lag_s,
             waiting=self._worker.waiting,
+            busy_s=self._worker.busy_s,
             worker_is_alive=self._worker.is_alive,
+            restarts=restarts - before[2],
+            failing=session.slam.failing,
+            memory_is_short=self._memory_is_short,
             overflows=overflows - before[0],
             failures=failures - before[1],
             recording_fails=session.recording_fails,

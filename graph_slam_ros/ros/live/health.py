@@ -50,7 +50,11 @@ class Facts:
     ----------
     lifecycle : ``unconfigured``, ``inactive``, ``active`` or ``finalized``
     faults : exceptions of callbacks in the last ten seconds
-    overflows, failures : messages refused for want of room, and solves that failed, since the last look
+    busy_s : for how long the solver has been at what it does
+    overflows, failures, restarts : messages refused for want of room, solves that failed, and threads of the solver
+        that died, since the last look
+    failing : why the last solve failed; empty where it did not
+    memory_is_short : the process has more than ``health.memory_mib``
     authorities : other nodes that broadcast map -> odom, if somebody does
     """
 
@@ -62,7 +66,11 @@ class Facts:
     is_stopped: bool = False
     lag_s: float = 0.0
     waiting: int = 0
+    busy_s: float = 0.0
     worker_is_alive: bool = True
+    restarts: int = 0
+    failing: str = ""
+    memory_is_short: bool = False
     faults: int = 0
     overflows: int = 0
     failures: int = 0
@@ -161,8 +169,16 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
             yield f"{one.topic}: {_unlinked(one)}"
     if facts.is_paused:
         yield "paused"
-    if facts.failures:
+    if facts.failing:
+        yield f"solves fail, the last good estimate stands: {facts.failing}"
+    elif facts.failures:
         yield f"{facts.failures} solves failed: the last good estimate stands"
+    if facts.restarts:
+        yield "the solver's thread had died and was started again"
+    if facts.memory_is_short:
+        yield "the process has more memory than health.memory_mib: loop closures are refused"
+    if facts.busy_s > health.stuck_s:
+        yield f"solver stuck: it has been at one thing for {facts.busy_s:.1f} s"
     if facts.overflows:
         yield f"{facts.overflows} messages refused: the queue is full (inputs.queue)"
     if facts.lag_s > health.lag_s:

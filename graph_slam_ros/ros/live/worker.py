@@ -23,8 +23,10 @@ class Worker:
         self._most = most
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any] | None, float] | None] = queue.SimpleQueue()
         self._since: float | None = None
-        self._thread = threading.Thread(target=self._run, name="graph_slam_worker", daemon=True)
-        self._thread.start()
+        self._begun: float | None = None
+        self._future: Future[Any] | None = None  # of the job in hand
+        self._is_stopped = False
+        self._thread = self._started(None)
 
     def offer(self, job: Callable[[], None]) -> bool:
         """Have a job done that raises nothing; False where too many wait, and nothing is taken."""
@@ -51,21 +53,46 @@ class Worker:
         return 0.0 if since is None else time.monotonic() - since
 
     @property
+    def busy_s(self) -> float:
+        """How long the job in hand has taken."""
+        begun = self._begun
+        return 0.0 if begun is None else time.monotonic() - begun
+
+    @property
     def is_alive(self) -> bool:
         """Whether the thread runs."""
         return self._thread.is_alive()
 
+    def revive(self, first: Callable[[], Any]) -> bool:
+        """Where the thread has died of a job, have another go on with the next, after ``first``; whether it had."""
+        if self._is_stopped or self._thread.is_alive():
+            return False
+        if self._future is not None and not self._future.done():
+            self._future.set_exception(RuntimeError("the thread has died of it"))
+        self._thread = self._started(first)
+        return True
+
     def stop(self, timeout_s: float | None = None) -> bool:
         """Do what waits, then end; False if that takes longer."""
+        self._is_stopped = True
         self._jobs.put(None)
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
-    def _run(self) -> None:
+    def _started(self, first: Callable[[], Any] | None) -> threading.Thread:
+        thread = threading.Thread(target=self._run, args=(first,), name="graph_slam_worker", daemon=True)
+        thread.start()
+        return thread
+
+    def _run(self, first: Callable[[], Any] | None) -> None:
+        self._since = self._begun = self._future = None
+        if first is not None:
+            _do(first, None)
         while (item := self._jobs.get()) is not None:
-            job, future, self._since = item
-            _do(job, future)
-            self._since = None
+            job, self._future, self._since = item
+            self._begun = time.monotonic()
+            _do(job, self._future)
+            self._since = self._begun = None
 
 
 def _do(job: Callable[[], Any], future: "Future[Any] | None") -> None:

@@ -1,0 +1,21 @@
+"""What the process has in memory."""
+
+import os
+from pathlib import Path
+
+_STATM = Path("/proc/self/statm")
+_ENOUGH = 0.95  # of the limit: less, and there is room again
+
+
+def resident_mib() -> float:
+    """Of this process; 0 where there is no /proc to tell."""
+    try:
+        pages = int(_STATM.read_text().split()[1])
+    except OSError:
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def is_short(limit_mib: float, *, was_short: bool) -> bool:
+    """Whether the process has more than it should; no limit is 0."""
+    return 0.0 < (_ENOUGH if was_short else 1.0) * limit_mib < resident_mib()

@@ -1,0 +1,203 @@
+"""What may happen to the process of the node: faults of its threads, memory, load; what it then does, and says.
+
+The node is in this process, with a thread of its own for its callbacks, so that its solver can be made to fail.
+"""
+
+import contextlib
+import itertools
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+from live_drive import Drive
+from live_nodes import ENVIRONMENT, own_domain, replayed, results, robot, until
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+
+from graph_slam_ros.ros.live.memory import resident_mib
+from graph_slam_ros.ros.live.session import Session
+from graph_slam_ros.ros.live.worker import Worker
+from graph_slam_ros.ros.node import GraphSlamNode
+from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.measurements import Closure
+
+HEARS = "/diagnostics", "/tf", "pose"
+NUMBERS = itertools.count()  # of nodes: who was there before in this process may be heard for a while
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch):
+    """Of each test its own: what is left of others says nothing here."""
+    with own_domain() as number:
+        monkeypatch.setitem(ENVIRONMENT, "ROS_DOMAIN_ID", number)
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield
+
+
+@contextlib.contextmanager
+def inside(namespace, **values):
+    """A node at work in this process."""
+    context = Context()
+    context.init(args=[], domain_id=int(ENVIRONMENT["ROS_DOMAIN_ID"]))
+    given = {"output.folder": "", "inputs.reliable": True} | {k.replace("__", "."): v for k, v in values.items()}
+    parameters = [Parameter(k, value=v) for k, v in given.items()]
+    slam = GraphSlamNode(context=context, namespace=namespace, parameter_overrides=parameters)
+    executor, ended = SingleThreadedExecutor(context=context), threading.Event()
+    executor.add_node(slam)
+
+    def spin():
+        while not ended.is_set():
+            executor.spin_once(timeout_sec=0.1)
+
+    thread = threading.Thread(target=spin, daemon=True)
+    try:
+        slam.trigger_configure()
+        slam.trigger_activate()
+        thread.start()
+        yield slam
+    finally:
+        ended.set()
+        thread.join(10.0)
+        slam.finish(1.0)
+        executor.shutdown()
+        slam.destroy_node()
+        context.try_shutdown()
+
+
+@contextlib.contextmanager
+def at_work(**values):
+    """A node at work that is well, the robot that it hears, and its drive."""
+    namespace = f"/robot_{next(NUMBERS)}"
+    with inside(namespace, **values) as slam, robot(of=f"{namespace}/graph_slam", hears=HEARS) as r:
+        r.wait_for_node()
+        drive = Drive()
+        r.until_it_says("OK", spin=drive.pace(r))
+        until(lambda: len(r.heard["pose"]) > 3, drive.pace(r), "poses")
+        yield slam, r, drive
+
+
+def test_P9_where_a_solve_does_not_end_it_says_so_and_transforms_go_on():
+    with at_work(health__stuck_s=0.5) as (slam, r, drive):
+        gate = threading.Event()
+        solver = slam._run._session.slam.solver
+        update = solver.update
+
+        def hang():
+            gate.wait(60.0)
+            return update()
+
+        solver.update = hang
+        try:
+            r.until_it_says("DEGRADED", "solver stuck", spin=drive.pace(r))
+            r.heard["tf"].clear()
+            until(lambda: len(r.heard["tf"]) > 20, drive.pace(r), "transforms")
+        finally:
+            gate.set()
+            del solver.update
+        r.until_it_says("OK", spin=drive.pace(r))
+
+
+def test_G7_while_solves_fail_it_says_so_and_why_and_transforms_go_on_by_the_last_good_estimate():
+    with at_work() as (slam, r, drive):
+        session = slam._run._session
+        solver = session.slam.solver
+
+        def fail(*arguments):
+            raise MemoryError("no room")
+
+        solver.update = solver.optimize = fail
+        r.until_it_says("DEGRADED", "solves fail, the last good estimate stands: no room", spin=drive.pace(r))
+        r.heard["tf"].clear()
+        until(lambda: len(r.heard["tf"]) > 20, drive.pace(r), "transforms")
+        del solver.update, solver.optimize
+        r.until_it_says("OK", spin=drive.pace(r))
+        assert session.slam.counters["solver", "MemoryError"] > 0
+
+
+def test_P7_above_its_limit_of_memory_closures_are_refused_and_counted_and_below_taken_again(tmp_path):
+    with at_work(output__folder=str(tmp_path / "run")) as (slam, r, drive):
+        run, backend = slam._run, slam._run._session.slam.backend
+        assert r.set({"health.memory_mib": 0.5 * resident_mib()}) == (True, "")
+        r.until_it_says("DEGRADED", "health.memory_mib", spin=drive.pace(r))
+        closure = Closure(
+            drive.stamp_ns, drive.stamp_ns - 10**9, "/closures", (0.0, 0.0, 0.0), (1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0)
+        )
+        run._take([closure], b"")
+        assert run.counters["/closures", "memory"] == 1
+        until(lambda: backend.spares_memory, drive.pace(r), "no second looks")
+        assert r.set({"health.memory_mib": 10.0 * resident_mib()}) == (True, "")
+        r.until_it_says("OK", spin=drive.pace(r))
+        until(lambda: not backend.spares_memory, drive.pace(r), "second looks")
+        run._take([closure], b"")
+        assert run.counters["/closures", "memory"] == 1
+        assert r.save().success
+        assert results(tmp_path / "run") == replayed(tmp_path / "run", tmp_path)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_P23_where_the_solvers_thread_dies_another_goes_on_with_the_graph_that_there_is(monkeypatch):
+    with at_work() as (slam, r, drive):
+        run = slam._run
+        slam_before, before = run._session.slam, len(run._session.slam.keyframes)
+        process = GraphSlam.process
+
+        def dies(self, measurement):
+            monkeypatch.setattr(GraphSlam, "process", process)
+            raise SystemExit
+
+        monkeypatch.setattr(GraphSlam, "process", dies)
+        until(lambda: run.counters["node", "worker_restarted"] == 1, drive.pace(r), "another thread")
+        r.until_it_says("OK", spin=drive.pace(r))
+        until(lambda: len(run._session.slam.keyframes) > before + 5, drive.pace(r), "keyframes")
+        assert run._session.slam is slam_before
+        assert run._worker.is_alive
+        assert not slam_before.failing
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_P23_who_waits_for_a_job_that_its_thread_died_of_is_told():
+    worker, done = Worker(10), []
+
+    def die():
+        raise SystemExit
+
+    future, after = worker.call(die), worker.call(lambda: done.append("after"))
+    until(lambda: not worker.is_alive, time.sleep, "end of the thread")
+    assert worker.revive(lambda: done.append("first"))
+    with pytest.raises(RuntimeError, match="died"):
+        future.result(10.0)
+    after.result(10.0)
+    assert done == ["first", "after"]
+    assert not worker.revive(done.clear)
+    assert worker.stop(10.0)
+    assert not worker.revive(done.clear)
+
+
+def test_P21_exceptions_of_callbacks_are_counted_told_once_and_an_error_from_a_hundred_on(monkeypatch, capfd):
+    with at_work() as (slam, r, drive):
+        take = Session.take
+        monkeypatch.setattr(Session, "take", lambda *_: 1 // 0)
+        for _ in range(5):
+            drive.step(r)
+        until(lambda: slam._run.counters["node", "ZeroDivisionError"] > 4, r.spin, "faults")
+        assert r.verdict.state != "ERROR"
+        r.until_it_says("ERROR", "faults in callbacks in 10 s", spin=drive.pace(r), patience_s=20.0)
+        monkeypatch.setattr(Session, "take", take)
+        r.heard["pose"].clear()
+        until(lambda: r.heard["pose"], drive.pace(r), "poses")
+    assert capfd.readouterr().err.count("Traceback") == 1
+
+
+def test_P24_numpy_has_one_thread_in_the_node():
+    """As many threads in all as where one is asked for, and fewer than where two are."""
+    code = "import graph_slam_ros.ros.node, pathlib; print(len(list(pathlib.Path('/proc/self/task').iterdir())))"
+    nothing_said = {k: v for k, v in ENVIRONMENT.items() if not k.endswith("_NUM_THREADS")}
+
+    def threads(**said):
+        command = [sys.executable, "-c", code]
+        return int(subprocess.run(command, env=nothing_said | said, capture_output=True, text=True, check=True).stdout)
+
+    assert threads() == threads(OPENBLAS_NUM_THREADS="1") < threads(OPENBLAS_NUM_THREADS="2")
