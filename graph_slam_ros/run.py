@@ -2,7 +2,8 @@
 
 ``graph.g2o`` and ``graph_vertices.csv`` (stamp and name of each vertex), ``ledger.csv`` and ``ledger_changes.csv``
 (each edge, what is believed of it, and how that came: ``ledger_file``), ``path.tum``, ``covariances.csv``,
-``sightings.tum``, ``odometry.tum``, ``landmarks.csv``, ``run.mcap``, ``ingest.mcap``, ``config.yaml``, ``run.json``.
+``sightings.tum``, ``odometry.tum``, ``landmarks.csv``, ``run.mcap``, ``ingest.mcap`` (the journal), ``map.mcap`` (the
+map as it grew: ``map_log``), ``config.yaml``, ``run.json``.
 
 Covariances are written as their upper triangle, row by row. Those of ``covariances.csv``, of each pose of ``path.tum``,
 are in the pose's tangent space, with (x, y, theta) or (x, y, z, rotation vector) along and about the axes of the robot;

@@ -1,0 +1,85 @@
+"""How long it takes to take up the map of a run that was cut off: ``python -m benchmarks.recovery [--poses 10000]``.
+
+A Manhattan with a closure per three poses is driven as the node drives, its journal flushed after each update, and left
+without an end. Then its map is read and solved, as the node does when it starts again; and what came of it is compared.
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.live.streams import AFTER_NS, BEFORE_NS, CITY_SIGMA_M, CITY_SIGMA_RAD, STEP_NS
+from benchmarks.problem import city_problem
+from graph_slam_ros.lie import se2
+from graph_slam_ros.map_log import read_map
+from graph_slam_ros.run import RunRecorder
+from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry
+from graph_slam_ros.warmup import warmup
+
+START_NS = 10**15
+
+
+def drive(folder: Path, config: Config, poses: int) -> GraphSlam:
+    """A run that nobody ends."""
+    problem = city_problem(poses, dimensions=2)
+    covariance = tuple(np.diag(np.square([CITY_SIGMA_M, CITY_SIGMA_M, CITY_SIGMA_RAD])).ravel().tolist())
+    steps, closures = {}, {}
+    for ends, measured in zip(problem.relative.ends.tolist(), problem.relative.measured.tolist(), strict=True):
+        (steps if ends[1] == ends[0] + 1 else closures)[ends[1]] = ends[0], tuple(measured)
+    recorder = RunRecorder(folder, config, config.journal.sync_s)
+    slam = GraphSlam(config, recorder.sink)
+    at = se2.IDENTITY
+    for k in range(poses):
+        stamp_ns = START_NS + k * STEP_NS
+        at = tuple(map(float, se2.compose(at, steps[k][1]))) if k else at
+        measurements = [Odometry(stamp_ns, at)]
+        if k in closures:
+            earlier, T_earlier_now = closures[k]
+            from_ns = START_NS + earlier * STEP_NS
+            measurements.append(Closure(stamp_ns - BEFORE_NS, from_ns, "closures", T_earlier_now, covariance))
+        if k + 1 < poses:
+            ahead = se2.interpolate(se2.IDENTITY, steps[k + 1][1], AFTER_NS / STEP_NS)
+            measurements.append(Odometry(stamp_ns + AFTER_NS, tuple(map(float, se2.compose(at, ahead)))))
+        for m in measurements:
+            recorder.record(slam, slam.process(m))
+            recorder.flush()
+    recorder.record(slam, slam.process(Control("flush")))
+    recorder.flush()
+    return slam
+
+
+def main() -> None:
+    """The programme."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--poses", type=int, default=10_000, metavar="N")
+    args = parser.parse_args()
+    warmup()
+    config = Config.from_mapping({"keyframes.max_interval_s": 1.0, "keyframes.min_distance_m": 0.5})
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "run"
+        start_s = time.process_time()
+        slam = drive(run, config, args.poses)
+        drove_s = time.process_time() - start_s
+        written = {name: (run / f"{name}.mcap").stat().st_size / 2**20 for name in ("ingest", "map")}
+        start, cpu_s = time.perf_counter(), time.process_time()
+        state = read_map(run, losses := [])
+        assert state is not None
+        read_s = time.perf_counter() - start
+        again = GraphSlam(config, start=state)
+        took_s, cpu_s = time.perf_counter() - start, time.process_time() - cpu_s
+        solved = slam.solver.optimize()
+        apart_m = np.abs(again.trajectory() - slam.trajectory()).max()
+        same = (again.ledger.verdict.values == slam.ledger.verdict.values).all()
+        print(
+            f"RELIABILITY recovery keyframes={len(slam.keyframes)} edges={slam.graph.edge_count} drove_s={drove_s:.1f}"
+            f" journal_mib={written['ingest']:.1f} map_mib={written['map']:.1f} read_s={read_s:.2f}"
+            f" recovered_s={took_s:.2f} cpu_s={cpu_s:.2f} verdicts={'same' if same else 'other'}"
+            f" apart={apart_m:.1e} chi2={again.solver.evaluate().chi2_final / solved.chi2_final:.9f} lost={losses}"
+        )
+
+
+if __name__ == "__main__":
+    main()
