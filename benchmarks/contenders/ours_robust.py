@@ -61,14 +61,16 @@ def measurements(problem: Problem, closures: Edges) -> Iterator[Measurement]:
         yield Odometry(stamp_ns, tuple(problem.poses[step.pose].tolist()), _twist_covariance(problem, step.relative))
         if len(step.sightings):
             yield Sightings(stamp_ns, "landmarks", tuple(_sightings(step.sightings)))
-        for k in range(*arrived[step.pose : step.pose + 2].tolist()):
+        first, end = arrived[step.pose : step.pose + 2].tolist()
+        for k in range(first, end):
             earlier, later = closures.ends[k].tolist()
             measured, covariance = tuple(closures.measured[k].tolist()), _covariance(closures.root[k])
             if earlier > later:
                 back = group.adjoint(measured)
                 earlier, later, measured = later, earlier, tuple(float(x) for x in group.inverse(measured))
                 covariance = back @ covariance @ back.T
-            yield Closure(later * _SECOND_NS, earlier * _SECOND_NS, "closures", measured, _flat(covariance))
+            source = f"closures{k - first}"  # each of its own: what one says twice is taken once, and graphs repeat edges
+            yield Closure(later * _SECOND_NS, earlier * _SECOND_NS, source, measured, _flat(covariance))
 
 
 def _run(problem: Problem, closures: Edges, name: str) -> Believed:
