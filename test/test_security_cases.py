@@ -19,12 +19,13 @@ import yaml
 
 import graph_slam_ros
 from graph_slam_ros.errors import ConfigError, GraphSlamError
+from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.parameters import _StrictLoader
 from graph_slam_ros.replay import replay
 from graph_slam_ros.ros.live.session import Session
 from graph_slam_ros.ros.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS, Interface
 from graph_slam_ros.simulation import simulate, write_bag
-from graph_slam_ros.slam import Config, Counters
+from graph_slam_ros.slam import Config, Counters, Odometry
 from graph_slam_ros.slam.config import parameters
 
 PACKAGE = Path(graph_slam_ros.__file__).parent
@@ -216,6 +217,26 @@ def test_X2_an_earlier_run_is_not_written_over(folders):
     config = Config.from_mapping({"output.folder": str(folders / "earlier")})
     Session(config, Counters(), lambda slam, update: None, lambda *_: None).finish()
     assert {file.name: file.read_bytes() for file in (folders / "earlier-1").iterdir()} == before
+
+
+def test_F27_a_link_in_the_run_folder_is_not_written_through(folders):
+    victim = folders / "victim"
+    victim.write_text("mine")
+    running = session(folders)
+    for name in ("graph.g2o", "run.json", "path.tum", "config.yaml"):
+        for link in (folders / "now" / name, folders / "now" / f"{name}.new"):
+            link.unlink(missing_ok=True)
+            link.symlink_to(victim)
+    running.take([Odometry(10**18 + k * 10**8, (0.3 * k, 0.0, 0.0), None) for k in range(20)])
+    running.save()
+    assert victim.read_text() == "mine"
+    assert not (folders / "now" / "path.tum").is_symlink()
+    (folders / "now" / "run_9.mcap").symlink_to(victim)
+    file = AppendedFile(folders / "now" / "run_9.mcap")
+    file.write(b"theirs")
+    with pytest.raises(OSError, match="symbolic links"):
+        file.flush()
+    assert victim.read_text() == "mine"
 
 
 def test_X2_what_is_no_run_is_not_touched(folders):

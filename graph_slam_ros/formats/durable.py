@@ -64,7 +64,7 @@ _NOT_MADE, _CLOSED = -1, -2
 
 
 def _made(path: Path) -> int:
-    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
     try:
         sync_folder(path.parent)
     except OSError:
@@ -78,6 +78,7 @@ def replaced(path: Path) -> Iterator[Path]:
     """A new file to be written in its place; a reader sees the old one or the new one, whatever happens in between."""
     new = path.with_name(path.name + NEW)
     try:
+        new.unlink(missing_ok=True)  # left behind, or a link that leads elsewhere
         yield new
         fd = os.open(new, os.O_RDONLY | os.O_CLOEXEC)
         try:
