@@ -130,7 +130,7 @@ $(VENV)-bench-g2o/stamp: benchmarks/requirements-g2o.txt
 # What test/guided_fuzzing.py runs with: atheris has wheels for some versions of Python, and is a compiler's work for others.
 $(VENV)-fuzz/stamp: setup.py setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)-fuzz
-	$(VENV)-fuzz/bin/pip install --quiet atheris==3.1.0 -e .
+	$(VENV)-fuzz/bin/pip install --quiet atheris==3.0.0 -e .
 	@touch $@
 
 bench: $(VENV)-bench/stamp $(VENV)-bench-g2o/stamp
