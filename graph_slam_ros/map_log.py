@@ -137,11 +137,7 @@ def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> Ma
             break
     if (start_only and not has_start) or not state.keyframes:
         return None
-    out = np.flatnonzero(np.isin(state.ledger.verdict.values, (Verdict.PENDING, Verdict.REJECTED)))
-    state.graph.set_weights(out, 0.0)
-    for mark in state.landmarks.values():  # what was given to another is withdrawn from this one
-        mark.seen = [one for one in mark.seen if not state.ledger.is_withdrawn(one.edge)]
-        mark.stamps = {one.where.stamp_ns for one in mark.seen}
+    _take_effect(state)
     return state
 
 
@@ -150,6 +146,7 @@ def state_of(slam: GraphSlam) -> MapState:
     state = MapState()
     _grow(state, Growth().since(slam))
     state.values = slam.solver.values
+    _take_effect(state)
     return state
 
 
@@ -210,6 +207,15 @@ def _seen(one: Seen) -> list[Any]:
 
 
 # -- what is read -----------------------------------------------------------------------------------------------------
+
+
+def _take_effect(state: MapState) -> None:
+    """What is not believed pulls no more; what was given to another landmark is withdrawn from the one before."""
+    out = np.flatnonzero(np.isin(state.ledger.verdict.values, (Verdict.PENDING, Verdict.REJECTED)))
+    state.graph.set_weights(out, 0.0)
+    for mark in state.landmarks.values():
+        mark.seen = [one for one in mark.seen if not state.ledger.is_withdrawn(one.edge)]
+        mark.stamps = {one.where.stamp_ns for one in mark.seen}
 
 
 def _grow(state: MapState, record: Mapping[str, Any]) -> None:

@@ -111,6 +111,11 @@ def _repeated(folder: Path, losses: list[str]) -> MapState:
     return state_of(slam)
 
 
+def taken_up(folder: Path, losses: list[str]) -> GraphSlam:
+    """The map of a run, solved; as ``map_of``."""
+    return GraphSlam(run_config(folder), start=map_of(folder, losses))
+
+
 def run_config(folder: Path) -> Config:
     """The configuration a run was made with. Raises ConfigError naming the file."""
     values = read_parameters(folder / _CONFIG)
@@ -278,7 +283,7 @@ class RunRecorder:
     def _save_results(self, slam: GraphSlam, summary: dict[str, Any]) -> None:
         """All that can be computed first, then file by file; the summary, the last, tells which belong together."""
         stamps = slam.sighting_poses.stamps_ns.tolist()
-        ids, vertices = _numbered(slam)
+        ids, vertices = numbered(slam)
         texts = {
             GRAPH: g2o_text(G2oFile(slam.graph, ids), slam.solver.estimate),
             VERTICES: vertices,
@@ -356,7 +361,7 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
     }
 
 
-def _numbered(slam: GraphSlam) -> tuple[list[int], str]:
+def numbered(slam: GraphSlam) -> tuple[list[int], str]:
     """The number of each vertex, and the table of them.
 
     Poses are numbered from 0 in order of time, landmarks after them: other tools read odometry from that. What is

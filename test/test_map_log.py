@@ -2,11 +2,11 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from runs import drive, with_a_wrong_sighting, without_names
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import FormatError
@@ -15,7 +15,7 @@ from graph_slam_ros.map_log import MAP, Growth, read_map, state_of
 from graph_slam_ros.replay import replay
 from graph_slam_ros.run import RunError, RunRecorder, is_cut_off, keep_earlier, map_of, run_config
 from graph_slam_ros.simulation import measurements, simulate
-from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sightings
+from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 
 GOLDEN = Path(__file__).parent / "golden"
 WORLDS = {
@@ -23,23 +23,6 @@ WORLDS = {
     "ranges": ({"landmarks.range_offset_sigma_m": 0.5}, {"sensor": "range"}),
     "unnamed": ({"landmarks.association": "joint"}, {"sensor": "position"}),
 }
-
-
-def without_names(world):
-    for m in world:
-        if isinstance(m, Sightings):
-            m = replace(m, sightings=tuple(replace(one, id="") for one in m.sightings))
-        yield m
-
-
-def drive(folder, config, world):
-    """A run as a node records it, flushed update by update, that nobody ends."""
-    recorder = RunRecorder(folder, config)
-    slam = GraphSlam(config, recorder.sink)
-    for m in [*world, Control("end"), Control("optimize")]:
-        recorder.record(slam, slam.process(m))
-        recorder.flush()
-    return slam
 
 
 def told(state):
@@ -161,11 +144,16 @@ def test_what_is_no_map_is_refused_by_record(tmp_path, record, complaint):
 
 
 def test_a_run_of_an_earlier_version_is_taken_up_by_repeating_it(tmp_path):
-    slam = drive(tmp_path / "run", Config(), measurements(simulate("warehouse", 0, aisles=2, laps=1)))
+    world = measurements(simulate("warehouse", 0, aisles=2, laps=1))
+    slam = drive(tmp_path / "run", Config(), with_a_wrong_sighting(world))
     (tmp_path / "run" / "map.mcap").unlink()
     state = map_of(tmp_path / "run", [])
     assert state.keyframes == list(slam.keyframes)
     assert state.ledger.history == slam.ledger.history
+    out = slam.ledger.outside.tolist()
+    weights = [float(table.weight.values[row]) for table, row in map(state.graph.row, range(state.graph.edge_count))]
+    assert [edge for edge, weight in enumerate(weights) if not weight] == out
+    assert out, "or nothing is tried"
 
 
 def test_a_run_is_cut_off_until_it_is_ended_and_kept_whatever_is_asked(tmp_path):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from graph_slam_ros import __version__
-from graph_slam_ros.cli import decided, graphs, recordings, worlds
+from graph_slam_ros.cli import decided, graphs, maps, recordings, worlds
 from graph_slam_ros.cli.console import REFUSED
 from graph_slam_ros.errors import GraphSlamError
 
@@ -41,6 +41,7 @@ def parser() -> argparse.ArgumentParser:
     _recover(
         command("recover", recordings.recover, "the results of a run that was cut off, without repeating the drive")
     )
+    _export(command("export", maps.export, "a run's path as TUM, its graph as g2o, or both as an mcap of ROS messages"))
     _info(
         command("info", recordings.info, "topics, types, rates, frames and span of a recording, and how to replay it")
     )
@@ -99,6 +100,12 @@ def _replay(sub: argparse.ArgumentParser) -> None:
 def _recover(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("run_folder", type=Path, metavar="RUN")
     sub.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder for the results")
+
+
+def _export(sub: argparse.ArgumentParser) -> None:
+    _of_run(sub)
+    sub.add_argument("--to", choices=("tum", "g2o", "mcap"), required=True, help="g2o: stamps and names beside it")
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE")
 
 
 def _info(sub: argparse.ArgumentParser) -> None:

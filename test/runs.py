@@ -1,0 +1,33 @@
+"""Runs for tests, as a node records them."""
+
+from dataclasses import replace
+
+from graph_slam_ros.run import RunRecorder
+from graph_slam_ros.slam import Control, GraphSlam, Sightings
+
+
+def drive(folder, config, world, start=None):
+    """A run that is flushed update by update and that nobody ends."""
+    recorder = RunRecorder(folder, config, start=start)
+    slam = GraphSlam(config, recorder.sink, start=start)
+    for m in [*world, Control("end"), Control("optimize")]:
+        recorder.record(slam, slam.process(m))
+        recorder.flush()
+    return slam
+
+
+def without_names(world):
+    for m in world:
+        if isinstance(m, Sightings):
+            m = replace(m, sightings=tuple(replace(one, id="") for one in m.sightings))
+        yield m
+
+
+def with_a_wrong_sighting(world, at=100, by_m=3.0):
+    """The first thing in one message is told to be elsewhere."""
+    for k, m in enumerate(world):
+        if isinstance(m, Sightings) and k >= at and m.sightings:
+            first, *others = m.sightings
+            x, *rest = first.measured
+            m, at = replace(m, sightings=(replace(first, measured=(x + by_m, *rest)), *others)), float("inf")
+        yield m
