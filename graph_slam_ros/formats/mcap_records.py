@@ -20,6 +20,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema
 from mcap.stream_reader import MAGIC_SIZE
+from mcap.summary import Summary
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.decompression import MOST_BYTES, decompressed
@@ -72,7 +73,7 @@ def contents(path: Path) -> Contents:
     """From the summary, or by reading everything where there is no whole one."""
     try:
         with _Stream(path) as stream:
-            summary = make_reader(stream).get_summary() if _has_whole_summary(stream) else None
+            summary = _summary(stream)
     except Exception:  # of a damaged file the library raises almost anything
         summary = None
     if summary is not None and summary.statistics is not None and summary.channels:
@@ -131,6 +132,12 @@ def records(path: Path, losses: list[str], warnings: list[str] | None = None) ->
                 read += isinstance(record, Message)
                 yield record
             at = after
+        told = _told(stream)
+        if told is not None and told != read:  # a record whose kind is damaged is passed over in silence
+            what = f"{told - read} of its messages could not be read"
+            if read > told:
+                what = f"{read - told} messages too many"
+            losses.append(f"{path.name}: {what}")
     if unchecked and warnings is not None:
         warnings.append(f"{path.name}: carries no checksums: a damaged byte in it may go unnoticed")
 
@@ -204,6 +211,19 @@ def _lost(error: Exception, read: int, at: int, next_chunk: int | None, size: in
 
 def _what(error: Exception) -> str:
     return str(error) if isinstance(error, FormatError) else type(error).__name__
+
+
+def _summary(stream: _Stream) -> Summary | None:
+    return make_reader(stream).get_summary() if _has_whole_summary(stream) else None
+
+
+def _told(stream: _Stream) -> int | None:
+    """How many messages there are by the summary; None where it is damaged itself, or does not say."""
+    try:
+        summary = _summary(stream)
+    except Exception:  # see contents
+        return None
+    return summary.statistics.message_count if summary is not None and summary.statistics is not None else None
 
 
 def _has_whole_summary(stream: _Stream) -> bool:

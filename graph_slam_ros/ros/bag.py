@@ -200,19 +200,13 @@ class _McapPart:
     def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
         # a channel's own record may sit in a damaged chunk: the summary knows it, too
         names = {channel.id: channel.topic for channel in self._contents.channels.values()}
-        read = 0
         for record in mcap_records.records(self.file, losses, warnings):
             if isinstance(record, Message):
-                read += 1
                 name = names.get(record.channel_id, "")
                 if name in topics:
                     yield BagMessage(name, record.log_time, record.data)
             elif isinstance(record, Channel):
                 names[record.id] = record.topic
-        missing = sum(self._contents.counts.values()) - read
-        if missing:
-            what = f"{missing} of its messages could not be read" if missing > 0 else f"{-missing} messages too many"
-            losses.append(f"{self.file.name}: {what}")
 
     def _topic(self, channel: Channel, schema: Schema | None, count: int) -> Topic:
         type_name = schema.name if schema else ""

@@ -195,7 +195,7 @@ class Session:
         ended = release == "end"
         summary = summarize(self.slam) | {"counters": counters.as_dict(), "ended": ended}
         folder = str(self._recorder.save(self.slam, summary))
-        self._is_saved, self._is_ended = True, ended
+        self._is_saved, self._is_ended, self.recording_fails = True, ended, False
         return folder
 
     def reset(self) -> str:
