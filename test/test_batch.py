@@ -77,7 +77,7 @@ def without_a_weight(graph):
     ids=["none", "an empty table", "one of no weight", "a heading", "one position", "an offset of a sensor"],
 )
 @pytest.mark.parametrize("init", STARTS)
-def test_the_first_pose_is_held_where_priors_do_not_fix_position_and_heading(prior, init):
+def test_G2_the_first_pose_is_held_where_priors_do_not_fix_position_and_heading(prior, init):
     graph = chain()
     prior(graph)
     solved = optimize(graph, init=init)

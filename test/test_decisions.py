@@ -91,7 +91,7 @@ def lies(every):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_false_closures_pull_nothing_and_all_true_ones_stay(seed):
+def test_G10_false_closures_pull_nothing_and_all_true_ones_stay(seed):
     clean = Drive(seed, decide=False, loss="none").go(100).error
     drive = Drive(seed).go(100, lies(every=1))
     assert len(drive.false) > 30
@@ -121,7 +121,7 @@ def test_a_verdict_tells_why_and_against_what():
     assert math.hypot(*ledger.residual(edge)) == pytest.approx(math.hypot(*off), rel=0.1)
 
 
-def test_what_was_held_back_comes_in_when_the_map_agrees_in_the_end():
+def test_G14_what_was_held_back_comes_in_when_the_map_agrees_in_the_end():
     """A fix far away, which nobody believes until all others say the same."""
     drive = Drive(review_every_keyframes=1).go(60)
     moved = se2.compose(drive.true[20], (0.0, 3.0, 0.0))
@@ -164,7 +164,7 @@ def test_the_innovation_is_what_the_cost_would_grow_by():
     assert expected == pytest.approx(solver.evaluate().chi2_final - before, rel=0.05)
 
 
-def test_two_places_that_look_the_same_are_reported_as_ambiguous_with_what_speaks_for_each():
+def test_G11_two_places_that_look_the_same_are_reported_as_ambiguous_with_what_speaks_for_each():
     """After a lap the robot takes the aisle for the next one: ten closures that agree, against five that are true."""
 
     def close(one, k):

@@ -200,7 +200,7 @@ def test_keyframes_and_sightings_are_the_same_one_by_one_and_as_columns():
     assert p.keyframes[-1].stamp_ns == T0 + 9 * S
 
 
-def test_a_standing_robot_makes_no_keyframes_and_gathers_no_noise():
+def test_G20_a_standing_robot_makes_no_keyframes_and_gathers_no_noise():
     wiggle = [odometry(k / 10, (1e-6 * (k % 2), 0.0, 0.0)) for k in range(1, 6001)]
     p = run(slam(), odometry(0, (0, 0, 0)), *wiggle, seen(600.0, point()))
     assert len(p.keyframes) == 1
@@ -503,7 +503,7 @@ class Failing:
         raise SingularError("the edges do not determine vertex 7")
 
 
-def test_a_solve_that_fails_is_counted_and_the_last_estimate_stays(monkeypatch):
+def test_G7_a_solve_that_fails_is_counted_and_the_last_estimate_stays(monkeypatch):
     p = slam(solve={"every_keyframes": 2})
     failing = Failing(p, monkeypatch)
     items = [m for o in straight(2) for m in (o, seen((o.stamp_ns - T0) / S, point(at=(3.0 - o.T_odom_base[0], 0.1))))]

@@ -162,7 +162,7 @@ def test_where_no_clock_runs_or_nobody_asks_nothing_is_ahead():
 # -- the worker --------------------------------------------------------------------------------------------------------
 
 
-def test_a_worker_does_everything_in_order_refuses_what_is_too_much_and_survives_what_fails():
+def test_P10_a_worker_does_everything_in_order_refuses_what_is_too_much_and_survives_what_fails():
     worker, gate, done = Worker(3), threading.Event(), []
     first = worker.call(gate.wait)
     deadline = time.monotonic() + 10.0

@@ -27,7 +27,7 @@ def config():
     return Config.from_mapping(read_parameters(ROOT / "config" / "nav2.yaml"))
 
 
-def test_the_nodes_of_the_example_fit_each_other(config):
+def test_P14_the_nodes_of_the_example_fit_each_other(config):
     manager = SECTIONS["lifecycle_manager_localization"]
     assert set(SECTIONS) == {"map_server", "graph_slam", "lifecycle_manager_localization"}
     assert set(manager["node_names"]) == set(SECTIONS) - {"lifecycle_manager_localization"}

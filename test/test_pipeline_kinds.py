@@ -141,7 +141,7 @@ def test_ranges_that_share_an_offset_say_how_large_it_is(space):
     assert pipeline.solver.estimate([offset])[0] == pytest.approx([0.4], abs=0.02)
 
 
-def test_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why():
+def test_G3_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why():
     pipeline = slam(PLANE)
     for k in range(40):
         pipeline.process(Odometry(stamp(k), (0.0, 0.0, 0.0)))
@@ -150,7 +150,7 @@ def test_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why():
     assert "too few" in pipeline.waiting["a"]
 
 
-def test_both_mirror_places_of_a_landmark_are_kept_until_the_robot_turns():
+def test_G5_both_mirror_places_of_a_landmark_are_kept_until_the_robot_turns():
     pipeline, at = slam(PLANE, landmarks__mirror_chi2=20.0), PLANE.identity
     for k in range(160):
         pipeline.process(Odometry(stamp(k), at))

@@ -212,7 +212,7 @@ def test_a_second_update_changes_nothing():
     assert solver.optimize(Settings(**TIGHT)).stop != "nothing_to_do"  # another question
 
 
-def test_an_update_that_ran_out_of_iterations_goes_on_with_the_next():
+def test_G9_an_update_that_ran_out_of_iterations_goes_on_with_the_next():
     world = World(0)
     solver = world.solver(max_iterations=3, step_tolerance=1e-6, cost_tolerance=0.0)
     reports = [solver.optimize()]
@@ -319,7 +319,7 @@ def test_the_information_matrix_is_that_of_numeric_derivatives():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_loops_do_not_make_the_anchored_pose_more_certain_than_its_anchor(seed):
+def test_G2_loops_do_not_make_the_anchored_pose_more_certain_than_its_anchor(seed):
     world = World(seed)
     solver = world.solver()
     solver.optimize()
@@ -433,7 +433,7 @@ def test_nothing_at_all_is_solved():
     assert len(solver.estimate([])) == 0
 
 
-def test_parts_without_a_link_are_solved_as_if_alone():
+def test_G1_parts_without_a_link_are_solved_as_if_alone():
     a, b, both = World(1), World(2), World(1)
     shift = both.graph.vertex_count
     other = World(2)
@@ -451,7 +451,7 @@ def test_parts_without_a_link_are_solved_as_if_alone():
     assert second == pytest.approx(alone[1].estimate(range(POSES)), abs=1e-9)
 
 
-def test_a_part_that_nothing_fixes_is_named_and_the_estimate_stays():
+def test_G1_a_part_that_nothing_fixes_is_named_and_the_estimate_stays():
     graph = small([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0], [6.5, 0.0, 0.0], [8.0, 0.0, 0.0])
     for i, j in ((0, 1), (2, 3), (3, 4)):
         graph.add_edge(RELATIVE_POSE, [i, j], [1.0, 0.0, 0.0], PLANAR, "odometry")
@@ -490,7 +490,7 @@ def test_an_edge_taken_out_can_leave_a_part_without_gauge():
 
 @pytest.mark.parametrize("method", ["gn", "lm", "dogleg"])
 @pytest.mark.parametrize("seed", range(6))
-def test_a_pose_that_may_turn_around_its_only_landmark_is_named(method, seed):
+def test_G6_a_pose_that_may_turn_around_its_only_landmark_is_named(method, seed):
     rng = np.random.default_rng(seed)
     graph = small(*rng.standard_normal((2, 3)))
     graph.add_vertex(R2, rng.standard_normal(2))
@@ -569,7 +569,7 @@ def test_gauss_newton_that_fails_is_done_again_with_damping(seed):
     assert min(values) > values[0] * (1.0 - 2e-6)  # a minimum along each axis, up to the tolerance of the cost
 
 
-def test_a_step_that_ends_above_the_start_is_not_taken_for_an_answer():
+def test_G8_a_step_that_ends_above_the_start_is_not_taken_for_an_answer():
     # two turns of a hundred degrees make Gauss-Newton overshoot; a loose tolerance would let it end there
     graph = small([0.0, 0.0, 0.0], [0.0, 1.0, 1.8], [1.0, 1.0, -1.8])
     graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
@@ -614,7 +614,7 @@ def test_dogleg_converges_on_contradictions_where_levenberg_marquardt_does(seed)
 
 
 @pytest.mark.parametrize("origin", [(5e5, 4e6), (-4e6, 5e5)])
-def test_far_from_the_origin_the_answer_is_the_same(origin):
+def test_G17_far_from_the_origin_the_answer_is_the_same(origin):
     near, far = World(9), World(9, origin=origin)
     one, other = near.solver(), far.solver()
     at_home, abroad = one.optimize(), other.optimize()
@@ -627,7 +627,7 @@ def test_far_from_the_origin_the_answer_is_the_same(origin):
 
 
 @pytest.mark.parametrize("method", ["gn", "lm", "dogleg"])
-def test_numbers_that_overflow_are_refused_and_name_the_edge(method):
+def test_G7_numbers_that_overflow_are_refused_and_name_the_edge(method):
     graph = small([0.0, 0.0, 0.0], [1e200, 0.0, 0.0])
     graph.add_edge(POSE_PRIOR, [0], [0.0, 0.0, 0.0], PLANAR, "anchor")
     graph.add_edge(RELATIVE_POSE, [0, 1], [1.0, 0.0, 0.0], PLANAR, "odometry")

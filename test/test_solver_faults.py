@@ -1,7 +1,12 @@
 """Solves that fail, for whatever reason and at any moment: the last good estimate stays, and soon one succeeds."""
 
 import math
+import os
+import resource
+import signal
 import time
+import traceback
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -213,3 +218,62 @@ def test_a_second_look_that_fails_changes_nothing_and_is_counted(clean):
     assert not p.failing
     run(p, END)
     assert p.trajectory() == pytest.approx(clean[0].trajectory(), abs=1e-6)
+
+
+# -- memory ------------------------------------------------------------------------------------------------------------
+
+BAD, RAISED_ONLY, DEGRADED, FINE = 1, 10, 11, 12
+STEP = 1 << 15
+
+
+def squeezed(p, measurements, more):
+    """In a child: go on with so much more memory and no more, then with enough; how that went, as an exit code."""
+    good, code = p.trajectory(), FINE
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    unlimited = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + more, unlimited))
+    for m in measurements[:-20]:
+        try:
+            p.process(m)
+            code = min(code, DEGRADED if p.failing else FINE)
+        except MemoryError:  # what the node counts, and goes on
+            code = RAISED_ONLY
+    resource.setrlimit(resource.RLIMIT_AS, (unlimited, unlimited))
+    if not np.isfinite(p.trajectory()).all() or np.abs(p.trajectory()[: len(good)] - good).max() > 1.0:
+        return BAD
+    for m in measurements[-20:]:
+        p.process(m)
+    return code if not p.failing and np.isfinite(p.trajectory()).all() else BAD + 1
+
+
+def test_T13_without_memory_a_solve_fails_and_with_memory_again_it_goes_on():
+    """In children of this process, each with a little more memory than the last."""
+    p = run(pipeline(), many(0, 600))
+    measurements, codes = [*many(600, 660), *END], []
+    for k in range(times(64, 1000)):
+        child = os.fork()
+        if not child:
+            code = BAD + 2
+            try:
+                signal.alarm(60)
+                code = squeezed(p, measurements, k * STEP)
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                os._exit(code)
+        _, status = os.waitpid(child, 0)
+        codes.append(os.waitstatus_to_exitcode(status))
+    tell("out_of_memory", tried=len(codes), faults=sum(c in (RAISED_ONLY, DEGRADED) for c in codes), failed=0)
+    print(codes)
+    assert {RAISED_ONLY, DEGRADED, FINE} >= set(codes)
+
+
+def many(first, end):
+    """Odometry of a long way round and round, and what is seen of one landmark."""
+    pose = se2.IDENTITY
+    for k in range(end):
+        if k >= first:
+            yield Odometry(stamp(k), pose)
+            local = se2.act(se2.inverse(pose), PLACES["a"])
+            yield Sightings(stamp(k), "/landmarks", (Sighting("a", "position", local, (0.0025, 0, 0, 0.0025)),))
+        pose = se2.compose(pose, (2.0, 0.0, 2.0 * math.pi / AROUND))

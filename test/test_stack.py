@@ -195,7 +195,7 @@ def test_two_robots_in_namespaces_do_not_see_each_other(tmp_path):
             assert "WARN" not in n.said.replace("WAITING", "").replace("[WARN]", "", n.said.count("WAITING")), n.said
 
 
-def test_two_nodes_of_one_name_say_so_until_one_has_gone():
+def test_P19_two_nodes_of_one_name_say_so_until_one_has_gone():
     with node("output.folder:=''") as one, node("output.folder:=''") as other, robot(hears=("/diagnostics",)) as r:
         r.wait_for_node()
         r.until_it_says("ERROR", "another node has this node's name")
@@ -214,7 +214,7 @@ def foreign_correction(stamp_ns, x=9.0):
     return message
 
 
-def test_another_broadcaster_of_map_to_odom_is_named_and_left_alone_where_that_is_asked_for():
+def test_P18_another_broadcaster_of_map_to_odom_is_named_and_left_alone_where_that_is_asked_for():
     with node("output.folder:=''") as n, robot(hears=("/diagnostics", "/tf")) as r:
         r.wait_for_node()
         drive = Drive()
@@ -257,7 +257,7 @@ def told(r):
     ]
 
 
-def test_transforms_begin_with_the_first_solution_and_are_told_once_for_an_odometry_stamp():
+def test_P20_transforms_begin_with_the_first_solution_and_are_told_once_for_an_odometry_stamp():
     with node("output.folder:=''", "tf.transform_publish_period:=0.01") as n, robot(hears=("/tf", "/diagnostics")) as r:
         r.wait_for_node()
         drive, sent = Drive(), set()
@@ -292,7 +292,7 @@ def test_transforms_begin_with_the_first_solution_and_are_told_once_for_an_odome
         assert n.stop()[0] == 0
 
 
-def test_transforms_dated_by_the_clock_are_ahead_of_it_by_the_tolerance():
+def test_P20_transforms_dated_by_the_clock_are_ahead_of_it_by_the_tolerance():
     with node("output.folder:=''", "tf.stamp:=now", "tf.transform_tolerance:=0.3") as n, robot(hears=("/tf",)) as r:
         r.wait_for_node()
         drive, late_s = Drive(), []
@@ -398,7 +398,7 @@ def veteran(tmp_path_factory):
         n.process.kill()  # to save all of it takes a while
 
 
-def test_of_a_path_that_is_too_long_some_poses_are_published_the_first_and_last_among_them(veteran):
+def test_P8_of_a_path_that_is_too_long_some_poses_are_published_the_first_and_last_among_them(veteran):
     r, drive, keyframes, earlier = veteran
     path = typestore().deserialize_cdr(r.heard["path"][0], "nav_msgs/msg/Path")
     stamps = [stamp_ns(one.header) for one in path.poses]
@@ -415,7 +415,7 @@ def test_of_a_path_that_is_too_long_some_poses_are_published_the_first_and_last_
     assert stamp_ns(path.poses[-1].header) > drive.stamp_ns - NS, "of now"
 
 
-def test_while_everything_is_solved_and_saved_transforms_odometry_and_diagnostics_go_on(veteran):
+def test_P9_while_everything_is_solved_and_saved_transforms_odometry_and_diagnostics_go_on(veteran):
     r, drive, *_ = veteran
     drive.go(r, 20)
     r.settle()

@@ -87,7 +87,7 @@ def weight(process):
     return int(status["VmRSS"].split()[0]) / 1024.0, len(list((of / "fd").iterdir())), int(status["Threads"])
 
 
-def test_a_life_of_many_transitions_leaves_nothing_behind(tmp_path):
+def test_P13_a_life_of_many_transitions_leaves_nothing_behind(tmp_path):
     times, warm = often(20), 5
     with managed(tmp_path / "run") as n, robot(hears=("pose", "path", "/tf", "/diagnostics")) as r:
         drive, weights = Drive(), []
@@ -111,7 +111,7 @@ def test_a_life_of_many_transitions_leaves_nothing_behind(tmp_path):
     assert {run.name for run in tmp_path.iterdir()} == {"run", *(f"run-{last - k}" for k in range(5))}
 
 
-def test_a_transition_out_of_turn_is_refused_by_name_and_by_number_and_the_node_is_as_it_was(tmp_path):
+def test_P22_a_transition_out_of_turn_is_refused_by_name_and_by_number_and_the_node_is_as_it_was(tmp_path):
     with managed(tmp_path / "run") as n, robot(hears=("/diagnostics",)) as r:
         rng, state = random.Random(5), "unconfigured"
         for _ in range(often(30)):
@@ -195,7 +195,7 @@ MEANWHILE = "", "save", "optimize", "reset", "clear_closures"
 
 
 @pytest.mark.parametrize("seed", range(often(5)))
-def test_told_to_stop_at_any_moment_of_a_drive_it_saves_what_it_has_and_ends_with_0(tmp_path, seed):
+def test_P6_told_to_stop_at_any_moment_of_a_drive_it_saves_what_it_has_and_ends_with_0(tmp_path, seed):
     rng, meanwhile = random.Random(seed), MEANWHILE[seed % len(MEANWHILE)]
     with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=("pose",)) as r:
         r.wait_for_node()
@@ -224,7 +224,7 @@ def hears_signals(process):
 
 
 @pytest.mark.parametrize("seed", range(often(3)))
-def test_told_to_stop_at_any_moment_of_its_start_it_ends_with_0_and_may_begin_again(tmp_path, seed):
+def test_P6_told_to_stop_at_any_moment_of_its_start_it_ends_with_0_and_may_begin_again(tmp_path, seed):
     rng = random.Random(seed)
     with node(f"output.folder:={tmp_path / 'run'}") as n:
         until(lambda: hears_signals(n.process), time.sleep, "handler of signals")
@@ -236,7 +236,7 @@ def test_told_to_stop_at_any_moment_of_its_start_it_ends_with_0_and_may_begin_ag
     check_room(tmp_path / "run")
 
 
-def test_told_to_stop_while_kernels_are_compiled_it_does_not_wait_for_them(tmp_path, monkeypatch):
+def test_P6_told_to_stop_while_kernels_are_compiled_it_does_not_wait_for_them(tmp_path, monkeypatch):
     monkeypatch.setitem(ENVIRONMENT, "GRAPH_SLAM_CACHE", str(tmp_path / "cache"))
     with node(f"output.folder:={tmp_path / 'run'}") as n:
         until(lambda: list(tmp_path.glob("cache/**/*.nbi")), time.sleep, "first compiled kernel", 60.0)
@@ -247,7 +247,7 @@ def test_told_to_stop_while_kernels_are_compiled_it_does_not_wait_for_them(tmp_p
     check_room(tmp_path / "run")
 
 
-def test_told_to_stop_while_a_long_run_is_loaded_it_does_not_wait_for_it(tmp_path):
+def test_P6_told_to_stop_while_a_long_run_is_loaded_it_does_not_wait_for_it(tmp_path):
     earlier_run(tmp_path / "life", 20_000)  # without its map: the drive is repeated, which takes long
     parameters = f"output.folder:={tmp_path / 'run'}", "output.load:=life", "output.load_at_start:=true"
     with node(*parameters) as n, robot(hears=("/diagnostics",)) as r:
@@ -332,7 +332,7 @@ def hostile(rng):
     )
 
 
-def test_of_parameters_that_are_set_together_all_or_none_change_and_the_run_repeats_with_them(tmp_path):
+def test_P15_of_parameters_that_are_set_together_all_or_none_change_and_the_run_repeats_with_them(tmp_path):
     rng, done = random.Random(3), 0
     with (
         node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n,
@@ -390,7 +390,7 @@ def test_a_node_that_is_not_configured_takes_what_is_valid_but_neither_folder_no
     assert [run.name for run in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_parameter_without_value_or_of_no_type_is_refused_and_the_node_goes_on(tmp_path):
+def test_P16_a_parameter_without_value_or_of_no_type_is_refused_and_the_node_goes_on(tmp_path):
     with managed(tmp_path / "run") as n, robot(hears=(), sends=()) as r:
         for kind in (0, 42, 255):
             nothing = [Parameter(name="tf.publish_tf", value=ParameterValue(type=kind))]
@@ -407,7 +407,7 @@ def test_a_parameter_without_value_or_of_no_type_is_refused_and_the_node_goes_on
 # -- services ----------------------------------------------------------------------------------------------------------
 
 
-def test_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(tmp_path):
+def test_P12_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(tmp_path):
     hears = "pose", "/tf", "odometry", "/diagnostics", "landmarks"
     with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=hears) as r:
         r.wait_for_node()

@@ -163,7 +163,7 @@ def test_by_range_and_bearing_from_as_far_as_ever_nothing_known_is_taken_for_it(
     assert len(slam.landmarks) == 2
 
 
-def test_where_association_asks_of_what_cannot_be_solved_no_covariance_is_known():
+def test_G19_where_association_asks_of_what_cannot_be_solved_no_covariance_is_known():
     slam = pipeline("joint")
     standing(slam, lambda t_s: [(8.0, 2.0)], 10.0)
     assert np.isfinite(slam.landmark_covariances()).all()
