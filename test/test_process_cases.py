@@ -79,25 +79,67 @@ def at_work(**values):
         yield slam, r, drive
 
 
+@contextlib.contextmanager
+def held(slam):
+    """Until the end no solve ends."""
+    gate, solver = threading.Event(), slam._run._session.slam.solver
+    update = solver.update
+
+    def hold():
+        gate.wait(60.0)
+        return update()
+
+    solver.update = hold
+    try:
+        yield
+    finally:
+        gate.set()
+        del solver.update
+
+
 def test_P9_where_a_solve_does_not_end_it_says_so_and_transforms_go_on():
     with at_work(health__stuck_s=0.5) as (slam, r, drive):
-        gate = threading.Event()
-        solver = slam._run._session.slam.solver
-        update = solver.update
-
-        def hang():
-            gate.wait(60.0)
-            return update()
-
-        solver.update = hang
-        try:
+        with held(slam):
             r.until_it_says("DEGRADED", "solver stuck", spin=drive.pace(r))
             r.heard["tf"].clear()
             until(lambda: len(r.heard["tf"]) > 20, drive.pace(r), "transforms")
-        finally:
-            gate.set()
-            del solver.update
         r.until_it_says("OK", spin=drive.pace(r))
+
+
+def test_P10_what_does_not_fit_into_the_queue_is_refused_before_it_is_accepted_and_soon_all_is_well(tmp_path):
+    with at_work(inputs__queue=20, output__folder=str(tmp_path / "run")) as (slam, r, drive):
+        run = slam._run
+        with held(slam):
+            drive.go(r, 200)
+            until(lambda: run.counters["odom", "overflow"] > 50, r.spin, "refusals")
+            r.until_it_says("DEGRADED", "messages refused: the queue is full", spin=drive.pace(r))
+            assert run._worker.waiting <= 21
+        r.until_it_says("OK", spin=drive.pace(r))
+        assert r.save().success
+        assert results(tmp_path / "run") == replayed(tmp_path / "run", tmp_path)
+
+
+def test_P17_a_parameter_that_is_set_during_a_solve_takes_effect_after_it(tmp_path):
+    with at_work(output__folder=str(tmp_path / "run")) as (slam, r, drive):
+        session = slam._run._session
+        with held(slam):
+            until(lambda: slam._run._worker.waiting > 3, drive.pace(r), "measurements that wait")
+            assert r.set({"keyframes.min_distance_m": 2.5}) == (True, "")
+            assert session.slam.config.keyframes.min_distance_m < 2.5
+        until(lambda: session.slam.config.keyframes.min_distance_m == 2.5, drive.pace(r), "the new value")
+        assert r.save().success
+        assert results(tmp_path / "run") == replayed(tmp_path / "run", tmp_path)
+
+
+def test_P11_a_robot_that_has_gone_and_comes_back_is_heard_again():
+    """Its participant is a new one, as after a restart of its middleware."""
+    with at_work() as (slam, r, drive):
+        r.close()
+        with robot(of=slam.get_fully_qualified_name(), hears=HEARS) as again:
+            again.wait_for_node()
+            again.until_it_says("OK", spin=drive.pace(again))
+            until(lambda: len(again.heard["pose"]) > 3, drive.pace(again), "poses")
+            assert again.graph()["segments"] == 1
 
 
 def test_G7_while_solves_fail_it_says_so_and_why_and_transforms_go_on_by_the_last_good_estimate():
