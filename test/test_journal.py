@@ -169,6 +169,24 @@ def test_T9_F3_a_flipped_bit_gives_no_record_that_was_not_written_and_none_after
     assert not row("journal_flipped", FLIPS, FLIPS, wrong)
 
 
+def test_F3_a_last_chunk_that_is_taken_for_something_else_is_missed_and_nothing_after_it_is_read(parts, tmp_path):
+    part, after = parts[0], parts[1]
+    (before, _), (_, count) = part.flushed[-2:]
+    heads = [before]  # of the records from there to the end of the data
+    while part.data[heads[-1]] != Opcode.DATA_END:
+        heads.append(heads[-1] + 9 + struct.unpack_from("<Q", part.data, heads[-1] + 1)[0])
+    written, missed = part.records + after.records, 0
+    for at, bit in itertools.product(heads, range(8)):
+        data = bytearray(part.data)
+        data[at] ^= 1 << bit
+        losses = []
+        read = list(read_ingest(laid_out(tmp_path, [data, after.data]), losses))
+        assert read == written[: len(read)], (at, bit)
+        assert read == written or losses, (at, bit)
+        missed += len(read) < count
+    assert missed >= 7
+
+
 def test_F19_a_length_of_2_to_the_60_in_a_journal_is_refused_before_memory_is_asked_for(parts, tmp_path):
     for end, count in parts[0].flushed[:-1]:
         data = bytearray(parts[0].data)
