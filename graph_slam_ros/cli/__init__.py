@@ -1,7 +1,7 @@
 """The commands ``graph_slam`` and ``graph_slam_node``.
 
 Exit codes: 0 done, 1 a fault of ours, 2 refused (one line names the culprit), 3 done but something was lost;
-of ``optimize --certify`` also 4 not certified, 5 the certificate does not apply.
+of ``optimize --certify`` also 4 not certified, 5 the certificate does not apply; of ``diff`` 4 they differ.
 """
 
 import os

@@ -10,6 +10,7 @@ from typing import Any
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 DONE, FAULT, REFUSED, LOSSES = 0, 1, 2, 3
 NOT_CERTIFIED, NOT_APPLICABLE = 4, 5  # of optimize --certify
+DIFFERENT = 4  # of diff
 
 
 def say(*lines: str) -> None:

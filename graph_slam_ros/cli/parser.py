@@ -42,6 +42,7 @@ def parser() -> argparse.ArgumentParser:
         command("recover", recordings.recover, "the results of a run that was cut off, without repeating the drive")
     )
     _export(command("export", maps.export, "a run's path as TUM, its graph as g2o, or both as an mcap of ROS messages"))
+    _diff(command("diff", maps.diff, "what differs between two runs' maps: keyframes, landmarks, verdicts, chi2"))
     _info(
         command("info", recordings.info, "topics, types, rates, frames and span of a recording, and how to replay it")
     )
@@ -106,6 +107,13 @@ def _export(sub: argparse.ArgumentParser) -> None:
     _of_run(sub)
     sub.add_argument("--to", choices=("tum", "g2o", "mcap"), required=True, help="g2o: stamps and names beside it")
     sub.add_argument("--out", type=Path, required=True, metavar="FILE")
+
+
+def _diff(sub: argparse.ArgumentParser) -> None:
+    sub.epilog = f"{_CODES} 4: they differ."
+    sub.add_argument("a", type=Path, metavar="A", help="run folder")
+    sub.add_argument("b", type=Path, metavar="B", help="run folder")
+    sub.add_argument("--json", action="store_true", help="all of it as one line")
 
 
 def _info(sub: argparse.ArgumentParser) -> None:
