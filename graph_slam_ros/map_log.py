@@ -106,6 +106,11 @@ def has_map(folder: Path) -> bool:
     return bool(parts_of(folder, MAP))
 
 
+def grew(folder: Path) -> bool:
+    """Whether there is anything in it."""
+    return any(record.get("type") == "growth" for record in read_records(folder, MAP, []))
+
+
 def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> MapState | None:
     """The map of a run folder, as far as it can be read; None where there is none.
 

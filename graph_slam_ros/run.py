@@ -33,7 +33,7 @@ from graph_slam_ros.formats.ingest import INGEST, MEASUREMENT, Parts, close_all,
 from graph_slam_ros.formats.parameters import parameters_text, read_parameters
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
-from graph_slam_ros.map_log import GROWTH, MAP, Growth, has_map, read_map, state_of
+from graph_slam_ros.map_log import GROWTH, MAP, Growth, grew, has_map, read_map, state_of
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter
 from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
@@ -87,7 +87,7 @@ def is_cut_off(folder: Path) -> bool:
 
 
 def _holds_something(folder: Path) -> bool:
-    return is_run(folder) and next(read_ingest(folder, []), None) is not None
+    return is_run(folder) and (next(read_ingest(folder, []), None) is not None or grew(folder))
 
 
 def map_of(folder: Path, losses: list[str]) -> MapState:
