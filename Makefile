@@ -38,7 +38,7 @@ demo: install
 	@$(BIN)/graph_slam demo
 
 test: install lint
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
 SOAKED := any_message timing_cases mutated_recordings
 soak: install

@@ -22,6 +22,17 @@ def tell(name, *, worst=None, **numbers):
         _WORST[name][key] = max(value, _WORST[name].get(key, value))
 
 
+def told():
+    """All of it, for another process."""
+    return [(name, dict(numbers), dict(_WORST[name])) for name, numbers in _TOLD.items()]
+
+
+def add(others):
+    """What another process was told."""
+    for name, numbers, worst in others:
+        tell(name, worst=worst, **numbers)
+
+
 def lines():
     """What was told."""
     for name, numbers in _TOLD.items():
