@@ -100,9 +100,11 @@ class Safeguard:
             raise DivergedError("the estimate is not finite")
         if np.abs(values - before).max(initial=0.0) <= _FAR:
             return
-        now, then = self._solver.evaluate(), self._solver.evaluate(at=before)
-        numbers = sum(one.residuals for one in now.classes.values())
-        if not now.cost_final <= _RISE * max(then.cost_final, numbers):
+        now = self._solver.evaluate()
+        if now.cost_final <= _RISE * sum(one.residuals for one in now.classes.values()):
+            return
+        then = self._solver.evaluate(at=before)
+        if not now.cost_final <= _RISE * then.cost_final:
             raise DivergedError(f"the cost rose from {then.cost_final:.3g} to {now.cost_final:.3g}")
 
     # -- quarantine --------------------------------------------------------------------------------------------------
