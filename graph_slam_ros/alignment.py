@@ -31,12 +31,15 @@ class Alignment:
     ----------
     apart : a less b, in the axes of a (k, n)
     covariance : of each of these (k, n, n), of both maps and of the alignment
+    chi2, limit : of each by that (k,), and what it may be
     fits : which agree with one another (k,)
     """
 
     T_a_b: Numbers
     apart: Array
     covariance: Array
+    chi2: Array
+    limit: float
     fits: Mask
 
     def distance(self, k: int) -> tuple[float, float]:
@@ -84,10 +87,11 @@ def align(space: Space, a: tuple[Array, Array], b: tuple[Array, Array], gate: fl
         turn, shift = _motion(a[0][fits], b[0][fits])
         apart = a[0] - b[0] @ turn.T - shift
         covariance = _covariance(a, b, turn, fits)
-        before, fits = fits, np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart) <= limit
+        chi2 = np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart)
+        before, fits = fits, chi2 <= limit
         if (fits == before).all():
             break
-    return Alignment(_pose(space, turn, shift), apart, covariance, fits)
+    return Alignment(_pose(space, turn, shift), apart, covariance, chi2, limit, fits)
 
 
 def as_they_are(space: Space, a: tuple[Array, Array], b: tuple[Array, Array], T_a_b: Numbers) -> Alignment:
@@ -96,7 +100,8 @@ def as_they_are(space: Space, a: tuple[Array, Array], b: tuple[Array, Array], T_
     moved = np.stack(space.group.act(T_a_b, tuple(b[0].T)), axis=-1).reshape(count, n)
     turn, variances = space.turn(T_a_b), [np.einsum("kikj->kij", c.reshape(count, n, count, n)) for _, c in (a, b)]
     covariance = variances[0] + turn @ variances[1] @ turn.T
-    return Alignment(T_a_b, a[0] - moved, covariance, np.zeros(count, dtype=bool))
+    unknown, none = np.full(count, np.nan), np.zeros(count, dtype=bool)
+    return Alignment(T_a_b, a[0] - moved, covariance, unknown, math.nan, none)
 
 
 def laid_on(space: Space, a: Array, b: Array) -> Numbers | None:

@@ -1,7 +1,7 @@
 """What differs between the maps of two runs."""
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -191,9 +191,19 @@ def _aligned(one: GraphSlam, two: GraphSlam, common: list[str]) -> tuple[Alignme
 
 
 def _of_one_stamp(one: GraphSlam, two: GraphSlam) -> tuple[Array, Array]:
-    """Poses of the keyframes of one stamp, the first where there are several."""
-    _, k, m = np.intersect1d(one.keyframes.stamps_ns, two.keyframes.stamps_ns, return_indices=True)
-    return one.trajectory()[k], two.trajectory()[m]
+    """Poses of the keyframes of one stamp; where there are several the first and the first, and so on."""
+    a, b = _by_stamp(one), _by_stamp(two)
+    common = [stamp for stamp in a if stamp in b]
+    return one.trajectory()[[a[stamp] for stamp in common]], two.trajectory()[[b[stamp] for stamp in common]]
+
+
+def _by_stamp(slam: GraphSlam) -> dict[tuple[int, int], int]:
+    times = Counter[int]()
+    out = {}
+    for k, stamp in enumerate(slam.keyframes.stamps_ns.tolist()):
+        out[stamp, times[stamp]] = k
+        times[stamp] += 1
+    return out
 
 
 def _keyframes_apart(one: GraphSlam, two: GraphSlam, T_a_b: Numbers) -> Array:

@@ -149,10 +149,15 @@ def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> Ma
 def state_of(slam: GraphSlam) -> MapState:
     """The map of a pipeline, apart from it."""
     state = MapState()
-    _grow(state, Growth().since(slam))
+    extend(state, Growth().since(slam))
     state.values = slam.solver.values
-    _take_effect(state)
     return state
+
+
+def extend(state: MapState, record: Mapping[str, Any]) -> None:
+    """Take a ``growth`` in, after what there is."""
+    _grow(state, record)
+    _take_effect(state)
 
 
 # -- what is written --------------------------------------------------------------------------------------------------

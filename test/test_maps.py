@@ -9,9 +9,11 @@ import pytest
 from runs import drive, with_a_wrong_sighting
 
 from graph_slam_ros import cli, read_g2o
+from graph_slam_ros.alignment import laid_on
+from graph_slam_ros.map_log import read_map
 from graph_slam_ros.ros.bag import open_bag
 from graph_slam_ros.ros.interfaces import typestore
-from graph_slam_ros.run import RunRecorder, taken_up
+from graph_slam_ros.run import RunRecorder, map_of, run_config, taken_up
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
 
@@ -216,3 +218,157 @@ def test_diff_of_the_plane_and_space_is_refused(first, tmp_path, capsys):
     assert run("diff", first, other) == 2
     assert "world.dimensions" in capsys.readouterr().err
     assert told(capsys, "diff", other, other, "--json")[0] == 0
+
+
+# -- merge -------------------------------------------------------------------------------------------------------------
+
+RECORDED = ("graph.g2o", "ledger.csv", "ledger_changes.csv", "path.tum", "landmarks.csv", "covariances.csv")
+ELSEWHERE = Config.from_mapping({"anchor.pose": "30 -20 2"})  # its map lies otherwise
+
+
+def rmse(slam, *recordings):
+    """Of the positions of keyframes, a segment of each recording, once they are laid on the truth as one."""
+    n, truth = slam.space.dimensions, []
+    for recording, stamps in zip(recordings, np.split(slam.keyframes.stamps_ns, slam.segments[1:]), strict=True):
+        truth.append(recording.T_world_base[np.searchsorted(recording.stamps_ns, stamps), :n])
+    truth, at = np.concatenate(truth), slam.trajectory()[:, :n]
+    moved = slam.space.group.act(laid_on(slam.space, truth, at), tuple(at.T))
+    return np.sqrt(np.mean(np.sum((np.stack(moved, axis=-1) - truth) ** 2, axis=1)))
+
+
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory):
+    """Of another drive, in another map frame."""
+    world = measurements(simulate("warehouse", 5, aisles=2, laps=1))
+    return ended(tmp_path_factory.mktemp("runs") / "elsewhere", world, ELSEWHERE)
+
+
+@pytest.fixture(scope="module")
+def merged(first, elsewhere, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "merged"
+    assert run("merge", first, elsewhere, "--out", folder) == 0
+    return folder
+
+
+def test_merge_lays_the_second_session_on_the_first(first, elsewhere, merged):
+    one, two, both = (taken_up(folder, []) for folder in (first, elsewhere, merged))
+    count = len(one.keyframes)
+    assert len(both.keyframes) == count + len(two.keyframes)
+    assert both.segments == [*one.segments, *(count + k for k in two.segments)]
+    assert set(both.landmarks) == set(one.landmarks) | set(two.landmarks)
+    assert both.graph.edge_count == one.graph.edge_count + two.graph.edge_count
+    for name, mark in both.landmarks.items():
+        assert mark.sightings == sum(m.landmarks[name].sightings for m in (one, two) if name in m.landmarks)
+    drives = [simulate("warehouse", seed, aisles=2, laps=1) for seed in (0, 5)]
+    assert rmse(both, *drives) < 0.05 + 0.5 * (rmse(one, drives[0]) + rmse(two, drives[1]))
+    assert np.median(np.diag(both.landmark_covariances()[0])) < np.median(np.diag(one.landmark_covariances()[0]))
+
+
+def test_a_merged_run_repeats_recovers_and_is_gone_on_in(merged, world, tmp_path):
+    assert run("replay", merged, "--out", tmp_path / "again") == 0
+    for name in RECORDED:
+        assert (merged / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+    assert run("recover", merged, "--out", tmp_path / "recovered") == 0
+    assert run("diff", merged, tmp_path / "recovered") == 0
+    assert run("explain", merged) == 0
+    start = map_of(merged, [])
+    known = set(start.landmarks)
+    slam = drive(tmp_path / "third", run_config(merged), world, start)
+    assert set(slam.landmarks) == known
+    drives = [simulate("warehouse", seed, aisles=2, laps=1) for seed in (0, 5, 0)]
+    assert rmse(slam, *drives) < 0.15
+
+
+def test_merge_leaves_out_what_has_moved_and_tells(first, tmp_path, capsys):
+    seen = taken_up(first, []).landmarks
+    name = max(seen, key=lambda name: seen[name].sightings)
+    other = moved(measurements(simulate("warehouse", 5, aisles=2, laps=1)), name, 1.5)
+    assert run("merge", first, ended(tmp_path / "other", other, ELSEWHERE), "--out", tmp_path / "out") == 0
+    warning = capsys.readouterr().err
+    assert f"landmark {name} is 1." in warning
+    assert len(warning.splitlines()) == 1
+    one, both = taken_up(first, []), taken_up(tmp_path / "out", [])
+    _, found = told(capsys, "diff", first, tmp_path / "out", "--json")
+    (same,) = (one for one in found["moved"] if one["landmark"] == name)
+    assert same["distance_m"] < 0.1, "it is where the first session saw it"
+    out = [edge for edge in both.ledger.outside.tolist() if edge >= one.graph.edge_count]
+    assert len(out) == sum(one.id == name for m in other_sightings() for one in m.sightings)
+
+
+def other_sightings():
+    return simulate("warehouse", 5, aisles=2, laps=1).seen
+
+
+def test_merge_of_unnamed_landmarks_keeps_them_apart(first, elsewhere, tmp_path):
+    config = Config.from_mapping({"landmarks.association": "joint"})
+
+    def half_named(seed):
+        world = measurements(simulate("warehouse", seed, aisles=2, laps=1, sensor="position"))
+        for m in world:
+            if isinstance(m, Sightings):
+                m = replace(m, sightings=tuple(replace(s, id=s.id if hash_of(s.id) % 2 else "") for s in m.sightings))
+            yield m
+
+    def hash_of(name):
+        return sum(map(ord, name))
+
+    a, b = ended(tmp_path / "a", half_named(0), config), ended(tmp_path / "b", half_named(5), config)
+    assert run("merge", a, b, "--out", tmp_path / "out") == 0
+    start = read_map(tmp_path / "out", [], start_only=True)
+    one, two = (taken_up(folder, []) for folder in (a, b))
+    unnamed = [sum(mark.is_unnamed for mark in slam.touched_landmarks(0).values()) for slam in (one, two)]
+    assert min(unnamed) > 3
+    assert sum(mark.is_unnamed for mark in start.landmarks.values()) == sum(unnamed)
+    for mark in start.landmarks.values():
+        for one in mark.seen:
+            table, row = start.graph.row(one.edge)
+            assert table.vertices.values[row].tolist() == [one.where.vertex, mark.vertex]
+            assert start.keyframes[one.where.keyframe].vertex == one.where.vertex
+    assert run("replay", tmp_path / "out", "--out", tmp_path / "again") == 0
+    assert (tmp_path / "out" / "graph.g2o").read_bytes() == (tmp_path / "again" / "graph.g2o").read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["flight", "ranges"])
+def test_merge_in_space_and_of_what_shares_an_offset(kind, tmp_path):
+    options = {"aisles": 2, "laps": 2, "sensor": "range"} if kind == "ranges" else {}
+    settings = {"landmarks.range_offset_sigma_m": 0.5} if kind == "ranges" else {"world.dimensions": 3}
+    name = "warehouse" if kind == "ranges" else "flight"
+    recordings = [simulate(name, seed, **options) for seed in (0, 3)]
+    runs = [ended(tmp_path / str(k), measurements(r), Config.from_mapping(settings)) for k, r in enumerate(recordings)]
+    assert run("merge", *runs, "--out", tmp_path / "out") == 0
+    one, two, both = (taken_up(folder, []) for folder in (*runs, tmp_path / "out"))
+    assert list(both.range_offsets) == list(one.range_offsets)
+    assert both.graph.vertex_count < one.graph.vertex_count + two.graph.vertex_count
+    assert len(both.graph.edges_of("range_offset")) == len(one.graph.edges_of("range_offset"))
+    assert rmse(both, *recordings) < 0.05 + 0.5 * (rmse(one, recordings[0]) + rmse(two, recordings[1]))
+
+
+def test_merge_refuses_in_one_line(first, elsewhere, world, tmp_path, capsys):
+    few = taken_up(first, []).landmarks
+    keep = next(iter(few))
+    one_only = [
+        replace(m, sightings=tuple(s for s in m.sightings if s.id == keep)) if isinstance(m, Sightings) else m
+        for m in world
+    ]
+    swapped = dict(zip(few, reversed(list(few)), strict=True))
+    confused = [
+        replace(m, sightings=tuple(replace(s, id=swapped.get(s.id, s.id)) for s in m.sightings))
+        if isinstance(m, Sightings)
+        else m
+        for m in world
+    ]
+    flight = list(measurements(simulate("flight", 0)))[:400]
+    surveyed = Config.from_mapping({"landmarks.surveyed": f"id,x,y,sigma\n{keep},1,1,0.1"})
+    for other, complaint in (
+        (ended(tmp_path / "few", one_only), "it takes 2"),
+        (ended(tmp_path / "confused", confused), "on how one lies on the other"),
+        (ended(tmp_path / "flight", flight, Config.from_mapping({"world.dimensions": 3})), "world.dimensions"),
+        (ended(tmp_path / "surveyed", world, surveyed), "merge"),
+        (tmp_path / "none", "none"),
+    ):
+        assert run("merge", first, other, "--out", tmp_path / "out") == 2
+        told = capsys.readouterr().err
+        assert complaint in told
+        assert len(told.splitlines()) == 1
+    assert run("merge", first, elsewhere, "--out", first) == 2
+    assert not (tmp_path / "out").exists()

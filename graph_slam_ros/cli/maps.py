@@ -1,4 +1,4 @@
-"""The commands on the maps of runs: ``export``, ``diff``."""
+"""The commands on the maps of runs: ``export``, ``diff``, ``merge``."""
 
 import argparse
 import json
@@ -24,3 +24,19 @@ def diff(args: argparse.Namespace) -> int:
     found = compared(args.a, args.b, losses)
     console.say(json.dumps(found.as_dict()) if args.json else str(found))
     return console.told(losses) or (console.DONE if found.is_same else console.DIFFERENT)
+
+
+def merge(args: argparse.Namespace) -> int:
+    """Make one map of two runs."""
+    from graph_slam_ros.cli.recordings import run_text
+    from graph_slam_ros.merge import merge as merged
+
+    done = merged(args.a, args.b, args.out)
+    agree = done.shared - len(done.left_out)
+    console.say(run_text(done.summary), f"{agree} of {done.shared} landmarks of both lay B on A")
+    console.say(f"results in {args.out}")
+    moved = [
+        f"landmark {name} is {metres:.2f} m ({sigmas:.0f} sigmas) elsewhere in B: what B saw of it is left out"
+        for name, (metres, sigmas) in done.left_out.items()
+    ]
+    return console.told(done.losses, moved)

@@ -43,6 +43,7 @@ def parser() -> argparse.ArgumentParser:
     )
     _export(command("export", maps.export, "a run's path as TUM, its graph as g2o, or both as an mcap of ROS messages"))
     _diff(command("diff", maps.diff, "what differs between two runs' maps: keyframes, landmarks, verdicts, chi2"))
+    _merge(command("merge", maps.merge, "one map of two runs, laid on one another by the landmarks of both"))
     _info(
         command("info", recordings.info, "topics, types, rates, frames and span of a recording, and how to replay it")
     )
@@ -114,6 +115,12 @@ def _diff(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("a", type=Path, metavar="A", help="run folder")
     sub.add_argument("b", type=Path, metavar="B", help="run folder")
     sub.add_argument("--json", action="store_true", help="all of it as one line")
+
+
+def _merge(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("a", type=Path, metavar="A", help="run folder, in whose map frame and configuration the result is")
+    sub.add_argument("b", type=Path, metavar="B", help="run folder")
+    sub.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder for the results")
 
 
 def _info(sub: argparse.ArgumentParser) -> None:

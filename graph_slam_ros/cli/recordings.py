@@ -144,12 +144,13 @@ def _config(args: argparse.Namespace) -> "Config":
 
 
 def _say_run(source: Path, summary: dict[str, Any]) -> None:
-    console.say(_run_text(summary))
+    console.say(run_text(summary))
     if not summary["keyframes"]:
         raise GraphSlamError(f"{source}: no odometry of it could be used, see what was counted and graph_slam info")
 
 
-def _run_text(summary: dict[str, Any]) -> str:
+def run_text(summary: dict[str, Any]) -> str:
+    """A run in some lines."""
     counters = [f"{source}: {reason} {n}" for source, by in summary["counters"].items() for reason, n in by.items()]
     lines = [
         f"keyframes  {summary['keyframes']:8d}   over {summary['span_s']:.1f} s",

@@ -7,7 +7,7 @@ giving the sightings of one to the other, and are parted again where these do no
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +31,8 @@ _MOST_CANDIDATES = 24  # landmarks that one message is compared with: the neares
 _MOST_AT_ONCE = 8  # new landmarks whose pairings are weighed together: the latest
 _MOST_OPTIONS = 12  # older ones that each may be: the nearest
 _REACH_SIGMA = 5.0
-_NAME = "unnamed"
+NAME = "unnamed"
+"""What landmarks are called that have no name; a number follows."""
 _POSITIONED = ("position", "pose", "range_bearing")
 
 
@@ -59,6 +60,12 @@ class Weighed:
         return Weighed([self.pairs[p] for p in some], self.residual[rows], self.covariance[rows[:, None], rows])
 
 
+def last_number(names: Iterable[str]) -> int:
+    """The highest that follows ``NAME``; 0 where there is none."""
+    numbers = (name.removeprefix(NAME) for name in names)
+    return max((int(number) for number in numbers if number.isdecimal()), default=0)
+
+
 class Unnamed:
     """Association of a message's sightings with the landmarks, and what follows from it later.
 
@@ -83,8 +90,7 @@ class Unnamed:
 
     def take_up(self) -> None:
         """New names are other than those that there are."""
-        numbers = [name.removeprefix(_NAME) for name, mark in self._landmarks.known.items() if mark.is_unnamed]
-        self._begun = max((int(number) for number in numbers if number.isdecimal()), default=self._begun)
+        self._begun = last_number(name for name, mark in self._landmarks.known.items() if mark.is_unnamed)
 
     def identified(self, m: Sightings, where: Where) -> list[tuple[str, Sighting]]:
         """The sightings of a message that can be used, each with an identity; the others are counted."""
@@ -138,7 +144,7 @@ class Unnamed:
 
     def _new_name(self) -> str:
         self._begun += 1
-        name = f"{_NAME}{self._begun}"
+        name = f"{NAME}{self._begun}"
         return name if name not in self._landmarks.known else self._new_name()
 
     def _position(self, s: Sighting, where: Where) -> Carried:
