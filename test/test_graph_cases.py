@@ -26,6 +26,7 @@ from graph_slam_ros.graph import (
     Graph,
 )
 from graph_slam_ros.lie import se2, so3
+from graph_slam_ros.run import RunRecorder, map_of
 from graph_slam_ros.slam import Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.ledger import Reason, Verdict
 from graph_slam_ros.slam.measurements import Closure
@@ -174,7 +175,7 @@ def driven(p, until, each=lambda k: None):
     return states
 
 
-def test_G6_a_landmark_that_makes_the_problem_singular_is_taken_out_and_what_else_came_stays():
+def test_G6_a_landmark_that_makes_the_problem_singular_is_taken_out_and_what_else_came_stays(tmp_path):
     """Put into the graph by hand: the pipeline itself lets none in that is not determined."""
     p, noise = slam(), Gaussian.from_sigmas(0.01)
 
@@ -192,6 +193,12 @@ def test_G6_a_landmark_that_makes_the_problem_singular_is_taken_out_and_what_els
     assert 21 not in p.solver.vertices
     assert verdicts(p, "landmarks") == {"ACCEPTED": 29, "REJECTED": 1}
     assert p.trajectory()[-1] == pytest.approx([14.5, 0.0, 0.0], abs=0.05)
+    recorder = RunRecorder(tmp_path / "run", p.config)
+    recorder.record(p, p.process(Control("optimize")))
+    recorder.flush()
+    again = GraphSlam(p.config, start=map_of(tmp_path / "run", []))
+    assert 21 not in again.solver.vertices, "nor is it in the map that is taken up"
+    assert again.trajectory() == pytest.approx(p.trajectory(), abs=1e-9)
 
 
 def test_G7_where_nothing_that_has_come_is_to_blame_the_last_good_estimate_is_held_until_it_heals():

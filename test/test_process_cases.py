@@ -151,7 +151,9 @@ def test_G7_while_solves_fail_it_says_so_and_why_and_transforms_go_on_by_the_las
             raise MemoryError("no room")
 
         solver.update = solver.optimize = fail
-        r.until_it_says("DEGRADED", "solves fail, the last good estimate stands: no room", spin=drive.pace(r))
+        r.until_it_says(
+            "DEGRADED", "solves fail, the last good estimate stands", "MemoryError: no room", spin=drive.pace(r)
+        )
         r.heard["tf"].clear()
         until(lambda: len(r.heard["tf"]) > 20, drive.pace(r), "transforms")
         del solver.update, solver.optimize

@@ -209,6 +209,21 @@ def test_G7_what_a_solve_fails_with_again_and_again_is_quarantined_and_nothing_e
     assert p.trajectory() == pytest.approx(clean[0].trajectory(), abs=0.1)
 
 
+@pytest.mark.parametrize("at", [5, 40, 70])
+def test_P23_to_go_back_to_the_last_good_estimate_in_a_solver_made_anew_changes_nothing_in_the_end(at, clean):
+    p = pipeline()
+    for k, m in enumerate(drive(0)):
+        p.process(m)
+        if k == at:
+            before = p.trajectory()
+            p.process(Control("restart"))
+            assert p.trajectory() == pytest.approx(before, abs=1e-12)
+            assert np.isnan(p.keyframe_covariances()).all(), "unknown until the next solve"
+    run(p, END)
+    assert p.trajectory() == pytest.approx(clean[0].trajectory(), abs=1e-4)
+    assert not p.counters.as_dict()
+
+
 def fails():
     raise MemoryError("injected")
 

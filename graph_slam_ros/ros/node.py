@@ -23,10 +23,10 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import UInt64
 
-from graph_slam_ros.errors import ConfigError, GraphSlamError
+from graph_slam_ros.errors import ConfigError, GraphSlamError, said
 from graph_slam_ros.ros import to_msg
 from graph_slam_ros.ros.live import health
-from graph_slam_ros.ros.live.configured import Configured, said
+from graph_slam_ros.ros.live.configured import Configured
 from graph_slam_ros.ros.live.deferred import serve_later
 from graph_slam_ros.ros.live.outputs import LATCHED
 from graph_slam_ros.ros.live.params import changed, declare_parameters

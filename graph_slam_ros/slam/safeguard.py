@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.errors import DivergedError
+from graph_slam_ros.errors import DivergedError, said
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.decisions import CANDIDATES, landmark_of
@@ -83,7 +83,7 @@ class Safeguard:
 
     def _fail(self, error: Exception) -> None:
         self._counters.count("solver", type(error).__name__)
-        self.failing = str(error) or type(error).__name__
+        self.failing = said(error)
         self._in_a_row += 1
         self.go_back()
 

@@ -14,7 +14,7 @@ from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import said
 from graph_slam_ros.ros import results, to_msg
 from graph_slam_ros.ros.from_msg import Border, Decoder, twist_of
 from graph_slam_ros.ros.inputs import Measured, uses
@@ -293,9 +293,7 @@ class Configured:
 
         def note(done: "Future[Any]") -> None:
             if (error := done.exception()) is not None:
-                self._node.get_logger().error(
-                    str(error) if isinstance(error, GraphSlamError) else f"{type(error).__name__}: {error}"
-                )
+                self._node.get_logger().error(said(error))
 
         future.add_done_callback(note)
 
@@ -359,11 +357,6 @@ class Configured:
             authorities=rivals or (),
             twins=twins,
         )
-
-
-def said(error: BaseException) -> str:
-    """An exception in one line: one of ours says enough by itself."""
-    return str(error) if isinstance(error, GraphSlamError) else f"{type(error).__name__}: {error}"
 
 
 def _installed(config: Config) -> dict[str, Decoder]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from std_srvs.srv import Trigger
 
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import said
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ def _filled(response: Any, future: "Future[str]") -> Any:
 
 def _failed(response: Any, error: BaseException) -> Any:
     response.success = False
-    response.message = str(error) if isinstance(error, GraphSlamError) else f"{type(error).__name__}: {error}"
+    response.message = said(error)
     return response
 
 
