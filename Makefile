@@ -40,7 +40,7 @@ demo: install
 test: install lint
 	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
-SOAKED := any_message timing_cases mutated_recordings
+SOAKED := any_message timing_cases mutated_recordings solver_faults
 soak: install
 	GRAPH_SLAM_SOAK=10 $(BIN)/python -m pytest -q --durations=20 $(or $(TESTS),$(wildcard test/test_stack*.py) $(SOAKED:%=test/test_%.py))
 

@@ -224,6 +224,27 @@ def test_P23_to_go_back_to_the_last_good_estimate_in_a_solver_made_anew_changes_
     assert not p.counters.as_dict()
 
 
+def test_P21_a_fault_of_one_measurement_costs_none_of_those_that_are_released_with_it():
+    p = GraphSlam(Config.from_mapping({"ordering.window_s": 5.0}))
+    for k in range(5):
+        p.process(Odometry(stamp(0) + k * S // 2, (0.5 * k, 0.0, 0.0)))
+        seen = [Sighting(name, "position", (1.0, 1.0), (0.01, 0.0, 0.0, 0.01)) for name in (f"{k}",)]
+        p.process(Sightings(stamp(0) + k * S // 2, "/landmarks", tuple(seen)))
+    add = p._landmarks.add
+
+    def faulty(topic, name, *others):
+        if name == "1":
+            raise RuntimeError("injected")
+        add(topic, name, *others)
+
+    p._landmarks.add = faulty
+    with pytest.raises(RuntimeError, match="injected"):
+        p.process(Control("flush"))
+    run(p, END)
+    assert set(p.landmarks) == {"0", "2", "3", "4"}
+    assert len(p.keyframes) == 5
+
+
 def fails():
     raise MemoryError("injected")
 

@@ -308,12 +308,19 @@ class GraphSlam:
     # -- odometry ------------------------------------------------------------------------------------------------
 
     def _use(self, released: list[Odometry | Observation]) -> None:
+        """Each by itself: a fault of one costs none of the others, and is raised in the end."""
+        faults = []
         for m in released:
-            if isinstance(m, Odometry):
-                for step in self._odometry.take(m):
-                    self._on_step(step)
-            else:
-                self._on_observation(m)
+            try:
+                if isinstance(m, Odometry):
+                    for step in self._odometry.take(m):
+                        self._on_step(step)
+                else:
+                    self._on_observation(m)
+            except Exception as fault:
+                faults.append(fault)
+        if faults:
+            raise faults[0]
 
     def _on_step(self, step: Step) -> None:
         if not self.keyframes:
