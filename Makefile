@@ -3,8 +3,7 @@
 # install       .venv with everything of requirements.txt, real ROS 2 included where there is none (default)
 # demo          install, then the demonstration
 # test          install, then style, types and tests
-# soak          what runs nodes and robots again, ten times as often, and what tries many cases, of many more; hours;
-#               TESTS= what pytest is given
+# soak          what takes too long for every test run: up to three hours, resumed where it was; ONLY=name,name
 # colcon        build and test as ROS does, in a scratch folder; colcon goes into .venv-colcon; TESTS= what pytest is given
 # test-oldest   the tests without ROS, in .venv-oldest with the lowest versions that setup.py allows
 # lint, format  style and types: tell, mend
@@ -40,9 +39,10 @@ demo: install
 test: install lint
 	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
-SOAKED := any_message timing_cases mutated_recordings solver_faults
-soak: install
-	GRAPH_SLAM_SOAK=10 $(BIN)/python -m pytest -q --durations=20 $(or $(TESTS),$(wildcard test/test_stack*.py) $(SOAKED:%=test/test_%.py))
+soak: install $(VENV)-fuzz/stamp
+	$(BIN)/python test/soak.py $(subst $(comma), ,$(ONLY))
+
+comma := ,
 
 lint: $(VENV)/package.stamp
 	$(BIN)/ruff check

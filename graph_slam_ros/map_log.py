@@ -30,7 +30,7 @@ from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.formats.ingest import parts_of, read_records
 from graph_slam_ros.graph import Gaussian, Graph
-from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, SE3
+from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.carry import Where
 from graph_slam_ros.slam.landmarks import Landmark, Seen
@@ -136,12 +136,14 @@ def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> Ma
                     state.values[: len(values)] = values
                 case "start":
                     has_start = True
-        except (LookupError, TypeError, ValueError, GraphSlamError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, GraphSlamError) as error:
             raise FormatError(f"{folder.name}/{MAP}.mcap: record {count}: {error}") from None
         if start_only and has_start:
             break
     if (start_only and not has_start) or not state.keyframes:
         return None
+    if fault := _fault(state):
+        raise FormatError(f"{folder.name}/{MAP}.mcap: {fault}")
     _take_effect(state)
     return state
 
@@ -158,6 +160,41 @@ def extend(state: MapState, record: Mapping[str, Any]) -> None:
     """Take a ``growth`` in, after what there is."""
     _grow(state, record)
     _take_effect(state)
+
+
+def _fault(state: MapState) -> str:
+    """Where the parts do not fit together; empty if they do."""
+    graph = state.graph
+    kinds = [graph.kinds[code] for code in graph.kind.values.tolist()]
+    pose = next((kind for kind in kinds if kind in GROUPS), None)
+
+    def is_index(one: Any, count: int) -> bool:
+        return isinstance(one, int) and 0 <= one < count
+
+    def is_instant(stamp_ns: Any, at: tuple[Any, ...]) -> bool:
+        numbers = all(isinstance(x, int | float) and math.isfinite(x) for x in at)
+        return is_index(stamp_ns, 2**63) and numbers and pose is not None and len(at) == pose.size
+
+    for k, one in enumerate(state.keyframes):
+        fits = is_index(one.vertex, len(kinds)) and kinds[one.vertex] is pose
+        if not (fits and is_instant(one.stamp_ns, one.T_odom_base)):
+            return f"keyframe {k} is none"
+    for k, seen in enumerate(state.sighting_poses):
+        if not (is_index(seen.keyframe, len(state.keyframes)) and is_instant(seen.stamp_ns, seen.T_keyframe_base)):
+            return f"sighting {k} is none"
+    for name, mark in state.landmarks.items():
+        if not all(map(is_index, (mark.vertex, mark.sightings), (len(kinds), 2**31))):
+            return f"landmark {name} is none"
+        if not all(is_index(stamp_ns, 2**63) for stamp_ns in (mark.first_seen_ns, mark.last_seen_ns)):
+            return f"landmark {name} was never seen"
+    for name, vertex in state.range_offsets.items():
+        if not (is_index(vertex, len(kinds)) and kinds[vertex] is R1):
+            return f"the offset of {name} is none"
+    if not all(is_index(one, len(state.keyframes)) for one in state.segments):
+        return "a segment begins where no keyframe is"
+    if len(state.ledger) > graph.edge_count:
+        return f"{len(state.ledger)} verdicts on {graph.edge_count} edges"
+    return "" if np.isfinite(state.values).all() else "an estimate is not finite"
 
 
 # -- what is written --------------------------------------------------------------------------------------------------

@@ -1,18 +1,19 @@
-"""Coverage-guided fuzzing of g2o, parameter files and the decoding of messages.
+"""Coverage-guided fuzzing of g2o, parameter files, the journal and the decoding of messages.
 
-``python test/guided_fuzzing.py g2o|yaml|cdr SECONDS`` with atheris (``make .venv-fuzz/stamp``: it is for this alone)
+``python test/guided_fuzzing.py g2o|yaml|cdr|journal SECONDS`` with atheris (``make .venv-fuzz/stamp``: for this alone)
 begins with ``test/corpus`` and adds to it what takes a new way through the code. An input that ends in anything but
 data or one of our errors is written to the present folder, and the exit code is not 0. The tests run the corpus through
 the same functions without atheris.
 """
 
 import contextlib
+import json
 import sys
 import tempfile
 from pathlib import Path
 
 CORPUS = Path(__file__).resolve().parent / "corpus"
-TARGETS = ("g2o", "yaml", "cdr")
+TARGETS = ("g2o", "yaml", "cdr", "journal")
 LIMITS = ["-timeout=5", "-rss_limit_mb=512", "-max_len=4096"]
 INPUTS = {
     "odom": "nav_msgs/msg/Odometry",
@@ -25,6 +26,8 @@ INPUTS = {
     "tf": "tf2_msgs/msg/TFMessage",
     "initialpose": "geometry_msgs/msg/PoseWithCovarianceStamped",
 }
+INSTRUMENTED = ["graph_slam_ros.formats", "graph_slam_ros.map_log", "graph_slam_ros.ros", "yaml"]
+"""Without what is compiled."""
 OF_THE_NODE = ("tf", "initialpose")
 
 
@@ -32,9 +35,12 @@ def target(name, file):
     """What takes the bytes of one input; the file is where those are put that a reader wants in one."""
     from graph_slam_ros.errors import GraphSlamError
     from graph_slam_ros.formats.g2o import read_g2o
+    from graph_slam_ros.formats.ingest import INGEST, IngestWriter, read_ingest
     from graph_slam_ros.formats.parameters import read_parameters
+    from graph_slam_ros.map_log import MAP, read_map
     from graph_slam_ros.ros.from_msg import Border
-    from graph_slam_ros.slam import Config, Counters
+    from graph_slam_ros.slam import Config, Counters, GraphSlam
+    from graph_slam_ros.slam.measurements import from_record
 
     def g2o(data):
         file.write_bytes(data)
@@ -54,7 +60,29 @@ def target(name, file):
             for _ in range(2):
                 border.take(tuple(INPUTS)[data[0] % len(INPUTS)], data[1:])
 
-    of_name = {"g2o": g2o, "yaml": yaml, "cdr": cdr}[name]
+    def journal(data):
+        """The lines as records of both files; beginning with mcap's magic, as the files themselves."""
+        for part in (INGEST, MAP):
+            path = file.with_name(f"{part}.mcap")
+            if data.startswith(b"\x89"):
+                path.write_bytes(data)
+                continue
+            writer = IngestWriter(path)
+            for record in data.splitlines():
+                with contextlib.suppress(ValueError, RecursionError):  # what our own writer could not have written
+                    told = json.loads(record)
+                    if isinstance(told, dict) and isinstance(told.get("type"), str):
+                        writer.write([told | {"stamp_ns": 0}])
+            writer.close()
+        with contextlib.suppress(GraphSlamError):
+            state = read_map(file.parent, [])
+            if state is not None:
+                GraphSlam(start=state)
+        slam = GraphSlam()
+        for record in read_ingest(file.parent, []):
+            slam.process(from_record(record))
+
+    of_name = {"g2o": g2o, "yaml": yaml, "cdr": cdr, "journal": journal}[name]
 
     def run(data):
         with contextlib.suppress(GraphSlamError):
@@ -66,9 +94,13 @@ def target(name, file):
 def main(name, seconds):
     import atheris
 
-    with atheris.instrument_imports(include=["graph_slam_ros", "yaml"]):
+    from graph_slam_ros.warmup import warmup
+
+    warmup()
+    with atheris.instrument_imports(include=INSTRUMENTED):
         import graph_slam_ros.formats.g2o
         import graph_slam_ros.formats.parameters
+        import graph_slam_ros.map_log
         import graph_slam_ros.ros.from_msg  # noqa: F401
     with tempfile.TemporaryDirectory() as folder:
         run = target(name, Path(folder) / f"input.{name}")

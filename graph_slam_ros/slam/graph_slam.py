@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.errors import DivergedError
+from graph_slam_ros.errors import DivergedError, GraphSlamError
 from graph_slam_ros.slam import carry
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import Beside, when_asked
@@ -293,6 +293,8 @@ class GraphSlam:
 
     def _take_up(self, start: MapState) -> None:
         """Solve a map anew, and be nowhere in it yet."""
+        if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
+            raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
         self._trail.take_up(start.keyframes, start.segments)
         for pose in start.sighting_poses:
             self.sighting_poses.append(pose.keyframe, pose.stamp_ns, pose.T_keyframe_base)

@@ -1,0 +1,87 @@
+"""What takes too long for every test run: ``make soak``, or ``python test/soak.py [NAME ...]``; up to three hours.
+
+Two programmes at a time, each with its output in ``soak/NAME.txt``; what is through with the present code is not run
+again.
+"""
+
+import argparse
+import hashlib
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+OUT = ROOT / "soak"
+PASSED = "soak: passed"
+
+
+def tests(*words):
+    return [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words]
+
+
+def guided(name):
+    return [str(ROOT / ".venv-fuzz/bin/python"), str(HERE / "guided_fuzzing.py"), name, "600"]
+
+
+PROGRAMMES = {
+    "lives": tests("test/test_life.py"),
+    "mutated_bags": tests("test/test_mutated_recordings.py"),
+    "soak": tests("test/test_soak.py"),
+    "journal": tests("test/test_journal.py"),
+    "messages": tests("test/test_any_message.py"),
+    "permutations": tests("test/test_timing_cases.py", "-k", "B1"),
+    "solver_faults": tests("test/test_solver_faults.py", "test/test_graph_cases.py"),
+    "fuzzing": tests("test/test_fuzzing.py"),
+    **{f"guided_{name}": guided(name) for name in ("g2o", "yaml", "cdr", "journal")},
+    "planted_bugs": [sys.executable, "test/planted_bugs.py"],
+    "recovery": [sys.executable, "-m", "benchmarks.recovery"],
+    "stack": tests(*sorted(f"test/{file.name}" for file in HERE.glob("test_stack*.py"))),
+}
+"""The longest first."""
+
+
+def code():
+    """What a programme that is through was through with."""
+    files = sorted(file for folder in ("graph_slam_ros", "test") for file in (ROOT / folder).rglob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+def run(name, version):
+    """Whether a programme passes."""
+    told = OUT / f"{name}.txt"
+    if told.is_file() and told.read_text().endswith(f"{PASSED} {version}\n"):
+        say(name, told, "passed before")
+        return True
+    with told.open("w") as out:
+        environment = os.environ | {"GRAPH_SLAM_SOAK": "10"}
+        done = subprocess.run(PROGRAMMES[name], cwd=ROOT, env=environment, stdout=out, stderr=subprocess.STDOUT)
+        print(PASSED if done.returncode == 0 else "soak: failed", version, file=out)
+    say(name, told, "passed" if done.returncode == 0 else f"failed: {told}")
+    return done.returncode == 0
+
+
+def say(name, told, how):
+    print(f"soak: {name} {how}", flush=True)
+    for line in told.read_text().splitlines():
+        if line.startswith("RELIABILITY"):
+            print(line, flush=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PROGRAMMES)}")
+    names = parser.parse_args().names or list(PROGRAMMES)
+    strange = [name for name in names if name not in PROGRAMMES]
+    if strange:
+        parser.error(f"{strange[0]} is none of {', '.join(PROGRAMMES)}")
+    OUT.mkdir(exist_ok=True)
+    version = code()
+    with ThreadPoolExecutor(2) as pool:
+        return 0 if all(list(pool.map(lambda name: run(name, version), names))) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
