@@ -11,7 +11,8 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
   keyframe, stamp, ``T_keyframe_base``;
 * ``landmarks``: by name, vertex, whether without identity, whether tentative, number of sightings, first and last
   stamp, or null where it was given up; ``seen``: of those without identity, each sighting and its edge; ``offsets``: by
-  input, the vertex of what its ranges have in common.
+  input, the vertex of what its ranges have in common;
+* ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are.
 
 Now and then an ``estimate`` tells all values, end to end. A run that goes on in another's map has that first, as one
 ``growth`` and one ``estimate``, up to a record ``start``.
@@ -60,6 +61,7 @@ class Growth:
     def __init__(self, start: MapState | None = None) -> None:
         self._vertices = self._edges = self._judged = self._changes = 0
         self._keyframes = self._segments = self._sightings = self._landmarks = self._offsets = 0
+        self._frozen = 0
         self._estimated = 0  # keyframes at the last estimate
         self.first: list[Record] = [{"type": "map", "version": VERSION}]
         if start is not None:
@@ -92,12 +94,14 @@ class Growth:
         out["seen"] = [_seen(one) for mark in landmarks.values() if mark for one in _newer(mark.seen, first_edge)]
         if len(a.range_offsets) > self._offsets:
             out["offsets"] = a.range_offsets
+        if a.frozen > self._frozen:
+            out["frozen"] = [a.frozen, a.ledger.final]
         if keyframes:
             out["stamp_ns"] = keyframes[-1].stamp_ns
         self._vertices, self._edges, self._judged = graph.vertex_count, graph.edge_count, len(a.ledger)
         self._changes, self._keyframes, self._segments = len(a.ledger.history), len(a.keyframes), len(a.segments)
         self._sightings, self._offsets = len(a.sighting_poses), len(a.range_offsets)
-        self._landmarks = a.landmark_changes
+        self._landmarks, self._frozen = a.landmark_changes, a.frozen
         return {name: part for name, part in out.items() if part}
 
 
@@ -283,6 +287,9 @@ def _grow(state: MapState, record: Mapping[str, Any]) -> None:
     state.sighting_poses += [SightingPose(k, stamp, tuple(pose)) for k, stamp, pose in record.get("sightings", ())]
     _know(state, record)
     state.range_offsets.update(record.get("offsets", {}))
+    if "frozen" in record:
+        state.frozen, edges = record["frozen"]
+        ledger.finish(edges)
 
 
 def _judge(ledger: Ledger, judged: Sequence[Any]) -> None:

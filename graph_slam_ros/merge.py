@@ -4,7 +4,6 @@ The drive of the second follows as a new segment, as after a jump of time: nothi
 came there.
 """
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +17,8 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.map_log import Growth, Record, extend, state_of
-from graph_slam_ros.run import RunRecorder, check_room, run_config, summarize, taken_up
-from graph_slam_ros.slam import Control, GraphSlam
+from graph_slam_ros.run import check_room, run_config, save_map, settled
+from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.decisions import landmark_of
 from graph_slam_ros.slam.ledger import Reason, Verdict
 from graph_slam_ros.slam.map_state import MapState
@@ -53,11 +52,10 @@ def merge(a: Path, b: Path, out: Path) -> Merged:
     GraphSlamError
         They cannot be laid on one another.
     """
-    start, cpu = time.perf_counter(), time.process_time()
     for folder in (a, b):
         check_room(out, folder)
     losses: list[str] = []
-    one, two = _settled(a, losses), _settled(b, losses)
+    one, two = settled(a, losses), settled(b, losses)
     refuse_other_space(one, two, a, b)
     shared = _shared(one, two, a, b)
     aligned = _aligned(one, two, shared)
@@ -67,25 +65,8 @@ def merge(a: Path, b: Path, out: Path) -> Merged:
     left_out = {name: aligned.distance(k) for k, name in enumerate(shared) if not aligned.fits[k]}
     chi2 = {one.landmarks[name].vertex: float(aligned.chi2[k]) for k, name in enumerate(shared) if name in left_out}
     _leave_out(state, first_edge, chi2, aligned.limit)
-    recorder = RunRecorder(out, run_config(a), start=state)
-    try:
-        slam = GraphSlam(run_config(a), recorder.sink, start=state)
-        recorder.record(slam, slam.process(Control("optimize")))
-        took = {"time_s": time.perf_counter() - start, "cpu_s": time.process_time() - cpu}
-        summary = summarize(slam) | took | {"losses": list(dict.fromkeys(losses))}
-        recorder.save(slam, summary)
-    finally:
-        recorder.close()
+    summary = save_map(out, run_config(a), state, losses)
     return Merged(summary, summary["losses"], len(shared), left_out)
-
-
-def _settled(folder: Path, losses: list[str]) -> GraphSlam:
-    """The map of a run with all of it judged."""
-    slam = taken_up(folder, losses)
-    slam.process(Control("optimize"))
-    if not slam.is_solved:
-        raise GraphSlamError(f"{folder}: its map cannot be solved: {slam.failing}")
-    return slam
 
 
 def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:

@@ -36,7 +36,7 @@ from graph_slam_ros.ledger_file import CHANGES, LEDGER, changes_text, ledger_tex
 from graph_slam_ros.map_log import GROWTH, MAP, Growth, grew, has_map, read_map, state_of
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
+from graph_slam_ros.slam import Config, Control, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.measurements import from_record, to_record
 from graph_slam_ros.solver.leverage import leverage
@@ -114,6 +114,37 @@ def _repeated(folder: Path, losses: list[str]) -> MapState:
 def taken_up(folder: Path, losses: list[str]) -> GraphSlam:
     """The map of a run, solved; as ``map_of``."""
     return GraphSlam(run_config(folder), start=map_of(folder, losses))
+
+
+def settled(folder: Path, losses: list[str]) -> GraphSlam:
+    """The same with all of it judged. Raises GraphSlamError, too, where it cannot be solved."""
+    slam = taken_up(folder, losses)
+    slam.process(Control("optimize"))
+    if not slam.is_solved:
+        raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
+    return slam
+
+
+def save_map(folder: Path, config: Config, state: MapState, losses: Sequence[str]) -> dict[str, Any]:
+    """Write a run that begins in a map, which is then the run's, and does nothing but solve it; returns its summary."""
+    recorder = RunRecorder(folder, config, start=state)
+    try:
+        slam = GraphSlam(config, recorder.sink, start=state)
+        recorder.record(slam, slam.process(Control("optimize")))
+        summary = summarize(slam) | {"losses": list(dict.fromkeys(losses))}
+        recorder.save(slam, summary)
+    finally:
+        recorder.close()
+    return summary
+
+
+def freeze(folder: Path, out: Path) -> dict[str, Any]:
+    """Write a run that begins in the map of another, all of which then stays as it is; returns its summary."""
+    check_room(out, folder)
+    losses: list[str] = []
+    state = state_of(settled(folder, losses))
+    state.freeze()
+    return save_map(out, run_config(folder), state, losses)
 
 
 def run_config(folder: Path) -> Config:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from runs import drive, with_a_wrong_sighting
+from runs import drive, with_a_wrong_sighting, without_names
 
 from graph_slam_ros import cli, read_g2o
 from graph_slam_ros.alignment import laid_on
@@ -14,7 +14,7 @@ from graph_slam_ros.map_log import read_map
 from graph_slam_ros.ros.bag import open_bag
 from graph_slam_ros.ros.interfaces import typestore
 from graph_slam_ros.run import RunRecorder, map_of, run_config, taken_up
-from graph_slam_ros.simulation import measurements, simulate
+from graph_slam_ros.simulation import measurements, simulate, with_closures
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
 
 
@@ -372,3 +372,127 @@ def test_merge_refuses_in_one_line(first, elsewhere, world, tmp_path, capsys):
         assert len(told.splitlines()) == 1
     assert run("merge", first, elsewhere, "--out", first) == 2
     assert not (tmp_path / "out").exists()
+
+
+# -- freeze ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def frozen(first, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "frozen"
+    assert run("freeze", first, "--out", folder) == 0
+    return folder
+
+
+def gone_on(folder, source, world):
+    """The pipeline of a run that goes on in a map, saved whole."""
+    start = map_of(source, [])
+    recorder = RunRecorder(folder, run_config(source), start=start)
+    slam = GraphSlam(run_config(source), recorder.sink, start=start)
+    for m in [*world, Control("end"), Control("optimize")]:
+        recorder.record(slam, slam.process(m))
+    recorder.save(slam)
+    recorder.close()
+    return slam
+
+
+def assert_untouched(slam, source):
+    """Not a bit of a frozen map has changed, neither value nor verdict."""
+    state = read_map(source, [])
+    count, edges = len(state.values), state.ledger.final
+    assert state.frozen == state.graph.vertex_count > 50
+    assert edges == state.graph.edge_count
+    assert slam.solver.values[:count].tobytes() == state.values.tobytes()
+    for column in ("verdict", "reason", "statistic", "threshold"):
+        ours, theirs = (getattr(ledger, column).values[:edges].tolist() for ledger in (slam.ledger, state.ledger))
+        assert ours == theirs, column
+
+
+def another_drive():
+    return simulate("warehouse", 5, aisles=2, laps=1)
+
+
+def test_freeze_changes_nothing_and_is_a_run_like_any_other(first, frozen, tmp_path):
+    assert run("diff", first, frozen) == 0
+    assert run("explain", frozen) == 0
+    assert not np.genfromtxt(frozen / "covariances.csv", delimiter=",", skip_header=1)[:, 1:].any(), "it is held"
+    assert run("replay", frozen, "--out", tmp_path / "again") == 0
+    for name in RECORDED:
+        assert (frozen / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+
+
+def test_in_a_frozen_map_the_robot_is_located_as_well_as_in_one_that_goes_on(first, frozen, tmp_path):
+    world = list(measurements(another_drive()))
+    slam = gone_on(tmp_path / "run", frozen, world)
+    assert_untouched(slam, frozen)
+    assert len(slam.keyframes) > 1.5 * slam.segments[1], "the drive is in the graph"
+    drives = [simulate("warehouse", 0, aisles=2, laps=1), another_drive()]
+    open_map = gone_on(tmp_path / "open", first, world)
+    assert rmse(slam, *drives) < 1.5 * rmse(open_map, *drives) + 0.02
+    assert run("replay", tmp_path / "run", "--out", tmp_path / "again") == 0
+    for name in RECORDED:
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+    assert_untouched(taken_up(tmp_path / "run", []), frozen)
+
+
+def test_new_landmarks_are_added_to_a_frozen_map(world, tmp_path):
+    names = sorted({s.id for m in world if isinstance(m, Sightings) for s in m.sightings})
+    known = set(names[::2])
+    half = [
+        replace(m, sightings=tuple(s for s in m.sightings if s.id in known)) if isinstance(m, Sightings) else m
+        for m in world
+    ]
+    assert run("freeze", ended(tmp_path / "half", half), "--out", tmp_path / "frozen") == 0
+    slam = gone_on(tmp_path / "run", tmp_path / "frozen", measurements(another_drive()))
+    assert_untouched(slam, tmp_path / "frozen")
+    assert set(slam.landmarks) == set(names)
+    truth = another_drive().landmarks
+    at = np.array([slam.solver.estimate([slam.landmarks[name].vertex])[0][:2] for name in names])
+    true = np.array([truth[name][:2] for name in names])
+    moved = np.stack(slam.space.group.act(laid_on(slam.space, true, at), tuple(at.T)), axis=-1)
+    assert np.sqrt(np.mean(np.sum((moved - true) ** 2, axis=1))) < 0.2
+    new = [name for name in names if name not in known]
+    assert all(np.trace(slam.solver.marginal([slam.landmarks[name].vertex])[0]) > 0.0 for name in new)
+
+
+def test_what_is_wrong_moves_neither_a_frozen_map_nor_the_robot_in_it(frozen, tmp_path):
+    world = list(measurements(another_drive()))
+    right = gone_on(tmp_path / "right", frozen, world)
+    slam = gone_on(tmp_path / "wrong", frozen, with_a_wrong_sighting(world, len(world) // 2))
+    assert_untouched(slam, frozen)
+    assert slam.ledger.outside_count == right.ledger.outside_count + 1
+    _, k, m = np.intersect1d(
+        *(one.keyframes.stamps_ns[one.segments[1] :] for one in (slam, right)), return_indices=True
+    )
+    there, here = (one.trajectory()[one.segments[1] :][i] for one, i in ((slam, k), (right, m)))
+    assert len(k) > 200
+    assert there[:, :2] == pytest.approx(here[:, :2], abs=0.05)
+
+
+def test_a_run_in_a_frozen_map_that_was_cut_off_is_taken_up_with_it_frozen(frozen, tmp_path):
+    world = list(measurements(another_drive()))
+    drive(tmp_path / "run", run_config(frozen), world[: len(world) // 2], map_of(frozen, []))
+    start = read_map(tmp_path / "run", [])
+    assert start.frozen < start.graph.vertex_count
+    slam = gone_on(tmp_path / "more", tmp_path / "run", world[len(world) // 2 :])
+    assert_untouched(slam, frozen)
+    assert run("merge", frozen, tmp_path / "more", "--out", tmp_path / "merged") == 0
+    assert_untouched(taken_up(tmp_path / "merged", []), frozen)
+
+
+def test_without_names_and_with_closures_a_frozen_map_stays(tmp_path):
+    config = Config.from_mapping({"landmarks.association": "joint"})
+    recording = with_closures(simulate("warehouse", 0, aisles=2, laps=2, sensor="position"), 60, 0)
+    source = ended(tmp_path / "run", without_names(measurements(recording)), config)
+    assert run("freeze", source, "--out", tmp_path / "frozen") == 0
+    again = with_closures(simulate("warehouse", 5, aisles=2, laps=2, sensor="position"), 60, 1)
+    world = [*without_names(measurements(again)), Control("clear_closures")]
+    slam = gone_on(tmp_path / "more", tmp_path / "frozen", world)
+    assert_untouched(slam, tmp_path / "frozen")
+    closures = slam.graph.edges_of("closures")
+    is_ours = closures < slam.ledger.final
+    assert is_ours.any()
+    assert not is_ours.all()
+    assert not any(slam.ledger.is_withdrawn(edge) for edge in closures[is_ours].tolist())
+    assert all(slam.ledger.is_withdrawn(edge) for edge in closures[~is_ours].tolist())
+    assert not any(mark.is_tentative for mark in read_map(tmp_path / "frozen", []).landmarks.values())

@@ -1,4 +1,4 @@
-"""The commands on the maps of runs: ``export``, ``diff``, ``merge``."""
+"""The commands on the maps of runs: ``export``, ``diff``, ``merge``, ``freeze``."""
 
 import argparse
 import json
@@ -40,3 +40,13 @@ def merge(args: argparse.Namespace) -> int:
         for name, (metres, sigmas) in done.left_out.items()
     ]
     return console.told(done.losses, moved)
+
+
+def freeze(args: argparse.Namespace) -> int:
+    """Make a map in which to be located, and which nothing changes."""
+    from graph_slam_ros.cli.recordings import run_text
+    from graph_slam_ros.run import freeze as frozen
+
+    summary = frozen(args.run_folder, args.out)
+    console.say(run_text(summary), f"results in {args.out}: what is there now stays, whatever is seen from now on")
+    return console.told(summary["losses"])

@@ -44,6 +44,7 @@ def parser() -> argparse.ArgumentParser:
     _export(command("export", maps.export, "a run's path as TUM, its graph as g2o, or both as an mcap of ROS messages"))
     _diff(command("diff", maps.diff, "what differs between two runs' maps: keyframes, landmarks, verdicts, chi2"))
     _merge(command("merge", maps.merge, "one map of two runs, laid on one another by the landmarks of both"))
+    _freeze(command("freeze", maps.freeze, "a run's map as one that stays as it is: load it to be located in it"))
     _info(
         command("info", recordings.info, "topics, types, rates, frames and span of a recording, and how to replay it")
     )
@@ -120,6 +121,11 @@ def _diff(sub: argparse.ArgumentParser) -> None:
 def _merge(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("a", type=Path, metavar="A", help="run folder, in whose map frame and configuration the result is")
     sub.add_argument("b", type=Path, metavar="B", help="run folder")
+    sub.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder for the results")
+
+
+def _freeze(sub: argparse.ArgumentParser) -> None:
+    _of_run(sub)
     sub.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder for the results")
 
 

@@ -33,6 +33,7 @@ class Backend:
     ----------
     graph, solver, decisions
     handed_over : vertices and edges of the graph that the solver has
+    frozen : the first so many vertices stay where they are
     spares_memory : whether no second look is begun
     rivals : other explanations of the same measurements that the last second look could not rule out
     """
@@ -50,7 +51,7 @@ class Backend:
         self.graph = start.graph
         self.solver = Solver(self.graph, settings)
         self.decisions = Decisions(config, self.graph, self.solver, start.ledger)
-        self.handed_over = 0, 0
+        self.handed_over, self.frozen = (0, 0), start.frozen
         self._background = Background(config, beside)
         self.rivals: tuple[Rival, ...] = ()
         self.spares_memory = False
@@ -66,6 +67,9 @@ class Backend:
         """Solve all that is believed in a graph that was taken over: some of its vertices, from some values."""
         self.solver.add(vertices, range(self.graph.edge_count))
         self.solver.start_at(values)
+        for vertex in vertices:
+            if vertex < self.frozen:
+                self.solver.hold(vertex)
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         report = self.solver.optimize()
         self.decisions.tighten()
@@ -167,4 +171,5 @@ class Backend:
 
     def _frozen(self, keyframe: int, settings: Settings) -> Frozen:
         solver = self.solver
-        return Frozen(keyframe, self.graph.copy(), solver.vertices, solver.values, settings, self.ledger.copy())
+        problem = self.graph.copy(), solver.vertices, solver.held, solver.values
+        return Frozen(keyframe, *problem, settings, self.ledger.copy())

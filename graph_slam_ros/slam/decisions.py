@@ -170,7 +170,7 @@ class Decisions:
     def follow(self, other: Ledger, keyframe: int) -> bool:
         """Take over verdicts on the same edges from who has had a second look; whether that changed one."""
         mine, known = self.ledger, len(other)
-        judged = np.flatnonzero(mine.verdict.values[:known] != Verdict.NOT_EVALUATED)
+        judged = mine.final + np.flatnonzero(mine.verdict.values[mine.final : known] != Verdict.NOT_EVALUATED)
         standing = judged[~np.isin(mine.reason.values[judged], FINAL)]
         return self._have_in(standing, np.isin(standing, other.inside), keyframe, other)
 
@@ -265,6 +265,8 @@ class Decisions:
         if found is None:
             return False
         landmark, among = found
+        if self._solver.is_held(landmark):
+            return False
         holds = self._holds.get(landmark, 0) - (among is self._holds)
         helps = self._helps.get(landmark, 0) - (among is self._helps)
         return holds < 1 and helps < _TOGETHER

@@ -278,6 +278,11 @@ class GraphSlam:
         return self._odometry.used.source if self._odometry.used else ""
 
     @property
+    def frozen(self) -> int:
+        """So many vertices, the first, are of a map that is frozen: they stay where they are."""
+        return self.backend.frozen
+
+    @property
     def range_offsets(self) -> dict[str, int]:
         """By input, the vertex of what all its ranges have in common."""
         return self._landmarks.offsets
@@ -549,9 +554,9 @@ class GraphSlam:
         self.correction = Correction(distance_m, float(self.space.angle(moved)), edges, chi2)
 
     def _clear_closures(self) -> None:
-        """Take all loop closures out; the next solve goes without them."""
+        """Take all loop closures out, but for those of a frozen map; the next solve goes without them."""
         self.backend.hand_over()
-        closures = self.graph.edges_of("closures").tolist()
+        closures = [edge for edge in self.graph.edges_of("closures").tolist() if edge >= self.ledger.final]
         self._withdraw(closures)
         if closures:
             self.counters.count("closures", "cleared", len(closures))

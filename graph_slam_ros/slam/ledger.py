@@ -61,6 +61,7 @@ class Ledger:
     statistic, threshold : chi2 that was last judged, and what it was held against
     numbers : how many numbers were measured, the statistic's degrees of freedom
     keyframe : at which it was judged first
+    final : verdicts of the first so many edges stay: they are of a map that is frozen
     history : every change after the first verdict, and first verdicts that are not ``ACCEPTED``, in order
     """
 
@@ -70,7 +71,13 @@ class Ledger:
         self.numbers, self.keyframe = Column(np.int64), Column(np.int64)
         self._residual, self._residual_at = Column(np.float64), Column(np.int64)
         self.history: list[Change] = []
+        self.final = 0
         self._out: set[int] = set()
+
+    def finish(self, edges: int) -> None:
+        """Verdicts of the first so many edges stay."""
+        self.final = edges
+        self._out = {edge for edge in self._out if edge >= edges}
 
     def __len__(self) -> int:
         return len(self.verdict)
@@ -158,9 +165,9 @@ class Ledger:
 
     @property
     def inside(self) -> Index:
-        """Edges that were judged and pull."""
-        verdict = self.verdict.values
-        return np.flatnonzero((verdict == _ACCEPTED) | (verdict == _DOWN_WEIGHTED))
+        """Edges that were judged and pull, and may be judged anew."""
+        verdict = self.verdict.values[self.final :]
+        return self.final + np.flatnonzero((verdict == _ACCEPTED) | (verdict == _DOWN_WEIGHTED))
 
     @property
     def outside(self) -> Index:

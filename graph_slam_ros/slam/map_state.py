@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.slam.landmarks import Landmark
-from graph_slam_ros.slam.ledger import Ledger
+from graph_slam_ros.slam.ledger import Ledger, Reason, Verdict
 from graph_slam_ros.slam.trail import Keyframe, SightingPose
 
 Array = NDArray[np.float64]
@@ -20,6 +20,7 @@ class MapState:
     Attributes
     ----------
     values : stored numbers of all vertices, as ``Graph.initial``: where solving begins
+    frozen : the first so many vertices stay there, and verdicts on what is between them as they are
     """
 
     graph: Graph = field(default_factory=Graph)
@@ -30,6 +31,7 @@ class MapState:
     sighting_poses: list[SightingPose] = field(default_factory=list)
     landmarks: dict[str, Landmark] = field(default_factory=dict)
     range_offsets: dict[str, int] = field(default_factory=dict)
+    frozen: int = 0
 
     @property
     def vertices(self) -> list[int]:
@@ -37,6 +39,23 @@ class MapState:
         poses = {one.vertex for one in self.keyframes}
         points = {mark.vertex for mark in self.landmarks.values()}
         return sorted(poses | points | {*self.range_offsets.values()})
+
+    def freeze(self) -> None:
+        """Have all of it stay as it is; what is too new to be believed is given up first.
+
+        All of its edges must have been judged.
+        """
+        for name in [name for name, mark in self.landmarks.items() if mark.is_tentative]:
+            self._give_up(name)
+        self.frozen = self.graph.vertex_count
+        self.ledger.finish(self.graph.edge_count)
+
+    def _give_up(self, name: str) -> None:
+        mark, last = self.landmarks.pop(name), len(self.keyframes) - 1
+        for edge in [one.edge for one in mark.seen]:
+            self.graph.set_weights(np.array([edge]), 0.0)
+            statistic = float(self.ledger.statistic.values[edge])
+            self.ledger.note(edge, last, Verdict.REJECTED, Reason.WITHDRAWN, statistic)
 
     def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
         """All of them, but for the first so many."""

@@ -37,6 +37,7 @@ class Frozen:
     Attributes
     ----------
     vertices : of the graph, that are part of the problem
+    held : those of them that stay where they are
     values : the online estimate, the stored numbers of all vertices
     ledger : what is believed online
     """
@@ -44,6 +45,7 @@ class Frozen:
     keyframe: int
     graph: Graph
     vertices: Index
+    held: Index
     values: Array
     settings: Settings
     ledger: Ledger
@@ -149,7 +151,7 @@ def _starts(frozen: Frozen) -> Iterator[tuple[str, Array, Index | None]]:
     if not len(closures):
         yield "all", frozen.values, candidates
         return
-    odometry = _along_odometry(graph, frozen.values)
+    odometry = _along_odometry(graph, frozen.values, set(frozen.held.tolist()))
     groups = agreeing(graph, odometry, closures, ledger.threshold.values[closures])
     believed = np.concatenate((others, *groups))
     yield "neighbours", frozen.values, believed
@@ -171,6 +173,8 @@ def _explained(
     solver = Solver(graph, frozen.settings)
     solver.add(frozen.vertices, range(len(mine)))
     solver.start_at(start)
+    for vertex in frozen.held.tolist():
+        solver.hold(vertex)
     decisions = Decisions(config, graph, solver, mine)
     if believed is not None:
         decisions.believe(believed, frozen.keyframe)
@@ -195,12 +199,14 @@ def _cost(solver: Solver, ledger: Ledger) -> float:
     return solver.evaluate().chi2_final - float(chi2.sum()) + doubted
 
 
-def _along_odometry(graph: Graph, values: Array) -> Array:
-    """Where odometry alone says that the robot was; landmarks stay where they are, as points or as poses."""
+def _along_odometry(graph: Graph, values: Array, held: set[int]) -> Array:
+    """Where odometry alone says that the robot was; landmarks, and what is held, stay where they are."""
     out = values.copy()
     for edge in graph.edges_of("odometry").tolist():
         table, row = graph.row(edge)
         last, new = table.vertices.values[row].tolist()
+        if new in held:
+            continue
         a, b = graph.offset.values[[last, new]].tolist()
         kind = graph.kind_of(new)
         pose, step = tuple(out[a : a + kind.size]), tuple(table.measured.values[row])

@@ -304,6 +304,8 @@ class Unnamed:
 
     def _may_be(self, name: str, other: str) -> bool:
         a, b = self._landmarks.known[name], self._landmarks.known[other]
+        if self._solver.is_held(a.vertex):
+            return False
         is_later = a.is_tentative or (b.first_seen_ns, other) < (a.first_seen_ns, name)
         return name != other and is_later and (other, name) not in self._parted and a.stamps.isdisjoint(b.stamps)
 

@@ -155,6 +155,15 @@ class Solver:
             self._waiting.again(on_it)
             self._take_out(one)
 
+    @property
+    def held(self) -> Index:
+        """Ids of the vertices that are kept where they are."""
+        return np.flatnonzero(self._held)
+
+    def is_held(self, vertex: int) -> bool:
+        """Whether a vertex is kept where it is."""
+        return vertex < len(self._held) and bool(self._held[vertex])
+
     def remove(self, vertex: int) -> None:
         """Take a vertex out of the problem again; all its edges must be out (weight 0) before."""
         self._grow()
@@ -252,7 +261,7 @@ class Solver:
             else:
                 report = self.evaluate(settings)
         self._kept[:] = self._tree.estimate
-        self._settled, self._stages.young = False, NONE
+        self._settled, self._stages.young = not len(unknowns), NONE
         self._solved_with = settings if report.converged else None
         self._unfinished = not report.converged
         return report
@@ -369,7 +378,7 @@ class Solver:
         fresh = Solver(self.graph, self.settings)
         fresh.start_at(values)
         fresh.add(vertices, taken)
-        for vertex in np.flatnonzero(self._held).tolist():
+        for vertex in self.held.tolist():
             fresh.hold(vertex)
         vars(self).update(vars(fresh))
 
