@@ -222,14 +222,14 @@ def _chi2(slam: GraphSlam) -> float:
 
 def _edges(one: GraphSlam, two: GraphSlam) -> tuple[Counts, list[Judged]]:
     """Those of one type between the same with the same measurement, and those of them that are not judged alike."""
-    a, b = _by_meaning(one), _by_meaning(two)
+    a, b, names = _by_meaning(one), _by_meaning(two), _names(one)
     pairs = [pair for key in a if key in b for pair in zip(a[key], b[key], strict=False)]
     verdicts = []
     for in_a, in_b in pairs:
         said = one.ledger.verdict_of(in_a), two.ledger.verdict_of(in_b)
         if said[0] is not said[1]:
             words = [verdict.name.lower() for verdict in said]
-            verdicts.append(Judged(_about(one, in_a), in_a, in_b, *words))
+            verdicts.append(Judged(_about(one, names, in_a), in_a, in_b, *words))
     return Counts(one.graph.edge_count, two.graph.edge_count, len(pairs)), verdicts
 
 
@@ -251,12 +251,9 @@ def _names(slam: GraphSlam) -> dict[int, int | str]:
     return poses | {mark.vertex: name for name, mark in slam.landmarks.items()}
 
 
-def _about(slam: GraphSlam, edge: int) -> str:
+def _about(slam: GraphSlam, names: dict[int, int | str], edge: int) -> str:
     """Its class, and the landmark it is about or the stamp that it is of."""
     table, row = slam.graph.row(edge)
-    name = _names(slam).get(int(table.vertices.values[row, -1]), "")
-    return (
-        f"{slam.graph.label_of(edge)} {name / 1e9:.3f} s"
-        if isinstance(name, int)
-        else f"{slam.graph.label_of(edge)} {name}"
-    )
+    name = names.get(int(table.vertices.values[row, -1]), "")
+    what = f"{name / 1e9:.3f} s" if isinstance(name, int) else name
+    return f"{slam.graph.label_of(edge)} {what}"
