@@ -238,6 +238,26 @@ def test_G7_a_measurement_whose_cost_is_not_finite_is_quarantined_where_nothing_
     assert again.ledger.history == p.ledger.history
 
 
+@pytest.mark.parametrize(
+    "twist",
+    [1e-300 * np.eye(3), np.diag([1e-30, 0.01, 0.01]), np.full((3, 3), 0.01)],
+    ids=["tiny", "tiny_along_one_axis", "of_rank_1"],
+)
+def test_A12_however_certain_odometry_says_it_is_its_edges_are_not_and_what_they_are_part_of_is_solved(twist):
+    p, poses = slam(), [se2.IDENTITY]
+    for k in range(40):
+        run(p, Odometry(T0 + k * S, poses[k], tuple(twist.ravel().tolist())))
+        if k > 10:
+            run(p, closure(k, k - 10, se2.between(poses[k - 10], poses[k])))
+        assert not p.failing
+        poses.append(se2.compose(poses[k], (0.5, 0.0, 0.05)))
+    run(p, *END)
+    roots = p.graph.tables[RELATIVE_POSE].sqrt_information.values
+    assert (np.linalg.svd(roots, compute_uv=False)[:, 0] <= 1.01 / 1e-5).all(), "no surer than 0.01 mrad"
+    assert p.trajectory() == pytest.approx(np.array(poses[:-1]), abs=1e-6)
+    assert np.isfinite(p.keyframe_covariances()).all()
+
+
 def test_G19_of_what_is_not_determined_no_covariance_is_told():
     graph = Graph()
     graph.add_vertex(SE2, (0.0, 0.0, 0.0))

@@ -188,6 +188,15 @@ def test_B18_a_short_drop_out_of_odometry_is_a_longer_step_of_more_noise():
     assert lossy.trajectory()[-1] == pytest.approx(whole.trajectory()[-1], abs=0.3)
 
 
+def test_B7_after_a_jump_of_time_what_is_older_than_the_map_is_used_and_begins_a_segment():
+    before, after = straight(100, 3), [at(40 + 0.1 * k, 103 + 0.1 * k) for k in range(31)]
+    p = run(slam(), *before, seen(102, (2.0, 1.0)), Control("time_jump"), *after, seen(41, (0.0, 1.0)), *END)
+    assert p.counters.as_dict() == {}
+    assert len(p.segments) == 2
+    assert p.trajectory()[-1] == pytest.approx([106.0, 0.0, 0.0], abs=0.3)
+    assert p.landmarks["a"].sightings == 2
+
+
 def begins_anew(*stamps_s, source="odom"):
     """Whether stamps of odometry begin anew, message by message."""
     jump = StampJump(0.2)
