@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runs import drive, with_a_wrong_sighting, without_names
+from driven import drive, with_a_wrong_sighting, without_names
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import FormatError

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from runs import drive, with_a_wrong_sighting, without_names
+from driven import drive, with_a_wrong_sighting, without_names
 
 from graph_slam_ros import cli, read_g2o
 from graph_slam_ros.alignment import laid_on
