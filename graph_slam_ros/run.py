@@ -98,8 +98,8 @@ def map_of(folder: Path, losses: list[str]) -> MapState:
     RunError, FormatError
         There is none, or it cannot be read.
     """
-    state = read_map(folder, losses) if has_map(folder) else _repeated(folder, losses)
-    if state is None or not state.keyframes:
+    state = (read_map(folder, losses) if has_map(folder) else None) or _repeated(folder, losses)
+    if not state.keyframes:
         raise RunError(f"{folder.name}: no keyframe, so there is no map")
     return state
 

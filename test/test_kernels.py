@@ -20,7 +20,7 @@ SMALL = [
     "test_solver.py::test_a_joint_marginal_is_the_block_of_the_dense_inverse_in_the_order_asked_for",
     "test_edges.py",
     "test_solver.py::test_vectors_are_solved_in_one_step_to_the_weighted_mean",
-    "test_solver.py::test_parts_without_a_link_are_solved_as_if_alone",
+    "test_solver.py::test_G1_parts_without_a_link_are_solved_as_if_alone",
     "test_online.py::test_updates_that_fail_many_times_write_nothing_beyond_the_arrays",
     "test_online.py::test_a_vertex_is_held_at_its_estimate_and_not_where_it_was_linearised",
     "test_online.py::test_a_removed_vertex_may_be_added_again_and_is_there_once[60-40]",

@@ -184,7 +184,7 @@ def test_a_run_that_cannot_be_saved_ends_with_its_cleanup_and_another_may_begin(
         assert not r.change("configure")
         assert not r.call("save").success
         assert n.stop()[0] == 0
-    assert f"{tmp_path / 'run'}/graph.g2o.new: Not a directory" in n.said
+    assert f"{tmp_path / 'run'}: Not a directory" in n.said
     assert "Traceback" not in n.said
 
 

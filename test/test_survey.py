@@ -130,8 +130,8 @@ def test_a_surveyed_point_has_a_prior_of_its_own_from_when_it_is_first_seen():
     slam = pipeline(landmarks__surveyed=table([("a", 2, 1, 0.5), ("never seen", 9, 9, 0.5)]))
     slam.process(Odometry(0, se2.IDENTITY))
     assert POINT_PRIOR[R2] not in slam.graph.tables
-    for _ in range(2):
-        slam.process(Sightings(0, "tags", (Sighting("a", "position", (2.2, 1.0), (0.25, 0, 0, 0.25)),)))
+    for topic in ("tags", "more tags"):
+        slam.process(Sightings(0, topic, (Sighting("a", "position", (2.2, 1.0), (0.25, 0, 0, 0.25)),)))
     priors = slam.graph.tables[POINT_PRIOR[R2]]
     assert priors.measured.values.tolist() == [[2.0, 1.0]]
     assert priors.sqrt_information.values[0] == pytest.approx(2.0 * np.eye(2))

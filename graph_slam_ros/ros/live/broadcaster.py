@@ -36,12 +36,14 @@ class Broadcaster:
         self._node, self._look = node, look
         self._policy = MapToOdom(config)
         self._publisher = node.create_publisher(TFMessage, "/tf", 100)
+        self._is_closed = False
         self._ours: deque[bytes] = deque(maxlen=_REMEMBERED)
         self._others_s = -1e9
         self._timer = node.create_timer(config.tf.transform_publish_period, guarded(self._tick))
 
     def close(self) -> None:
-        """Take timer and publisher away."""
+        """Take timer and publisher away; a tick that is on its way already finds it so."""
+        self._is_closed = True
         self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)
 
@@ -67,7 +69,13 @@ class Broadcaster:
 
     def _tick(self) -> None:
         config, estimate, newest = self._look()
-        if estimate is None or newest is None or not config.tf.publish_tf or not estimate.is_confirmed:
+        if (
+            self._is_closed
+            or estimate is None
+            or newest is None
+            or not config.tf.publish_tf
+            or not estimate.is_confirmed
+        ):
             return
         if config.tf.second_authority == "yield" and self.has_rival:
             return
