@@ -108,6 +108,7 @@ def _repeated(folder: Path, losses: list[str]) -> MapState:
     slam = GraphSlam(run_config(folder), start=read_map(folder, losses, start_only=True))
     for record in read_ingest(folder, losses):
         slam.process(from_record(record))
+    slam.process(Control("end"))
     return state_of(slam)
 
 

@@ -269,8 +269,9 @@ class Configured:
 
         def begin() -> str:
             said = job()
-            self._outputs.begin(self._node.config)
-            self._outputs.publish_due(self._session.slam)
+            slam = self._session.slam
+            self._outputs.begin(self._node.config, has_map=bool(slam.keyframes))
+            self._outputs.publish_due(slam)
             return said
 
         return self._worker.call(begin)

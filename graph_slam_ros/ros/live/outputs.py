@@ -57,8 +57,9 @@ class Outputs:
         self._has_something = False
         self.begin(config)
 
-    def begin(self, config: Config) -> None:
-        """A new run: what was sent is of another."""
+    def begin(self, config: Config, *, has_map: bool = False) -> None:
+        """A new run, perhaps in a map: what was sent is of another."""
+        self._has_something |= has_map
         output = config.output
         self._updates = PathUpdates(output.path_moved_m, output.path_moved_rad)
         self._landmarks_at = 0
