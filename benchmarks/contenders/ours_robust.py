@@ -69,7 +69,7 @@ def measurements(problem: Problem, closures: Edges) -> Iterator[Measurement]:
                 back = group.adjoint(measured)
                 earlier, later, measured = later, earlier, tuple(float(x) for x in group.inverse(measured))
                 covariance = back @ covariance @ back.T
-            source = f"closures{k - first}"  # what one source says twice is taken once, and graphs repeat edges
+            source = f"closures{k - first:06}"  # what one says twice is taken once, and graphs repeat edges; in order
             yield Closure(later * _SECOND_NS, earlier * _SECOND_NS, source, measured, _flat(covariance))
 
 
