@@ -349,6 +349,9 @@ class RunRecorder:
         self._fill()
         failed = self._syncing.exception() if self._syncing is not None else None
         self._syncing = None
+        if self._disk is not None:  # its thread ends; another comes with the next sync
+            self._disk.shutdown(wait=False)
+            self._disk = ThreadPoolExecutor(1, "journal")
         if self._bag is not None:
             self._ended_bags.append(self._bag.end())
             self._bag, self._bags = None, self._bags + 1
