@@ -7,6 +7,7 @@ without an end. Then its map is read and solved, as the node does when it starts
 import argparse
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,8 @@ import numpy as np
 from benchmarks.live.streams import AFTER_NS, BEFORE_NS, CITY_SIGMA_M, CITY_SIGMA_RAD, STEP_NS
 from benchmarks.problem import city_problem
 from graph_slam_ros.lie import se2
-from graph_slam_ros.map_log import read_map
 from graph_slam_ros.run import RunRecorder
+from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry
 from graph_slam_ros.warmup import warmup
 
@@ -70,7 +71,7 @@ def main() -> None:
         read_s = time.perf_counter() - start
         again = GraphSlam(config, start=state)
         took_s, cpu_s = time.perf_counter() - start, time.process_time() - cpu_s
-        solved = slam.solver.optimize()
+        solved = slam.solver.optimize(replace(slam.solver.settings, step_tolerance=1e-8, cost_tolerance=0.0))
         apart_m = np.abs(again.trajectory() - slam.trajectory()).max()
         same = (again.ledger.verdict.values == slam.ledger.verdict.values).all()
         print(

@@ -12,8 +12,8 @@ from scipy.special import gammainc
 from graph_slam_ros import quantities
 from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.formats.strict import integer, lines
-from graph_slam_ros.ledger_file import Entry, read_changes, read_ledger
 from graph_slam_ros.run import SUMMARY, run_config
+from graph_slam_ros.run.ledger_file import Entry, read_changes, read_ledger
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.association import quantile
 from graph_slam_ros.slam.ledger import FINAL, Change, Reason, Verdict

@@ -16,9 +16,9 @@ from graph_slam_ros.diff import refuse_other_space, shared_landmarks
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.graph import Gaussian
-from graph_slam_ros.map_log import Growth, Record, extend, state_of
-from graph_slam_ros.run import check_room, run_config, save_map, settled
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.run import check_room, record_run, run_config, settled
+from graph_slam_ros.run.map_log import Growth, Record, extend, state_of
+from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.decisions import landmark_of
 from graph_slam_ros.slam.ledger import Reason, Verdict
 from graph_slam_ros.slam.map_state import MapState
@@ -65,7 +65,7 @@ def merge(a: Path, b: Path, out: Path) -> Merged:
     left_out = {name: aligned.distance(k) for k, name in enumerate(shared) if not aligned.fits[k]}
     chi2 = {one.landmarks[name].vertex: float(aligned.chi2[k]) for k, name in enumerate(shared) if name in left_out}
     _leave_out(state, first_edge, chi2, aligned.limit)
-    summary = save_map(out, run_config(a), state, losses)
+    _, summary = record_run(out, run_config(a), [Control("optimize")], losses, state)
     return Merged(summary, summary["losses"], len(shared), left_out)
 
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from graph_slam_ros.ledger_file import Entry
 from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.run.ledger_file import Entry
 
 _XY, _XYZ = ("x m", "y m"), ("x m", "y m", "z m")
 _POSE, _POSE_3D = (*_XY, "heading rad"), (*_XYZ, "turn x rad", "turn y rad", "turn z rad")

@@ -1,20 +1,20 @@
 """Replay: a recording, or the ingest sequence of an earlier run, through ``GraphSlam`` as fast as the CPU allows."""
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from graph_slam_ros.formats.ingest import read_ingest
-from graph_slam_ros.map_log import read_map
+from graph_slam_ros.formats.journal import read_ingest
 from graph_slam_ros.ros.bag import Bag, BagError, open_bag
 from graph_slam_ros.ros.definitions import recorded_decoder
 from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border
 from graph_slam_ros.ros.inputs import Measured, uses
 from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.ros.survey import with_survey
-from graph_slam_ros.run import RunRecorder, check_room, is_run, map_of, run_config, summarize
+from graph_slam_ros.run import check_room, is_run, record_run, run_config, stopwatch
+from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.input_config import InputConfig, default_input
 from graph_slam_ros.slam.measurements import from_record
@@ -156,34 +156,24 @@ def replay(
     config : default: the run's own, or the defaults
     """
     warmup()
-    start, cpu = time.perf_counter(), time.process_time()
-    counters = Counters()
+    took = stopwatch()
+    border = Counters()
     check_room(out, source)
+    state = None
     if is_run(source):
         config = with_survey(config or run_config(source))
-        losses, warnings = list[str](), list[str]()
+        losses, warnings, total = list[str](), list[str](), 0
+        state = read_map(source, losses, start_only=True)
         items: Iterable[Sequence[Measurement]] = ([from_record(record)] for record in read_ingest(source, losses))
-        total = 0
     else:
         config = with_survey(config or Config())
         bag = open_bag(source)
         inputs = choose_inputs(bag, config, odometry, landmarks)
-        items = _with_end(measurements(bag, inputs, config, counters))
+        items = _with_end(measurements(bag, inputs, config, border))
         total = sum(bag.topics[topic].count for topic in inputs.by_topic()) + 3
         losses, warnings = bag.losses, bag.warnings
-    state = read_map(source, losses, start_only=True) if is_run(source) else None
-    recorder = RunRecorder(out, config, start=state)
-    slam = GraphSlam(config, recorder.sink, start=state)
-    try:
-        for several in progress(items, total):
-            for measurement in several:
-                recorder.record(slam, slam.process(measurement))
-        slam.counters.update(counters)
-        took = {"time_s": time.perf_counter() - start, "cpu_s": time.process_time() - cpu}
-        summary = summarize(slam) | took | {"losses": list(dict.fromkeys(losses))}
-        recorder.save(slam, summary)
-    finally:
-        recorder.close()
+    one_by_one = chain.from_iterable(progress(items, total))
+    slam, summary = record_run(out, config, one_by_one, losses, state, border=border, took=took)
     return Replayed(slam, summary, summary["losses"], warnings)
 
 
@@ -192,22 +182,3 @@ def _with_end(items: Iterable[Sequence[Measurement]]) -> Iterator[Sequence[Measu
     yield from items
     yield [Control("end")]
     yield [Control("optimize")]
-
-
-def recover(source: Path, out: Path) -> Replayed:
-    """The results of a run that was never ended, from its map as it was written down: the drive is not repeated."""
-    warmup()
-    start, cpu = time.perf_counter(), time.process_time()
-    check_room(out, source)
-    losses: list[str] = []
-    config = with_survey(run_config(source))
-    state = map_of(source, losses)
-    recorder = RunRecorder(out, config, start=state)
-    try:
-        slam = GraphSlam(config, start=state)
-        took = {"time_s": time.perf_counter() - start, "cpu_s": time.process_time() - cpu}
-        summary = summarize(slam) | took | {"losses": list(dict.fromkeys(losses))}
-        recorder.save(slam, summary)
-    finally:
-        recorder.close()
-    return Replayed(slam, summary, summary["losses"], [])

@@ -16,8 +16,8 @@ from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.graph_file import EDGE_TAGS, G2oFile
 from graph_slam_ros.graph import Gaussian, Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
-from graph_slam_ros.ledger_file import LEDGER, Entry, read_ledger
 from graph_slam_ros.run import GRAPH, run_config
+from graph_slam_ros.run.ledger_file import LEDGER, Entry, read_ledger
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.solver.linearization import linearized
 

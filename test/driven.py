@@ -7,12 +7,14 @@ from graph_slam_ros.slam import Control, GraphSlam, Sightings
 
 
 def drive(folder, config, world, start=None):
-    """A run that is flushed update by update and that nobody ends."""
+    """A run that is flushed update by update and that nobody ends; what is returned is solved until nothing moves."""
     recorder = RunRecorder(folder, config, start=start)
     slam = GraphSlam(config, recorder.sink, start=start)
     for m in [*world, Control("end"), Control("optimize")]:
         recorder.record(slam, slam.process(m))
         recorder.flush()
+    slam.solver.optimize(replace(slam.solver.settings, step_tolerance=1e-9, cost_tolerance=0.0))
+    slam.solver.update()  # so that covariances are at hand
     return slam
 
 

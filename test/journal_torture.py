@@ -22,10 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from graph_slam_ros import run
+import graph_slam_ros.run.recorder
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import NEW, AppendedFile
-from graph_slam_ros.formats.ingest import read_ingest
+from graph_slam_ros.formats.journal import read_ingest
 from graph_slam_ros.ros.live.session import Session
 from graph_slam_ros.run import RunError, RunRecorder, check_room, earlier_runs, is_run, run_config
 from graph_slam_ros.simulation import measurements, simulate
@@ -215,7 +215,7 @@ def drive_naively(folder, tell, keep_earlier):
         flush(self)
         close(self)
 
-    run.replaced = naive
+    graph_slam_ros.run.recorder.replaced = naive
     AppendedFile.flush = AppendedFile.sync = lambda self: None
     AppendedFile.close = flush_and_close
     drive(folder, tell, keep_earlier)

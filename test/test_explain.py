@@ -12,8 +12,8 @@ from faulty import faulty_run
 
 from graph_slam_ros import cli, quantities
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
-from graph_slam_ros.ledger_file import LEDGER, Entry, read_ledger
 from graph_slam_ros.replay import replay
+from graph_slam_ros.run.ledger_file import LEDGER, Entry, read_ledger
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.ledger import Reason, Verdict
 

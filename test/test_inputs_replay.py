@@ -11,7 +11,7 @@ from foreign import DEFINITIONS
 from messages import DATUM, LANDMARKS, STAMP_NS, odometry, pose, quaternion, record_drive, recorded
 
 from graph_slam_ros.cli import main
-from graph_slam_ros.formats.ingest import read_ingest
+from graph_slam_ros.formats.journal import read_ingest
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.lie import se2
 from graph_slam_ros.replay import choose_inputs, replay

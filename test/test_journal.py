@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, Writer
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import AppendedFile
-from graph_slam_ros.formats.ingest import IngestWriter, part_name, read_ingest
+from graph_slam_ros.formats.journal import RecordWriter, part_name, read_ingest
 from graph_slam_ros.formats.mcap_records import MAGIC
 from graph_slam_ros.replay import replay
 from graph_slam_ros.ros.live.session import Session
@@ -200,7 +200,7 @@ def test_F19_a_length_of_2_to_the_60_in_a_journal_is_refused_before_memory_is_as
 
 def test_F18_a_kind_of_record_that_is_not_known_is_refused_by_its_name(tmp_path):
     RunRecorder(tmp_path / "run", Config()).close()
-    writer = IngestWriter(tmp_path / "run" / "ingest.mcap")
+    writer = RecordWriter(tmp_path / "run" / "ingest.mcap")
     writer.write([to_record(Odometry(1, (0.0, 0.0, 0.0))), {"type": "sonar", "stamp_ns": 2}])
     writer.close()
     with pytest.raises(FormatError, match="sonar"):

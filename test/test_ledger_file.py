@@ -5,9 +5,9 @@ import pytest
 from faulty import CONFIG, faulty_run
 
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.formats.ingest import read_ingest
-from graph_slam_ros.ledger_file import LEDGER, read_changes, read_ledger
+from graph_slam_ros.formats.journal import read_ingest
 from graph_slam_ros.ros.live.events import of_update
+from graph_slam_ros.run.ledger_file import LEDGER, read_changes, read_ledger
 from graph_slam_ros.slam import GraphSlam, Update
 from graph_slam_ros.slam.ledger import Reason, Verdict
 from graph_slam_ros.slam.measurements import from_record

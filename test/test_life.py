@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from reliability import tell, times
 
-from graph_slam_ros.map_log import read_map
 from graph_slam_ros.replay import replay
 from graph_slam_ros.ros.live.session import Session
+from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.slam import Closure, Config, Control, Counters, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.measurements import Fix, InitialPose
 

@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.evaluation import read_tum
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.formats.ingest import IngestWriter, parts_of, read_ingest
+from graph_slam_ros.formats.journal import RecordWriter, parts_of, read_ingest
 from graph_slam_ros.replay import replay
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter, open_bag
@@ -172,7 +172,7 @@ def test_a_sequence_cut_off_is_replayed_as_far_as_it_goes_and_the_loss_told(tmp_
 
 
 def test_a_sequence_with_a_record_that_is_no_json_is_refused(tmp_path):
-    writer = IngestWriter(tmp_path / "ingest.mcap")
+    writer = RecordWriter(tmp_path / "ingest.mcap")
     writer._channels["odometry"] = writer._writer.register_channel("odometry", "json", writer._schema)
     writer._writer.add_message(writer._channels["odometry"], 0, b"{no", 0, 0)
     writer.close()

@@ -192,7 +192,7 @@ def test_stages_end_where_the_last_loss_has_its_minimum():
     staged = World(3, outliers=True).solver(losses={"landmarks": STAGES["cauchy"]}, **TIGHT)
     report = staged.optimize()
     alone = World(3, outliers=True).solver(losses={"landmarks": STAGES["huber"]}, **TIGHT)
-    first = alone.optimize()
+    first = alone.optimize(alone.settings.on_the_way())
     assert report.iterations[: len(first.iterations)] == first.iterations
     assert len(report.iterations) > len(first.iterations)
     alone.settings = Settings(losses={"landmarks": [Loss(CAUCHY, 2.0)]}, **TIGHT)

@@ -19,7 +19,7 @@ from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from vision_msgs.msg import Detection3DArray
 
-from graph_slam_ros.formats.ingest import read_ingest
+from graph_slam_ros.formats.journal import read_ingest
 from graph_slam_ros.run import check_room, is_cut_off
 from graph_slam_ros.slam import Control
 from graph_slam_ros.slam.config import parameters

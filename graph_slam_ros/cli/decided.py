@@ -18,13 +18,15 @@ _SHOWN = 10  # edges that fit worse
 def explain(args: argparse.Namespace) -> int:
     """Say why."""
     from graph_slam_ros.explain import explain_edge, explain_run
+    from graph_slam_ros.run import changed_since
 
     console.say(*(explain_edge(args.run_folder, args.edge) if args.edge else explain_run(args.run_folder)))
-    return console.DONE
+    return console.told([], changed_since(args.run_folder))
 
 
 def solve(args: argparse.Namespace) -> int:
     """Solve a run's graph again with other edges in, or another loss; say what moves."""
+    from graph_slam_ros.run import changed_since
     from graph_slam_ros.what_if import SavedGraph
 
     if not (args.without or args.let_in or args.loss):
@@ -34,11 +36,12 @@ def solve(args: argparse.Namespace) -> int:
     solver = run.solve(args.without, args.let_in, args.loss)
     took_s = time.perf_counter() - start
     console.say(*_moved_text(run, run.moved(solver)), f"solved in {1e3 * took_s:.0f} ms")
-    return console.DONE
+    return console.told([], changed_since(args.run_folder))
 
 
 def influence(args: argparse.Namespace) -> int:
     """Say which edges the last pose hangs on."""
+    from graph_slam_ros.run import changed_since
     from graph_slam_ros.what_if import SavedGraph
 
     run = SavedGraph(args.run_folder)
@@ -50,7 +53,7 @@ def influence(args: argparse.Namespace) -> int:
         exact = f"{one.exact_m:10.4f} m" if math.isfinite(one.exact_m) else "undetermined"
         told = f"{one.first_order_m:10.4f} m {exact}"
         console.say(f"  {one.edge:<8d} {run.edge(one.edge).about:24s} {told}")
-    return console.DONE
+    return console.told([], changed_since(args.run_folder))
 
 
 def _moved_text(run: "SavedGraph", moved: "Moved") -> Iterable[str]:

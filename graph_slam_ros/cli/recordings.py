@@ -60,12 +60,12 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
 
 def recover(args: argparse.Namespace) -> int:
     """Write the results of a run that was never ended."""
-    from graph_slam_ros.replay import recover as recovered
+    from graph_slam_ros.run import recover as recovered
 
-    done = recovered(args.run_folder, args.out)
-    _say_run(args.run_folder, done.summary)
+    summary = recovered(args.run_folder, args.out)
+    _say_run(args.run_folder, summary)
     console.say(f"results in {args.out}")
-    return console.told(done.losses)
+    return console.told(summary["losses"])
 
 
 def info(args: argparse.Namespace) -> int:
@@ -86,6 +86,7 @@ def evaluate(args: argparse.Namespace) -> int:
     """Compare a run with the truth."""
     from graph_slam_ros.evaluation import evaluate as compared
     from graph_slam_ros.report import draw_run
+    from graph_slam_ros.run import changed_since
 
     scores = compared(args.run_folder, args.truth, estimate=args.estimate)
     console.say(json.dumps(scores.as_dict()) if args.json else str(scores))
@@ -93,7 +94,7 @@ def evaluate(args: argparse.Namespace) -> int:
     draw_run(args.run_folder, args.truth, picture)
     if not args.json:
         console.say(f"picture in {picture}")
-    return console.told(scores.losses)
+    return console.told(scores.losses, changed_since(args.run_folder))
 
 
 def warmup(args: argparse.Namespace) -> int:

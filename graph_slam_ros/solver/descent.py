@@ -1,7 +1,7 @@
 """Batch optimisation on the clique tree: Gauss-Newton, Levenberg-Marquardt, dogleg, with losses in stages."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _TINY = 1e-12  # a cost of zero up to rounding has converged
+_ON_THE_WAY = 1e-4  # where another stage follows, what the cost still changes by is of no interest
 _DAMPING_FIRST, _DAMPING_LEAST, _DAMPING_MOST, _DAMPING_FACTOR = 1e-4, 1e-12, 1e12, 10.0
 _RADIUS_FIRST, _RADIUS_LEAST = 1.0, 1e-12
 _LEAST = {  # of the settings that are numbers
@@ -45,8 +46,8 @@ class Settings:
     max_iterations : of each stage
     step_tolerance : converged when no component of a step is larger [m, rad]
     cost_tolerance : converged when the cost changes by a smaller fraction
-    losses : by label, the stages of its loss: each is minimised until converged, then the next; a label with fewer
-        stages keeps its last. Online an edge has the first at its first update and the last from then on
+    losses : by label, the stages of its loss: each is minimised, the last until converged; a label with fewer stages
+        keeps its last. Online an edge has the first at its first update and the last from then on
     relinearize_above : online, a vertex is linearised anew when a component of its step is larger [m, rad]
     relinearize_error : or when its step squared is more than so many standard deviations of its strongest measurement
     relinearize_every : that is looked for at every so many updates, or after two thirds of these at one that closes a
@@ -82,6 +83,14 @@ class Settings:
         """One loss per label for each stage."""
         count = max((len(stages) for stages in self.losses.values()), default=1)
         return [{name: s[min(k, len(s) - 1)] for name, s in self.losses.items()} for k in range(count)]
+
+    def last_stage(self) -> "Settings":
+        """The same without the stages before the last: for an estimate that is near."""
+        return replace(self, losses={label: stages[-1:] for label, stages in self.losses.items()})
+
+    def on_the_way(self) -> "Settings":
+        """For a stage that another follows."""
+        return replace(self, cost_tolerance=max(self.cost_tolerance, _ON_THE_WAY))
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +181,7 @@ class _Descent:
 
 
 def minimise(problem: Problem, settings: Settings) -> Report:
-    """Minimise stage after stage of the losses; the tree is left at the last finite iterate.
+    """Minimise stage after stage of the losses, the last until converged; the tree is left at the last finite iterate.
 
     Gauss-Newton may rise on its way. It has failed when it ends above where it began, or not finite, or without
     converging, or met a singular system; then the stage is done again with damping. Damping hides what the edges
@@ -194,11 +203,12 @@ def minimise(problem: Problem, settings: Settings) -> Report:
         begin = problem.here()
         if losses is not stages[0]:
             problem.linearize(losses)
-        descent = _DESCENTS[settings.method](problem, losses, settings)
+        until = settings if losses is stages[-1] else settings.on_the_way()
+        descent = _DESCENTS[settings.method](problem, losses, until)
         if settings.method == "gn" and descent.stop not in ("step", "cost"):
             problem.back_to(begin)
             problem.linearize(losses)
-            descent = _levenberg_marquardt(problem, losses, settings)
+            descent = _levenberg_marquardt(problem, losses, until)
             used = "lm"
         stop = descent.stop
         iterations += descent.iterations

@@ -1,7 +1,7 @@
-"""The journal: what the pipeline accepted, in that order, as JSON records in mcap, on disk as it goes.
+"""JSON records in mcap, on disk as they come: the journal of what the pipeline accepted, and the map as it grew.
 
-One channel per kind of record; the order of the file is the order of acceptance, and ``sequence`` counts it. Each flush
-writes one chunk, which carries its CRC. A sequence may be split over several files, ``ingest.mcap``,
+One channel per kind of record; the order of the file is that in which they came, and ``sequence`` counts it. Each flush
+writes one chunk, which carries its CRC. What is recorded may be split over several files, ``ingest.mcap``,
 ``ingest_1.mcap``, ...
 """
 
@@ -24,7 +24,7 @@ MEASUREMENT = "graph_slam_ros.Measurement"
 _SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}}, "required": ["type"]}).encode()
 
 
-class IngestWriter:
+class RecordWriter:
     """Appends records to one new file: they wait in memory for the next ``flush`` of that."""
 
     def __init__(self, path: Path, schema: str = MEASUREMENT) -> None:
@@ -74,20 +74,19 @@ class Parts:
     def __init__(self, folder: Path, name: str, schema: str) -> None:
         self._folder, self._name, self._schema = folder, name, schema
         self._part = 0
-        self._present: IngestWriter | None = None
+        self._present: RecordWriter | None = None
         self._ended: list[AppendedFile] = []
 
-    def begin(self) -> None:
+    def begin(self) -> RecordWriter:
         """Have the present part, also where nothing is to be written yet."""
         if self._present is None:
-            self._present = IngestWriter(self._folder / part_name(self._name, self._part), self._schema)
+            self._present = RecordWriter(self._folder / part_name(self._name, self._part), self._schema)
+        return self._present
 
     def write(self, several: Sequence[Mapping[str, Any]]) -> None:
         """Append records: they wait for ``flush``."""
         if several:
-            self.begin()
-            assert self._present is not None
-            self._present.write(several)
+            self.begin().write(several)
 
     @property
     def waiting(self) -> int:

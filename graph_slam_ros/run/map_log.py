@@ -29,7 +29,7 @@ import numpy as np
 
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
-from graph_slam_ros.formats.ingest import parts_of, read_records
+from graph_slam_ros.formats.journal import parts_of, read_records
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3
 from graph_slam_ros.slam import GraphSlam

@@ -1,0 +1,52 @@
+"""The run folder: everything a run leaves behind, written the same way by the node and by replay.
+
+``graph.g2o`` and ``graph_vertices.csv`` (stamp and name of each vertex), ``ledger.csv`` and ``ledger_changes.csv``
+(each edge, what is believed of it, and how that came: ``ledger_file``), ``path.tum``, ``covariances.csv``,
+``sightings.tum``, ``odometry.tum``, ``landmarks.csv``, ``run.mcap``, ``ingest.mcap`` (the journal), ``map.mcap`` (the
+map as it grew: ``map_log``), ``config.yaml``, ``run.json``.
+
+Covariances are written as their upper triangle, row by row. Those of ``covariances.csv``, of each pose of ``path.tum``,
+are in the pose's tangent space, with (x, y, theta) or (x, y, z, rotation vector) along and about the axes of the robot;
+those of ``landmarks.csv`` are in the axes of map. What is not known is nan; what a point does not have is empty.
+"""
+
+from graph_slam_ros.run.folder import (
+    COVARIANCES,
+    GRAPH,
+    SUMMARY,
+    RunError,
+    changed_since,
+    check_room,
+    earlier_runs,
+    is_cut_off,
+    is_run,
+    keep_earlier,
+    run_config,
+)
+from graph_slam_ros.run.recorder import RunRecorder
+from graph_slam_ros.run.saved import freeze, map_of, record_run, recover, settled, stopwatch, taken_up
+from graph_slam_ros.run.tables import numbered, summarize
+
+__all__ = [
+    "COVARIANCES",
+    "GRAPH",
+    "SUMMARY",
+    "RunError",
+    "RunRecorder",
+    "changed_since",
+    "check_room",
+    "earlier_runs",
+    "freeze",
+    "is_cut_off",
+    "is_run",
+    "keep_earlier",
+    "map_of",
+    "numbered",
+    "record_run",
+    "recover",
+    "run_config",
+    "settled",
+    "stopwatch",
+    "summarize",
+    "taken_up",
+]

@@ -1,0 +1,141 @@
+"""Which folder is a run, which of several is the newest, and what of a folder may be replaced."""
+
+import contextlib
+import json
+import re
+import zlib
+from pathlib import Path
+
+from graph_slam_ros.errors import ConfigError, GraphSlamError
+from graph_slam_ros.formats.durable import NEW, sync_folder
+from graph_slam_ros.formats.journal import parts_of, read_ingest
+from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.run.ledger_file import CHANGES, LEDGER
+from graph_slam_ros.run.map_log import grew
+from graph_slam_ros.slam import Config
+
+SUMMARY, CONFIG = "run.json", "config.yaml"
+GRAPH, VERTICES, COVARIANCES = "graph.g2o", "graph_vertices.csv", "covariances.csv"
+PATH, SIGHTINGS, ODOMETRY, LANDMARKS = "path.tum", "sightings.tum", "odometry.tum", "landmarks.csv"
+_RESULTS = {SUMMARY, GRAPH, VERTICES, LEDGER, CHANGES, PATH, COVARIANCES, SIGHTINGS, ODOMETRY, LANDMARKS, "path.png"}
+_RECORDED = re.compile(r"(ingest|map|run)(_\d+)?\.mcap")
+
+
+class RunError(GraphSlamError):
+    """A run folder that cannot be written or read."""
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder holds a run: an ingest sequence and the configuration it was taken with."""
+    return folder.is_dir() and (folder / CONFIG).is_file() and bool(parts_of(folder))
+
+
+def is_cut_off(folder: Path) -> bool:
+    """Whether the newest run, there or moved out of its way, holds something and was never ended."""
+    earlier = earlier_runs(folder)
+    newest = folder if _holds_something(folder) else earlier[max(earlier)] if earlier else folder
+    if not _holds_something(newest):
+        return False
+    try:
+        return not json.loads((newest / SUMMARY).read_text(encoding="utf-8"))["ended"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return True
+
+
+def _holds_something(folder: Path) -> bool:
+    return is_run(folder) and (next(read_ingest(folder, []), None) is not None or grew(folder))
+
+
+def run_config(folder: Path) -> Config:
+    """The configuration a run was made with. Raises ConfigError naming the file."""
+    values = read_parameters(folder / CONFIG)
+    try:
+        return Config.from_mapping(values)
+    except GraphSlamError as error:
+        raise ConfigError(f"{folder / CONFIG}: {error}") from None
+
+
+def changed_since(folder: Path) -> list[str]:
+    """Results that are not those that ``run.json`` was written with: of a save that was cut off, or edited since."""
+    try:
+        files = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["files"]
+        there = [name for name in sorted(_RESULTS & set(files)) if (folder / name).exists()]
+        changed = [name for name in there if checksum((folder / name).read_bytes()) != files[name]]
+    except (OSError, ValueError, LookupError, TypeError):
+        return []
+    return [f"{name} is not the one that {SUMMARY} was saved with" for name in changed]
+
+
+def checksum(data: bytes) -> str:
+    """CRC-32."""
+    return f"{zlib.crc32(data):08x}"
+
+
+def check_room(folder: Path, source: Path | None = None) -> None:
+    """Refuse a folder that holds anything but an earlier run, or the source that is about to be read.
+
+    Raises
+    ------
+    RunError
+        Nothing was touched.
+    """
+    try:
+        if source is not None and folder.resolve() in (source.resolve(), source.resolve().parent):
+            raise RunError(f"{folder}: cannot be read from and written to at once")
+        if folder.exists() and not is_run(folder) and not all(map(_is_of_a_start, folder.iterdir())):
+            raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
+    except OSError as error:
+        raise RunError(f"{folder}: {error.strerror}") from None
+
+
+def keep_earlier(folder: Path, most: int) -> None:
+    """Move an earlier run out of the way: to ``folder-1``, or one more than the last; so many of them are kept.
+
+    One that holds nothing is not kept; one that was never ended is in any case. Of older ones the files that a run has
+    are removed, and nothing else.
+    """
+    most = max(most, is_cut_off(folder))
+    if not _holds_something(folder) or not most:
+        return
+    earlier = earlier_runs(folder)
+    try:
+        folder.rename(folder.with_name(f"{folder.name}-{max(earlier, default=0) + 1}"))
+        for number in sorted(earlier)[: max(0, len(earlier) + 1 - most)]:
+            _clear(earlier[number])
+            with contextlib.suppress(OSError):  # somebody has put more into it
+                earlier[number].rmdir()
+    except OSError as error:
+        raise RunError(f"{folder}: {error.strerror}") from None
+
+
+def earlier_runs(folder: Path) -> dict[int, Path]:
+    """Earlier runs beside a run folder, by number."""
+    named = re.compile(re.escape(folder.name) + r"-([1-9]\d*)")
+    there = folder.parent.iterdir() if folder.parent.is_dir() else ()
+    found = {int(match[1]): run for run in there if (match := named.fullmatch(run.name))}
+    return {number: run for number, run in found.items() if is_run(run)}
+
+
+def _is_of_a_start(file: Path) -> bool:
+    """What a run that was stopped as it began may have left, before its folder can be told for a run."""
+    return file.name.removesuffix(NEW) == CONFIG or _RECORDED.fullmatch(file.name) is not None
+
+
+def make_room(folder: Path) -> None:
+    """Make a folder for a run; an earlier one in it is removed. Raises RunError where something else is."""
+    check_room(folder)
+    try:
+        if not folder.exists():
+            folder.mkdir(parents=True)
+            sync_folder(folder.parent)
+        _clear(folder)
+    except OSError as error:
+        raise RunError(f"{folder}: {error.strerror}") from None
+
+
+def _clear(folder: Path) -> None:
+    """What makes it a run goes last: who is stopped half-way leaves a folder that may be cleared again."""
+    there = sorted(folder.iterdir(), reverse=True)
+    results = [file for file in there if file.name.removesuffix(NEW) in _RESULTS]
+    for file in results + [file for file in there if _is_of_a_start(file)]:
+        file.unlink()

@@ -1,0 +1,180 @@
+"""Recording a run as it goes on, and saving its results."""
+
+import json
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros.formats.durable import AppendedFile, replaced
+from graph_slam_ros.formats.journal import INGEST, MEASUREMENT, Parts, close_all, part_name
+from graph_slam_ros.formats.parameters import parameters_text
+from graph_slam_ros.ros import results
+from graph_slam_ros.ros.bag import BagWriter
+from graph_slam_ros.run.folder import CONFIG, SUMMARY, RunError, checksum, make_room
+from graph_slam_ros.run.map_log import GROWTH, MAP, Growth
+from graph_slam_ros.run.tables import result_texts, summarize
+from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
+from graph_slam_ros.slam.map_state import MapState
+from graph_slam_ros.slam.measurements import to_record
+from graph_slam_ros.solver.leverage import leverage
+
+_PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
+_TOGETHER = 256  # measurements that are written at once: one by one, as they come, each takes several times as long
+
+
+class RunRecorder:
+    """Records a run while it goes on, and saves its results.
+
+    What was accepted is in the journal once ``flush`` has returned. A disk that is full loses nothing: what could not
+    be written is written when there is room.
+
+    Parameters
+    ----------
+    folder : made if it is not there; an earlier run in it is replaced, other contents are refused
+    sync_s : so often at most the disk is asked to take the journal, in a thread of its own; 0: at the end
+    start : the map that the run goes on in
+    """
+
+    def __init__(self, folder: Path | str, config: Config, sync_s: float = 0.0, start: MapState | None = None) -> None:
+        self.folder = Path(folder)
+        self._sync_s, self._due_s = sync_s, 0.0
+        self._disk = ThreadPoolExecutor(1, "journal") if sync_s else None
+        self._syncing: Future[None] | None = None
+        self._journal = Parts(self.folder, INGEST, MEASUREMENT)
+        self._map = Parts(self.folder, MAP, GROWTH)
+        self._accepted: list[Measurement] = []  # and not written yet
+        self._growth = Growth(start)
+        self._grown = self._growth.first
+        self._bag: BagWriter | None = None
+        self._bags = 0
+        self._ended_bags: list[AppendedFile] = []
+        self._next_path_at = 1.0
+        make_room(self.folder)
+        self._journal.begin()  # from the start: it makes the folder a run
+        try:
+            self._journal.flush()
+            self._put(CONFIG, parameters_text(config.as_mapping()))
+        except OSError as error:
+            self._journal.abandon()
+            raise RunError(f"{self.folder}: {error.strerror}") from None
+
+    def sink(self, measurement: Measurement) -> None:
+        """Append to the journal: the sink of ``GraphSlam``. Raises OSError as ``flush`` does."""
+        self._accepted.append(measurement)
+        if len(self._accepted) >= _TOGETHER or (self._sync_s and time.monotonic() >= self._due_s):
+            self.flush()
+
+    def flush(self) -> None:
+        """Bring to the disk what was accepted and what came of it: before any of that is told to anybody.
+
+        Raises
+        ------
+        OSError
+            It is kept, and written by the next call that can; or the disk did not take what was flushed before.
+        """
+        self._fill()
+        self._journal.flush()
+        self._map.flush()  # last: it is never ahead of what it came of
+        self._sync_if_due()
+
+    def _fill(self) -> None:
+        accepted, self._accepted = self._accepted, []
+        self._journal.write([to_record(measurement) for measurement in accepted])
+        grown, self._grown = self._grown, []
+        self._map.write(grown)
+
+    @property
+    def unwritten(self) -> int:
+        """Bytes of the journal that wait for room on the disk."""
+        return self._journal.waiting + self._map.waiting
+
+    def _sync_if_due(self) -> None:
+        """The disk may take long: nobody waits for it, but the next that would ask it again."""
+        now = time.monotonic()
+        if self._disk is None or now < self._due_s or (self._syncing is not None and not self._syncing.done()):
+            return
+        before, self._syncing = self._syncing, self._disk.submit(self._sync)
+        self._due_s = now + self._sync_s
+        if before is not None:
+            before.result()
+
+    def _sync(self) -> None:
+        self._journal.sync()
+        self._map.sync()
+
+    def record(self, slam: GraphSlam, update: Update) -> None:
+        """Append what an update changed: the map, pose and TF, and the path and the landmarks when they have grown."""
+        if not update or not slam.keyframes:
+            return
+        self._grown += self._growth.of(slam)
+        stamp = slam.keyframes[-1].stamp_ns
+        self._write("/tf", results.TF, stamp, results.map_to_odom(slam, stamp))
+        self._write("/tf", results.TF, stamp, results.odom_to_base(slam))
+        self._write("/pose", results.POSE, stamp, results.pose(slam))
+        if len(slam.keyframes) >= self._next_path_at:
+            self._next_path_at = len(slam.keyframes) * _PATH_GROWTH
+            self._record_map(slam)
+
+    def save(self, slam: GraphSlam, summary: dict[str, Any] | None = None) -> Path:
+        """Write all results; recording may go on, in new parts of ``ingest`` and ``run``. Returns the folder.
+
+        Raises
+        ------
+        RunError
+            The folder cannot be written.
+        """
+        try:
+            if slam.keyframes:
+                self._record_map(slam)
+            self.close()
+            self._save_results(slam, summary or {})
+        except OSError as error:
+            raise RunError(f"{self.folder}: {error.strerror}") from None
+        return self.folder
+
+    def _save_results(self, slam: GraphSlam, summary: dict[str, Any]) -> None:
+        """All that can be computed first, then file by file; the summary, the last, tells which belong together."""
+        files = {name: self._put(name, text) for name, text in result_texts(slam).items()}
+        told = summarize(slam) | summary | {"leverage": leverage(slam.solver) if slam.is_solved else {}, "files": files}
+        self._put(SUMMARY, json.dumps(told, indent=2) + "\n")
+
+    def _put(self, name: str, text: str) -> str:
+        """Write a file whole or not at all; returns its CRC-32."""
+        data = text.encode()
+        with replaced(self.folder / name) as new:
+            new.write_bytes(data)
+        return checksum(data)
+
+    def close(self) -> None:
+        """End the present part of the recording.
+
+        Raises
+        ------
+        OSError
+            What the disk did not take is kept: the next ``flush`` or ``close`` tries again.
+        """
+        self._fill()
+        failed = self._syncing.exception() if self._syncing is not None else None
+        self._syncing = None
+        if self._disk is not None:  # its thread ends; another comes with the next sync
+            self._disk.shutdown(wait=False)
+            self._disk = ThreadPoolExecutor(1, "journal")
+        if self._bag is not None:
+            self._ended_bags.append(self._bag.end())
+            self._bag, self._bags = None, self._bags + 1
+        self._journal.end()
+        self._map.end()
+        close_all(self._ended_bags)
+        if failed is not None:
+            raise failed
+
+    def _record_map(self, slam: GraphSlam) -> None:
+        stamp = slam.keyframes[-1].stamp_ns
+        self._write("/path", results.PATH, stamp, results.path(slam))
+        self._write("/landmarks", results.LANDMARKS, stamp, results.landmarks(slam))
+
+    def _write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
+        if self._bag is None:
+            self._bag = BagWriter(self.folder / part_name("run", self._bags))
+        self._bag.write(topic, type_name, stamp_ns, cdr)

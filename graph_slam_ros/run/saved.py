@@ -1,0 +1,116 @@
+"""What becomes of a run after it: it is recorded again from its events, or its map is gone on in."""
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros.formats.journal import read_ingest
+from graph_slam_ros.ros.survey import with_survey
+from graph_slam_ros.run.folder import RunError, check_room, run_config
+from graph_slam_ros.run.map_log import has_map, read_map, state_of
+from graph_slam_ros.run.recorder import RunRecorder
+from graph_slam_ros.run.tables import summarize
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
+from graph_slam_ros.slam.map_state import MapState
+from graph_slam_ros.slam.measurements import from_record
+from graph_slam_ros.warmup import warmup
+
+Summary = dict[str, Any]
+Took = Callable[[], dict[str, float]]
+
+
+def map_of(folder: Path, losses: list[str]) -> MapState:
+    """The map of a run: as it was written down, or where it was not, by repeating the drive.
+
+    Raises
+    ------
+    RunError, FormatError
+        There is none, or it cannot be read.
+    """
+    state = (read_map(folder, losses) if has_map(folder) else None) or _repeated(folder, losses)
+    if not state.keyframes:
+        raise RunError(f"{folder.name}: no keyframe, so there is no map")
+    return state
+
+
+def _repeated(folder: Path, losses: list[str]) -> MapState:
+    slam = GraphSlam(run_config(folder), start=read_map(folder, losses, start_only=True))
+    for record in read_ingest(folder, losses):
+        slam.process(from_record(record))
+    slam.process(Control("end"))
+    return state_of(slam)
+
+
+def taken_up(folder: Path, losses: list[str]) -> GraphSlam:
+    """The map of a run, solved; as ``map_of``."""
+    return GraphSlam(run_config(folder), start=map_of(folder, losses))
+
+
+def settled(folder: Path, losses: list[str]) -> GraphSlam:
+    """The same with all of it judged. Raises GraphSlamError, too, where it cannot be solved."""
+    slam = taken_up(folder, losses)
+    slam.process(Control("optimize"))
+    if not slam.is_solved:
+        raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
+    return slam
+
+
+def record_run(
+    folder: Path,
+    config: Config,
+    measurements: Iterable[Measurement],
+    losses: Sequence[str],
+    start: MapState | None = None,
+    *,
+    border: Counters | None = None,
+    took: Took | None = None,
+) -> tuple[GraphSlam, Summary]:
+    """Run the pipeline over measurements and save it all; returns the pipeline and the summary.
+
+    Parameters
+    ----------
+    losses : what could not be read, as known when the last measurement was
+    start : the map to go on in
+    border : counters of what was refused before it came here
+    took : the time since whatever is told as its beginning
+    """
+    took = took or stopwatch()
+    recorder = RunRecorder(folder, config, start=start)
+    try:
+        slam = GraphSlam(config, recorder.sink, start=start)
+        for measurement in measurements:
+            recorder.record(slam, slam.process(measurement))
+        slam.counters.update(border or Counters())
+        summary = summarize(slam) | took() | {"losses": list(dict.fromkeys(losses))}
+        recorder.save(slam, summary)
+    finally:
+        recorder.close()
+    return slam, summary
+
+
+def stopwatch() -> Took:
+    """Of what follows."""
+    start_s, cpu_s = time.perf_counter(), time.process_time()
+    return lambda: {"time_s": time.perf_counter() - start_s, "cpu_s": time.process_time() - cpu_s}
+
+
+def recover(folder: Path, out: Path) -> Summary:
+    """Write the results of a run that was never ended, from its map: the drive is not repeated."""
+    warmup()
+    took = stopwatch()
+    check_room(out, folder)
+    losses: list[str] = []
+    state = map_of(folder, losses)
+    return record_run(out, with_survey(run_config(folder)), (), losses, state, took=took)[1]
+
+
+def freeze(folder: Path, out: Path) -> Summary:
+    """Write a run that begins in the map of another, all of which then stays as it is."""
+    warmup()
+    took = stopwatch()
+    check_room(out, folder)
+    losses: list[str] = []
+    state = state_of(settled(folder, losses))
+    state.freeze()
+    return record_run(out, run_config(folder), [Control("optimize")], losses, state, took=took)[1]

@@ -1,0 +1,111 @@
+"""The tables of a run, and what happened in it in numbers."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from typing import Any, TypeVar
+
+import numpy as np
+
+from graph_slam_ros import __version__
+from graph_slam_ros.formats.g2o_writer import g2o_text
+from graph_slam_ros.formats.graph_file import G2oFile
+from graph_slam_ros.formats.tum import tum_text
+from graph_slam_ros.ros import results
+from graph_slam_ros.run.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, SIGHTINGS, VERTICES
+from graph_slam_ros.run.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
+from graph_slam_ros.slam import GraphSlam
+
+Name = TypeVar("Name")
+_TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
+_POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
+
+
+def result_texts(slam: GraphSlam) -> dict[str, str]:
+    """The results but for the summary, by the names of their files."""
+    stamps = slam.sighting_poses.stamps_ns.tolist()
+    ids, vertices = numbered(slam)
+    return {
+        GRAPH: g2o_text(G2oFile(slam.graph, ids), slam.solver.estimate),
+        VERTICES: vertices,
+        LEDGER: ledger_text(slam, ids),
+        CHANGES: changes_text(slam),
+        PATH: tum_text(slam.keyframes.stamps_ns.tolist(), slam.trajectory()),
+        COVARIANCES: _covariance_table(slam),
+        SIGHTINGS: tum_text(stamps, slam.sighting_trajectory()),
+        ODOMETRY: tum_text(stamps, slam.sighting_odometry()),
+        LANDMARKS: _landmark_table(slam),
+    }
+
+
+def summarize(slam: GraphSlam) -> dict[str, Any]:
+    """What happened, in numbers."""
+    last = slam.report
+    return {
+        "version": __version__,
+        "keyframes": len(slam.keyframes),
+        "landmarks": len(slam.landmarks),
+        "waiting": slam.waiting,
+        "segments": len(slam.segments),
+        "sightings": sum(landmark.sightings for landmark in slam.landmarks.values()),
+        "edges": slam.graph.edge_count,
+        "solves": slam.solves,
+        "chi2": last.chi2_final if last else 0.0,
+        "cost": last.cost_final if last else 0.0,
+        "ended": True,
+        "converged": last.converged if last else True,
+        "stop": last.stop if last else "nothing_to_do",
+        "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
+        "rivals": [asdict(rival) for rival in slam.backend.rivals],
+        "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
+        "counters": slam.counters.as_dict(),
+    }
+
+
+def numbered(slam: GraphSlam) -> tuple[list[int], str]:
+    """The number of each vertex, and the table of them.
+
+    Poses are numbered from 0 in order of time, landmarks after them: other tools read odometry from that. What is
+    neither is an offset that the ranges of a sensor share.
+    """
+    names: list[tuple[int, str, int | str, str]] = []
+    for k, keyframe in enumerate(slam.keyframes):
+        names.append((keyframe.vertex, "keyframe", keyframe.stamp_ns, str(k)))
+    for name, landmark in slam.landmarks.items():
+        names.append((landmark.vertex, "landmark", "", name))
+    named = {vertex for vertex, *_ in names}
+    names += [(vertex, "offset", "", "") for vertex in range(slam.graph.vertex_count) if vertex not in named]
+    ids = [0] * slam.graph.vertex_count
+    rows = ["id,vertex,stamp_ns,name"]
+    for file_id, (vertex, what, stamp, name) in enumerate(names):
+        ids[vertex] = file_id
+        rows.append(f"{file_id},{what},{stamp},{_csv(name)}")
+    return ids, "\n".join(rows) + "\n"
+
+
+def _covariance_table(slam: GraphSlam) -> str:
+    dof = slam.config.space.dof
+    rows = [f"stamp_ns,{','.join(f'tangent_{a}{b}' for a, b in _upper(_TANGENT[dof]))}"]
+    for stamp_ns, covariance in zip(slam.keyframes.stamps_ns, slam.keyframe_covariances(), strict=True):
+        rows.append(f"{stamp_ns},{','.join(map(repr, covariance[np.triu_indices(dof)].tolist()))}")
+    return "\n".join(rows) + "\n"
+
+
+def _landmark_table(slam: GraphSlam) -> str:
+    space = slam.config.space
+    rows = [f"id,kind,{_POSE[space.dof]},sightings,{','.join(f'cov_{a}{b}' for a, b in _upper(_TANGENT[space.dof]))}"]
+    for name, value, covariance in results.landmark_estimates(slam):
+        kind = "pose" if len(value) == space.pose.size else "point"
+        at = [*map(repr, value), *[""] * (space.pose.size - len(value))]
+        spread = [f"{covariance[i, j]:.9e}" if j < len(covariance) else "" for i, j in _upper(range(space.dof))]
+        rows.append(",".join([_csv(name), kind, *at, str(slam.landmarks[name].sightings), *spread]))
+    return "\n".join(rows) + "\n"
+
+
+def _upper(names: Sequence[Name]) -> Iterator[tuple[Name, Name]]:
+    """Pairs of the upper triangle of a matrix, row by row."""
+    return itertools.combinations_with_replacement(names, 2)
+
+
+def _csv(text: str) -> str:
+    return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\n\r') else text
