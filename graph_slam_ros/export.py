@@ -7,12 +7,11 @@ from pathlib import Path
 
 from graph_slam_ros.formats.durable import replaced
 from graph_slam_ros.formats.g2o_writer import write_g2o, write_text
-from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.strict import is_gzipped
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.ros import results, to_msg
 from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.run import RunError, numbered, taken_up
+from graph_slam_ros.run import RunError, graph_file, numbered, taken_up
 from graph_slam_ros.slam import GraphSlam
 
 
@@ -38,7 +37,7 @@ def _tum(slam: GraphSlam, out: Path) -> list[Path]:
 def _g2o(slam: GraphSlam, out: Path) -> list[Path]:
     """All that is believed; g2o has neither stamps nor names: these are in a table beside it."""
     ids, table = numbered(slam)
-    write_g2o(out, G2oFile(slam.graph, ids), slam.solver.estimate)
+    write_g2o(out, graph_file(slam, ids), slam.solver.estimate)
     whole = out.with_suffix("") if is_gzipped(out) else out
     beside = whole.with_name(f"{whole.stem}_vertices.csv")
     write_text(beside, table)

@@ -70,7 +70,7 @@ class SavedGraph:
         config = run_config(folder)
         self.space, self._settings = config.space, config.solver_settings()
         self.entries = read_ledger(folder)
-        self.graph = _graph(folder, self.entries)
+        self.graph, self._held = _graph(folder, self.entries)
         self.keyframes = [k for e in self.entries if e.label in ("anchor", "odometry") for k in e.vertices[-1:]]
         for vertex in self.keyframes:
             if self.graph.kind_of(vertex) is not self.space.pose:
@@ -119,7 +119,10 @@ class SavedGraph:
         if loss is not None:
             settings = replace(settings, losses={label: [loss] for label in settings.losses})
         solver = Solver(graph, settings)
-        solver.add(np.unique([*self.keyframes, *(v for e in edges for v in _ends(graph, e))]), edges)
+        vertices = np.unique([*self.keyframes, *(v for e in edges for v in _ends(graph, e))])
+        solver.add(vertices, edges)
+        for vertex in np.intersect1d(vertices, self._held).tolist():
+            solver.hold(vertex)
         solver.optimize()
         return solver
 
@@ -178,7 +181,8 @@ class SavedGraph:
         return step
 
 
-def _graph(folder: Path, entries: Sequence[Entry]) -> Graph:
+def _graph(folder: Path, entries: Sequence[Entry]) -> tuple[Graph, list[int]]:
+    """And the vertices that are held: those of a map that was frozen."""
     file, out = read_g2o(folder / GRAPH), Graph()
     if sorted(file.ids) != list(range(len(file.ids))):
         raise FormatError(f"{folder / GRAPH}: vertices are not numbered one after another from 0: is it of a run?")
@@ -192,7 +196,7 @@ def _graph(folder: Path, entries: Sequence[Entry]) -> Graph:
         except GraphSlamError as error:
             raise FormatError(f"{folder / LEDGER}: edge {entry.edge}: {error}") from None
     _check_same_run(folder, file, entries)
-    return out
+    return out, [file.ids[vertex] for vertex in file.fixed]
 
 
 def _check_same_run(folder: Path, file: G2oFile, entries: Iterable[Entry]) -> None:

@@ -16,6 +16,7 @@ from graph_slam_ros.run import RunRecorder, map_of, run_config, taken_up
 from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.simulation import measurements, simulate, with_closures
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
+from graph_slam_ros.what_if import SavedGraph
 
 
 @pytest.fixture(scope="module")
@@ -433,6 +434,18 @@ def test_in_a_frozen_map_the_robot_is_located_as_well_as_in_one_that_goes_on(fir
     for name in RECORDED:
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
     assert_untouched(taken_up(tmp_path / "run", []), frozen)
+
+
+def test_what_is_asked_of_a_run_in_a_frozen_map_leaves_that_where_it_is(frozen, world, tmp_path):
+    slam = gone_on(tmp_path / "run", frozen, world)
+    saved = SavedGraph(tmp_path / "run")
+    first_new = len(read_map(frozen, []).keyframes)
+    edges = [e for e in saved.entries if e.is_in and e.verdict and max(e.vertices[:1]) >= first_new][:20]
+    after = saved.solve([e.edge for e in edges])
+    moved = np.abs(after.estimate(saved.keyframes) - saved.solve().estimate(saved.keyframes)).max(axis=1)
+    assert moved[:first_new].max() == 0.0 < moved[first_new:].max()
+    assert saved.solve().estimate(saved.keyframes) == pytest.approx(slam.trajectory(), abs=1e-4)
+    assert run("influence", tmp_path / "run") == run("explain", tmp_path / "run", edges[0].edge) == 0
 
 
 def test_new_landmarks_are_added_to_a_frozen_map(world, tmp_path):

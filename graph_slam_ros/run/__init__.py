@@ -25,7 +25,7 @@ from graph_slam_ros.run.folder import (
 )
 from graph_slam_ros.run.recorder import RunRecorder
 from graph_slam_ros.run.saved import freeze, map_of, record_run, recover, settled, stopwatch, taken_up
-from graph_slam_ros.run.tables import numbered, summarize
+from graph_slam_ros.run.tables import graph_file, numbered, summarize
 
 __all__ = [
     "COVARIANCES",
@@ -37,6 +37,7 @@ __all__ = [
     "check_room",
     "earlier_runs",
     "freeze",
+    "graph_file",
     "is_cut_off",
     "is_run",
     "keep_earlier",

@@ -26,7 +26,7 @@ def result_texts(slam: GraphSlam) -> dict[str, str]:
     stamps = slam.sighting_poses.stamps_ns.tolist()
     ids, vertices = numbered(slam)
     return {
-        GRAPH: g2o_text(G2oFile(slam.graph, ids), slam.solver.estimate),
+        GRAPH: g2o_text(graph_file(slam, ids), slam.solver.estimate),
         VERTICES: vertices,
         LEDGER: ledger_text(slam, ids),
         CHANGES: changes_text(slam),
@@ -81,6 +81,11 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
         ids[vertex] = file_id
         rows.append(f"{file_id},{what},{stamp},{_csv(name)}")
     return ids, "\n".join(rows) + "\n"
+
+
+def graph_file(slam: GraphSlam, ids: list[int]) -> G2oFile:
+    """The graph, with the vertices of a frozen map fixed."""
+    return G2oFile(slam.graph, ids, slam.solver.held.tolist())
 
 
 def _covariance_table(slam: GraphSlam) -> str:
