@@ -29,7 +29,7 @@ def told(losses: Sequence[str], warnings: Sequence[str] = ()) -> int:
     """Tell what was lost, and what to beware of; returns the exit code."""
     for warning in warnings:
         tell(f"beware: {warning}")
-    for loss in losses:
+    for loss in dict.fromkeys(losses):
         tell(f"lost: {loss}")
     return LOSSES if losses else DONE
 

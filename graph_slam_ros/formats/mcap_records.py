@@ -205,7 +205,7 @@ def _next_chunk(stream: _Stream, at: int) -> int | None:
 
 def _lost(error: Exception, read: int, at: int, next_chunk: int | None, size: int) -> str:
     if next_chunk is None:
-        return f"cut off after {read} messages, {size - at} of {size} bytes are lost ({_what(error)})"
+        return f"cut off after {read} messages, {max(0, size - at)} of {size} bytes are lost ({_what(error)})"
     return f"damaged at {at}: {next_chunk - at} bytes were passed over ({_what(error)})"
 
 

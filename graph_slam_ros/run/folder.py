@@ -48,6 +48,8 @@ def _holds_something(folder: Path) -> bool:
 
 def run_config(folder: Path) -> Config:
     """The configuration a run was made with. Raises ConfigError naming the file."""
+    if not (folder / CONFIG).is_file():
+        raise ConfigError(f"{folder}: not a run: no {CONFIG} in it")
     values = read_parameters(folder / CONFIG)
     try:
         return Config.from_mapping(values)

@@ -31,6 +31,9 @@ def map_of(folder: Path, losses: list[str]) -> MapState:
     state = (read_map(folder, losses) if has_map(folder) else None) or _repeated(folder, losses)
     if not state.keyframes:
         raise RunError(f"{folder.name}: no keyframe, so there is no map")
+    space = run_config(folder).space
+    if state.graph.kind_of(state.keyframes[0].vertex) is not space.pose:
+        raise RunError(f"{folder.name}: its map is not in {space.dimensions} dimensions, as its configuration says")
     return state
 
 
