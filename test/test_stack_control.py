@@ -20,7 +20,9 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from vision_msgs.msg import Detection3DArray
 
 from graph_slam_ros.formats.journal import read_ingest
-from graph_slam_ros.run import check_room, is_cut_off
+from graph_slam_ros.merge import merge
+from graph_slam_ros.run import check_room, freeze, is_cut_off
+from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.slam import Control
 from graph_slam_ros.slam.config import parameters
 from graph_slam_ros.slam.measurements import from_record
@@ -407,13 +409,21 @@ def test_P16_a_parameter_without_value_or_of_no_type_is_refused_and_the_node_goe
 # -- services ----------------------------------------------------------------------------------------------------------
 
 
-def test_P12_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(tmp_path):
+@pytest.mark.parametrize("loaded", ["newest", "frozen", "merged"])
+def test_P12_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(tmp_path, loaded):
     hears = "pose", "/tf", "odometry", "/diagnostics", "landmarks"
-    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=hears) as r:
+    parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true"
+    named = () if loaded == "newest" else (f"output.load:={loaded}",)
+    with node(*parameters, *named) as n, robot(hears=hears) as r:
         r.wait_for_node()
         drive = Drive()
         drive.go(r, 120, every=3)
         assert r.call("reset").success
+        site = tmp_path / "run-1"
+        if loaded == "frozen":
+            freeze(site, tmp_path / "frozen")
+        if loaded == "merged":
+            merge(site, site, tmp_path / "merged")
         assert r.call("load").success
         r.settle()
         assert {m.text for m in r.heard["landmarks"][-1].markers if m.text} == set(TAGS)
@@ -433,6 +443,9 @@ def test_P12_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(t
         assert r.graph()["landmarks"] == len(TAGS)
         assert n.stop()[0] == 0
     assert is_repeated(tmp_path / "run", tmp_path)
+    if loaded == "frozen":
+        frozen, since = (read_map(tmp_path / name, []) for name in ("frozen", "run"))
+        assert (since.values[: len(frozen.values)] == frozen.values).all()
 
 
 def test_X9_reset_saves_first_and_of_what_it_saved_the_last_five_are_kept(tmp_path):
