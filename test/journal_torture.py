@@ -441,9 +441,7 @@ class Trial:
         except RunError as error:
             self._told.append(error)
             assert not list(self._folder.glob(f"*{NEW}")), "a new file was left there"
-            if not self._faulty.fired:
-                assert self._state == STATES[3], error  # a sync of the full disk is told of late
-                return self._again(call)
+            assert self._faulty.fired, error
             self._faulty.lift()
             return call()
 

@@ -11,6 +11,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -300,6 +301,29 @@ def test_P4_no_room_for_the_journal_is_told_and_all_is_written_when_there_is_roo
     assert [r for r in records if r["type"] != "control"] == as_read(recorded()[:120])
     again = replay(tmp_path / "run", tmp_path / "again")
     assert again.slam.trajectory().tolist() == session.slam.trajectory().tolist()
+
+
+def test_P4_that_the_disk_did_not_take_it_in_time_is_told_and_does_not_keep_it_from_being_saved(tmp_path, monkeypatch):
+    fsync, failed, told = os.fsync, threading.Event(), []
+
+    def failing(fd):
+        if threading.current_thread() is not threading.main_thread() and not failed.is_set():
+            failed.set()
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        fsync(fd)
+
+    monkeypatch.setattr(os, "fsync", failing)
+    session = session_in(tmp_path / "run", told)
+    session.take(recorded()[:1])
+    assert failed.wait(10.0)
+    assert not told
+    session.save()
+    assert told == [("output.folder", os.strerror(errno.EIO))]
+    assert not session.recording_fails
+    session.take(recorded()[1:60])
+    session.finish()
+    assert len(told) == 1
+    assert len(list(read_ingest(tmp_path / "run", []))) > 60
 
 
 def as_read(measurements):

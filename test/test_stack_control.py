@@ -418,6 +418,7 @@ def test_P12_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(t
         r.wait_for_node()
         drive = Drive()
         drive.go(r, 120, every=3)
+        r.settle()  # or the call may come before what was sent
         assert r.call("reset").success
         site = tmp_path / "run-1"
         if loaded == "frozen":

@@ -76,7 +76,10 @@ class RunRecorder:
         self._fill()
         self._journal.flush()
         self._map.flush()  # last: it is never ahead of what it came of
-        self._sync_if_due()
+        if self._syncing is None or self._syncing.done():
+            synced, self._syncing = self._syncing, self._sync_if_due()
+            if synced is not None:
+                synced.result()
 
     def _fill(self) -> None:
         accepted, self._accepted = self._accepted, []
@@ -89,15 +92,19 @@ class RunRecorder:
         """Bytes of the journal that wait for room on the disk."""
         return self._journal.waiting + self._map.waiting
 
-    def _sync_if_due(self) -> None:
-        """The disk may take long: nobody waits for it, but the next that would ask it again."""
+    def _sync_if_due(self) -> Future[None] | None:
+        """The disk may take long: nobody waits for it."""
         now = time.monotonic()
-        if self._disk is None or now < self._due_s or (self._syncing is not None and not self._syncing.done()):
-            return
-        before, self._syncing = self._syncing, self._disk.submit(self._sync)
+        if self._disk is None or now < self._due_s:
+            return None
         self._due_s = now + self._sync_s
-        if before is not None:
-            before.result()
+        return self._disk.submit(self._sync)
+
+    def wait_synced(self) -> None:
+        """Wait until the disk has taken what it was asked to take. Raises OSError: it did not, which is told once."""
+        asked, self._syncing = self._syncing, None
+        if asked is not None:
+            asked.result()
 
     def _sync(self) -> None:
         self._journal.sync()

@@ -184,8 +184,10 @@ class Session:
 
     def save(self, release: str = "flush") -> str:
         """Release what waits, solve, and write the run folder; returns its name."""
+        self._recorded(RunRecorder.wait_synced)  # what the disk refused before is told, and is no reason not to save
         if self._recorder is None:
-            raise GraphSlamError("output.folder is empty: nowhere to save")
+            why = "recording was given up" if self._folder else "output.folder is empty"
+            raise GraphSlamError(f"{why}: nowhere to save")
         if not self._is_saved:
             for event in (release, "optimize"):
                 self._process(Control(event))
