@@ -7,7 +7,6 @@ without an end. Then its map is read and solved, as the node does when it starts
 import argparse
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +70,7 @@ def main() -> None:
         read_s = time.perf_counter() - start
         again = GraphSlam(config, start=state)
         took_s, cpu_s = time.perf_counter() - start, time.process_time() - cpu_s
-        solved = slam.solver.optimize(replace(slam.solver.settings, step_tolerance=1e-8, cost_tolerance=0.0))
+        solved = slam.solver.optimize(slam.solver.settings.until_still())
         apart_m = np.abs(again.trajectory() - slam.trajectory()).max()
         same = (again.ledger.verdict.values == slam.ledger.verdict.values).all()
         print(

@@ -16,7 +16,7 @@ from graph_slam_ros.diff import refuse_other_space, shared_landmarks
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.graph import Gaussian
-from graph_slam_ros.run import check_room, record_run, run_config, settled
+from graph_slam_ros.run import check_room, record_run, run_config, settled, stopwatch
 from graph_slam_ros.run.map_log import Growth, Record, extend, state_of
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.decisions import landmark_of
@@ -52,6 +52,7 @@ def merge(a: Path, b: Path, out: Path) -> Merged:
     GraphSlamError
         They cannot be laid on one another.
     """
+    took = stopwatch()
     for folder in (a, b):
         check_room(out, folder)
     losses: list[str] = []
@@ -65,7 +66,7 @@ def merge(a: Path, b: Path, out: Path) -> Merged:
     left_out = {name: aligned.distance(k) for k, name in enumerate(shared) if not aligned.fits[k]}
     chi2 = {one.landmarks[name].vertex: float(aligned.chi2[k]) for k, name in enumerate(shared) if name in left_out}
     _leave_out(state, first_edge, chi2, aligned.limit)
-    _, summary = record_run(out, run_config(a), [Control("optimize")], losses, state)
+    _, summary = record_run(out, run_config(a), [Control("optimize")], losses, state, took=took)
     return Merged(summary, summary["losses"], len(shared), left_out)
 
 

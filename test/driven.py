@@ -13,7 +13,7 @@ def drive(folder, config, world, start=None):
     for m in [*world, Control("end"), Control("optimize")]:
         recorder.record(slam, slam.process(m))
         recorder.flush()
-    slam.solver.optimize(replace(slam.solver.settings, step_tolerance=1e-9, cost_tolerance=0.0))
+    slam.solver.optimize(slam.solver.settings.until_still())
     slam.solver.update()  # so that covariances are at hand
     return slam
 

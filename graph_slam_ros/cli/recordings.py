@@ -40,7 +40,7 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
         raise GraphSlamError("--ros needs ROS 2 (no rclpy here); without --ros the same replay runs without it")
     bag = open_bag(args.bag)
     from graph_slam_ros.ros.player import config_of, own_node, play
-    from graph_slam_ros.run import check_room
+    from graph_slam_ros.run import SUMMARY, check_room
 
     node_name = args.node or "/graph_slam"
     config = config_of(node_name) if args.out is None else config
@@ -52,7 +52,7 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
         check_room(args.out, args.bag)
         with own_node(args.out, inputs, config) as own:
             played = play(bag, inputs, own=own, **options)
-        _say_run(args.bag, json.loads((args.out / "run.json").read_text()))
+        _say_run(args.bag, json.loads((args.out / SUMMARY).read_text()))
     console.say(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
     losses = bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else [])
     return console.told(losses, bag.warnings)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.formats.journal import read_ingest
-from graph_slam_ros.ros.survey import with_survey
 from graph_slam_ros.run.folder import RunError, check_room, run_config
 from graph_slam_ros.run.map_log import has_map, read_map, state_of
 from graph_slam_ros.run.recorder import RunRecorder
@@ -28,6 +27,7 @@ def map_of(folder: Path, losses: list[str]) -> MapState:
     RunError, FormatError
         There is none, or it cannot be read.
     """
+    warmup()
     state = (read_map(folder, losses) if has_map(folder) else None) or _repeated(folder, losses)
     if not state.keyframes:
         raise RunError(f"{folder.name}: no keyframe, so there is no map")
@@ -38,7 +38,7 @@ def map_of(folder: Path, losses: list[str]) -> MapState:
 
 
 def _repeated(folder: Path, losses: list[str]) -> MapState:
-    slam = GraphSlam(run_config(folder), start=read_map(folder, losses, start_only=True))
+    slam = GraphSlam(run_config(folder), start=read_map(folder, [], start_only=True))  # its losses are known
     for record in read_ingest(folder, losses):
         slam.process(from_record(record))
     slam.process(Control("end"))
@@ -100,17 +100,15 @@ def stopwatch() -> Took:
 
 def recover(folder: Path, out: Path) -> Summary:
     """Write the results of a run that was never ended, from its map: the drive is not repeated."""
-    warmup()
     took = stopwatch()
     check_room(out, folder)
     losses: list[str] = []
     state = map_of(folder, losses)
-    return record_run(out, with_survey(run_config(folder)), (), losses, state, took=took)[1]
+    return record_run(out, run_config(folder), (), losses, state, took=took)[1]
 
 
 def freeze(folder: Path, out: Path) -> Summary:
     """Write a run that begins in the map of another, all of which then stays as it is."""
-    warmup()
     took = stopwatch()
     check_room(out, folder)
     losses: list[str] = []

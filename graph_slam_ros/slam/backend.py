@@ -18,7 +18,6 @@ from graph_slam_ros.solver import Report, Settings, Solver
 
 Array = NDArray[np.float64]
 
-_AS_BEFORE = 1e-8  # m and rad: a map that is taken up is to be where it was
 _UPDATES = 6  # until what was let in fits, before everything is solved for it
 
 
@@ -72,8 +71,7 @@ class Backend:
             if vertex < self.frozen:
                 self.solver.hold(vertex)
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
-        settings = self.solver.settings.last_stage()  # what is believed was decided: it need not be found again
-        report = self.solver.optimize(replace(settings, step_tolerance=_AS_BEFORE, cost_tolerance=0.0))
+        report = self.solver.optimize(self.solver.settings.until_still())  # what is believed was decided before
         self.decisions.tighten()
         self._background.cancel(self.ledger.outside_count)
         return report

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _TINY = 1e-12  # a cost of zero up to rounding has converged
+_STILL = 1e-8  # m and rad
 _ON_THE_WAY = 1e-4  # where another stage follows, what the cost still changes by is of no interest
 _DAMPING_FIRST, _DAMPING_LEAST, _DAMPING_MOST, _DAMPING_FACTOR = 1e-4, 1e-12, 1e12, 10.0
 _RADIUS_FIRST, _RADIUS_LEAST = 1.0, 1e-12
@@ -84,9 +85,10 @@ class Settings:
         count = max((len(stages) for stages in self.losses.values()), default=1)
         return [{name: s[min(k, len(s) - 1)] for name, s in self.losses.items()} for k in range(count)]
 
-    def last_stage(self) -> "Settings":
-        """The same without the stages before the last: for an estimate that is near."""
-        return replace(self, losses={label: stages[-1:] for label, stages in self.losses.items()})
+    def until_still(self) -> "Settings":
+        """For an estimate that is near: the last stage alone, until nothing moves."""
+        last = {label: stages[-1:] for label, stages in self.losses.items()}
+        return replace(self, losses=last, step_tolerance=_STILL, cost_tolerance=0.0)
 
     def on_the_way(self) -> "Settings":
         """For a stage that another follows."""
