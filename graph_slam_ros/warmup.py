@@ -7,6 +7,7 @@ first gives it to all.
 """
 
 import contextlib
+import functools
 import os
 import subprocess
 import sys
@@ -80,6 +81,7 @@ def _ended(process: "subprocess.Popen[bytes]") -> int | None:
     return None
 
 
+@functools.cache  # what is loaded stays
 def _use_all() -> None:
     """Linearise every edge type and solve a graph."""
     for edge in _edge_types():

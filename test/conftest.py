@@ -1,5 +1,8 @@
 """Before any test: kernels are compiled in a process of their own and loaded in one order, as they are for users."""
 
+import tempfile
+from pathlib import Path
+
 import pytest
 import reliability
 
@@ -9,6 +12,13 @@ from graph_slam_ros.warmup import warmup
 def pytest_sessionstart() -> None:
     """Not by the first test that needs one, whose digits would be its own."""
     warmup()
+
+
+@pytest.fixture
+def memory():  # type: ignore[no-untyped-def]
+    """A folder in memory, where there is one: what kills a process leaves the same there, and syncing takes no time."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
+        yield Path(folder)
 
 
 def pytest_sessionfinish(session) -> None:  # type: ignore[no-untyped-def]

@@ -10,7 +10,6 @@ import signal
 import struct
 import subprocess
 import sys
-import tempfile
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,13 +32,6 @@ from graph_slam_ros.slam.measurements import to_record
 
 CUTS, FLIPS = 2_000, 5_000 if IS_LONG else 500
 KILLS = 3_000 if IS_LONG else 200
-
-
-@pytest.fixture
-def memory():
-    """A folder in memory, where there is one: what kills a process leaves the same there, and syncing takes no time."""
-    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
-        yield Path(folder)
 
 
 # -- cut and flipped ---------------------------------------------------------------------------------------------------

@@ -154,12 +154,11 @@ class Life:
 
 
 @pytest.mark.parametrize("part", range(10))
-def test_T3_whatever_happens_in_whatever_order_nothing_that_was_told_is_lost(tmp_path, part):
+def test_T3_whatever_happens_in_whatever_order_nothing_that_was_told_is_lost(memory, part):
     count = times(3, 300)
     for seed in range(part * count, (part + 1) * count):
-        shutil.rmtree(tmp_path)
-        tmp_path.mkdir()
-        life = Life(tmp_path / "run", seed)
+        folder = memory / str(seed)
+        life = Life(folder / "run", seed)
         done = []
         try:
             for _ in range(times(STEPS, 2 * STEPS)):
@@ -167,4 +166,5 @@ def test_T3_whatever_happens_in_whatever_order_nothing_that_was_told_is_lost(tmp
             life.end()
         except Exception as error:
             raise AssertionError(f"seed {seed}, after {' '.join(done[-12:])}") from error
+        shutil.rmtree(folder)
     tell("lives", tried=count, steps=count * times(STEPS, 2 * STEPS), failed=0)
