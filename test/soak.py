@@ -35,6 +35,7 @@ PROGRAMMES = {
     "permutations": tests("test/test_timing_cases.py", "-k", "B1"),
     "solver_faults": tests("test/test_solver_faults.py", "test/test_graph_cases.py"),
     "fuzzing": tests("test/test_fuzzing.py"),
+    "kernels": tests("test/test_kernels.py"),
     **{f"guided_{name}": guided(name) for name in ("g2o", "yaml", "cdr", "journal")},
     "planted_bugs": [sys.executable, "test/planted_bugs.py"],
     "recovery": [sys.executable, "-m", "benchmarks.recovery"],

@@ -155,7 +155,7 @@ class Life:
 
 @pytest.mark.parametrize("part", range(10))
 def test_T3_whatever_happens_in_whatever_order_nothing_that_was_told_is_lost(memory, part):
-    count = times(3, 300)
+    count = times(30, 300)
     for seed in range(part * count, (part + 1) * count):
         folder = memory / str(seed)
         life = Life(folder / "run", seed)

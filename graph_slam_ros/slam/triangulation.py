@@ -64,10 +64,10 @@ def places(space: Space, glances: Sequence[Glance], offset_sigma_m: float = 0.0)
     """
     fields = _fields(space, glances)
     known = 1.0 / max(offset_sigma_m, _NO_OFFSET_M) ** 2
+    starts = np.array([[*start, 0.0] for start in _starts(space, glances[0])])
     found: list[Place] = []
-    for start in _starts(space, glances[0]):
-        place = _descend(space, fields, np.append(start, 0.0), known)
-        if place and all(np.linalg.norm(place.position - other.position) > _ONE_PLACE_M for other in found):
+    for place in _descend(space, fields, starts, known):
+        if all(np.linalg.norm(place.position - other.position) > _ONE_PLACE_M for other in found):
             found.append(place)
     return sorted(found, key=lambda place: place.chi2)
 
@@ -106,26 +106,34 @@ def _directions(n: int) -> Array:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
-def _descend(space: Space, fields: list[Field], start: Array, known: float) -> Place | None:
-    """Levenberg-Marquardt to the nearest minimum; None where it does not arrive.
+def _descend(space: Space, fields: list[Field], starts: Array, known: float) -> list[Place]:
+    """Levenberg-Marquardt from all starts at once, each to the nearest minimum; those that arrive, in their order.
 
     Parameters
     ----------
-    start : (n + 1,) a point and the ranges' offset
+    starts : (s, n + 1) points and the ranges' offset
     known : information on the offset
     """
-    n, at, damping = space.dimensions, start, 1e-3
+    n, at, damping = space.dimensions, starts.copy(), np.full(len(starts), 1e-3)
     chi2, b, h = _normal(space, fields, at, known)
+    under_way, has_arrived = np.arange(len(starts)), np.zeros(len(starts), dtype=bool)
     for _ in range(_ITERATIONS):
-        step = -np.linalg.solve(h + np.diag(damping * np.diag(h) + _LEAST_CURVATURE), b)
-        tried = _normal(space, fields, at + step, known)
-        if tried[0] > chi2:
-            damping *= 10.0
-            continue
-        at, (chi2, b, h), damping = at + step, tried, 0.1 * damping
-        if np.linalg.norm(step) < _ARRIVED_M * (1.0 + np.linalg.norm(at)):
-            return Place(at[:n], _covariance(h[:n, :n] - np.outer(h[:n, n], h[n, :n]) / h[n, n]), chi2)
-    return None
+        k = under_way
+        lift = damping[k, None] * np.einsum("kii->ki", h[k]) + _LEAST_CURVATURE
+        step = -np.linalg.solve(h[k] + lift[..., None] * np.eye(n + 1), b[k, :, None])[..., 0]
+        tried = at[k] + step
+        chi2_there, b_there, h_there = _normal(space, fields, tried, known)
+        goes = ~(chi2_there > chi2[k])
+        gone = k[goes]
+        at[gone], chi2[gone], b[gone], h[gone] = tried[goes], chi2_there[goes], b_there[goes], h_there[goes]
+        damping[k] *= np.where(goes, 0.1, 10.0)
+        is_short = np.linalg.norm(step, axis=1) < _ARRIVED_M * (1.0 + np.linalg.norm(tried, axis=1))
+        has_arrived[k] = goes & is_short
+        under_way = k[~has_arrived[k]]
+        if not len(under_way):
+            break
+    points = h[:, :n, :n] - h[:, :n, n:] * h[:, n:, :n] / h[:, n:, n:]  # the offset is eliminated
+    return [Place(at[k, :n], _covariance(points[k]), float(chi2[k])) for k in np.flatnonzero(has_arrived).tolist()]
 
 
 def _covariance(information: Array) -> Array:
@@ -136,23 +144,25 @@ def _covariance(information: Array) -> Array:
     return inverse
 
 
-def _normal(space: Space, fields: list[Field], at: Array, known: float) -> tuple[float, Array, Array]:
-    """chi2, gradient (n + 1,) and Gauss-Newton matrix (n + 1, n + 1) at a point and an offset."""
+def _normal(space: Space, fields: list[Field], at: Array, known: float) -> tuple[Array, Array, Array]:
+    """chi2 (s,), gradients (s, n + 1) and Gauss-Newton matrices (s, n + 1, n + 1) at points and offsets (s, n + 1)."""
     n = space.dimensions
-    b, h = np.zeros(n + 1), np.zeros((n + 1, n + 1))
-    chi2, b[n], h[n, n] = known * at[n] ** 2, known * at[n], known
+    b, h = np.zeros(at.shape), np.zeros((*at.shape, n + 1))
+    chi2, b[:, n], h[:, n, n] = known * at[:, n] ** 2, known * at[:, n], known
     for kind, turns, sensors, said, whiten in fields:
-        p = np.einsum("kij,ki->kj", turns, at[:n] - sensors)
+        p = np.einsum("kij,ski->skj", turns, at[:, None, :n] - sensors)
         r = seen_as(space, kind, p) - said
         first_angle = 0 if kind == "bearing" else 1
-        r[:, first_angle:] = se2.wrap(r[:, first_angle:])
+        r[..., first_angle:] = se2.wrap(r[..., first_angle:])
         j = np.zeros((*r.shape, n + 1))
         j[..., :n] = gradient(space, kind, p) @ np.swapaxes(turns, 1, 2)
         if kind == "range":
-            r[:, 0] += at[n]
-            j[:, 0, n] = 1.0
-        j, r = whiten @ j, np.einsum("kij,kj->ki", whiten, r)
-        chi2 += float(np.sum(r * r))
-        b += np.einsum("kij,ki->j", j, r)
-        h += np.einsum("kij,kil->jl", j, j)
+            r[..., 0] += at[:, None, n]
+            j[..., 0, n] = 1.0
+        j = (whiten @ j).reshape(len(at), -1, n + 1)
+        r = (whiten @ r[..., None]).reshape(len(at), -1, 1)
+        transposed = np.swapaxes(j, 1, 2)
+        chi2 += np.sum(r * r, axis=(1, 2))
+        b += (transposed @ r)[..., 0]
+        h += transposed @ j
     return chi2, b, h
