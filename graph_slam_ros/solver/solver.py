@@ -456,7 +456,7 @@ class Solver:
         """
         self._grow()
         waiting, tree = self._waiting, self._tree
-        vertices, edges = waiting.vertices, self._weighted(waiting.edges)
+        vertices, edges = waiting.vertices, self._weighted(waiting.edges())
         wanted = self._inside[vertices] & ~self._held[vertices]
         if not wanted.all():
             vertices = vertices[wanted]

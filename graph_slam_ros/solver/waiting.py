@@ -21,29 +21,34 @@ class Waiting:
     Attributes
     ----------
     vertices : that were added
-    edges : that were added or came back, or have another weight or a newly held vertex
+    new, back : edges that were added; that came back, or have another weight or a newly held vertex
     touched : vertices that lost an edge or a neighbour
     loose : whether something that held parts together may be gone
     broken : whether the tree must be made anew
     """
 
     vertices: Index = field(default_factory=_none)
-    edges: Index = field(default_factory=_none)
+    new: Index = field(default_factory=_none)
+    back: list[Index] = field(default_factory=list)
     touched: Index = field(default_factory=_none)
     loose: bool = False
     broken: bool = False
 
     def __bool__(self) -> bool:
-        return bool(len(self.vertices) or len(self.edges) or len(self.touched) or self.broken)
+        return bool(len(self.vertices) or len(self.new) or self.back or len(self.touched) or self.broken)
 
     def add(self, vertices: Index, edges: Index) -> None:
         """New ones."""
         self.vertices = np.concatenate((self.vertices, vertices)) if len(self.vertices) else vertices
-        self.edges = np.concatenate((self.edges, edges)) if len(self.edges) else edges
+        self.new = np.concatenate((self.new, edges)) if len(self.new) else edges
 
     def again(self, edges: Index) -> None:
         """Edges that are to be linearised, whether or not they wait already."""
-        self.edges = np.union1d(self.edges, edges)
+        self.back.append(edges)
+
+    def edges(self) -> Index:
+        """All of them, each once."""
+        return np.unique(np.concatenate((self.new, *self.back))) if self.back else self.new
 
     def touch(self, vertices: Index) -> None:
         """Vertices that lost an edge or a neighbour."""
