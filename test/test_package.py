@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import pytest
 import yaml
+from planted_bugs import BUGS
 
 import graph_slam_ros
 
@@ -155,6 +156,14 @@ def pins(file):
     """Normalised names to the versions that a lock names for them, one for each kind of machine."""
     found = re.findall(r"^([\w.-]+)==([^\s;]+)", (ROOT / file).read_text(), re.MULTILINE)
     return {name: {v for n, v in found if n == name} for name, _ in found}
+
+
+@pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
+def test_each_planted_bug_changes_something_that_is_there(bug):
+    before, after = bug.planted(ROOT)
+    assert all(after[file] != text for file, text in before.items())
+    files = {test.partition("::")[0]: test.partition("::")[2].partition("[")[0] for test in bug.tests}
+    assert all(f"def {name}(" in (ROOT / "test" / file).read_text() for file, name in files.items())
 
 
 def test_both_locks_fit_the_requirements():
