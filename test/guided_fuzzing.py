@@ -97,10 +97,9 @@ def main(name, seconds):
     from graph_slam_ros.warmup import warmup
 
     warmup()
-    with atheris.instrument_imports(include=INSTRUMENTED):
-        pass
     with tempfile.TemporaryDirectory() as folder:
-        run = target(name, Path(folder) / f"input.{name}")
+        with atheris.instrument_imports(include=INSTRUMENTED):
+            run = target(name, Path(folder) / f"input.{name}")
         atheris.Setup([sys.argv[0], f"-max_total_time={seconds}", *LIMITS, str(CORPUS / name)], run)
         atheris.Fuzz()
 
