@@ -16,7 +16,7 @@ from graph_slam_ros.diff import refuse_other_space, shared_landmarks
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.graph import Gaussian
-from graph_slam_ros.run import check_room, record_run, run_config, settled, stopwatch
+from graph_slam_ros.run import check_room, record_run, settled, stopwatch
 from graph_slam_ros.run.map_log import Growth, Record, extend, state_of
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.decisions import landmark_of
@@ -58,16 +58,33 @@ def merge(a: Path, b: Path, out: Path) -> Merged:
     losses: list[str] = []
     one, two = settled(a, losses), settled(b, losses)
     refuse_other_space(one, two, a, b)
+    _refuse_other_datum(one, two, a, b)
     shared = _shared(one, two, a, b)
     aligned = _aligned(one, two, shared)
+    _refuse_same_drive(one, two, a, b)
     state = state_of(one)
     first_edge = state.graph.edge_count
     extend(state, _Second(one, two, aligned, shared).record())
     left_out = {name: aligned.distance(k) for k, name in enumerate(shared) if not aligned.fits[k]}
     chi2 = {one.landmarks[name].vertex: float(aligned.chi2[k]) for k, name in enumerate(shared) if name in left_out}
     _leave_out(state, first_edge, chi2, aligned.limit)
-    _, summary = record_run(out, run_config(a), [Control("optimize")], losses, state, took=took)
+    _, summary = record_run(out, one.config, [Control("optimize")], losses, state, took=took)
     return Merged(summary, summary["losses"], len(shared), left_out)
+
+
+def _refuse_other_datum(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
+    if one.datum and two.datum and one.datum != two.datum:
+        raise GraphSlamError(
+            f"fixes of {a} are from {one.datum}, of {b} from {two.datum}: configure one datum for both"
+        )
+
+
+def _refuse_same_drive(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
+    """What was measured once would count twice."""
+    driven = {(k.stamp_ns, k.T_odom_base) for k in one.keyframes}
+    same = sum((k.stamp_ns, k.T_odom_base) in driven for k in two.keyframes)
+    if same > 1:  # two robots may begin at one time
+        raise GraphSlamError(f"{same} keyframes are of the same drive in {a} and {b}: nothing new is in one of them")
 
 
 def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:
@@ -142,6 +159,7 @@ class _Second:
                 [number[edge], topic, sighting, first + keyframe, self._vertex[vertex], *rest]
                 for edge, topic, sighting, keyframe, vertex, *rest in told.get("seen", ())
             ],
+            "datum": told.get("datum", self._one.datum),
             "offsets": {name: self._vertex[vertex] for name, vertex in told.get("offsets", {}).items()},
         }
 

@@ -13,7 +13,7 @@ from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border
 from graph_slam_ros.ros.inputs import Measured, uses
 from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.ros.survey import with_survey
-from graph_slam_ros.run import check_room, is_run, record_run, run_config, stopwatch
+from graph_slam_ros.run import RunError, check_room, is_run, record_run, run_config, stopwatch
 from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.input_config import InputConfig, default_input
@@ -155,13 +155,14 @@ def replay(
     source : a bag, or a run folder: then exactly its events are repeated, nothing is added
     config : default: the run's own, or the defaults
     """
-    warmup()
     took = stopwatch()
     border = Counters()
     check_room(out, source)
     state = None
     if is_run(source):
-        config = with_survey(config or run_config(source))
+        config, own = with_survey(config or run_config(source)), run_config(source)
+        if config.world != own.world:
+            raise RunError(f"{source}: world.dimensions is {own.world.dimensions} there")
         losses, warnings, total = list[str](), list[str](), 0
         state = read_map(source, losses, start_only=True)
         items: Iterable[Sequence[Measurement]] = ([from_record(record)] for record in read_ingest(source, losses))
@@ -172,6 +173,7 @@ def replay(
         items = _with_end(measurements(bag, inputs, config, border))
         total = sum(bag.topics[topic].count for topic in inputs.by_topic()) + 3
         losses, warnings = bag.losses, bag.warnings
+    warmup()
     one_by_one = chain.from_iterable(progress(items, total))
     slam, summary = record_run(out, config, one_by_one, losses, state, border=border, took=took)
     return Replayed(slam, summary, summary["losses"], warnings)

@@ -275,7 +275,16 @@ def test_the_first_fix_is_the_datum_where_none_is_configured():
     assert (first.kind, first.measured, first.point) == ("position", (0.0, 0.0, 0.0), ())
     # at 48 degrees a degree of latitude is 111.2 km, one of longitude 74.6 km
     assert second.measured == pytest.approx((0.746, 1.112, 2.0), abs=2e-3)
+    assert first.datum == second.datum == (48.0, 11.0, 500.0)
     assert heard(receiver(datum="48 11 400"), "gps", gnss()).measured == pytest.approx((0.0, 0.0, 100.0), abs=1e-6)
+
+
+def test_in_a_map_that_was_taken_up_fixes_are_from_its_datum():
+    b = receiver()
+    b.begin_at((48.0, 11.0, 400.0))
+    fix = heard(b, "gps", gnss())
+    assert fix.measured == pytest.approx((0.0, 0.0, 100.0), abs=1e-6)
+    assert fix.datum == (48.0, 11.0, 400.0)
 
 
 def test_the_covariance_of_a_fix_and_where_its_antenna_sits_are_kept():

@@ -79,15 +79,17 @@ def test_export_as_messages_has_every_pose_at_its_stamp(cut_off, tmp_path):
     assert len(next(iter(bag.messages({"/landmarks_estimate"}))).cdr) > 100 * len(slam.landmarks)
 
 
-def test_export_of_a_map_that_is_cut_is_of_what_is_left_and_tells(cut_off, tmp_path, capsys):
+@pytest.mark.parametrize("what", ["map", "all"])
+def test_export_of_a_map_that_is_cut_is_of_what_is_left_and_tells(what, cut_off, tmp_path, capsys):
     folder, slam = cut_off
     shutil.copytree(folder, tmp_path / "run")
-    whole = (folder / "map.mcap").read_bytes()
-    (tmp_path / "run" / "map.mcap").write_bytes(whole[: len(whole) // 2])
+    for name in ("map.mcap", "ingest.mcap") if what == "all" else ("map.mcap",):
+        whole = (folder / name).read_bytes()
+        (tmp_path / "run" / name).write_bytes(whole[: len(whole) // 2])
     assert run("export", tmp_path / "run", "--to", "tum", "--out", tmp_path / "path.tum") == 3
     assert "lost: " in capsys.readouterr().err
     stamps = [line.split()[0] for line in (tmp_path / "path.tum").read_text().splitlines()]
-    assert 10 < len(stamps) < len(slam.keyframes)
+    assert 10 < len(stamps) < len(slam.keyframes) if what == "all" else len(stamps) == len(slam.keyframes)
     assert stamps[0] == f"{slam.keyframes[0].stamp_ns / 1e9:.9f}"
 
 
@@ -366,6 +368,7 @@ def test_merge_refuses_in_one_line(first, elsewhere, world, tmp_path, capsys):
         (ended(tmp_path / "flight", flight, Config.from_mapping({"world.dimensions": 3})), "world.dimensions"),
         (ended(tmp_path / "surveyed", world, surveyed), "merge"),
         (tmp_path / "none", "none"),
+        (first, "of the same drive"),
     ):
         assert run("merge", first, other, "--out", tmp_path / "out") == 2
         told = capsys.readouterr().err
@@ -489,7 +492,8 @@ def test_a_run_in_a_frozen_map_that_was_cut_off_is_taken_up_with_it_frozen(froze
     assert start.frozen < start.graph.vertex_count
     slam = gone_on(tmp_path / "more", tmp_path / "run", world[len(world) // 2 :])
     assert_untouched(slam, frozen)
-    assert run("merge", frozen, tmp_path / "more", "--out", tmp_path / "merged") == 0
+    other = ended(tmp_path / "other", world)
+    assert run("merge", frozen, other, "--out", tmp_path / "merged") == 0
     assert_untouched(taken_up(tmp_path / "merged", []), frozen)
 
 

@@ -424,7 +424,10 @@ def test_P12_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(t
         if loaded == "frozen":
             freeze(site, tmp_path / "frozen")
         if loaded == "merged":
-            merge(site, site, tmp_path / "merged")
+            drive.go(r, 60, every=3)
+            r.settle()
+            assert r.call("reset").success
+            merge(site, tmp_path / "run-2", tmp_path / "merged")
         assert r.call("load").success
         r.settle()
         assert {m.text for m in r.heard["landmarks"][-1].markers if m.text} == set(TAGS)

@@ -162,7 +162,9 @@ def read_records(folder: Path, name: str, losses: list[str]) -> Iterator[dict[st
     for part, file in enumerate(parts_of(folder, name)):
         if file.name != (due := part_name(name, part)):
             losses.append(f"{due}: not there; what came after was not read")
-        if len(losses) > lost:  # what came after would be out of place
+        if len(losses) > lost:
+            if file.name == due:
+                losses.append(f"{due}: not read, with what came after it: it would be out of place")
             return
         known: set[int] = set()
         expected = 0

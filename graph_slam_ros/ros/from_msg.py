@@ -14,7 +14,7 @@ import numpy as np
 
 from graph_slam_ros.ros.inputs import CONVERTERS, Measured, checks, fixes, uses
 from graph_slam_ros.ros.inputs.checks import MessageError
-from graph_slam_ros.ros.inputs.source import NotYet, Source
+from graph_slam_ros.ros.inputs.source import NotYet, Origin, Source
 from graph_slam_ros.ros.interfaces import typestore
 from graph_slam_ros.ros.transforms import Transforms, pose
 from graph_slam_ros.slam.config import Config
@@ -89,8 +89,10 @@ class Border:
         self._waiting: deque[tuple[Source, Any]] = deque()  # for /tf to tell where their sensors were
         self._types = {TF_STATIC: TRANSFORMS, TF: TRANSFORMS}
         by_name = {settings.name: settings for settings in config.sources}
+        told = (settings.numbers("datum", 3) for settings in config.sources)
+        self._origin = Origin(next(filter(None, told), ()))
         for name, use in uses(config).items():
-            source = self._sources[name] = Source(by_name[name], use, config, self._transforms)
+            source = self._sources[name] = Source(by_name[name], use, config, self._transforms, self._origin)
             self._types[name] = by_name[name].type
             self._convert[name] = partial(CONVERTERS[by_name[name].type][use], source)
         for name, add in ((TF_STATIC, self._add_static), (TF, self._add_moving)):
@@ -134,6 +136,10 @@ class Border:
         """What a geometry_msgs/PoseWithCovarianceStamped of ``initialpose`` says, if it can be used."""
         out: list[Any] = self.take(INITIAL_POSE, cdr)
         return out
+
+    def begin_at(self, datum: tuple[float, ...]) -> None:
+        """Fixes are of a map that begins at this latitude, longitude and height, where no input says another."""
+        self._origin.datum = datum
 
     def forget_time(self) -> None:
         """Stamps begin anew: what /tf has told of moving joints is of another time."""

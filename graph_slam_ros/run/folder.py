@@ -5,8 +5,9 @@ import json
 import re
 import zlib
 from pathlib import Path
+from typing import Any
 
-from graph_slam_ros.errors import ConfigError, GraphSlamError
+from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
 from graph_slam_ros.formats.durable import NEW, sync_folder
 from graph_slam_ros.formats.journal import parts_of, read_ingest
 from graph_slam_ros.formats.parameters import read_parameters
@@ -36,14 +37,25 @@ def is_cut_off(folder: Path) -> bool:
     newest = folder if _holds_something(folder) else earlier[max(earlier)] if earlier else folder
     if not _holds_something(newest):
         return False
-    try:
-        return not json.loads((newest / SUMMARY).read_text(encoding="utf-8"))["ended"]
-    except (OSError, ValueError, LookupError, TypeError):
-        return True
+    return not _told(newest).get("ended")
 
 
 def _holds_something(folder: Path) -> bool:
-    return is_run(folder) and (next(read_ingest(folder, []), None) is not None or grew(folder))
+    if not is_run(folder) or _told(folder).get("keyframes"):
+        return is_run(folder)
+    try:
+        return next(read_ingest(folder, []), None) is not None or grew(folder)
+    except FormatError:  # who knows
+        return True
+
+
+def _told(folder: Path) -> dict[str, Any]:
+    """The summary; nothing where it cannot be read."""
+    try:
+        told = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return told if isinstance(told, dict) else {}
 
 
 def run_config(folder: Path) -> Config:
@@ -59,13 +71,16 @@ def run_config(folder: Path) -> Config:
 
 def changed_since(folder: Path) -> list[str]:
     """Results that are not those that ``run.json`` was written with: of a save that was cut off, or edited since."""
+    told = _told(folder)
     try:
-        files = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["files"]
+        files, parts = told["files"], told.get("parts")
         there = [name for name in sorted(_RESULTS & set(files)) if (folder / name).exists()]
         changed = [name for name in there if checksum((folder / name).read_bytes()) != files[name]]
-    except (OSError, ValueError, LookupError, TypeError):
+        went_on = parts is not None and len(parts_of(folder)) > parts
+    except (OSError, LookupError, TypeError):
         return []
-    return [f"{name} is not the one that {SUMMARY} was saved with" for name in changed]
+    out = [f"{name} is not the one that {SUMMARY} was saved with" for name in changed]
+    return out + ["the run went on after its results were saved: graph_slam recover has those of its end"] * went_on
 
 
 def checksum(data: bytes) -> str:
@@ -100,22 +115,27 @@ def keep_earlier(folder: Path, most: int) -> None:
     if not _holds_something(folder) or not most:
         return
     earlier = earlier_runs(folder)
+    target = folder.with_name(f"{folder.name}-{max(_numbered(folder), default=0) + 1}")
     try:
-        folder.rename(folder.with_name(f"{folder.name}-{max(earlier, default=0) + 1}"))
+        folder.rename(target)
         for number in sorted(earlier)[: max(0, len(earlier) + 1 - most)]:
             _clear(earlier[number])
             with contextlib.suppress(OSError):  # somebody has put more into it
                 earlier[number].rmdir()
     except OSError as error:
-        raise RunError(f"{folder}: {error.strerror}") from None
+        raise RunError(f"{folder}: cannot be moved to {target.name}: {error.strerror}") from None
 
 
 def earlier_runs(folder: Path) -> dict[int, Path]:
     """Earlier runs beside a run folder, by number."""
+    return {number: run for number, run in _numbered(folder).items() if is_run(run)}
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    """Whatever is called as an earlier run is."""
     named = re.compile(re.escape(folder.name) + r"-([1-9]\d*)")
     there = folder.parent.iterdir() if folder.parent.is_dir() else ()
-    found = {int(match[1]): run for run in there if (match := named.fullmatch(run.name))}
-    return {number: run for number, run in found.items() if is_run(run)}
+    return {int(match[1]): run for run in there if (match := named.fullmatch(run.name))}
 
 
 def _is_of_a_start(file: Path) -> bool:

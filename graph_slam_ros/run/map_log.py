@@ -12,6 +12,7 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 * ``landmarks``: by name, vertex, whether without identity, whether tentative, number of sightings, first and last
   stamp, or null where it was given up; ``seen``: of those without identity, each sighting and its edge; ``offsets``: by
   input, the vertex of what its ranges have in common;
+* ``datum``: latitude, longitude and height that fixes are from; ``settings``: parameters that were changed on the way;
 * ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are.
 
 Now and then an ``estimate`` tells all values, end to end. A run that goes on in another's map has that first, as one
@@ -62,6 +63,8 @@ class Growth:
         self._vertices = self._edges = self._judged = self._changes = 0
         self._keyframes = self._segments = self._sightings = self._landmarks = self._offsets = 0
         self._frozen = 0
+        self._datum: tuple[float, ...] = ()
+        self._settings: dict[str, Any] = {}
         self._estimated = 0  # keyframes at the last estimate
         self.first: list[Record] = [{"type": "map", "version": VERSION}]
         if start is not None:
@@ -69,7 +72,9 @@ class Growth:
 
     def of(self, slam: GraphSlam) -> Iterator[Record]:
         """What there is since the last call, and now and then where all of it is thought to be."""
-        yield self.since(slam)
+        changed = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
+        self._settings = dict(slam.settings)
+        yield self.since(slam) | changed
         count = len(slam.keyframes)
         has_jumped = slam.correction.distance_m > _JUMP_M and count > 1.01 * self._estimated
         if has_jumped or count >= _MORE * self._estimated + 1:
@@ -96,6 +101,8 @@ class Growth:
             out["offsets"] = a.range_offsets
         if a.frozen > self._frozen:
             out["frozen"] = [a.frozen, a.ledger.final]
+        if a.datum != self._datum:
+            out["datum"] = self._datum = a.datum
         if keyframes:
             out["stamp_ns"] = keyframes[-1].stamp_ns
         self._vertices, self._edges, self._judged = graph.vertex_count, graph.edge_count, len(a.ledger)
@@ -156,7 +163,7 @@ def state_of(slam: GraphSlam) -> MapState:
     """The map of a pipeline, apart from it."""
     state = MapState()
     extend(state, Growth().since(slam))
-    state.values = slam.solver.values
+    state.values, state.settings = slam.solver.values, dict(slam.settings)
     return state
 
 
@@ -172,33 +179,36 @@ def _fault(state: MapState) -> str:
     kinds = [graph.kinds[code] for code in graph.kind.values.tolist()]
     pose = next((kind for kind in kinds if kind in GROUPS), None)
 
-    def is_index(one: Any, count: int) -> bool:
-        return isinstance(one, int) and 0 <= one < count
-
     def is_instant(stamp_ns: Any, at: tuple[Any, ...]) -> bool:
         numbers = all(isinstance(x, int | float) and math.isfinite(x) for x in at)
-        return is_index(stamp_ns, 2**63) and numbers and pose is not None and len(at) == pose.size
+        return _is_index(stamp_ns, 2**63) and numbers and pose is not None and len(at) == pose.size
 
     for k, one in enumerate(state.keyframes):
-        fits = is_index(one.vertex, len(kinds)) and kinds[one.vertex] is pose
+        fits = _is_index(one.vertex, len(kinds)) and kinds[one.vertex] is pose
         if not (fits and is_instant(one.stamp_ns, one.T_odom_base)):
             return f"keyframe {k} is none"
     for k, seen in enumerate(state.sighting_poses):
-        if not (is_index(seen.keyframe, len(state.keyframes)) and is_instant(seen.stamp_ns, seen.T_keyframe_base)):
+        if not (_is_index(seen.keyframe, len(state.keyframes)) and is_instant(seen.stamp_ns, seen.T_keyframe_base)):
             return f"sighting {k} is none"
     for name, mark in state.landmarks.items():
-        if not all(map(is_index, (mark.vertex, mark.sightings), (len(kinds), 2**31))):
+        if not all(map(_is_index, (mark.vertex, mark.sightings), (len(kinds), 2**31))):
             return f"landmark {name} is none"
-        if not all(is_index(stamp_ns, 2**63) for stamp_ns in (mark.first_seen_ns, mark.last_seen_ns)):
+        if not all(_is_index(stamp_ns, 2**63) for stamp_ns in (mark.first_seen_ns, mark.last_seen_ns)):
             return f"landmark {name} was never seen"
     for name, vertex in state.range_offsets.items():
-        if not (is_index(vertex, len(kinds)) and kinds[vertex] is R1):
+        if not (_is_index(vertex, len(kinds)) and kinds[vertex] is R1):
             return f"the offset of {name} is none"
-    if not all(is_index(one, len(state.keyframes)) for one in state.segments):
+    if not all(_is_index(one, len(state.keyframes)) for one in state.segments):
         return "a segment begins where no keyframe is"
+    if state.datum and not (len(state.datum) == 3 and all(isinstance(x, int | float) for x in state.datum)):
+        return "its datum is none"
     if len(state.ledger) > graph.edge_count:
         return f"{len(state.ledger)} verdicts on {graph.edge_count} edges"
     return "" if np.isfinite(state.values).all() else "an estimate is not finite"
+
+
+def _is_index(one: Any, count: int) -> bool:
+    return isinstance(one, int) and not isinstance(one, bool) and 0 <= one < count
 
 
 # -- what is written --------------------------------------------------------------------------------------------------
@@ -287,8 +297,13 @@ def _grow(state: MapState, record: Mapping[str, Any]) -> None:
     state.sighting_poses += [SightingPose(k, stamp, tuple(pose)) for k, stamp, pose in record.get("sightings", ())]
     _know(state, record)
     state.range_offsets.update(record.get("offsets", {}))
+    state.datum = tuple(record.get("datum", state.datum))
+    state.settings.update(record.get("settings", {}))
     if "frozen" in record:
-        state.frozen, edges = record["frozen"]
+        vertices, edges = record["frozen"]
+        if not (_is_index(vertices, graph.vertex_count + 1) and _is_index(edges, len(ledger) + 1)):
+            raise ValueError(f"frozen {record['frozen']}: more than there is")
+        state.frozen = vertices
         ledger.finish(edges)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.formats.durable import AppendedFile, replaced
-from graph_slam_ros.formats.journal import INGEST, MEASUREMENT, Parts, close_all, part_name
+from graph_slam_ros.formats.journal import INGEST, MEASUREMENT, Parts, close_all, part_name, parts_of
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter
@@ -144,6 +144,7 @@ class RunRecorder:
         """All that can be computed first, then file by file; the summary, the last, tells which belong together."""
         files = {name: self._put(name, text) for name, text in result_texts(slam).items()}
         told = summarize(slam) | summary | {"leverage": leverage(slam.solver) if slam.is_solved else {}, "files": files}
+        told["parts"] = len(parts_of(self.folder))  # more of them: it went on
         self._put(SUMMARY, json.dumps(told, indent=2) + "\n")
 
     def _put(self, name: str, text: str) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.journal import read_ingest
 from graph_slam_ros.run.folder import RunError, check_room, run_config
 from graph_slam_ros.run.map_log import has_map, read_map, state_of
@@ -28,13 +29,26 @@ def map_of(folder: Path, losses: list[str]) -> MapState:
         There is none, or it cannot be read.
     """
     warmup()
-    state = (read_map(folder, losses) if has_map(folder) else None) or _repeated(folder, losses)
+    lost = len(losses)
+    state = read_map(folder, losses) if has_map(folder) else None
+    if state is None or len(losses) > lost:  # what came of the drive may be worse off than what was measured
+        repeated = _repeated(folder, losses)
+        if state is None or len(repeated.keyframes) > len(state.keyframes):
+            state = repeated
     if not state.keyframes:
-        raise RunError(f"{folder.name}: no keyframe, so there is no map")
+        raise RunError(f"{folder}: no keyframe, so there is no map")
     space = run_config(folder).space
     if state.graph.kind_of(state.keyframes[0].vertex) is not space.pose:
-        raise RunError(f"{folder.name}: its map is not in {space.dimensions} dimensions, as its configuration says")
+        raise RunError(f"{folder}: its map is not in {space.dimensions} dimensions, as its configuration says")
     return state
+
+
+def config_of(folder: Path, state: MapState) -> Config:
+    """The configuration of a run when its map was as it is: with what was changed on the way."""
+    try:
+        return run_config(folder).changed(state.settings)
+    except ConfigError as error:
+        raise RunError(f"{folder}: changed on the way: {error}") from None
 
 
 def _repeated(folder: Path, losses: list[str]) -> MapState:
@@ -47,7 +61,10 @@ def _repeated(folder: Path, losses: list[str]) -> MapState:
 
 def taken_up(folder: Path, losses: list[str]) -> GraphSlam:
     """The map of a run, solved; as ``map_of``."""
-    return GraphSlam(run_config(folder), start=map_of(folder, losses))
+    lost = len(losses)
+    state = map_of(folder, losses)
+    losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
+    return GraphSlam(config_of(folder, state), start=state)
 
 
 def settled(folder: Path, losses: list[str]) -> GraphSlam:
@@ -104,7 +121,7 @@ def recover(folder: Path, out: Path) -> Summary:
     check_room(out, folder)
     losses: list[str] = []
     state = map_of(folder, losses)
-    return record_run(out, run_config(folder), (), losses, state, took=took)[1]
+    return record_run(out, config_of(folder, state), (), losses, state, took=took)[1]
 
 
 def freeze(folder: Path, out: Path) -> Summary:
@@ -112,6 +129,7 @@ def freeze(folder: Path, out: Path) -> Summary:
     took = stopwatch()
     check_room(out, folder)
     losses: list[str] = []
-    state = state_of(settled(folder, losses))
+    slam = settled(folder, losses)
+    state = state_of(slam)
     state.freeze()
-    return record_run(out, run_config(folder), [Control("optimize")], losses, state, took=took)[1]
+    return record_run(out, slam.config, [Control("optimize")], losses, state, took=took)[1]

@@ -40,7 +40,7 @@ def result_texts(slam: GraphSlam) -> dict[str, str]:
 
 def summarize(slam: GraphSlam) -> dict[str, Any]:
     """What happened, in numbers."""
-    last = slam.report
+    last = slam.report or (slam.solver.evaluate() if slam.is_solved else None)
     return {
         "version": __version__,
         "keyframes": len(slam.keyframes),

@@ -29,6 +29,12 @@ class Counters:
         """Add all counts of another."""
         self._counts.update(other._counts)
 
+    def since(self, before: "Counters") -> "Counters":
+        """What was counted after there were these."""
+        out = Counters()
+        out._counts = self._counts - before._counts
+        return out
+
     def as_dict(self) -> dict[str, dict[str, int]]:
         """``{source: {reason: times}}``, sorted by name."""
         out: dict[str, dict[str, int]] = {}

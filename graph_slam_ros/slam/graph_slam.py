@@ -118,6 +118,8 @@ class GraphSlam:
         self.solves = 0
         self.report: Report | None = None  # of the last solve of everything
         self.correction = Correction()  # of the last solve
+        self.datum = start.datum if start is not None else ()  # where on earth the map begins, by the first fix
+        self.settings: dict[str, bool | int | float | str] = {}  # parameters that were changed on the way
         self._sink = sink
         self._order = StampOrder(self.config.ordering, self.counters)
         self._odometry = OdometryChoice(
@@ -147,6 +149,8 @@ class GraphSlam:
         """Take one measurement or control event; returns what it changed."""
         if not isinstance(measurement, Control | InitialPose) and not self._order.accepts(measurement):
             return _NOTHING
+        if isinstance(measurement, Fix) and not self._is_of_this_map(measurement):
+            return _NOTHING
         if self._sink is not None:
             self._sink(measurement)
         first_new, solves, report = len(self.keyframes), self.solves, self.report
@@ -174,6 +178,7 @@ class GraphSlam:
                 self.backend.spares_memory = bool(dict(values)["is_short"])
             case Control("set", values):
                 self.config = self.config.changed(dict(values))
+                self.settings |= dict(values)
                 self.solver.settings = self.config.solver_settings()
             case Control(event):
                 self.counters.count("control", f"unknown event {event}")
@@ -295,6 +300,14 @@ class GraphSlam:
     def landmark_changes(self) -> int:
         """How often one has changed."""
         return len(self._landmarks.touched)
+
+    def _is_of_this_map(self, fix: Fix) -> bool:
+        """Whether its numbers are from where all others of the map are."""
+        self.datum = self.datum or fix.datum
+        if fix.datum and fix.datum != self.datum:
+            self.counters.count(fix.topic, "other_datum")
+            return False
+        return True
 
     def _take_up(self, start: MapState) -> None:
         """Solve a map anew, and be nowhere in it yet."""

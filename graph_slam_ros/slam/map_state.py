@@ -1,6 +1,7 @@
 """A map that can be taken up again: all of a run but what was on its way."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ class MapState:
     ----------
     values : stored numbers of all vertices, as ``Graph.initial``: where solving begins
     frozen : the first so many vertices stay there, and verdicts on what is between them as they are
+    datum : of fixes on earth, as in ``Fix``
+    settings : parameters that were changed on the way, by name
     """
 
     graph: Graph = field(default_factory=Graph)
@@ -32,6 +35,8 @@ class MapState:
     landmarks: dict[str, Landmark] = field(default_factory=dict)
     range_offsets: dict[str, int] = field(default_factory=dict)
     frozen: int = 0
+    datum: tuple[float, ...] = ()
+    settings: dict[str, Any] = field(default_factory=dict)
 
     @property
     def vertices(self) -> list[int]:

@@ -70,6 +70,7 @@ class Fix:
     covariance : of ``measured``: of a position in the axes of map, where a variance of 1e6 m^2 or more says that an
         axis is not known; of a pose or attitude in its tangent space
     point : of ``position``, the antenna in the base frame; empty: its origin
+    datum : of a position on earth, latitude [deg], longitude [deg] and height [m] of the map's origin
     """
 
     stamp_ns: int
@@ -78,6 +79,7 @@ class Fix:
     measured: Numbers
     covariance: Numbers
     point: Numbers = ()
+    datum: Numbers = ()
 
 
 @dataclass(frozen=True, slots=True)

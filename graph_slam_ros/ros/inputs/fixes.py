@@ -95,11 +95,12 @@ def gnss(source: Source, m: Any) -> Iterator[Fix]:
     arm = tuple(map(float, se3.position(source.T_base(source.frame(m.header.frame_id), stamp_ns))))[:n]
     block = source.checked(covariance[:n, :n], n)
     here = m.latitude, m.longitude, m.altitude if has_altitude else 0.0
-    datum = source.settings.numbers("datum", 3) or source.state.setdefault("datum", here)
+    source.origin.datum = source.origin.datum or here
+    datum = source.settings.numbers("datum", 3) or source.origin.datum
     measured = east_north_up(here if has_altitude else (*here[:2], datum[2]), datum)
     if max(map(abs, measured)) > _FARTHEST_M:
         raise MessageError("far_from_datum")
-    yield Fix(stamp_ns, source.name, "position", measured[:n], block, arm if any(arm) else ())
+    yield Fix(stamp_ns, source.name, "position", measured[:n], block, arm if any(arm) else (), datum)
 
 
 def east_north_up(here: tuple[float, float, float], datum: tuple[float, ...]) -> tuple[float, float, float]:

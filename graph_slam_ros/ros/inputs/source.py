@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter, deque
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,13 @@ _FLAT = 0.5  # the horizontal part of an x axis that is too short to have a head
 _LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # of a robot that moves in a plane
 
 
+@dataclass(slots=True)
+class Origin:
+    """Where on earth the map begins, for all inputs that do not say it themselves; empty before the first fix."""
+
+    datum: Numbers = ()
+
+
 class NotYet(Exception):
     """/tf may still tell where the sensor was: the message is to be tried again."""
 
@@ -33,6 +41,7 @@ class Source:
     Parameters
     ----------
     use : what the input is used as
+    origin : of the map, which all inputs share
 
     Attributes
     ----------
@@ -42,13 +51,16 @@ class Source:
     unlinked : frames of the last messages that nothing links to the robot
     """
 
-    def __init__(self, settings: InputConfig, use: str, config: Config, transforms: Transforms) -> None:
+    def __init__(
+        self, settings: InputConfig, use: str, config: Config, transforms: Transforms, origin: Origin | None = None
+    ) -> None:
         self.name = settings.name
         self.settings = settings
         self.use = use
         self.config = config
         self.space = config.space
         self.transforms = transforms
+        self.origin = origin or Origin()
         self.tally: Counter[str] = Counter()
         self.hurried = not config.inputs.tf
         self.state: dict[str, Any] = {}

@@ -270,6 +270,8 @@ class Configured:
         def begin() -> str:
             said = job()
             slam = self._session.slam
+            if slam.datum:
+                self._border.begin_at(slam.datum)
             self._outputs.begin(self._node.config, has_map=bool(slam.keyframes))
             self._outputs.publish_due(slam)
             return said

@@ -76,17 +76,21 @@ class Session:
         self._border, self._on_update, self._tell = border, on_update, tell
         self._folder = Path(config.output.folder) if config.output.folder else None
         self.estimate: Estimate | None = None
+        self._recorder: RunRecorder | None = None
         self.was_cut_off = self._folder is not None and is_cut_off(self._folder)
         self._begin()
 
     def _begin(self, start: MapState | None = None) -> None:
-        self._recorder: RunRecorder | None = None
+        recorder: RunRecorder | None = None
         if self._folder is not None:
             keep_earlier(self._folder, self.config.output.keep_earlier)
-            self._recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start)
-        self.recording_fails = False
+            self._recorder, self.recording_fails = None, True  # until there is another
+            recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start)
         self.slam = GraphSlam(self.config, self._sink, in_a_thread, start)
+        self._recorder, self.recording_fails = recorder, False
         self.slam.counters.on_first = self._tell
+        self._refused_before = Counters()
+        self._refused_before.update(self._border)
         self.estimate = None
         self._is_saved, self._is_ended = True, False
         self._loaded = len(self.slam.keyframes)
@@ -185,15 +189,13 @@ class Session:
     def save(self, release: str = "flush") -> str:
         """Release what waits, solve, and write the run folder; returns its name."""
         self._recorded(RunRecorder.wait_synced)  # what the disk refused before is told, and is no reason not to save
+        for event in (release, "optimize") if self._recorder is not None and not self._is_saved else ():
+            self._process(Control(event))
         if self._recorder is None:
             why = "recording was given up" if self._folder else "output.folder is empty"
             raise GraphSlamError(f"{why}: nowhere to save")
-        if not self._is_saved:
-            for event in (release, "optimize"):
-                self._process(Control(event))
-        counters = Counters()
-        for some in (self._border, self.slam.counters):
-            counters.update(some)
+        counters = self._border.since(self._refused_before)
+        counters.update(self.slam.counters)
         ended = release == "end"
         summary = summarize(self.slam) | {"counters": counters.as_dict(), "ended": ended}
         folder = str(self._recorder.save(self.slam, summary))
@@ -202,7 +204,7 @@ class Session:
 
     def reset(self) -> str:
         """Save, keep that, and begin anew."""
-        said = self.finish() or "nothing to save"
+        said = self.finish() or ("recording was given up" if self.recording_fails else "nothing to save")
         self.config = self.slam.config
         self._begin()
         return said
@@ -213,13 +215,15 @@ class Session:
         loaded = run_config(run)
         if loaded.world != self.config.world:
             raise RunError(f"{run.name}: world.dimensions is {loaded.world.dimensions} there")
+        if run == self._folder:
+            self.finish()
         losses: list[str] = []
         start = map_of(run, losses)
         self.finish()
         self.config = self.slam.config
         try:
             self._begin(start)
-        except GraphSlamError:
+        except Exception:
             self._begin()
             raise
         self._recorded(RunRecorder.flush)

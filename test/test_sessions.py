@@ -1,0 +1,184 @@
+"""One run after another in a folder: what one leaves is what the next finds, and nothing is lost on the way."""
+
+import json
+import shutil
+
+import pytest
+
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.journal import RecordWriter, read_ingest
+from graph_slam_ros.merge import merge
+from graph_slam_ros.replay import replay
+from graph_slam_ros.ros.live.session import Session
+from graph_slam_ros.run import RunError, RunRecorder, changed_since, is_cut_off, map_of, recover, run_config
+from graph_slam_ros.run.map_log import read_map
+from graph_slam_ros.simulation import measurements, simulate
+from graph_slam_ros.slam import Config, Control, Counters
+from graph_slam_ros.slam.measurements import Fix
+
+WORLD = tuple(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0)))
+MUNICH, OSLO = (48.0, 11.0, 500.0), (60.0, 11.0, 100.0)
+
+
+def session(folder, border=None, told=None, **config):
+    values = {"output.folder": str(folder)} | {name.replace("__", "."): value for name, value in config.items()}
+    tell = (lambda *_: None) if told is None else (lambda *said: told.append(said))
+    return Session(Config.from_mapping(values), border or Counters(), lambda *_: None, tell)
+
+
+def with_fixes(datum):
+    for m in WORLD[:60]:
+        yield m
+        yield Fix(m.stamp_ns, "gps", "position", (0.0, 0.0), (1.0, 0.0, 0.0, 1.0), (), datum)
+
+
+def test_fixes_from_another_datum_are_refused_also_in_a_map_that_was_taken_up(tmp_path):
+    first = session(tmp_path / "run")
+    first.take(list(with_fixes(MUNICH)))
+    first.abandon()
+    again = session(tmp_path / "run")
+    again.load("")
+    assert again.slam.datum == MUNICH
+    fixes = len(again.slam.graph.edges_of("fixes"))
+    later = WORLD[60:90]
+    for m in later:
+        again.take([m, Fix(m.stamp_ns, "gps", "position", (0.0, 0.0), (1.0, 0.0, 0.0, 1.0), (), OSLO)])
+    again.finish()
+    assert again.slam.counters["gps", "other_datum"] > 20
+    assert len(again.slam.graph.edges_of("fixes")) == fixes > 3
+
+
+def test_maps_whose_fixes_are_from_other_datums_are_not_merged(tmp_path):
+    for name, datum in (("a", MUNICH), ("b", OSLO)):
+        one = session(tmp_path / name)
+        one.take(list(with_fixes(datum)))
+        one.finish()
+    with pytest.raises(Exception, match="configure one datum for both"):
+        merge(tmp_path / "a", tmp_path / "b", tmp_path / "out")
+
+
+def test_what_was_set_on_the_way_is_in_effect_in_what_is_made_of_the_map(tmp_path):
+    one = session(tmp_path / "run")
+    one.take([*WORLD[:50], Control("set", (("robust.gate", 0.5),)), *WORLD[50:90]])
+    one.abandon()
+    assert run_config(tmp_path / "run").robust.gate != 0.5
+    assert read_map(tmp_path / "run", []).settings == {"robust.gate": 0.5}
+    recover(tmp_path / "run", tmp_path / "out")
+    assert run_config(tmp_path / "out").robust.gate == 0.5
+
+
+def test_a_folder_that_only_looks_like_an_earlier_run_is_stepped_over(tmp_path):
+    (tmp_path / "run-1").mkdir()
+    (tmp_path / "run-1" / "notes.txt").write_text("mine")
+    one = session(tmp_path / "run")
+    one.take(WORLD[:60])
+    one.reset()
+    one.finish()
+    assert (tmp_path / "run-1" / "notes.txt").read_text() == "mine"
+    assert json.loads((tmp_path / "run-2" / "run.json").read_text())["keyframes"] > 3
+
+
+def test_a_reset_that_cannot_begin_anew_says_that_nothing_is_recorded(tmp_path, monkeypatch):
+    told = []
+    one = session(tmp_path / "run", told=told)
+    one.take(WORLD[:60])
+    monkeypatch.setattr(RunRecorder, "__init__", lambda *_: (_ for _ in ()).throw(RunError("run: no room")))
+    with pytest.raises(RunError, match="no room"):
+        one.reset()
+    monkeypatch.undo()
+    assert one.recording_fails
+    one.take(WORLD[60:90])
+    assert one.recording_fails
+    assert one.reset() == "recording was given up"
+    assert not one.recording_fails
+    one.take(WORLD[90:120])
+    assert one.finish() == str(tmp_path / "run")
+
+
+def test_counters_of_the_border_are_those_of_the_run(tmp_path):
+    border = Counters()
+    one = session(tmp_path / "run", border)
+    border.count("odom", "nonfinite")
+    one.take(WORLD[:60])
+    one.reset()
+    one.take(WORLD[60:120])
+    one.finish()
+    counters = [json.loads((tmp_path / name / "run.json").read_text())["counters"] for name in ("run-1", "run")]
+    assert ["odom" in some for some in counters] == [True, False]
+
+
+def test_results_are_kept_whose_recordings_are_gone(tmp_path):
+    one = session(tmp_path / "run")
+    one.take(WORLD[:60])
+    one.finish()
+    for name in ("ingest.mcap", "map.mcap"):
+        (tmp_path / "run" / name).write_bytes(b"")
+    session(tmp_path / "run")
+    assert (tmp_path / "run-1" / "path.tum").stat().st_size > 100
+
+
+def test_a_newest_run_that_cannot_be_read_is_kept_and_does_not_stop_the_next(tmp_path):
+    one = session(tmp_path / "run")
+    one.take(WORLD[:60])
+    one.abandon()
+    shutil.copy(tmp_path / "run" / "run.mcap", tmp_path / "run" / "ingest.mcap")
+    session(tmp_path / "run")
+    assert (tmp_path / "run-1" / "map.mcap").is_file()
+
+
+def test_of_a_run_that_went_on_its_results_are_told_to_be_older(tmp_path):
+    one = session(tmp_path / "run")
+    one.take(WORLD[:60])
+    one.save()
+    assert changed_since(tmp_path / "run") == []
+    one.take(WORLD[60:120])
+    one.abandon()
+    (warning,) = changed_since(tmp_path / "run")
+    assert "went on after its results were saved" in warning
+    assert is_cut_off(tmp_path / "run")
+
+
+def test_of_a_map_that_is_half_readable_the_journal_makes_the_rest(tmp_path):
+    one = session(tmp_path / "run")
+    one.take(WORLD[:120])
+    one.abandon()
+    file = tmp_path / "run" / "map.mcap"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    state = map_of(tmp_path / "run", losses := [])
+    assert losses
+    assert len(state.keyframes) == len(one.slam.keyframes)
+
+
+def test_a_part_after_one_that_is_damaged_is_told_to_be_left_out(tmp_path):
+    one = session(tmp_path / "run")
+    one.take(WORLD[:60])
+    one.save()
+    one.take(WORLD[60:120])
+    one.abandon()
+    file = tmp_path / "run" / "ingest.mcap"
+    file.write_bytes(file.read_bytes()[:-3])
+    list(read_ingest(tmp_path / "run", losses := []))
+    assert any("ingest_1.mcap: not read" in loss for loss in losses)
+
+
+@pytest.mark.parametrize("frozen", [["x", 0], [3, "x"], [10**6, 0], [-5, 0], [3, 10**6]])
+def test_a_map_is_frozen_no_farther_than_it_is(frozen, tmp_path):
+    one = session(tmp_path / "run")
+    one.take(WORLD[:60])
+    one.finish()
+    writer = RecordWriter(tmp_path / "run" / "map_1.mcap")
+    writer.write([{"type": "growth", "frozen": frozen}])
+    writer.close()
+    with pytest.raises(FormatError, match=r"run/map\.mcap: record \d+: frozen"):
+        read_map(tmp_path / "run", [])
+
+
+def test_a_replay_in_other_dimensions_is_refused_before_anything_is_replaced(tmp_path):
+    for name in ("run", "out"):
+        one = session(tmp_path / name)
+        one.take(WORLD[:60])
+        one.finish()
+    before = (tmp_path / "out" / "path.tum").read_bytes()
+    with pytest.raises(RunError, match=r"world\.dimensions is 2 there"):
+        replay(tmp_path / "run", tmp_path / "out", Config.from_mapping({"world.dimensions": 3}))
+    assert (tmp_path / "out" / "path.tum").read_bytes() == before
