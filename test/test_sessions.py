@@ -10,7 +10,7 @@ from graph_slam_ros.formats.journal import RecordWriter, read_ingest
 from graph_slam_ros.merge import merge
 from graph_slam_ros.replay import replay
 from graph_slam_ros.ros.live.session import Session
-from graph_slam_ros.run import RunError, RunRecorder, changed_since, is_cut_off, map_of, recover, run_config
+from graph_slam_ros.run import RunError, RunRecorder, changed_since, is_cut_off, recover, run_config
 from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, Counters
@@ -136,17 +136,6 @@ def test_of_a_run_that_went_on_its_results_are_told_to_be_older(tmp_path):
     (warning,) = changed_since(tmp_path / "run")
     assert "went on after its results were saved" in warning
     assert is_cut_off(tmp_path / "run")
-
-
-def test_of_a_map_that_is_half_readable_the_journal_makes_the_rest(tmp_path):
-    one = session(tmp_path / "run")
-    one.take(WORLD[:120])
-    one.abandon()
-    file = tmp_path / "run" / "map.mcap"
-    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    state = map_of(tmp_path / "run", losses := [])
-    assert losses
-    assert len(state.keyframes) == len(one.slam.keyframes)
 
 
 def test_a_part_after_one_that_is_damaged_is_told_to_be_left_out(tmp_path):

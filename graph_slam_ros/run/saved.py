@@ -29,12 +29,7 @@ def map_of(folder: Path, losses: list[str]) -> MapState:
         There is none, or it cannot be read.
     """
     warmup()
-    lost = len(losses)
-    state = read_map(folder, losses) if has_map(folder) else None
-    if state is None or len(losses) > lost:  # what came of the drive may be worse off than what was measured
-        repeated = _repeated(folder, losses)
-        if state is None or len(repeated.keyframes) > len(state.keyframes):
-            state = repeated
+    state = (read_map(folder, losses) if has_map(folder) else None) or _repeated(folder, losses)
     if not state.keyframes:
         raise RunError(f"{folder}: no keyframe, so there is no map")
     space = run_config(folder).space
