@@ -4,6 +4,7 @@ import os
 import re
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections import deque
@@ -288,6 +289,15 @@ class _Told:
 
 def main() -> int:
     """Run the node until it is told to stop; returns the exit code: 0, 1 our fault, 2 refused to start or save."""
+    code = _run()
+    if any(thread.daemon and thread is not threading.current_thread() for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)  # one that still solves would be ended inside compiled code, and abort the process
+    return code
+
+
+def _run() -> int:
     told = _Told()
     sys.setswitchinterval(_SWITCH_S)
     try:
