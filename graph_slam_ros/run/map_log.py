@@ -179,9 +179,11 @@ def _fault(state: MapState) -> str:
     kinds = [graph.kinds[code] for code in graph.kind.values.tolist()]
     pose = next((kind for kind in kinds if kind in GROUPS), None)
 
+    def are_numbers(several: tuple[Any, ...]) -> bool:
+        return all(isinstance(x, int | float) and math.isfinite(x) for x in several)
+
     def is_instant(stamp_ns: Any, at: tuple[Any, ...]) -> bool:
-        numbers = all(isinstance(x, int | float) and math.isfinite(x) for x in at)
-        return _is_index(stamp_ns, 2**63) and numbers and pose is not None and len(at) == pose.size
+        return _is_index(stamp_ns, 2**63) and are_numbers(at) and pose is not None and len(at) == pose.size
 
     for k, one in enumerate(state.keyframes):
         fits = _is_index(one.vertex, len(kinds)) and kinds[one.vertex] is pose
@@ -200,7 +202,7 @@ def _fault(state: MapState) -> str:
             return f"the offset of {name} is none"
     if not all(_is_index(one, len(state.keyframes)) for one in state.segments):
         return "a segment begins where no keyframe is"
-    if state.datum and not (len(state.datum) == 3 and all(isinstance(x, int | float) for x in state.datum)):
+    if state.datum and not (len(state.datum) == 3 and are_numbers(state.datum)):
         return "its datum is none"
     if len(state.ledger) > graph.edge_count:
         return f"{len(state.ledger)} verdicts on {graph.edge_count} edges"
