@@ -32,7 +32,7 @@ class Counters:
     def since(self, before: "Counters") -> "Counters":
         """What was counted after there were these."""
         out = Counters()
-        out._counts = self._counts - before._counts
+        out._counts = Counter(self._counts) - before._counts  # of a copy: another thread may be counting
         return out
 
     def as_dict(self) -> dict[str, dict[str, int]]:
