@@ -132,6 +132,7 @@ def run(recording, folder, settings):
     for m in [*measurements(recording), Control("end"), Control("optimize")]:
         slam.process(m)
     recorder.save(slam)
+    recorder.close()
     return slam
 
 

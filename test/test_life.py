@@ -114,9 +114,9 @@ class Life:
 
     def killed(self):
         """What is in memory is gone."""
-        told, lost = self.acknowledged, self.session
+        told = self.acknowledged
+        self.session._recorder.abandon()
         self.begin()
-        lost._recorder._disk.shutdown()
         if told:
             assert self.session.was_cut_off
             self.session.load("")

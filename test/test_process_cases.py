@@ -4,6 +4,7 @@ The node is in this process, with a thread of its own for its callbacks, so that
 """
 
 import contextlib
+import gc
 import itertools
 import subprocess
 import sys
@@ -95,6 +96,26 @@ def held(slam):
     finally:
         gate.set()
         del solver.update
+
+
+def test_a_node_that_is_destroyed_is_seen_by_nobody_from_then_on():
+    gc.disable()  # which would end what still keeps it
+    try:
+        with robot(of="/gone/graph_slam", hears=()) as r:
+
+            def is_seen():
+                return ("graph_slam", "/gone") in r.node.get_node_names_and_namespaces()
+
+            with inside("/gone"):
+                until(is_seen, r.spin, "node")
+            until(lambda: not is_seen(), r.spin, "end of the node")
+            r.settle(1.0)
+            assert not is_seen()
+        with robot(of="/gone/graph_slam", hears=(), name="later") as r:
+            r.settle(2.0)
+            assert ("graph_slam", "/gone") not in r.node.get_node_names_and_namespaces()
+    finally:
+        gc.enable()
 
 
 def test_P9_where_a_solve_does_not_end_it_says_so_and_transforms_go_on():

@@ -470,6 +470,7 @@ def a_run(folder):
     slam = GraphSlam(sink=recorder.sink)
     slam.process(Odometry(1, (0.0, 0.0, 0.0)))
     recorder.save(slam)
+    recorder.close()
 
 
 @pytest.mark.parametrize("most", [0, 1, 2, 5])

@@ -1,7 +1,11 @@
 """One run after another in a folder: what one leaves is what the next finds, and nothing is lost on the way."""
 
+import errno
+import fcntl
 import json
+import os
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -10,9 +14,9 @@ from graph_slam_ros.formats.journal import RecordWriter, read_ingest
 from graph_slam_ros.merge import merge
 from graph_slam_ros.replay import replay
 from graph_slam_ros.ros.live.session import Session
-from graph_slam_ros.run import RunError, RunRecorder, changed_since, is_cut_off, recover, run_config
+from graph_slam_ros.run import RunError, RunRecorder, changed_since, is_cut_off, is_run, recover, run_config
 from graph_slam_ros.run.map_log import read_map
-from graph_slam_ros.simulation import measurements, simulate
+from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.slam.measurements import Fix
 
@@ -93,6 +97,66 @@ def test_a_reset_that_cannot_begin_anew_says_that_nothing_is_recorded(tmp_path, 
     assert not one.recording_fails
     one.take(WORLD[90:120])
     assert one.finish() == str(tmp_path / "run")
+
+
+def test_a_folder_that_is_being_recorded_into_is_left_alone_by_everybody_else(tmp_path):
+    one = session(tmp_path / "run")
+    one.take(WORLD[:60])
+    bag = tmp_path / "drive.mcap"
+    write_bag(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0), bag)
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    for other in (
+        lambda: session(tmp_path / "run"),
+        lambda: replay(bag, tmp_path / "run"),
+        lambda: RunRecorder(tmp_path / "run", Config()),
+    ):
+        with pytest.raises(RunError, match="another process records there"):
+            other()
+    assert sorted(path.name for path in tmp_path.rglob("*")) == before
+    one.take(WORLD[60:90])
+    one.finish()
+    assert len(read_map(tmp_path / "run", []).keyframes) == len(one.slam.keyframes)
+    session(tmp_path / "run").finish()
+    assert is_run(tmp_path / "run-1")
+
+
+@pytest.mark.parametrize("number", [errno.EOPNOTSUPP, errno.ENOLCK])
+def test_where_the_file_system_has_no_locks_it_is_recorded_all_the_same(tmp_path, monkeypatch, number):
+    def refuse(fd, how):
+        raise OSError(number, "no locks")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    one = session(tmp_path / "run")
+    one.take(WORLD[:60])
+    assert one.finish() == str(tmp_path / "run")
+
+
+def test_whoever_cannot_save_leaves_the_folder_to_the_next(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    one = session(tmp_path / "run")
+    one.take(WORLD[:60])
+    monkeypatch.setattr(os, "pwrite", full)
+    with pytest.raises(RunError, match="No space left"):
+        one.finish()
+    one.abandon()
+    monkeypatch.undo()
+    another = session(tmp_path / "run")
+    another.load("")
+    assert another.slam.keyframes.stamps_ns.tolist() == one.slam.keyframes.stamps_ns.tolist()
+
+
+def test_recordings_that_were_given_up_leave_no_file_open(tmp_path):
+    def is_open():
+        fds = (Path("/proc/self/fd", number) for number in os.listdir("/proc/self/fd"))
+        return any(os.readlink(fd).startswith(str(tmp_path)) for fd in fds if fd.is_symlink())
+
+    one = session(tmp_path / "run")
+    one.take(WORLD[:60])
+    assert is_open()
+    one._recorder.abandon()
+    assert not is_open()
 
 
 def test_counters_of_the_border_are_those_of_the_run(tmp_path):

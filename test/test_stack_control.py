@@ -238,6 +238,18 @@ def test_P6_told_to_stop_at_any_moment_of_its_start_it_ends_with_0_and_may_begin
     check_room(tmp_path / "run")
 
 
+def test_P6_a_second_node_that_would_record_into_the_folder_of_the_first_does_not_start_and_says_why(tmp_path):
+    folder = f"output.folder:={tmp_path / 'run'}"
+    with node(folder) as n, robot(hears=("/diagnostics",)) as r:
+        r.wait_for_node()
+        with node(folder, remap=("__node:=second",)) as second:
+            code, said = second.ended(30.0)
+        assert code == 2
+        assert f"{tmp_path / 'run'}: another process records there" in said
+        assert n.is_alive
+        assert n.stop()[0] == 0
+
+
 def test_P6_told_to_stop_while_kernels_are_compiled_it_does_not_wait_for_them(tmp_path, monkeypatch):
     monkeypatch.setitem(ENVIRONMENT, "GRAPH_SLAM_CACHE", str(tmp_path / "cache"))
     with node(f"output.folder:={tmp_path / 'run'}") as n:

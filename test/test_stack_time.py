@@ -228,7 +228,7 @@ def test_B7_where_that_is_asked_for_a_jump_back_saves_the_run_and_begins_another
     with simulated(tmp_path / "run", "time.on_jump:=reset") as n, robot(hears=HEARS) as r:
         r.wait_for_node()
         played = Played(r)
-        r.until_it_says("OK", spin=played.step, patience_s=30.0)  # the node of the test before may be heard for 20 s
+        r.until_it_says("OK", spin=played.step)
         played.go(60)
         before = r.graph()["keyframes"]
         played.drive.stamp_ns -= 60 * NS

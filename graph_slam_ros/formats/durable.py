@@ -1,6 +1,8 @@
 """Files that outlive whoever writes them: one that only grows, and one that is replaced whole or not at all."""
 
 import contextlib
+import errno
+import fcntl
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -90,6 +92,38 @@ def replaced(path: Path) -> Iterator[Path]:
         new.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Have a folder to oneself among those who ask, until the end of it or of the process.
+
+    Raises
+    ------
+    BlockingIOError
+        Somebody else has it, or it was replaced by another of its name just now.
+    """
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        if not (_locked(fd) and os.path.samestat(os.fstat(fd), folder.stat())):
+            raise BlockingIOError(errno.EWOULDBLOCK, "another process records there")
+        yield
+    finally:
+        os.close(fd)
+
+
+def _locked(fd: int) -> bool:
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in _WITHOUT_LOCKS:
+            raise
+    return True
+
+
+_WITHOUT_LOCKS = errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL  # some network file systems
 
 
 def sync_folder(folder: Path) -> None:

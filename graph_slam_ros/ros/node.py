@@ -152,6 +152,11 @@ class GraphSlamNode(LifecycleNode):
             run, self._run = self._run, None
             run.finish(patience_s)
 
+    def destroy_node(self) -> None:
+        """As rclpy's, and at once: its state machine would keep the node in the graph until it is collected."""
+        super().destroy_node()
+        del self._state_machine
+
     # -- parameters --------------------------------------------------------------------------------------------------
 
     def set_parameters_atomically(self, parameter_list: Any) -> SetParametersResult:

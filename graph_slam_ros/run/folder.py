@@ -4,11 +4,12 @@ import contextlib
 import json
 import re
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
-from graph_slam_ros.formats.durable import NEW, sync_folder
+from graph_slam_ros.formats.durable import NEW, claimed, sync_folder
 from graph_slam_ros.formats.journal import parts_of, read_ingest
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.run.ledger_file import CHANGES, LEDGER
@@ -101,6 +102,9 @@ def check_room(folder: Path, source: Path | None = None) -> None:
             raise RunError(f"{folder}: cannot be read from and written to at once")
         if folder.exists() and not is_run(folder) and not all(map(_is_of_a_start, folder.iterdir())):
             raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
+        if folder.exists():
+            with claimed(folder):
+                pass
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None
 
@@ -117,7 +121,8 @@ def keep_earlier(folder: Path, most: int) -> None:
     earlier = earlier_runs(folder)
     target = folder.with_name(f"{folder.name}-{max(_numbered(folder), default=0) + 1}")
     try:
-        folder.rename(target)
+        with claimed(folder):
+            folder.rename(target)
         for number in sorted(earlier)[: max(0, len(earlier) + 1 - most)]:
             _clear(earlier[number])
             with contextlib.suppress(OSError):  # somebody has put more into it
@@ -143,16 +148,26 @@ def _is_of_a_start(file: Path) -> bool:
     return file.name.removesuffix(NEW) == CONFIG or _RECORDED.fullmatch(file.name) is not None
 
 
-def make_room(folder: Path) -> None:
-    """Make a folder for a run; an earlier one in it is removed. Raises RunError where something else is."""
+@contextlib.contextmanager
+def room(folder: Path) -> Iterator[None]:
+    """Make a folder for a run, and have it for oneself; an earlier run in it is removed.
+
+    Raises
+    ------
+    RunError
+        Something else is there, or somebody else records there.
+    """
     check_room(folder)
-    try:
-        if not folder.exists():
-            folder.mkdir(parents=True)
-            sync_folder(folder.parent)
-        _clear(folder)
-    except OSError as error:
-        raise RunError(f"{folder}: {error.strerror}") from None
+    with contextlib.ExitStack() as held:
+        try:
+            if not folder.exists():
+                folder.mkdir(parents=True, exist_ok=True)
+                sync_folder(folder.parent)
+            held.enter_context(claimed(folder))
+            _clear(folder)
+        except OSError as error:
+            raise RunError(f"{folder}: {error.strerror}") from None
+        yield
 
 
 def _clear(folder: Path) -> None:

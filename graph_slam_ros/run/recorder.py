@@ -3,6 +3,7 @@
 import json
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from graph_slam_ros.formats.journal import INGEST, MEASUREMENT, Parts, close_all
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.run.folder import CONFIG, SUMMARY, RunError, checksum, make_room
+from graph_slam_ros.run.folder import CONFIG, SUMMARY, RunError, checksum, room
 from graph_slam_ros.run.map_log import GROWTH, MAP, Growth
 from graph_slam_ros.run.tables import result_texts, summarize
 from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
@@ -50,13 +51,14 @@ class RunRecorder:
         self._bags = 0
         self._ended_bags: list[AppendedFile] = []
         self._next_path_at = 1.0
-        make_room(self.folder)
+        self._room = ExitStack()
+        self._room.enter_context(room(self.folder))
         self._journal.begin()  # from the start: it makes the folder a run
         try:
             self._journal.flush()
             self._put(CONFIG, parameters_text(config.as_mapping()))
         except OSError as error:
-            self._journal.abandon()
+            self.abandon()
             raise RunError(f"{self.folder}: {error.strerror}") from None
 
     def sink(self, measurement: Measurement) -> None:
@@ -134,7 +136,7 @@ class RunRecorder:
         try:
             if slam.keyframes:
                 self._record_map(slam)
-            self.close()
+            self._end_parts()
             self._save_results(slam, summary or {})
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
@@ -155,13 +157,28 @@ class RunRecorder:
         return checksum(data)
 
     def close(self) -> None:
-        """End the present part of the recording.
+        """End the recording: somebody else may have the folder.
 
         Raises
         ------
         OSError
             What the disk did not take is kept: the next ``flush`` or ``close`` tries again.
         """
+        self._end_parts()
+        self._room.close()
+
+    def abandon(self) -> None:
+        """End the recording as it is on the disk: what waits is lost."""
+        if self._disk is not None:
+            self._disk.shutdown(wait=False)
+        self._journal.abandon()
+        self._map.abandon()
+        for file in [*self._ended_bags, *([self._bag.end()] if self._bag is not None else [])]:
+            file.abandon()
+        self._room.close()
+
+    def _end_parts(self) -> None:
+        """What comes is of the next."""
         self._fill()
         failed = self._syncing.exception() if self._syncing is not None else None
         self._syncing = None

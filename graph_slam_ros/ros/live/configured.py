@@ -108,13 +108,13 @@ class Configured:
         self._hand_over(self._border.finish())
         try:
             if not self._worker.stop(patience_s):
-                self._session.abandon()
                 self._node.get_logger().error(
                     "a solve takes too long to wait for: replay the run folder for its results"
                 )
             elif folder := self._session.finish():
                 self._node.get_logger().info(f"saved {Path(folder).name}")
         finally:
+            self._session.abandon()
             self._outputs.close()
 
     # -- in the main thread: messages --------------------------------------------------------------------------------

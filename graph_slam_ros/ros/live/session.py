@@ -81,13 +81,13 @@ class Session:
         self._begin()
 
     def _begin(self, start: MapState | None = None) -> None:
+        slam = GraphSlam(self.config, self._sink, in_a_thread, start)
         recorder: RunRecorder | None = None
         if self._folder is not None:
             keep_earlier(self._folder, self.config.output.keep_earlier)
             self._recorder, self.recording_fails = None, True  # until there is another
             recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start)
-        self.slam = GraphSlam(self.config, self._sink, in_a_thread, start)
-        self._recorder, self.recording_fails = recorder, False
+        self.slam, self._recorder, self.recording_fails = slam, recorder, False
         self.slam.counters.on_first = self._tell
         self._refused_before = Counters()
         self._refused_before.update(self._border)
@@ -138,6 +138,7 @@ class Session:
                 self._tell("output.folder", error.strerror or type(error).__name__)
             self.recording_fails = True
             if self._recorder.unwritten > _MOST_UNWRITTEN:
+                self._recorder.abandon()
                 self._recorder = None
                 self._tell("output.folder", "recording was given up: too much waits for room")
             return False
@@ -254,9 +255,13 @@ class Session:
         return folder
 
     def abandon(self) -> None:
-        """End the recording as it is: there is no time to save."""
-        if self._recorder is not None:
+        """End the recording as it is, where it was not finished."""
+        if self._recorder is None:
+            return
+        try:
             self._recorder.close()
+        except OSError:  # told when it was to be saved
+            self._recorder.abandon()
 
 
 _MOST_UNWRITTEN = 256 * 2**20  # bytes of the journal: hours of a robot's measurements
