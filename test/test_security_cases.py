@@ -189,9 +189,11 @@ def test_F27_a_name_leads_to_a_run_in_the_data_folder_or_nowhere(folders, hostil
         hostile.load(wanted)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def hostile(folders):
-    return session(folders)
+    s = session(folders)
+    yield s
+    s.finish()
 
 
 def test_F27_a_link_out_of_the_data_folder_is_not_followed_and_a_run_in_it_is_loaded(hostile):

@@ -62,9 +62,9 @@ class Computer:
     def die(self):
         """Nothing is saved; what is told is all that may be known of afterwards."""
         self.failures += self.session.failures
-        lost, told = self.session, self.keyframes
+        told = self.keyframes
+        self.session._recorder.abandon()
         self.start()
-        lost.abandon()
         return told - len(self.session.slam.keyframes)
 
 
