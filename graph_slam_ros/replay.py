@@ -13,7 +13,7 @@ from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border
 from graph_slam_ros.ros.inputs import Measured, uses
 from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.ros.survey import with_survey
-from graph_slam_ros.run import RunError, check_room, is_run, record_run, run_config, stopwatch
+from graph_slam_ros.run import RunError, check_room, is_run, missing, record_run, run_config, stopwatch
 from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.input_config import InputConfig, default_input
@@ -163,7 +163,7 @@ def replay(
         config, own = with_survey(config or run_config(source)), run_config(source)
         if config.world != own.world:
             raise RunError(f"{source}: world.dimensions is {own.world.dimensions} there")
-        losses, warnings, total = list[str](), list[str](), 0
+        losses, warnings, total = missing(source), list[str](), 0
         state = read_map(source, losses, start_only=True)
         items: Iterable[Sequence[Measurement]] = ([from_record(record)] for record in read_ingest(source, losses))
     else:

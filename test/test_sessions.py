@@ -159,6 +159,61 @@ def test_recordings_that_were_given_up_leave_no_file_open(tmp_path):
     assert not is_open()
 
 
+def in_a_map(tmp_path):
+    """A run that begins in the map of an earlier one, saved twice on its way."""
+    first = session(tmp_path / "run")
+    first.take(WORLD[:60])
+    first.finish()
+    one = session(tmp_path / "run")
+    one.load("run-1")
+    for some in (WORLD[60:90], WORLD[90:120]):
+        one.take(some)
+        one.save()
+    one.finish()
+    return tmp_path / "run"
+
+
+def test_where_the_map_is_gone_that_a_run_began_in_it_is_told(tmp_path):
+    run = in_a_map(tmp_path)
+    assert replay(run, tmp_path / "again").losses == []
+    for file in run.glob("map*.mcap"):
+        file.unlink()
+    told = replay(run, tmp_path / "without").losses
+    assert "map.mcap: not there, though the run began in a map: what follows is without it" in told
+    assert recover(run, tmp_path / "recovered")["losses"]
+
+
+@pytest.mark.parametrize("name, make", [("ingest", replay), ("map", recover)])
+def test_where_the_last_part_of_a_recording_is_gone_it_is_told(tmp_path, name, make):
+    run = in_a_map(tmp_path)
+    parts = sorted(run.glob(f"{name}*.mcap"))
+    assert len(parts) > 1
+    parts[-1].unlink()
+    done = make(run, tmp_path / "out")
+    losses = done["losses"] if make is recover else done.losses
+    assert f"{name}: {len(parts)} parts when it was saved, {len(parts) - 1} now" in losses
+
+
+@pytest.mark.parametrize("parts", [3, {"ingest": "x"}, {"map": None, "more": 7}, [], {"ingest": 10**30}])
+def test_a_summary_that_tells_nonsense_of_parts_hurts_nobody(tmp_path, parts):
+    run = in_a_map(tmp_path)
+    told = json.loads((run / "run.json").read_text()) | {"parts": parts}
+    (run / "run.json").write_text(json.dumps(told))
+    assert recover(run, tmp_path / "out")["keyframes"] == told["keyframes"]
+    changed_since(run)
+
+
+def test_the_run_whose_map_is_gone_on_in_stays_however_few_are_kept(tmp_path):
+    run = in_a_map(tmp_path)
+    for _ in range(3):
+        one = session(run, output__keep_earlier=1, output__load="run-1")
+        one.load("run-1")
+        one.take(WORLD[60:90])
+        one.finish()
+    assert is_run(tmp_path / "run-1")
+    assert len(list(tmp_path.glob("run-*"))) == 2
+
+
 def test_counters_of_the_border_are_those_of_the_run(tmp_path):
     border = Counters()
     one = session(tmp_path / "run", border)

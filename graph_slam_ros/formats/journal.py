@@ -19,7 +19,9 @@ from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.mcap_records import records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
-INGEST = "ingest"
+INGEST, MAP = "ingest", "map"
+BEGINS_IN_A_MAP = {"type": "begins_in_a_map"}
+"""The first record of the journal of such a run; its start is in ``map.mcap``."""
 MEASUREMENT = "graph_slam_ros.Measurement"
 _SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}}, "required": ["type"]}).encode()
 
@@ -153,7 +155,11 @@ def parts_of(folder: Path, name: str = INGEST) -> list[Path]:
 
 def read_ingest(folder: Path, losses: list[str]) -> Iterator[dict[str, Any]]:
     """The measurements of a run folder in order of acceptance, as ``read_records`` reads them."""
-    return read_records(folder, INGEST, losses)
+    for record in read_records(folder, INGEST, losses):
+        if record != BEGINS_IN_A_MAP:
+            yield record
+        elif not parts_of(folder, MAP):
+            losses.append(f"{part_name(MAP, 0)}: not there, though the run began in a map: what follows is without it")
 
 
 def read_records(folder: Path, name: str, losses: list[str]) -> Iterator[dict[str, Any]]:

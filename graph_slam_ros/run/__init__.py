@@ -21,6 +21,7 @@ from graph_slam_ros.run.folder import (
     is_cut_off,
     is_run,
     keep_earlier,
+    missing,
     run_config,
 )
 from graph_slam_ros.run.recorder import RunRecorder
@@ -42,6 +43,7 @@ __all__ = [
     "is_run",
     "keep_earlier",
     "map_of",
+    "missing",
     "numbered",
     "record_run",
     "recover",

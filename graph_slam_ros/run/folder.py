@@ -10,7 +10,7 @@ from typing import Any
 
 from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
 from graph_slam_ros.formats.durable import NEW, claimed, sync_folder
-from graph_slam_ros.formats.journal import parts_of, read_ingest
+from graph_slam_ros.formats.journal import INGEST, MAP, parts_of, read_ingest
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.run.ledger_file import CHANGES, LEDGER
 from graph_slam_ros.run.map_log import grew
@@ -72,16 +72,30 @@ def run_config(folder: Path) -> Config:
 
 def changed_since(folder: Path) -> list[str]:
     """Results that are not those that ``run.json`` was written with: of a save that was cut off, or edited since."""
-    told = _told(folder)
     try:
-        files, parts = told["files"], told.get("parts")
+        files = _told(folder)["files"]
         there = [name for name in sorted(_RESULTS & set(files)) if (folder / name).exists()]
         changed = [name for name in there if checksum((folder / name).read_bytes()) != files[name]]
-        went_on = parts is not None and len(parts_of(folder)) > parts
     except (OSError, LookupError, TypeError):
         return []
     out = [f"{name} is not the one that {SUMMARY} was saved with" for name in changed]
-    return out + ["the run went on after its results were saved: graph_slam recover has those of its end"] * went_on
+    if any(now > then for _, then, now in _parts(folder)):
+        out.append("the run went on after its results were saved: graph_slam recover has those of its end")
+    return out
+
+
+def missing(folder: Path) -> list[str]:
+    """Of its recordings, those that have fewer parts than when the run was saved."""
+    return [f"{name}: {then} parts when it was saved, {now} now" for name, then, now in _parts(folder) if now < then]
+
+
+def _parts(folder: Path) -> Iterator[tuple[str, int, int]]:
+    """Of each recording of a run that was saved: how many parts it had then and has now."""
+    parts = _told(folder).get("parts")
+    told: dict[str, Any] = parts if isinstance(parts, dict) else {}
+    for name in (INGEST, MAP):
+        if isinstance(then := told.get(name), int):
+            yield name, then, len(parts_of(folder, name))
 
 
 def checksum(data: bytes) -> str:
@@ -109,11 +123,15 @@ def check_room(folder: Path, source: Path | None = None) -> None:
         raise RunError(f"{folder}: {error.strerror}") from None
 
 
-def keep_earlier(folder: Path, most: int) -> None:
+def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> None:
     """Move an earlier run out of the way: to ``folder-1``, or one more than the last; so many of them are kept.
 
     One that holds nothing is not kept; one that was never ended is in any case. Of older ones the files that a run has
     are removed, and nothing else.
+
+    Parameters
+    ----------
+    loaded : the run whose map is gone on in, or is to be: it stays
     """
     most = max(most, is_cut_off(folder))
     if not _holds_something(folder) or not most:
@@ -124,9 +142,10 @@ def keep_earlier(folder: Path, most: int) -> None:
         with claimed(folder):
             folder.rename(target)
         for number in sorted(earlier)[: max(0, len(earlier) + 1 - most)]:
-            _clear(earlier[number])
-            with contextlib.suppress(OSError):  # somebody has put more into it
-                earlier[number].rmdir()
+            if earlier[number] != loaded:
+                _clear(earlier[number])
+                with contextlib.suppress(OSError):  # somebody has put more into it
+                    earlier[number].rmdir()
     except OSError as error:
         raise RunError(f"{folder}: cannot be moved to {target.name}: {error.strerror}") from None
 

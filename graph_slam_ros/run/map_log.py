@@ -30,7 +30,7 @@ import numpy as np
 
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
-from graph_slam_ros.formats.journal import parts_of, read_records
+from graph_slam_ros.formats.journal import MAP, parts_of, read_records
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3
 from graph_slam_ros.slam import GraphSlam
@@ -41,7 +41,7 @@ from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.measurements import Sighting
 from graph_slam_ros.slam.trail import Keyframe, SightingPose
 
-MAP, GROWTH = "map", "graph_slam_ros.Map"
+GROWTH = "graph_slam_ros.Map"
 VERSION = 1
 _TAGS = {edge_type: tag for tag, edge_type in EDGE_TAGS.items()}
 _KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}

@@ -8,12 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.formats.durable import AppendedFile, replaced
-from graph_slam_ros.formats.journal import INGEST, MEASUREMENT, Parts, close_all, part_name, parts_of
+from graph_slam_ros.formats.journal import (
+    BEGINS_IN_A_MAP,
+    INGEST,
+    MAP,
+    MEASUREMENT,
+    Parts,
+    close_all,
+    part_name,
+    parts_of,
+)
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter
 from graph_slam_ros.run.folder import CONFIG, SUMMARY, RunError, checksum, room
-from graph_slam_ros.run.map_log import GROWTH, MAP, Growth
+from graph_slam_ros.run.map_log import GROWTH, Growth
 from graph_slam_ros.run.tables import result_texts, summarize
 from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.map_state import MapState
@@ -54,6 +63,7 @@ class RunRecorder:
         self._room = ExitStack()
         self._room.enter_context(room(self.folder))
         self._journal.begin()  # from the start: it makes the folder a run
+        self._journal.write([BEGINS_IN_A_MAP] if start is not None else [])
         try:
             self._journal.flush()
             self._put(CONFIG, parameters_text(config.as_mapping()))
@@ -146,7 +156,7 @@ class RunRecorder:
         """All that can be computed first, then file by file; the summary, the last, tells which belong together."""
         files = {name: self._put(name, text) for name, text in result_texts(slam).items()}
         told = summarize(slam) | summary | {"leverage": leverage(slam.solver) if slam.is_solved else {}, "files": files}
-        told["parts"] = len(parts_of(self.folder))  # more of them: it went on
+        told["parts"] = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}  # more of them: it went on
         self._put(SUMMARY, json.dumps(told, indent=2) + "\n")
 
     def _put(self, name: str, text: str) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.journal import read_ingest
-from graph_slam_ros.run.folder import RunError, check_room, run_config
+from graph_slam_ros.run.folder import RunError, check_room, missing, run_config
 from graph_slam_ros.run.map_log import has_map, read_map, state_of
 from graph_slam_ros.run.recorder import RunRecorder
 from graph_slam_ros.run.tables import summarize
@@ -29,6 +29,7 @@ def map_of(folder: Path, losses: list[str]) -> MapState:
         There is none, or it cannot be read.
     """
     warmup()
+    losses += missing(folder)
     state = (read_map(folder, losses) if has_map(folder) else None) or _repeated(folder, losses)
     if not state.keyframes:
         raise RunError(f"{folder}: no keyframe, so there is no map")

@@ -80,11 +80,12 @@ class Session:
         self.was_cut_off = self._folder is not None and is_cut_off(self._folder)
         self._begin()
 
-    def _begin(self, start: MapState | None = None) -> None:
+    def _begin(self, start: MapState | None = None, loaded: Path | None = None) -> None:
         slam = GraphSlam(self.config, self._sink, in_a_thread, start)
         recorder: RunRecorder | None = None
         if self._folder is not None:
-            keep_earlier(self._folder, self.config.output.keep_earlier)
+            named = self._folder.with_name(load) if (load := self.config.output.load) else None
+            keep_earlier(self._folder, self.config.output.keep_earlier, loaded or named)
             self._recorder, self.recording_fails = None, True  # until there is another
             recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start)
         self.slam, self._recorder, self.recording_fails = slam, recorder, False
@@ -223,7 +224,7 @@ class Session:
         self.finish()
         self.config = self.slam.config
         try:
-            self._begin(start)
+            self._begin(start, run)
         except Exception:
             self._begin()
             raise
