@@ -11,7 +11,7 @@ from graph_slam_ros.formats.strict import is_gzipped
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.ros import results, to_msg
 from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.run import RunError, graph_file, numbered, taken_up
+from graph_slam_ros.run import RunError, graph_file, is_run, numbered, taken_up
 from graph_slam_ros.slam import GraphSlam
 
 
@@ -25,6 +25,10 @@ def export(folder: Path, out: Path, target: str, losses: list[str]) -> list[Path
     """
     if out.resolve().parent == folder.resolve():
         raise RunError(f"{out}: cannot be read from and written to at once")
+    if is_run(out.resolve().parent):
+        raise RunError(f"{out}: a run is there, with files of its own")
+    if target == "mcap" and out.suffix != ".mcap":
+        raise RunError(f"{out}: what reads mcap wants a name that ends in .mcap")
     return TARGETS[target](taken_up(folder, losses), out)
 
 

@@ -92,11 +92,15 @@ def test_export_of_a_map_that_is_cut_is_of_what_is_left_and_tells(cut_off, tmp_p
 
 
 def test_export_refuses_in_one_line(whole, tmp_path, capsys):
+    another = tmp_path / "another"
+    shutil.copytree(whole, another)
     before = (whole / "path.tum").read_bytes()
     for words in (
         (whole, "--to", "tum", "--out", whole / "path.tum"),
         (tmp_path, "--to", "tum", "--out", tmp_path / "path.tum"),
         (whole, "--to", "mcap", "--out", tmp_path / "none" / "map.mcap"),
+        (whole, "--to", "mcap", "--out", tmp_path / "map.bag"),
+        (whole, "--to", "g2o", "--out", another / "graph.g2o"),
     ):
         assert run("export", *words) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
