@@ -318,6 +318,34 @@ def test_P4_that_the_disk_did_not_take_it_in_time_is_told_and_does_not_keep_it_f
     assert len(list(read_ingest(tmp_path / "run", []))) > 60
 
 
+def test_P3_a_part_that_begins_while_the_disk_is_still_busy_with_another_is_not_asked_for_too_soon(
+    tmp_path, monkeypatch
+):
+    fsync, flush, begins, told = os.fsync, AppendedFile.flush, threading.Event(), []
+
+    def slow(fd):
+        if threading.current_thread() is not threading.main_thread():
+            assert begins.wait(10.0)
+        fsync(fd)
+
+    def late(file):
+        if file._path.name == "map_1.mcap" and not begins.is_set():
+            begins.set()
+            assert session._recorder._syncing.exception(10.0) is None
+        flush(file)
+
+    session = session_in(tmp_path / "run", told)
+    session.take(recorded()[:60])
+    session.save()
+    monkeypatch.setattr(os, "fsync", slow)
+    monkeypatch.setattr(AppendedFile, "flush", late)
+    session._recorder._due_s = 0.0
+    session.take(recorded()[60:120])
+    assert begins.is_set()
+    session.finish()
+    assert not told
+
+
 def as_read(measurements):
     return [json.loads(json.dumps(to_record(m))) for m in measurements]
 

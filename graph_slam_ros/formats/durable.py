@@ -45,8 +45,9 @@ class AppendedFile:
             del self._waiting[:written]
 
     def sync(self) -> None:
-        """Have the disk take what was flushed. May be called from another thread; raises OSError."""
-        os.fsync(self._fd)
+        """Have the disk take what was flushed, if anything was. May be called from another thread; raises OSError."""
+        if (fd := self._fd) >= 0:
+            os.fsync(fd)
 
     def close(self) -> None:
         """Flush, sync and close. Raises OSError: then it is open still, and may be closed again."""
