@@ -238,7 +238,7 @@ def test_P6_told_to_stop_at_any_moment_of_its_start_it_ends_with_0_and_may_begin
     check_room(tmp_path / "run")
 
 
-def test_P6_a_second_node_that_would_record_into_the_folder_of_the_first_does_not_start_and_says_why(tmp_path):
+def test_P5_a_second_node_that_would_record_into_the_folder_of_the_first_does_not_start_and_says_why(tmp_path):
     folder = f"output.folder:={tmp_path / 'run'}"
     with node(folder) as n, robot(hears=("/diagnostics",)) as r:
         r.wait_for_node()
