@@ -120,7 +120,7 @@ def test_a_folder_that_is_being_recorded_into_is_left_alone_by_everybody_else(tm
     assert is_run(tmp_path / "run-1")
 
 
-@pytest.mark.parametrize("number", [errno.EOPNOTSUPP, errno.ENOLCK])
+@pytest.mark.parametrize("number", [errno.EOPNOTSUPP, errno.ENOLCK, errno.EBADF])
 def test_where_the_file_system_has_no_locks_it_is_recorded_all_the_same(tmp_path, monkeypatch, number):
     def refuse(fd, how):
         raise OSError(number, "no locks")

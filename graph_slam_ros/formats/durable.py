@@ -118,13 +118,9 @@ def _locked(fd: int) -> bool:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    except OSError as error:
-        if error.errno not in _WITHOUT_LOCKS:
-            raise
+    except OSError:  # a file system that has no locks, or none for folders
+        return True
     return True
-
-
-_WITHOUT_LOCKS = errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL  # some network file systems
 
 
 def sync_folder(folder: Path) -> None:
