@@ -106,8 +106,9 @@ def test_a_node_that_is_destroyed_is_seen_by_nobody_from_then_on():
             def is_seen():
                 return ("graph_slam", "/gone") in r.node.get_node_names_and_namespaces()
 
-            with inside("/gone"):
+            with inside("/gone") as slam:
                 until(is_seen, r.spin, "node")
+                slam.destroy_node()  # and once more at the end
             until(lambda: not is_seen(), r.spin, "end of the node")
             r.settle(1.0)
             assert not is_seen()

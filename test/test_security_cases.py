@@ -317,7 +317,9 @@ def running():
 
 def until_steady(node, want):
     """(publications, subscriptions, services) of the running node, once they are as wanted or patience has ended."""
-    deadline, found = time.monotonic() + 3 * PATIENCE_S, interfaces(node)  # it may still be starting
+    from live_nodes import lenient
+
+    deadline, found = time.monotonic() + lenient(PATIENCE_S), interfaces(node)  # it may still be starting
     while any(w is not None and w != f for w, f in zip(want, found, strict=True)) and time.monotonic() < deadline:
         time.sleep(0.05)
         found = interfaces(node)

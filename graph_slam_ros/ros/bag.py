@@ -364,6 +364,10 @@ class BagWriter:
         self._writer.finish()
         return self._file
 
+    def abandon(self) -> None:
+        """Close the file as it is on the disk, without an index: what waits is lost."""
+        self._file.abandon()
+
     def close(self) -> None:
         """Write the index and close the file."""
         self.end().close()

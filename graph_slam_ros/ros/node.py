@@ -155,7 +155,7 @@ class GraphSlamNode(LifecycleNode):
     def destroy_node(self) -> None:
         """As rclpy's, and at once: its state machine would keep the node in the graph until it is collected."""
         super().destroy_node()
-        del self._state_machine
+        self._state_machine = None
 
     # -- parameters --------------------------------------------------------------------------------------------------
 

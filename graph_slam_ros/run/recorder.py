@@ -183,8 +183,10 @@ class RunRecorder:
             self._disk.shutdown(wait=False)
         self._journal.abandon()
         self._map.abandon()
-        for file in [*self._ended_bags, *([self._bag.end()] if self._bag is not None else [])]:
-            file.abandon()
+        for bag in self._ended_bags:
+            bag.abandon()
+        if self._bag is not None:
+            self._bag.abandon()
         self._room.close()
 
     def _end_parts(self) -> None:

@@ -137,16 +137,24 @@ class Backend:
         Its loss lets go of what is far off. Only where nothing has told yet how good odometry is may it pull with all
         its weight: later that would bend the map for whatever is false and just possible.
         """
+        before = self.solver.values
         for _ in range(_UPDATES):
             self.solver.update()
             if self.decisions.fit(admitted):
-                return
+                break
+        if self._rose_since(before):  # an update's steps may overshoot where much turns; everything at once does not
+            self.solver.start_at(before)
+        elif self.decisions.fit(admitted):
+            return
         settings = self.solver.settings
         pulling = [] if self.decisions.is_calibrated else [Loss()]
         losses = {label: [*pulling, stages[-1]] for label, stages in settings.losses.items()}
         self.solver.optimize(replace(settings, losses=losses))
         if self.decisions.refuse_unfit(admitted, keyframe):
             self.solver.update()
+
+    def _rose_since(self, before: Array) -> bool:
+        return self.solver.evaluate().cost_final > self.solver.evaluate(at=before).cost_final
 
     def _looked(self, look: Work) -> Outcome | None:
         """What a second look has found; nothing where it failed, which changes nothing."""

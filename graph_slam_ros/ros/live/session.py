@@ -226,7 +226,7 @@ class Session:
         try:
             self._begin(start, run)
         except Exception:
-            self._begin()
+            self._begin(loaded=run)
             raise
         self._recorded(RunRecorder.flush)
         self._look(Update(), 0.0)
