@@ -488,6 +488,20 @@ def test_marginals_asked_for_before_an_update_do_not_keep_it_from_the_optimum():
     assert off_by(solver) < 1e-6
 
 
+def test_what_a_marginal_has_moved_far_is_linearised_anew_before_it_is_built_upon():
+    solver = chain(12)
+    graph = solver.graph
+    bent = graph.add_edge(RELATIVE_POSE, [5, 6], [0.0, 1.0, 1.5], Gaussian.from_sigmas(0.01, 0.01, 0.01), "closures")
+    solver.add([], [bent])
+    solver.optimize()
+    solver.set_weight(bent, 0.0)
+    solver.marginal([11])  # all is straight again
+    added = append(solver, 12)
+    solver.update()
+    assert solver.chi2_of(added)[0].max() < 1e-6
+    assert off_by(solver) < 1e-3
+
+
 def _square(x, at, measured):
     """``r = x^2 - z``: no measurement of minus one can be met, and at zero it tells nothing."""
     here = x[at[:, 0]]

@@ -420,11 +420,7 @@ class Solver:
             raise GraphSlamError(f"vertex {int(wanted[~self._inside[wanted]][0])} is not in the problem")
         if not self._held[wanted].all():
             if self._waiting or not self._settled:
-                arriving = self._arriving()
-                with self._transaction(*arriving):
-                    moved, _ = self._take_in(*arriving)
-                self._keep(moved)
-                self._schedule.note(moved)
+                self.update()
             if (self._tree.vertex[wanted[~self._held[wanted]], CLIQUE] == NOTHING).any():
                 raise GraphSlamError("a covariance was asked for within an update")
         return wanted
