@@ -34,6 +34,7 @@ from graph_slam_ros.solver.tree import (
     LINK_NEXT,
     LINKS,
     LIVE,
+    LIVE_MADE,
     LOCAL,
     MEMBERS_TOP,
     MEMBERS_WANTED,
@@ -190,7 +191,7 @@ def deactivate(t: Tree, edges: Index) -> None:
 def reset(t: Tree, unknowns: Index) -> None:
     """Forget order and cliques: all unknowns are new."""
     vertex, region, state = t.vertex, t.region, t.state
-    state[CLIQUES] = state[MEMBERS_TOP] = state[FRONTS_TOP] = state[LIVE] = 0
+    state[CLIQUES] = state[MEMBERS_TOP] = state[FRONTS_TOP] = state[LIVE] = state[LIVE_MADE] = 0
     state[FREE_CLIQUE] = NOTHING
     state[REGIONS], state[FREE_REGION] = 1, NOTHING
     region[0, :] = NOTHING
@@ -291,7 +292,9 @@ def _restructure(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
         return False, touched
     release(t, marked)
     state[AFFECTED] += len(order)
-    return True, build(t, order, start, later, group, last, size, orphans)
+    cliques = build(t, order, start, later, group, last, size, orphans)
+    state[LIVE_MADE] = state[LIVE_MADE] or state[LIVE]
+    return True, cliques
 
 
 def restructure(tree: Tree, touched: Index, new: Index) -> tuple[Tree, Index]:

@@ -4,7 +4,8 @@ Regions form a binary tree. The vertices of an inner region separate those of it
 after both: a path from any vertex to the root is short, and an update touches little. The newest vertices, the
 *tail*, come last of all in order of time, so that the next odometry edge meets the root. When the tail is long its
 older part moves down, each vertex into the deepest region that keeps the separation true. A region whose subtree has
-grown too much is dissected anew; that is paid for by what was added to it.
+grown too much is dissected anew; that is paid for by what was added to it. So is all of it when the numbers of its
+fronts have grown as much: by lap after lap along the same places they grow faster than the vertices.
 """
 
 import numpy as np
@@ -25,6 +26,8 @@ from graph_slam_ros.solver.tree import (
     LINK,
     LINK_EDGE,
     LINK_NEXT,
+    LIVE,
+    LIVE_MADE,
     LOCAL,
     NEXT,
     NOTHING,
@@ -104,6 +107,8 @@ def move_tail(t: Tree, touched: Index) -> Index:
             ):
                 overgrown = r
             r = region[r, R_PARENT]
+    if state[LIVE] > GROWTH * state[LIVE_MADE] > 0:
+        overgrown = 0
     touched = np.concatenate((touched, neighbourhood(t, moving)))
     if overgrown != NOTHING:
         touched = np.concatenate((touched, dissect(t, overgrown)))
@@ -254,6 +259,8 @@ def dissect(t: Tree, region: int) -> Index:
     """Divide a subtree anew, from its vertices and the edges among them; returns the vertices."""
     t_region = t.region
     vertices = _clear(t, region)
+    if region == 0:
+        t.state[LIVE_MADE] = 0  # it is told when there are cliques
     start, neighbour, strength, weight = _graph_of(t, vertices)
     n = len(vertices)
     part = np.arange(n)
