@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.solver.tree import TAIL_LEAST
+from graph_slam_ros.solver.waiting import NONE
 
 Index = NDArray[np.int64]
 
@@ -15,11 +16,13 @@ class Schedule:
 
     def __init__(self) -> None:
         self._moved: list[Index] = []
+        self._unseen = NONE
         self._updates = 0
 
     def note(self, moved: Index) -> None:
-        """Vertices that moved beside what an update takes in."""
+        """Vertices that moved after the last look of an update: the next looks at them."""
         self._moved.append(moved)
+        self._unseen = moved
 
     def hasten(self, every: int) -> None:
         """Have the present update look among all."""
@@ -30,10 +33,11 @@ class Schedule:
 
         After so many updates among all that moved since, sooner if much moved anyway; else among what this one moved.
         """
-        self.note(moved)
+        self._moved.append(moved)
         self._updates += 1
         if self._updates * (3 if len(moved) > TAIL_LEAST else 2) < 2 * every:
-            return moved, _BY_FAR
+            unseen, self._unseen = self._unseen, NONE
+            return np.union1d(moved, unseen) if len(unseen) else moved, _BY_FAR
         moved = np.unique(np.concatenate(self._moved))
-        self._moved, self._updates = [], 0
+        self._moved, self._unseen, self._updates = [], NONE, 0
         return moved, 1.0
