@@ -53,7 +53,7 @@ class Settings:
     relinearize_error : or when its step squared is more than so many standard deviations of its strongest measurement
     relinearize_every : that is looked for at every so many updates, or after two thirds of these at one that closes a
         loop; steps ten times as large are at any
-    relinearize_passes : how often at most within one update
+    relinearize_passes : how often at most within one update; after the first time for steps as large as that
     tolerance : online, changes of a step up to this are not followed [m, rad]
     tolerance_sigmas : nor are those up to so many standard deviations of the vertex given its neighbours
     """
@@ -66,7 +66,7 @@ class Settings:
     relinearize_above: float = 0.05
     relinearize_error: float = 0.1
     relinearize_every: int = 10
-    relinearize_passes: int = 1
+    relinearize_passes: int = 5
     tolerance: float = 1e-5
     tolerance_sigmas: float = 1e-3
 

@@ -8,7 +8,7 @@ from graph_slam_ros.solver.waiting import NONE
 
 Index = NDArray[np.int64]
 
-_BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
+BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
 
 
 class Schedule:
@@ -37,7 +37,7 @@ class Schedule:
         self._updates += 1
         if self._updates * (3 if len(moved) > TAIL_LEAST else 2) < 2 * every:
             unseen, self._unseen = self._unseen, NONE
-            return np.union1d(moved, unseen) if len(unseen) else moved, _BY_FAR
+            return np.union1d(moved, unseen) if len(unseen) else moved, BY_FAR
         moved = np.unique(np.concatenate(self._moved))
         self._moved, self._unseen, self._updates = [], NONE, 0
         return moved, 1.0

@@ -26,7 +26,7 @@ from graph_slam_ros.solver.linearization import (
 )
 from graph_slam_ros.solver.numeric import keep, settle
 from graph_slam_ros.solver.report import Change, Report
-from graph_slam_ros.solver.schedule import Schedule
+from graph_slam_ros.solver.schedule import BY_FAR, Schedule
 from graph_slam_ros.solver.stages import Stages
 from graph_slam_ros.solver.symbolic import compact
 from graph_slam_ros.solver.tree import (
@@ -535,7 +535,7 @@ class Solver:
             if failed != NOTHING:
                 raise undetermined(failed)
             self._schedule.note(moved)
-            far = 1.0
+            far = BY_FAR
             yield len(edges), moved
 
     def _forget_numbers(self) -> None:
