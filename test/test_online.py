@@ -488,6 +488,20 @@ def test_marginals_asked_for_before_an_update_do_not_keep_it_from_the_optimum():
     assert off_by(solver) < 1e-6
 
 
+def test_what_was_asked_after_a_batch_changes_nothing_that_comes_later():
+    asked, silent = chain(30), chain(30)
+    for solver in (asked, silent):
+        solver.add([], [solver.graph.add_edge(RELATIVE_POSE, [0, 29], [28.0, 3.0, 0.4], PLANAR, "closures")])
+        solver.optimize()
+    assert not asked.is_current
+    asked.marginal([29])
+    for k in range(30, 60):
+        for solver in (asked, silent):
+            append(solver, k, *([k - 20] if k % 7 == 0 else []))
+            solver.update()
+    assert np.array_equal(asked.values, silent.values)
+
+
 @pytest.mark.parametrize("way", ["update", "marginal"])
 def test_what_has_moved_far_is_linearised_anew_where_it_is_built_upon(way):
     solver, sure = chain(12), Gaussian.from_sigmas(0.01, 0.01, 0.01)

@@ -419,8 +419,13 @@ class Solver:
         if not self._inside[wanted].all():
             raise GraphSlamError(f"vertex {int(wanted[~self._inside[wanted]][0])} is not in the problem")
         if not self._held[wanted].all():
-            if self._waiting or not self._settled:
+            if self._waiting:
                 self.update()
+            elif not self._settled:
+                arriving = self._arriving()
+                with self._transaction(*arriving):
+                    moved, _ = self._take_in(*arriving)
+                self._keep(moved)
             if (self._tree.vertex[wanted[~self._held[wanted]], CLIQUE] == NOTHING).any():
                 raise GraphSlamError("a covariance was asked for within an update")
         return wanted
