@@ -70,7 +70,8 @@ def test_what_is_read_back_is_what_there_was(run):
 def test_it_is_solved_to_where_it_was(run):
     folder, slam = run
     again = GraphSlam(run_config(folder), start=read_map(folder, []))
-    exact = slam.report.converged and again.report.converged  # by range alone both creep along a valley, till they stop
+    # by range alone both creep along a valley, and may stop anywhere in it
+    exact = not slam.range_offsets or (slam.report.converged and again.report.converged)
     if exact:
         assert again.trajectory() == pytest.approx(slam.trajectory(), abs=1e-6)
     else:
