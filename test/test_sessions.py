@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from graph_slam_ros.errors import FormatError
+from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats.journal import RecordWriter, read_ingest
 from graph_slam_ros.merge import merge
 from graph_slam_ros.replay import replay
@@ -18,6 +18,7 @@ from graph_slam_ros.run import RunError, RunRecorder, changed_since, is_cut_off,
 from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, Counters
+from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.measurements import Fix
 
 WORLD = tuple(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0)))
@@ -212,6 +213,22 @@ def test_the_run_whose_map_is_gone_on_in_stays_however_few_are_kept(tmp_path):
         one.finish()
     assert is_run(tmp_path / "run-1")
     assert len(list(tmp_path.glob("run-*"))) == 2
+
+
+def test_a_map_that_cannot_be_gone_on_in_stays_however_few_are_kept(tmp_path, monkeypatch):
+    run = in_a_map(tmp_path)
+    one = session(run, output__keep_earlier=2)
+    one.take(WORLD[60:90])
+
+    def refused(*_):
+        raise GraphSlamError("no solution")
+
+    with monkeypatch.context() as patch, pytest.raises(GraphSlamError, match="no solution"):
+        patch.setattr(Backend, "take_up", refused)
+        one.load("run-1")
+    assert is_run(tmp_path / "run-1")
+    one.take(WORLD[90:120])
+    assert one.finish() == str(run)
 
 
 def test_counters_of_the_border_are_those_of_the_run(tmp_path):
