@@ -116,6 +116,7 @@ def _use_all() -> None:
     for method in METHODS:
         solver.start_at(graph.initial.values)
         solver.optimize(Settings(method))
+    SE2.retract(np.zeros((1, 3)), np.zeros((1, 3)))
     se2.noise_during((1.0, 0.0, 0.1), np.eye(3))
     se2.propagate_during(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))
     se2.propagate(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))

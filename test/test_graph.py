@@ -183,11 +183,20 @@ def test_a_step_between_two_values_leads_from_one_to_the_other(kind):
 def test_a_column_keeps_its_rows_while_it_grows():
     column, rows = Column(np.float64, 2), np.arange(2000.0).reshape(-1, 2)
     for start, end in itertools.pairwise([0, 1, 3, 16, 17, 40, 700, 1000]):
-        column.extend(rows[start:end], end - start)
+        Column.extend((column, rows[start:end], end - start))
         assert len(column) == end
         assert np.array_equal(column.values, rows[:end])
-    column.extend(-1.0, 2)
+    Column.extend((column, -1.0, 2))
     assert np.array_equal(column.values[-3:], [rows[-1], [-1, -1], [-1, -1]])
+
+
+def test_several_columns_grow_together_or_not_at_all():
+    first, second = Column(np.int64), Column(np.float64, 2)
+    Column.extend((first, [1, 2], 2), (second, [[1.0, 2.0], [3.0, 4.0]], 2))
+    with pytest.raises(ValueError, match="broadcast"):
+        Column.extend((first, [3, 4, 5], 3), (second, np.zeros((3, 7)), 3))
+    assert first.values.tolist() == [1, 2]
+    assert second.values.tolist() == [[1.0, 2.0], [3.0, 4.0]]
 
 
 def test_ids_are_dense_and_records_stay_where_they_were_put():

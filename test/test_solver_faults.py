@@ -3,10 +3,12 @@
 import contextlib
 import math
 import os
+import random
 import resource
 import signal
 import time
 import traceback
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -245,6 +247,34 @@ def test_P21_a_fault_of_one_measurement_costs_none_of_those_that_are_released_wi
     assert len(p.keyframes) == 5
 
 
+@pytest.mark.parametrize("label", ["odometry", "landmarks"])
+def test_T13_a_vertex_that_came_without_its_edge_costs_one_solve(label):
+    p, raised = pipeline(), 0
+    add_edge = p.graph.add_edge
+
+    def faulty(*arguments):
+        if label in arguments and p.graph.vertex_count > 5:
+            p.graph.add_edge = add_edge
+            raise MemoryError("injected")
+        return add_edge(*arguments)
+
+    p.graph.add_edge = faulty
+    for m in many(0, 30):
+        if isinstance(m, Sightings):  # of another landmark each time
+            m = replace(m, sightings=(replace(m.sightings[0], id=str(m.stamp_ns)),))
+        try:
+            p.process(m)
+        except MemoryError:
+            raised += 1
+    assert (raised, p.failing) == (1, "")
+    assert p.counters.as_dict() == {"solver": {"GaugeError": 1}}
+    run(p, END)
+    assert len(p.keyframes) == 30
+    assert len(p.landmarks) == (30 if label == "odometry" else 29)
+    true = {m.stamp_ns: m.T_odom_base for m in many(0, 30) if isinstance(m, Odometry)}
+    assert is_where_it_was(p, [true[stamp_ns] for stamp_ns in p.keyframes.stamps_ns.tolist()])
+
+
 def fails():
     raise MemoryError("injected")
 
@@ -259,55 +289,72 @@ def test_a_second_look_that_fails_changes_nothing_and_is_counted(clean):
 
 # -- memory ------------------------------------------------------------------------------------------------------------
 
-BAD, RAISED_ONLY, DEGRADED, FINE = 1, 10, 11, 12
-PIECE = 1 << 16
+BAD, RAISED_ONLY, DEGRADED, FINE = 5, 10, 11, 12
 
 
-def squeezed(p, measurements, more):
-    """In a child: go on with so many pieces of memory and no more, then with enough; how that went, as an exit code."""
+def squeezed(p, measurements, seed):
+    """In a child: go on with hardly any memory, then with enough; how that went, as an exit code.
+
+    Pieces of less than 4 KiB are not taken away: without them Python itself ends.
+    """
+    rng = random.Random(seed)
     good, code, ballast = p.trajectory(), FINE, []
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     unlimited = resource.getrlimit(resource.RLIMIT_AS)[1]
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize(), unlimited))
-    with contextlib.suppress(MemoryError):
-        while True:
-            ballast.append(bytearray(PIECE))
-    del ballast[len(ballast) - more :]
+    limit = pages * resource.getpagesize() + rng.choice([0, 1 << 20, 1 << 22])
+    resource.setrlimit(resource.RLIMIT_AS, (limit, unlimited))
+    for size in sorted((1 << rng.randrange(12, 21) for _ in range(3)), reverse=True):
+        with contextlib.suppress(MemoryError):
+            while True:
+                ballast.append(bytearray(size))
+    for _ in range(min(rng.choice([1, 3, 10, 30, 100]), len(ballast))):
+        del ballast[rng.randrange(len(ballast))]
     for m in measurements[:-20]:
+        if rng.random() < 0.05 and ballast:
+            del ballast[rng.randrange(len(ballast))]
         try:
             p.process(m)
             code = min(code, DEGRADED if p.failing else FINE)
-        except MemoryError:  # what the node counts, and goes on
+        except (MemoryError, SystemError):  # what the node counts, and goes on; compiled code raises either
             code = RAISED_ONLY
     resource.setrlimit(resource.RLIMIT_AS, (unlimited, unlimited))
     del ballast
-    if not np.isfinite(p.trajectory()).all() or np.abs(p.trajectory()[: len(good)] - good).max() > 1.0:
+    if not is_where_it_was(p, good):
         return BAD
     for m in measurements[-20:]:
         p.process(m)
-    return code if not p.failing and np.isfinite(p.trajectory()).all() else BAD + 1
+    return code if not p.failing and is_where_it_was(p, good) else BAD + 1
+
+
+def is_where_it_was(p, good):
+    """Headings that differ by whole turns are the same."""
+    now = p.trajectory()
+    away = [np.abs(se2.between(tuple(a), tuple(b))).max() for a, b in zip(good, now[: len(good)], strict=True)]
+    return bool(np.isfinite(now).all()) and max(away) < 0.01
 
 
 def test_T13_without_memory_a_solve_fails_and_with_memory_again_it_goes_on():
-    """In children of this process, each with a little more memory than the last."""
+    """In children of this process, of which each lacks other memory."""
     p = run(pipeline(), many(0, 600))
-    measurements, codes = [*many(600, 660), *END], []
-    for k in range(times(64, 1000)):
+    measurements, codes = [*many(600, 660), *END], {}
+    for seed in range(times(64, 1000)):
         child = os.fork()
         if not child:
             code = BAD + 2
             try:
                 signal.alarm(60)
-                code = squeezed(p, measurements, k % 24)
+                code = squeezed(p, measurements, seed)
             except BaseException:
                 traceback.print_exc()
             finally:
                 os._exit(code)
         _, status = os.waitpid(child, 0)
-        codes.append(os.waitstatus_to_exitcode(status))
-    tell("out_of_memory", tried=len(codes), faults=sum(c in (RAISED_ONLY, DEGRADED) for c in codes), failed=0)
-    assert {RAISED_ONLY, DEGRADED, FINE} >= set(codes)
-    assert set(codes) > {FINE}, "or nothing is shown"
+        codes[seed] = os.waitstatus_to_exitcode(status)
+    failed = {seed: code for seed, code in codes.items() if code not in (RAISED_ONLY, DEGRADED, FINE)}
+    faults = sum(code in (RAISED_ONLY, DEGRADED) for code in codes.values())
+    tell("out_of_memory", tried=len(codes), faults=faults, failed=len(failed))
+    assert not failed
+    assert set(codes.values()) == {RAISED_ONLY, DEGRADED, FINE}, "or not all is shown"
 
 
 def many(first, end):

@@ -35,15 +35,25 @@ class Column:
         """The rows so far, a view."""
         return self._buffer[: self._length]
 
-    def extend(self, rows: ArrayLike, count: int) -> None:
-        """Append ``count`` rows; one row (or a scalar) is repeated."""
+    @staticmethod
+    def extend(*parts: tuple["Column", ArrayLike, int]) -> None:
+        """Append to columns, each so many rows (one row, or a scalar, is repeated): to all of them, or to none.
+
+        Half a record would put all later ones out of step.
+        """
+        ends = [column._put(rows, count) for column, rows, count in parts]
+        for (column, _, _), end in zip(parts, ends, strict=True):
+            column._length = end
+
+    def _put(self, rows: ArrayLike, count: int) -> int:
+        """Write beyond the end, where nobody sees it; returns where that ends."""
         end = self._length + count
         if end > len(self._buffer):
             grown = np.empty((max(end, 2 * len(self._buffer)), *self._buffer.shape[1:]), dtype=self._buffer.dtype)
             grown[: self._length] = self.values
             self._buffer = grown
         self._buffer[self._length : end] = rows
-        self._length = end
+        return end
 
 
 def whole_numbers(ids: ArrayLike, what: str) -> Index:
@@ -138,9 +148,11 @@ class Graph:
         ids = np.arange(self.vertex_count, self.vertex_count + count)
         if kind not in self.kinds:
             self.kinds.append(kind)
-        self.kind.extend(self.kinds.index(kind), count)
-        self.offset.extend(start + kind.size * np.arange(count), count)
-        self.initial.extend(rows.ravel(), rows.size)
+        Column.extend(
+            (self.kind, self.kinds.index(kind), count),
+            (self.offset, start + kind.size * np.arange(count), count),
+            (self.initial, rows.ravel(), rows.size),
+        )
         return ids
 
     def add_vertex(self, kind: VertexKind, value: ArrayLike) -> int:
@@ -170,18 +182,21 @@ class Graph:
         self._check(edge, at, z, noise)
         table = self.tables.get(edge)
         if table is None:
-            table = self.tables[edge] = EdgeTable(edge, len(self.tables))
-            self._in_order.append(table)
+            table = EdgeTable(edge, len(self.tables))
+            self._in_order[table.code :] = [table]  # also where this was interrupted before
+            self.tables[edge] = table
         ids, count = np.arange(self.edge_count, self.edge_count + len(at)), len(at)
-        self.table_of_edge.extend(table.code, count)
-        self.row_of_edge.extend(np.arange(len(table), len(table) + count), count)
-        table.id.extend(ids, count)
-        table.vertices.extend(at, count)
-        table.measured.extend(z, count)
-        table.sqrt_information.extend(noise.sqrt_information, count)
-        table.label.extend(_code(self.labels, label), count)
-        table.source.extend(_code(self.sources, source), count)
-        table.weight.extend(1.0, count)
+        Column.extend(
+            (self.table_of_edge, table.code, count),
+            (self.row_of_edge, np.arange(len(table), len(table) + count), count),
+            (table.id, ids, count),
+            (table.vertices, at, count),
+            (table.measured, z, count),
+            (table.sqrt_information, noise.sqrt_information, count),
+            (table.label, _code(self.labels, label), count),
+            (table.source, _code(self.sources, source), count),
+            (table.weight, 1.0, count),
+        )
         return ids
 
     def add_edge(

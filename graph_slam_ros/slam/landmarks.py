@@ -188,9 +188,10 @@ class Landmarks:
     def _offset(self, topic: str) -> int:
         """The vertex of what all ranges of a topic have in common."""
         if topic not in self.offsets:
-            vertex = self.offsets[topic] = self._graph.add_vertex(R1, [0.0])
+            vertex = self._graph.add_vertex(R1, [0.0])
             noise = Gaussian.from_sigmas(self._config.landmarks.range_offset_sigma_m)
             self._graph.add_edge(POINT_PRIOR[R1], [vertex], [0.0], noise, "range_offset")
+            self.offsets[topic] = vertex
         return self.offsets[topic]
 
     # -- taken back ----------------------------------------------------------------------------------------------

@@ -108,14 +108,16 @@ class Ledger:
         """
         count = len(statistic)
         ids = np.arange(len(self), len(self) + count)
-        self.verdict.extend(np.where(judged, Verdict.ACCEPTED, Verdict.NOT_EVALUATED), count)
-        self.reason.extend(Reason.NONE, count)
-        self.keyframe.extend(keyframe, count)
-        self.statistic.extend(statistic, count)
-        self.threshold.extend(threshold, count)
-        self.numbers.extend(numbers, count)
-        self._residual_at.extend(len(self._residual) + np.cumsum(numbers) - numbers, count)
-        self._residual.extend(residuals, len(residuals))
+        Column.extend(
+            (self.verdict, np.where(judged, Verdict.ACCEPTED, Verdict.NOT_EVALUATED), count),
+            (self.reason, Reason.NONE, count),
+            (self.keyframe, keyframe, count),
+            (self.statistic, statistic, count),
+            (self.threshold, threshold, count),
+            (self.numbers, numbers, count),
+            (self._residual_at, len(self._residual) + np.cumsum(numbers) - numbers, count),
+            (self._residual, residuals, len(residuals)),
+        )
         return ids
 
     def hold_back(self, edge: int) -> None:

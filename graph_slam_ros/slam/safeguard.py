@@ -72,7 +72,7 @@ class Safeguard:
     def go_back(self) -> None:
         """Have the last good estimate, in a solver that is made anew."""
         self._solver.start_at(self._last_good())
-        with suppress(MemoryError):  # it is good without
+        with suppress(Exception):  # e.g. no memory for it: the estimate is good without
             self._solver.rebuild()
 
     def _done(self, work: Callable[[], Result]) -> Result:
@@ -86,6 +86,18 @@ class Safeguard:
         self.failing = said(error)
         self._in_a_row += 1
         self.go_back()
+        self._drop_unmeasured()
+
+    def _drop_unmeasured(self) -> None:
+        """Take out vertices that a fault parted from the edges they were added for: nothing tells where they are."""
+        vertices = self._solver.vertices
+        unmeasured = set(vertices[vertices >= self._good_vertices].tolist())
+        for edge in range(self._good_edges, self._graph.edge_count):
+            table, row = self._graph.row(edge)
+            unmeasured.difference_update(table.vertices.values[row].tolist())
+        for vertex in unmeasured:
+            self._solver.remove(vertex)
+        self._on_gone(unmeasured)
 
     def _last_good(self) -> Array:
         """What is newer than the last good estimate is where it was put by it."""

@@ -46,9 +46,7 @@ class Track(Generic[Instant]):
 
     def append(self, id_: int, stamp_ns: int, pose: Numbers) -> None:
         """Add an instant."""
-        self._id.extend(id_, 1)
-        self._stamp_ns.extend(stamp_ns, 1)
-        self._pose.extend(pose, 1)
+        Column.extend((self._id, id_, 1), (self._stamp_ns, stamp_ns, 1), (self._pose, pose, 1))
 
     def __len__(self) -> int:
         return len(self._id)

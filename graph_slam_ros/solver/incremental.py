@@ -189,8 +189,10 @@ def deactivate(t: Tree, edges: Index) -> None:
 
 @kernel
 def reset(t: Tree, unknowns: Index) -> None:
-    """Forget order and cliques: all unknowns are new."""
+    """Forget order and cliques, and what a call that failed left in the scratch: all unknowns are new."""
     vertex, region, state = t.vertex, t.region, t.state
+    vertex[:, LOCAL] = NOTHING
+    t.edge[:, TAKEN] = 0
     state[CLIQUES] = state[MEMBERS_TOP] = state[FRONTS_TOP] = state[LIVE] = state[LIVE_MADE] = 0
     state[FREE_CLIQUE] = NOTHING
     state[REGIONS], state[FREE_REGION] = 1, NOTHING

@@ -24,7 +24,7 @@ def leverage(solver: Solver) -> dict[str, float]:
     for table, rows in rows_of(graph, solver.edges).items():
         for code, label in enumerate(graph.labels):
             of_class = rows[table.label.values[rows] == code]
-            looked_at = of_class[:: max(1, -(-len(of_class) // _MOST))]
+            looked_at = of_class[:: max(1, -(-len(of_class) // _MOST))].copy()  # the layout kernels are compiled for
             for block in linearize(graph, solver.values, {table: looked_at}, losses):
                 for jacobian, ends in zip(block.jacobian, table.vertices.values[block.rows], strict=True):
                     covariance = solver.joint_marginal(ends)

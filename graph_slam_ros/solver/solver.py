@@ -327,7 +327,8 @@ class Solver:
         """
         wanted = self._certain(ids)
         free = wanted[~self._held[wanted]]
-        numbers = marginals(self._tree, free) if len(free) else np.empty(0)
+        with self._looking():
+            numbers = marginals(self._tree, free) if len(free) else np.empty(0)
         out, at = [], 0
         for vertex in wanted.tolist():
             dof = self.graph.kind_of(vertex).dof
@@ -348,7 +349,8 @@ class Solver:
         out = np.zeros((int(dof.sum()), int(dof.sum())))
         if free.any():
             at = np.flatnonzero(np.repeat(free, dof))
-            out[np.ix_(at, at)] = joint(self._tree, wanted[free])
+            with self._looking():
+                out[np.ix_(at, at)] = joint(self._tree, wanted[free])
         return out
 
     def information_matrix(self) -> Array:
@@ -482,11 +484,20 @@ class Solver:
             yield
         except BaseException:
             waiting.broken, self._stages.young, self._settled = True, NONE, True
-            incremental.leave(self._tree, vertices, edges)
-            self._set_estimate(self._kept)
             tree.state[TAIL_FIRST] = tree.state[TAIL_END] = 0  # it is filled anew with the tree
+            self._set_estimate(self._kept)
+            incremental.leave(self._tree, vertices, edges)  # the last: it needs memory
             raise
         self._waiting = Waiting()
+
+    @contextmanager
+    def _looking(self) -> Iterator[None]:
+        """What fails leaves its scratch in the tree, which is made anew at the next update."""
+        try:
+            yield
+        except BaseException:
+            self._waiting.broken = True
+            raise
 
     def _keep(self, moved: Index) -> None:
         """The estimates of vertices are those to come back to."""

@@ -39,8 +39,9 @@ class Waiting:
 
     def add(self, vertices: Index, edges: Index) -> None:
         """New ones."""
-        self.vertices = np.concatenate((self.vertices, vertices)) if len(self.vertices) else vertices
-        self.new = np.concatenate((self.new, edges)) if len(self.new) else edges
+        all_vertices = np.concatenate((self.vertices, vertices)) if len(self.vertices) else vertices
+        all_new = np.concatenate((self.new, edges)) if len(self.new) else edges
+        self.vertices, self.new = all_vertices, all_new  # both, or where memory lacks neither
 
     def again(self, edges: Index) -> None:
         """Edges that are to be linearised, whether or not they wait already."""
