@@ -268,8 +268,8 @@ def test_landmarks_come_on_the_way_about_every_20_keyframes(session):
     assert at == sorted(at)
     assert 1 < len(set(at)) <= 2 + len(saved) / 20
     known = [sum(bool(m.text) for m in message.markers) for message in session["on_the_way"]]
-    assert known[0] > 0
-    assert known == sorted(known)
+    assert known == sorted(known), "at first perhaps that there are none"
+    assert known[-1] > 0
 
 
 def test_transforms_lead_from_map_to_odom_at_stamps_that_strictly_increase(session):
