@@ -37,7 +37,7 @@ demo: install
 	@$(BIN)/graph_slam demo
 
 test: install lint
-	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist worksteal
 
 soak: install $(VENV)-fuzz/stamp
 	$(BIN)/python test/soak.py $(subst $(comma), ,$(ONLY))

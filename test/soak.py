@@ -35,6 +35,7 @@ PROGRAMMES = {
     "messages": tests("test/test_any_message.py"),
     "permutations": tests("test/test_timing_cases.py", "-k", "B1"),
     "solver_faults": tests("test/test_solver_faults.py", "test/test_graph_cases.py"),
+    "recorded": tests("test/test_recorded.py"),
     "fuzzing": tests("test/test_fuzzing.py"),
     "kernels": tests("test/test_kernels.py"),
     **{f"guided_{name}": guided(name) for name in ("g2o", "yaml", "cdr", "journal")},
