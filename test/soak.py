@@ -32,7 +32,7 @@ PROGRAMMES = {
     "mutated_bags": tests("test/test_mutated_recordings.py"),
     "soak": tests("test/test_soak.py"),
     "journal": tests("test/test_journal.py"),
-    "messages": tests("test/test_any_message.py"),
+    "messages": tests("test/test_any_message.py", "test/test_any_measurement.py"),
     "permutations": tests("test/test_timing_cases.py", "-k", "B1"),
     "solver_faults": tests("test/test_solver_faults.py", "test/test_graph_cases.py"),
     "recorded": tests("test/test_recorded.py"),

@@ -20,6 +20,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.ledger import Reason, Verdict
 from graph_slam_ros.slam.measurements import Closure
+from graph_slam_ros.solver.tree import LOCAL, NOTHING, TAKEN
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -273,6 +274,24 @@ def test_T13_a_vertex_that_came_without_its_edge_costs_one_solve(label):
     assert len(p.landmarks) == (30 if label == "odometry" else 29)
     true = {m.stamp_ns: m.T_odom_base for m in many(0, 30) if isinstance(m, Odometry)}
     assert is_where_it_was(p, [true[stamp_ns] for stamp_ns in p.keyframes.stamps_ns.tolist()])
+
+
+@pytest.mark.parametrize("method", ["marginals", "joint"])
+def test_T13_what_a_covariance_that_fails_left_in_the_tree_does_no_harm(method, monkeypatch):
+    p = run(pipeline(), (*drive(0), *END))
+    solver, vertices = p.solver, p.keyframes.ids.tolist()
+    before = solver.joint_marginal(vertices)
+
+    def faulty(tree, ids):
+        tree.vertex[ids, LOCAL], tree.edge[:, TAKEN] = 10**6, 1
+        raise MemoryError("injected")
+
+    with monkeypatch.context() as patch, pytest.raises(MemoryError, match="injected"):
+        patch.setattr(f"graph_slam_ros.solver.solver.{method}", faulty)
+        solver.marginal(vertices) if method == "marginals" else solver.joint_marginal(vertices)
+    assert solver.joint_marginal(vertices) == pytest.approx(before, rel=1e-6, abs=1e-12)
+    assert (solver._tree.vertex[: p.graph.vertex_count, LOCAL] == NOTHING).all()
+    assert not solver._tree.edge[: p.graph.edge_count, TAKEN].any()
 
 
 def fails():
