@@ -168,7 +168,7 @@ def test_sightings_that_wait_for_odometry_are_bounded():
 
 
 def test_an_unknown_control_event_is_counted():
-    assert run(slam(), Control("dance")).counters.as_dict() == {"control": {"unknown event dance": 1}}
+    assert run(slam(), Control("dance")).counters.as_dict() == {"control": {"unknown_event": 1}}
 
 
 # -- keyframes and motion -------------------------------------------------------------------------------------------

@@ -234,7 +234,7 @@ def test_a_pose_without_covariance_needs_configured_noise():
     cdr = posed(POSE_STAMPED, pose(3.0, 4.0, 0.0, quaternion(yaw=0.5)))
     b = located(type_name=POSE_STAMPED)
     assert heard(b, "mocap", cdr) is None
-    assert counted(b) == {"mocap": {"covariance_unknown": 1}}
+    assert counted(b) == {"mocap": {"noise_unknown": 1}}
     m = heard(located(type_name=POSE_STAMPED, sigma_m=0.2), "mocap", cdr)
     assert (m.kind, m.covariance) == ("position", pytest.approx((0.04, 0, 0, 0.04)))
     m = heard(located(type_name=POSE_STAMPED, sigma_m=0.2, sigma_rad=0.1), "mocap", cdr)

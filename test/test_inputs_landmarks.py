@@ -108,7 +108,7 @@ def test_a_range_alone_is_a_range():
         (lambda: cloud(XYZ, (math.nan, 2.0, 3.0, 4, 0.1)), "nonfinite"),
         (lambda: cloud(XYZ, (1.0, 2.0, 3.0, 4, math.nan)), "nonfinite_covariance"),
         (lambda: cloud([("id", "u4"), ("range", "f8")], (1, -2.0)), "range_not_positive"),
-        (lambda: cloud([("id", "u4"), ("bearing", "f8")], (1, 0.2)), "covariance_unknown"),
+        (lambda: cloud([("id", "u4"), ("bearing", "f8")], (1, 0.2)), "noise_unknown"),
     ],
 )
 def test_a_cloud_that_cannot_be_used_is_counted_under_its_reason(sent, reason):

@@ -163,8 +163,8 @@ def test_A7_zero_covariance_means_unknown():
     for _ in range(2):
         assert heard(b, "odom", odometry(twist=np.zeros((3, 3)))).twist_covariance is None, "the densities are used"
     assert counted(b) == {"detections": {"covariance_unknown": 1}, "odom": {"covariance_unknown": 2}}
-    none_of(posing(), "pose", posed(POSE, pose(1.0, 2.0), covariance=np.zeros((6, 6))), "covariance_unknown")
-    none_of(compass(3), "imu", imu(quaternion(), np.zeros((3, 3))), "covariance_unknown")
+    none_of(posing(), "pose", posed(POSE, pose(1.0, 2.0), covariance=np.zeros((6, 6))), "noise_unknown")
+    none_of(compass(3), "imu", imu(quaternion(), np.zeros((3, 3))), "noise_unknown")
     assert heard(compass(2, sigma_rad=0.1), "imu", imu(quaternion(), np.zeros((3, 3)))).covariance == pytest.approx(
         (0.01,)
     )
@@ -497,7 +497,7 @@ def test_A28_of_a_robot_that_leaves_the_plane_the_projection_is_used_and_it_is_c
     "fields, reason",
     [
         ({"status": -1}, "no_fix"),
-        ({"kind": 0}, "covariance_unknown"),
+        ({"kind": 0}, "noise_unknown"),
         ({"latitude": 91.0}, "not_on_earth"),
         ({"longitude": 361.0}, "not_on_earth"),
         ({"latitude": 0.0, "longitude": 0.0}, "no_position"),
@@ -537,7 +537,7 @@ def test_A32_a_closure_from_where_there_was_no_odometry_is_refused():
     [
         ({"name": str(STAMP_NS)}, "closure_with_itself"),
         ({"name": "5", "results": 0}, "no_result"),
-        ({"name": "5", "covariance": np.zeros((6, 6))}, "covariance_unknown"),
+        ({"name": "5", "covariance": np.zeros((6, 6))}, "noise_unknown"),
     ],
 )
 def test_A33_a_closure_with_itself_or_of_nothing_is_refused_and_the_others_of_its_message_are_not(found, reason):

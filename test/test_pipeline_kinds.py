@@ -244,7 +244,7 @@ def test_an_attitude_holds_roll_and_pitch_and_is_refused_in_the_plane():
     planar = slam(PLANE)
     planar.process(Odometry(stamp(0), (0.0, 0.0, 0.0)))
     planar.process(Fix(stamp(0), "imu", "attitude", (0.0, 0.0, 0.0, 1.0), covariance(3)))
-    assert planar.counters.as_dict() == {"imu": {"attitude_not_in_the_plane": 1}}
+    assert planar.counters.as_dict() == {"imu": {"not_in_this_space": 1}}
 
 
 @BOTH

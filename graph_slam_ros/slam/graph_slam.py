@@ -180,8 +180,8 @@ class GraphSlam:
                 self.config = self.config.changed(dict(values))
                 self.settings |= dict(values)
                 self.solver.settings = self.config.solver_settings()
-            case Control(event):
-                self.counters.count("control", f"unknown event {event}")
+            case Control():
+                self.counters.count("control", "unknown_event")
         if len(self.keyframes) == first_new and self.solves == solves:
             return _NOTHING
         new = self.report if self.report is not report else None

@@ -40,7 +40,7 @@ class PoseEdges:
         """A prior on a keyframe; of a position that lacks some axes, one on each principal axis that is known."""
         space, vertices, topic = self._space, [where.vertex], m.topic
         if m.kind not in space.fixes:
-            self._counters.count(topic, f"{m.kind}_not_in_the_plane")
+            self._counters.count(topic, "not_in_this_space")
             return
         carried = carry.fix(space, m, where, T_map_keyframe)
         n = space.dimensions

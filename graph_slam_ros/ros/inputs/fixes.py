@@ -134,7 +134,7 @@ def imu(source: Source, m: Any) -> Iterator[Fix]:
     plane = source.space.dimensions == 2
     if source.settings.noise == "sigmas" or not (covariance[2:, 2:] if plane else covariance).any():
         if source.settings.sigma_rad == 0.0:
-            raise MessageError("covariance_unknown")
+            raise MessageError("noise_unknown")
         covariance = np.eye(3) * source.settings.sigma_rad**2
     if not np.isfinite(covariance).all():
         raise MessageError("nonfinite_covariance")
@@ -179,7 +179,7 @@ def _closure(source: Source, stamp_ns: int, frame: str, one: Any) -> Closure:
     T_frame_earlier = pose(at.pose.position, source.unit(at.pose.orientation))
     covariance = source.pose_covariance(at.covariance, 0.0)
     if not source.block(covariance).any():
-        raise MessageError("covariance_unknown")
+        raise MessageError("noise_unknown")
     T_base_earlier = se3.compose(T_base_frame, T_frame_earlier)
     # T exp(d) inverted is T^-1 exp(-Ad(T) d)
     into_base = se3.adjoint(T_base_earlier)

@@ -146,7 +146,7 @@ def _polar(
         if sigma == 0.0:
             out[k] = source.sigma_m(measured[0]) if has_range and k == 0 else source.settings.sigma_rad
             if out[k] == 0.0:
-                raise MessageError("covariance_unknown")
+                raise MessageError("noise_unknown")
             if told:
                 source.count("covariance_unknown")
     if source.space.dimensions == 2 and kind != "range":

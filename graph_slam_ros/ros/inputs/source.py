@@ -189,7 +189,7 @@ class Source:
         if sigma_m == 0.0 and self.use == "landmarks":
             sigma_m = self.config.landmarks.sigma_m
         if sigma_m == 0.0:
-            raise MessageError("covariance_unknown")
+            raise MessageError("noise_unknown")
         return sigma_m + self.settings.sigma_per_m * distance_m
 
     def checked(self, block: Array, lengths: int, distance_m: float = 0.0) -> Numbers:

@@ -1,0 +1,207 @@
+"""Every reason under which something is counted: what it does to a message, what it means, and what mends it.
+
+``Counters`` count by (source, reason). Live diagnostics, the table at the end of a replay and docs/troubleshooting.md
+all explain a reason by its row here.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Effect(Enum):
+    """What a reason does to what was measured."""
+
+    REFUSED = "refused"
+    """It is not used, and something is lost."""
+    REPAIRED = "repaired"
+    """It is used after a change."""
+    NOTED = "noted"
+    """Nothing is lost: a repetition, what the parameters ask for, or an event."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """One row of the table.
+
+    Attributes
+    ----------
+    meaning : what has happened, in one sentence without a full stop
+    remedy : the parameter or command that mends it, where ``INPUT`` is the name of the input; empty where nothing is
+        to be done
+    """
+
+    effect: Effect
+    meaning: str
+    remedy: str = ""
+
+
+_REFUSED, _REPAIRED, _NOTED = Effect.REFUSED, Effect.REPAIRED, Effect.NOTED
+_COVARIANCE = "correct the driver's covariance, or INPUT.noise=sigmas with INPUT.sigma_m and INPUT.sigma_rad"
+_SIGMAS = "INPUT.sigma_m, INPUT.sigma_rad: its standard deviations; of closures with INPUT.noise=sigmas"
+_FRAMES = "publish the transform on /tf_static, or INPUT.mount, or frames.base as the recording names it"
+_SPACE = "world.dimensions=3"
+
+REASONS: dict[str, Reason] = {
+    # -- stamps and order
+    "bad_stamp": Reason(
+        _REFUSED, "the stamp is negative or has 1e9 nanoseconds or more", "correct the driver's stamps"
+    ),
+    "zero_stamp": Reason(_REFUSED, "the stamp is zero", "have the driver fill in header.stamp"),
+    "late": Reason(
+        _REFUSED,
+        "it came after newer messages that had been used already",
+        "ordering.window_s for odometry, ordering.late_s for all else, INPUT.offset_s for a clock that differs",
+    ),
+    "future": Reason(
+        _REFUSED,
+        "the stamp is ahead of the node's clock by more than time.future_s",
+        "use_sim_time for a recording, INPUT.offset_s for a clock that differs",
+    ),
+    "before_jump": Reason(_REFUSED, "it was sent before the clock jumped back and arrived after"),
+    "before_odometry": Reason(
+        _REFUSED, "it is older than all odometry", "begin with odometry; INPUT.offset_s for a clock that differs"
+    ),
+    "after_odometry": Reason(
+        _REFUSED, "it is newer than the last odometry", "end with odometry; INPUT.offset_s for a clock that differs"
+    ),
+    "overflow": Reason(_REFUSED, "too many messages waited", "inputs.queue of a node, ordering.max_waiting"),
+    "duplicate": Reason(_NOTED, "the same message has come before"),
+    "duplicate_stamp": Reason(
+        _REFUSED,
+        "odometry says two different things for one stamp",
+        "one publisher for each odometry topic: ros2 topic info -v TOPIC",
+    ),
+    "sent_again": Reason(_NOTED, "the transform was sent before with the same stamp"),
+    # -- frames
+    "frame_slash_stripped": Reason(_REPAIRED, "the name of a frame began with a slash"),
+    "frame_empty": Reason(_REFUSED, "the message names no frame", "INPUT.frame, or INPUT.mount"),
+    "frame_in_itself": Reason(_REFUSED, "a frame is its own parent", "correct the driver's frame names"),
+    "frame_unknown": Reason(_REFUSED, "no transform links the message's frame to the robot", _FRAMES),
+    "child_frame_unknown": Reason(_REFUSED, "no transform links the message's child frame to the robot", _FRAMES),
+    # -- numbers
+    "undecodable": Reason(_REFUSED, "the bytes are not a message of this type", "INPUT.type, or record it again"),
+    "nonfinite": Reason(_REFUSED, "a number is NaN or infinite", "correct the driver"),
+    "too_far": Reason(_REFUSED, "a coordinate is beyond 1e9 m", "correct the driver"),
+    "quaternion_normalized": Reason(_REPAIRED, "the quaternion was not quite of length one"),
+    "zero_quaternion": Reason(_REFUSED, "the quaternion is zero", "have the driver fill in the orientation"),
+    "denormal_quaternion": Reason(
+        _REFUSED, "the quaternion's length is off by more than 10 %", "correct the driver's orientation"
+    ),
+    "no_heading": Reason(_REFUSED, "the x axis is nearly vertical, so there is no heading in the plane", _SPACE),
+    "out_of_plane": Reason(
+        _NOTED, "the pose is more than 0.5 m above or below the plane, or tilted by more than 20 degrees", _SPACE
+    ),
+    # -- noise
+    "noise_unknown": Reason(_REFUSED, "neither the message nor the parameters tell its noise", _SIGMAS),
+    "covariance_unknown": Reason(_REPAIRED, "the covariance is zero: the configured noise is used"),
+    "covariance_of_some_axes_unknown": Reason(
+        _REPAIRED, "the twist's covariance lacks some axes: the configured densities are used"
+    ),
+    "covariance_clamped": Reason(_REPAIRED, "a variance above 1e6 m^2 or 1e3 rad^2 was lowered to that"),
+    "covariance_floored": Reason(_REPAIRED, "a variance that is nearly zero was raised"),
+    "covariance_symmetrized": Reason(_REPAIRED, "the covariance was slightly asymmetric"),
+    "covariance_asymmetric": Reason(_REFUSED, "the covariance is not symmetric", _COVARIANCE),
+    "covariance_not_positive_definite": Reason(_REFUSED, "the covariance is not positive definite", _COVARIANCE),
+    "nonfinite_covariance": Reason(_REFUSED, "the covariance has NaN, infinite or negative numbers", _COVARIANCE),
+    # -- odometry
+    "not_in_use": Reason(_NOTED, "another odometry is used, the first of inputs.names that is alive"),
+    "switched_to": Reason(_NOTED, "this odometry took over from one that fell silent, or is of higher priority"),
+    "switched_to_unlinked": Reason(
+        _NOTED, "this odometry took over, but had not come before: the motion between is unknown"
+    ),
+    "jump": Reason(
+        _NOTED,
+        "odometry (or tf: the correction) jumped; after a jump of odometry a new segment begins",
+        "odometry.max_speed_m_s; for tf, tf.report_jump_m",
+    ),
+    "reset_to_zero": Reason(_NOTED, "odometry was set back to zero: a new segment begins"),
+    # -- landmarks
+    "no_id": Reason(_REFUSED, "the detection has no identity", "landmarks.association=joint"),
+    "id_too_long": Reason(_REFUSED, "the identity has more than 128 bytes", "shorter ids, or landmarks.id_from"),
+    "id_conflict": Reason(
+        _REFUSED, "one message has an identity twice, at places that do not agree", "one id for each landmark"
+    ),
+    "id_merged": Reason(_REPAIRED, "one message has an identity twice, at places that agree: their mean is used"),
+    "id_of_an_unnamed": Reason(
+        _REFUSED, "the identity is a name that is given to landmarks without one", "INPUT.id_prefix"
+    ),
+    "unclear_which": Reason(
+        _REFUSED, "a detection without identity may be of several landmarks, or of none", "landmarks.association=joint"
+    ),
+    "not_for_a_pose": Reason(
+        _REFUSED, "a range or bearing to a landmark that is known as a pose", "INPUT.id_prefix: two identities"
+    ),
+    "not_used": Reason(_NOTED, "landmarks.association is none"),
+    "poor_tag": Reason(_NOTED, "the tag is beyond INPUT.hamming_max or below INPUT.decision_margin_min"),
+    "too_many": Reason(
+        _REFUSED,
+        "the message has more landmarks than landmarks.max_per_message: the nearest are used",
+        "landmarks.max_per_message",
+    ),
+    "unknown_action": Reason(_REFUSED, "the marker's action is none of add, modify, delete", "correct the driver"),
+    "lengths_differ": Reason(_REFUSED, "the message has not as many ids as poses", "correct the driver"),
+    "range_not_positive": Reason(_REFUSED, "the range is zero, negative or beyond 1e9 m", "correct the driver"),
+    "bearing_wrapped": Reason(_REPAIRED, "the bearing was beyond half a turn"),
+    "bearing_out_of_range": Reason(_REFUSED, "an angle is far beyond a turn", "radians, not degrees"),
+    "no_elevation": Reason(_REFUSED, "a bearing in space needs an elevation", "world.dimensions=2"),
+    "sensor_tilted": Reason(
+        _REFUSED, "an azimuth alone, of a sensor that is not level, is no direction in the plane", "send the elevation"
+    ),
+    "overhead": Reason(_REFUSED, "the landmark is straight above or below: no direction in the plane", _SPACE),
+    "fields_unknown": Reason(
+        _REFUSED,
+        "the cloud's fields are none of x y z, range, bearing, elevation, or not single numbers",
+        "name the fields so; a scan is no list of landmarks",
+    ),
+    "fields_beyond_point": Reason(_REFUSED, "a field of the cloud lies outside its point", "correct the driver"),
+    "too_many_points": Reason(_REFUSED, "the cloud has more than 100,000 points", "a scan is no list of landmarks"),
+    "cut_off": Reason(_REFUSED, "the cloud has fewer bytes than it says", "correct the driver"),
+    "undecided": Reason(_NOTED, "several unnamed landmarks may be the same ones in too many ways: decided later"),
+    "merged": Reason(_NOTED, "two unnamed landmarks turned out to be one"),
+    "parted": Reason(_NOTED, "two landmarks that had been merged turned out to be two"),
+    "given_up": Reason(_NOTED, "a new unnamed landmark was not seen again in landmarks.give_up_s"),
+    # -- fixes
+    "no_fix": Reason(_REFUSED, "the receiver has no fix", "wait for one: a clear view of the sky"),
+    "no_position": Reason(_REFUSED, "latitude and longitude are zero", "wait for a fix"),
+    "not_on_earth": Reason(_REFUSED, "latitude or longitude is out of range", "degrees, not radians or 1e-7 degrees"),
+    "far_from_datum": Reason(_REFUSED, "the fix is more than 100 km from the map's origin", "INPUT.datum"),
+    "other_datum": Reason(_REFUSED, "the fix counts from another origin than the map", "the same INPUT.datum for all"),
+    "no_altitude": Reason(_REPAIRED, "the fix has no altitude: it counts in the horizontal only"),
+    "no_orientation": Reason(_REFUSED, "the IMU says that it has no orientation", "an IMU with a filter, or no input"),
+    "not_in_this_space": Reason(_REFUSED, "such a fix does not exist in this many dimensions", "world.dimensions"),
+    # -- closures
+    "id_not_a_stamp": Reason(_REFUSED, "a closure's id is not the earlier stamp in nanoseconds", "see docs/node.md"),
+    "closure_with_itself": Reason(_REFUSED, "a closure's two stamps are the same", "correct the publisher"),
+    "no_result": Reason(_REFUSED, "a closure has no result with a pose", "correct the publisher"),
+    "within_one_keyframe": Reason(_REFUSED, "a closure links two moments of one keyframe: it says nothing new"),
+    "from_where_there_was_no_odometry": Reason(
+        _REFUSED, "a closure's earlier stamp is outside the odometry", "stamps by the robot's clock"
+    ),
+    "cleared": Reason(_NOTED, "loop closures that ~/clear_closures took out"),
+    "quarantined": Reason(
+        _REFUSED, "the solver failed with these measurements and works without them", "graph_slam explain RUN"
+    ),
+    # -- the node and its solver
+    "memory": Reason(_REFUSED, "a closure, while memory is short", "health.memory_mib"),
+    "paused": Reason(_NOTED, "it came while the node was paused", "~/pause with data false"),
+    "stopped": Reason(_REFUSED, "the clock jumped back and time.on_jump is stop", "~/reset"),
+    "worker_restarted": Reason(_NOTED, "the solver's thread died and was started again", "report it"),
+    "unknown_event": Reason(_NOTED, "a recorded event of another version"),
+    "fault": Reason(
+        _NOTED,
+        "an exception, counted by its type: of a solve (the last good estimate stands), of a second look, or of a"
+        " callback",
+        "report it with the log",
+    ),
+}
+"""By the name it is counted under; ``fault`` is for those that are counted by the type of an exception."""
+
+
+def explain(reason: str) -> Reason:
+    """The row of a reason; exceptions are counted by their type and share one."""
+    return REASONS.get(reason, REASONS["fault"])
+
+
+def remedy(source: str, reason: str) -> str:
+    """What mends it for this input; empty where nothing is to be done."""
+    return explain(reason).remedy.replace("INPUT", source)
