@@ -185,7 +185,7 @@ def _convert(sub: argparse.ArgumentParser) -> None:
 
 def _simulate(sub: "_Parser") -> None:
     sub.formatter_class = argparse.RawDescriptionHelpFormatter
-    sub.more = _faults
+    sub.more = _world_options
     sub.add_argument("scenario", metavar="SCENARIO", help="a world, city (a graph), or the file of a graph")
     sub.add_argument(
         "--out", type=Path, required=True, metavar="BAG.mcap|GRAPH.g2o", help="a recording, or by its ending a graph"
@@ -204,17 +204,28 @@ def _simulate(sub: "_Parser") -> None:
     )
 
 
-def _faults() -> str:
-    """Every kind of fault with its options and their defaults."""
+def _world_options() -> str:
+    """Every option of the worlds and every kind of fault, with defaults."""
+    from graph_slam_ros.simulation import WORLDS, Instruments
     from graph_slam_ros.simulation.faults import KINDS
     from graph_slam_ros.simulation.options import options_of
 
-    lines = ["faults, and what of them can be set; what is wrong then is in OUT.faults.csv:"]
-    for name, kind in KINDS.items():
-        lines.append(f"  {name}: {kind.about}")
-        for o in options_of(kind.options):
+    def told(cls: type) -> list[str]:
+        lines = []
+        for o in options_of(cls):
             choices = f": {', '.join(o.choices)}" if o.choices else ""
-            lines.append(f"    {o.name}={o.default}  {o.meaning}{choices}")
+            default = str(o.default).lower() if isinstance(o.default, bool) else o.default
+            lines.append(f"    {o.name}={default}{f' [{o.unit}]' if o.unit else ''}  {o.meaning}{choices}")
+        return lines
+
+    lines = ["options of the worlds, for --set:"]
+    for name, world in WORLDS.items():
+        lines += [f"  {name}: {world.about}", *told(world.options)]
+    lines += ["  every world: a satellite receiver and an IMU besides", *told(Instruments)]
+    lines += ["", "faults, and what of them can be set; what is wrong then is in OUT.faults.csv:"]
+    for name, kind in KINDS.items():
+        lines += [f"  {name}: {kind.about}", *told(kind.options)]
+    lines += ["", "example: graph_slam simulate warehouse --out world.mcap --set gnss=5 --set imu=100"]
     return "\n".join(lines)
 
 

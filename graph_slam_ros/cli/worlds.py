@@ -62,6 +62,8 @@ def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
         truth = poses.ravel()
     else:
         recording = _recorded(args)
+        if recording.gnss or recording.imu:
+            raise GraphSlamError(f"{args.out}: a graph has no use for gnss or imu: --out FILE.mcap")
         graph = landmark_graph(recording)
         truth = truth_of(recording, graph)
     file = G2oFile(graph, list(range(graph.vertex_count)), [0])

@@ -16,6 +16,7 @@ from graph_slam_ros.simulation.fault_table import WrongLine, WrongMessage, write
 from graph_slam_ros.simulation.faults import KINDS, Fault
 from graph_slam_ros.simulation.faulty_graph import faulty_graph
 from graph_slam_ros.simulation.faulty_recording import faulty_recording
+from graph_slam_ros.simulation.instruments import Instruments, with_instruments
 from graph_slam_ros.simulation.options import Option, fill, options_of
 from graph_slam_ros.simulation.pose_graph import CityGraph, city_graph, landmark_graph, write_graph
 from graph_slam_ros.simulation.recording import Recording, measurements
@@ -54,7 +55,11 @@ def simulate(world: str, /, seed: int, **options: Any) -> Recording:
         raise GraphSlamError(f"no world {world!r}; there are {', '.join(WORLDS)}")
     if seed < 0:
         raise GraphSlamError(f"seed {seed} is negative")
-    return WORLDS[world].drive(seed, fill(world, WORLDS[world].options, options))
+    of_world, of_instruments = WORLDS[world].options, {o.name for o in options_of(Instruments)}
+    chosen = {name: value for name, value in options.items() if name in of_instruments}
+    rest = {name: value for name, value in options.items() if name not in of_instruments}
+    recording = WORLDS[world].drive(seed, fill(world, of_world, rest, [*of_instruments]))
+    return with_instruments(recording, seed, fill(world, Instruments, chosen))
 
 
 __all__ = [
@@ -62,6 +67,7 @@ __all__ = [
     "WORLDS",
     "CityGraph",
     "Fault",
+    "Instruments",
     "Option",
     "Recording",
     "World",

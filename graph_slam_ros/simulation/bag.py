@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from heapq import merge
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from graph_slam_ros.ros.to_msg import (
     transform,
     vector,
 )
+from graph_slam_ros.simulation.instrument_messages import Message, gnss_messages, imu_messages
 from graph_slam_ros.simulation.motion import space_of
 from graph_slam_ros.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Recording
 from graph_slam_ros.slam import Closure, Sighting, Sightings
@@ -48,6 +50,8 @@ def write_bag(recording: Recording, path: Path | str) -> None:
     ``elevation``, ``sigma`` and ``sigma_bearing``, as far as they are measured, in the frame ``sensor`` of
     ``/tf_static``. A field holds no name: landmarks then go by their numbers, in the truth, too.
 
+    A satellite receiver is on ``/gps/fix`` (NavSatFix, frame ``gps``), an IMU on ``/imu/data`` (Imu, ``imu_link``).
+
     Raises
     ------
     GraphSlamError
@@ -59,6 +63,8 @@ def write_bag(recording: Recording, path: Path | str) -> None:
         raise GraphSlamError(f"no message holds {' and '.join(sorted(kinds))} together")
     closed = recording.closures_at()
     twist_covariance = covariance6(recording.twist_covariance, _UNUSED)
+    instruments = merge(gnss_messages(recording.gnss), imu_messages(recording.imu), key=_stamp_of)
+    beside = next(instruments, None)
     with BagWriter(path) as bag:
         first_ns = int(recording.stamps_ns[0])
         for k, stamp_ns in enumerate(recording.stamps_ns.tolist()):
@@ -66,6 +72,9 @@ def write_bag(recording: Recording, path: Path | str) -> None:
                 T_base_sensor = next(s.T_base_sensor for one in recording.seen for s in one.sightings) or space.identity
                 mounted = transform(stamp_ns, "base_link", _SENSOR, T_base_sensor)
                 bag.write("/tf_static", "tf2_msgs/msg/TFMessage", stamp_ns, mounted)
+            while beside is not None and _stamp_of(beside) <= stamp_ns:
+                bag.write(*beside)
+                beside = next(instruments, None)
             bag.write(ODOMETRY_TOPIC, "nav_msgs/msg/Odometry", stamp_ns, _odometry(recording, k, twist_covariance))
             if stamp_ns in seen and polar:
                 bag.write(LANDMARKS_TOPIC, _POINTS, stamp_ns, _point_cloud(seen[stamp_ns], names))
@@ -79,6 +88,10 @@ def write_bag(recording: Recording, path: Path | str) -> None:
                 true = _true_landmarks(recording, space)
                 true = replace(true, sightings=tuple(replace(s, id=names[s.id]) for s in true.sightings))
                 bag.write(TRUE_LANDMARKS_TOPIC, _DETECTIONS, stamp_ns, _detections(true, "world", space))
+
+
+def _stamp_of(message: Message) -> int:
+    return message[2]
 
 
 def recorded_names(recording: Recording) -> dict[str, str]:

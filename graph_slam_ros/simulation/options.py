@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -54,8 +54,12 @@ def options_of(cls: type) -> Iterator[Option]:
         yield Option(f.name, f.default, *f.metadata["about"])
 
 
-def fill(world: str, cls: type[Options], values: Mapping[str, Any]) -> Options:
-    """The dataclass with the named values; others keep their defaults.
+def fill(world: str, cls: type[Options], values: Mapping[str, Any], others: Sequence[str] = ()) -> Options:
+    """The dataclass with the named values; the rest keep their defaults.
+
+    Parameters
+    ----------
+    others : names of options that are elsewhere, to be named beside those of the dataclass
 
     Raises
     ------
@@ -65,5 +69,5 @@ def fill(world: str, cls: type[Options], values: Mapping[str, Any]) -> Options:
     known = {o.name: o for o in options_of(cls)}
     for name in values:
         if name not in known:
-            raise GraphSlamError(f"{world}: no option {name!r}; it has {', '.join(known)}")
+            raise GraphSlamError(f"{world}: no option {name!r}; it has {', '.join([*known, *others])}")
     return cls(**{name: known[name].check(world, value) for name, value in values.items()})

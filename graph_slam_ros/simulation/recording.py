@@ -18,6 +18,47 @@ CLOSURES_TOPIC = "/closures"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Gnss:
+    """What a satellite receiver says.
+
+    Attributes
+    ----------
+    stamps_ns : (n,)
+    geodetic : (n, 3) latitude [deg], longitude [deg] and height above the ellipsoid [m] of the antenna
+    covariance : (3, 3) of each: the truth about the noise that was added, east, north and up [m^2]
+    has_fix : (n,) where it does not, it says so
+    antenna : in base_link [m]; None where no transform tells
+    """
+
+    stamps_ns: Stamps
+    geodetic: Array
+    covariance: Array
+    has_fix: NDArray[np.bool_]
+    antenna: Numbers | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imu:
+    """What an inertial measurement unit says.
+
+    Attributes
+    ----------
+    stamps_ns : (n,)
+    orientation : (n, 4) quaternions (x, y, z, w) of R_world_imu
+    covariance : (3, 3) of each about the axes of world, without its drift [rad^2]
+    rate, acceleration : (n, 3) in its own axes [rad/s, m/s^2]
+    T_base_imu : where it is
+    """
+
+    stamps_ns: Stamps
+    orientation: Array
+    covariance: Array
+    rate: Array
+    acceleration: Array
+    T_base_imu: Numbers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Recording:
     """A drive or flight: odometry and sightings as measured, poses and landmarks as they are.
 
@@ -34,6 +75,7 @@ class Recording:
     T_world_base : (n, 3) or (n, 7) true poses
     landmarks : true poses in world by id; of points the position alone
     closures : in order of their later stamp; both are stamps of odometry
+    gnss, imu : None where the robot has none
     """
 
     stamps_ns: Stamps
@@ -45,6 +87,8 @@ class Recording:
     T_world_base: Array
     landmarks: dict[str, Numbers]
     closures: tuple[Closure, ...] = ()
+    gnss: Gnss | None = None
+    imu: Imu | None = None
 
     def closures_at(self) -> dict[int, list[Closure]]:
         """Those of each later stamp."""
@@ -55,7 +99,10 @@ class Recording:
 
 
 def measurements(recording: Recording) -> Iterator[Odometry | Sightings | Closure]:
-    """What ``GraphSlam.process`` takes, in order of stamp, odometry before what was seen at the same stamp."""
+    """What ``GraphSlam.process`` takes, in order of stamp, odometry before what was seen at the same stamp.
+
+    What a satellite receiver or an IMU says is not among it: that becomes a fix at the border, from a bag.
+    """
     twist_covariance = tuple(recording.twist_covariance.ravel().tolist())
     seen = {s.stamp_ns: s for s in recording.seen}
     closed = recording.closures_at()
