@@ -92,9 +92,10 @@ class Difference:
         return asdict(self) | {"keyframes_m": apart, "same": self.is_same}
 
     def __str__(self) -> str:
-        return "\n".join(self._lines())
+        return "\n".join(self.lines())
 
-    def _lines(self) -> Iterator[str]:
+    def lines(self) -> Iterator[str]:
+        """What differs, for people."""
         yield f"{'':10s}{'A':>14s}{'B':>14s}{'both':>14s}"
         for name in ("keyframes", "landmarks", "edges"):
             one: Counts = getattr(self, name)

@@ -7,21 +7,34 @@ import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+# Control characters, and those that change the direction of a text or are not seen.
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
+_MOST_TOLD, _LINES_TOLD = 2000, 20  # characters of a message on standard error; lines of losses
 DONE, FAULT, REFUSED, LOSSES = 0, 1, 2, 3
 NOT_CERTIFIED, NOT_APPLICABLE = 4, 5  # of optimize --certify
 DIFFERENT = 4  # of diff
 
 
+def escaped(text: str) -> str:
+    r"""A text of one line that a terminal shows as it is: control characters as Python writes them (``\x1b``)."""
+    return _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
+
+
 def say(*lines: str) -> None:
-    """The answer of a command, on standard output."""
+    """Print the answer of a command to standard output.
+
+    Each argument is one line: control characters in it, line ends included, are escaped, since names in it may come
+    from a file or a message.
+    """
     for line in lines:
-        print(line)
+        print(escaped(line))
 
 
 def tell(what: str, programme: str = "graph_slam") -> None:
     """What stands beside the answer, on standard error: a line, whatever is in the names that it tells."""
-    line = _CONTROL.sub(lambda found: repr(found[0])[1:-1], what)
+    line = escaped(what)
+    if len(line) > _MOST_TOLD:
+        line = f"{line[:_MOST_TOLD]} ..."
     print(f"{programme}: {line}", file=sys.stderr)
 
 
@@ -29,8 +42,11 @@ def told(losses: Sequence[str], warnings: Sequence[str] = ()) -> int:
     """Tell what was lost, and what to beware of; returns the exit code."""
     for warning in warnings:
         tell(f"beware: {warning}")
-    for loss in dict.fromkeys(losses):
+    distinct = list(dict.fromkeys(losses))
+    for loss in distinct[:_LINES_TOLD]:
         tell(f"lost: {loss}")
+    if len(distinct) > _LINES_TOLD:
+        tell(f"lost: and {len(distinct) - _LINES_TOLD} more of this kind")
     return LOSSES if losses else DONE
 
 

@@ -22,7 +22,7 @@ def diff(args: argparse.Namespace) -> int:
 
     losses: list[str] = []
     found = compared(args.a, args.b, losses)
-    console.say(json.dumps(found.as_dict()) if args.json else str(found))
+    console.say(*([json.dumps(found.as_dict())] if args.json else found.lines()))
     return console.told(losses) or (console.DONE if found.is_same else console.DIFFERENT)
 
 
@@ -33,7 +33,7 @@ def merge(args: argparse.Namespace) -> int:
 
     done = merged(args.a, args.b, args.out)
     agree = done.shared - len(done.left_out)
-    console.say(run_text(done.summary), f"{agree} of {done.shared} landmarks of both lay B on A")
+    console.say(*run_text(done.summary), f"{agree} of {done.shared} landmarks of both lay B on A")
     console.say(f"results in {args.out}")
     moved = [
         f"landmark {name} is {metres:.2f} m ({sigmas:.0f} sigmas) elsewhere in B: what B saw of it is left out"
@@ -48,5 +48,5 @@ def freeze(args: argparse.Namespace) -> int:
     from graph_slam_ros.run import freeze as frozen
 
     summary = frozen(args.run_folder, args.out)
-    console.say(run_text(summary), f"results in {args.out}: what is there now stays, whatever is seen from now on")
+    console.say(*run_text(summary), f"results in {args.out}: what is there now stays, whatever is seen from now on")
     return console.told(summary["losses"])

@@ -89,7 +89,7 @@ def evaluate(args: argparse.Namespace) -> int:
     from graph_slam_ros.run import changed_since
 
     scores = compared(args.run_folder, args.truth, estimate=args.estimate)
-    console.say(json.dumps(scores.as_dict()) if args.json else str(scores))
+    console.say(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
     picture = args.plot or args.run_folder / "path.png"
     draw_run(args.run_folder, args.truth, picture)
     if not args.json:
@@ -145,12 +145,12 @@ def _config(args: argparse.Namespace) -> "Config":
 
 
 def _say_run(source: Path, summary: dict[str, Any]) -> None:
-    console.say(run_text(summary))
+    console.say(*run_text(summary))
     if not summary["keyframes"]:
         raise GraphSlamError(f"{source}: no odometry of it could be used, see what was counted and graph_slam info")
 
 
-def run_text(summary: dict[str, Any]) -> str:
+def run_text(summary: dict[str, Any]) -> list[str]:
     """A run in some lines."""
     counters = [f"{source}: {reason} {n}" for source, by in summary["counters"].items() for reason, n in by.items()]
     lines = [
@@ -162,4 +162,4 @@ def run_text(summary: dict[str, Any]) -> str:
     if "time_s" in summary:
         lines.append(f"time       {summary['time_s']:10.1f} s")
     waiting = [f"waiting    {name}: {reason}" for name, reason in summary["waiting"].items()]
-    return "\n".join(lines + waiting + [f"counted    {text}" for text in counters])
+    return lines + waiting + [f"counted    {text}" for text in counters]

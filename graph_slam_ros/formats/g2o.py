@@ -256,10 +256,11 @@ def read_g2o(
         raise FormatError(f"error map {error_map!r}: choose {' or '.join(ERROR_MAPS)}")
     if dialect not in (None, *DIALECTS):
         raise FormatError(f"dialect {dialect!r}: choose {', '.join(DIALECTS)}")
-    numbered = list(lines(path))
-    own_numbers = dialect == "gtsam" or any(text.split(None, 1)[:1] == ["LANDMARK"] for _, text in numbered)
+    own_numbers = dialect == "gtsam" or any(
+        text.lstrip().startswith(("LANDMARK ", "LANDMARK\t")) for _, text in lines(path)
+    )
     reader = _Reader(path.name, lenient, Text(dialect, raw, LANDMARK_IDS_FROM if own_numbers else 0))
-    for number, text in numbered:
+    for number, text in lines(path):
         reader.take(number, text)
     if not reader.vertices:
         reader.declare_all()

@@ -35,9 +35,9 @@ _READ: dict[Opcode, Any] = {
     Opcode.DATA_END: DataEnd,
 }
 _MOST_PADDING = 64  # a later version may add fields; after a damaged length there is more
-_BLOCK = 2**20
+_BLOCK, _FIRST_BLOCK = 2**20, 2**12
 # A chunk's head: opcode, length, two times, size, checksum, codec; then the length of its data.
-_CHUNK = re.compile(rb"\x06(?=(.{8}).{28}(?:\0{4}|\x04\0{3}zstd|\x03\0{3}lz4)(.{8}))", re.DOTALL)
+_CHUNK = re.compile(rb"\x06(?=(.{8}).{28}(\0{4}|\x04\0{3}zstd|\x03\0{3}lz4)(.{8}))", re.DOTALL)
 _CHUNK_HEAD = 57
 
 
@@ -188,19 +188,41 @@ def _inside(chunk: Chunk) -> Iterator[McapRecord]:
 
 
 def _next_chunk(stream: _Stream, at: int) -> int | None:
-    """Where the next chunk begins that is whole: its head agrees with itself, and its end is in the file."""
-    while at < stream.size:
+    """Where the next chunk begins that is whole: its head agrees with itself, and its end is in the file.
+
+    The blocks that are searched begin small and double: forged heads, one after another, cost little each.
+    """
+    size = _FIRST_BLOCK
+    while (at := _data_from(stream, at)) < stream.size:
         stream.go(at)
-        block = stream.read(min(_BLOCK + _CHUNK_HEAD, stream.size - at))
+        block = stream.read(min(size + _CHUNK_HEAD, stream.size - at))
         for found in _CHUNK.finditer(block):
-            if found.start() >= _BLOCK:
+            if found.start() >= size:
                 break
-            length, within = (int.from_bytes(group, "little") for group in found.groups())
+            length, within = int.from_bytes(found[1], "little"), int.from_bytes(found[3], "little")
             begins = at + found.start()
-            if 0 <= length - within - 40 <= 4 and begins + _HEAD.size + length <= stream.size:
+            is_whole = length == within + 36 + len(found[2]) and begins + _HEAD.size + length <= stream.size
+            if is_whole and length <= MOST_BYTES:
                 return begins
-        at += _BLOCK
+        at += size
+        size = min(2 * size, _BLOCK)
     return None
+
+
+def _data_from(stream: _Stream, at: int) -> int:
+    """The next byte that is on the disk: a file may say to be a terabyte and hold nothing."""
+    try:
+        return os.lseek(stream.fileno(), at, os.SEEK_DATA)
+    except OSError:  # nothing follows; or the file system does not know
+        return at if at < stream.size and not _knows_holes(stream) else stream.size
+
+
+def _knows_holes(stream: _Stream) -> bool:
+    try:
+        os.lseek(stream.fileno(), 0, os.SEEK_HOLE)
+    except OSError:
+        return False
+    return True
 
 
 def _lost(error: Exception, read: int, at: int, next_chunk: int | None, size: int) -> str:

@@ -91,7 +91,9 @@ _CONSTRUCT: dict[str, Any] = {
     _BOOL: yaml.SafeLoader.construct_yaml_bool,
 }
 _AS_EVERYBODY = {
-    _FLOAT: re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)", re.ASCII),
+    _FLOAT: re.compile(
+        r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)", re.ASCII
+    ),
     _INT: re.compile(r"[-+]?(?:0|[1-9]\d*)|0x[0-9a-fA-F]+", re.ASCII),
     _BOOL: re.compile("true|false", re.IGNORECASE),
 }
@@ -99,7 +101,7 @@ for _tag in _CONSTRUCT:
     _StrictLoader.add_constructor(_tag, _StrictLoader.construct_plain)
 # YAML 1.1 reads 1e-3 as a text; ROS and people read a number
 _StrictLoader.add_implicit_resolver(
-    _FLOAT, re.compile(r"^[-+]?(?:\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+    _FLOAT, re.compile(r"^[-+]?(?:\d+(?:\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
 )
 
 
@@ -119,7 +121,7 @@ def read_parameters(path: Path | str) -> dict[str, Any]:
             raise ConfigError("not a file")
         if path.stat().st_size > _MAX_BYTES:
             raise ConfigError(f"larger than {_MAX_BYTES} bytes")
-        values = yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)
+        values = yaml.load(path.read_text(encoding="utf-8-sig"), Loader=_StrictLoader)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     except ConfigError as error:

@@ -144,6 +144,8 @@ def _checked(fields: Fields, data: bytes) -> tuple[Fields, bytes] | None:
 def _record(stream: BinaryIO, size: int) -> tuple[Fields, bytes]:
     """The next record's header and data; no length is believed that leads beyond the end."""
     fields = _fields(_sized(stream, size, _MOST_HEADER))
+    if "op" not in fields:
+        raise FormatError("a record of no kind")
     return fields, _sized(stream, size, MOST_BYTES)
 
 

@@ -16,6 +16,7 @@ from graph_slam_ros.formats.decompression import MOST_BYTES
 
 MAGIC = b"SQLite format 3\x00"
 _DEFINITIONS = "SELECT topic_type, encoded_message_definition FROM message_definitions WHERE encoding = 'ros2msg'"
+_LEAST_LIMIT = 2**20  # bytes of a text or blob; none is longer than the file
 _ROWS = "SELECT topic_id, timestamp, data FROM messages"
 
 
@@ -36,6 +37,8 @@ def contents(path: Path) -> Contents:
             kinds = dict(database.execute("SELECT name, type FROM sqlite_master WHERE name IN ('topics', 'messages')"))
             if kinds != {"topics": "table", "messages": "table"}:
                 raise FormatError(f"{path}: not a readable recording: no tables of rosbag2 in it")
+            for table in ("topics", "messages", "message_definitions"):
+                _refuse_computed(database, path, table)
             rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
             topics = {int(number): (str(name), str(kind), str(code)) for number, name, kind, code in rows}
             counts: dict[int, int] = {}
@@ -49,6 +52,14 @@ def contents(path: Path) -> Contents:
     except (sqlite3.Error, TypeError, ValueError) as error:
         raise FormatError(f"{path}: not a readable recording ({error})") from None
     return Contents(topics, counts, definitions, first_ns)
+
+
+def _refuse_computed(database: sqlite3.Connection, path: Path, table: str) -> None:
+    """Raise FormatError where reading a table would compute its columns: a few bytes may then give gigabytes."""
+    columns = database.execute(f"PRAGMA table_xinfo({table})").fetchall()
+    computed = [str(name) for _, name, *_, hidden in columns if hidden]
+    if computed:
+        raise FormatError(f"{path}: not a readable recording: the column {computed[0]} of {table} is computed")
 
 
 def messages(path: Path, topics: Sequence[int], losses: list[str]) -> Iterator[tuple[int, int, bytes]]:
@@ -85,10 +96,17 @@ def _connection(path: Path) -> sqlite3.Connection:
     database = sqlite3.connect(f"file:{quote(str(path.absolute()))}?{how}", uri=True)
     database.text_factory = _text
     if sys.version_info >= (3, 11):
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_BYTES)
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _most(path))
     database.execute("PRAGMA trusted_schema = OFF")
     database.execute("PRAGMA writable_schema = ON")  # else a file that is cut is not opened at all; it is read only
     return database
+
+
+def _most(path: Path) -> int:
+    """Bytes of the longest text or blob that the file and its log of writes can hold."""
+    log = path.with_name(path.name + "-wal")
+    size = path.stat().st_size + (log.stat().st_size if log.is_file() else 0)
+    return min(MOST_BYTES, max(_LEAST_LIMIT, size))
 
 
 def _beside(path: Path, ending: str) -> bool:

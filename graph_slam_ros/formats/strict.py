@@ -1,18 +1,28 @@
 """Strict reading of text: what Python's own conversions would let through is refused by name."""
 
 import gzip
+import itertools
 import re
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from reprlib import repr as shortened
+from typing import Any
 
 import numpy as np
 
 from graph_slam_ros.errors import FormatError
 
-# float() also accepts 1_0, inf, nan and digits of other scripts
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+# float() also accepts 1_0, inf, nan and digits of other scripts. No part can match what the one before it gave back:
+# time is linear in the length of a word.
+_NUMBER = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+MOST_DIGITS = 1100
+"""Characters of a number; the longest double, written out, has 1,077 of them."""
+MOST_LINE = 2**20
+"""Characters of a line: a list of 100,000 ids fits."""
+MOST_TEXT_RATIO = 100
+"""Text of graphs is compressed 4 to 30 times; what grows beyond this is made to exhaust its reader."""
+_FREE = 2**20  # characters that may be unpacked whatever the ratio
 _ID = re.compile(r"[+-]?\d{1,18}", re.ASCII)
 _STAMP = re.compile(r"\d{1,18}|[1-8]\d{18}", re.ASCII)
 
@@ -23,14 +33,30 @@ def lines(path: Path) -> Iterator[tuple[int, str]]:
         if not path.is_file():
             raise FormatError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
         opened = gzip.open if is_gzipped(path) else open
-        with opened(path, "rt", encoding="utf-8", newline="") as stream:  # a quoted field may have any
-            yield from enumerate(stream, start=1)
+        most = max(_FREE, MOST_TEXT_RATIO * path.stat().st_size) if is_gzipped(path) else None
+        with opened(path, "rt", encoding="utf-8-sig", newline="") as stream:  # a quoted field may have any line end
+            yield from _bounded(stream, path, most)
     except (gzip.BadGzipFile, zlib.error, EOFError):
         raise FormatError(f"{path.name}: damaged, or not a gzip file") from None
     except UnicodeDecodeError:
         raise FormatError(f"{path.name}: not a text file") from None
     except OSError as error:
         raise FormatError(f"{path}: {error.strerror}") from None
+
+
+def _bounded(stream: Any, path: Path, most: int | None) -> Iterator[tuple[int, str]]:
+    """Numbered lines, none longer than ``MOST_LINE``, and no more than ``most`` characters together."""
+    total = 0
+    for number in itertools.count(1):
+        line = stream.readline(MOST_LINE + 1)
+        if not line:
+            return
+        if len(line) > MOST_LINE:
+            raise FormatError(f"{path.name}:{number}: a line of more than {MOST_LINE} characters")
+        total += len(line)
+        if most is not None and total > most:
+            raise FormatError(f"{path.name}: it unpacks to more than {MOST_TEXT_RATIO} times its size: not read")
+        yield number, line
 
 
 def is_gzipped(path: Path) -> bool:
@@ -66,6 +92,6 @@ def stamp(word: str) -> int:
 def numbers(words: list[str]) -> list[float]:
     """Finite numbers. Raises FormatError naming the first that is none."""
     for word in words:
-        if not _NUMBER.fullmatch(word) or float(word) in (np.inf, -np.inf):
+        if len(word) > MOST_DIGITS or not _NUMBER.fullmatch(word) or float(word) in (np.inf, -np.inf):
             raise FormatError(f"{shortened(word)} is not a finite number")
     return [float(word) for word in words]

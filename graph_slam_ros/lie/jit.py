@@ -6,13 +6,17 @@ setting of the compiler (bounds checks). So the cache lives in one folder per di
 
 import hashlib
 import os
+import stat
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numba
 from numba.extending import register_jitable
+
+from graph_slam_ros.errors import GraphSlamError
 
 __all__ = ["CACHE_DIR", "COMPILED", "jitable", "kernel"]
 
@@ -40,18 +44,38 @@ def _place() -> str:
 
 
 def _cache_dir() -> Path:
-    root = os.environ.get("GRAPH_SLAM_CACHE") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    wanted = Path(root) / "graph_slam_ros" / f"kernels-{_digest()}"
+    """The first of the user's cache and a folder of this user and this source in /tmp that is usable and private."""
+    choices = []
+    root = os.environ.get("GRAPH_SLAM_CACHE") or os.environ.get("XDG_CACHE_HOME")
+    with suppress(RuntimeError):  # no home folder is known
+        choices.append(Path(root or Path.home() / ".cache") / "graph_slam_ros" / f"kernels-{_digest()}")
+    with suppress(OSError):  # no folder for temporary files
+        choices.append(Path(tempfile.gettempdir()) / f"graph_slam_ros-{os.getuid()}-{_digest()}")
+    for folder in choices:
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if _is_private(folder):
+                with tempfile.TemporaryFile(dir=folder):
+                    return folder
+        except OSError:  # read-only, or not a folder
+            continue
     try:
-        wanted.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=wanted):
-            return wanted
-    except OSError:  # a read-only home: compile into a folder of this user and this source
-        fallback = Path(tempfile.gettempdir()) / f"graph_slam_ros-{os.getuid()}-{_digest()}"
-        fallback.mkdir(mode=0o700, exist_ok=True)
-        if fallback.is_symlink() or fallback.stat().st_uid != os.getuid():  # another user's: what it caches is code
-            return Path(tempfile.mkdtemp(prefix="graph_slam_ros-"))
-        return fallback
+        return Path(tempfile.mkdtemp(prefix="graph_slam_ros-"))
+    except OSError:
+        raise GraphSlamError("no folder to keep compiled kernels in: set GRAPH_SLAM_CACHE to one of yours") from None
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether nobody else could have put anything into it: Numba unpickles and runs what it caches.
+
+    A folder of ours that others may write to, as a lax umask leaves it, is closed to them; what is in it must be ours.
+    """
+    about = folder.lstat()
+    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid():
+        return False
+    if about.st_mode & 0o022:
+        folder.chmod(0o700)
+    return all(entry.stat(follow_symlinks=False).st_uid == os.getuid() for entry in os.scandir(folder))
 
 
 CACHE_DIR = _cache_dir()

@@ -1,0 +1,208 @@
+"""Files that are made to exhaust their reader, or to write to the terminal of whoever looks at them."""
+
+import gzip
+import os
+import sqlite3
+import struct
+import subprocess
+import sys
+import time
+from contextlib import closing, suppress
+from math import log
+
+import pytest
+from confined import confined
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.errors import ConfigError, FormatError
+from graph_slam_ros.formats import mcap_records
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.ros.bag import BagError, open_bag
+
+# A word, or lines, of n characters that a careless pattern matches in n^2 steps.
+SHAPES = {
+    "digits": lambda n: "1" * n + "x",
+    "decimals": lambda n: "." + "1" * n + "x",
+    "points": lambda n: "1." * (n // 2),
+    "exponent": lambda n: "1e" + "1" * n + "x",
+    "underscores": lambda n: "1_" * (n // 2),
+    "sixties": lambda n: "1:" * (n // 2) + "x",
+    "spaces": lambda n: " " * n + "x",
+    "comment": lambda n: "# 1 1" + " " * n + "x",
+    "lines": lambda n: "\n" * n + "x",
+    "quotes": lambda n: "'" * n,
+    "brackets": lambda n: "[" * n,
+    "keys": lambda n: "a: " * (n // 3),
+}
+WRITERS = {
+    "g2o": ("graph.g2o", lambda text: f"VERTEX_SE2 0 0 0 {text}\n", read_g2o, FormatError),
+    "yaml": ("config.yaml", lambda text: f"a: {text}\n", read_parameters, ConfigError),
+    "mcap": ("a.mcap", lambda text: f"\x89MCAP0\r\n{text}", open_bag, BagError),
+    "bag": ("a.bag", lambda text: f"#ROSBAG V2.0\n{text}", open_bag, BagError),
+}
+
+
+def seconds(read, path, refusal):
+    """CPU time of the quickest of three readings, refused or not."""
+    best = float("inf")
+    for _ in range(3):
+        start = time.process_time()
+        with suppress(refusal):
+            read(path)
+        best = min(best, time.process_time() - start)
+    return best
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_F33_the_time_to_read_grows_with_the_size_of_a_file_and_not_with_its_square(tmp_path, kind):
+    name, text, read, refusal = WRITERS[kind]
+    small, large = 20_000, 320_000  # squared it would be 256 times as long
+    for shape in SHAPES.values():
+        times = []
+        for n in (small, large):
+            (tmp_path / name).write_text(text(shape(n)), encoding="latin-1")
+            times.append(seconds(read, tmp_path / name, refusal))
+        if times[1] > 0.2:  # below, it harms nobody
+            assert log(times[1] / times[0]) / log(large / small) < 1.5
+
+
+def test_F33_a_line_and_a_number_have_a_longest(tmp_path):
+    (tmp_path / "line.g2o").write_text("# " + "x" * 2**20)
+    with pytest.raises(FormatError, match=r"line.g2o:1: a line of more than 1048576 characters"):
+        read_g2o(tmp_path / "line.g2o")
+    (tmp_path / "number.g2o").write_text(f"VERTEX_SE2 0 0 0 {'0' * 2000}\n")
+    with pytest.raises(FormatError, match="is not a finite number"):
+        read_g2o(tmp_path / "number.g2o")
+
+
+def test_F34_a_table_that_computes_its_messages_is_refused_before_any_is(tmp_path):
+    path = tmp_path / "bomb.db3"
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")
+        database.execute("INSERT INTO topics VALUES (1, '/odom', 'nav_msgs/msg/Odometry', 'cdr')")
+        computed = "data BLOB GENERATED ALWAYS AS (zeroblob(200000000)) VIRTUAL"
+        database.execute(
+            f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, {computed})"
+        )
+        database.executemany(
+            "INSERT INTO messages(id, topic_id, timestamp) VALUES (?, 1, ?)", [(k, k) for k in range(99)]
+        )
+    assert path.stat().st_size < 20_000
+    with pytest.raises(BagError, match="the column data of messages is computed"):
+        open_bag(path)
+
+
+@pytest.mark.parametrize("text", ["VERTEX_SE2 0 0 0 0\n", "1"], ids=["lines", "line"])
+def test_F35_a_gzipped_graph_that_grows_without_end_is_not_unpacked(tmp_path, text):
+    path = tmp_path / "bomb.g2o.gz"
+    with gzip.open(path, "wb") as stream:
+        for _ in range(100):
+            stream.write(text.encode() * (2_000_000 // len(text)))
+    with pytest.raises(FormatError, match=r"unpacks to more than 100 times its size|a line of more than"):
+        confined(read_g2o, path)
+
+
+@pytest.mark.parametrize(
+    ("name", "begin"), [("a.g2o", b""), ("a.mcap", mcap_records.MAGIC + b"\xff" * 99), ("a.bag", b"#ROSBAG V2.0\n")]
+)
+def test_F35_a_sparse_file_of_a_terabyte_is_refused_at_once(tmp_path, capsys, name, begin):
+    path = tmp_path / name
+    path.write_bytes(begin)
+    os.truncate(path, 2**40)
+    start = time.process_time()
+    assert main(["optimize" if name == "a.g2o" else "info", str(path)]) == 2
+    assert time.process_time() - start < 5.0  # seconds of 10 minutes
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("claims", [lambda left: left - 9, lambda left: 44], ids=["all the rest", "nothing"])
+def test_F35_forged_heads_of_chunks_one_after_another_cost_little_each(tmp_path, claims):
+    def file(heads):
+        body = b""
+        for k in range(heads):
+            length = claims(58 * (heads - k))
+            body += (
+                b"\x06"
+                + struct.pack("<Q", length)
+                + bytes(28)
+                + b"\4\0\0\0zstd"
+                + struct.pack("<Q", length - 44)
+                + b"\xff"
+            )
+        path = tmp_path / f"{heads}.mcap"
+        path.write_bytes(mcap_records.MAGIC + body + mcap_records.MAGIC)
+        return path
+
+    few, many = (seconds(open_bag, file(heads), BagError) for heads in (2_000, 32_000))
+    assert many < 1.0 or log(many / few) / log(16) < 1.5
+
+
+def test_F36_a_byte_order_mark_is_no_part_of_the_first_word(tmp_path):
+    (tmp_path / "graph.g2o").write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\n", encoding="utf-8-sig")
+    assert read_g2o(tmp_path / "graph.g2o").graph.vertex_count == 2
+    (tmp_path / "config.yaml").write_text("solve:\n  every_keyframes: 2\n", encoding="utf-8-sig")
+    assert read_parameters(tmp_path / "config.yaml") == {"solve": {"every_keyframes": 2}}
+
+
+HOSTILE = "tag\x1b]0;owned\x07\x1b[2J\nkeyframes 7\u202ered\u200b"
+
+
+def test_X11_what_a_name_says_to_a_terminal_is_shown_and_not_done(tmp_path, capsys):
+    lines = [f"VERTEX_SE2 {k} {k} 0 0\n" for k in range(3)]
+    one = "EDGE_SE2 {} {} 1 0 0 100 0 0 100 0 400\n"
+    weird = "# 0 2 class " + HOSTILE.replace("\n", "").replace(" ", "") + "\n"
+    (tmp_path / "graph.g2o").write_text("".join([*lines, weird, one.format(0, 1), one.format(1, 2)]))
+    assert main(["optimize", str(tmp_path / "graph.g2o")]) in (0, 3)
+    said = capsys.readouterr()
+    assert "owned" in said.out
+    assert not set(said.out + said.err) & set("\x1b\x07\u202e\u200b")
+
+
+def test_X11_every_line_of_a_command_is_one_line(capsys):
+    from graph_slam_ros.cli import console
+
+    console.say(f"landmark {HOSTILE}")
+    console.tell(HOSTILE)
+    console.told([HOSTILE], [HOSTILE])
+    console.told([f"{k}" for k in range(100)])
+    said = capsys.readouterr()
+    assert len(said.out.splitlines()) == 1
+    assert len(said.err.splitlines()) == 3 + 21
+    assert not set(said.out + said.err) & set("\x1b\x07\u202e\u200b")
+
+
+CACHE = "from graph_slam_ros.lie.jit import CACHE_DIR; print(CACHE_DIR)"
+
+
+def cache_dir(**environment):
+    """Where a new process keeps its compiled kernels."""
+    environment = {name: value for name, value in (os.environ | environment).items() if value is not None}
+    done = subprocess.run([sys.executable, "-c", CACHE], env=environment, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def test_X12_compiled_kernels_are_loaded_from_a_folder_that_nobody_else_can_write_to(tmp_path):
+    first = cache_dir(GRAPH_SLAM_CACHE=str(tmp_path))
+    assert first.startswith(str(tmp_path))
+    os.chmod(first, 0o777)
+    assert cache_dir(GRAPH_SLAM_CACHE=str(tmp_path)) == first
+    assert os.stat(first).st_mode & 0o777 == 0o700
+    os.rename(first, tmp_path / "elsewhere")
+    os.symlink(tmp_path / "elsewhere", first)
+    assert not cache_dir(GRAPH_SLAM_CACHE=str(tmp_path)).startswith(str(tmp_path))
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a file to somebody else")
+def test_X12_a_file_of_somebody_else_in_the_folder_is_not_loaded(tmp_path):
+    first = cache_dir(GRAPH_SLAM_CACHE=str(tmp_path))
+    planted = os.path.join(first, "planted.nbi")
+    open(planted, "wb").close()
+    os.chown(planted, 12345, 12345)
+    assert cache_dir(GRAPH_SLAM_CACHE=str(tmp_path)) != first
+
+
+def test_X12_without_a_home_or_a_usable_cache_there_is_another_folder(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert cache_dir(GRAPH_SLAM_CACHE=str(tmp_path / "file"), TMPDIR=str(tmp_path)).startswith(str(tmp_path))
+    assert cache_dir(HOME=None, XDG_CACHE_HOME=None, GRAPH_SLAM_CACHE=None)
