@@ -153,6 +153,7 @@ class _Second:
             "changes": [[number[edge], first + keyframe, *rest] for edge, keyframe, *rest in told.get("changes", ())],
             "keyframes": [[self._vertex[vertex], *rest] for vertex, *rest in told["keyframes"]],
             "segments": [first + keyframe for keyframe in told["segments"]],
+            "drives": [first + keyframe for keyframe in told["drives"]],
             "sightings": [[first + keyframe, *rest] for keyframe, *rest in told.get("sightings", ())],
             "landmarks": self._landmarks(told.get("landmarks", {})),
             "seen": [

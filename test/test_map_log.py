@@ -53,6 +53,7 @@ def test_what_is_read_back_is_what_there_was(run):
     assert state.ledger.outside.tolist() == slam.ledger.outside.tolist()
     assert state.keyframes == list(slam.keyframes)
     assert state.segments == slam.segments
+    assert state.drives == slam.drives == [0]
     assert state.sighting_poses == list(slam.sighting_poses)
     assert state.range_offsets == slam.range_offsets
     assert told(state)["landmarks"] == told(state_of(slam))["landmarks"]
@@ -99,7 +100,11 @@ def test_a_run_that_goes_on_in_a_map_knows_its_landmarks_and_is_repeated_byte_by
         recorder.record(slam, slam.process(m))
     recorder.save(slam)
     recorder.close()
-    assert slam.segments == [0, len(before.keyframes)]
+    assert slam.segments == slam.drives == [0, len(before.keyframes)]
+    assert read_map(tmp_path / "after", []).drives == slam.drives
+    (first, second) = json.loads((tmp_path / "after" / "run.json").read_text())["drives"]
+    assert first == {"keyframe": 0, "sighting": 0}
+    assert second == {"keyframe": len(before.keyframes), "sighting": len(before.sighting_poses)}
     assert set(slam.landmarks) == set(before.landmarks)
     first, second = np.split(slam.trajectory(), [len(before.keyframes)])
     assert np.hypot(*(first - second[: len(first)])[:, :2].T).max() < 0.2

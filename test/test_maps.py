@@ -260,6 +260,7 @@ def test_merge_lays_the_second_session_on_the_first(first, elsewhere, merged):
     count = len(one.keyframes)
     assert len(both.keyframes) == count + len(two.keyframes)
     assert both.segments == [*one.segments, *(count + k for k in two.segments)]
+    assert both.drives == [0, count]
     assert set(both.landmarks) == set(one.landmarks) | set(two.landmarks)
     assert both.graph.edge_count == one.graph.edge_count + two.graph.edge_count
     for name, mark in both.landmarks.items():

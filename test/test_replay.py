@@ -29,6 +29,7 @@ from graph_slam_ros.slam.measurements import from_record, to_record
 RESULTS = (
     "graph.g2o",
     "path.tum",
+    "path_odometry.tum",
     "covariances.csv",
     "sightings.tum",
     "landmarks.csv",
@@ -207,6 +208,7 @@ def test_trajectories_have_a_line_for_each_keyframe_and_each_sighting(folder, ru
     for name, poses in (
         ("sightings.tum", run.slam.sighting_trajectory()),
         ("odometry.tum", run.slam.sighting_odometry()),
+        ("path_odometry.tum", run.slam.keyframes.poses),
     ):
         assert read_tum(folder / name).poses[:, :2] == pytest.approx(poses[:, :2])
 

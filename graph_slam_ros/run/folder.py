@@ -18,8 +18,11 @@ from graph_slam_ros.slam import Config
 
 SUMMARY, CONFIG = "run.json", "config.yaml"
 GRAPH, VERTICES, COVARIANCES = "graph.g2o", "graph_vertices.csv", "covariances.csv"
-PATH, SIGHTINGS, ODOMETRY, LANDMARKS = "path.tum", "sightings.tum", "odometry.tum", "landmarks.csv"
-_RESULTS = {SUMMARY, GRAPH, VERTICES, LEDGER, CHANGES, PATH, COVARIANCES, SIGHTINGS, ODOMETRY, LANDMARKS, "path.png"}
+PATH, PATH_ODOMETRY = "path.tum", "path_odometry.tum"  # at keyframes: estimate, and what odometry alone says
+SIGHTINGS, ODOMETRY = "sightings.tum", "odometry.tum"  # the same at the stamps of sightings
+LANDMARKS, PICTURE = "landmarks.csv", "path.png"
+_PATHS = {PATH, PATH_ODOMETRY, SIGHTINGS, ODOMETRY, COVARIANCES}
+_RESULTS = {SUMMARY, GRAPH, VERTICES, LEDGER, CHANGES, LANDMARKS, PICTURE, *_PATHS}
 _RECORDED = re.compile(r"(ingest|map|run)(_\d+)?\.mcap")
 
 

@@ -7,8 +7,8 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
   information by rows, class, input. Both are numbered in order from 0;
 * ``judged``: of each edge, in order, keyframe at which it was judged first, statistic, threshold, numbers measured,
   residual then, verdict, reason; ``changes``: edge, keyframe, verdict, reason, statistic, threshold;
-* ``keyframes``: vertex, stamp, ``T_odom_base``; ``segments``: keyframes at which odometry began; ``sightings``:
-  keyframe, stamp, ``T_keyframe_base``;
+* ``keyframes``: vertex, stamp, ``T_odom_base``; ``segments``: keyframes at which odometry began; ``drives``:
+  the first keyframe of each drive; ``sightings``: keyframe, stamp, ``T_keyframe_base``;
 * ``landmarks``: by name, vertex, whether without identity, whether tentative, number of sightings, first and last
   stamp, or null where it was given up; ``seen``: of those without identity, each sighting and its edge; ``offsets``: by
   input, the vertex of what its ranges have in common;
@@ -62,7 +62,7 @@ class Growth:
     def __init__(self, start: MapState | None = None) -> None:
         self._vertices = self._edges = self._judged = self._changes = 0
         self._keyframes = self._segments = self._sightings = self._landmarks = self._offsets = 0
-        self._frozen = 0
+        self._frozen = self._drives = 0
         self._datum: tuple[float, ...] = ()
         self._settings: dict[str, Any] = {}
         self._estimated = 0  # keyframes at the last estimate
@@ -92,6 +92,7 @@ class Growth:
         keyframes = [a.keyframes[k] for k in range(self._keyframes, len(a.keyframes))]
         out["keyframes"] = [[k.vertex, k.stamp_ns, k.T_odom_base] for k in keyframes]
         out["segments"] = a.segments[self._segments :]
+        out["drives"] = a.drives[self._drives :]
         poses = [a.sighting_poses[k] for k in range(self._sightings, len(a.sighting_poses))]
         out["sightings"] = [[p.keyframe, p.stamp_ns, p.T_keyframe_base] for p in poses]
         landmarks = a.touched_landmarks(self._landmarks)
@@ -108,6 +109,7 @@ class Growth:
         self._vertices, self._edges, self._judged = graph.vertex_count, graph.edge_count, len(a.ledger)
         self._changes, self._keyframes, self._segments = len(a.ledger.history), len(a.keyframes), len(a.segments)
         self._sightings, self._offsets = len(a.sighting_poses), len(a.range_offsets)
+        self._drives = len(a.drives)
         self._landmarks, self._frozen = a.landmark_changes, a.frozen
         return {name: part for name, part in out.items() if part}
 
@@ -200,8 +202,8 @@ def _fault(state: MapState) -> str:
     for name, vertex in state.range_offsets.items():
         if not (_is_index(vertex, len(kinds)) and kinds[vertex] is R1):
             return f"the offset of {name} is none"
-    if not all(_is_index(one, len(state.keyframes)) for one in state.segments):
-        return "a segment begins where no keyframe is"
+    if not all(_is_index(one, len(state.keyframes)) for one in (*state.segments, *state.drives)):
+        return "a segment or a drive begins where no keyframe is"
     if state.datum and not (len(state.datum) == 3 and are_numbers(state.datum)):
         return "its datum is none"
     if len(state.ledger) > graph.edge_count:
@@ -296,6 +298,7 @@ def _grow(state: MapState, record: Mapping[str, Any]) -> None:
         ledger.note(edge, keyframe, *_verdict(verdict, reason), float(statistic), float(threshold))
     state.keyframes += [Keyframe(vertex, stamp, tuple(pose)) for vertex, stamp, pose in record.get("keyframes", ())]
     state.segments += record.get("segments", ())
+    state.drives += record.get("drives", ())
     state.sighting_poses += [SightingPose(k, stamp, tuple(pose)) for k, stamp, pose in record.get("sightings", ())]
     _know(state, record)
     state.range_offsets.update(record.get("offsets", {}))

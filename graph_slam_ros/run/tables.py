@@ -12,7 +12,7 @@ from graph_slam_ros.formats.g2o_writer import g2o_text
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.ros import results
-from graph_slam_ros.run.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, SIGHTINGS, VERTICES
+from graph_slam_ros.run.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, PATH_ODOMETRY, SIGHTINGS, VERTICES
 from graph_slam_ros.run.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
 from graph_slam_ros.slam import GraphSlam
 
@@ -31,6 +31,7 @@ def result_texts(slam: GraphSlam) -> dict[str, str]:
         LEDGER: ledger_text(slam, ids),
         CHANGES: changes_text(slam),
         PATH: tum_text(slam.keyframes.stamps_ns.tolist(), slam.trajectory()),
+        PATH_ODOMETRY: tum_text(slam.keyframes.stamps_ns.tolist(), slam.keyframes.poses),
         COVARIANCES: _covariance_table(slam),
         SIGHTINGS: tum_text(stamps, slam.sighting_trajectory()),
         ODOMETRY: tum_text(stamps, slam.sighting_odometry()),
@@ -47,6 +48,7 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
         "landmarks": len(slam.landmarks),
         "waiting": slam.waiting,
         "segments": len(slam.segments),
+        "drives": _drives(slam),
         "sightings": sum(landmark.sightings for landmark in slam.landmarks.values()),
         "edges": slam.graph.edge_count,
         "solves": slam.solves,
@@ -60,6 +62,12 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
         "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
         "counters": slam.counters.as_dict(),
     }
+
+
+def _drives(slam: GraphSlam) -> list[dict[str, int]]:
+    """Where each drive begins in ``path.tum`` and in ``sightings.tum``: rows, from 0."""
+    of = slam.sighting_poses.ids
+    return [{"keyframe": first, "sighting": int(np.sum(of < first))} for first in slam.drives]
 
 
 def numbered(slam: GraphSlam) -> tuple[list[int], str]:

@@ -128,6 +128,7 @@ class GraphSlam:
         self._noise = OdometryNoise(self.config.odometry, self.space)
         self._trail = Trail(self._noise, self.space)
         self.keyframes, self.segments = self._trail.keyframes, self._trail.segments
+        self.drives = self._trail.drives  # the first keyframe of each; the last drive is the present one
         self._edges = PoseEdges(self.space, self.graph, self.counters)
         self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
         self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over)
@@ -313,7 +314,7 @@ class GraphSlam:
         """Solve a map anew, and be nowhere in it yet."""
         if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
-        self._trail.take_up(start.keyframes, start.segments)
+        self._trail.take_up(start.keyframes, start.segments, start.drives)
         for pose in start.sighting_poses:
             self.sighting_poses.append(pose.keyframe, pose.stamp_ns, pose.T_keyframe_base)
         self._landmarks.take_up(start.landmarks, start.range_offsets)

@@ -31,6 +31,7 @@ class MapState:
     values: Array = field(default_factory=lambda: np.zeros(0))
     keyframes: list[Keyframe] = field(default_factory=list)
     segments: list[int] = field(default_factory=list)
+    drives: list[int] = field(default_factory=list)
     sighting_poses: list[SightingPose] = field(default_factory=list)
     landmarks: dict[str, Landmark] = field(default_factory=dict)
     range_offsets: dict[str, int] = field(default_factory=dict)

@@ -37,11 +37,14 @@ class Trail:
     Attributes
     ----------
     segments : keyframes at which odometry began, or began anew
+    drives : the first keyframe of each drive: more than one where the map was loaded
     """
 
     def __init__(self, noise: OdometryNoise, space: Space) -> None:
         self.keyframes = Track(Keyframe, space.pose.size)
         self.segments: list[int] = []
+        self.drives: list[int] = []
+        self._is_new_drive = True
         self._noise, self._space = noise, space
         self._motions: deque[Motion] = deque()
         self._epoch = 0  # the first keyframe since stamps began anew
@@ -63,17 +66,21 @@ class Trail:
 
     def append(self, vertex: int, step: Step, late_s: float) -> None:
         """Add a keyframe where odometry is; motions are forgotten that ended more than ``late_s`` ago."""
+        if self._is_new_drive:
+            self.drives.append(len(self.keyframes))
+            self._is_new_drive = False
         self.keyframes.append(vertex, step.stamp_ns, step.T_odom_base)
         self._motions.append(Motion(self._noise, self._space, len(self.keyframes) - 1, step.stamp_ns))
         oldest_ns = step.stamp_ns - round(late_s * 1e9)
         while len(self._motions) > 2 and self._motions[1].start_ns <= oldest_ns:
             self._motions.popleft()
 
-    def take_up(self, keyframes: Sequence[Keyframe], segments: Sequence[int]) -> None:
+    def take_up(self, keyframes: Sequence[Keyframe], segments: Sequence[int], drives: Sequence[int]) -> None:
         """Go on after these; how the robot came from the last of them to where it is, nobody knows."""
         for one in keyframes:
             self.keyframes.append(one.vertex, one.stamp_ns, one.T_odom_base)
         self.segments += segments
+        self.drives += drives or [0]  # a map of an earlier version does not say
         self.forget_time()
 
     def forget_time(self) -> None:
