@@ -72,7 +72,8 @@ setup(
         "tqdm>=4.60.0",
     ],
     extras_require={
-        "evaluate": ["evo>=1.31.1"],  # GPL-3.0: never a requirement of the Apache-2.0 package itself
+        # Tests compare our scores with its. GPL-3.0: never a requirement of the Apache-2.0 package itself.
+        "evaluate": ["evo>=1.31.1"],
         "jazzy": [f"{line} ; {WHERE_JAZZY_HAS_WHEELS}" for line in JAZZY],
         "test": [
             "hypothesis>=6.82",

@@ -23,8 +23,8 @@ from benchmarks.fresh import ROOT
 from benchmarks.kept import Kept, code_of, digest
 from benchmarks.problem import Array, Index, Problem, landmark_problem
 from benchmarks.trials import in_order_of_sighting
-from graph_slam_ros.evaluation import interpolated
 from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.path_error import interpolated
 from graph_slam_ros.replay import choose_inputs, measurements
 from graph_slam_ros.ros.bag import open_bag
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam

@@ -6,7 +6,7 @@ as many degrees of freedom as e has components, which is also its mean.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -77,12 +77,18 @@ class ClassNoise:
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """NEES of the last pose, of all poses and of landmarks' positions, each None where it is not known, and classes."""
+    """NEES of the last pose, of all poses and of landmarks' positions, each None where it is not known, and classes.
+
+    Attributes
+    ----------
+    left_out : why there is no NEES: by ``poses`` and ``landmarks``, a reason for each that is None
+    """
 
     last_pose: Nees | None
     poses: Nees | None
     landmarks: Nees | None
     classes: dict[str, ClassNoise]
+    left_out: dict[str, str] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -101,6 +107,7 @@ class Consistency:
                 lines.append(
                     f"{name:30s}{nees.mean:10.2f}{nees.dof:10d}{band:>16s}{nees.inside:8.0%}{nees.n:7d}{nees.skipped:9d}"
                 )
+        lines += [f"{f'NEES of {name}':30s}left out: {reason}" for name, reason in self.left_out.items()]
         if self.classes:
             lines.append(f"{'class of edges':30s}{'residuals':>10s}{'dof':>10s}{'chi2/dof':>16s}   sigmas should be")
         for name, c in self.classes.items():

@@ -1,4 +1,4 @@
-"""How far a run is from the truth: position, orientation and map, measured by evo; and whether it knows how far.
+"""How far a run is from the truth: position, orientation, drift and map; and whether it knows how far.
 
 For the errors the estimate is moved onto the truth by the rigid motion that fits best, of the plane or of space as the
 run was made, without scale; poses are compared where both have a stamp within 0.05 s. Consistency is told in the frame
@@ -6,34 +6,35 @@ that both share at the run's first pose.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from graph_slam_ros.consistency import ClassNoise, Consistency, class_noise, landmark_nees, pose_nees
+from graph_slam_ros.consistency import ClassNoise, Consistency, Nees, class_noise, landmark_nees, pose_nees
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3
+from graph_slam_ros.path_error import (
+    STATISTICS,
+    Drift,
+    PathError,
+    Statistics,
+    alignment,
+    associate,
+    interpolated,
+    path_error,
+)
 from graph_slam_ros.run import COVARIANCES, SUMMARY, is_run, run_config
-from graph_slam_ros.truth import Point, Trajectory, Truth, read_covariances, read_landmarks, read_truth, read_tum
+from graph_slam_ros.trajectory import Point, Trajectory, read_covariances, read_landmarks, read_tum
+from graph_slam_ros.truth import Truth, read_truth
 
 Array = NDArray[np.float64]
 
-MAX_STAMP_DIFFERENCE_S = 0.05
-_STATISTICS = ("rmse", "median", "max")
-_EXACT_S = 1e-6  # stamps in seconds are rounded to less
-
-
-@dataclass(frozen=True, slots=True)
-class PathError:
-    """Errors of a path at n stamps, each as {rmse, median, max}."""
-
-    position_m: dict[str, float]
-    angle_rad: dict[str, float]
-    n: int
+_KEYFRAMES = ("path.tum", "path_odometry.tum")  # estimate and dead reckoning
+_SIGHTINGS = ("sightings.tum", "odometry.tum")
+_ONE_DRIVE = [{"keyframe": 0, "sighting": 0}]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,8 @@ class Scores:
     consistency : of the run, or None where it left no covariances
     dimensions : 2 or 3
     losses : what of the truth could not be read
+    warnings : why the errors may mean less than they seem to
+    scored : what was compared with what, in words
     """
 
     estimate: PathError
@@ -55,6 +58,8 @@ class Scores:
     consistency: Consistency | None = None
     dimensions: int = 2
     losses: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    scored: dict[str, str] = field(default_factory=dict)
 
     @property
     def _angle(self) -> str:
@@ -63,55 +68,116 @@ class Scores:
     def as_dict(self) -> dict[str, Any]:
         """Plain values; what there is not is None. Angles are ``heading_rad`` in the plane, ``angle_rad`` in space."""
 
+        def drift(one: Drift | None, unit: str) -> dict[str, Any] | None:
+            angle = f"{self._angle}_rad_per_{unit}"
+            return None if one is None else {f"position_m_per_{unit}": one.position, angle: one.angle, "n": one.n}
+
         def plain(error: PathError) -> dict[str, Any]:
-            return {"position_m": error.position_m, f"{self._angle}_rad": error.angle_rad, "n": error.n}
+            return {
+                "position_m": error.position_m,
+                f"{self._angle}_rad": error.angle_rad,
+                "drift": {"per_s": drift(error.per_s, "s"), "per_m": drift(error.per_m, "m")},
+                "n": error.n,
+                "of": error.of,
+            }
 
         return plain(self.estimate) | {
             "map_m": None if self.map_rmse_m is None else {"rmse": self.map_rmse_m},
             "odometry": self.odometry and plain(self.odometry),
             "consistency": self.consistency and self.consistency.as_dict(),
+            "scored": self.scored,
         }
 
     def __str__(self) -> str:
-        lines = [f"{f'error at {self.estimate.n} stamps':30s}{'rmse':>10s}{'median':>10s}{'max':>10s}"]
+        lines = [f"{name:30s}{what}" for name, what in self.scored.items()]
+        title = f"error at {self.estimate.n} of {self.estimate.of} stamps"
+        lines.append(f"{title:30s}{'rmse':>10s}{'median':>10s}{'max':>10s}")
         for name, error in (("estimate", self.estimate), ("dead reckoning", self.odometry)):
             if error is not None:
-                lines.append(_line(f"{name}, position [m]", error.position_m, 1.0, 3))
-                lines.append(_line(f"{name}, {self._angle} [deg]", error.angle_rad, 180.0 / np.pi, 2))
+                lines += self._rows(name, error)
         if self.map_rmse_m is not None:
             lines.append(f"{'landmarks, position [m]':30s}{self.map_rmse_m:10.3f}")
         if self.consistency is not None:
             lines.append(str(self.consistency))
         return "\n".join(lines)
 
+    def _rows(self, name: str, error: PathError) -> list[str]:
+        degrees = 180.0 / np.pi
+        rows = [
+            (f"{name}, position [m]", error.position_m, 1.0, 3),
+            (f"{name}, {self._angle} [deg]", error.angle_rad, degrees, 2),
+        ]
+        for one, unit in ((error.per_s, "s"), (error.per_m, "m")):
+            if one is not None:
+                rows.append((f"{name}, drift [m/{unit}]", one.position, 1.0, 4))
+                rows.append((f"{name}, drift [deg/{unit}]", one.angle, degrees, 3))
+        return [_line(*row) for row in rows if row[1] is not None]  # type: ignore[arg-type]
 
-def _line(name: str, values: dict[str, float], factor: float, digits: int) -> str:
-    return f"{name:30s}" + "".join(f"{factor * values[key]:10.{digits}f}" for key in _STATISTICS)
+
+def _line(name: str, values: Statistics, factor: float, digits: int) -> str:
+    return f"{name:30s}" + "".join(f"{factor * values[key]:10.{digits}f}" for key in STATISTICS)
 
 
-def evaluate(run: Path, truth: str | Path, estimate: str = "sightings.tum") -> Scores:
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """The part of a run's folder that is scored: the paths of one drive.
+
+    Attributes
+    ----------
+    estimate, odometry : with the names of their files; odometry is None where there is none
+    number, count : which of how many, from 1; the others were in the map that was loaded
+    first_keyframe, end_keyframe : its rows in ``path.tum``, the second not included; None: to the end
+    """
+
+    estimate: Trajectory
+    odometry: Trajectory | None
+    names: tuple[str, str]
+    number: int = 1
+    count: int = 1
+    first_keyframe: int = 0
+    end_keyframe: int | None = None
+
+    @property
+    def keyframes(self) -> slice:
+        """Its rows in ``path.tum``."""
+        return slice(self.first_keyframe, self.end_keyframe)
+
+
+def evaluate(run: Path | str, truth: str | Path, estimate: str = "", topic: str = "", *, align: bool = True) -> Scores:
     """Compare a run's folder with the truth.
 
     Parameters
     ----------
     truth : ``BAG``, ``BAG:TOPIC`` or ``FILE.tum``
-    estimate : which path of the run is scored
+    estimate : which path of the run is scored; default: ``sightings.tum``, or ``path.tum`` where nothing was seen
+    topic : of the truth, as in ``read_truth``
+    align : without, the map is taken to be in the frame of the truth
 
     Raises
     ------
     GraphSlamError
-        A file or topic that is missing or unreadable, too few common stamps, or no evo.
+        A file or topic that is missing or unreadable, or too few common stamps.
     """
-    known, dimensions = read_truth(truth), dimensions_of(run)
-    odometry = run / "odometry.tum"
+    run = Path(run)
+    inputs = input_topics(run)
+    known, dimensions = read_truth(truth, topic, inputs), dimensions_of(run)
+    drive = scored_drive(run, known.trajectory, estimate)
     landmarks = {name: landmark.position for name, landmark in read_landmarks(run / "landmarks.csv").items()}
+    scored = {"truth": known.source, "estimate": _described(drive)}
+    scored["frame"] = "the run lies on the truth as well as can be" if align else "as they are, not aligned"
+    warnings = []
+    if known.topic in inputs:
+        warnings.append(f"{known.topic} was an input of the run: the error says how well it fits, not how true it is")
+    odometry = drive.odometry
     return Scores(
-        path_error(read_tum(run / estimate), known.trajectory, dimensions),
-        path_error(read_tum(odometry), known.trajectory, dimensions) if odometry.exists() else None,
+        path_error(drive.estimate, known.trajectory, dimensions, align=align),
+        None if odometry is None else path_error(odometry, known.trajectory, dimensions),
         _map_rmse(landmarks, known.landmarks, dimensions),
-        _consistency(run, known),
+        _consistency(run, known, drive),
         dimensions,
         known.losses,
+        tuple(warnings),
+        scored,
     )
 
 
@@ -120,63 +186,67 @@ def dimensions_of(run: Path) -> int:
     return run_config(run).world.dimensions if is_run(run) else 2
 
 
-def path_error(estimate: Trajectory, truth: Trajectory, dimensions: int = 2) -> PathError:
-    """Errors of one path, aligned by itself."""
-    metrics = _evo("metrics")
-    if dimensions == 2:
-        estimate, truth = estimate.in_plane(), truth.in_plane()
-    matched, reference = associate(estimate, truth)
-    aligned = matched.moved(alignment(matched.poses[:, :dimensions], reference.poses[:, :dimensions]))
-    found = []
-    for relation in (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad):
-        error = metrics.APE(relation)
-        error.process_data((_evo_path(reference), _evo_path(aligned)))
-        found.append({name: float(error.get_statistic(metrics.StatisticsType[name])) for name in _STATISTICS})
-    return PathError(found[0], found[1], len(aligned.stamps_s))
+def input_topics(run: Path) -> set[str]:
+    """Topics that a run listened to, by its configuration."""
+    return {f"/{one.topic.lstrip('/')}" for one in run_config(run).sources} if is_run(run) else set()
 
 
-def associate(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
-    """The poses of both that belong together: nearest stamps, within 0.05 s, none before or after the truth.
+def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Drive:
+    """The last drive of a run that was under way while the truth was recorded; the last where there is no truth.
 
     Raises
     ------
     GraphSlamError
-        Fewer than two.
+        The path of the run cannot be read.
     """
-    inside = (estimate.stamps_s >= truth.stamps_s[0]) & (estimate.stamps_s <= truth.stamps_s[-1])
-    ids, theirs = _evo("sync").matching_time_indices(estimate.stamps_s[inside], truth.stamps_s, MAX_STAMP_DIFFERENCE_S)
-    mine = np.flatnonzero(inside)[ids].tolist() if ids else []
-    if len(mine) < 2:
-        raise GraphSlamError(
-            f"{len(mine)} of {len(estimate.stamps_s)} stamps are within {MAX_STAMP_DIFFERENCE_S} s of the truth's:"
-            f" the estimate spans {_span(estimate)}, the truth {_span(truth)}"
+    seen = run / _SIGHTINGS[0]
+    has_sightings = seen.exists() and seen.stat().st_size > 0
+    of_sightings = estimate == _SIGHTINGS[0] or (not estimate and has_sightings)
+    default, odometry = _SIGHTINGS if of_sightings else _KEYFRAMES
+    name = estimate or default
+    if not (run / odometry).exists():
+        odometry = _SIGHTINGS[1]
+    whole = read_tum(run / name)
+    beside = read_tum(run / odometry) if (run / odometry).exists() else None
+    drives = _drives(run) if name in (*_SIGHTINGS, *_KEYFRAMES) else _ONE_DRIVE
+    chosen = None
+    for k in reversed(range(len(drives))):
+        follows = drives[k + 1] if k + 1 < len(drives) else {}
+        rows = {key: slice(drives[k][key], follows.get(key)) for key in ("keyframe", "sighting")}
+        estimated = whole.at(rows["sighting" if name in _SIGHTINGS else "keyframe"])
+        reckoned = beside and beside.at(rows["sighting" if odometry in _SIGHTINGS else "keyframe"])
+        if not len(estimated.stamps_s):
+            continue
+        part = Drive(
+            estimated, reckoned, (name, odometry), k + 1, len(drives), drives[k]["keyframe"], follows.get("keyframe")
         )
-    return tuple(Trajectory(t.stamps_s[at], t.poses[at]) for t, at in ((estimate, mine), (truth, theirs)))  # type: ignore[return-value]
+        chosen = chosen or part
+        if truth is None or _overlap(estimated, truth):
+            return part
+    return chosen or Drive(whole, beside, (name, odometry))
 
 
-def alignment(points: Array, reference: Array) -> se3.Pose:
-    """The rigid motion that takes points (n, 2) or (n, 3) nearest to their reference.
-
-    Of the plane where they have two coordinates: a rotation there cannot turn into the mirror image that turning over
-    in space would allow.
-
-    Raises
-    ------
-    GraphSlamError
-        All points are in one place, or in space on a line.
-    """
-    geometry = _evo("geometry")
-    dimensions = points.shape[1]
+def _drives(run: Path) -> list[dict[str, int]]:
+    """Where each drive begins; one where the summary does not say."""
     try:
-        rotation, translation, _ = geometry.umeyama_alignment(points.T, reference.T, False)
-    except geometry.GeometryException:
-        where = "in one place" if dimensions == 2 else "on a line"
-        raise GraphSlamError(f"cannot align: all positions are {where}") from None
-    full = np.eye(3)
-    full[:dimensions, :dimensions] = rotation
-    turn = Rotation.from_matrix(full).as_quat()
-    x, y, z = (*translation.tolist(), 0.0)[:3]
-    return (x, y, z, *turn.tolist())
+        told = json.loads((run / SUMMARY).read_text(encoding="utf-8"))["drives"]
+        drives = [{key: int(one[key]) for key in ("keyframe", "sighting")} for one in told]
+    except (OSError, ValueError, KeyError, TypeError):
+        return _ONE_DRIVE
+    return drives or _ONE_DRIVE
+
+
+def _overlap(path: Trajectory, truth: Trajectory) -> bool:
+    try:
+        return len(associate(path, truth)[0].stamps_s) > 1
+    except GraphSlamError:
+        return False
+
+
+def _described(drive: Drive) -> str:
+    if drive.count == 1:
+        return drive.names[0]
+    return f"{drive.names[0]}, drive {drive.number} of {drive.count} alone: the others are of other recordings"
 
 
 def _map_rmse(landmarks: dict[str, Point], true: dict[str, Point], dimensions: int) -> float | None:
@@ -187,26 +257,23 @@ def _map_rmse(landmarks: dict[str, Point], true: dict[str, Point], dimensions: i
     flat = np.array([1.0, 1.0, 0.0 if dimensions == 2 else 1.0])
     points, reference = (np.array([where[name] for name in shared]) * flat for where in (landmarks, true))
     moved = np.stack(se3.act(alignment(points[:, :dimensions], reference[:, :dimensions]), tuple(points.T)), axis=1)
-    level = np.tile(se3.IDENTITY[3:], (len(shared), 1))
-    metrics = _evo("metrics")
-    error = metrics.APE(metrics.PoseRelation.translation_part)
-    at = np.zeros(len(shared))
-    error.process_data(tuple(_evo_path(Trajectory(at, np.hstack([p, level]))) for p in (reference, moved)))
-    return float(error.get_statistic(metrics.StatisticsType.rmse))
+    return float(np.sqrt(np.mean(np.sum((moved - reference) ** 2, axis=1))))
 
 
-def _consistency(run: Path, known: Truth) -> Consistency | None:
+def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
     """From what the run left; None where it left no covariances."""
     if not (run / COVARIANCES).exists():
         return None
     path, covariances = read_tum(run / "path.tum"), read_covariances(run / COVARIANCES)
     if len(covariances) != len(path.stamps_s):
         raise GraphSlamError(f"{run / COVARIANCES}: {len(covariances)} covariances of {len(path.stamps_s)} poses")
+    path, covariances = path.at(drive.keyframes), covariances[drive.keyframes]
     truth = known.trajectory if covariances.shape[1] == 6 else known.trajectory.in_plane()
     true = interpolated(truth, path.stamps_s)
     is_held, noise = _classes(run)
-    if is_held:  # by the fixes, not by the first pose, and nobody says in which frame
-        true[:] = np.nan
+    reason = _why_no_nees(known, drive, path, true, is_held)
+    if reason:
+        return Consistency(None, None, None, noise, {"poses and landmarks": reason})
     landmarks = read_landmarks(run / "landmarks.csv")
     unknown = (np.nan, np.nan, np.nan)
     of_landmarks = landmark_nees(
@@ -217,7 +284,38 @@ def _consistency(run: Path, known: Truth) -> Consistency | None:
         true[0],
         covariances[0],
     )
-    return Consistency(*pose_nees(path.poses, true, covariances), of_landmarks, noise)
+    last, poses = pose_nees(path.poses, true, covariances)
+    return Consistency(last, poses, of_landmarks, noise, _left_out(last, poses, of_landmarks, known, len(landmarks)))
+
+
+def _why_no_nees(known: Truth, drive: Drive, path: Trajectory, true: Array, is_held: bool) -> str:
+    """Why errors and covariances cannot be compared at all; empty where they can."""
+    if not known.trajectory.has_orientation:
+        return f"{known.source} has no orientation, which says how the map lies in its frame"
+    if is_held:
+        return "fixes hold the map, not its first pose, and how their frame lies in that of the truth is not known"
+    if drive.number > 1:
+        return "the map was there before the drive, so the first pose of the drive does not hold it"
+    if not np.isfinite(true[0]).all():
+        return f"the first keyframe, at {path.stamps_s[0]:.3f} s, has no truth within 0.05 s: both frames meet there"
+    return ""
+
+
+def _left_out(
+    last: Nees | None, poses: Nees | None, of_landmarks: Nees | None, known: Truth, landmarks: int
+) -> dict[str, str]:
+    out = {}
+    if poses is None:
+        out["poses"] = "none but the first has a truth within 0.05 s and a covariance"
+    elif last is None:
+        out["last pose"] = "it has no truth within 0.05 s, or no covariance"
+    if of_landmarks is None and landmarks:
+        out["landmarks"] = (
+            "none of them has a covariance and is among the true ones"
+            if known.landmarks
+            else "the truth has none (/landmarks_ground_truth)"
+        )
+    return out
 
 
 def _classes(run: Path) -> tuple[bool, dict[str, ClassNoise]]:
@@ -227,34 +325,3 @@ def _classes(run: Path) -> tuple[bool, dict[str, ClassNoise]]:
         return "fixes" in summary["classes"], class_noise(summary["classes"], summary["leverage"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run ({type(error).__name__}: {error})") from None
-
-
-def interpolated(truth: Trajectory, stamps_s: Array) -> Array:
-    """True poses (n, 7) at stamps (n,), between neighbours at most twice 0.05 s apart; elsewhere NaN."""
-    after = np.clip(np.searchsorted(truth.stamps_s, stamps_s), 1, max(1, len(truth.stamps_s) - 1))
-    before = after - 1
-    after = np.minimum(after, len(truth.stamps_s) - 1)
-    first, gap = truth.stamps_s[before], truth.stamps_s[after] - truth.stamps_s[before]
-    fraction = (stamps_s - first) / np.where(gap > 0.0, gap, 1.0)
-    out = np.stack(se3.interpolate(tuple(truth.poses[before].T), tuple(truth.poses[after].T), fraction), axis=1)
-    off_s = np.minimum(np.abs(stamps_s - first), np.abs(truth.stamps_s[after] - stamps_s))
-    between = (fraction >= 0.0) & (fraction <= 1.0) & (gap <= 2.0 * MAX_STAMP_DIFFERENCE_S)
-    out[~(between | (off_s <= _EXACT_S))] = np.nan
-    return out
-
-
-def _evo(module: str) -> Any:
-    """A module of evo's core; it takes half a second and not everybody has it."""
-    try:
-        from evo.core import geometry, metrics, sync, trajectory
-    except ImportError:
-        raise GraphSlamError("scores need evo: pip install 'graph_slam_ros[evaluate]'") from None
-    return {"geometry": geometry, "metrics": metrics, "sync": sync, "trajectory": trajectory}[module]
-
-
-def _evo_path(t: Trajectory) -> Any:
-    return _evo("trajectory").PosePath3D(t.poses[:, :3], np.roll(t.poses[:, 3:], 1, axis=1))
-
-
-def _span(t: Trajectory) -> str:
-    return f"{t.stamps_s[0]:.3f} to {t.stamps_s[-1]:.3f} s"

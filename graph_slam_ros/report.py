@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from graph_slam_ros import evaluation
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3
-from graph_slam_ros.truth import Trajectory, read_landmarks, read_truth, read_tum
+from graph_slam_ros.path_error import alignment, associate
+from graph_slam_ros.trajectory import Trajectory, read_landmarks, read_tum
+from graph_slam_ros.truth import read_truth
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -107,8 +109,8 @@ def draw_graph(
 
 
 def _onto(path: Trajectory, truth: Trajectory, dimensions: int) -> se3.Pose:
-    mine, theirs = evaluation.associate(path, truth)
-    return evaluation.alignment(mine.poses[:, :dimensions], theirs.poses[:, :dimensions])
+    mine, theirs = associate(path, truth)
+    return alignment(mine.poses[:, :dimensions], theirs.poses[:, :dimensions])
 
 
 def _within(truth: Trajectory, path: Trajectory) -> Trajectory:

@@ -1,7 +1,11 @@
-"""Paths and maps out of files: TUM, a run's table of landmarks, and the truth in a recording."""
+"""The truth that a run is compared with: a TUM file, or a topic of a recording.
 
-import csv
-from collections.abc import Iterator
+A recording may have the robot's pose (PoseStamped, PoseWithCovarianceStamped, TransformStamped, Odometry, a transform
+on TF) or its position alone (PointStamped; NavSatFix, then east, north and up of its first fix).
+"""
+
+import math
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,56 +17,27 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3
 from graph_slam_ros.ros.bag import Bag, open_bag
 from graph_slam_ros.ros.definitions import recorded_decoder
+from graph_slam_ros.ros.inputs.fixes import east_north_up
+from graph_slam_ros.trajectory import Point, Trajectory, read_tum, trajectory
 
 Array = NDArray[np.float64]
-Point = tuple[float, float, float]
 
 TRUTH_TOPIC = "/ground_truth"
 TRUE_LANDMARKS_TOPIC = "/landmarks_ground_truth"
 _ODOMETRY_TOPIC = "/odom"
 _ODOMETRY = "nav_msgs/msg/Odometry"
+_FIX = "sensor_msgs/msg/NavSatFix"
+_POINT = "geometry_msgs/msg/PointStamped"
+_TF = "tf2_msgs/msg/TFMessage"
 _POSE_TYPES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
+    _POINT,
+    _FIX,
     _ODOMETRY,
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Trajectory:
-    """Poses at stamps.
-
-    Attributes
-    ----------
-    stamps_s : (n,) seconds, increasing
-    poses : (n, 7) x, y, z [m], qx, qy, qz, qw
-    """
-
-    stamps_s: Array
-    poses: Array
-
-    def moved(self, T_new_old: se3.Pose) -> "Trajectory":
-        """The same trajectory in another frame."""
-        return Trajectory(self.stamps_s, np.stack(se3.compose(T_new_old, tuple(self.poses.T)), axis=1))
-
-    def in_plane(self) -> "Trajectory":
-        """Without height, roll and pitch."""
-        return Trajectory(self.stamps_s, se3.in_space(se3.in_plane(self.poses)))
-
-
-@dataclass(frozen=True, slots=True)
-class Landmark:
-    """A landmark of a run.
-
-    Attributes
-    ----------
-    position : in map [m]
-    covariance : (3, 3) of the position in the axes of map, zero for what a plane does not have; NaN where unknown
-    """
-
-    position: Point
-    covariance: Array
+Row = tuple[int, tuple[float, ...]]  # stamp [ns] and pose (7,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,138 +48,124 @@ class Truth:
     ----------
     landmarks : positions in metres by id, where they are known
     losses : what of the recording could not be read
+    source : the file, or the topic with its type
     """
 
     trajectory: Trajectory
     landmarks: dict[str, Point]
     losses: tuple[str, ...] = ()
+    source: str = ""
+    topic: str = ""
 
 
-def read_tum(path: Path) -> Trajectory:
-    """Poses of a TUM file (stamp x y z qx qy qz qw).
+def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = ()) -> Truth:
+    """True poses and landmarks.
 
-    Raises
-    ------
-    GraphSlamError
-        No such file, nothing in it, or rows that are not eight numbers.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise GraphSlamError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise GraphSlamError(f"{path}: not a readable text file ({type(error).__name__})") from None
-    found = []
-    for number, line in enumerate(lines, start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            try:
-                found.append([float(word) for word in line.split()])
-            except ValueError as error:
-                raise GraphSlamError(f"{path}:{number}: {error}") from None
-            if len(found[-1]) != 8 or not np.isfinite(found[-1]).all():
-                raise GraphSlamError(f"{path}:{number}: a row of a TUM file is eight finite numbers")
-    if not found:
-        raise GraphSlamError(f"{path}: no pose in it")
-    rows = np.array(found)
-    return _trajectory(rows[:, 0], rows[:, 1:], str(path))
-
-
-def _trajectory(stamps_s: Array, poses: Array, source: str) -> Trajectory:
-    """Poses in order of stamp, with unit quaternions: files round them."""
-    norm = np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    if not (norm > 0.0).all():
-        raise GraphSlamError(f"{source}: a quaternion of zeros is no rotation")
-    order = np.argsort(stamps_s, kind="stable")
-    return Trajectory(stamps_s[order], np.hstack([poses[:, :3], poses[:, 3:] / norm])[order])
-
-
-def read_landmarks(path: Path) -> dict[str, Landmark]:
-    """Landmarks by id of a run's ``landmarks.csv``; empty where there is no such file."""
-    if not path.exists():
-        return {}
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            return {row["id"]: _landmark(row) for row in csv.DictReader(stream)}
-    except (KeyError, TypeError, ValueError) as error:
-        raise GraphSlamError(f"{path}: not a table of landmarks ({error})") from None
-
-
-def _landmark(row: dict[str, str]) -> Landmark:
-    names = "xyz" if "z" in row else "xy"
-    covariance = np.zeros((3, 3))
-    for i, a in enumerate(names):
-        for j, b in enumerate(names[i:], start=i):
-            covariance[i, j] = covariance[j, i] = float(row[f"cov_{a}{b}"])
-    return Landmark((float(row["x"]), float(row["y"]), float(row.get("z", 0.0))), covariance)
-
-
-def read_covariances(path: Path) -> Array:
-    """Covariances of a run's ``covariances.csv``, (n, 3, 3) or (n, 6, 6), each in its pose's tangent space.
-
-    Raises
-    ------
-    GraphSlamError
-        It is no such table.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()[1:]
-        rows = np.array([[float(word) for word in line.split(",")[1:]] for line in lines])
-        dof = {6: 3, 21: 6}[rows.shape[-1]]
-    except (KeyError, ValueError, OSError) as error:
-        raise GraphSlamError(f"{path}: not a table of covariances ({error})") from None
-    upper = np.triu_indices(dof)
-    out = np.empty((len(rows), dof, dof))
-    out[:, upper[0], upper[1]] = out[:, upper[1], upper[0]] = rows
-    return out
-
-
-def read_truth(truth: str | Path) -> Truth:
-    """True poses and landmarks from ``BAG``, ``BAG:TOPIC`` or ``FILE.tum``.
+    Parameters
+    ----------
+    truth : ``BAG``, ``BAG:TOPIC`` or ``FILE.tum``
+    topic : of the recording; of a topic of transforms also ``TOPIC:PARENT:CHILD``, the names of two frames.
+        Default: ``/ground_truth``, else the only topic that can be the truth
+    not_these : topics that are not chosen by themselves
 
     Raises
     ------
     GraphSlamError
         No such file, or no such topic; those that exist are named.
     """
-    path, topic = Path(truth), ""
-    if not path.exists() and ":" in str(truth):
-        before, _, topic = str(truth).rpartition(":")
-        path = Path(before)
+    path, named = _file_and_topic(str(truth))
+    topic = topic or named
     if path.suffix in (".tum", ".txt"):
-        return Truth(read_tum(path), {})
+        if topic:
+            raise GraphSlamError(f"{path}: a TUM file has no topics: leave out {topic}")
+        return Truth(read_tum(path), {}, source=str(path))
     bag = open_bag(path)
-    poses, landmarks = _recorded_poses(bag, topic or _truth_topic(bag, path), path), _recorded_landmarks(bag)
-    return Truth(poses, landmarks, tuple(bag.losses))
+    name, _, frames = (topic or _only_topic(bag, path, not_these)).partition(":")
+    if name not in bag.topics or bag.topics[name].type not in (*_POSE_TYPES, _TF):
+        raise GraphSlamError(f"{path}: no topic {name} of poses; {_listed(bag)}")
+    kind = bag.topics[name].type
+    rows = _transforms(bag, path, name, frames) if kind == _TF else list(_rows(bag, name, kind))
+    finite = [row for row in rows if all(map(math.isfinite, row[1]))]
+    if len(finite) < len(rows):
+        bag.losses.append(f"{len(rows) - len(finite)} of {len(rows)} poses on {name} are not finite")
+    rows = finite
+    if not rows:
+        raise GraphSlamError(f"{path}: nothing on {name} that tells where the robot was")
+    # One rounding, as of the decimal text in a TUM file: equal stamps stay equal.
+    stamps_s = np.array([stamp_ns / 10**9 for stamp_ns, _ in rows])
+    found = trajectory(stamps_s, np.array([pose for _, pose in rows], dtype=float), f"{path}, {name}")
+    has_orientation = kind not in (_FIX, _POINT)
+    found = Trajectory(found.stamps_s, found.poses, has_orientation)
+    landmarks = _recorded_landmarks(bag)
+    return Truth(found, landmarks, tuple(bag.losses), f"{topic or name} ({kind})", name)
 
 
-def _truth_topic(bag: Bag, path: Path) -> str:
-    """``/ground_truth``, or the only topic of poses besides the odometry (of its type only where there is no other)."""
+def _file_and_topic(truth: str) -> tuple[Path, str]:
+    """Before the first colon that a file ends at; a name may hold colons itself."""
+    path = Path(truth)
+    at = truth.find(":")
+    while not path.exists() and at >= 0:
+        if at and (Path(truth[:at]).exists() or truth.find(":", at + 1) < 0 or truth[at + 1] == "/"):
+            return Path(truth[:at]), truth[at + 1 :]
+        at = truth.find(":", at + 1)
+    return path, ""
+
+
+def _only_topic(bag: Bag, path: Path, not_these: Collection[str]) -> str:
+    """``/ground_truth``, or the only topic that can be the truth: one of odometry only where there is no other."""
     if TRUTH_TOPIC in bag.topics:
         return TRUTH_TOPIC
-    poses = [t for t in bag.topics.values() if t.type in _POSE_TYPES and t.name != _ODOMETRY_TOPIC]
-    best = [t.name for t in poses if t.type != _ODOMETRY] or [t.name for t in poses]
+    left_out = {_ODOMETRY_TOPIC, *not_these}
+    found = [t for t in bag.topics.values() if t.type in _POSE_TYPES and t.name not in left_out]
+    best = [t.name for t in found if t.type != _ODOMETRY] or [t.name for t in found]
     if len(best) == 1:
         return best[0]
-    raise GraphSlamError(f"{path}: no topic {TRUTH_TOPIC}; name the truth as BAG:TOPIC, {_listed(bag)}")
+    if best:
+        raise GraphSlamError(f"{path}: several topics may be the truth: {', '.join(sorted(best))}; choose with --topic")
+    raise GraphSlamError(f"{path}: no topic {TRUTH_TOPIC}; name the truth with --topic TOPIC, {_listed(bag)}")
 
 
 def _listed(bag: Bag) -> str:
     names = sorted(t.name for t in bag.topics.values() if t.type in _POSE_TYPES)
+    names += [f"{t.name}:PARENT:CHILD" for t in bag.topics.values() if t.type == _TF and t.name != "/tf_static"]
     return f"with poses there are {', '.join(names)}" if names else "but no topic has poses"
 
 
-def _recorded_poses(bag: Bag, topic: str, path: Path) -> Trajectory:
-    if topic not in bag.topics or bag.topics[topic].type not in _POSE_TYPES:
-        raise GraphSlamError(f"{path}: no topic {topic} of poses; {_listed(bag)}")
-    stamps, rows = [], []
+def _rows(bag: Bag, topic: str, kind: str) -> Iterator[Row]:
+    datum: tuple[float, float, float] | None = None
     for message in _decoded(bag, topic):
-        p, q = _position_and_orientation(message)
-        # One rounding, as of the decimal text in a TUM file: equal stamps stay equal.
-        stamps.append((message.header.stamp.sec * 10**9 + message.header.stamp.nanosec) / 10**9)
-        rows.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-    if not rows:
-        raise GraphSlamError(f"{path}: no message on {topic}")
-    return _trajectory(np.array(stamps), np.array(rows, dtype=float), f"{path}, {topic}")
+        stamp_ns = _nanoseconds(message.header.stamp)
+        if kind == _FIX:
+            here = (message.latitude, message.longitude, message.altitude)
+            if message.status.status < 0 or not all(map(math.isfinite, here[:2])) or here[0] == here[1] == 0.0:
+                continue
+            here = (*here[:2], here[2] if math.isfinite(here[2]) else datum[2] if datum else 0.0)
+            datum = datum or here
+            yield stamp_ns, (*east_north_up(here, datum), *se3.IDENTITY[3:])
+        elif kind == _POINT:
+            yield stamp_ns, (message.point.x, message.point.y, message.point.z, *se3.IDENTITY[3:])
+        else:
+            yield stamp_ns, _numbers(*_position_and_orientation(message))
+
+
+def _transforms(bag: Bag, path: Path, topic: str, frames: str) -> list[Row]:
+    """Of one pair of frames: the named one, or the only one that does not begin or end in a frame of the robot."""
+    found: dict[tuple[str, str], list[Row]] = {}
+    for message in _decoded(bag, topic):
+        for one in message.transforms:
+            pair = (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/"))
+            row = (_nanoseconds(one.header.stamp), _numbers(one.transform.translation, one.transform.rotation))
+            found.setdefault(pair, []).append(row)
+    names = ", ".join(f"{topic}:{parent}:{child}" for parent, child in sorted(found))
+    if frames:
+        parent, _, child = frames.partition(":")
+        pair = (parent.lstrip("/"), child.lstrip("/"))
+        if pair not in found:
+            raise GraphSlamError(f"{path}: no transform {topic}:{frames}; there are {names or 'none'}")
+        return found[pair]
+    if len(found) == 1:
+        return next(iter(found.values()))
+    raise GraphSlamError(f"{path}: {topic} has several transforms: choose with --topic one of {names or 'none'}")
 
 
 def _decoded(bag: Bag, topic: str) -> Iterator[Any]:
@@ -219,11 +180,19 @@ def _decoded(bag: Bag, topic: str) -> Iterator[Any]:
         yield message
 
 
+def _nanoseconds(stamp: Any) -> int:
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
 def _position_and_orientation(message: Any) -> tuple[Any, Any]:
     if hasattr(message, "transform"):
         return message.transform.translation, message.transform.rotation
     pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
     return pose.position, pose.orientation
+
+
+def _numbers(p: Any, q: Any) -> tuple[float, ...]:
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
 def _recorded_landmarks(bag: Bag) -> dict[str, Point]:

@@ -8,14 +8,15 @@ from scipy.stats import chi2
 
 from graph_slam_ros.consistency import Nees, class_noise, landmark_nees, pose_nees
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.evaluation import Trajectory, evaluate, interpolated
+from graph_slam_ros.evaluation import evaluate
 from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.path_error import interpolated
 from graph_slam_ros.replay import replay
 from graph_slam_ros.run import RunRecorder
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.solver.leverage import leverage
-from graph_slam_ros.truth import read_covariances
+from graph_slam_ros.trajectory import Trajectory, read_covariances
 
 
 def spread(rng, dof):
@@ -150,7 +151,6 @@ def test_leverages_add_up_to_the_unknowns_and_a_sample_of_edges_tells_them_too(t
 
 @pytest.mark.parametrize("world, n", [("warehouse", 3), ("flight", 6)])
 def test_a_run_with_the_noise_it_was_told_of_is_consistent_and_its_sigmas_are_right(tmp_path, world, n):
-    pytest.importorskip("evo")
     options = {"warehouse": {"aisles": 2, "laps": 1, "aisle_m": 6.0}, "flight": {"laps": 1, "beacons": 3}}[world]
     # a keyframe at each look: what is carried from look to keyframe shares its noise, which is not modelled
     settings = CLEAN | {"world.dimensions": n // 3 + 1, "keyframes.max_interval_s": 0.15}
@@ -168,13 +168,13 @@ def test_a_run_with_the_noise_it_was_told_of_is_consistent_and_its_sigmas_are_ri
 
 
 def test_a_flight_is_scored_in_space_in_words_and_in_plain_values(tmp_path):
-    pytest.importorskip("evo")
     recording = simulate("flight", 1, laps=1)
     slam = run(recording, tmp_path / "run", {"world.dimensions": 3})
     write_bag(recording, tmp_path / "truth.mcap")
     scores = evaluate(tmp_path / "run", tmp_path / "truth.mcap")
     plain = json.loads(json.dumps(scores.as_dict()))
-    assert set(plain) == {"position_m", "angle_rad", "n", "map_m", "odometry", "consistency"}
+    own = {"position_m", "angle_rad", "drift", "n", "of"}
+    assert set(plain) == own | {"map_m", "odometry", "consistency", "scored"}
     assert plain["position_m"]["rmse"] < 0.05 < plain["odometry"]["position_m"]["rmse"]
     assert plain["map_m"]["rmse"] < 0.1
     assert plain["consistency"]["poses"]["dof"] == 6
@@ -189,6 +189,7 @@ def test_a_flight_is_scored_in_space_in_words_and_in_plain_values(tmp_path):
     (tmp_path / "run" / "run.json").write_text(json.dumps(summary))
     held = evaluate(tmp_path / "run", tmp_path / "truth.mcap").consistency
     assert (held.last_pose, held.poses, held.landmarks) == (None, None, None), "the map is held elsewhere"
+    assert "left out: fixes hold the map" in str(held)
     assert read_covariances(tmp_path / "run" / "covariances.csv") == pytest.approx(
         np.array(slam.solver.marginal(slam.keyframes.ids))
     )
@@ -198,7 +199,6 @@ def test_a_flight_is_scored_in_space_in_words_and_in_plain_values(tmp_path):
     "text", ["", "{", "[]", "{}", '{"classes": {"a": {}}, "leverage": {}}', '{"classes": [], "leverage": 1}']
 )
 def test_a_summary_that_is_none_is_refused_by_name(tmp_path, text):
-    pytest.importorskip("evo")
     recording = simulate("pythonrobotics", 1)
     run(recording, tmp_path / "run", {})
     write_bag(recording, tmp_path / "truth.mcap")
@@ -218,7 +218,6 @@ def test_a_file_that_is_no_table_of_covariances_is_refused_by_name(tmp_path, tex
     "world, sensor", [("flight", "pose"), ("flight", "range_bearing"), ("warehouse", "range_bearing")]
 )
 def test_a_simulated_bag_is_replayed_to_a_run_that_is_near_the_truth_and_knows_it(tmp_path, world, sensor):
-    pytest.importorskip("evo")
     write_bag(simulate(world, 1, laps=1, sensor=sensor), tmp_path / "bag.mcap")
     settings = {"world.dimensions": 3 if world == "flight" else 2}
     if sensor != "pose":

@@ -1,25 +1,23 @@
-import sys
+import json
+import re
+from dataclasses import replace as changed
 
 import numpy as np
 import pytest
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.evaluation import (
-    Trajectory,
-    alignment,
-    associate,
-    evaluate,
-    path_error,
-    read_truth,
-    read_tum,
-)
+from graph_slam_ros.evaluation import evaluate
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.path_error import alignment, associate, path_error
+from graph_slam_ros.replay import replay
 from graph_slam_ros.ros.bag import BagWriter
 from graph_slam_ros.ros.to_msg import encode, header, heading, make, point, pose, pose_stamped, vector
-from graph_slam_ros.simulation import simulate, write_bag
-
-pytest.importorskip("evo")
+from graph_slam_ros.run import map_of, record_run
+from graph_slam_ros.simulation import measurements, simulate, write_bag
+from graph_slam_ros.slam import Config, Control
+from graph_slam_ros.trajectory import Trajectory, read_tum
+from graph_slam_ros.truth import read_truth
 
 START_S = 1_700_000_000
 
@@ -192,10 +190,13 @@ def test_the_scores_as_plain_values_are_exactly_these(run, tmp_path):
     add_true_landmarks(tmp_path / "map.mcap", {"a": (7.0, 0.0), "b": (0.0, 7.0)})
     scores = evaluate(run, str(tmp_path / "map.mcap")).as_dict()
     three = {"rmse", "median", "max"}
-    assert set(scores) == {"position_m", "heading_rad", "map_m", "n", "odometry", "consistency"}
+    own = {"position_m", "heading_rad", "drift", "n", "of"}
+    assert set(scores) == own | {"map_m", "odometry", "consistency", "scored"}
     assert set(scores["position_m"]) == set(scores["heading_rad"]) == three
     assert set(scores["map_m"]) == {"rmse"}
-    assert set(scores["odometry"]) == {"position_m", "heading_rad", "n"}
+    assert set(scores["odometry"]) == own
+    assert set(scores["drift"]["per_s"]) == {"position_m_per_s", "heading_rad_per_s", "n"}
+    assert set(scores["drift"]["per_m"]) == {"position_m_per_m", "heading_rad_per_m", "n"}
     assert scores["n"] == scores["odometry"]["n"] == 200
     assert scores["position_m"]["max"] < 1e-6 < scores["odometry"]["position_m"]["rmse"]
 
@@ -211,11 +212,13 @@ def test_the_table_tells_metres_and_degrees(run, tmp_path):
     poses = np.add(se3.in_plane(eight().poses), (0.0, 0.0, np.deg2rad(3.0)))
     write_tum(run / "sightings.tum", eight().stamps_s, poses)
     lines = str(evaluate(run, tmp_path / "truth.mcap")).splitlines()
-    assert [line.split() for line in lines if "estimate" in line] == [
+    assert [line.split() for line in lines if re.match(r"estimate,.*(position|deg)", line)] == [
         ["estimate,", "position", "[m]", "0.000", "0.000", "0.000"],
         ["estimate,", "heading", "[deg]", "3.00", "3.00", "3.00"],
+        ["estimate,", "drift", "[deg/s]", "0.000", "0.000", "0.000"],  # the same offset throughout
+        ["estimate,", "drift", "[deg/m]", "0.000", "0.000", "0.000"],
     ]
-    assert len({len(line) for line in lines if "landmarks" not in line}) == 1
+    assert len({len(line) for line in lines[3:] if "landmarks" not in line}) == 1
 
 
 def test_truth_is_read_from_every_type_of_pose(tmp_path):
@@ -273,7 +276,7 @@ def test_the_truth_is_its_usual_topic_or_the_only_one_of_poses_besides_the_odome
 @pytest.mark.parametrize("names", [["odom"], ["wheels", "vicon"]])
 def test_where_the_truth_cannot_be_told_it_must_be_named(tmp_path, names):
     write_topics(tmp_path / "bag.mcap", **dict.fromkeys(names, "nav_msgs/msg/Odometry"))
-    with pytest.raises(GraphSlamError, match="name the truth as BAG:TOPIC") as refused:
+    with pytest.raises(GraphSlamError, match="with --topic") as refused:
         read_truth(tmp_path / "bag.mcap")
     assert all(f"/{name}" in str(refused.value) for name in names)
     assert read_truth(f"{tmp_path / 'bag.mcap'}:/{names[0]}").trajectory.poses[:, 0].tolist() == [1.0]
@@ -315,7 +318,236 @@ def test_missing_files_are_named(run, tmp_path):
         evaluate(run, "nowhere.mcap:/ground_truth")
 
 
-def test_without_evo_the_error_says_how_to_get_it(run, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "evo.core", None)
-    with pytest.raises(GraphSlamError, match=r"pip install 'graph_slam_ros\[evaluate\]'"):
-        evaluate(run, tmp_path / "truth.mcap")
+def test_absolute_and_relative_errors_are_those_of_evo():
+    metrics, trajectory = (pytest.importorskip(f"evo.core.{name}") for name in ("metrics", "trajectory"))
+    rng = np.random.default_rng(4)
+    noise = [se3.exp(tuple(d)) for d in rng.normal(scale=0.05, size=(300, 6))]
+    for dimensions in (2, 3):
+        steps = [se3.exp(tuple(d)) for d in np.add(rng.normal(scale=0.3, size=(300, 6)), (0.5, 0, 0, 0, 0, 0.1))]
+        poses = [se3.IDENTITY]
+        for step in steps[1:]:
+            poses.append(se3.compose(poses[-1], step))
+        truth = Trajectory(START_S + np.arange(300.0), np.array(poses))
+        truth = truth.in_plane() if dimensions == 2 else truth
+        moved = np.stack(se3.compose(tuple(truth.poses.T), tuple(np.array(noise).T)), axis=1)
+        estimate = Trajectory(truth.stamps_s, moved).moved(motion(4.0, 2.0, 1.0))
+        ours = path_error(estimate, truth, dimensions)
+        estimate = estimate.in_plane() if dimensions == 2 else estimate
+        theirs = [
+            trajectory.PoseTrajectory3D(t.poses[:, :3], np.roll(t.poses[:, 3:], 1, axis=1), t.stamps_s)
+            for t in (truth, estimate)
+        ]
+        theirs[1].align(theirs[0])
+        parts = metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad
+        absolute = zip(parts, (ours.position_m, ours.angle_rad), strict=True)
+        relative = zip(parts, (ours.per_s.position, ours.per_s.angle), strict=True)
+        pairs = [(metrics.APE(part), found) for part, found in absolute]
+        pairs += [(metrics.RPE(part, 1.0, metrics.Unit.frames), found) for part, found in relative]  # at 1 Hz
+        for metric, found in pairs:
+            metric.process_data(tuple(theirs))
+            for name, value in found.items():
+                assert metric.get_statistic(metrics.StatisticsType[name]) == pytest.approx(value, rel=1e-6)
+
+
+# -- what may be the truth --------------------------------------------------------------------------------------------
+
+
+def stamped(stamp_ns, kind, **fields):
+    return encode(make(kind, header=header(stamp_ns, fields.pop("frame", "world")), **fields))
+
+
+def write_fixes(path, stamps_s, poses, topic="/fix", datum=(48.0, 11.0, 500.0)):
+    """NavSatFix at poses that lie east and north of the datum; the first message has no fix."""
+    radius_m = 6_378_137.0
+    status = {
+        name: make("sensor_msgs/msg/NavSatStatus", status=code, service=1) for name, code in (("no", -1), ("yes", 0))
+    }
+    with BagWriter(path) as bag:
+        for k, (stamp, p) in enumerate(zip(stamps_s, poses, strict=True)):
+            stamp_ns = round(stamp * 1e9)
+            # of a sphere with the ellipsoid's radii at the datum: to a millimetre over some metres
+            flat = 0.00669437999014
+            square = 1.0 - flat * np.sin(np.deg2rad(datum[0])) ** 2
+            north_m, east_m = radius_m * (1.0 - flat) / square**1.5, radius_m / np.sqrt(square)
+            latitude = datum[0] + np.rad2deg(p[1] / (north_m + datum[2]))
+            longitude = datum[1] + np.rad2deg(p[0] / ((east_m + datum[2]) * np.cos(np.deg2rad(datum[0]))))
+            cdr = stamped(
+                stamp_ns,
+                "sensor_msgs/msg/NavSatFix",
+                status=status["yes" if k else "no"],
+                latitude=float(latitude) if k else 0.0,
+                longitude=float(longitude) if k else 0.0,
+                altitude=datum[2],
+                position_covariance=np.zeros(9),
+                position_covariance_type=0,
+            )
+            bag.write(topic, "sensor_msgs/msg/NavSatFix", stamp_ns, cdr)
+
+
+def test_fixes_are_a_truth_without_orientation_east_and_north_of_the_first(run, tmp_path):
+    truth = eight()
+    write_fixes(tmp_path / "fixes.mcap", truth.stamps_s, truth.poses)
+    scores = evaluate(run, tmp_path / "fixes.mcap")
+    assert scores.estimate.position_m["max"] < 0.005
+    assert scores.odometry.position_m["rmse"] > 0.1
+    assert (scores.estimate.angle_rad, scores.estimate.per_s.angle) == (None, None)
+    assert scores.estimate.per_m.position["max"] < 0.005
+    assert scores.estimate.n == 199, "the first is no fix"
+    assert "heading" not in str(scores)
+    assert "deg" not in str(scores)
+    assert json.loads(json.dumps(scores.as_dict()))["heading_rad"] is None
+    assert scores.scored["truth"] == "/fix (sensor_msgs/msg/NavSatFix)"
+    first = read_truth(tmp_path / "fixes.mcap").trajectory.poses[0, :3]
+    assert first == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+def test_points_are_a_truth_without_orientation(run, tmp_path):
+    with BagWriter(tmp_path / "points.mcap") as bag:
+        for stamp, p in zip(eight().stamps_s, eight().poses, strict=True):
+            cdr = stamped(round(stamp * 1e9), "geometry_msgs/msg/PointStamped", point=point(*p[:3]))
+            bag.write("/prism", "geometry_msgs/msg/PointStamped", round(stamp * 1e9), cdr)
+    scores = evaluate(run, tmp_path / "points.mcap")
+    assert scores.estimate.position_m["max"] < 1e-6
+    assert scores.estimate.angle_rad is None
+
+
+def write_transforms(path, *pairs):
+    """On /tf at each stamp the poses of ``eight`` between the first two frames, and standing still between others."""
+    with BagWriter(path) as bag:
+        for stamp, p in zip(eight().stamps_s, eight().poses, strict=True):
+            stamp_ns = round(stamp * 1e9)
+            transforms = []
+            for k, (parent, child) in enumerate(pairs):
+                moved = make(
+                    "geometry_msgs/msg/Transform",
+                    translation=vector(*(p[:2] if not k else (1.0, 2.0))),
+                    rotation=heading(0.0)
+                    if k
+                    else make("geometry_msgs/msg/Quaternion", x=p[3], y=p[4], z=p[5], w=p[6]),
+                )
+                one = header(stamp_ns, parent)
+                transforms.append(
+                    make("geometry_msgs/msg/TransformStamped", header=one, child_frame_id=child, transform=moved)
+                )
+            cdr = encode(make("tf2_msgs/msg/TFMessage", transforms=transforms))
+            bag.write("/tf", "tf2_msgs/msg/TFMessage", stamp_ns, cdr)
+
+
+def test_a_transform_is_a_truth_by_the_names_of_its_frames(run, tmp_path):
+    write_transforms(tmp_path / "tf.mcap", ("vicon", "robot"), ("base_link", "wheel"))
+    bag = tmp_path / "tf.mcap"
+    for scores in (evaluate(run, bag, topic="/tf:vicon:robot"), evaluate(run, f"{bag}:/tf:vicon:robot")):
+        assert scores.estimate.position_m["max"] < 1e-6
+        assert scores.estimate.angle_rad["max"] < 1e-6
+    with pytest.raises(GraphSlamError, match=r"--topic one of /tf:base_link:wheel, /tf:vicon:robot$"):
+        evaluate(run, bag, topic="/tf")
+    with pytest.raises(GraphSlamError, match=r"no transform /tf:vicon:base; there are /tf:base_link:wheel"):
+        evaluate(run, bag, topic="/tf:vicon:base")
+    with pytest.raises(GraphSlamError, match="/tf:PARENT:CHILD"):
+        evaluate(run, bag)
+    write_transforms(tmp_path / "one.mcap", ("vicon", "robot"))
+    assert evaluate(run, tmp_path / "one.mcap", topic="/tf").estimate.position_m["max"] < 1e-6
+
+
+def test_where_several_topics_may_be_the_truth_they_are_named_and_the_option_that_chooses(tmp_path):
+    kinds = {"vicon": "geometry_msgs/msg/PoseStamped", "amcl_pose": "geometry_msgs/msg/PoseStamped"}
+    write_topics(tmp_path / "bag.mcap", **kinds)
+    with pytest.raises(GraphSlamError, match=r"may be the truth: /amcl_pose, /vicon; choose with --topic"):
+        read_truth(tmp_path / "bag.mcap")
+    assert read_truth(tmp_path / "bag.mcap", "/amcl_pose").trajectory.poses[:, 0].tolist() == [2.0]
+    assert read_truth(tmp_path / "bag.mcap", not_these={"/vicon"}).trajectory.poses[:, 0].tolist() == [2.0]
+
+
+def test_a_pose_that_is_not_finite_is_left_out_and_told(tmp_path):
+    truth = eight()
+    poses = truth.poses.copy()
+    poses[5] = np.nan
+    write_truth(tmp_path / "truth.mcap", truth.stamps_s, poses)
+    known = read_truth(tmp_path / "truth.mcap")
+    assert len(known.trajectory.stamps_s) == 199
+    assert known.losses == ("1 of 200 poses on /ground_truth are not finite",)
+
+
+# -- drift, frames, drives --------------------------------------------------------------------------------------------
+
+
+def test_drift_is_the_error_of_a_second_and_of_a_metre_whatever_their_steps():
+    seconds = np.arange(0.0, 60.0, 0.25)
+    truth = planar(START_S + seconds, np.column_stack([2.0 * seconds, 0.0 * seconds, 0.0 * seconds]))
+    too_far = planar(truth.stamps_s, np.column_stack([2.2 * seconds, 0.0 * seconds, 0.03 * seconds]))
+    error = path_error(too_far, truth)
+    assert error.per_s.angle["max"] == pytest.approx(0.03)
+    assert error.per_m.angle["max"] == pytest.approx(0.015)
+    straight = planar(truth.stamps_s, np.column_stack([2.2 * seconds, 0.0 * seconds, 0.0 * seconds]))
+    assert path_error(straight, truth).per_s.position["rmse"] == pytest.approx(0.2)
+    assert path_error(straight, truth).per_m.position["rmse"] == pytest.approx(0.1)
+
+
+def test_poses_too_far_apart_in_time_have_no_drift():
+    truth = eight(20, 5.0)
+    assert path_error(truth, truth).per_s is None
+
+
+def test_without_alignment_a_shift_is_an_error(run, tmp_path):
+    assert evaluate(run, tmp_path / "truth.mcap").estimate.position_m["max"] < 1e-6
+    assert evaluate(run, tmp_path / "truth.mcap", align=False).estimate.position_m["rmse"] > 1.0
+
+
+def test_a_run_that_saw_nothing_is_scored_at_its_keyframes(run, tmp_path):
+    truth = eight()
+    (run / "sightings.tum").write_text("")
+    (run / "odometry.tum").write_text("")
+    write_tum(run / "path_odometry.tum", truth.stamps_s[::2], truth.poses[::2] * (1.1, 1.1, *[1.0] * 5))
+    scores = evaluate(run, tmp_path / "truth.mcap")
+    assert scores.estimate.n == scores.odometry.n == 100
+    assert scores.estimate.position_m["max"] < 1e-6 < 0.1 < scores.odometry.position_m["rmse"]
+    assert scores.scored["estimate"] == "path.tum"
+
+
+def test_of_a_run_in_a_loaded_map_the_drive_of_the_truth_alone_is_scored(tmp_path):
+    world = simulate("pythonrobotics", 0, poses=40)
+    write_bag(world, tmp_path / "bag.mcap")
+    replay(tmp_path / "bag.mcap", tmp_path / "before")
+    before = map_of(tmp_path / "before", [])
+    hour_ns = 3_600_000_000_000
+    record_run(tmp_path / "after", Config(), [*later(measurements(world), hour_ns), Control("end")], [], before)
+    truth = Trajectory((world.stamps_ns + hour_ns) / 1e9, se3.in_space(world.T_world_base))
+    write_tum(tmp_path / "truth.tum", truth.stamps_s, truth.poses)
+    new = evaluate(tmp_path / "after", tmp_path / "truth.tum")
+    assert new.scored["estimate"].startswith("sightings.tum, drive 2 of 2 alone")
+    assert new.estimate.n == new.estimate.of == new.odometry.of
+    assert "left out: the map was there before the drive" in str(new)
+    old = evaluate(tmp_path / "after", tmp_path / "bag.mcap")
+    assert old.scored["estimate"].startswith("sightings.tum, drive 1 of 2 alone")
+    assert old.consistency.poses.n > 0
+    whole = read_tum(tmp_path / "after" / "sightings.tum")
+    assert new.estimate.of + old.estimate.of == len(whole.stamps_s)
+
+
+def later(items, by_ns):
+    for one in items:
+        yield changed(one, stamp_ns=one.stamp_ns + by_ns)
+
+
+def test_a_replay_of_odometry_alone_is_scored_and_an_input_is_no_truth_unless_it_is_said(tmp_path):
+    write_bag(simulate("warehouse", 3, aisles=2, laps=1, aisle_m=4.0), tmp_path / "bag.mcap")
+    config = Config.from_mapping({"landmarks.association": "none"})
+    replay(tmp_path / "bag.mcap", tmp_path / "run", config)
+    scores = evaluate(tmp_path / "run", tmp_path / "bag.mcap")
+    assert scores.estimate.n > 20
+    assert scores.estimate.position_m["rmse"] == pytest.approx(scores.odometry.position_m["rmse"], rel=0.05)
+    fits = evaluate(tmp_path / "run", tmp_path / "bag.mcap", topic="/odom")
+    assert fits.warnings == ("/odom was an input of the run: the error says how well it fits, not how true it is",)
+
+
+def test_why_there_is_no_nees_is_told(run, tmp_path):
+    write_bag(simulate("pythonrobotics", 0), tmp_path / "bag.mcap")
+    replay(tmp_path / "bag.mcap", tmp_path / "replayed")
+    truth = read_truth(tmp_path / "bag.mcap").trajectory
+    write_tum(tmp_path / "late.tum", truth.stamps_s[5:], truth.poses[5:])
+    assert "left out: the first keyframe, at" in str(evaluate(tmp_path / "replayed", tmp_path / "late.tum"))
+    write_tum(tmp_path / "all.tum", truth.stamps_s, truth.poses)
+    scores = evaluate(tmp_path / "replayed", tmp_path / "all.tum")
+    assert scores.consistency.left_out == {"landmarks": "the truth has none (/landmarks_ground_truth)"}
+    write_fixes(tmp_path / "fixes.mcap", truth.stamps_s, truth.poses)
+    assert "has no orientation" in str(evaluate(tmp_path / "replayed", tmp_path / "fixes.mcap"))

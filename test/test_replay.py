@@ -14,7 +14,6 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from graph_slam_ros.errors import FormatError, GraphSlamError
-from graph_slam_ros.evaluation import read_tum
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.journal import RecordWriter, parts_of, read_ingest
 from graph_slam_ros.replay import replay
@@ -25,6 +24,7 @@ from graph_slam_ros.run import RunError, RunRecorder, earlier_runs, is_run, keep
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 from graph_slam_ros.slam.measurements import from_record, to_record
+from graph_slam_ros.trajectory import read_tum
 
 RESULTS = (
     "graph.g2o",

@@ -65,7 +65,6 @@ def run(tmp_path, recording):
 
 
 def test_with_truth_everything_is_drawn_in_the_frame_of_the_truth(run, recording, figures):
-    pytest.importorskip("evo")
     draw_run(run, run / "bag.mcap", run / "run.png")
     (axes,) = figures[0].axes
     truth = recording.T_world_base[:, :2]
@@ -81,7 +80,6 @@ def test_with_truth_everything_is_drawn_in_the_frame_of_the_truth(run, recording
 
 
 def test_paths_have_their_colors_and_axes_their_units_and_one_scale(run, figures):
-    pytest.importorskip("evo")
     draw_run(run, run / "bag.mcap", run / "run.png")
     (axes,) = figures[0].axes
     colors = {line.get_label(): to_hex(line.get_color()) for line in axes.get_lines()}
@@ -105,7 +103,6 @@ def test_without_truth_or_landmarks_the_run_is_drawn_in_its_own_frame(run, recor
 
 @pytest.mark.parametrize("left", [None, ""])
 def test_a_run_that_saw_nothing_is_aligned_by_its_keyframes(run, recording, figures, left):
-    pytest.importorskip("evo")
     (run / "sightings.tum").unlink()
     if left is not None:
         (run / "sightings.tum").write_text(left)
@@ -114,7 +111,6 @@ def test_a_run_that_saw_nothing_is_aligned_by_its_keyframes(run, recording, figu
 
 
 def test_no_line_crosses_a_gap_in_the_truth_and_none_of_it_outside_the_run_is_drawn(run, recording, figures):
-    pytest.importorskip("evo")
     stamps_s = recording.stamps_ns / 1e9
     keep = [k for k in range(51) if k <= 10 or k >= 25]
     before = np.add(stamps_s[:5], -100.0)
@@ -128,7 +124,6 @@ def test_no_line_crosses_a_gap_in_the_truth_and_none_of_it_outside_the_run_is_dr
 
 
 def test_a_run_in_space_is_drawn_from_above_and_from_the_side(tmp_path, figures):
-    pytest.importorskip("evo")
     flight = simulate("flight", 1, laps=1)
     write_bag(flight, tmp_path / "bag.mcap")
     stamps, truth = flight.stamps_ns.tolist(), flight.T_world_base

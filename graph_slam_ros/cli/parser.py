@@ -231,10 +231,27 @@ def _world_options() -> str:
 
 def _evaluate(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("run_folder", type=Path, metavar="RUN")
-    sub.add_argument("--truth", required=True, metavar="BAG[:TOPIC]|FILE.tum")
-    sub.add_argument("--estimate", default="sightings.tum", metavar="FILE", help="which trajectory of the run")
+    _add_truth(sub, required=True)
+    sub.add_argument(
+        "--estimate",
+        default="",
+        metavar="FILE",
+        help="which trajectory of the run (default: sightings.tum; path.tum where nothing was seen)",
+    )
     sub.add_argument("--json", action="store_true", help="the numbers as one line")
     sub.add_argument("--plot", type=Path, metavar="FILE.png", help="default: path.png in the run folder")
+
+
+def _add_truth(sub: argparse.ArgumentParser, *, required: bool) -> None:
+    sub.add_argument("--truth", required=required, metavar="BAG|FILE.tum", help="a recording, or a TUM file")
+    sub.add_argument(
+        "--topic",
+        default="",
+        metavar="TOPIC",
+        help="topic of the truth: poses, odometry, NavSatFix or PointStamped; of transforms /tf:PARENT:CHILD"
+        " (default: /ground_truth, or the only one that may be it)",
+    )
+    sub.add_argument("--no-align", action="store_true", help="the map is in the frame of the truth already")
 
 
 def _explain(sub: argparse.ArgumentParser) -> None:

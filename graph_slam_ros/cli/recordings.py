@@ -88,13 +88,13 @@ def evaluate(args: argparse.Namespace) -> int:
     from graph_slam_ros.report import draw_run
     from graph_slam_ros.run import changed_since
 
-    scores = compared(args.run_folder, args.truth, estimate=args.estimate)
+    scores = compared(args.run_folder, args.truth, args.estimate, args.topic, align=not args.no_align)
     console.say(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
     picture = args.plot or args.run_folder / "path.png"
     draw_run(args.run_folder, args.truth, picture)
     if not args.json:
         console.say(f"picture in {picture}")
-    return console.told(scores.losses, changed_since(args.run_folder))
+    return console.told(scores.losses, [*scores.warnings, *changed_since(args.run_folder)])
 
 
 def warmup(args: argparse.Namespace) -> int:
