@@ -16,6 +16,7 @@ from graph_slam_ros.ros.inputs import CONVERTERS, Measured, checks, fixes, uses
 from graph_slam_ros.ros.inputs.checks import MessageError
 from graph_slam_ros.ros.inputs.source import NotYet, Origin, Source
 from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.ros.one_publisher import OnePublisher
 from graph_slam_ros.ros.transforms import Transforms, pose
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
@@ -86,6 +87,7 @@ class Border:
         self._transforms = Transforms(round(config.inputs.tf_buffer_s * 1e9))
         self._sources: dict[str, Source] = {}
         self._convert: dict[str, Callable[[Any], Any]] = {}
+        self._publishers: dict[str, OnePublisher] = {}  # of each odometry
         self._waiting: deque[tuple[Source, Any]] = deque()  # for /tf to tell where their sensors were
         self._types = {TF_STATIC: TRANSFORMS, TF: TRANSFORMS}
         by_name = {settings.name: settings for settings in config.sources}
@@ -95,6 +97,8 @@ class Border:
             source = self._sources[name] = Source(by_name[name], use, config, self._transforms, self._origin)
             self._types[name] = by_name[name].type
             self._convert[name] = partial(CONVERTERS[by_name[name].type][use], source)
+            if use == "odometry":
+                self._publishers[name] = OnePublisher(config.odometry.timeout_s, partial(self._is_of_another, name))
         for name, add in ((TF_STATIC, self._add_static), (TF, self._add_moving)):
             source = self._sources[name] = Source(InputConfig(name), "none", config, self._transforms)
             self._convert[name] = partial(self._transforms_of, source, add)
@@ -115,6 +119,9 @@ class Border:
         for m in out:
             if isinstance(m, Odometry):
                 self._transforms.now_ns = max(m.stamp_ns, self._transforms.now_ns or 0)
+        if source.use == "odometry":
+            publishers = self._publishers[name]
+            out = [one for m in out if isinstance(m, Odometry) for one in publishers.take(m)]
         if name == TF or source.use == "odometry":
             for _ in range(len(self._waiting)):
                 out += self._converted(*self._waiting.popleft())
@@ -122,9 +129,10 @@ class Border:
             out += self._hurried(*self._waiting.popleft())
         return out
 
-    def finish(self) -> list[Measured]:
-        """No more messages come: what waits for /tf is used or refused."""
-        out = [one for waiting in self._waiting for one in self._hurried(*waiting)]
+    def finish(self, *, is_end: bool = True) -> list[Measured]:
+        """What waits for /tf is used or refused; at the end of all messages, odometry that waits, too."""
+        out: list[Measured] = [m for one in self._publishers.values() for m in one.finish()] if is_end else []
+        out += [one for waiting in self._waiting for one in self._hurried(*waiting)]
         self._waiting.clear()
         return out
 
@@ -144,7 +152,12 @@ class Border:
     def forget_time(self) -> None:
         """Stamps begin anew: what /tf has told of moving joints is of another time."""
         self._waiting.clear()
+        for publishers in self._publishers.values():
+            publishers.forget_time()
         self._transforms.forget_time()
+
+    def _is_of_another(self, name: str) -> None:
+        self._counters.count(name, "other_publisher")
 
     def _hurried(self, source: Source, message: Any) -> list[Measured]:
         before, source.hurried = source.hurried, True

@@ -114,6 +114,11 @@ REASONS: dict[str, Reason] = {
         "odometry (or tf: the correction) jumped; after a jump of odometry a new segment begins",
         "odometry.max_speed_m_s; for tf, tf.report_jump_m",
     ),
+    "other_publisher": Reason(
+        _REFUSED,
+        "the pose does not continue the odometry in use: another node publishes on the same topic, or it is an outlier",
+        "one publisher for each odometry topic: ros2 topic info -v TOPIC; a second odometry is an input of its own",
+    ),
     "reset_to_zero": Reason(_NOTED, "odometry was set back to zero: a new segment begins"),
     # -- landmarks
     "no_id": Reason(_REFUSED, "the detection has no identity", "landmarks.association=joint"),

@@ -124,9 +124,9 @@ class Configured:
         if self._before_ns and self._is_of_before(measured):
             self._refuse("before_jump", measured)
             return
-        for m in measured:
-            if isinstance(m, Odometry) and self._is_newest(m) and self._sends_odometry:
-                self._send_odometry(m, cdr)
+        newest = [m for m in measured if isinstance(m, Odometry) and self._is_newest(m)]
+        if newest and self._sends_odometry:
+            self._send_odometry(newest[-1], cdr)
         if self._memory_is_short:
             measured = self._without_closures(measured)
         for some in self._ahead.pass_on(measured):
@@ -174,7 +174,7 @@ class Configured:
         if estimate is None or not estimate.is_confirmed:
             return
         frames, unused = config.frames, config.output.pose_covariance_max
-        twist = twist_of(cdr, frames.base) if m.source in self._with_twist else None
+        twist = twist_of(cdr, frames.base) if m.source.partition("#")[0] in self._with_twist else None
         pose, covariance = self._reckoning.pose(estimate)
         self._outputs.odometry(to_msg.odometry(m.stamp_ns, frames.map, frames.base, pose, covariance, unused, twist))
 
@@ -247,7 +247,7 @@ class Configured:
 
     def save(self) -> "Future[str]":
         """Solve everything and write the run folder."""
-        self._hand_over(self._border.finish())
+        self._hand_over(self._border.finish(is_end=False))
         return self._worker.call(self._session.save)
 
     @property

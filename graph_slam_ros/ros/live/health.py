@@ -26,6 +26,7 @@ class InputFacts:
     counts : of what was refused or repaired, by reason
     silent_s : since the last message, by the clock of the node; infinite before the first
     publishers : names of the nodes that publish it
+    is_contested : whether several publish what is of one: an odometry
     mismatch : what keeps publisher and subscription from connecting, in words; empty where nothing does
     frames : those of its messages that nothing links to the robot, the last ones
     """
@@ -38,6 +39,7 @@ class InputFacts:
     counts: Mapping[str, int] = field(default_factory=dict)
     silent_s: float = math.inf
     publishers: tuple[str, ...] = ()
+    is_contested: bool = False
     mismatch: str = ""
     frames: tuple[str, ...] = ()
 
@@ -160,6 +162,11 @@ def _unlinked(one: InputFacts) -> str:
 def _faults(facts: Facts, config: Config) -> Iterator[str]:
     health, estimate = config.health, facts.estimate
     for one in facts.inputs:
+        if one.is_contested:
+            yield (
+                f"{one.topic}: {' and '.join(one.publishers)} publish it, and one of them is used:"
+                " give each odometry a topic and an input of its own (inputs.names)"
+            )
         most_s = health.odometry_silent_s if one.use == "odometry" else health.landmarks_silent_s
         if one.mismatch:
             yield f"{one.topic}: {one.mismatch}"

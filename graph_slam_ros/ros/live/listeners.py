@@ -133,6 +133,7 @@ class Listeners:
                     counted.get(one.name, {}),
                     silent_s,
                     names,
+                    used[one.name] == "odometry" and one.type != TRANSFORMS and len(names) > 1,
                     "; ".join(filter(None, (self._mismatch(p, one.type) for p in told))),
                     self._border.unlinked(one.name),
                 )

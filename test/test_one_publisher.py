@@ -1,0 +1,187 @@
+"""Several publishers on one odometry topic, without ROS: at the border and in recordings."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from live_drive import TAGS, Drive
+from messages import DETECTIONS, odometry, pose, quaternion
+
+from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.replay import replay
+from graph_slam_ros.ros.bag import BagWriter
+from graph_slam_ros.ros.one_publisher import OnePublisher
+from graph_slam_ros.slam import Odometry
+
+NS = 10**9
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+class Publisher:
+    """What is handed on of messages, and how many were refused."""
+
+    def __init__(self, timeout_s=0.5):
+        self.refused, self.used = 0, []
+        self._one = OnePublisher(timeout_s, self._refuse)
+
+    def _refuse(self):
+        self.refused += 1
+
+    def hear(self, messages):
+        for m in messages:
+            self.used += self._one.take(m)
+        return self
+
+    def end(self):
+        self.used += self._one.finish()
+        return self
+
+
+def circle(t, speed=1.0):
+    radius = max(5.0, speed**2 / 5.0)
+    angle = speed * t / radius
+    return radius * math.sin(angle), radius * (1.0 - math.cos(angle)), angle
+
+
+def driven(hertz, seconds=10.0, begin=0.0, offset=se2.IDENTITY, late_s=0.0, speed=1.0):
+    """Odometry of a robot on a circle, in a frame that is off."""
+    times = np.arange(begin, seconds, 1.0 / hertz) + late_s
+    return [Odometry(NS + round(t * NS), se2.compose(offset, circle(t, speed)), None, "odom") for t in times]
+
+
+def mixed(*publishers):
+    return sorted(itertools.chain(*publishers), key=lambda m: m.stamp_ns)
+
+
+@pytest.mark.parametrize("offset", [(0.3, 0.0, 0.0), (8.0, -3.0, 1.0), (0.0, 0.0, 0.4), (400.0, 0.0, 3.0)], ids=str)
+@pytest.mark.parametrize(("mine", "others"), [(50, 30), (10, 100), (20, 20), (100, 10)])
+@pytest.mark.parametrize("begin", [0.0, 4.0], ids=["from the start", "later"])
+def test_A34_of_two_publishers_the_first_is_used_and_every_message_of_the_other_is_counted(mine, others, begin, offset):
+    used, other = driven(mine), driven(others, 9.0, begin, offset, late_s=0.003)
+    p = Publisher().hear(mixed(used, other)).end()
+    assert p.used == used
+    assert p.refused == len(other)
+
+
+def test_A34_three_publishers_are_told_apart():
+    used, others = driven(50), [driven(30, 9.0, 1.0, (k, -k, 0.5 * k), late_s=0.004 * k) for k in (1.0, 2.0)]
+    p = Publisher().hear(mixed(used, *others)).end()
+    assert p.used == used
+    assert p.refused == sum(map(len, others))
+
+
+def test_A34_in_space_they_are_told_apart_by_where_they_are_and_how_they_are_turned():
+    def drone(k, offset):
+        turn = so3.exp((0.0, 0.0, 0.02 * k))
+        return Odometry(k * NS // 50, se3.compose(offset, (0.02 * k, 0.0, 0.3, *turn)), None, "odom")
+
+    for offset in [(0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, *so3.exp((0.5, 0.0, 0.0)))]:
+        used = [drone(k, se3.IDENTITY) for k in range(100, 400)]
+        other = [drone(k, offset) for k in range(150, 300)]
+        p = Publisher().hear(mixed(used, other)).end()
+        assert p.used == used
+        assert p.refused == len(other)
+
+
+def test_an_odometry_that_jumps_goes_on_there_and_loses_nothing():
+    before, after = driven(20, 5.0), driven(20, 10.0, 5.0, (7.0, 7.0, 2.0))
+    p = Publisher().hear(before)
+    p.hear(after[:6])
+    assert p.used == [*before, *after[:6]], "within a few messages"
+    p.hear(after[6:])
+    assert p.used == [*before, *after]
+    assert p.refused == 0
+    assert Publisher().hear(before).hear(after[:2]).end().used == [*before, *after[:2]], "also where it ends there"
+
+
+def test_an_outlier_is_left_out():
+    used = driven(20)
+    outlier = Odometry(used[50].stamp_ns + 10**7, (90.0, 0.0, 0.0), None, "odom")
+    p = Publisher().hear([*used[:51], outlier, *used[51:]]).end()
+    assert p.used == used
+    assert p.refused == 1
+
+
+def test_noise_of_two_centimetres_and_crowded_stamps_and_fast_robots_are_no_other_publisher():
+    rng = np.random.default_rng(1)
+    noisy = [
+        Odometry(m.stamp_ns, tuple(np.add(m.T_odom_base, [*rng.normal(0.0, 0.02, 2), 0.0])), None, "odom")
+        for m in driven(20, 60.0)
+    ]
+    assert Publisher().hear(noisy).end().refused < 0.02 * len(noisy)
+    crowded = [Odometry(m.stamp_ns // 10**8 * 10**8 + k % 5, *_rest(m)) for k, m in enumerate(driven(50))]
+    assert Publisher().hear(crowded).end().used == crowded
+    for hertz, speed in ((1, 2.0), (10, 3.0), (10, 30.0), (50, 30.0)):
+        fast = driven(hertz, 20.0, speed=speed, begin=0.0)
+        assert Publisher().hear(fast).end().used == fast, (hertz, speed)
+
+
+def _rest(m):
+    return m.T_odom_base, m.twist_covariance, m.source
+
+
+def test_when_the_one_in_use_dies_another_takes_over_under_a_name_of_its_own():
+    used, other = driven(50, 5.0), driven(30, 10.0, 0.0, (3.0, 0.0, 1.0), late_s=0.003)
+    p = Publisher().hear(mixed(used, other)).end()
+    taken = [m for m in p.used if m.source == "odom#2"]
+    assert p.used == [*used, *taken]
+    assert taken[0].stamp_ns <= used[-1].stamp_ns < taken[1].stamp_ns, "it reaches back: the two can be linked"
+    assert taken[-1].stamp_ns == other[-1].stamp_ns
+    assert p.refused + len(taken) == len(other)
+
+
+def test_where_stamps_begin_anew_tracks_do():
+    used = driven(20)
+    p = Publisher().hear(used)
+    p._one.forget_time()
+    assert p.hear(used).used == [*used, *used]
+
+
+# -- recordings --------------------------------------------------------------------------------------------------------
+
+
+def record(file, *, intruder=None, ends=10**9):
+    """A drive of 30 s; the other odometry drifts to the other side, from a start of its own."""
+    drive, other, truth = Drive(10**18), (5.0, -2.0, 0.7), []
+    with BagWriter(file) as bag:
+        for k in range(300):
+            if k < ends:
+                bag.write("/odom", ODOMETRY, drive.stamp_ns, drive.odometry())
+            if intruder and k in intruder:
+                x, y, yaw = other
+                at = pose(x, y, 0.0, quaternion(yaw=yaw))
+                bag.write("/odom", ODOMETRY, drive.stamp_ns, odometry(at, stamp_ns=drive.stamp_ns + 40_000_000))
+            if k % 3 == 0:
+                bag.write("/landmarks", DETECTIONS, drive.stamp_ns, drive.seen())
+            truth.append(drive.truth)
+            drive.move()
+            other = tuple(map(float, se2.compose(other, (0.1, 0.0, 0.98 * drive.turn))))
+    return truth
+
+
+def off_m(slam, truth):
+    """The newest keyframe from where the robot was."""
+    k = round((slam.keyframes[-1].stamp_ns - 10**18) / 10**8)
+    return math.dist(slam.trajectory()[-1][:2], truth[k][:2])
+
+
+@pytest.mark.parametrize("intruder", [range(300), range(100, 200)], ids=["from the start", "for a while"])
+def test_A34_a_recording_of_two_odometries_on_one_topic_gives_what_one_would(tmp_path, intruder):
+    truth = record(tmp_path / "two.mcap", intruder=intruder)
+    done = replay(tmp_path / "two.mcap", tmp_path / "run")
+    assert done.slam.segments == [0], "no segment begins"
+    assert off_m(done.slam, truth) < 0.3
+    assert done.summary["counters"]["odom"] == {"other_publisher": len(intruder)}
+    for name, at in TAGS.items():
+        there = done.slam.solver.estimate([done.slam.landmarks[name].vertex])[0, :2]
+        assert math.dist(there, at) < 0.3
+
+
+def test_A34_a_recording_in_which_the_first_odometry_ends_goes_on_with_the_other_without_a_jump(tmp_path):
+    truth = record(tmp_path / "two.mcap", intruder=range(300), ends=150)
+    done = replay(tmp_path / "two.mcap", tmp_path / "run")
+    assert done.slam.segments == [0]
+    assert len(done.slam.keyframes) > 90
+    assert off_m(done.slam, truth) < 0.3
+    assert done.summary["counters"]["odom#2"]["switched_to"] == 1
