@@ -143,12 +143,14 @@ class Drive:
         return slice(self.first_keyframe, self.end_keyframe)
 
 
-def evaluate(run: Path | str, truth: str | Path, estimate: str = "", topic: str = "", *, align: bool = True) -> Scores:
+def evaluate(
+    run: Path | str, truth: Truth | str | Path, estimate: str = "", topic: str = "", *, align: bool = True
+) -> Scores:
     """Compare a run's folder with the truth.
 
     Parameters
     ----------
-    truth : ``BAG``, ``BAG:TOPIC`` or ``FILE.tum``
+    truth : ``BAG``, ``BAG:TOPIC`` or ``FILE.tum``, or what ``read_truth`` has read
     estimate : which path of the run is scored; default: ``sightings.tum``, or ``path.tum`` where nothing was seen
     topic : of the truth, as in ``read_truth``
     align : without, the map is taken to be in the frame of the truth
@@ -160,7 +162,8 @@ def evaluate(run: Path | str, truth: str | Path, estimate: str = "", topic: str 
     """
     run = Path(run)
     inputs = input_topics(run)
-    known, dimensions = read_truth(truth, topic, inputs), dimensions_of(run)
+    known = truth if isinstance(truth, Truth) else read_truth(truth, topic, inputs)
+    dimensions = dimensions_of(run)
     drive = scored_drive(run, known.trajectory, estimate)
     landmarks = {name: landmark.position for name, landmark in read_landmarks(run / "landmarks.csv").items()}
     scored = {"truth": known.source, "estimate": _described(drive)}
@@ -199,15 +202,13 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
     GraphSlamError
         The path of the run cannot be read.
     """
-    seen = run / _SIGHTINGS[0]
-    has_sightings = seen.exists() and seen.stat().st_size > 0
-    of_sightings = estimate == _SIGHTINGS[0] or (not estimate and has_sightings)
+    of_sightings = estimate == _SIGHTINGS[0] or (not estimate and _is_filled(run / _SIGHTINGS[0]))
     default, odometry = _SIGHTINGS if of_sightings else _KEYFRAMES
     name = estimate or default
-    if not (run / odometry).exists():
+    if not _is_filled(run / odometry):
         odometry = _SIGHTINGS[1]
     whole = read_tum(run / name)
-    beside = read_tum(run / odometry) if (run / odometry).exists() else None
+    beside = read_tum(run / odometry) if _is_filled(run / odometry) else None
     drives = _drives(run) if name in (*_SIGHTINGS, *_KEYFRAMES) else _ONE_DRIVE
     chosen = None
     for k in reversed(range(len(drives))):
@@ -224,6 +225,10 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
         if truth is None or _overlap(estimated, truth):
             return part
     return chosen or Drive(whole, beside, (name, odometry))
+
+
+def _is_filled(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size > 0
 
 
 def _drives(run: Path) -> list[dict[str, int]]:

@@ -13,7 +13,7 @@ from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border
 from graph_slam_ros.ros.inputs import Measured, uses
 from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.ros.survey import with_survey
-from graph_slam_ros.run import RunError, check_room, is_run, missing, record_run, run_config, stopwatch
+from graph_slam_ros.run import RunError, check_room, is_run, missing, record_run, recording_of, run_config, stopwatch
 from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.input_config import InputConfig, default_input
@@ -140,8 +140,8 @@ def _through(border: Border, bag: Bag, inputs: Inputs, jump: StampJump) -> Itera
 
 
 def replay(
-    source: Path,
-    out: Path,
+    source: Path | str,
+    out: Path | str,
     config: Config | None = None,
     *,
     odometry: str | None = None,
@@ -156,6 +156,7 @@ def replay(
     config : default: the run's own, or the defaults
     """
     took = stopwatch()
+    source, out = Path(source), Path(out)
     border = Counters()
     check_room(out, source)
     state = None
@@ -175,7 +176,8 @@ def replay(
         losses, warnings = bag.losses, bag.warnings
     warmup()
     one_by_one = chain.from_iterable(progress(items, total))
-    slam, summary = record_run(out, config, one_by_one, losses, state, border=border, took=took)
+    name = recording_of(source) if is_run(source) else source.resolve().name
+    slam, summary = record_run(out, config, one_by_one, losses, state, border=border, took=took, recording=name)
     return Replayed(slam, summary, summary["losses"], warnings)
 
 

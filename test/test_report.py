@@ -7,12 +7,15 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.lie import se3
+from graph_slam_ros.path_error import path_error
 from graph_slam_ros.report import draw_graph, draw_run
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
+from graph_slam_ros.trajectory import Trajectory, read_tum
 
 COLUMNS = "id,kind,x,y,theta,sightings,cov_xx,cov_xy,cov_yy"
 
@@ -66,12 +69,13 @@ def run(tmp_path, recording):
 
 def test_with_truth_everything_is_drawn_in_the_frame_of_the_truth(run, recording, figures):
     draw_run(run, run / "bag.mcap", run / "run.png")
-    (axes,) = figures[0].axes
+    axes, _ = figures[0].axes
     truth = recording.T_world_base[:, :2]
     drawn = lines(axes)
     assert drawn["truth"] == pytest.approx(truth, abs=1e-6)
     assert drawn["estimate"] == pytest.approx(truth, abs=1e-6)
     assert drawn["start"] == pytest.approx(truth[:1], abs=1e-6)
+    assert drawn["end"] == pytest.approx(truth[-1:], abs=1e-6)
     # dead reckoning is aligned by itself: about the same place
     assert drawn["dead reckoning"].mean(axis=0) == pytest.approx(truth.mean(axis=0), abs=1e-6)
     known = np.array([recording.landmarks[name][:2] for name in "0123"])
@@ -81,12 +85,13 @@ def test_with_truth_everything_is_drawn_in_the_frame_of_the_truth(run, recording
 
 def test_paths_have_their_colors_and_axes_their_units_and_one_scale(run, figures):
     draw_run(run, run / "bag.mcap", run / "run.png")
-    (axes,) = figures[0].axes
+    axes, below = figures[0].axes
     colors = {line.get_label(): to_hex(line.get_color()) for line in axes.get_lines()}
     assert (colors["truth"], colors["dead reckoning"], colors["estimate"]) == ("#1f6fd6", "#1a1a1a", "#d62728")
     assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_aspect()) == ("x [m]", "y [m]", 1.0)
     legend = axes.get_legend()
-    assert {text.get_text() for text in legend.get_texts()} == set(colors) | {"landmarks", "true landmarks"}
+    assert {text.get_text() for text in legend.get_texts()} == set(colors) | {"landmarks", "true landmarks", "2 sigma"}
+    assert (below.get_xlabel(), below.get_ylabel()) == ("time [s]", "position error [m]")
     image = imread(run / "run.png")
     assert min(image.shape[:2]) > 1000
     assert image[:, :, :3].std() > 0.05
@@ -97,7 +102,7 @@ def test_without_truth_or_landmarks_the_run_is_drawn_in_its_own_frame(run, recor
     (run / "odometry.tum").unlink()
     draw_run(run, None, run / "run.png")
     (axes,) = figures[0].axes
-    assert set(lines(axes)) == {"estimate", "start"}
+    assert set(lines(axes)) == {"estimate", "start", "end"}
     assert lines(axes)["estimate"] == pytest.approx(np.add(recording.T_world_base[:, :2], (40.0, 0.0)), abs=1e-6)
 
 
@@ -133,10 +138,110 @@ def test_a_run_in_space_is_drawn_from_above_and_from_the_side(tmp_path, figures)
     (tmp_path / "config.yaml").write_text(parameters_text(Config.from_mapping({"world.dimensions": 3}).as_mapping()))
     (tmp_path / "ingest.mcap").write_bytes(b"")
     draw_run(tmp_path, tmp_path / "bag.mcap", tmp_path / "run.png")
-    above, side = figures[0].axes
+    above, side, _ = figures[0].axes
     assert (above.get_xlabel(), above.get_ylabel(), side.get_ylabel()) == ("x [m]", "y [m]", "z [m]")
     assert lines(above)["estimate"] == pytest.approx(truth[:, [0, 1]], abs=1e-6)
     assert lines(side)["estimate"] == pytest.approx(truth[:, [0, 2]], abs=1e-6)
+
+
+def test_the_title_names_the_recording_and_tells_the_errors_where_they_are_known(run, recording, figures):
+    (run / "run.json").write_text('{"recording": "yard.mcap"}')
+    draw_run(run, None, run / "run.png")
+    draw_run(run, run / "bag.mcap", run / "run.png")
+    plain, scored = (figure.get_suptitle() for figure in figures)
+    assert plain == f"yard.mcap  ·  {len(recording.stamps_ns)} keyframes  ·  4 landmarks"
+    truth = Trajectory(recording.stamps_ns / 1e9, se3.in_space(recording.T_world_base))
+    odometry = path_error(read_tum(run / "odometry.tum"), truth).position_m["rmse"]
+    assert scored == f"{plain}  ·  position error 0.000 m rmse, dead reckoning {odometry:.3f} m"
+
+
+def test_the_error_over_time_is_that_which_is_scored(run, recording, figures):
+    draw_run(run, run / "bag.mcap", run / "run.png")
+    drawn = lines(figures[0].axes[1])
+    truth = Trajectory(recording.stamps_ns / 1e9, se3.in_space(recording.T_world_base))
+    error = path_error(read_tum(run / "odometry.tum"), truth)
+    times, values = drawn["dead reckoning"].T
+    assert times == pytest.approx((recording.stamps_ns - recording.stamps_ns[0]) / 1e9, abs=1e-6)
+    assert np.sqrt(np.mean(values**2)) == pytest.approx(error.position_m["rmse"])
+    assert values.max() == pytest.approx(error.position_m["max"])
+    assert drawn["estimate"][:, 1].max() < 1e-6
+
+
+def ellipses(axes):
+    """Of the only collection of them: centres (n, 2), and half axes (n, 2) with the angle of the first."""
+    (found,) = [one for one in axes.collections if type(one).__name__ == "EllipseCollection"]
+    size = 0.5 * np.column_stack([found.get_widths(), found.get_heights()])
+    return np.asarray(found.get_offsets()), size, np.asarray(found.get_angles())
+
+
+def test_ellipses_are_two_sigma_and_turn_with_what_is_drawn(run, recording, figures):
+    poses = np.add(recording.T_world_base, (40.0, 0.0, 0.0))
+    rows = [f"{stamp},0.04,0,0,0.01,0,1" for stamp in recording.stamps_ns]  # 0.2 m along the robot, 0.1 m across
+    (run / "covariances.csv").write_text("\n".join(["stamp_ns,xx,xy,xt,yy,yt,tt", *rows]) + "\n")
+    (run / "landmarks.csv").write_text(f"{COLUMNS}\na,point,3,4,,5,0.09,0,0.01\nb,point,5,5,,1,nan,nan,nan\n")
+    quarter = np.column_stack([-poses[:, 1], poses[:, 0], poses[:, 2] + 0.5 * np.pi])
+    (run / "turned.tum").write_text(tum(recording.stamps_ns / 1e9, quarter))
+    for truth, turn in ((None, 0.0), (run / "turned.tum", 90.0)):
+        draw_run(run, truth, run / "run.png")
+        centres, half, angles = ellipses(figures[-1].axes[0])
+        drawn = lines(figures[-1].axes[0])["estimate"]
+        assert len(centres) == 31, "of thirty poses, and of the landmark whose covariance is known"
+        assert half[:-1] == pytest.approx(np.tile([0.4, 0.2], (30, 1)))
+        assert half[-1] == pytest.approx([0.6, 0.2])
+        assert np.hypot(*(centres[0] - drawn[0])) < 1e-9
+        headings = np.degrees(poses[[0, -1], 2]) + turn
+        off = angles[[0, -2, -1]] - [*headings, turn]
+        assert (off + 90.0) % 180.0 - 90.0 == pytest.approx(np.zeros(3), abs=1e-4), "an ellipse has two ends"
+
+
+def test_an_odometry_that_went_astray_does_not_shrink_the_picture(run, recording, figures):
+    poses = recording.T_odom_base.copy()
+    poses[20:, 0] += 5000.0
+    (run / "odometry.tum").write_text(tum(recording.stamps_ns / 1e9, poses))
+    draw_run(run, None, run / "run.png")
+    low, high = figures[0].axes[0].get_xlim()
+    assert high - low < 3.0 * np.ptp(recording.T_world_base[:, 0])
+
+
+def test_scales_are_equal_however_long_and_narrow_the_path_is(tmp_path, figures):
+    poses = np.column_stack([np.linspace(0.0, 200.0, 50), np.sin(np.arange(50.0)), np.zeros(50)])
+    (tmp_path / "path.tum").write_text(tum(np.arange(50.0), poses))
+    draw_run(tmp_path, None, tmp_path / "run.png")
+    (axes,) = figures[0].axes
+    pixels = axes.transData.transform([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
+    assert pixels[1, 0] - pixels[0, 0] == pytest.approx(pixels[2, 1] - pixels[0, 1])
+    width, height = figures[0].get_size_inches()
+    assert height < 0.6 * width
+
+
+def test_a_planted_link_is_replaced_and_not_written_through(run, tmp_path):
+    (run / "mine.txt").write_text("mine")
+    (run / "run.png").symlink_to(run / "mine.txt")
+    draw_run(run, None, run / "run.png")
+    assert (run / "mine.txt").read_text() == "mine"
+    assert not (run / "run.png").is_symlink()
+
+
+def test_plot_draws_with_and_without_truth_and_replay_always(tmp_path, recording, figures, capsys, monkeypatch):
+    write_bag(recording, tmp_path / "yard.mcap")
+    bag, out = str(tmp_path / "yard.mcap"), str(tmp_path / "run")
+    assert main(["replay", bag, "--out", out]) == 0
+    assert f"picture in {out}/path.png" in capsys.readouterr().out
+    assert (tmp_path / "run/path.png").stat().st_size > 10_000
+    assert figures[0].get_suptitle().startswith("yard.mcap  ·  51 keyframes")
+    assert main(["plot", out, "--out", str(tmp_path / "a.png")]) == 0
+    assert main(["plot", out, "--truth", bag, "--topic", "/ground_truth", "--out", str(tmp_path / "b.png")]) == 0
+    assert [len(figure.axes) for figure in figures] == [1, 1, 2]
+    assert main(["plot", out, "--topic", "/odom"]) == 2
+    assert main(["plot", str(tmp_path / "none")]) == 2
+    capsys.readouterr()
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert main(["replay", bag, "--out", str(tmp_path / "bare")]) == 0
+    assert "no picture: matplotlib is not installed: pip install matplotlib" in capsys.readouterr().err
+    assert not (tmp_path / "bare/path.png").exists()
+    assert main(["evaluate", str(tmp_path / "bare"), "--truth", bag]) == 0
+    assert main(["plot", out]) == 2
+    assert "pip install matplotlib" in capsys.readouterr().err
 
 
 def test_a_graph_is_drawn_before_and_after_with_closures_unlike_odometry(tmp_path, figures):

@@ -59,6 +59,7 @@ def parser() -> argparse.ArgumentParser:
             "record a synthetic world with truth: pythonrobotics, manhattan, warehouse, flight; put faults into it",
         )
     )
+    _plot(command("plot", recordings.plot, "a picture of a run: path, landmarks, and the truth where there is one"))
     _evaluate(command("evaluate", recordings.evaluate, "errors of a run, and whether it knows them; a picture"))
     _explain(command("explain", decided.explain, "why: what a run believed and what not, or all about one edge of it"))
     _solve(
@@ -240,6 +241,12 @@ def _evaluate(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument("--json", action="store_true", help="the numbers as one line")
     sub.add_argument("--plot", type=Path, metavar="FILE.png", help="default: path.png in the run folder")
+
+
+def _plot(sub: argparse.ArgumentParser) -> None:
+    _of_run(sub)
+    sub.add_argument("--out", type=Path, metavar="PNG", help="default: path.png in the run folder")
+    _add_truth(sub, required=False)
 
 
 def _add_truth(sub: argparse.ArgumentParser, *, required: bool) -> None:

@@ -1,6 +1,7 @@
 """The commands on recordings and runs: ``replay``, ``info``, ``evaluate``, ``warmup``, ``demo``."""
 
 import argparse
+import importlib.util
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,8 @@ from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
     from graph_slam_ros.slam import Config
+
+_NO_MATPLOTLIB = "matplotlib is not installed: pip install matplotlib"
 
 
 def replay(args: argparse.Namespace) -> int:
@@ -29,6 +32,7 @@ def replay(args: argparse.Namespace) -> int:
     )
     _say_run(args.bag, done.summary)
     console.say(f"results in {args.out}")
+    _draw(args.out)
     return console.told(done.losses, done.warnings)
 
 
@@ -53,6 +57,7 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
         with own_node(args.out, inputs, config) as own:
             played = play(bag, inputs, own=own, **options)
         _say_run(args.bag, json.loads((args.out / SUMMARY).read_text()))
+        _draw(args.out)
     console.say(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
     losses = bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else [])
     return console.told(losses, bag.warnings)
@@ -85,16 +90,53 @@ def info(args: argparse.Namespace) -> int:
 def evaluate(args: argparse.Namespace) -> int:
     """Compare a run with the truth."""
     from graph_slam_ros.evaluation import evaluate as compared
-    from graph_slam_ros.report import draw_run
+    from graph_slam_ros.evaluation import input_topics
     from graph_slam_ros.run import changed_since
+    from graph_slam_ros.truth import read_truth
 
-    scores = compared(args.run_folder, args.truth, args.estimate, args.topic, align=not args.no_align)
+    truth = read_truth(args.truth, args.topic, input_topics(args.run_folder))
+    scores = compared(args.run_folder, truth, args.estimate, align=not args.no_align)
     console.say(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
-    picture = args.plot or args.run_folder / "path.png"
-    draw_run(args.run_folder, args.truth, picture)
-    if not args.json:
-        console.say(f"picture in {picture}")
+    _draw(args.run_folder, truth, args.plot, align=not args.no_align, quiet=args.json)
     return console.told(scores.losses, [*scores.warnings, *changed_since(args.run_folder)])
+
+
+def plot(args: argparse.Namespace) -> int:
+    """Draw a run."""
+    from graph_slam_ros.report import draw_run
+    from graph_slam_ros.run import PICTURE, changed_since
+
+    if not args.truth and (args.topic or args.no_align):
+        raise GraphSlamError("plot: no use for --topic or --no-align without --truth")
+    if not _has_matplotlib():
+        raise GraphSlamError(_NO_MATPLOTLIB)
+    picture = args.out or args.run_folder / PICTURE
+    draw_run(args.run_folder, args.truth, picture, args.topic, align=not args.no_align)
+    console.say(f"picture in {picture}")
+    return console.told([], changed_since(args.run_folder))
+
+
+def _draw(run: Path, truth: Any = None, out: Path | None = None, *, align: bool = True, quiet: bool = False) -> None:
+    """Draw a run besides something else, which does not fail where this cannot be done."""
+    from graph_slam_ros.run import PICTURE
+
+    if not _has_matplotlib():
+        return console.tell(f"no picture: {_NO_MATPLOTLIB}")
+    from graph_slam_ros.report import draw_run
+
+    picture = out or run / PICTURE
+    try:
+        draw_run(run, truth, picture, align=align)
+    except GraphSlamError as error:
+        if out is not None:  # it was asked for
+            raise
+        return console.tell(f"no picture: {error}")
+    if not quiet:
+        console.say(f"picture in {picture}")
+
+
+def _has_matplotlib() -> bool:
+    return importlib.util.find_spec("matplotlib") is not None
 
 
 def warmup(args: argparse.Namespace) -> int:
@@ -160,6 +202,7 @@ def run_text(summary: dict[str, Any]) -> list[str]:
         f"chi2       {summary['chi2']:12.3f}   after {summary['solves']} solves",
     ]
     if "time_s" in summary:
-        lines.append(f"time       {summary['time_s']:10.1f} s")
+        cpu = f", {summary['cpu_s']:.1f} s of CPU time" if "cpu_s" in summary else ""
+        lines.append(f"took       {summary['time_s']:10.1f} s{cpu}")
     waiting = [f"waiting    {name}: {reason}" for name, reason in summary["waiting"].items()]
     return lines + waiting + [f"counted    {text}" for text in counters]

@@ -95,8 +95,9 @@ def records(path: Path, losses: list[str], warnings: list[str] | None = None) ->
     """Schemas, channels and messages in order of the file.
 
     What is damaged is passed over up to the next chunk; a cut tail ends it. Each adds a line to ``losses``; one in
-    ``warnings`` says where no checksum would tell of damage.
+    ``warnings`` says where there is damage, and no checksum that would tell of more.
     """
+    known = len(losses)
     read, unchecked, loose = 0, False, False
     with _Stream(path) as stream:
         at = MAGIC_SIZE
@@ -138,8 +139,8 @@ def records(path: Path, losses: list[str], warnings: list[str] | None = None) ->
             if read > told:
                 what = f"{read - told} messages too many"
             losses.append(f"{path.name}: {what}")
-    if unchecked and warnings is not None:
-        warnings.append(f"{path.name}: carries no checksums: a damaged byte in it may go unnoticed")
+    if unchecked and len(losses) > known and warnings is not None:
+        warnings.append(f"{path.name}: carries no checksums: more of it may be damaged than was found")
 
 
 def _record(stream: _Stream, at: int) -> tuple[McapRecord | None, int]:

@@ -14,6 +14,7 @@ those of ``landmarks.csv`` are in the axes of map. What is not known is nan; wha
 from graph_slam_ros.run.folder import (
     COVARIANCES,
     GRAPH,
+    PICTURE,
     SUMMARY,
     RunError,
     changed_since,
@@ -23,6 +24,7 @@ from graph_slam_ros.run.folder import (
     is_run,
     keep_earlier,
     missing,
+    recording_of,
     run_config,
 )
 from graph_slam_ros.run.recorder import RunRecorder
@@ -32,6 +34,7 @@ from graph_slam_ros.run.tables import graph_file, numbered, summarize
 __all__ = [
     "COVARIANCES",
     "GRAPH",
+    "PICTURE",
     "SUMMARY",
     "RunError",
     "RunRecorder",
@@ -47,6 +50,7 @@ __all__ = [
     "missing",
     "numbered",
     "record_run",
+    "recording_of",
     "recover",
     "run_config",
     "settled",

@@ -62,6 +62,12 @@ def _told(folder: Path) -> dict[str, Any]:
     return told if isinstance(told, dict) else {}
 
 
+def recording_of(folder: Path) -> str:
+    """The name of the recording that a run was replayed from; empty where it was a live run, or is not known."""
+    name = _told(folder).get("recording", "")
+    return name if isinstance(name, str) else ""
+
+
 def run_config(folder: Path) -> Config:
     """The configuration a run was made with. Raises ConfigError naming the file."""
     if not (folder / CONFIG).is_file():

@@ -81,6 +81,7 @@ def record_run(
     *,
     border: Counters | None = None,
     took: Took | None = None,
+    recording: str = "",
 ) -> tuple[GraphSlam, Summary]:
     """Run the pipeline over measurements and save it all; returns the pipeline and the summary.
 
@@ -90,6 +91,7 @@ def record_run(
     start : the map to go on in
     border : counters of what was refused before it came here
     took : the time since whatever is told as its beginning
+    recording : the name of the file or folder that the measurements are from
     """
     took = took or stopwatch()
     recorder = RunRecorder(folder, config, start=start)
@@ -99,6 +101,7 @@ def record_run(
             recorder.record(slam, slam.process(measurement))
         slam.counters.update(border or Counters())
         summary = summarize(slam) | took() | {"losses": list(dict.fromkeys(losses))}
+        summary |= {"recording": recording} if recording else {}
         recorder.save(slam, summary)
     finally:
         recorder.close()
