@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import re
 import time
 
 import numpy as np
@@ -137,6 +138,8 @@ def test_it_waits_is_well_is_degraded_while_odometry_is_silent_and_well_again():
     with node("output.folder:=''") as n, robot(hears=("/diagnostics",)) as r:
         r.wait_for_node()
         r.until_it_says("WAITING", "publishes it, but nothing has come yet")
+        until(lambda: re.search(r"\[WARN\].*WAITING", n.said), r.spin, "a warning that it waits still")
+        assert re.search(r"\[(\w+)\].*WAITING", n.said)[1] == "INFO", "at first that is no reason to warn"
         drive = Drive()
         r.until_it_says("OK", spin=drive.pace(r))
         r.until_it_says("DEGRADED", "/odom: silent for")

@@ -253,14 +253,18 @@ class GraphSlamNode(LifecycleNode):
         self._diagnostics.publish(to_msg.diagnostics(self.now_ns, statuses))
 
     def _tell(self, verdict: health.Verdict) -> None:
-        """In the log where it changes, numbers apart; what somebody must do something about, every few seconds."""
+        """In the log where it changes, numbers apart; what somebody must do something about, every few seconds.
+
+        A node that has just begun to wait is no reason to warn: publishers take a moment to be discovered.
+        """
         before, self._verdict = self._verdict, verdict
-        urgent = verdict.state in ("WAITING", "ERROR") and time.monotonic() - self._logged_s > _AGAIN_S
+        has_lasted = before.state == verdict.state and time.monotonic() - self._logged_s > _AGAIN_S
+        urgent = verdict.state in ("WAITING", "ERROR") and has_lasted
         if _without_numbers(before) == _without_numbers(verdict) and not urgent:
             return
         self._logged_s = time.monotonic()
         said = "; ".join((verdict.state, *verdict.reasons))
-        if verdict.level == to_msg.OK:
+        if verdict.level == to_msg.OK or (verdict.state == "WAITING" and not urgent):
             self.get_logger().info(said)
         else:
             self.get_logger().warn(said)

@@ -45,6 +45,7 @@ _OVERTAKE_NS = 20_000_000  # at most, and well inside the node's ordering window
 _CLOCK_NS = 5_000_000
 _PATIENCE_S = 10.0
 _START_S = 300.0  # the first start of an installation compiles
+_OWN_LAG_S = 60.0  # the player waits for its own node: that it is behind is no fault
 _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -258,6 +259,7 @@ def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subproces
         inputs=replace(config.inputs, reliable=True),
         sources=tuple(replace(one, topic=inputs.topics.get(one.name, one.topic)) for one in config.sources),
         output=replace(config.output, folder=str(folder), keep_earlier=0),
+        health=replace(config.health, lag_s=max(config.health.lag_s, _OWN_LAG_S)),
     )
     with tempfile.TemporaryDirectory() as scratch:
         parameters = Path(scratch) / "parameters.yaml"
