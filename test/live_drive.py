@@ -31,6 +31,7 @@ class Drive:
         self._frames = frames
         self.truth, self.odom, self.turn = truth, se2.IDENTITY, turn
         self.sees = True
+        self.claims = {}  # positions in its own frame of tags that are not there
         self.steps = 0
 
     def odometry(self):
@@ -45,6 +46,8 @@ class Drive:
         for name, at in TAGS.items():
             local = se2.act(se2.inverse(self.truth), at)
             found.append(detection(pose(*map(float, local)), np.eye(2) * 0.01, name))
+        for name, at in self.claims.items():
+            found.append(detection(pose(*at), np.eye(3) * 0.01, name))
         return detections(*found, frame=frame or f"{self._frames}base_link", stamp_ns=self.stamp_ns)
 
     def move(self):

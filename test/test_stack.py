@@ -1,6 +1,8 @@
 """The node among others: who joins late, what does not fit, several of them, transforms, odometry, long paths."""
 
+import csv
 import itertools
+import json
 import math
 import re
 import time
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from live_drive import TAGS, Drive, distance, earlier_run
-from live_nodes import ENVIRONMENT, lenient, node, often, own_domain, robot, until
+from live_nodes import ENVIRONMENT, lenient, node, often, own_domain, replayed, results, robot, until
 from nav_msgs.msg import Path
 from rclpy.qos import ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
@@ -154,6 +156,30 @@ def test_B13_a_clock_that_does_not_come_is_named_where_simulated_time_is_used():
         drive = Drive()
         r.until_it_says("WAITING", "use_sim_time is set and nothing comes on /clock", spin=drive.pace(r))
         assert n.stop()[0] == 0
+
+
+def test_after_eight_seconds_of_detections_at_1e8_m_every_solve_succeeds_as_before(tmp_path):
+    run = tmp_path / "run"
+    parameters = f"output.folder:={run}", "inputs.reliable:=true", "world.dimensions:=3"
+    with node(*parameters) as n, robot(hears=("/diagnostics", "pose")) as r:
+        r.wait_for_node()
+        drive = Drive()
+        drive.go(r, 60)
+        drive.claims = {"far": (0.0, 0.0, 1e8)}
+        drive.go(r, 80)
+        drive.claims = {}
+        drive.go(r, 60)
+        r.until_it_says("OK", spin=drive.pace(r))
+        assert r.save().success
+        assert n.stop()[0] == 0
+    record = json.loads((run / "run.json").read_text())
+    assert record["counters"]["detections"]["beyond_max_distance"] == 27
+    assert "solver" not in record["counters"]
+    found = {row["id"]: row for row in csv.DictReader((run / "landmarks.csv").read_text().splitlines())}
+    assert found.keys() == TAGS.keys()
+    for name, at in TAGS.items():
+        assert distance(at, (float(found[name]["x"]), float(found[name]["y"]))) < 0.1
+    assert replayed(run, tmp_path) == results(run)
 
 
 # -- several nodes -----------------------------------------------------------------------------------------------------

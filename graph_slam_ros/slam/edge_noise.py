@@ -10,18 +10,21 @@ from graph_slam_ros.slam.counters import Counters
 Array = NDArray[np.float64]
 
 LEAST_M2, LEAST_RAD2 = 1e-8, 1e-10  # 0.1 mm, 0.01 mrad
+_FINEST = 1e-6  # of a distance: a lever arm of a million standard deviations is as much as a solve resolves
 _LEAST_EIGENVALUE = 1e-9  # of the largest, where rounding has left a covariance indefinite
 
 
-def edge_noise(counters: Counters, source: str, covariance: Array, metres: int) -> Gaussian:
+def edge_noise(counters: Counters, source: str, covariance: Array, metres: int, distance_m: float = 0.0) -> Gaussian:
     """Made before anything is added to the graph: it must not fail half-way.
 
     Parameters
     ----------
     covariance : (m, m); its first ``metres`` rows are lengths, the others angles
+    distance_m : how far away what was measured is: nothing is known better than to a millionth of it
     """
     size = len(covariance)
-    least = covariance + np.diag([LEAST_M2] * metres + [LEAST_RAD2] * (size - metres))
+    least_m2 = max(LEAST_M2, (_FINEST * distance_m) ** 2)
+    least = covariance + np.diag([least_m2] * metres + [LEAST_RAD2] * (size - metres))
     try:
         return Gaussian.from_covariance(least)
     except NoiseError:  # of extreme numbers: a kilometre's lever arm, an hour's motion in one step

@@ -5,7 +5,7 @@ Its state is a function of the configuration and the sequence of accepted measur
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ from graph_slam_ros.slam.measurements import (
 from graph_slam_ros.slam.motion import Motion, OdometryNoise
 from graph_slam_ros.slam.odometry_choice import OdometryChoice, Step
 from graph_slam_ros.slam.pose_edges import PoseEdges
+from graph_slam_ros.slam.reach import Reach, off_the_pole
 from graph_slam_ros.slam.safeguard import Safeguard
 from graph_slam_ros.slam.space import Numbers
 from graph_slam_ros.slam.stamp_order import StampOrder
@@ -129,6 +130,7 @@ class GraphSlam:
         self._trail = Trail(self._noise, self.space)
         self.keyframes, self.segments = self._trail.keyframes, self._trail.segments
         self.drives = self._trail.drives  # the first keyframe of each; the last drive is the present one
+        self._reach = Reach(self.space, self.config.sources)
         self._edges = PoseEdges(self.space, self.graph, self.counters)
         self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
         self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over)
@@ -458,6 +460,13 @@ class GraphSlam:
         self.counters.count(m.topic, reason, len(m.sightings) if isinstance(m, Sightings) else 1)
 
     def _observe(self, m: Observation) -> None:
+        within, beyond = self._reach.split(m)
+        if beyond:
+            self.counters.count(m.topic, "beyond_max_distance", beyond)
+        if within is not None:
+            self._observe_within_reach(within)
+
+    def _observe_within_reach(self, m: Observation) -> None:
         where = self._trail.where(m.stamp_ns)
         motion = self._trail.motion
         if motion is not None and self._deserves_keyframe(m, where, motion):
@@ -465,6 +474,7 @@ class GraphSlam:
         match m:
             case Sightings():
                 self.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
+                m = replace(m, sightings=tuple(off_the_pole(self.space, s) for s in m.sightings))
                 for name, sighting in self._identified(m, where):
                     self._landmarks.add(m.topic, name, sighting, where)
             case Fix():

@@ -45,6 +45,13 @@ class InputConfig:
         low=-3600.0,
         high=3600.0,
     )
+    max_distance_m: float = setting(
+        0.0,
+        "landmarks and closures farther away are refused; 0: ten times as far as it has seen, 1 km at least and 100 km"
+        " at most",
+        "m",
+        low=0.0,
+    )
     id: str = setting("", "identity of the landmark in messages that carry none")
     id_prefix: str = setting("", "put before every identity, where two inputs have the same for different landmarks")
     frame_prefix: str = setting("", "of transforms as landmarks: what the names of their frames begin with")

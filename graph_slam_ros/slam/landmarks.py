@@ -159,7 +159,8 @@ class Landmarks:
             if s.kind == "range" and self._config.landmarks.range_offset_sigma_m > 0.0:
                 edge_type = space.range_with_offset
                 vertices.append(self._offset(topic))
-        noise = edge_noise(self._counters, topic, self._blurred(s, carried), metres)
+        distance_m = float(np.linalg.norm(carried.measured[:metres]))
+        noise = edge_noise(self._counters, topic, self._blurred(s, carried), metres, distance_m)
         edge = self._graph.add_edge(edge_type, vertices, carried.measured, noise, LABEL, topic)
         if not s.id:
             landmark.seen.append(Seen(edge, topic, s, where))

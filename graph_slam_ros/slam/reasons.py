@@ -82,6 +82,11 @@ REASONS: dict[str, Reason] = {
     "undecodable": Reason(_REFUSED, "the bytes are not a message of this type", "INPUT.type, or record it again"),
     "nonfinite": Reason(_REFUSED, "a number is NaN or infinite", "correct the driver"),
     "too_far": Reason(_REFUSED, "a coordinate is beyond 1e9 m", "correct the driver"),
+    "beyond_max_distance": Reason(
+        _REFUSED,
+        "the landmark or closure is farther away than the sensor can see",
+        "INPUT.max_distance_m where it does see so far, else correct the driver",
+    ),
     "quaternion_normalized": Reason(_REPAIRED, "the quaternion was not quite of length one"),
     "zero_quaternion": Reason(_REFUSED, "the quaternion is zero", "have the driver fill in the orientation"),
     "denormal_quaternion": Reason(

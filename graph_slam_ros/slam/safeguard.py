@@ -131,7 +131,8 @@ class Safeguard:
         blamed = self._to_blame(suspects)
         for one in blamed:
             self._counters.count(self._graph.label_of(one.edges[0]), "quarantined", len(one.edges))
-            self._backend.withdraw(one.edges, keyframe, Reason.QUARANTINED)
+            out = one.edges if one.landmark is None else self._solver.edges_on(one.landmark).tolist()
+            self._backend.withdraw(out, keyframe, Reason.QUARANTINED)  # also edges that were held back before
         self._on_gone({one.landmark for one in blamed if one.landmark is not None})
         return True
 

@@ -170,13 +170,18 @@ class Solver:
         one = _known([vertex], self._vertices, "vertex")
         if not self._inside[vertex]:
             raise GraphSlamError(f"vertex {vertex} is not in the problem")
-        on_it = incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
-        there = self._weighted(on_it[self._taken[on_it]])
+        there = self._weighted(self.edges_on(vertex))
         if len(there):
             raise GraphSlamError(f"vertex {vertex} is needed by edge {int(there[0])}")
         self._inside[vertex] = self._held[vertex] = False
         self._waiting.forget(vertex)
         self._take_out(one)
+
+    def edges_on(self, vertex: int) -> Index:
+        """Ids of the edges of the problem on one vertex, also those of weight 0."""
+        self._grow()
+        _known([vertex], self._vertices, "vertex")
+        return incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
 
     @property
     def vertices(self) -> Index:

@@ -1,0 +1,202 @@
+"""Distances that no sensor can mean, and what is left of a drive after them; directions straight up and down."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry, Sighting, Sightings, edge_noise
+from graph_slam_ros.slam.reach import Reach, off_the_pole
+from graph_slam_ros.slam.space import PLANE, SPACE
+
+S, RATE = 10**9, 10
+SOURCE = "detections"
+
+
+def settings(dimensions, association="id", **more):
+    return Config.from_mapping(
+        {"world.dimensions": dimensions, "landmarks.association": association, "solve.max_iterations": 20} | more
+    )
+
+
+def pose(dimensions, second):
+    """On a circle of 2 m, and the rotation from the robot's axes to the map's."""
+    angle = 0.3 * second
+    at = np.zeros(dimensions)
+    at[:2] = 2.0 * np.sin(angle), 2.0 * (1.0 - np.cos(angle))
+    turn = np.eye(dimensions)
+    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    whole = (*at, angle) if dimensions == 2 else (*at, 0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2))
+    return at, turn, tuple(map(float, whole))
+
+
+def drive(config, far=None, seconds=24):
+    """Past twelve landmarks; in the second third of the time with a detection far away in every message."""
+    n = config.space.dimensions
+    taken, rng = [], np.random.default_rng(0)
+    slam = GraphSlam(config, sink=taken.append)
+    marks = rng.uniform(-10.0, 10.0, (12, n))
+    covariance = tuple((np.eye(n) * 0.05**2).ravel())
+    has_id = config.landmarks.association == "id"
+    for k in range(seconds * RATE):
+        at, turn, whole = pose(n, k / RATE)
+        slam.process(Odometry(S + k * S // RATE, whole))
+        near = [j for j in range(12) if np.linalg.norm(marks[j] - at) < 9.0]
+        seen = [(f"m{j}", turn.T @ (marks[j] - at) + rng.normal(0.0, 0.02, n)) for j in near]
+        if far is not None and seconds // 3 <= k / RATE < 2 * seconds // 3:
+            seen.insert(0, ("far", np.asarray(far)))
+        items = (Sighting(name * has_id, "position", tuple(map(float, z)), covariance) for name, z in seen)
+        slam.process(Sightings(S + k * S // RATE, SOURCE, tuple(items)))
+    for event in ("end", "optimize"):
+        slam.process(Control(event))
+    return slam, taken, at
+
+
+def written(slam):
+    return slam.trajectory().tobytes(), slam.keyframe_covariances().tobytes(), list(slam.landmarks)
+
+
+@pytest.mark.parametrize("dimensions, association", list(itertools.product((2, 3), ("id", "joint"))))
+def test_a_detection_at_1e8_m_is_refused_and_changes_nothing(dimensions, association):
+    config = settings(dimensions, association)
+    far = np.zeros(dimensions)
+    far[-1] = 1e8
+    slam, taken, _ = drive(config, far)
+    assert not slam.failing
+    counted = slam.counters.as_dict()
+    assert counted[SOURCE].pop("beyond_max_distance") == 8 * RATE
+    undisturbed, _, _ = drive(config)
+    assert written(slam) == written(undisturbed)
+    replayed = GraphSlam(config)
+    for m in taken:
+        replayed.process(m)
+    assert written(replayed) == written(slam)
+    assert replayed.counters.as_dict()[SOURCE]["beyond_max_distance"] == 8 * RATE
+
+
+@pytest.mark.parametrize("dimensions, association", list(itertools.product((2, 3), ("id", "nearest"))))
+@pytest.mark.parametrize("axis", [0, -1])
+def test_where_it_is_allowed_to_see_so_far_every_solve_still_succeeds(dimensions, association, axis):
+    config = settings(dimensions, association, **{f"{SOURCE}.max_distance_m": 1e9})
+    far = np.zeros(dimensions)
+    far[axis] = 1e8
+    slam, _, at = drive(config, far)
+    assert not slam.failing
+    assert "solver" not in slam.counters.as_dict()
+    assert np.linalg.norm(slam.trajectory()[-1][: len(at)] - at) < 0.1
+
+
+def test_an_edge_that_was_held_back_goes_with_its_landmark_when_that_is_quarantined(monkeypatch):
+    """Numbers that no solve resolves: with nothing added to the noise of what is far, the landmark is taken out."""
+    monkeypatch.setattr(edge_noise, "_FINEST", 0.0)
+    slam = GraphSlam(settings(3, **{f"{SOURCE}.max_distance_m": 1e9, "solve.every_keyframes": 8}))
+    marks, covariance = np.random.default_rng(0).uniform(-10.0, 10.0, (12, 3)), tuple((np.eye(3) * 0.0025).ravel())
+    for k in range(150):
+        at, turn, whole = pose(3, k / RATE)
+        slam.process(Odometry(S + k * S // RATE, whole))
+        seen = [(f"m{j}", turn.T @ (mark - at)) for j, mark in enumerate(marks)]
+        seen += [("far", np.array([9e8, 0.0, 0.0]))] * (50 <= k < 100)
+        items = (Sighting(name, "position", tuple(map(float, z)), covariance) for name, z in seen)
+        slam.process(Sightings(S + k * S // RATE, SOURCE, tuple(items)))
+    for event in ("end", "optimize"):
+        slam.process(Control(event))
+    counted = slam.counters.as_dict()
+    assert counted["landmarks"]["quarantined"] > 0
+    assert counted["solver"].keys() == {"SingularError"}
+    assert not slam.failing
+    assert np.linalg.norm(slam.trajectory()[-1][:3] - at) < 0.1
+
+
+# -- the limit ---------------------------------------------------------------------------------------------------------
+
+
+def seen_at(*distances, kind="range"):
+    cov = (0.01,) if kind == "range" else (0.01, 0.0, 0.0, 0.01)
+    items = ((d,) if kind == "range" else (d, 0.0) for d in distances)
+    return Sightings(S, SOURCE, tuple(Sighting("a", kind, numbers, cov) for numbers in items))
+
+
+def refused(reach, *distances, **options):
+    return reach.split(seen_at(*distances, **options))[1]
+
+
+def test_the_first_of_a_long_range_sensor_are_used_and_so_is_what_is_a_little_farther():
+    reach = Reach(PLANE, Config().sources)
+    assert refused(reach, 60e3) == 0
+    for far in np.geomspace(2e3, 90e3, 300):
+        assert refused(reach, float(far)) == 0
+    short = Reach(PLANE, Config().sources)
+    assert refused(short, *[0.5] * 1000) == 0
+    assert refused(short, 900.0, kind="position") == 0
+
+
+def test_a_limit_is_learned_from_the_third_farthest_so_that_two_wrong_distances_teach_nothing():
+    reach = Reach(PLANE, Config().sources)
+    assert refused(reach, 99e3, 99e3, *[200.0] * 30) == 0
+    assert reach.limit_m(SOURCE) == 2e3
+    assert refused(reach, 2.1e3, 1.9e3, 1e8) == 2
+    assert reach.limit_m("another") == 1e5
+    assert refused(Reach(PLANE, Config().sources), 1.1e5) == 1
+
+
+def test_a_given_limit_is_kept_to_the_letter_and_a_bearing_has_none():
+    reach = Reach(PLANE, Config.from_mapping({f"{SOURCE}.max_distance_m": 5.0}).sources)
+    assert refused(reach, 5.0, 5.1, 4.0, kind="position") == 1
+    bearing = Sightings(S, SOURCE, (Sighting("a", "bearing", (1.0,), (0.01,)),))
+    assert reach.split(bearing) == (bearing, 0)
+    assert reach.split(seen_at(6.0)) == (None, 1)
+
+
+def test_a_closure_farther_than_any_is_refused_and_counted():
+    slam = GraphSlam(settings(2))
+    for k in range(50):
+        slam.process(Odometry(S + k * S // RATE, (0.1 * k, 0.0, 0.0)))
+    identity = tuple(np.eye(3).ravel() * 1e-4)
+    slam.process(Closure(5 * S, 2 * S, "loops", (2e8, 0.0, 0.0), identity))
+    slam.process(Closure(5 * S, 2 * S, "loops", (3.0, 0.0, 0.0), identity))
+    for event in ("end", "optimize"):
+        slam.process(Control(event))
+    assert slam.counters.as_dict() == {"loops": {"beyond_max_distance": 1}}
+    assert len(slam.graph.edges_of("closures")) == 1
+
+
+# -- straight up and down ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["bearing", "range_bearing"])
+@pytest.mark.parametrize("height, aside", list(itertools.product((5.0, -2.0), (0.0, 1e-7, 0.02))))
+def test_a_landmark_at_the_zenith_or_nadir_is_found_and_every_solve_succeeds(kind, height, aside):
+    slam, mark, rng = GraphSlam(settings(3)), np.array([1.5, aside, height]), np.random.default_rng(1)
+    for k in range(60):
+        x = 0.05 * k
+        slam.process(Odometry(S + k * S // RATE, (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)))
+        p = mark - (x, 0.0, 0.0) + (rng.normal(0.0, 0.005, 3) if k != 30 else 0.0)
+        flat = math.hypot(p[0], p[1])
+        angles = math.atan2(p[1], p[0]), math.atan2(p[2], flat)
+        measured = angles if kind == "bearing" else (float(np.linalg.norm(p)), *angles)
+        covariance = tuple((np.eye(len(measured)) * 1e-4).ravel())
+        slam.process(Sightings(S + k * S // RATE, SOURCE, (Sighting("lamp", kind, measured, covariance),)))
+    for event in ("end", "optimize"):
+        slam.process(Control(event))
+    assert not slam.failing
+    assert slam.report.converged
+    assert slam.counters.as_dict() == {}
+    assert np.linalg.norm(slam.solver.estimate([slam.landmarks["lamp"].vertex])[0] - mark) < 0.1
+
+
+def test_a_steep_direction_is_the_same_direction_in_other_axes():
+    for azimuth, elevation, sensor in itertools.product((-2.0, 0.0, 3.0), (1.4, -1.5, math.pi / 2), (None, True)):
+        T_base_sensor = SPACE.group.exp((0.1, 0.2, 0.3, 0.4, -0.5, 0.6)) if sensor else None
+        s = Sighting("a", "range_bearing", (2.0, azimuth, elevation), tuple(np.diag([1.0, 0.04, 0.01]).ravel()))
+        s = Sighting(s.id, s.kind, s.measured, s.covariance, T_base_sensor)
+        turned = off_the_pole(SPACE, s)
+        flat = 2.0 * math.cos(elevation)
+        point = (flat * math.cos(azimuth), flat * math.sin(azimuth), 2.0 * math.sin(elevation))
+        at = SPACE.group.act(T_base_sensor or SPACE.identity, point)
+        assert turned.measured == (2.0, 0.0, 0.0)
+        assert np.allclose(SPACE.group.act(turned.T_base_sensor, (2.0, 0.0, 0.0)), at)
+        expected = np.diag([1.0, max(0.04 * math.cos(elevation) ** 2, 0.01), 0.01])
+        assert np.allclose(np.reshape(turned.covariance, (3, 3)), expected)
+    level = Sighting("a", "bearing", (1.0, 1.3), (0.01, 0.0, 0.0, 0.01))
+    assert off_the_pole(SPACE, level) is level
