@@ -122,8 +122,8 @@ BUGS = (
         (
             (
                 "run/recorder.py",
-                "        with replaced(self.folder / name) as new:\n            new.write_bytes(data)\n",
-                "        (self.folder / name).write_bytes(data)\n",
+                "    with replaced(folder / name) as new:\n        new.write_bytes(data)\n",
+                "    (folder / name).write_bytes(data)\n",
             ),
         ),
         ("test_journal.py::test_T11_a_crash_at_any_call_that_reaches_the_disk_loses_nothing_that_was_told",),
@@ -131,7 +131,7 @@ BUGS = (
     Bug(
         "journal_at_the_end",
         "what was told is not on the disk when the node is killed",
-        (("run/recorder.py", "        self._fill()\n        self._journal.flush()\n", "        return\n"),),
+        (("run/recorder.py", "            self._fill()\n            self._journal.flush()\n", "            return\n"),),
         ("test_journal.py::test_T11_a_crash_at_any_call_that_reaches_the_disk_loses_nothing_that_was_told",),
     ),
     Bug(

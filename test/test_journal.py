@@ -77,7 +77,7 @@ def parts(tmp_path_factory):
             recorder.flush()
             note()
         if k % 125 == 124:
-            recorder.close()
+            recorder._end_parts()
             note()
             written.append(list(accepted))
             accepted.clear()

@@ -181,7 +181,7 @@ def test_P10_a_worker_does_everything_in_order_refuses_what_is_too_much_and_surv
     assert not worker.is_alive
 
 
-def test_a_worker_that_is_stopped_does_first_what_waits_and_tells_when_it_cannot_in_time():
+def test_a_worker_that_is_stopped_tells_when_what_waits_cannot_be_done_in_time_and_begins_no_more():
     worker, gate, done = Worker(10), threading.Event(), []
     worker.offer(lambda: gate.wait(10.0) and None)
     worker.offer(lambda: done.append(1))
@@ -189,7 +189,8 @@ def test_a_worker_that_is_stopped_does_first_what_waits_and_tells_when_it_cannot
     assert worker.lag_s > 0.0
     gate.set()
     worker._thread.join(10.0)
-    assert done == [1]
+    assert not worker.is_alive
+    assert done == []
 
 
 # -- health ------------------------------------------------------------------------------------------------------------

@@ -244,14 +244,14 @@ def test_P23_who_waits_for_a_job_that_its_thread_died_of_is_told():
 
 def test_P21_exceptions_of_callbacks_are_counted_told_once_and_an_error_from_a_hundred_on(monkeypatch, capfd):
     with at_work() as (slam, r, drive):
-        take = Session.take
-        monkeypatch.setattr(Session, "take", lambda *_: 1 // 0)
+        process = Session.process
+        monkeypatch.setattr(Session, "process", lambda *_: 1 // 0)
         for _ in range(5):
             drive.step(r)
         until(lambda: slam._run.counters["node", "ZeroDivisionError"] > 4, r.spin, "faults")
         assert r.verdict.state != "ERROR"
         r.until_it_says("ERROR", "faults in callbacks in 10 s", spin=drive.pace(r), patience_s=20.0)
-        monkeypatch.setattr(Session, "take", take)
+        monkeypatch.setattr(Session, "process", process)
         r.heard["pose"].clear()
         until(lambda: r.heard["pose"], drive.pace(r), "poses")
     assert capfd.readouterr().err.count("Traceback") == 1

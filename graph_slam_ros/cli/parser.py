@@ -103,7 +103,7 @@ def _replay(sub: argparse.ArgumentParser) -> None:
 
 def _recover(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("run_folder", type=Path, metavar="RUN")
-    sub.add_argument("--out", type=Path, metavar="DIR", required=True, help="folder for the results")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: RUN itself)")
 
 
 def _export(sub: argparse.ArgumentParser) -> None:

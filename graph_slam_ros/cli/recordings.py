@@ -64,12 +64,13 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
 
 
 def recover(args: argparse.Namespace) -> int:
-    """Write the results of a run that was never ended."""
+    """Write the results of a run that was never ended, or before all was processed."""
+    from graph_slam_ros.run import complete
     from graph_slam_ros.run import recover as recovered
 
-    summary = recovered(args.run_folder, args.out)
+    summary = recovered(args.run_folder, args.out) if args.out else complete(args.run_folder)
     _say_run(args.run_folder, summary)
-    console.say(f"results in {args.out}")
+    console.say(f"results in {args.out or args.run_folder}")
     return console.told(summary["losses"])
 
 

@@ -162,8 +162,43 @@ def read_ingest(folder: Path, losses: list[str]) -> Iterator[dict[str, Any]]:
             losses.append(f"{part_name(MAP, 0)}: not there, though the run began in a map: what follows is without it")
 
 
+def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) -> list[dict[str, Any]]:
+    """The measurements that a map lacks which came of the first so many records.
+
+    Those after them, and of those the ones that waited for their turn then: newer than the last odometry that was used.
+    """
+    waited: list[dict[str, Any]] = []
+    rest: list[dict[str, Any]] = []
+    count = 0
+    for file, channel, message in _messages(folder, INGEST, losses):
+        if channel == BEGINS_IN_A_MAP["type"]:
+            continue
+        if count >= processed:
+            rest.append(_decoded(file, message))
+        elif channel == "control":
+            if _decoded(file, message).get("event") == "time_jump":
+                waited.clear()
+        elif channel != "initial_pose" and used_ns is not None and message.log_time > used_ns:
+            waited.append(_decoded(file, message))
+        count += 1
+    return waited + rest
+
+
 def read_records(folder: Path, name: str, losses: list[str]) -> Iterator[dict[str, Any]]:
     """In the order they were written, up to the first that cannot be read; what is lost adds to ``losses``."""
+    for file, _, message in _messages(folder, name, losses):
+        yield _decoded(file, message)
+
+
+def _decoded(file: str, message: Message) -> Any:
+    try:
+        return json.loads(message.data)
+    except ValueError:
+        raise FormatError(f"{file}: record {message.sequence} is not JSON") from None
+
+
+def _messages(folder: Path, name: str, losses: list[str]) -> Iterator[tuple[str, str, Message]]:
+    """The same before they are decoded, each with its file and its kind."""
     lost = len(losses)
     for part, file in enumerate(parts_of(folder, name)):
         if file.name != (due := part_name(name, part)):
@@ -172,19 +207,16 @@ def read_records(folder: Path, name: str, losses: list[str]) -> Iterator[dict[st
             if file.name == due:
                 losses.append(f"{due}: not read, with what came after it: it would be out of place")
             return
-        known: set[int] = set()
+        known: dict[int, str] = {}
         expected = 0
         for record in records(file, losses):
             if isinstance(record, Channel):
                 if record.message_encoding != "json":
                     raise FormatError(f"{file.name}: channel {record.topic} is {record.message_encoding}, not json")
-                known.add(record.id)
+                known[record.id] = record.topic
             elif isinstance(record, Message) and record.channel_id in known:
                 if record.sequence != expected:
                     losses.append(f"{file.name}: record {expected} is missing; what came after was not read")
                     return
                 expected += 1
-                try:
-                    yield json.loads(record.data)
-                except ValueError:
-                    raise FormatError(f"{file.name}: record {record.sequence} is not JSON") from None
+                yield file.name, known[record.channel_id], record

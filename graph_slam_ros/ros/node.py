@@ -31,13 +31,13 @@ from graph_slam_ros.ros.live.configured import Configured
 from graph_slam_ros.ros.live.deferred import serve_later
 from graph_slam_ros.ros.live.outputs import LATCHED
 from graph_slam_ros.ros.live.params import changed, declare_parameters
+from graph_slam_ros.ros.live.worker import URGENT_S
 from graph_slam_ros.ros.message_class import message_class
 from graph_slam_ros.warmup import warmup
 
 _SUCCESS, _FAILURE, _ERROR = (getattr(TransitionCallbackReturn, name) for name in ("SUCCESS", "FAILURE", "ERROR"))
 _TICK_S = 0.1
 _AGAIN_S = 5.0
-_STOP_S = 2.0  # what a solve may still take when the node is told to stop
 _SWITCH_S = 5e-4  # a callback waits no longer than this for the worker's Python; the default is ten times that
 
 
@@ -146,11 +146,11 @@ class GraphSlamNode(LifecycleNode):
 
         Parameters
         ----------
-        patience_s : how long a solve that goes on may still take; None: as long as it takes
+        patience_s : how long what waits may still take; None: as long as it takes, unless the node is told to stop
         """
         if self._run is not None:
             run, self._run = self._run, None
-            run.finish(patience_s)
+            run.finish(patience_s, self._is_told_to_stop)
 
     def destroy_node(self) -> None:
         """As rclpy's, and at once: its state machine would keep the node in the graph until it is collected."""
@@ -318,7 +318,7 @@ def _run() -> int:
             return 2
         while not told.to_stop and rclpy.ok():
             executor.spin_once(timeout_sec=0.1)
-        node.finish(_STOP_S)
+        node.finish(URGENT_S)
         executor.shutdown()
         node.destroy_node()
     except GraphSlamError as error:

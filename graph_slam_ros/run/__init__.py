@@ -20,7 +20,9 @@ from graph_slam_ros.run.folder import (
     changed_since,
     check_room,
     earlier_runs,
+    incomplete_runs,
     is_cut_off,
+    is_incomplete,
     is_run,
     keep_earlier,
     missing,
@@ -28,7 +30,7 @@ from graph_slam_ros.run.folder import (
     run_config,
 )
 from graph_slam_ros.run.recorder import RunRecorder
-from graph_slam_ros.run.saved import freeze, map_of, record_run, recover, settled, stopwatch, taken_up
+from graph_slam_ros.run.saved import complete, freeze, map_of, record_run, recover, settled, stopwatch, taken_up
 from graph_slam_ros.run.tables import graph_file, numbered, summarize
 
 __all__ = [
@@ -40,10 +42,13 @@ __all__ = [
     "RunRecorder",
     "changed_since",
     "check_room",
+    "complete",
     "earlier_runs",
     "freeze",
     "graph_file",
+    "incomplete_runs",
     "is_cut_off",
+    "is_incomplete",
     "is_run",
     "keep_earlier",
     "map_of",

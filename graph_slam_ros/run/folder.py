@@ -41,11 +41,28 @@ def is_cut_off(folder: Path) -> bool:
     newest = folder if _holds_something(folder) else earlier[max(earlier)] if earlier else folder
     if not _holds_something(newest):
         return False
-    return not _told(newest).get("ended")
+    return not summary_of(newest).get("ended")
+
+
+def incomplete_runs(folder: Path) -> list[Path]:
+    """Earlier runs that were ended before all that they had accepted was processed, the newest first."""
+    earlier = earlier_runs(folder)
+    return [earlier[number] for number in sorted(earlier, reverse=True) if is_incomplete(earlier[number])]
+
+
+def is_incomplete(folder: Path) -> bool:
+    """Whether a run was ended before all that it had accepted was processed, and its results are still to be made."""
+    return summary_of(folder).get("is_incomplete") is True
+
+
+def was_saved_whole(folder: Path) -> bool:
+    """Whether the map of a run has all of its journal, by its summary."""
+    parts = list(_parts(folder))
+    return summary_of(folder).get("waiting") == 0 and bool(parts) and all(then == now for _, then, now in parts)
 
 
 def _holds_something(folder: Path) -> bool:
-    if not is_run(folder) or _told(folder).get("keyframes"):
+    if not is_run(folder) or summary_of(folder).get("keyframes"):
         return is_run(folder)
     try:
         return next(read_ingest(folder, []), None) is not None or grew(folder)
@@ -53,7 +70,7 @@ def _holds_something(folder: Path) -> bool:
         return True
 
 
-def _told(folder: Path) -> dict[str, Any]:
+def summary_of(folder: Path) -> dict[str, Any]:
     """The summary; nothing where it cannot be read."""
     try:
         told = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
@@ -64,7 +81,7 @@ def _told(folder: Path) -> dict[str, Any]:
 
 def recording_of(folder: Path) -> str:
     """The name of the recording that a run was replayed from; empty where it was a live run, or is not known."""
-    name = _told(folder).get("recording", "")
+    name = summary_of(folder).get("recording", "")
     return name if isinstance(name, str) else ""
 
 
@@ -82,13 +99,13 @@ def run_config(folder: Path) -> Config:
 def changed_since(folder: Path) -> list[str]:
     """Results that are not those that ``run.json`` was written with: of a save that was cut off, or edited since."""
     try:
-        files = _told(folder)["files"]
+        files = summary_of(folder)["files"]
         there = [name for name in sorted(_RESULTS & set(files)) if (folder / name).exists()]
         changed = [name for name in there if checksum((folder / name).read_bytes()) != files[name]]
     except (OSError, LookupError, TypeError):
         return []
     out = [f"{name} is not the one that {SUMMARY} was saved with" for name in changed]
-    if any(now > then for _, then, now in _parts(folder)):
+    if any(now > then for _, then, now in _parts(folder)) or is_incomplete(folder):
         out.append("the run went on after its results were saved: graph_slam recover has those of its end")
     return out
 
@@ -100,7 +117,7 @@ def missing(folder: Path) -> list[str]:
 
 def _parts(folder: Path) -> Iterator[tuple[str, int, int]]:
     """Of each recording of a run that was saved: how many parts it had then and has now."""
-    parts = _told(folder).get("parts")
+    parts = summary_of(folder).get("parts")
     told: dict[str, Any] = parts if isinstance(parts, dict) else {}
     for name in (INGEST, MAP):
         if isinstance(then := told.get(name), int):
@@ -142,7 +159,7 @@ def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> None:
     ----------
     loaded : the run whose map is gone on in, or is to be: it stays
     """
-    most = max(most, is_cut_off(folder))
+    most = max(most, is_cut_off(folder) or is_incomplete(folder))
     if not _holds_something(folder) or not most:
         return
     earlier = earlier_runs(folder)

@@ -13,6 +13,8 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
   stamp, or null where it was given up; ``seen``: of those without identity, each sighting and its edge; ``offsets``: by
   input, the vertex of what its ranges have in common;
 * ``datum``: latitude, longitude and height that fixes are from; ``settings``: parameters that were changed on the way;
+* ``processed``: records of the ingest sequence that all of it came of; ``used``: stamp and input of the last odometry
+  that was used by then;
 * ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are.
 
 Now and then an ``estimate`` tells all values, end to end. A run that goes on in another's map has that first, as one
@@ -74,7 +76,8 @@ class Growth:
         """What there is since the last call, and now and then where all of it is thought to be."""
         changed = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
         self._settings = dict(slam.settings)
-        yield self.since(slam) | changed
+        used = {"used": [slam.newest_odometry_ns, slam.odometry_source]} if slam.odometry_source else {}
+        yield self.since(slam) | changed | {"processed": slam.processed} | used
         count = len(slam.keyframes)
         has_jumped = slam.correction.distance_m > _JUMP_M and count > 1.01 * self._estimated
         if has_jumped or count >= _MORE * self._estimated + 1:
@@ -149,6 +152,7 @@ def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> Ma
                     state.values[: len(values)] = values
                 case "start":
                     has_start = True
+                    state.processed = 0
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, GraphSlamError) as error:
             raise FormatError(f"{folder.name}/{MAP}.mcap: record {count}: {error}") from None
         if start_only and has_start:
@@ -204,6 +208,8 @@ def _fault(state: MapState) -> str:
             return f"the offset of {name} is none"
     if not all(_is_index(one, len(state.keyframes)) for one in (*state.segments, *state.drives)):
         return "a segment or a drive begins where no keyframe is"
+    if not (state.used_ns is None or _is_index(state.used_ns, 2**63)) or not isinstance(state.source, str):
+        return "the odometry that was used last is none"
     if state.datum and not (len(state.datum) == 3 and are_numbers(state.datum)):
         return "its datum is none"
     if len(state.ledger) > graph.edge_count:
@@ -304,12 +310,20 @@ def _grow(state: MapState, record: Mapping[str, Any]) -> None:
     state.range_offsets.update(record.get("offsets", {}))
     state.datum = tuple(record.get("datum", state.datum))
     state.settings.update(record.get("settings", {}))
+    state.processed = _count(record.get("processed"))
+    state.used_ns, state.source = record.get("used", (None, ""))
     if "frozen" in record:
         vertices, edges = record["frozen"]
         if not (_is_index(vertices, graph.vertex_count + 1) and _is_index(edges, len(ledger) + 1)):
             raise ValueError(f"frozen {record['frozen']}: more than there is")
         state.frozen = vertices
         ledger.finish(edges)
+
+
+def _count(told: Any) -> int | None:
+    if told is not None and not _is_index(told, 2**63):
+        raise ValueError(f"processed {told!r} is no count")
+    return told
 
 
 def _judge(ledger: Ledger, judged: Sequence[Any]) -> None:

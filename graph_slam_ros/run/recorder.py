@@ -1,7 +1,11 @@
 """Recording a run as it goes on, and saving its results."""
 
+import contextlib
 import json
+import threading
 import time
+from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -21,7 +25,7 @@ from graph_slam_ros.formats.journal import (
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.run.folder import CONFIG, SUMMARY, RunError, checksum, room
+from graph_slam_ros.run.folder import CONFIG, SUMMARY, RunError, checksum, room, summary_of
 from graph_slam_ros.run.map_log import GROWTH, Growth
 from graph_slam_ros.run.tables import result_texts, summarize
 from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
@@ -37,7 +41,8 @@ class RunRecorder:
     """Records a run while it goes on, and saves its results.
 
     What was accepted is in the journal once ``flush`` has returned. A disk that is full loses nothing: what could not
-    be written is written when there is room.
+    be written is written when there is room. One thread accepts measurements (``accept``) while another processes them
+    and calls everything else; ``leave`` may be called by either.
 
     Parameters
     ----------
@@ -49,11 +54,15 @@ class RunRecorder:
     def __init__(self, folder: Path | str, config: Config, sync_s: float = 0.0, start: MapState | None = None) -> None:
         self.folder = Path(folder)
         self._sync_s, self._due_s = sync_s, 0.0
-        self._disk = ThreadPoolExecutor(1, "journal") if sync_s else None
+        self._disk: ThreadPoolExecutor | None = None
+        self._writing = threading.RLock()
+        self._is_ended = False
+        self._flushing: Future[None] | None = None
+        self.accepted = 0  # measurements, written or not
         self._syncing: Future[None] | None = None
         self._journal = Parts(self.folder, INGEST, MEASUREMENT)
         self._map = Parts(self.folder, MAP, GROWTH)
-        self._accepted: list[Measurement] = []  # and not written yet
+        self._accepted: deque[Measurement] = deque()  # and not written yet
         self._growth = Growth(start)
         self._grown = self._growth.first
         self._bag: BagWriter | None = None
@@ -66,14 +75,38 @@ class RunRecorder:
         self._journal.write([BEGINS_IN_A_MAP] if start is not None else [])
         try:
             self._journal.flush()
-            self._put(CONFIG, parameters_text(config.as_mapping()))
+            _put(self.folder, CONFIG, parameters_text(config.as_mapping()))
         except OSError as error:
             self.abandon()
             raise RunError(f"{self.folder}: {error.strerror}") from None
 
+    def accept(self, measurement: Measurement) -> None:
+        """Take a measurement for the journal; it waits for ``flush`` or ``flush_beside``."""
+        self._accepted.append(measurement)
+        self.accepted += 1
+
+    def flush_beside(self) -> None:
+        """Have a thread write what was accepted, if that waits: the one that processes may be busy for long."""
+        if self._accepted and not self._is_ended and (self._flushing is None or self._flushing.done()):
+            with contextlib.suppress(RuntimeError):  # the recording has just been ended
+                self._flushing = self._beside().submit(self._flush_journal)
+
+    def _flush_journal(self) -> None:
+        with contextlib.suppress(OSError), self._writing:  # it waits, and the next flush raises that again
+            if not self._is_ended:
+                self._fill_journal()
+                self._journal.flush()
+                if self._syncing is None or (self._syncing.done() and not self._syncing.exception()):
+                    self._syncing = self._sync_if_due()
+
+    def _beside(self) -> ThreadPoolExecutor:
+        with self._writing:
+            self._disk = self._disk or ThreadPoolExecutor(1, "journal")
+            return self._disk
+
     def sink(self, measurement: Measurement) -> None:
         """Append to the journal: the sink of ``GraphSlam``. Raises OSError as ``flush`` does."""
-        self._accepted.append(measurement)
+        self.accept(measurement)
         if len(self._accepted) >= _TOGETHER or (self._sync_s and time.monotonic() >= self._due_s):
             self.flush()
 
@@ -85,17 +118,23 @@ class RunRecorder:
         OSError
             It is kept, and written by the next call that can; or the disk did not take what was flushed before.
         """
-        self._fill()
-        self._journal.flush()
-        self._map.flush()  # last: it is never ahead of what it came of
-        if self._syncing is None or self._syncing.done():
-            synced, self._syncing = self._syncing, self._sync_if_due()
-            if synced is not None:
-                synced.result()
+        with self._writing:
+            if self._is_ended:
+                return
+            self._fill()
+            self._journal.flush()
+            self._map.flush()  # last: it is never ahead of what it came of
+            if self._syncing is None or self._syncing.done():
+                synced, self._syncing = self._syncing, self._sync_if_due()
+                if synced is not None:
+                    synced.result()
+
+    def _fill_journal(self) -> None:
+        accepted = [self._accepted.popleft() for _ in range(len(self._accepted))]
+        self._journal.write([to_record(measurement) for measurement in accepted])
 
     def _fill(self) -> None:
-        accepted, self._accepted = self._accepted, []
-        self._journal.write([to_record(measurement) for measurement in accepted])
+        self._fill_journal()
         grown, self._grown = self._grown, []
         self._map.write(grown)
 
@@ -107,10 +146,10 @@ class RunRecorder:
     def _sync_if_due(self) -> Future[None] | None:
         """The disk may take long: nobody waits for it."""
         now = time.monotonic()
-        if self._disk is None or now < self._due_s:
+        if not self._sync_s or now < self._due_s:
             return None
         self._due_s = now + self._sync_s
-        return self._disk.submit(self._sync)
+        return self._beside().submit(self._sync)
 
     def wait_synced(self) -> None:
         """Wait until the disk has taken what it was asked to take. Raises OSError: it did not, which is told once."""
@@ -126,6 +165,11 @@ class RunRecorder:
         """Append what an update changed: the map, pose and TF, and the path and the landmarks when they have grown."""
         if not update or not slam.keyframes:
             return
+        with self._writing:
+            if not self._is_ended:
+                self._record(slam)
+
+    def _record(self, slam: GraphSlam) -> None:
         self._grown += self._growth.of(slam)
         stamp = slam.keyframes[-1].stamp_ns
         self._write("/tf", results.TF, stamp, results.map_to_odom(slam, stamp))
@@ -144,27 +188,51 @@ class RunRecorder:
             The folder cannot be written.
         """
         try:
-            if slam.keyframes:
-                self._record_map(slam)
-            self._end_parts()
-            self._save_results(slam, summary or {})
+            with self._writing:
+                self._refuse_if_ended()
+                if slam.keyframes:
+                    self._record_map(slam)
+                self._end_parts()
+            parts = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}  # more of them: it went on
+            waiting = max(0, self.accepted - slam.processed)
+            told = (summary or {}) | {"parts": parts, "waiting": waiting}
+            save_results(self.folder, slam, told, self._refuse_if_ended)
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
         return self.folder
 
-    def _save_results(self, slam: GraphSlam, summary: dict[str, Any]) -> None:
-        """All that can be computed first, then file by file; the summary, the last, tells which belong together."""
-        files = {name: self._put(name, text) for name, text in result_texts(slam).items()}
-        told = summarize(slam) | summary | {"leverage": leverage(slam.solver) if slam.is_solved else {}, "files": files}
-        told["parts"] = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}  # more of them: it went on
-        self._put(SUMMARY, json.dumps(told, indent=2) + "\n")
+    def _refuse_if_ended(self) -> None:
+        if self._is_ended:
+            raise RunError(f"{self.folder}: its recording has been ended")
 
-    def _put(self, name: str, text: str) -> str:
-        """Write a file whole or not at all; returns its CRC-32."""
-        data = text.encode()
-        with replaced(self.folder / name) as new:
-            new.write_bytes(data)
-        return checksum(data)
+    def leave(self, processed: int, keyframes: int) -> int:
+        """End the recording before all of it was processed, and note that in the summary; returns what waits.
+
+        What has been saved until now stays; ``complete`` makes the results of the whole.
+
+        Raises
+        ------
+        OSError
+            The disk refuses it.
+        """
+        waiting = max(0, self.accepted - processed)
+        with self._writing:
+            if self._is_ended:
+                return 0
+            self._end_parts()
+            parts = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}
+            now = {
+                "keyframes": keyframes,
+                "ended": True,
+                "is_incomplete": bool(waiting or keyframes),
+                "waiting": waiting,
+                "parts": parts,
+            }
+            told = summary_of(self.folder) | now
+            _put(self.folder, SUMMARY, json.dumps(told, indent=2) + "\n")
+            self._is_ended = True
+            self._room.close()
+        return waiting
 
     def close(self) -> None:
         """End the recording: somebody else may have the folder.
@@ -174,11 +242,18 @@ class RunRecorder:
         OSError
             What the disk did not take is kept: the next ``flush`` or ``close`` tries again.
         """
-        self._end_parts()
-        self._room.close()
+        with self._writing:
+            self._end_parts()
+            self._is_ended = True
+            self._room.close()
 
     def abandon(self) -> None:
         """End the recording as it is on the disk: what waits is lost."""
+        with self._writing:
+            self._is_ended = True
+            self._abandon()
+
+    def _abandon(self) -> None:
         if self._disk is not None:
             self._disk.shutdown(wait=False)
         self._journal.abandon()
@@ -196,7 +271,7 @@ class RunRecorder:
         self._syncing = None
         if self._disk is not None:  # its thread ends; another comes with the next sync
             self._disk.shutdown(wait=False)
-            self._disk = ThreadPoolExecutor(1, "journal")
+            self._disk = None
         if self._bag is not None:
             self._ended_bags.append(self._bag.end())
             self._bag, self._bags = None, self._bags + 1
@@ -215,3 +290,30 @@ class RunRecorder:
         if self._bag is None:
             self._bag = BagWriter(self.folder / part_name("run", self._bags))
         self._bag.write(topic, type_name, stamp_ns, cdr)
+
+
+def save_results(
+    folder: Path, slam: GraphSlam, summary: dict[str, Any], check: Callable[[], None] = lambda: None
+) -> None:
+    """All that can be computed first, then file by file; the summary, the last, tells which belong together.
+
+    Parameters
+    ----------
+    check : called before each file; where it raises, no more is written
+    """
+
+    def put(name: str, text: str) -> str:
+        check()
+        return _put(folder, name, text)
+
+    files = {name: put(name, text) for name, text in result_texts(slam).items()}
+    told = summarize(slam) | summary | {"leverage": leverage(slam.solver) if slam.is_solved else {}, "files": files}
+    put(SUMMARY, json.dumps(told, indent=2) + "\n")
+
+
+def _put(folder: Path, name: str, text: str) -> str:
+    """Write a file whole or not at all; returns its CRC-32."""
+    data = text.encode()
+    with replaced(folder / name) as new:
+        new.write_bytes(data)
+    return checksum(data)

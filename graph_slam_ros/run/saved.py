@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.formats.journal import read_ingest
-from graph_slam_ros.run.folder import RunError, check_room, missing, run_config
+from graph_slam_ros.formats.durable import claimed
+from graph_slam_ros.formats.journal import read_ingest, read_rest
+from graph_slam_ros.run.folder import RunError, check_room, missing, run_config, summary_of, was_saved_whole
 from graph_slam_ros.run.map_log import has_map, read_map, state_of
-from graph_slam_ros.run.recorder import RunRecorder
+from graph_slam_ros.run.recorder import RunRecorder, save_results
 from graph_slam_ros.run.tables import summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.map_state import MapState
@@ -21,7 +22,7 @@ Took = Callable[[], dict[str, float]]
 
 
 def map_of(folder: Path, losses: list[str]) -> MapState:
-    """The map of a run: as it was written down, or where it was not, by repeating the drive.
+    """The map of a run: as it was written down, with what its journal holds besides; or by repeating the drive.
 
     Raises
     ------
@@ -30,7 +31,8 @@ def map_of(folder: Path, losses: list[str]) -> MapState:
     """
     warmup()
     losses += missing(folder)
-    state = (read_map(folder, losses) if has_map(folder) else None) or _repeated(folder, losses)
+    state = read_map(folder, losses) if has_map(folder) else None
+    state = _repeated(folder, losses) if state is None else _with_rest(folder, state, losses)
     if not state.keyframes:
         raise RunError(f"{folder}: no keyframe, so there is no map")
     space = run_config(folder).space
@@ -53,6 +55,23 @@ def _repeated(folder: Path, losses: list[str]) -> MapState:
         slam.process(from_record(record))
     slam.process(Control("end"))
     return state_of(slam)
+
+
+def _with_rest(folder: Path, state: MapState, losses: list[str]) -> MapState:
+    """The map after those measurements, too, that were accepted and not processed any more."""
+    if state.processed is None or was_saved_whole(folder):
+        return state
+    rest = [from_record(record) for record in read_rest(folder, state.processed, state.used_ns, losses)]
+    if not rest:
+        return state
+    state.continues_with = state.source if state.used_ns is not None else ""
+    settings = dict(state.settings)
+    slam = GraphSlam(config_of(folder, state), start=state)
+    for measurement in [*rest, Control("end")]:
+        slam.process(measurement)
+    out = state_of(slam)
+    out.settings = settings | out.settings
+    return out
 
 
 def taken_up(folder: Path, losses: list[str]) -> GraphSlam:
@@ -121,6 +140,27 @@ def recover(folder: Path, out: Path) -> Summary:
     losses: list[str] = []
     state = map_of(folder, losses)
     return record_run(out, config_of(folder, state), (), losses, state, took=took)[1]
+
+
+def complete(folder: Path) -> Summary:
+    """Write into a run the results of all that it holds; its recordings stay as they are.
+
+    Raises
+    ------
+    RunError
+        Somebody else has the folder, or its map cannot be solved.
+    """
+    took = stopwatch()
+    losses: list[str] = []
+    try:
+        with claimed(folder):
+            before = summary_of(folder)
+            slam = settled(folder, losses)
+            summary = before | summarize(slam) | took() | {"losses": losses, "ended": True, "is_incomplete": False}
+            save_results(folder, slam, summary)
+    except OSError as error:
+        raise RunError(f"{folder}: {error.strerror}") from None
+    return summary
 
 
 def freeze(folder: Path, out: Path) -> Summary:

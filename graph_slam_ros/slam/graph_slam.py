@@ -98,9 +98,10 @@ class GraphSlam:
     Parameters
     ----------
     config : the parameters
-    sink : called with every measurement that was accepted, in that order, before it takes effect
+    sink : called with every measurement that is handed over, in that order, before it takes effect or is refused
     beside : begins work that may go on beside ``process``; what it returns waits for the result
-    start : the map to go on in, which is then this object's; the next odometry begins a segment
+    start : the map to go on in, which is then this object's; the next odometry begins a segment, unless the map tells
+        that the same drive continues
     """
 
     def __init__(
@@ -116,6 +117,7 @@ class GraphSlam:
         self.backend = Backend(self.config.robust, self.config.solver_settings(), beside, start, self.counters)
         self.graph, self.solver, self.ledger = self.backend.graph, self.backend.solver, self.backend.ledger
         self.sighting_poses = Track(SightingPose, self.space.pose.size)
+        self.processed = 0  # measurements and control events that were handed over
         self.solves = 0
         self.report: Report | None = None  # of the last solve of everything
         self.correction = Correction()  # of the last solve
@@ -150,12 +152,13 @@ class GraphSlam:
 
     def process(self, measurement: Measurement) -> Update:
         """Take one measurement or control event; returns what it changed."""
+        if self._sink is not None:
+            self._sink(measurement)
+        self.processed += 1
         if not isinstance(measurement, Control | InitialPose) and not self._order.accepts(measurement):
             return _NOTHING
         if isinstance(measurement, Fix) and not self._is_of_this_map(measurement):
             return _NOTHING
-        if self._sink is not None:
-            self._sink(measurement)
         first_new, solves, report = len(self.keyframes), self.solves, self.report
         first_edge = self.backend.handed_over[1]
         match measurement:
@@ -175,8 +178,7 @@ class GraphSlam:
             case Control("time_jump"):
                 self._forget_time()
             case Control("restart"):
-                self._safeguard.go_back()
-                self._solved_vertices = 0
+                self.restart()
             case Control("memory", values):
                 self.backend.spares_memory = bool(dict(values)["is_short"])
             case Control("set", values):
@@ -193,6 +195,11 @@ class GraphSlam:
         edges = range(first_edge, self.backend.handed_over[1])
         changes, self._told = tuple(self.ledger.history[self._told :]), len(self.ledger.history)
         return Update(tuple(range(first_new, len(self.keyframes))), edges, solved, new, correction, changes)
+
+    def restart(self) -> None:
+        """Go back to the last good estimate, after a fault outside."""
+        self._safeguard.go_back()
+        self._solved_vertices = 0
 
     # -- what is known now ---------------------------------------------------------------------------------------
 
@@ -317,6 +324,9 @@ class GraphSlam:
         if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
         self._trail.take_up(start.keyframes, start.segments, start.drives)
+        if start.continues_with:
+            self._trail.go_on()
+            self._odometry.go_on(self.keyframes[-1].stamp_ns, self.keyframes[-1].T_odom_base, start.continues_with)
         for pose in start.sighting_poses:
             self.sighting_poses.append(pose.keyframe, pose.stamp_ns, pose.T_keyframe_base)
         self._landmarks.take_up(start.landmarks, start.range_offsets)

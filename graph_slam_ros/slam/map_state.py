@@ -24,6 +24,10 @@ class MapState:
     frozen : the first so many vertices stay there, and verdicts on what is between them as they are
     datum : of fixes on earth, as in ``Fix``
     settings : parameters that were changed on the way, by name
+    processed : records of the ingest sequence that it came of; None where it does not tell
+    used_ns : stamp of the last odometry that was used by then; None before the first
+    source : the input of that odometry
+    continues_with : the odometry whose next message belongs to the same drive; empty where a new drive begins
     """
 
     graph: Graph = field(default_factory=Graph)
@@ -38,6 +42,10 @@ class MapState:
     frozen: int = 0
     datum: tuple[float, ...] = ()
     settings: dict[str, Any] = field(default_factory=dict)
+    processed: int | None = 0
+    used_ns: int | None = None
+    source: str = ""
+    continues_with: str = ""
 
     @property
     def vertices(self) -> list[int]:

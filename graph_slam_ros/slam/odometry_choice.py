@@ -62,6 +62,12 @@ class OdometryChoice:
         self._used = None
         self._last_step = self._space.identity
 
+    def go_on(self, stamp_ns: int, T_odom_base: Numbers, source: str) -> None:
+        """Begin as if an odometry message of this source had been used last."""
+        self._used = Odometry(stamp_ns, T_odom_base, None, source)
+        if source not in self._order:
+            self._order.append(source)
+
     def take(self, m: Odometry) -> list[Step]:
         """The steps that a message leads to: none where it is not the odometry in use."""
         if m.source not in self._order:

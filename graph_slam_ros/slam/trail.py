@@ -83,6 +83,14 @@ class Trail:
         self.drives += drives or [0]  # a map of an earlier version does not say
         self.forget_time()
 
+    def go_on(self) -> None:
+        """After ``take_up``: the same drive continues, so odometry tells the motion since the last keyframe."""
+        last = len(self.keyframes) - 1
+        backwards = np.flatnonzero(np.diff(self.keyframes.stamps_ns) < 0)
+        self._epoch = max(self.drives[-1], int(backwards[-1]) + 1 if len(backwards) else 0)
+        self._is_new_drive = False
+        self._motions.append(Motion(self._noise, self._space, last, self.keyframes[last].stamp_ns))
+
     def forget_time(self) -> None:
         """Stamps begin anew: none before can be told from them."""
         self._motions.clear()

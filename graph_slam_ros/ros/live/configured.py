@@ -22,6 +22,7 @@ from graph_slam_ros.ros.interfaces import typestore
 from graph_slam_ros.ros.live import events, health
 from graph_slam_ros.ros.live.ahead import Ahead
 from graph_slam_ros.ros.live.broadcaster import Broadcaster
+from graph_slam_ros.ros.live.completion import Completion
 from graph_slam_ros.ros.live.listeners import Listeners
 from graph_slam_ros.ros.live.memory import is_short
 from graph_slam_ros.ros.live.outputs import Outputs
@@ -32,7 +33,7 @@ from graph_slam_ros.ros.message_class import message_class
 from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.ros.survey import with_survey
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Update
-from graph_slam_ros.slam.measurements import Closure
+from graph_slam_ros.slam.measurements import Closure, InitialPose
 
 _ACKNOWLEDGE = 32  # messages
 _HINTS = {"future": ", ahead of the clock: is use_sim_time to be set, or does a clock differ?"}
@@ -58,6 +59,7 @@ class Configured:
         self._session = Session(config, self.counters, self._on_update, self._tell)
         self._outputs = Outputs(node, config)
         self._worker = Worker(config.inputs.queue)
+        self._completion = Completion(self._session.incomplete, node.get_logger())
         self._listeners: Listeners | None = None
         self._broadcaster: Broadcaster | None = None
         self._jumps: Any = None
@@ -98,24 +100,43 @@ class Configured:
         self._jumps.unregister()
         self._listeners = self._broadcaster = None
 
-    def finish(self, patience_s: float | None) -> None:
-        """Save what was not saved yet, and take everything away."""
+    def finish(self, patience_s: float | None, is_urgent: Callable[[], bool] = lambda: False) -> None:
+        """Save what was not saved yet, and take everything away.
+
+        What takes longer is left to the next start: all that was accepted is in the journal.
+
+        Parameters
+        ----------
+        patience_s, is_urgent : as of ``Worker.stop``
+        """
         self.deactivate()
         self._watch()
         for some in self._ahead.give_up():
             self._hand_over(some)
         self._node.destroy_subscription(self._initial)
         self._hand_over(self._border.finish())
+        saved = self._worker.call(self._session.finish)
         try:
-            if not self._worker.stop(patience_s):
-                self._node.get_logger().error(
-                    "a solve takes too long to wait for: replay the run folder for its results"
-                )
-            elif folder := self._session.finish():
-                self._node.get_logger().info(f"saved {Path(folder).name}")
+            if self._worker.stop(patience_s, is_urgent) and saved.done():
+                if folder := saved.result():
+                    self._node.get_logger().info(f"saved {Path(folder).name}")
+            else:
+                self._leave()
         finally:
             self._session.abandon()
             self._outputs.close()
+            self._completion.stop()
+
+    def _leave(self) -> None:
+        waiting, lost = self._session.leave()
+        folder, log = self._node.config.output.folder, self._node.get_logger()
+        if folder:
+            log.warn(
+                f"stopped while {waiting} measurements waited: all are in the journal; the next start completes the"
+                f" results, or graph_slam recover {folder}"
+            )
+        if lost:
+            log.error(f"{lost} measurements are lost: they came while another run was to begin, and it had not yet")
 
     # -- in the main thread: messages --------------------------------------------------------------------------------
 
@@ -144,7 +165,9 @@ class Configured:
             self._begin_anew("stamps", "odometry has gone back in time and stays there")
         reason = "stopped" if self._is_stopped else "paused" if self._is_paused else ""
         if measured and not reason:
-            if self._worker.offer(self._node.guarded(partial(self._use, measured))):
+            if self._worker.has_room:
+                self._session.accept(measured)
+                self._worker.offer(self._node.guarded(partial(self._use, measured)))
                 return
             reason = "overflow"
         self._refuse(reason, measured)
@@ -180,7 +203,12 @@ class Configured:
 
     def _on_initial_pose(self, cdr: bytes) -> None:
         for pose in self._border.initial_pose(cdr):
-            self.in_passing(self._worker.call(partial(self._session.take, [pose])))
+            self.in_passing(self._in_sequence([pose]))
+
+    def _in_sequence(self, events: Sequence[Control | InitialPose]) -> "Future[None]":
+        """Accept and process what is no measurement, at its place among those."""
+        self._session.accept(events)
+        return self._worker.call(partial(self._session.process, events))
 
     def _on_jump(self, jump: Any) -> None:
         """The clock jumped back, or another one is used."""
@@ -214,6 +242,8 @@ class Configured:
     def tick(self) -> None:
         """Ten times a second: what has waited long enough, and what somebody may have begun to listen to."""
         self._watch()
+        self._session.flush_beside()
+        self._completion.tick()
         for some in self._ahead.waited():
             self._hand_over(some)
         if self._listeners is not None:
@@ -226,13 +256,13 @@ class Configured:
 
     def _watch(self) -> None:
         """Over the worker's thread and the memory of the process."""
-        if self._worker.revive(partial(self._session.control, "restart")):
+        if self._worker.revive(self._session.restart):
             self.counters.count("node", "worker_restarted")
             self._node.get_logger().error("the solver's thread has died; another goes on with the graph that there is")
         limit, before = self._node.config.health.memory_mib, self._memory_is_short
         self._memory_is_short = is_short(limit, was_short=before)
         if self._memory_is_short != before:
-            self.in_passing(self._worker.call(partial(self._session.control, "memory", is_short=not before)))
+            self.in_passing(self._in_sequence([Control("memory", (("is_short", not before),))]))
 
     def _publish_received(self) -> None:
         count = self._passed + self._done
@@ -248,7 +278,7 @@ class Configured:
     def save(self) -> "Future[str]":
         """Solve everything and write the run folder."""
         self._hand_over(self._border.finish(is_end=False))
-        return self._worker.call(self._session.save)
+        return self._worker.call(partial(self._session.save, self._session.accept_save()))
 
     @property
     def was_cut_off(self) -> bool:
@@ -266,9 +296,13 @@ class Configured:
     def _anew(self, job: Callable[[], str]) -> "Future[str]":
         self._is_stopped = False
         self._reckoning.forget()
+        self._session.hold()
 
         def begin() -> str:
-            said = job()
+            try:
+                said = job()
+            finally:
+                self._session.release()
             slam = self._session.slam
             if slam.datum:
                 self._border.begin_at(slam.datum)
@@ -285,11 +319,13 @@ class Configured:
 
     def control(self, event: str) -> "Future[str]":
         """An event of the ingest sequence."""
-        return self._worker.call(partial(self._session.control, event))
+        asked = Control(event)
+        self._session.accept([asked])
+        return self._worker.call(partial(self._session.control, asked))
 
     def set(self, values: dict[str, Any]) -> None:
         """Change parameters at this place of the ingest sequence."""
-        self.in_passing(self._worker.call(partial(self._session.take, [Control("set", tuple(values.items()))])))
+        self.in_passing(self._in_sequence([Control("set", tuple(values.items()))]))
 
     def in_passing(self, future: "Future[Any]") -> None:
         """Where nobody waits for what was begun, the log says that it failed."""
@@ -304,7 +340,7 @@ class Configured:
 
     def _use(self, measured: Sequence[Measured]) -> None:
         try:
-            self._session.take(measured)
+            self._session.process(measured)
         finally:
             self._done += 1
             if self._has_player and (not self._worker.waiting or self._done % _ACKNOWLEDGE == 0):

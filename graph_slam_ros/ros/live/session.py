@@ -1,9 +1,12 @@
 """One run of the pipeline in a node, from configuration or reset to the next: its estimate, its recording, its files.
 
-All of it happens in the worker's thread; others see ``estimate``, which is replaced whole.
+The main thread accepts measurements (``accept``) in the order in which it hands them to the worker's thread. That does
+all the rest; others see ``estimate``, which is replaced whole.
 """
 
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +18,7 @@ from graph_slam_ros.run import (
     RunError,
     RunRecorder,
     earlier_runs,
+    incomplete_runs,
     is_cut_off,
     is_run,
     keep_earlier,
@@ -77,11 +81,15 @@ class Session:
         self._folder = Path(config.output.folder) if config.output.folder else None
         self.estimate: Estimate | None = None
         self._recorder: RunRecorder | None = None
+        self._accepting = threading.Lock()
+        self._held: deque[list[Measurement]] = deque()  # for each run that is still to begin, what was accepted for it
+        self._is_left = False
+        self._has_news = False  # since the last save was asked for
         self.was_cut_off = self._folder is not None and is_cut_off(self._folder)
         self._begin()
 
     def _begin(self, start: MapState | None = None, loaded: Path | None = None) -> None:
-        slam = GraphSlam(self.config, self._sink, in_a_thread, start)
+        slam = GraphSlam(self.config, None, in_a_thread, start)
         recorder: RunRecorder | None = None
         if self._folder is not None:
             named = self._folder.with_name(load) if (load := self.config.output.load) else None
@@ -100,23 +108,68 @@ class Session:
         self._fit, self._fitted_at, self._fit_due_s = float("nan"), 0, 0.0
 
     @property
+    def incomplete(self) -> list[Path]:
+        """Earlier runs that were ended while measurements waited, and whose results are not made yet."""
+        return incomplete_runs(self._folder) if self._folder is not None else []
+
+    @property
     def failures(self) -> int:
         """Solves that failed."""
         return sum(self.slam.counters.as_dict().get("solver", {}).values())
 
     # -- measurements ------------------------------------------------------------------------------------------------
 
-    def take(self, measurements: Sequence[Measurement]) -> None:
-        """Hand measurements to the pipeline, in order."""
+    def accept(self, measurements: Sequence[Measurement]) -> None:
+        """Put measurements into the journal, before they wait for their turn in ``process``."""
+        self._has_news = True
+        with self._accepting:
+            if self._held:
+                self._held[-1] += measurements
+            elif (recorder := self._recorder) is not None:
+                for measurement in measurements:
+                    recorder.accept(measurement)
+
+    def hold(self) -> None:
+        """What is accepted from now on belongs to a run that is still to begin: it waits for ``release``."""
+        self._has_news = False
+        with self._accepting:
+            self._held.append([])
+
+    def release(self) -> None:
+        """The run has begun, or the one before goes on."""
+        with self._accepting:
+            held = self._held.popleft()
+            if (recorder := self._recorder) is not None:
+                for measurement in held:
+                    recorder.accept(measurement)
+
+    def flush_beside(self) -> None:
+        """Have what was accepted written, however busy the worker is."""
+        if (recorder := self._recorder) is not None:
+            recorder.flush_beside()
+
+    def process(self, measurements: Sequence[Measurement]) -> None:
+        """Hand measurements that were accepted to the pipeline, in order."""
         for measurement in measurements:
+            if self._is_left:
+                return
             self._is_saved = False
             self._process(measurement)
+
+    def take(self, measurements: Sequence[Measurement]) -> None:
+        """Accept and process."""
+        self.accept(measurements)
+        self.process(measurements)
+
+    def restart(self) -> None:
+        """Go on after the thread has died, from the last good estimate; a replay needs no such step."""
+        self.slam.restart()
 
     def _process(self, measurement: Measurement) -> None:
         start = time.perf_counter()
         update = self.slam.process(measurement)
         took_s = time.perf_counter() - start
-        if not update:
+        if not update or self._is_left:
             return
         self._slowest_s = max(self._slowest_s, took_s) if update.solved else self._slowest_s
         recorded = self._recorded(lambda recorder: recorder.record(self.slam, update))
@@ -124,9 +177,6 @@ class Session:
             self.recording_fails = False
         self._look(update, took_s)
         self._on_update(self.slam, update)
-
-    def _sink(self, measurement: Measurement) -> None:
-        self._recorded(lambda recorder: recorder.sink(measurement))
 
     def _recorded(self, write: Callable[[RunRecorder], None]) -> bool:
         """Where the disk fails, the robot goes on; that nothing is recorded is told, and tried again and again."""
@@ -183,22 +233,35 @@ class Session:
 
     # -- services ----------------------------------------------------------------------------------------------------
 
-    def control(self, event: str, **values: Any) -> str:
-        """An event of the ingest sequence."""
-        self.take([Control(event, tuple(values.items()))])
+    def control(self, event: Control) -> str:
+        """Process an event that was accepted."""
+        self.process([event])
         return f"{len(self.slam.keyframes)} keyframes"
 
-    def save(self, release: str = "flush") -> str:
-        """Release what waits, solve, and write the run folder; returns its name."""
+    def accept_save(self) -> list[Control]:
+        """The events that belong before a save, at their place in the journal; none where nothing is new."""
+        events = [Control("flush"), Control("optimize")] if self._has_news else []
+        self.accept(events)
+        self._has_news = False
+        return events
+
+    def save(self, events: Sequence[Control] | None = None) -> str:
+        """Release what waits, solve, and write the run folder; returns its name.
+
+        Parameters
+        ----------
+        events : that were accepted for it; None: they are accepted now
+        """
         self._recorded(RunRecorder.wait_synced)  # what the disk refused before is told, and is no reason not to save
-        for event in (release, "optimize") if self._recorder is not None and not self._is_saved else ():
-            self._process(Control(event))
+        self.process(self.accept_save() if events is None else events)
+        return self._write(ended=False)
+
+    def _write(self, *, ended: bool) -> str:
         if self._recorder is None:
             why = "recording was given up" if self._folder else "output.folder is empty"
             raise GraphSlamError(f"{why}: nowhere to save")
         counters = self._border.since(self._refused_before)
         counters.update(self.slam.counters)
-        ended = release == "end"
         summary = summarize(self.slam) | {"counters": counters.as_dict(), "ended": ended}
         folder = str(self._recorder.save(self.slam, summary))
         self._is_saved, self._is_ended, self.recording_fails = True, ended, False
@@ -249,14 +312,37 @@ class Session:
         """Save what was not saved yet, and end the recording; returns the folder, or nothing."""
         if self._recorder is None:
             return ""
-        folder = ""
+        folder, recorder = "", self._recorder
         if not self._is_saved or (self.slam.keyframes and not self._is_ended):
-            folder = self.save("end")
-        self._recorder.close()
+            self._recorded(RunRecorder.wait_synced)
+            for event in (Control("end"), Control("optimize")) if not self._is_saved else ():
+                recorder.accept(event)
+                self._process(event)
+            folder = self._write(ended=True)
+        recorder.close()
         return folder
+
+    def leave(self) -> tuple[int, int]:
+        """End the recording though measurements wait for the pipeline.
+
+        Returns how many: those in the journal, whose results the next start makes, or ``graph_slam recover``; and those
+        for a run that has not begun, which are lost. May be called while the worker is busy: of what that still does
+        nothing is recorded or published.
+        """
+        self._is_left = True
+        recorder = self._recorder
+        lost = sum(map(len, self._held))
+        if recorder is None:
+            return 0, lost
+        try:
+            return recorder.leave(self.slam.processed, len(self.slam.keyframes)), lost
+        except OSError as error:
+            recorder.abandon()
+            raise RunError(f"{recorder.folder}: {error.strerror}") from None
 
     def abandon(self) -> None:
         """End the recording as it is, where it was not finished."""
+        self._is_left = True
         if self._recorder is None:
             return
         try:

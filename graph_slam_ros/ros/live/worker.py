@@ -3,12 +3,16 @@
 Callbacks only hand over; what takes long never holds them up.
 """
 
+import math
 import queue
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
+
+URGENT_S = 2.0  # for what waits when the node is told to stop
+_POLL_S = 0.05
 
 
 class Worker:
@@ -25,12 +29,12 @@ class Worker:
         self._since: float | None = None
         self._begun: float | None = None
         self._future: Future[Any] | None = None  # of the job in hand
-        self._is_stopped = False
+        self._is_stopped = self._is_left = False
         self._thread = self._started(None)
 
     def offer(self, job: Callable[[], None]) -> bool:
         """Have a job done that raises nothing; False where too many wait, and nothing is taken."""
-        if self._jobs.qsize() >= self._most:
+        if not self.has_room:
             return False
         self._jobs.put((job, None, time.monotonic()))
         return True
@@ -72,12 +76,28 @@ class Worker:
         self._thread = self._started(first)
         return True
 
-    def stop(self, timeout_s: float | None = None) -> bool:
-        """Do what waits, then end; False if that takes longer."""
+    @property
+    def has_room(self) -> bool:
+        """Whether ``offer`` would take another job."""
+        return self._jobs.qsize() < self._most
+
+    def stop(self, timeout_s: float | None = None, is_urgent: Callable[[], bool] = lambda: False) -> bool:
+        """Do what waits, then end; False if that takes longer: then no further job is begun.
+
+        Parameters
+        ----------
+        timeout_s : None: as long as it takes
+        is_urgent : asked meanwhile; from then on it may take ``URGENT_S``
+        """
         self._is_stopped = True
         self._jobs.put(None)
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+        deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        while self._thread.is_alive() and time.monotonic() < deadline:
+            self._thread.join(min(_POLL_S, max(0.0, deadline - time.monotonic())))
+            if deadline == math.inf and is_urgent():
+                deadline = time.monotonic() + URGENT_S
+        self._is_left = self._thread.is_alive()
+        return not self._is_left
 
     def _started(self, first: Callable[[], Any] | None) -> threading.Thread:
         thread = threading.Thread(target=self._run, args=(first,), name="graph_slam_worker", daemon=True)
@@ -88,7 +108,7 @@ class Worker:
         self._since = self._begun = self._future = None
         if first is not None:
             _do(first, None)
-        while (item := self._jobs.get()) is not None:
+        while (item := self._jobs.get()) is not None and not self._is_left:
             job, self._future, self._since = item
             self._begun = time.monotonic()
             _do(job, self._future)
