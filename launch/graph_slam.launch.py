@@ -28,6 +28,12 @@ def _frames(context: LaunchContext) -> dict[str, str]:
     return {key: prefix + name for key, name in names.items()} if prefix else {}
 
 
+def _folder(context: LaunchContext) -> dict[str, str]:
+    """Nothing without an argument, so that the folder of params_file stays: by default one for each node."""
+    folder = LaunchConfiguration("folder").perform(context)
+    return {"output.folder": folder} if folder else {}
+
+
 def _start(context: LaunchContext) -> list[Node]:
     namespace = LaunchConfiguration("namespace")
     slam = Node(
@@ -36,7 +42,12 @@ def _start(context: LaunchContext) -> list[Node]:
         namespace=namespace,
         parameters=[
             LaunchConfiguration("params_file"),
-            {"use_sim_time": _flag("use_sim_time"), "node.autostart": _flag("autostart"), **_frames(context)},
+            {
+                "use_sim_time": _flag("use_sim_time"),
+                "node.autostart": _flag("autostart"),
+                **_frames(context),
+                **_folder(context),
+            },
         ],
         remappings=[(topic, LaunchConfiguration(topic)) for topic in ("odom", "landmarks")],
         ros_arguments=["--log-level", LaunchConfiguration("log_level")],
@@ -65,6 +76,11 @@ def generate_launch_description() -> LaunchDescription:
                 "frame_prefix",
                 default_value="",
                 description="Put before map, odom and base_link, which then are the frames whatever params_file says",
+            ),
+            DeclareLaunchArgument(
+                "folder",
+                default_value="",
+                description="Run folder; without it that of params_file, by default NAMESPACE_graph_slam_run",
             ),
             DeclareLaunchArgument("use_sim_time", default_value="false", description="Take the time from /clock"),
             DeclareLaunchArgument(

@@ -300,11 +300,16 @@ class Started:
     parameters : ``name:=value``
     module : run as a module, else as the installed script
     remap : further ROS arguments for ``-r``
+    words : further ROS arguments
     """
 
-    def __init__(self, *parameters, module=True, cwd=None, remap=()):
+    def __init__(self, *parameters, module=True, cwd=None, remap=(), words=()):
         command = [sys.executable, "-m", "graph_slam_ros.ros.node"] if module else [executable("graph_slam_node")]
-        words = [word for p in parameters for word in ("-p", p)] + [word for r in remap for word in ("-r", r)]
+        words = [
+            *words,
+            *(word for p in parameters for word in ("-p", p)),
+            *(word for r in remap for word in ("-r", r)),
+        ]
         self.process = subprocess.Popen(
             [*command, "--ros-args", *words], env=ENVIRONMENT, cwd=cwd, stderr=subprocess.PIPE, text=True
         )

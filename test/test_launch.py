@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -53,7 +54,7 @@ def test_the_readme_has_every_argument_with_its_default_and_meaning():
     _, _, below = (ROOT / "README.md").read_text().partition("| argument | default | |\n|---|---|---|\n")
     rows = [f"| `{name}` | {f'`{default}`' if default else ''} | {text} |" for name, default, text in arguments()]
     assert below.split("\n\n")[0].splitlines() == rows
-    assert len(rows) == 9
+    assert len(rows) == 10
 
 
 def test_the_executable_and_the_files_it_names_are_installed():
@@ -96,11 +97,12 @@ def launched(prefix, *words):
         ROS_LOG_DIR=str(prefix / "log"),
     )
     command = [sys.executable, "-c", LAUNCH, str(FILE), *words]
-    with (prefix / "said").open("w") as said:
+    told = prefix / f"said_{random.randrange(10**9)}"
+    with told.open("w") as said:
         options = {"stdout": said, "stderr": subprocess.STDOUT, "start_new_session": True}
         process = subprocess.Popen(command, env=environment, **options)
     try:
-        yield process, (prefix / "said").read_text
+        yield process, told.read_text
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
@@ -124,18 +126,32 @@ def test_without_arguments_the_node_has_the_shipped_parameters_and_no_rviz_is_op
     assert {"odom:=odom", "landmarks:=landmarks"} <= set(words)
     assert 'map: "map"' in parameters
     assert "frames.map" not in parameters, "the frames of params_file stay"
+    assert "output.folder:" not in parameters, "and its folder"
     assert "node.autostart: true" in parameters
     assert "use_sim_time: false" in parameters
 
 
 @needs_launch
 def test_arguments_reach_the_node_and_rviz_looks_at_the_same_robot(prefix):
-    given = ("namespace:=robot1", "odom:=/wheels", "frame_prefix:=robot1/", "autostart:=false", "use_sim_time:=true")
+    given = (
+        "namespace:=robot1",
+        "odom:=/wheels",
+        "frame_prefix:=robot1/",
+        "autostart:=false",
+        "use_sim_time:=true",
+        "folder:=/runs/1",
+    )
     out = started(prefix, *given, "log_level:=debug", "rviz:=true")
     words, parameters = out[NODE]
     assert {"__ns:=/robot1", "odom:=/wheels", "landmarks:=landmarks"} <= set(words)
     assert words[words.index("--log-level") + 1] == "debug"
-    for said in ("node.autostart: false", "use_sim_time: true", "frames.map: robot1/map", "frames.odom: robot1/odom"):
+    for said in (
+        "node.autostart: false",
+        "use_sim_time: true",
+        "frames.map: robot1/map",
+        "frames.odom: robot1/odom",
+        "output.folder: /runs/1",
+    ):
         assert said in parameters
     assert "frames.base: robot1/base_link" in parameters
     words, parameters = out[RVIZ]
@@ -159,3 +175,28 @@ def test_the_node_comes_up_and_ctrl_c_ends_it_cleanly(prefix):
         assert process.wait(timeout=20.0) == 0
     assert "process has finished cleanly" in said()
     assert "Traceback" not in said()
+
+
+@needs_launch
+def test_the_lines_of_the_readme_for_two_robots_start_both(prefix, monkeypatch):
+    install(prefix, NODE, RUN_NODE)
+    monkeypatch.chdir(prefix)
+    line = re.search(r"namespace:=robot1 frame_prefix:=robot1/", (ROOT / "README.md").read_text())[0]
+    with contextlib.ExitStack() as stack:
+        both = [
+            stack.enter_context(launched(prefix, *line.replace("robot1", name).split())) for name in ("robot1", "two")
+        ]
+        until_ready(both)
+        for process, _ in both:
+            os.killpg(process.pid, signal.SIGINT)
+        assert [process.wait(timeout=20.0) for process, _ in both] == [0, 0]
+    assert (prefix / "robot1_graph_slam_run").is_dir()
+    assert (prefix / "two_graph_slam_run").is_dir()
+
+
+def until_ready(several):
+    for process, said in several:
+        deadline = time.monotonic() + 120.0
+        while "kernels ready" not in said():
+            assert time.monotonic() < deadline and process.poll() is None, said()
+            time.sleep(0.1)

@@ -1,9 +1,11 @@
 """The node among others: who joins late, what does not fit, several of them, transforms, odometry, long paths."""
 
+import contextlib
 import csv
 import itertools
 import json
 import math
+import pathlib
 import re
 import time
 
@@ -17,6 +19,7 @@ from rclpy.qos import ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
 from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.run import is_run
 
 NS = 10**9
 STATES = ("path", "pose", "landmarks", "landmarks_estimate", "graph", "path_updates")
@@ -469,3 +472,18 @@ def longest_gap(times, column):
     """How long a count did not grow."""
     at = [b[0] for a, b in itertools.pairwise(times) if b[column] > a[column]]
     return max(b - a for a, b in itertools.pairwise(at))
+
+
+def test_two_robots_with_the_shipped_parameters_record_each_into_a_folder_of_its_own(tmp_path):
+    shipped = pathlib.Path(__file__).parents[1] / "config" / "planar.yaml"
+    with contextlib.ExitStack() as stack:
+        for name in ("robot1", "fleet/robot2"):
+            words = ("--params-file", str(shipped), "-r", f"__ns:=/{name}")
+            stack.enter_context(node(cwd=tmp_path, words=words))
+        robots = [stack.enter_context(robot(of=f"/{name}/graph_slam")) for name in ("robot1", "fleet/robot2")]
+        for r in robots:
+            r.wait_for_node()
+        names = [r.get(["output.folder"])["output.folder"] for r in robots]
+        assert names == ["robot1_graph_slam_run", "fleet_robot2_graph_slam_run"]
+        for name in names:
+            assert is_run(tmp_path / name)

@@ -89,7 +89,11 @@ class InitialPoseConfig:
 class OutputConfig:
     """What the node publishes and leaves behind."""
 
-    folder: str = setting("graph_slam_run", "run folder written by ~/save and at shutdown; empty: none at shutdown")
+    folder: str = setting(
+        "{node}_run",
+        "run folder written by ~/save and at shutdown; {node} stands for namespace and name of the node,"
+        " as in robot1_graph_slam; empty: none at shutdown",
+    )
     keep_earlier: int = setting(
         5, "earlier runs that are kept, as folder-1, folder-2, ...; 0: replaced", "runs", low=0, high=10_000
     )

@@ -10,6 +10,7 @@ from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.slam.config import Config, flatten, parameters
 from graph_slam_ros.slam.parameter import Parameter
 
+_NODE = "{node}"  # in output.folder
 _OTHERS = {"use_sim_time", "start_type_description_service"}  # rclpy's own
 _AT_START = {"inputs.names", "output.folder", "node.autostart", "landmarks.surveyed_file"}
 """Sections are declared by the first; what nobody may point elsewhere from outside is the second."""
@@ -30,6 +31,8 @@ def declare_parameters(node: Any) -> Config:
             if name not in _OTHERS and not name.startswith("qos_overrides")
         }
     )
+    folder = config.output.folder.replace(_NODE, node.get_fully_qualified_name().strip("/").replace("/", "_"))
+    config = config.changed({"output.folder": folder})
     used = dict(flatten(config.as_mapping()))
     for p in parameters(one.name for one in config.sources):
         node.declare_parameter(p.name, used[p.name], _descriptor(p), ignore_override=True)
