@@ -120,6 +120,8 @@ def measurements(bag: Bag, inputs: Inputs, config: Config, counters: Counters) -
     """
     used = [bag.topics[topic] for topic in inputs.topics.values()]
     border = Border(config, counters, {topic.type: recorded_decoder(topic) for topic in used})
+    for name in counters.received.keys() - inputs.topics.keys():
+        del counters.received[name]  # nobody asked for it
     return _through(border, bag, inputs, StampJump(config.time.jump_back_s))
 
 

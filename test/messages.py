@@ -227,13 +227,13 @@ def gnss(latitude=48.0, longitude=11.0, altitude=500.0, covariance=None, kind=2,
     return encode(message)
 
 
-def imu(q, covariance, frame="base_link"):
+def imu(q, covariance, frame="base_link", stamp_ns=STAMP_NS):
     """sensor_msgs/Imu."""
     zero = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
     return encode(
         make(
             "sensor_msgs/msg/Imu",
-            header=header(STAMP_NS, frame),
+            header=header(stamp_ns, frame),
             orientation=q,
             orientation_covariance=np.asarray(covariance, dtype=float).ravel(),
             angular_velocity=zero,
@@ -244,7 +244,9 @@ def imu(q, covariance, frame="base_link"):
     )
 
 
-def cloud(layout, *points, padding=3, big=False, height=1, row_padding=0, frame="base_link", **changes):
+def cloud(
+    layout, *points, padding=3, big=False, height=1, row_padding=0, frame="base_link", stamp_ns=STAMP_NS, **changes
+):
     """Points of (name, kind) fields with unused bytes between them, at the end of each and of each row."""
     order, offset, fields, formats, offsets = ">" if big else "<", 0, [], [], []
     for name, kind in layout:
@@ -268,7 +270,7 @@ def cloud(layout, *points, padding=3, big=False, height=1, row_padding=0, frame=
         "data": np.frombuffer(b"".join(row + b"\xff" * row_padding for row in rows), dtype=np.uint8),
         "is_dense": True,
     }
-    return encode(make(CLOUD, header=header(STAMP_NS, frame), **(values | changes)))
+    return encode(make(CLOUD, header=header(stamp_ns, frame), **(values | changes)))
 
 
 def closing(dimensions, *links):

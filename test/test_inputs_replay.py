@@ -101,10 +101,10 @@ def test_the_command_that_info_prints_uses_what_is_there(drive, tmp_path, capsys
     monkeypatch.chdir(tmp_path)
     assert main(["info", str(drive)]) == 0
     command = shlex.split(capsys.readouterr().out.splitlines()[-1])
-    assert "inputs.names=odom detections gps tags" in command
+    assert "inputs.names=odom detections tags gps" in command
     assert "tags.frame_prefix=tag36h11" in command
     assert main(command[1:]) == 0
-    topics = {m.topic for m in ingested(tmp_path / "run") if isinstance(m, Sightings | Fix)}
+    topics = {m.topic for m in ingested(tmp_path / command[-1]) if isinstance(m, Sightings | Fix)}
     assert topics == {"detections", "gps", "tags"}
 
 

@@ -481,6 +481,7 @@ def test_A28_of_a_robot_that_leaves_the_plane_the_projection_is_used_and_it_is_c
         (pose(1.0, 2.0, -0.4, quaternion(roll=0.2, pitch=0.2, yaw=0.5)), {}),
     ):
         b = border()
+        heard(b, "odom", odometry(pose(1.0, 1.9), stamp_ns=STAMP_NS - 10**9))
         assert heard(b, "odom", odometry(sent)).T_odom_base == pytest.approx((1.0, 2.0, 0.5))
         assert counted(b) == counts
     b = posing()

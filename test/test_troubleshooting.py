@@ -4,6 +4,7 @@
 """
 
 import ast
+import json
 import re
 from itertools import pairwise
 from pathlib import Path
@@ -101,6 +102,9 @@ def test_the_publisher_of_detections_works_with_a_node_as_it_stands(tmp_path):
     finally:
         detector.kill()
         detector.wait()
+    inputs = json.loads((tmp_path / "run/run.json").read_text())["inputs"]
+    assert inputs["odom"]["received"] >= inputs["odom"]["used"] > 10, "a live run tells it as a replay does"
+    assert inputs["detections"]["received"] >= inputs["detections"]["used"] > 2
     (line,) = [line for line in (tmp_path / "run/landmarks.csv").read_text().splitlines() if line.startswith("dock")]
     assert line.split(",")[2:4] == ["3.0", "0.5"]
 

@@ -28,12 +28,12 @@ def diff(args: argparse.Namespace) -> int:
 
 def merge(args: argparse.Namespace) -> int:
     """Make one map of two runs."""
-    from graph_slam_ros.cli.recordings import run_text
+    from graph_slam_ros import outcome
     from graph_slam_ros.merge import merge as merged
 
     done = merged(args.a, args.b, args.out)
     agree = done.shared - len(done.left_out)
-    console.say(*run_text(done.summary), f"{agree} of {done.shared} landmarks of both lay B on A")
+    console.say(*outcome.text(done.summary), f"{agree} of {done.shared} landmarks of both lay B on A")
     console.say(f"results in {args.out}")
     moved = [
         f"landmark {name} is {metres:.2f} m ({sigmas:.0f} sigmas) elsewhere in B: what B saw of it is left out"
@@ -44,9 +44,9 @@ def merge(args: argparse.Namespace) -> int:
 
 def freeze(args: argparse.Namespace) -> int:
     """Make a map in which to be located, and which nothing changes."""
-    from graph_slam_ros.cli.recordings import run_text
+    from graph_slam_ros import outcome
     from graph_slam_ros.run import freeze as frozen
 
     summary = frozen(args.run_folder, args.out)
-    console.say(*run_text(summary), f"results in {args.out}: what is there now stays, whatever is seen from now on")
+    console.say(*outcome.text(summary), f"results in {args.out}: what is there now stays, whatever is seen from now on")
     return console.told(summary["losses"])

@@ -30,10 +30,10 @@ def replay(args: argparse.Namespace) -> int:
     done = replayed(
         args.bag, args.out, own, odometry=args.odom, landmarks=args.landmarks, progress=console.progress("replay")
     )
-    _say_run(args.bag, done.summary)
+    code = _say_run(args.bag, done.summary)
     console.say(f"results in {args.out}")
     _draw(args.out)
-    return console.told(done.losses, done.warnings)
+    return console.told(done.losses, done.warnings) or code
 
 
 def _replay_live(args: argparse.Namespace, config: "Config") -> int:
@@ -42,7 +42,7 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
 
     if not console.has_ros():
         raise GraphSlamError("--ros needs ROS 2 (no rclpy here); without --ros the same replay runs without it")
-    bag = open_bag(args.bag)
+    bag, code = open_bag(args.bag), console.DONE
     from graph_slam_ros.ros.player import config_of, own_node, play
     from graph_slam_ros.run import SUMMARY, check_room
 
@@ -56,11 +56,13 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
         check_room(args.out, args.bag)
         with own_node(args.out, inputs, config) as own:
             played = play(bag, inputs, own=own, **options)
-        _say_run(args.bag, json.loads((args.out / SUMMARY).read_text()))
+        summary = json.loads((args.out / SUMMARY).read_text())
+        asked = {name: counts for name, counts in summary["inputs"].items() if name in inputs.topics}
+        code = _say_run(args.bag, summary | {"inputs": asked})
         _draw(args.out)
     console.say(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
     losses = bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else [])
-    return console.told(losses, bag.warnings)
+    return console.told(losses, bag.warnings) or code
 
 
 def recover(args: argparse.Namespace) -> int:
@@ -69,9 +71,9 @@ def recover(args: argparse.Namespace) -> int:
     from graph_slam_ros.run import recover as recovered
 
     summary = recovered(args.run_folder, args.out) if args.out else complete(args.run_folder)
-    _say_run(args.run_folder, summary)
+    code = _say_run(args.run_folder, summary)
     console.say(f"results in {args.out or args.run_folder}")
-    return console.told(summary["losses"])
+    return console.told(summary["losses"]) or code
 
 
 def info(args: argparse.Namespace) -> int:
@@ -84,8 +86,9 @@ def info(args: argparse.Namespace) -> int:
         console.say(f"an earlier run: graph_slam replay {args.bag} --out again")
         return console.DONE
     bag = open_bag(args.bag)
-    console.say(*describe(bag, args.bag))
-    return console.told(bag.losses, bag.warnings)
+    lines, fits = describe(bag, args.bag)
+    console.say(*lines)
+    return console.told(bag.losses, bag.warnings) or (console.DONE if fits else console.LOSSES)
 
 
 def evaluate(args: argparse.Namespace) -> int:
@@ -187,23 +190,14 @@ def _config(args: argparse.Namespace) -> "Config":
         raise GraphSlamError(f"{file}: {error}" if file and not args.set else str(error)) from None
 
 
-def _say_run(source: Path, summary: dict[str, Any]) -> None:
-    console.say(*run_text(summary))
+def _say_run(source: Path, summary: dict[str, Any]) -> int:
+    """What came of a run; returns the exit code, 3 where that is less than what was asked for."""
+    from graph_slam_ros import outcome
+
+    console.say(*outcome.text(summary))
     if not summary["keyframes"]:
         raise GraphSlamError(f"{source}: no odometry of it could be used, see what was counted and graph_slam info")
-
-
-def run_text(summary: dict[str, Any]) -> list[str]:
-    """A run in some lines."""
-    counters = [f"{source}: {reason} {n}" for source, by in summary["counters"].items() for reason, n in by.items()]
-    lines = [
-        f"keyframes  {summary['keyframes']:8d}   over {summary['span_s']:.1f} s",
-        f"landmarks  {summary['landmarks']:8d}   from {summary['sightings']} sightings",
-        f"edges      {summary['edges']:8d}",
-        f"chi2       {summary['chi2']:12.3f}   after {summary['solves']} solves",
-    ]
-    if "time_s" in summary:
-        cpu = f", {summary['cpu_s']:.1f} s of CPU time" if "cpu_s" in summary else ""
-        lines.append(f"took       {summary['time_s']:10.1f} s{cpu}")
-    waiting = [f"waiting    {name}: {reason}" for name, reason in summary["waiting"].items()]
-    return lines + waiting + [f"counted    {text}" for text in counters]
+    shortcomings = list(outcome.shortcomings(summary))
+    for sentence in shortcomings:
+        console.tell(sentence)
+    return console.LOSSES if shortcomings else console.DONE

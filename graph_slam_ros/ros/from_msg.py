@@ -94,6 +94,7 @@ class Border:
         told = (settings.numbers("datum", 3) for settings in config.sources)
         self._origin = Origin(next(filter(None, told), ()))
         for name, use in uses(config).items():
+            counters.received[name] += 0
             source = self._sources[name] = Source(by_name[name], use, config, self._transforms, self._origin)
             self._types[name] = by_name[name].type
             self._convert[name] = partial(CONVERTERS[by_name[name].type][use], source)
@@ -110,6 +111,7 @@ class Border:
     def take(self, name: str, cdr: bytes) -> list[Measured]:
         """What a message of an input, of ``tf_static`` or ``tf`` gives, itself or by what has waited for it."""
         source = self._sources[name]
+        self._counters.received[name] += 1
         try:
             message = self._decode[self._types[name]](cdr)
         except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors

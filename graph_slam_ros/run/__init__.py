@@ -31,7 +31,7 @@ from graph_slam_ros.run.folder import (
 )
 from graph_slam_ros.run.recorder import RunRecorder
 from graph_slam_ros.run.saved import complete, freeze, map_of, record_run, recover, settled, stopwatch, taken_up
-from graph_slam_ros.run.tables import graph_file, numbered, summarize
+from graph_slam_ros.run.tables import account, graph_file, numbered, summarize
 
 __all__ = [
     "COVARIANCES",
@@ -40,6 +40,7 @@ __all__ = [
     "SUMMARY",
     "RunError",
     "RunRecorder",
+    "account",
     "changed_since",
     "check_room",
     "complete",

@@ -1,6 +1,7 @@
 """The tables of a run, and what happened in it in numbers."""
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any, TypeVar
@@ -12,9 +13,12 @@ from graph_slam_ros.formats.g2o_writer import g2o_text
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.ros import results
+from graph_slam_ros.ros.inputs import uses
 from graph_slam_ros.run.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, PATH_ODOMETRY, SIGHTINGS, VERTICES
 from graph_slam_ros.run.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import Counters, GraphSlam
+from graph_slam_ros.slam.decisions import CANDIDATES
+from graph_slam_ros.slam.ledger import INSIDE, Verdict
 
 Name = TypeVar("Name")
 _TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
@@ -60,8 +64,45 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
         "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
         "rivals": [asdict(rival) for rival in slam.backend.rivals],
         "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
-        "counters": slam.counters.as_dict(),
-    }
+    } | account(slam, slam.counters)
+
+
+def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
+    """What was counted, and what came of each input.
+
+    ``received`` counts messages, ``used`` what was measured by them, ``believed`` the edges of that (odometry aside)
+    that the estimate follows.
+
+    Parameters
+    ----------
+    counters : those of the pipeline and of what stands before it
+    """
+    used_as = uses(slam.config)
+    is_of_map = not counters.used  # nothing was measured since: a run that is written from its map
+    believed = _believed(slam, 0 if is_of_map else slam.first_edge)
+    inputs = {}
+    for name in dict.fromkeys([*slam.config.inputs.names.split(), *counters.used, *believed]):
+        if name in counters.received or counters.used[name] or name in believed:
+            used = believed.get(name, 0) if is_of_map else counters.used[name]
+            of_input = {"received": counters.received.get(name), "used": used, "believed": believed.get(name)}
+            inputs[name] = {"use": used_as.get(name, "")} | of_input
+    return {"counters": counters.as_dict(), "inputs": inputs}
+
+
+def _believed(slam: GraphSlam, first_edge: int) -> dict[str, int]:
+    """Edges of landmarks, fixes and closures that pull, by input."""
+    out = Counter[str]()
+    inside = [Verdict.NOT_EVALUATED, *INSIDE]
+    verdicts = slam.ledger.verdict.values
+    for table in slam.graph.tables.values():
+        labels = np.array([label in CANDIDATES for label in slam.graph.labels], dtype=bool)
+        ids = table.id.values
+        chosen = labels[table.label.values] & (ids >= first_edge)
+        judged = chosen & (ids < len(verdicts))
+        chosen[judged] = np.isin(verdicts[ids[judged]], inside)
+        for code, count in zip(*np.unique(table.source.values[chosen], return_counts=True), strict=True):
+            out[slam.graph.sources[code]] += int(count)
+    return dict(out)
 
 
 def _drives(slam: GraphSlam) -> list[dict[str, int]]:

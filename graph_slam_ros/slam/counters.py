@@ -1,7 +1,8 @@
 """Nothing is dropped or repaired silently: each case adds to a counter by (source, reason)."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 
 class Counters:
@@ -10,9 +11,13 @@ class Counters:
     Attributes
     ----------
     on_first : called with source and reason the first time each is counted
+    received : messages of each input, zero included
+    used : measurements of each input that the estimate is made of: odometry messages, sightings, fixes, closures
     """
 
     def __init__(self) -> None:
+        self.received: Counter[str] = Counter()
+        self.used: Counter[str] = Counter()
         self._counts: Counter[tuple[str, str]] = Counter()
         self.on_first: Callable[[str, str], None] = lambda source, reason: None
 
@@ -27,13 +32,24 @@ class Counters:
 
     def update(self, other: "Counters") -> None:
         """Add all counts of another."""
-        self._counts.update(other._counts)
+        for own, more in self._with(other):
+            own.update(more)
 
     def since(self, before: "Counters") -> "Counters":
         """What was counted after there were these."""
         out = Counters()
-        out._counts = Counter(self._counts) - before._counts  # of a copy: another thread may be counting
+        for counts, own in out._with(self):
+            counts.update(own)
+        for counts, less in out._with(before):
+            counts.subtract(less)
+        out._counts = +out._counts
         return out
+
+    def _with(self, other: "Counters") -> Iterator[tuple[Counter[Any], Counter[Any]]]:
+        """Each kind of count beside a copy of the other's: another thread may be counting there."""
+        yield self._counts, Counter(other._counts)
+        yield self.received, Counter(other.received)
+        yield self.used, Counter(other.used)
 
     def as_dict(self) -> dict[str, dict[str, int]]:
         """``{source: {reason: times}}``, sorted by name."""

@@ -147,6 +147,7 @@ class GraphSlam:
         self._unsolved_keyframes = 0
         if start is not None and start.keyframes:
             self._take_up(start)
+        self.first_edge = self.graph.edge_count  # of this run: those before are of the map it began in
 
     # -- the door ------------------------------------------------------------------------------------------------
 

@@ -166,6 +166,7 @@ class Landmarks:
             landmark.seen.append(Seen(edge, topic, s, where))
             landmark.stamps.add(where.stamp_ns)
         landmark.sightings += 1
+        self._counters.used[topic] += 1
         self.touched.append(landmark.name)
         landmark.first_seen_ns = min(landmark.first_seen_ns or where.stamp_ns, where.stamp_ns)
         landmark.last_seen_ns = max(landmark.last_seen_ns, where.stamp_ns)
@@ -236,6 +237,8 @@ class Landmarks:
         self.touched.append(name)
 
     def _take_out(self, seen: Sequence[Seen]) -> None:
+        for one in seen:
+            self._counters.used[one.topic] -= 1
         self._withdraw([one.edge for one in seen])
 
     def kind_of(self, vertex: int) -> VertexKind:

@@ -126,6 +126,7 @@ class OdometryChoice:
     def _use(self, m: Odometry, step: Numbers, *, broken: str) -> Step:
         if broken:
             self._counters.count(m.source, broken)
+        self._counters.used[m.source] += 1
         self._used, self._last_step = m, self._space.identity if broken else step
         return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken))
 

@@ -54,6 +54,7 @@ class PoseEdges:
             metres = n if m.kind in ("pose", "position") else 0
             noise = edge_noise(self._counters, topic, carried.covariance, metres)
             self._graph.add_edge(space.fixes[m.kind], vertices, carried.measured, noise, "fixes", topic)
+        self._counters.used[topic] += 1
 
     def closure(self, m: Closure, earlier: Where, later: Where) -> None:
         """Between two keyframes."""
@@ -63,6 +64,7 @@ class PoseEdges:
         carried = carry.closure(self._space, m, earlier, later)
         noise, vertices = self._noise(m.topic, carried.covariance), [earlier.vertex, later.vertex]
         self._graph.add_edge(self._space.relative_pose, vertices, carried.measured, noise, "closures", m.topic)
+        self._counters.used[m.topic] += 1
 
     def _noise(self, source: str, covariance: Array) -> Gaussian:
         """Of a pose."""

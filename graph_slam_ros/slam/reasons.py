@@ -94,7 +94,7 @@ REASONS: dict[str, Reason] = {
     ),
     "no_heading": Reason(_REFUSED, "the x axis is nearly vertical, so there is no heading in the plane", _SPACE),
     "out_of_plane": Reason(
-        _NOTED, "the pose is more than 0.5 m above or below the plane, or tilted by more than 20 degrees", _SPACE
+        _NOTED, "the pose is more than 0.5 m above or below the first, or tilted by more than 20 degrees", _SPACE
     ),
     # -- noise
     "noise_unknown": Reason(_REFUSED, "neither the message nor the parameters tell its noise", _SIGMAS),
@@ -141,7 +141,7 @@ REASONS: dict[str, Reason] = {
     "not_for_a_pose": Reason(
         _REFUSED, "a range or bearing to a landmark that is known as a pose", "INPUT.id_prefix: two identities"
     ),
-    "not_used": Reason(_NOTED, "landmarks.association is none"),
+    "not_used": Reason(_NOTED, "landmarks.association is none", "landmarks.association=id"),
     "poor_tag": Reason(_NOTED, "the tag is beyond INPUT.hamming_max or below INPUT.decision_margin_min"),
     "too_many": Reason(
         _REFUSED,

@@ -68,7 +68,7 @@ def _named(source: Source, child: str) -> str:
     if child.startswith("/"):
         source.count("frame_slash_stripped")
         child = child[1:]
-    if not child:
+    if not child and not source.has_mount:
         raise MessageError("frame_empty")
     return child
 

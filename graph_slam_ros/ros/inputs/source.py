@@ -93,6 +93,11 @@ class Source:
             raise MessageError("frame_empty")
         return name
 
+    @property
+    def has_mount(self) -> bool:
+        """Whether it is configured where its frame is on the robot."""
+        return self._mount is not None
+
     def T_base(self, frame: str, stamp_ns: int) -> se3.Pose:
         """Where a frame was on the robot: by TF, else as configured.
 
@@ -149,10 +154,10 @@ class Source:
         return float(T[0]), float(T[1]), math.atan2(ahead[1], ahead[0])
 
     def of_robot(self, T: se3.Pose) -> Numbers:
-        """A pose of the robot; in the plane it is counted where it leaves that."""
+        """A pose of the robot; in the plane it is counted where it leaves that of the first."""
         if self.space.dimensions == 2:
             up = so3.act(se3.rotation(T), (0.0, 0.0, 1.0))
-            if abs(T[2]) > _LEVEL_M or up[2] < _UPRIGHT:
+            if abs(T[2] - self.state.setdefault("height", T[2])) > _LEVEL_M or up[2] < _UPRIGHT:
                 self.count("out_of_plane")
         return self.projected(T)
 

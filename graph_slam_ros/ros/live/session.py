@@ -17,6 +17,7 @@ from graph_slam_ros.ros.live.beside import in_a_thread
 from graph_slam_ros.run import (
     RunError,
     RunRecorder,
+    account,
     earlier_runs,
     incomplete_runs,
     is_cut_off,
@@ -262,7 +263,7 @@ class Session:
             raise GraphSlamError(f"{why}: nowhere to save")
         counters = self._border.since(self._refused_before)
         counters.update(self.slam.counters)
-        summary = summarize(self.slam) | {"counters": counters.as_dict(), "ended": ended}
+        summary = summarize(self.slam) | account(self.slam, counters) | {"ended": ended}
         folder = str(self._recorder.save(self.slam, summary))
         self._is_saved, self._is_ended, self.recording_fails = True, ended, False
         return folder
