@@ -1,17 +1,43 @@
 """A whole graph solved in one call: where it starts, what holds it, and what came out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2 as chi2_distribution
 
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.solver import Report, Settings, Solver, initial_values
 
 Array = NDArray[np.float64]
+
+
+_FAR_ABOVE = 2.0  # times its degrees of freedom: chi2 of an optimum is about as large as these, or smaller
+_UNLIKELY = 1e-3  # that one edge of a graph has so large a residual by chance
+_UNEVEN, _SEVERAL = 10.0, 10  # mean over median of what so many closures or more have as chi2: in an optimum 1 to 4
+_NO_RESIDUAL = 1e-6  # chi2 for each number measured: less is rounding
+_SAME = 1e-6  # part of the cost by which one optimum differs from start to start
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """What one start has led to.
+
+    Attributes
+    ----------
+    start : ``file``, ``tree``, ``chordal`` or ``online``
+    chi2, cost : of the result; NaN where there is none
+    failure : why there is none; empty where there is one
+    """
+
+    start: str
+    chi2: float = float("nan")
+    cost: float = float("nan")
+    failure: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,12 +50,16 @@ class Solution:
     solver : has the estimates and marginals of all vertices, by their ids in the graph
     report : how it went, and why it stopped
     start : where the initial values were from: ``file``, ``tree``, ``chordal`` or ``online``
+    suspicion : why the first result may be a local minimum, so that other starts were tried; empty where it was not
+    attempts : all starts that were tried, in order; the one with the least cost is this solution
     """
 
     file: G2oFile
     solver: Solver
     report: Report
     start: str
+    suspicion: str = ""
+    attempts: tuple[Attempt, ...] = ()
 
     @property
     def poses(self) -> Array:
@@ -42,7 +72,7 @@ class Solution:
         return self.solver.estimate(_vertices(self.file.graph, poses=False))
 
 
-def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = None, *, init: str = "file") -> Solution:
+def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = None, *, init: str = "auto") -> Solution:
     """Solve a whole graph: of a file, as read from one, or made by hand.
 
     What FIX lines name is held; where there are none, and priors do not fix both position and heading, the first pose
@@ -52,7 +82,8 @@ def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = N
     ----------
     init : where to start: ``file`` (initial values as they are; the tree where a file has none), ``tree`` (poses
         composed along a spanning tree), ``chordal``, or ``online`` (pose after pose, in order of id). Without
-        poses it is always the first
+        poses it is always the first. ``auto``: from the file, and where the result is suspicious also from
+        ``chordal`` and then ``online``; the least cost wins
 
     Raises
     ------
@@ -65,9 +96,58 @@ def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = N
         file = G2oFile(source, list(range(source.vertex_count)))
     else:
         file = source if isinstance(source, G2oFile) else read_g2o(source)
+    if init != "auto":
+        return _solved(file, settings, init)
+    return _best_of(_solved(file, settings, "file"), settings)
+
+
+def _solved(file: G2oFile, settings: Settings | None, init: str) -> Solution:
     solver, start = started(file, init)
     take_whole(solver, file)
-    return Solution(file, solver, solver.optimize(settings), start)
+    report = solver.optimize(settings)
+    return Solution(file, solver, report, start, attempts=(Attempt(start, report.chi2_final, report.cost_final),))
+
+
+def _best_of(first: Solution, settings: Settings | None) -> Solution:
+    """The first where nothing is suspicious about it, else the best of it and of other starts."""
+    best, attempts, suspicion = first, list(first.attempts), suspicion_of(first)
+    root = _root(first.file)
+    if not suspicion or root is None or not _is_pose(first.file.graph, root):
+        return replace(first, suspicion=suspicion)
+    for start in ("chordal", "online"):
+        try:
+            other = _solved(first.file, settings, start)
+        except (GraphSlamError, np.linalg.LinAlgError) as error:
+            attempts.append(Attempt(start, failure=str(error)))
+            continue
+        attempts += other.attempts
+        if other.report.cost_final < best.report.cost_final * (1.0 - _SAME):
+            best = other
+        if not suspicion_of(best):  # a good one is found
+            break
+    return replace(best, suspicion=suspicion, attempts=tuple(attempts))
+
+
+def suspicion_of(solution: Solution) -> str:
+    """Why a result may be a local minimum, in some words; empty where nothing speaks for it."""
+    solver, report, graph = solution.solver, solution.report, solution.file.graph
+    if not report.converged:
+        return f"it did not converge ({report.stop})"
+    freedom, edges = solver.degrees_of_freedom, solver.edges
+    if freedom > 0 and report.chi2_final > max(_FAR_ABOVE * freedom, chi2_distribution.isf(_UNLIKELY, freedom)):
+        return f"chi2 {report.chi2_final:.6g} is far above its {freedom} degrees of freedom"
+    chi2, numbers = solver.chi2_of(edges)
+    unlikely = chi2 > chi2_distribution.isf(_UNLIKELY / max(len(edges), 1), numbers)
+    far = np.flatnonzero(unlikely & (freedom > 0))
+    if len(far):
+        worst = int(np.argmax(chi2 / numbers))
+        what = f"{len(far)} residuals are far outside" if len(far) > 1 else "a residual is far outside"
+        return f"{what} of their noise, e.g. edge {int(edges[worst])} with chi2 {chi2[worst]:.4g}"
+    closures = graph.has_label(edges, ("closures",))
+    each = chi2[closures] / numbers[closures]
+    if len(each) >= _SEVERAL and each.mean() > max(_UNEVEN * float(np.median(each)), _NO_RESIDUAL):
+        return "a few closures have nearly all of the residuals"
+    return ""
 
 
 def started(file: G2oFile, init: str) -> tuple[Solver, str]:

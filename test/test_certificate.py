@@ -258,7 +258,7 @@ def test_with_noise_the_optimum_is_certified_and_bounds_chi2_from_below(world):
 @both
 def test_a_ring_wrapped_wrongly_is_not_certified_and_from_a_chordal_start_it_is(world):
     graph = ring(world, 2, noise=0.0)
-    wrong = optimize(graph)
+    wrong = optimize(graph, init="file")
     assert wrong.report.converged
     certificate = certify(wrong)
     assert certificate.verdict == NOT_CERTIFIED
@@ -282,7 +282,7 @@ def test_polishing_comes_down_from_far_away(world):
 
 
 def test_a_saddle_is_critical_and_not_certified():
-    certificate = certify(optimize(ring(SPACE, 3, noise=0.0)))  # in the plane it would be a minimum
+    certificate = certify(optimize(ring(SPACE, 3, noise=0.0), init="file"))  # in the plane it would be a minimum
     assert (certificate.verdict, certificate.reason) == (NOT_CERTIFIED, "")
     assert certificate.moved_max_m < 1e-6
     assert certificate.lambda_min < -100.0
@@ -432,27 +432,32 @@ def test_the_command_says_certified_and_ends_with_0(run):
 
 
 def test_the_command_tries_a_second_start_where_it_is_not_certified_and_ends_with_4(run):
-    code, out = run(ring(PLANE, 2))
+    code, out = run(ring(PLANE, 2), "--init", "file")
     assert code == 4
     assert "\nnot certified\n" in out
     assert "a second start, the chordal relaxation, comes to chi2 " in out
     assert "which is lower: --init chordal takes it\n  certified\n" in out
-    code, answer = run(ring(PLANE, 2), "--json")
+    code, answer = run(ring(PLANE, 2), "--init", "file", "--json")
     assert (code, answer["verdict"]) == (4, NOT_CERTIFIED)
     second = answer["second_start"]
     assert (second["start"], second["failure"], second["verdict"]) == ("chordal", "", CERTIFIED)
     assert second["chi2"] < 100.0 < answer["chi2"]
     assert run(ring(PLANE, 2), "--init", "chordal")[0] == 0
+    code, out = run(ring(PLANE, 2))
+    assert code == 0
+    assert "another start, the chordal relaxation, comes to chi2 " in out
+    assert "the answer is from the chordal relaxation: chi2 " in out
+    assert "\ncertified\n" in out
 
 
 def test_a_second_start_that_is_no_better_is_told_so_and_one_that_fails_why(run, monkeypatch):
     monkeypatch.setattr("graph_slam_ros.certificate.other_start", lambda start: "file")
-    code, out = run(ring(PLANE, 2))
+    code, out = run(ring(PLANE, 2), "--init", "file")
     assert code == 4
     assert "which is no lower\n  not certified\n" in out
     monkeypatch.setattr("graph_slam_ros.certificate.other_start", lambda start: "nowhere")
     monkeypatch.setattr("graph_slam_ros.cli.graphs._START", {"file": "the file", "nowhere": "nowhere"})
-    code, out = run(ring(PLANE, 2))
+    code, out = run(ring(PLANE, 2), "--init", "file")
     assert code == 4
     assert "a second start, nowhere, fails: init 'nowhere'" in out
 
@@ -470,7 +475,7 @@ def test_what_was_lost_goes_before_what_was_certified(tmp_path, capsys):
     path = tmp_path / "graph.g2o"
     write_graph(ring(PLANE, 2), path)
     path.write_text(path.read_text() + "VERTEX_SE2 99 nan 0 0\n")
-    assert main(["optimize", str(path), "--certify", "--lenient"]) == 3
+    assert main(["optimize", str(path), "--init", "file", "--certify", "--lenient"]) == 3
     assert "\nnot certified\n" in capsys.readouterr().out
 
 

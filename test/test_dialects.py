@@ -34,9 +34,19 @@ def test_toro_orders_the_information_its_own_way(tmp_path):
     assert np.allclose(information(toro, RELATIVE_POSE), information(g2o, RELATIVE_POSE), rtol=1e-12)
 
 
-def test_edge2_with_rows_of_the_upper_triangle_is_recognised(tmp_path):
-    file = read(tmp_path, "EDGE2 0 1 1 0 0.5 4 0 0 3 0 9\n")
-    assert np.allclose(information(file, RELATIVE_POSE)[0], np.diag([4.0, 3.0, 9.0]))
+def test_edge2_with_rows_of_the_upper_triangle_may_be_square_roots_and_is_asked_for(tmp_path):
+    text = "EDGE2 0 1 1 0 0.5 4 0 0 3 0 9\n"
+    with pytest.raises(FormatError, match=r":1: EDGE2 is not in TORO's order: --from isam .* or --from rows") as error:
+        read(tmp_path, text)
+    assert len(str(error.value)) <= 200
+    rows = read(tmp_path, text, dialect="rows")
+    assert np.allclose(information(rows, RELATIVE_POSE)[0], np.diag([4.0, 3.0, 9.0]))
+    isam = read(tmp_path, text + "LANDMARK 1 7 2 3 5 1 2\n", dialect="isam")
+    assert np.allclose(information(isam, RELATIVE_POSE)[0], np.diag([16.0, 9.0, 81.0]))
+    assert np.allclose(information(isam, LANDMARK_POSITION)[0], [[25.0, 5.0], [5.0, 5.0]])
+    root = np.array([[4.0, 1.0, 2.0], [0.0, 3.0, -1.0], [0.0, 0.0, 9.0]])
+    full = read(tmp_path, "ODOMETRY 0 1 1 0 0.5 4 1 2 3 -1 9\n", dialect="isam")
+    assert np.allclose(information(full, RELATIVE_POSE)[0], root.T @ root)
 
 
 def test_gtsam_text_gives_covariances_and_numbers_landmarks_apart(tmp_path):

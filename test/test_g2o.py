@@ -269,3 +269,30 @@ def test_what_cannot_be_written_is_named(tmp_path, read):
 def test_an_unknown_error_map_is_refused_with_the_choices(read):
     with pytest.raises(FormatError, match="'other': choose relative or seed"):
         read(FINE, error_map="other")
+
+
+@pytest.mark.parametrize(
+    "tag, measured, printed, expected",
+    [
+        ("SE2", "1 0 0.1", "2 2.0001 0 2 0 5", [2.0, 2.0, 5.0]),
+        ("SE3:QUAT", "1 0 0 0 0 0 1", "3 0 0 0 0 0 2 0 0 0 0 1 0 0 0 4 4.0001 0 4 0 4", [2.0] * 3 + [1.0] * 3),
+    ],
+)
+def test_information_that_only_print_has_made_indefinite_is_repaired_by_its_traces_and_told(
+    tmp_path, tag, measured, printed, expected
+):
+    nowhere = "0 0 0" if tag == "SE2" else "0 0 0 0 0 0 1"
+    path = tmp_path / "printed.g2o"
+    path.write_text(
+        "".join(f"VERTEX_{tag} {k} {nowhere}\n" for k in range(2)) + f"EDGE_{tag} 0 1 {measured} {printed}\n"
+    )
+    file = read_g2o(path)
+    (table,) = file.graph.tables.values()
+    root = table.sqrt_information.values[0]
+    assert np.allclose(root.T @ root, np.diag(expected))
+    assert len(file.repaired) == 1
+    assert file.repaired[0].startswith("printed.g2o:3: an information matrix not positive definite by the rounding")
+    path.write_text(path.read_text().replace("2.0001", "2.1").replace("4.0001", "4.1"))
+    with pytest.raises(FormatError, match="is not positive definite") as error:
+        read_g2o(path)
+    assert len(str(error.value)) <= 200

@@ -8,9 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from graph_slam_ros.cli import main
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.formats.g2o_writer import write_g2o
+from graph_slam_ros.solver import Solver
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 CITY = DATA / "city.g2o"
@@ -26,7 +30,7 @@ EDGE_SE2_XY 3 9 1.5 2 9 0 9
 EDGE_SE2_XY 5 9 -.5 2 9 0 9
 """
 KEYS = {"chi2_initial", "chi2_final", "cost_initial", "cost_final", "iterations", "converged", "stop", "method", "loss"}
-KEYS |= {"start", "error_map", "classes"}
+KEYS |= {"start", "starts", "suspicion", "error_map", "classes"}
 
 
 @pytest.fixture
@@ -128,7 +132,7 @@ def test_few_iterations_are_told_as_not_converged(run):
 
 
 def test_the_number_of_iterations_may_be_bounded(run):
-    answer = answer_of(run, CITY, "--max-iterations", 2)
+    answer = answer_of(run, CITY, "--init", "file", "--max-iterations", 2)
     assert (answer["stop"], answer["converged"]) == ("max_iterations", False)
     assert answer["iterations"] == 2
 
@@ -332,3 +336,23 @@ def test_the_installed_command_never_shows_a_traceback(tmp_path):
     )
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "graph_slam: noise.g2o: not a text file\n"
+
+
+def test_a_suspicious_result_is_told_with_what_other_starts_came_to_and_which_won(run, tmp_path):
+    file = read_g2o(CITY)
+    values = file.graph.initial.values
+    values[:] += np.random.default_rng(0).normal(0.0, 2.0, len(values))
+    lost = tmp_path / "lost.g2o"
+    write_g2o(lost, file, Solver(file.graph).estimate)
+    code, out, _ = run(lost)
+    assert code == 0
+    assert "suspicious from the file: chi2 1.66529e+06 is far above its 471 degrees of freedom\n" in out
+    assert "  another start, the chordal relaxation, comes to chi2 465.969818\n" in out
+    assert "  the answer is from the chordal relaxation: chi2 1665289." in out
+    answer = answer_of(run, lost)
+    assert (answer["start"], round(answer["chi2_final"], 3)) == ("chordal", 465.970)
+    assert [one["start"] for one in answer["starts"]] == ["file", "chordal"]
+    stuck = answer_of(run, lost, "--init", "file")
+    assert (stuck["start"], stuck["suspicion"], len(stuck["starts"])) == ("file", "", 1)
+    assert stuck["chi2_final"] > 1e6
+    assert "suspicious" not in run(CITY)[1]

@@ -29,35 +29,36 @@ _SAME = 1e-6  # of chi2: what one optimum may differ by from another run to it
 
 def optimize(args: argparse.Namespace) -> int:
     """Solve a graph, say how it went, write it and draw it."""
-    from graph_slam_ros.batch import Solution, started, take_whole
+    from graph_slam_ros.batch import optimize as solve
+    from graph_slam_ros.batch import started
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.solver import Settings
 
     file = _read_graph(args, error_map=args.error_map)
     graph = file.graph
-    solver, start = started(file, args.init)
     settings = Settings(
         method=args.method,
         max_iterations=args.max_iterations,
         cost_tolerance=args.tolerance,
         losses={label: [args.loss] for label in graph.labels if label != "odometry"},
     )
-    take_whole(solver, file)
-    before = _positions(graph, solver) if args.plot else None
-    report = solver.optimize(settings)
-    proof = _certify(Solution(file, solver, report, start), settings) if args.certify else None
+    solution = solve(file, settings, init=args.init)
+    solver, report, start = solution.solver, solution.report, solution.start
+    proof = _certify(solution, settings) if args.certify else None
     if args.json:
-        answer = _answer(report, start, args)
+        answer = _answer(report, start, args) | _starts(solution)
         console.say(json.dumps(answer if proof is None else answer | {"certificate": proof.as_dict()}))
     else:
         told_start = _START[start] + ("" if file.has_values else f": {_NO_VALUES}")
-        console.say(*_optimize_text(report, told_start, args.loss))
+        console.say(*_optimize_text(report, told_start, args.loss), *_starts_text(solution))
         console.say(*(proof.text(report.chi2_final) if proof else ()))
     if args.out:
         write_g2o(args.out, file, solver.estimate)
     if args.plot:
-        _plot_graph(args.plot, graph, before, _positions(graph, solver))
+        _plot_graph(args.plot, graph, _positions(graph, started(file, start)[0]), _positions(graph, solver))
     _tell_unknown(file)
+    for repair in file.repaired:
+        console.tell(repair)
     return console.told(file.skipped) or (proof.code if proof else console.DONE)
 
 
@@ -72,7 +73,7 @@ def convert(args: argparse.Namespace) -> int:
         raise GraphSlamError(f"{args.graph}: a trajectory has no edges, and so is no graph: TUM is only written")
     if args.out.exists() and args.graph.exists() and args.out.samefile(args.graph):
         raise GraphSlamError(f"{args.out}: cannot be read from and written to at once")
-    file = _read_graph(args, dialect=args.source)
+    file = _read_graph(args)
     if file.has_values or target != "gtsam":  # which alone needs no vertex lines
         solver, start = started(file, "file")
         written = write_graph(args.out, file, solver.estimate, target)
@@ -90,7 +91,8 @@ def convert(args: argparse.Namespace) -> int:
 def _read_graph(args: argparse.Namespace, **options: Any) -> "G2oFile":
     from graph_slam_ros.formats.g2o import read_g2o
 
-    return read_g2o(args.graph, lenient=args.lenient, raw=args.information == "raw", **options)
+    raw = args.information == "raw"
+    return read_g2o(args.graph, lenient=args.lenient, raw=raw, dialect=args.source, **options)
 
 
 def _tell_unknown(file: "G2oFile") -> None:
@@ -120,7 +122,7 @@ class _Proof:
         return self.first.as_dict() | {"second_start": again if self.start else None}
 
     def text(self, chi2: float) -> Iterable[str]:
-        yield str(self.first)
+        yield from str(self.first).splitlines()
         if self.failure:
             yield f"a second start, {_START[self.start]}, fails: {self.failure}"
         elif self.second:
@@ -143,6 +145,32 @@ def _certify(solution: "Solution", settings: "Settings") -> _Proof:
         return _Proof(first, start, certify(optimize(solution.file, settings, init=start)))
     except GraphSlamError as error:
         return _Proof(first, start, failure=str(error))
+
+
+def _starts(solution: "Solution") -> dict[str, Any]:
+    """For JSON: which starts were tried, and why more than one."""
+    tried = [
+        {"start": one.start, "chi2": None if one.failure else one.chi2, "failure": one.failure}
+        for one in solution.attempts
+    ]
+    return {"suspicion": solution.suspicion, "starts": tried}
+
+
+def _starts_text(solution: "Solution") -> Iterable[str]:
+    """Where the first result was suspicious: why, what came of other starts, and which of them is the answer."""
+    if not solution.suspicion:
+        return
+    first, *others = solution.attempts
+    yield f"suspicious from {_START[first.start]}: {solution.suspicion}"
+    for one in others:
+        found = f"fails: {one.failure[:120]}" if one.failure else f"comes to chi2 {one.chi2:.6f}"
+        yield f"  another start, {_START[one.start]}, {found}"
+    if solution.start != first.start:
+        yield f"  the answer is from {_START[solution.start]}: chi2 {first.chi2:.6f} was a local minimum"
+    elif others and not all(one.failure for one in others):
+        yield "  no start is better: wrong closures or too little noise are likelier than a local minimum"
+    elif others:
+        yield "  no other start could be solved: this may be a local minimum"
 
 
 def _answer(report: "Report", start: str, args: argparse.Namespace) -> dict[str, Any]:

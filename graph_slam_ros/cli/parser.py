@@ -157,9 +157,10 @@ def _optimize(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument(
         "--init",
-        choices=("file", "tree", "chordal", "online"),
-        default="file",
-        help="where to start (file; tree without vertices); online: pose after pose, for what no other start solves",
+        choices=("auto", "file", "tree", "chordal", "online"),
+        default="auto",
+        help="where to start; auto: the file (tree without vertices), and where the result is suspicious chordal and"
+        " then online (pose after pose) as well, of which the best is taken",
     )
     sub.add_argument("--error-map", choices=("relative", "seed"), default="relative", help="seed: of the inverse")
     sub.add_argument(
@@ -176,9 +177,6 @@ def _convert(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("graph", type=Path, metavar="A", help="g2o, TORO, iSAM or GTSAM text")
     sub.add_argument(
         "out", type=Path, metavar="B", help="by its ending: .g2o; .toro, .graph; .gtsam; .tum (poses, id as stamp)"
-    )
-    sub.add_argument(
-        "--from", dest="source", choices=("g2o", "toro", "gtsam"), help="refuse other lines (default: each by its tag)"
     )
     sub.add_argument("--to", choices=("g2o", "toro", "gtsam", "tum"), help="whatever the ending of B")
     _add_reading(sub)
@@ -315,6 +313,13 @@ def _add_config(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_reading(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--from",
+        dest="source",
+        choices=("g2o", "toro", "gtsam", "isam", "rows"),
+        help="refuse other lines (default: each by its tag); isam: square roots of the information; rows: information"
+        " of EDGE2 in rows of its upper triangle",
+    )
     sub.add_argument(
         "--information", choices=("g2o", "raw"), default="g2o", help="of rotations in space in g2o; raw: unscaled"
     )

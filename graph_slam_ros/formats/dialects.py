@@ -5,6 +5,8 @@ a g2o line into the line of the same meaning, so there is one writer.
 
 * TORO: the information of EDGE2 as I11 I12 I22 I33 I13 I23, that of EDGE3 in rows of the upper triangle; angles in
   radians, roll, pitch and yaw about fixed axes. It has poses and what is between them, nothing else.
+* iSAM 1: as TORO's tags in the plane, and ODOMETRY and LANDMARK, but with the square root R of the information
+  (``R'R``), in rows of the upper triangle. No line tells it from information in rows, so it must be named.
 * GTSAM: covariances, in rows of the upper triangle, in the plane. Landmarks have numbers of their own.
 """
 
@@ -36,7 +38,8 @@ class Text:
 
     Attributes
     ----------
-    dialect : ``g2o``, ``toro`` or ``gtsam``; None: each line is known by its tag
+    dialect : ``g2o``, ``toro``, ``gtsam``, ``isam`` or ``rows`` (EDGE2 with its information in rows of the upper
+        triangle); None: each line is known by its tag
     raw : whether g2o's information of rotations in space belongs to the rotation vector, as TORO's does
     landmarks_from : what the text's number of a VERTEX_XY lacks to its id
     """
@@ -79,12 +82,17 @@ def _vertex2(words: Words, _: Text) -> Words:
 
 
 def _edge2(words: Words, text: Text) -> Words:
-    """Files of other programs have the rows of the upper triangle: where only that is definite, it is meant."""
+    """Rows of the upper triangle may be the information or its square root: where only they can be meant, ask."""
     expect(words, 11)
     rows = numbers(words[6:])
+    if text.dialect == "isam":
+        return ["EDGE_SE2", *words[1:6], *_written(_squared(rows))]
     toro = [rows[k] for k in _TORO]
-    is_rows = text.dialect is None and not _is_definite(toro) and _is_definite(rows)
-    return ["EDGE_SE2", *words[1:6], *_written(rows if is_rows else toro)]
+    if text.dialect is None and not _is_definite(toro) and rows[0] > 0.0 and rows[3] > 0.0 and rows[5] > 0.0:
+        raise FormatError(
+            "EDGE2 is not in TORO's order: --from isam (square roots of the information) or --from rows (information)"
+        )
+    return ["EDGE_SE2", *words[1:6], *_written(rows if text.dialect == "rows" else toro)]
 
 
 def _vertex3(words: Words, _: Text) -> Words:
@@ -103,14 +111,18 @@ def _edge3(words: Words, text: Text) -> Words:
     return ["EDGE_SE3:QUAT", *words[1:3], *_written(_pose(values[:6])), *_written(information.tolist())]
 
 
-def _odometry(words: Words, _: Text) -> Words:
+def _odometry(words: Words, text: Text) -> Words:
     expect(words, 11)
+    if text.dialect == "isam":
+        return ["EDGE_SE2", *words[1:6], *_written(_squared(numbers(words[6:])))]
     return ["EDGE_SE2", *words[1:6], *_written(_inverse(numbers(words[6:]), "covariance"))]
 
 
-def _landmark(words: Words, _: Text) -> Words:
+def _landmark(words: Words, text: Text) -> Words:
     expect(words, 7)
     landmark = str(LANDMARK_IDS_FROM + integer(words[2]))
+    if text.dialect == "isam":
+        return ["EDGE_SE2_XY", words[1], landmark, *words[3:5], *_written(_squared(numbers(words[5:])))]
     return ["EDGE_SE2_XY", words[1], landmark, *words[3:5], *_written(_inverse(numbers(words[5:]), "covariance"))]
 
 
@@ -194,6 +206,8 @@ _TAGS = {
     "g2o": frozenset(_WRITTEN["g2o"]),
     "toro": frozenset({"VERTEX2", "EDGE2", "VERTEX3", "EDGE3"}),
     "gtsam": frozenset({"VERTEX_SE2", "VERTEX2", "VERTEX_XY", "ODOMETRY", "LANDMARK"}),
+    "isam": frozenset({"VERTEX2", "EDGE2", "ODOMETRY", "LANDMARK"}),
+    "rows": frozenset({"VERTEX2", "EDGE2"}),
 }
 DIALECTS = tuple(_TAGS)
 
@@ -228,6 +242,15 @@ def _is_definite(upper: list[float]) -> bool:
         return False
     b, c, e = b / (a * d) ** 0.5, c / (a * f) ** 0.5, e / (d * f) ** 0.5
     return b * b < 1.0 and 1.0 + 2.0 * b * c * e > b * b + c * c + e * e
+
+
+def _squared(rows: list[float]) -> list[float]:
+    """The upper triangle of ``R'R``, of R by the rows of its upper triangle."""
+    size = 3 if len(rows) == 6 else 2
+    at, root = np.triu_indices(size), np.zeros((size, size))
+    root[at] = rows
+    out: list[float] = (root.T @ root)[at].tolist()
+    return out
 
 
 def _inverse(upper: list[float], what: str) -> list[float]:

@@ -37,6 +37,7 @@ from graph_slam_ros.lie import se3
 
 _RELATIVE = ("EDGE_SE2", "EDGE_SE3:QUAT")
 _CLASS = re.compile(r"#\s+(?:\d+\s+\d+\s+)?class\s+(\S+)\s*", re.ASCII)  # our comment, the label of what follows it
+_PRINTED = 1e-3  # of correlations: what three printed digits leave of an eigenvalue that should not be negative
 _UNIT = 1e-12  # a squared quaternion norm this near to 1 is left as it was written
 ERROR_MAPS = {"relative": RELATIVE_POSE, "seed": INVERSE_RELATIVE_POSE}
 
@@ -62,6 +63,7 @@ class _Reader:
         self.offsets: dict[int, se3.Pose] = {}
         self.unknown: list[str] = []
         self.skipped: list[str] = []
+        self.repaired: list[int] = []
         self.has_values = True
         self.label = ""
 
@@ -163,7 +165,17 @@ class _Reader:
             self.skipped,
             self.text.raw,
             self.has_values,
+            self._repairs(),
         )
+
+    def _repairs(self) -> list[str]:
+        if not self.repaired:
+            return []
+        what = f"{len(self.repaired)} information matrices" if len(self.repaired) > 1 else "an information matrix"
+        return [
+            f"{self.name}:{self.repaired[0]}: {what} not positive definite by the rounding of print alone:"
+            " weights from the traces of position and rotation are used instead"
+        ]
 
     def _known(self, tag: str, edges: Sequence[_Edge]) -> Iterator[_Edge]:
         """Edges whose vertices exist and are of the right kind, and whose information is positive definite."""
@@ -201,6 +213,8 @@ class _Reader:
         if edge_type in HALVED and not self.text.raw:
             information *= np.outer(HALVED[edge_type], HALVED[edge_type])
         good = list(range(len(edges)))
+        kinds = edge_type.accepts
+        lengths = edge_type.residual_size - (0 if kinds[-1][0] not in (SE2, SE3) else 1 if SE2 in kinds[-1] else 3)
         try:
             noise = Gaussian.from_information(information)
         except NoiseError:
@@ -210,6 +224,12 @@ class _Reader:
                     Gaussian.from_information(information[k])
                     good.append(k)
                 except NoiseError as error:
+                    weighted = by_traces(information[k], lengths)
+                    if weighted is not None:
+                        information[k] = weighted
+                        self.repaired.append(edge.line)
+                        good.append(k)
+                        continue
                     self.refuse(edge.line, str(error).replace("information 0", "information", 1))
             if not good:
                 return {}
@@ -243,8 +263,9 @@ def read_g2o(
     error_map : ``relative`` (g2o's, ours) or ``seed`` (residual of the inverse, python-graphslam's)
     lenient : leave out bad lines and list them in ``skipped`` instead of refusing the file
     raw : take the information of rotations in space as belonging to the rotation vector, unscaled
-    dialect : ``g2o``, ``toro`` or ``gtsam``: refuse lines of the others, and guess at nothing; by default each line is
-        known by its tag
+    dialect : ``g2o``, ``toro``, ``gtsam``, ``isam`` (square roots of the information) or ``rows`` (EDGE2 with its
+        information in rows of the upper triangle): refuse lines of the others, and guess at nothing; by default each
+        line is known by its tag
 
     Raises
     ------
@@ -256,7 +277,7 @@ def read_g2o(
         raise FormatError(f"error map {error_map!r}: choose {' or '.join(ERROR_MAPS)}")
     if dialect not in (None, *DIALECTS):
         raise FormatError(f"dialect {dialect!r}: choose {', '.join(DIALECTS)}")
-    own_numbers = dialect == "gtsam" or any(
+    own_numbers = dialect in ("gtsam", "isam") or any(
         text.lstrip().startswith(("LANDMARK ", "LANDMARK\t")) for _, text in lines(path)
     )
     reader = _Reader(path.name, lenient, Text(dialect, raw, LANDMARK_IDS_FROM if own_numbers else 0))
@@ -267,6 +288,28 @@ def read_g2o(
     if not reader.vertices:
         raise FormatError(f"{path.name}: no vertex in it; is it a graph?")
     return reader.graph(ERROR_MAPS[error_map])
+
+
+def by_traces(information: Array, lengths: int) -> Array | None:
+    """Weights in place of an information matrix (m, m) that is not positive definite by the rounding of print alone.
+
+    As SE-Sync does for all: one weight for its first ``lengths`` numbers and one for the rest, each the mean of that
+    part of the diagonal. None where more than one eigenvalue is in doubt, one is too far below zero for rounding, or a
+    weight is not positive.
+    """
+    if len(information) < 2 or not np.isfinite(information).all():
+        return None
+    diagonal = np.diag(information)
+    if not (diagonal > 0.0).all():
+        return None
+    scale = np.sqrt(diagonal)
+    least, second, *_ = np.linalg.eigvalsh(information / np.outer(scale, scale))
+    if least < -_PRINTED or second < _PRINTED:
+        return None
+    weights = np.empty(len(diagonal))
+    for block in (slice(0, lengths), slice(lengths, None)):
+        weights[block] = diagonal[block].mean() if len(diagonal[block]) else 0.0
+    return np.diag(weights)
 
 
 def _quaternion_at(edge: EdgeType) -> int | None:

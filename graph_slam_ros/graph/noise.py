@@ -13,6 +13,9 @@ _ASYMMETRY = 1e-6  # of the largest entry; text files carry 6 digits
 _LEAST_EIGENVALUE = 16.0 * float(np.finfo(float).eps)  # of the correlations; that of a singular matrix is rounding
 
 
+_LONG = 120  # characters of a matrix in a message
+
+
 @dataclass(frozen=True, slots=True)
 class Gaussian:
     """Zero-mean noise of one residual, or of n residuals at once.
@@ -74,6 +77,8 @@ def _fault(stack: Array, what: str) -> str:
         else:
             continue
         text = np.array2string(matrix, separator=", ").replace("\n", "")
+        if len(text) > _LONG:
+            text = f"{len(matrix)} x {len(matrix)} with diagonal {np.array2string(np.diag(matrix), precision=3)}"
         return f"{what} {row} is {why}: {text}"
     return f"{what}: not symmetric positive definite"
 
