@@ -161,7 +161,7 @@ def test_landmarks_are_drawn_where_they_are_with_the_estimates_at_hand_or_withou
 
 
 def test_landmarks_are_published_with_identity_and_covariance_in_the_axes_of_the_map(slam):
-    n, most = slam.space.dimensions, slam.config.output.pose_covariance_max
+    n, most = slam.space.dimensions, to_msg.UNKNOWN
     message = typestore().deserialize_cdr(results.landmarks_estimate(slam), results.ESTIMATES)
     assert message.header.frame_id == "map"
     assert message.header.stamp.sec == STAMP_NS // 10**9 + 9
@@ -193,4 +193,4 @@ def test_an_unknown_covariance_is_published_as_a_large_one(slam):
     unknown = [("tag", slam.space.identity, np.full((size, size), np.nan))]
     message = typestore().deserialize_cdr(results.landmarks_estimate(slam, unknown), results.ESTIMATES)
     covariance = message.detections[0].results[0].pose.covariance.reshape(6, 6)
-    assert (covariance == slam.config.output.pose_covariance_max * np.eye(6)).all()
+    assert (covariance == to_msg.UNKNOWN * np.eye(6)).all()

@@ -14,8 +14,10 @@ from graph_slam_ros.ros.live import health
 from graph_slam_ros.ros.live.ahead import Ahead
 from graph_slam_ros.ros.live.health import Facts, InputFacts, judge, statuses
 from graph_slam_ros.ros.live.map_to_odom import MapToOdom
+from graph_slam_ros.ros.live.recent import Recent, RecentInputs
 from graph_slam_ros.ros.live.reckoning import Reckoning
 from graph_slam_ros.ros.live.session import Session
+from graph_slam_ros.ros.live.throttle import Throttle
 from graph_slam_ros.ros.live.worker import Worker
 from graph_slam_ros.slam import Config, Counters, Odometry, Sighting, Sightings
 
@@ -204,6 +206,10 @@ def tags(**values):
     return InputFacts(**{"name": "tags", "topic": "/tags", "use": "landmarks", "publishers": ("/eye",)} | values)
 
 
+def refused(came, **reasons):
+    return Recent(came, reasons, goes_on=True)
+
+
 @pytest.mark.parametrize(
     "facts, state, reason",
     [
@@ -214,11 +220,16 @@ def tags(**values):
         (Facts("active", (odom(),)), "WAITING", "/odom: /driver publishes it, but nothing has come yet"),
         (Facts("active", (odom(mismatch="best effort"),)), "WAITING", "/odom: best effort"),
         (
-            Facts("active", (odom(received=3, counts={"frame_unknown": 3}, frames=("wheels",)),)),
+            Facts("active", (odom(received=3, recent=refused(3, frame_unknown=3), frames=(("wheels", "base_link"),)),)),
             "WAITING",
-            "/odom: no transform links wheels to the robot (/tf, /tf_static)",
+            "/odom: all refused in 10 s (frame_unknown): no transform links wheels to base_link: publish the transform",
         ),
-        (Facts("active", (odom(received=3, counts={"late": 3}),)), "WAITING", "/odom: refused, late 3 times"),
+        (
+            Facts("active", (odom(received=3, recent=refused(3, late=3)),)),
+            "WAITING",
+            "/odom: all refused in 10 s (late): it came after newer messages that had been used already: ",
+        ),
+        (Facts("active", (odom(),), loads="run-1"), "WAITING", "loads the map of run-1"),
         (
             Facts("active", (odom(received=1),), waits_for_clock=True),
             "WAITING",
@@ -254,9 +265,22 @@ def test_what_is_wrong_before_the_first_estimate_is_named(facts, state, reason):
             {},
             (
                 odom(received=9, silent_s=0.0),
-                tags(received=4, silent_s=0.0, counts={"frame_unknown": 4}, frames=("c",)),
+                tags(received=4, silent_s=0.0, recent=refused(4, frame_unknown=4), frames=(("c", "base_link"),)),
             ),
-            "/tags: no transform links c to the robot (/tf, /tf_static)",
+            "/tags: all refused in 10 s (frame_unknown): no transform links c to base_link:"
+            " publish the transform on /tf_static, or tags.mount, or frames.base as the recording names it",
+        ),
+        (
+            {},
+            (odom(received=9, silent_s=0.0), tags(received=9, silent_s=0.0, recent=refused(90, no_id=80, late=1))),
+            "/tags: 81 of 90 refused in 10 s (no_id): the detection has no identity: landmarks.association=joint",
+        ),
+        ({}, (odom(received=9, silent_s=0.0), tags(received=9, silent_s=0.0, recent=refused(90, late=9))), ""),
+        (
+            {},
+            (odom(received=9, silent_s=0.0, publishers=("/ekf", "/wheels"), is_contested=True),),
+            "/odom: /ekf and /wheels publish it, and one of them is used:"
+            " give each odometry a topic and an input of its own (inputs.names)",
         ),
         ({"is_paused": True}, (), "paused"),
         ({"failures": 2}, (), "2 solves failed: the last good estimate stands"),
@@ -272,3 +296,43 @@ def test_at_work_it_is_well_or_degraded_with_the_reason(values, inputs, reason):
     assert told[0].values["healthy"] == str(not reason)
     assert told[0].message == "; ".join(("DEGRADED", reason) if reason else ("OK",))
     assert told[-1].values["keyframes"] == str(estimate.keyframes)
+
+
+def test_A35_what_is_refused_is_judged_by_the_last_seconds_wherever_it_was_refused():
+    recent, accepted, before, after = RecentInputs(), {}, {"tags": {}}, {"tags": {}}
+
+    def second(now_s, good=0, unlinked=0, unnamed=0, repaired=0):
+        accepted["tags"] = accepted.get("tags", 0) + good + unnamed
+        for counts, reason, times in (
+            (before, "frame_unknown", unlinked),
+            (before, "covariance_unknown", repaired),
+            (after, "no_id", unnamed),
+        ):
+            counts["tags"][reason] = counts["tags"].get(reason, 0) + times
+        return recent.look(100.0 + now_s, accepted, before, after)["tags"]
+
+    for k in range(20):
+        now = second(k, unlinked=5)
+    assert now.is_bad and now.is_nothing_used
+    assert 45 <= now.came == now.times <= 50
+    assert [second(20 + k, good=5).is_bad for k in range(4)] == [True, True, False, False], "over within three seconds"
+    for k in range(20):
+        now = second(24 + k, good=5, repaired=5)
+    assert not now.times, "what is repaired is used"
+    for k in range(10):
+        now = second(44 + k, good=17, unnamed=3)
+    assert now.is_bad and not now.is_nothing_used
+    assert now.worst == "no_id"
+    for k in range(20):
+        now = second(54 + k, good=19, unnamed=1)
+    assert not now.is_bad, "a twentieth"
+
+
+def test_A37_what_is_told_seldom_tells_how_often_it_was_left_out(monkeypatch):
+    throttle, at = Throttle(5.0), [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: at[0])
+    told = []
+    for _ in range(14):
+        told.append(throttle.next())
+        at[0] += 1.0
+    assert told == [0, *[None] * 4, 4, *[None] * 4, 4, *[None] * 3]

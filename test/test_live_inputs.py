@@ -1,11 +1,16 @@
 """Inputs of the running node: who publishes them, what is refused of them, and what is told of that."""
 
 import math
+import time
 
+import numpy as np
 import pytest
-from live_drive import Drive
-from live_nodes import ENVIRONMENT, node, own_domain, robot, until
-from messages import odometry, pose, quaternion
+from geometry_msgs.msg import TransformStamped
+from live_drive import TAGS, Drive, earlier_run
+from live_nodes import ENVIRONMENT, LATCHED, node, own_domain, robot, until
+from messages import detection, detections, odometry, pose, quaternion
+from rclpy.qos import ReliabilityPolicy
+from tf2_msgs.msg import TFMessage
 
 from graph_slam_ros.lie import se2
 
@@ -45,4 +50,116 @@ def test_A34_two_publishers_of_an_odometry_are_named_and_the_robot_stays_where_i
         assert r.graph()["segments"] == 1
         newest = r.heard["pose"][-1].pose.pose.position
         assert math.dist((newest.x, newest.y), drive.truth[:2]) < 0.5
+        assert n.stop()[0] == 0
+
+
+# -- what is refused ---------------------------------------------------------------------------------------------------
+
+
+def seen(drive, ids=True, covariance=0.01, **options):
+    """What a robot sees now of the tags."""
+    here = [(name, se2.act(se2.inverse(drive.truth), at)) for name, at in TAGS.items()]
+    of = [detection(pose(*map(float, at)), np.eye(2) * covariance, name if ids else "") for name, at in here]
+    return detections(*of, **{"stamp_ns": drive.stamp_ns, **options})
+
+
+def test_A35_an_input_that_is_refused_is_degraded_with_the_remedy_while_it_is_and_not_longer():
+    with node("output.folder:=''", "inputs.reliable:=true") as n, robot(hears=("/diagnostics",)) as r:
+        r.wait_for_node()
+        drive = Drive()
+        drive.sees = False
+
+        def with_tags(**options):
+            def step(seconds):
+                r.send("/landmarks", seen(drive, **options))
+                drive.pace(r)(seconds)
+
+            return step
+
+        unlinked = with_tags(frame="camera")
+        r.until_it_says(
+            "DEGRADED", "/landmarks: all refused in 10 s (frame_unknown)", "camera to base_link", spin=unlinked
+        )
+        linked = TFMessage(transforms=[TransformStamped()])
+        linked.transforms[0].header.frame_id, linked.transforms[0].child_frame_id = "base_link", "camera"
+        linked.transforms[0].transform.rotation.w = 1.0
+        r.publisher("/tf_static", TFMessage, LATCHED).publish(linked)
+        r.until_it_says("OK", spin=unlinked)
+        r.until_it_says(
+            "DEGRADED", "(no_id): the detection has no identity: landmarks.association=joint", spin=with_tags(ids=False)
+        )
+        r.until_it_says("OK", spin=with_tags())
+        r.until_it_says(
+            "DEGRADED", "detections.offset_s", spin=lambda s: with_tags(stamp_ns=drive.stamp_ns - 10**13)(s)
+        )
+        r.until_it_says("OK", spin=with_tags())
+        r.heard["diagnostics"].clear()
+        until(lambda: len(r.said()) > 4, with_tags(covariance=0.0), "diagnostics")
+        assert {values["state"] for _, values in r.said()} == {"OK"}, "a noise that was filled in is no refusal"
+        assert int(r.said("input detections")[-1][1]["counted: covariance_unknown"]) > 20
+        assert n.stop()[0] == 0
+
+
+def test_A36_while_a_map_is_loaded_that_is_what_is_said(tmp_path):
+    earlier_run(tmp_path / "life", 2_000)
+    parameters = f"output.folder:={tmp_path / 'run'}", "output.load:=life", "solve.every_keyframes:=100"
+    with node(*parameters) as n, robot(hears=("/diagnostics",)) as r:
+        r.wait_for_node()
+        r.heard["diagnostics"].clear()
+        loaded = r.ask("load")
+        until(loaded.done, r.spin, "loaded map", 60.0)
+        assert loaded.result().success
+        said = [values for _, values in r.said()]
+        assert any(values.get("reason 1") == "loads the map of life" for values in said), said
+        assert not any("ERROR" in values["state"] for values in said), said
+        n.process.kill()
+
+
+# -- a node that is behind, and messages that do not arrive ------------------------------------------------------------
+
+
+def test_A37_path_landmarks_and_graph_come_while_messages_wait_and_jumps_are_told_now_and_then():
+    slow = "keyframes.min_distance_m:=0.01", "tf.report_jump_m:=0.0", "tf.report_jump_rad:=0.0"
+    hears = "/diagnostics", "path", "landmarks", "graph", "pose"
+    with node("output.folder:=''", "inputs.reliable:=true", *slow) as n, robot(hears=hears) as r:
+        r.wait_for_node()
+        drive = Drive()
+        r.until_it_says("OK", spin=drive.pace(r))
+        since = time.monotonic()
+
+        def waiting():
+            return int(r.said()[-1][1]["messages waiting"]) if r.said() else 0
+
+        until(lambda: waiting() > 1000, lambda seconds: drive.go(r, 200, every=50), "backlog", 30.0)
+        results = [r.heard[name] for name in ("path", "landmarks", "graph")]
+        for heard in results:
+            heard.clear()
+        until(lambda: all(results), lambda seconds: waiting() < 5000 and drive.go(r, 50), "results", 30.0)
+        assert waiting() > 100, "while messages wait"
+        assert n.said.count("map -> odom moved") <= (time.monotonic() - since) / 5.0 + 2
+        assert " more since the last was told)" in n.said
+        assert int(r.graph()["solves"]) > 100
+        sigmas = np.sqrt(np.diag(r.heard["pose"][-1].pose.covariance.reshape(6, 6)))
+        assert sigmas[[2, 3, 4]] == pytest.approx(0.5), "what the plane leaves open can be drawn"
+        n.process.kill()
+
+
+def test_A38_what_the_middleware_loses_before_the_node_is_counted_and_degrades():
+    with node("output.folder:=''") as n, robot(reliability=ReliabilityPolicy.BEST_EFFORT, hears=("/diagnostics",)) as r:
+        r.wait_for_node()
+        drive = Drive()
+        r.until_it_says("OK", spin=drive.pace(r))
+        large = seen(drive, ids=False, frame="x" * 120_000)
+
+        def too_much(seconds):
+            for _ in range(20):
+                r.send("/landmarks", large)
+            drive.pace(r)(seconds)
+
+        def lost():
+            told = r.said("input detections")
+            return int(told[-1][1].get("counted: lost_in_transport", 0)) if told else 0
+
+        until(lambda: lost() > 100, too_much, "losses")
+        r.until_it_says("DEGRADED", "/landmarks: ", "refused in 10 s", spin=too_much)
         assert n.stop()[0] == 0

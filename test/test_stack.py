@@ -115,7 +115,7 @@ def test_B23_a_qos_that_does_not_match_and_all_else_that_keeps_odometry_from_com
             lost = Drive(frames="wheels/")
             other.until_it_says(
                 "WAITING",
-                "no transform links wheels/odom to the robot",
+                "no transform links wheels/odom to odom",
                 spin=lambda s: (lost.step(driver), other.spin(s)),
                 patience_s=3.0,
             )
@@ -134,7 +134,12 @@ def test_frames_that_nothing_links_to_the_robot_are_named_and_the_rest_goes_on(t
             drive.move()
             r.spin(seconds)
 
-        r.until_it_says("DEGRADED", "/landmarks: no transform links camera_of_its_own", spin=with_a_camera_of_its_own)
+        r.until_it_says(
+            "DEGRADED",
+            "/landmarks: all refused in 10 s",
+            "no transform links camera_of_its_own to base_link",
+            spin=with_a_camera_of_its_own,
+        )
         assert r.heard["path"], "odometry alone makes a path"
         assert n.stop()[0] == 0
 

@@ -138,8 +138,8 @@ class Border:
         self._waiting.clear()
         return out
 
-    def unlinked(self, name: str) -> tuple[str, ...]:
-        """Frames of an input that nothing links to the robot."""
+    def unlinked(self, name: str) -> tuple[tuple[str, str], ...]:
+        """Frames of an input, each with the frame that nothing links it to, of the last messages refused for that."""
         return tuple(self._sources[name].unlinked)
 
     def initial_pose(self, cdr: bytes) -> list[InitialPose]:

@@ -72,11 +72,11 @@ def landmarks(slam: GraphSlam, estimates: Sequence[Estimate] | None = None) -> b
 def landmarks_estimate(slam: GraphSlam, estimates: Sequence[Estimate] | None = None) -> bytes:
     """Landmarks with identity, pose and covariance in the map's axes; of all, or of ``landmark_estimates``.
 
-    What a point does not have, in the plane also height, roll and pitch, is zero with the variance
-    ``output.pose_covariance_max``; so is all of a covariance that is unknown.
+    What a point does not have, in the plane also height, roll and pitch, is zero with the variance ``to_msg.UNKNOWN``;
+    so is all of a covariance that is unknown.
     """
     known = landmark_estimates(slam) if estimates is None else estimates
-    space, unused = slam.space, slam.config.output.pose_covariance_max
+    space, unused = slam.space, to_msg.UNKNOWN
     poses, covariances = np.empty((len(known), 7)), np.empty((len(known), 36))
     for k, (_, value, covariance) in enumerate(known):
         full, size = unused * np.eye(space.dof), len(covariance)

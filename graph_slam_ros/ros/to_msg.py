@@ -21,6 +21,7 @@ from graph_slam_ros.slam.space import PLANE, SPACE
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
 
+UNKNOWN = 1e6  # variance [m^2, rad^2] of what is not known at all
 _IN_PLANE = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])  # of the 36 numbers: x, y and yaw
 _OUT_OF_PLANE = np.array([14, 21, 28])  # the variances of z, roll and pitch
 
@@ -115,12 +116,12 @@ def odometry(
     Parameters
     ----------
     covariance : of the pose, in its tangent space
-    unused : variance of what a pose in the plane does not have, and of a twist that is unknown
+    unused : variance of what a pose in the plane does not have
     twist : geometry_msgs/TwistWithCovariance as ``from_msg.twist_of`` gives it
     """
     space = PLANE if len(p) == 3 else SPACE
     numbers = se3.in_space(p).tobytes(), covariance6(space.in_parent_axes(p, covariance), unused).tobytes()
-    moving = _unknown_twist(unused) if twist is None else twist
+    moving = _unknown_twist(UNKNOWN) if twist is None else twist
     return b"".join((HEADER, stamp(stamp_ns), _frames(8, frame, child), *numbers, moving))
 
 

@@ -120,7 +120,11 @@ class OutputConfig:
         5_000, "edges of ~/graph; of more, the worst fitting are shown first", "edges", low=1, high=1_000_000, live=True
     )
     pose_covariance_max: float = setting(
-        1e6, "variance published for what a planar robot does not estimate (z, roll, pitch)", "m^2, rad^2", low=0.0
+        0.25,
+        "variance of z, roll and pitch in the poses of a planar robot, which are taken for zero: half a metre and"
+        " half a radian, about where odometry is counted as out_of_plane; 1e6: unknown (RViz draws a kilometre)",
+        "m^2, rad^2",
+        low=0.0,
     )
 
     def __post_init__(self) -> None:

@@ -72,6 +72,11 @@ REASONS: dict[str, Reason] = {
         "one publisher for each odometry topic: ros2 topic info -v TOPIC",
     ),
     "sent_again": Reason(_NOTED, "the transform was sent before with the same stamp"),
+    "lost_in_transport": Reason(
+        _REFUSED,
+        "the middleware lost it on its way to the node",
+        "inputs.reliable, a larger net.core.rmem_max, or messages that are smaller or fewer",
+    ),
     # -- frames
     "frame_slash_stripped": Reason(_REPAIRED, "the name of a frame began with a slash"),
     "frame_empty": Reason(_REFUSED, "the message names no frame", "INPUT.frame, or INPUT.mount"),

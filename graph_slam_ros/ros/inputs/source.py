@@ -48,7 +48,7 @@ class Source:
     tally : refusals and repairs of the present message by reason
     hurried : whether nothing is waited for any more
     state : what converters have to remember between messages
-    unlinked : frames of the last messages that nothing links to the robot
+    unlinked : frames of the last messages and the frames that nothing links them to
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Source:
         self.tally: Counter[str] = Counter()
         self.hurried = not config.inputs.tf
         self.state: dict[str, Any] = {}
-        self.unlinked: deque[str] = deque(maxlen=4)
+        self.unlinked: deque[tuple[str, str]] = deque(maxlen=4)
         self._offset_ns = round(settings.offset_s * 1e9)
         self._wait_ns = round(config.inputs.tf_wait_s * 1e9)
         self._mount = _mount(settings)
@@ -113,7 +113,7 @@ class Source:
             return self._mount
         now_ns = self.transforms.now_ns
         if self.hurried or (now_ns is not None and now_ns > stamp_ns + self._wait_ns):
-            raise self._not_linked("frame_unknown", frame)
+            raise self._not_linked("frame_unknown", frame, self.config.frames.base)
         raise NotYet
 
     def T_base_child(self, child: str) -> se3.Pose:
@@ -122,19 +122,19 @@ class Source:
         if found is None:
             found = self._mount if self._mount is not None or child else se3.IDENTITY
         if found is None:
-            raise self._not_linked("child_frame_unknown", child)
+            raise self._not_linked("child_frame_unknown", child, self.config.frames.base)
         return found
 
     def T_fixed(self, target: str, frame: str) -> se3.Pose:
         """Between frames that do not move."""
         found = self.transforms.lookup(target, frame)
         if found is None:
-            raise self._not_linked("frame_unknown", frame)
+            raise self._not_linked("frame_unknown", frame, target)
         return found
 
-    def _not_linked(self, reason: str, frame: str) -> MessageError:
-        if frame not in self.unlinked:
-            self.unlinked.append(frame)
+    def _not_linked(self, reason: str, frame: str, target: str) -> MessageError:
+        if (frame, target) not in self.unlinked:
+            self.unlinked.append((frame, target))
         return MessageError(reason)
 
     # -- rotations ---------------------------------------------------------------------------------------------------

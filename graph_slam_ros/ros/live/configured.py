@@ -4,6 +4,8 @@ The main thread has the callbacks, the border and map -> odom; the worker's thre
 publishes its results. Between them stand a queue one way and ``Session.estimate`` the other.
 """
 
+import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from functools import partial
@@ -26,16 +28,19 @@ from graph_slam_ros.ros.live.completion import Completion
 from graph_slam_ros.ros.live.listeners import Listeners
 from graph_slam_ros.ros.live.memory import is_short
 from graph_slam_ros.ros.live.outputs import Outputs
+from graph_slam_ros.ros.live.recent import RecentInputs
 from graph_slam_ros.ros.live.reckoning import Reckoning
 from graph_slam_ros.ros.live.session import Estimate, Session
+from graph_slam_ros.ros.live.throttle import Throttle
 from graph_slam_ros.ros.live.worker import Worker
 from graph_slam_ros.ros.message_class import message_class
 from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.ros.survey import with_survey
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Update
-from graph_slam_ros.slam.measurements import Closure, InitialPose
+from graph_slam_ros.slam.measurements import Closure, InitialPose, Sightings
 
 _ACKNOWLEDGE = 32  # messages
+_MOST_UNPUBLISHED_S, _AGAIN_S = 4.0, 5.0
 _HINTS = {"future": ", ahead of the clock: is use_sim_time to be set, or does a clock differ?"}
 
 
@@ -69,6 +74,10 @@ class Configured:
         self._with_twist = {one.name for one in config.sources if one.type == results.ODOMETRY}
         self._passed = self._done = 0  # messages, by this thread and by the worker's
         self._acknowledged = -1
+        self._is_overdue, self._published_s = False, time.monotonic()  # results, where the worker always has messages
+        self._jumps_told = Throttle(_AGAIN_S)
+        self._taken: Counter[str] = Counter()  # things that were handed to the pipeline, by input
+        self._recent = RecentInputs()
         self._has_player = False
         self._looked: tuple[int, int, int] = 0, 0, 0
         self._memory_is_short = False
@@ -86,7 +95,8 @@ class Configured:
             return
         node, config = self._node, self._node.config
         self._broadcaster = Broadcaster(node, config, node.guarded, self._look)
-        self._listeners = Listeners(node, config, self._border, self._take, node.guarded, self._broadcaster.heard)
+        heard = self._broadcaster.heard
+        self._listeners = Listeners(node, config, self._border, self._take, node.guarded, heard, self.counters)
         back = Duration(nanoseconds=-round(config.time.jump_back_s * 1e9))
         threshold = JumpThreshold(min_forward=None, min_backward=back, on_clock_change=True)
         self._jumps = node.get_clock().create_jump_callback(threshold, post_callback=node.guarded(self._on_jump))
@@ -175,7 +185,7 @@ class Configured:
     def _refuse(self, reason: str, measured: Sequence[Measured]) -> None:
         """A message that goes no further: the reason counts for each thing it said."""
         for m in measured:
-            self.counters.count(m.source if isinstance(m, Odometry) else m.topic, reason)
+            self.counters.count(_input(m), reason, _things(m))
         self._passed += 1
 
     def _is_newest(self, m: Odometry) -> bool:
@@ -251,8 +261,11 @@ class Configured:
         self._sends_odometry = self._outputs.has_listeners("odometry")
         self._has_player = self._node.has_player
         self._publish_received()
-        if self._worker.waiting < _ACKNOWLEDGE and self._outputs.are_due(self._node.config):
+        is_due = self._outputs.are_due(self._node.config)
+        if is_due and self._worker.waiting < _ACKNOWLEDGE:
             self._worker.offer(self._node.guarded(self._publish_due))
+        elif is_due and time.monotonic() - self._published_s > _MOST_UNPUBLISHED_S:
+            self._is_overdue = True
 
     def _watch(self) -> None:
         """Over the worker's thread and the memory of the process."""
@@ -343,6 +356,10 @@ class Configured:
             self._session.process(measured)
         finally:
             self._done += 1
+            for m in measured:
+                self._taken[_input(m)] += _things(m)
+            if self._is_overdue:
+                self._publish_due()
             if self._has_player and (not self._worker.waiting or self._done % _ACKNOWLEDGE == 0):
                 self._publish_received()
 
@@ -352,9 +369,12 @@ class Configured:
         moved = update.correction
         if update.solved and (moved.distance_m > tf.report_jump_m or moved.angle_rad > tf.report_jump_rad):
             slam.counters.count("tf", "jump")
-            self._node.get_logger().warn(events.correction(slam, update).message)
+            if (left_out := self._jumps_told.next()) is not None:
+                more = f" ({left_out} more since the last was told)" if left_out else ""
+                self._node.get_logger().warn(events.correction(slam, update).message + more)
 
     def _publish_due(self) -> None:
+        self._is_overdue, self._published_s = False, time.monotonic()
         self._outputs.publish_due(self._session.slam)
 
     # -- facts -------------------------------------------------------------------------------------------------------
@@ -364,15 +384,17 @@ class Configured:
         session, node, broadcaster = self._session, self._node, self._broadcaster
         if not self._worker.waiting and node.now_ns:
             self._worker.offer(node.guarded(session.evaluate))
-        counters = Counters()
-        for some in (self.counters, session.slam.counters):
+        counters, pipeline = Counters(), Counters()
+        pipeline.update(session.slam.counters)
+        for some in (self.counters, pipeline):
             counters.update(some)
         counted = counters.as_dict()
+        recent = self._recent.look(time.monotonic(), self._taken, self.counters.as_dict(), pipeline.as_dict())
         overflows = sum(of.get("overflow", 0) for of in counted.values())
         failures, restarts = session.failures, self.counters["node", "worker_restarted"]
         before, self._looked = self._looked, (overflows, failures, restarts)
         rivals = broadcaster.candidates() if broadcaster is not None and broadcaster.has_rival else None
-        inputs = self._listeners.facts(node.now_ns, counted) if self._listeners is not None else ()
+        inputs = self._listeners.facts(node.now_ns, counted, recent) if self._listeners is not None else ()
         twins = node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1
         return health.Facts(
             lifecycle,
@@ -380,6 +402,7 @@ class Configured:
             session.estimate,
             waits_for_clock=node.get_parameter("use_sim_time").value and not node.now_ns,
             is_paused=self._is_paused,
+            loads=session.loads,
             is_stopped=self._is_stopped,
             lag_s=self._worker.lag_s,
             waiting=self._worker.waiting,
@@ -396,6 +419,16 @@ class Configured:
             authorities=rivals or (),
             twins=twins,
         )
+
+
+def _input(m: Measured) -> str:
+    """The input that a measurement is of."""
+    return m.source.partition("#")[0] if isinstance(m, Odometry) else m.topic
+
+
+def _things(m: Measured) -> int:
+    """Each sighting counts."""
+    return len(m.sightings) if isinstance(m, Sightings) else 1
 
 
 def _installed(config: Config) -> dict[str, Decoder]:

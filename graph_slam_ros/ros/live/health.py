@@ -8,11 +8,14 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+from graph_slam_ros.ros.live.recent import WINDOW_S, Recent
 from graph_slam_ros.ros.live.session import Estimate
 from graph_slam_ros.ros.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.slam.config import Config
+from graph_slam_ros.slam.reasons import explain, remedy
 
 _LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them
+_LONGEST = 80  # of a frame's name
 _UNLINKED = ("frame_unknown", "child_frame_unknown")
 
 
@@ -23,12 +26,13 @@ class InputFacts:
     Attributes
     ----------
     received, used : messages, and what of them was handed on: of a message that holds several things, each
-    counts : of what was refused or repaired, by reason
+    counts : since the start, of what was refused, repaired or noted, by reason
     silent_s : since the last message, by the clock of the node; infinite before the first
     publishers : names of the nodes that publish it
     is_contested : whether several publish what is of one: an odometry
     mismatch : what keeps publisher and subscription from connecting, in words; empty where nothing does
-    frames : those of its messages that nothing links to the robot, the last ones
+    frames : those of its messages that nothing links to the robot, the last ones, each with the robot's
+    recent : what became of it in the last seconds
     """
 
     name: str
@@ -41,7 +45,8 @@ class InputFacts:
     publishers: tuple[str, ...] = ()
     is_contested: bool = False
     mismatch: str = ""
-    frames: tuple[str, ...] = ()
+    frames: tuple[tuple[str, str], ...] = ()
+    recent: Recent = field(default_factory=Recent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +56,7 @@ class Facts:
     Attributes
     ----------
     lifecycle : ``unconfigured``, ``inactive``, ``active`` or ``finalized``
+    loads : the run whose map is being loaded; empty where none is
     faults : exceptions of callbacks in the last ten seconds
     busy_s : for how long the solver has been at what it does
     overflows, failures, restarts : messages refused for want of room, solves that failed, and threads of the solver
@@ -65,6 +71,7 @@ class Facts:
     estimate: Estimate | None = None
     waits_for_clock: bool = False
     is_paused: bool = False
+    loads: str = ""
     is_stopped: bool = False
     lag_s: float = 0.0
     waiting: int = 0
@@ -129,6 +136,9 @@ def _errors(facts: Facts) -> Iterator[str]:
 
 def _missing(facts: Facts) -> Iterator[str]:
     """What keeps the first estimate from coming; of landmarks, only what is wrong."""
+    if facts.loads:
+        yield f"loads the map of {facts.loads}"
+        return
     if facts.waits_for_clock:
         yield "use_sim_time is set and nothing comes on /clock"
     for one in facts.inputs:
@@ -145,18 +155,21 @@ def _silence(one: InputFacts) -> Iterator[str]:
         yield f"{one.topic}: nobody publishes this {one.use}"
     elif not one.received:
         yield f"{one.topic}: {', '.join(one.publishers)} publishes it, but nothing has come yet"
-    elif any(one.counts.get(reason) for reason in _UNLINKED):
-        yield f"{one.topic}: {_unlinked(one)}"
-    elif one.counts:
-        worst = max(one.counts, key=lambda reason: one.counts[reason])
-        yield f"{one.topic}: refused, {worst} {one.counts[worst]} times"
+    elif one.recent.times:
+        yield f"{one.topic}: {_refused(one)}"
     else:
         yield f"{one.topic}: its first messages wait for their turn"
 
 
-def _unlinked(one: InputFacts) -> str:
-    frames = ", ".join(one.frames) or "its frame"
-    return f"no transform links {frames} to the robot (/tf, /tf_static)"
+def _refused(one: InputFacts) -> str:
+    """How much of an input was refused lately, for what reason most, and what mends that."""
+    recent = one.recent
+    meaning = explain(recent.worst).meaning
+    if recent.worst in _UNLINKED and one.frames:
+        meaning = "no transform links " + ", ".join(f"{frame[:_LONGEST]} to {robots}" for frame, robots in one.frames)
+    mend = remedy(one.name, recent.worst)
+    much = "all" if recent.is_nothing_used else f"{recent.times} of {recent.came}"
+    return f"{much} refused in {WINDOW_S:.0f} s ({recent.worst}): {meaning}{mend and ': '}{mend}"
 
 
 def _faults(facts: Facts, config: Config) -> Iterator[str]:
@@ -172,8 +185,8 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
             yield f"{one.topic}: {one.mismatch}"
         elif one.received and most_s and one.silent_s > most_s:
             yield f"{one.topic}: silent for {one.silent_s:.1f} s"
-        elif one.received and sum(one.counts.get(r, 0) for r in _UNLINKED) >= max(1, one.received // 2):
-            yield f"{one.topic}: {_unlinked(one)}"
+        elif one.recent.is_bad and not (one.is_contested and one.recent.worst == "other_publisher"):
+            yield f"{one.topic}: {_refused(one)}"
     if facts.is_paused:
         yield "paused"
     if facts.failing:
@@ -184,7 +197,7 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield "the solver's thread had died and was started again"
     if facts.memory_is_short:
         yield "the process has more memory than health.memory_mib: loop closures are refused"
-    if facts.busy_s > health.stuck_s:
+    if facts.busy_s > health.stuck_s and not facts.loads:
         yield f"solver stuck: it has been at one thing for {facts.busy_s:.1f} s"
     if facts.overflows:
         yield f"{facts.overflows} messages refused: the queue is full (inputs.queue)"
@@ -208,9 +221,11 @@ def statuses(facts: Facts, verdict: Verdict, node: str) -> Iterator[Status]:
     yield Status(verdict.level, f"{node}: health", message, node, healthy | reasons | load)
     for one in facts.inputs:
         told = {"topic": one.topic, "use": one.use, "received": str(one.received), "used": str(one.used)}
+        told |= {"came in 10 s": str(one.recent.came), "refused in 10 s": str(one.recent.times)}
         told |= {"silent [s]": f"{one.silent_s:.1f}", "publishers": ", ".join(one.publishers)}
         told |= {f"counted: {reason}": str(times) for reason, times in sorted(one.counts.items())}
-        level = WARN if one.mismatch or (one.use == "odometry" and not one.received) else OK
+        is_wrong = one.mismatch or one.is_contested or one.recent.is_bad
+        level = WARN if is_wrong or (one.use == "odometry" and not one.received) else OK
         yield Status(level, f"{node}: input {one.name}", one.mismatch or f"{one.received} received", node, told)
     if facts.estimate:
         told = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}

@@ -4,17 +4,24 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
+try:
+    from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
+except ImportError:  # Humble
+    from rclpy.qos_event import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border, is_correction
 from graph_slam_ros.ros.inputs import Measured, uses
 from graph_slam_ros.ros.live.health import InputFacts
+from graph_slam_ros.ros.live.recent import Recent
 from graph_slam_ros.ros.message_class import message_class
-from graph_slam_ros.slam import Config
+from graph_slam_ros.slam import Config, Counters
 
-Guard = Callable[[Callable[..., None]], Callable[..., None]]
+Heard = Callable[..., None]
+Guard = Callable[[Heard], Heard]
 Take = Callable[[Sequence[Measured], bytes], None]
 
 
@@ -43,6 +50,7 @@ class Listeners:
     take : is handed what the border makes of each message, and the message; also where that is nothing
     guarded : makes a callback that raises nothing
     on_correction : is handed each transform from map
+    counters : where messages are counted that the middleware has lost
     """
 
     def __init__(
@@ -53,9 +61,11 @@ class Listeners:
         take: Take,
         guarded: Guard,
         on_correction: Callable[[bytes], None],
+        counters: Counters,
     ) -> None:
         self._node, self._config, self._border = node, config, border
         self._take, self._guarded, self._on_correction = take, guarded, on_correction
+        self._counters = counters
         self._topics: dict[str, _Heard] = {}
         self._of_input: dict[str, str] = {}
         self._used: Counter[str] = Counter()
@@ -97,10 +107,21 @@ class Listeners:
                 measured += given
             self._take(measured, cdr)
 
-        subscription = self._node.create_subscription(
-            message_class(type_name), topic, self._guarded(on_message), qos, raw=True
-        )
+        def on_lost(event: Any) -> None:
+            if event.total_count_change:  # rclpy tells some events twice
+                for name in names:
+                    self._counters.count(name, "lost_in_transport", event.total_count_change)
+
+        subscription = self._subscription(type_name, topic, self._guarded(on_message), qos, self._guarded(on_lost))
         heard = self._topics[topic] = _Heard(subscription)
+
+    def _subscription(self, type_name: str, topic: str, on_message: Heard, qos: QoSProfile, on_lost: Heard) -> Any:
+        """With the event of messages that are lost before they come, where the middleware has it."""
+        create = partial(self._node.create_subscription, message_class(type_name), topic, on_message, qos, raw=True)
+        try:
+            return create(event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost))
+        except UnsupportedEventTypeError:
+            return create()
 
     # -- facts -------------------------------------------------------------------------------------------------------
 
@@ -110,8 +131,10 @@ class Listeners:
             if heard.received != heard.seen:
                 heard.seen, heard.at_ns = heard.received, now_ns
 
-    def facts(self, now_ns: int, counted: Mapping[str, Mapping[str, int]]) -> tuple[InputFacts, ...]:
-        """Of each input; with what was counted, by its name and reason."""
+    def facts(
+        self, now_ns: int, counted: Mapping[str, Mapping[str, int]], recent: Mapping[str, Recent]
+    ) -> tuple[InputFacts, ...]:
+        """Of each input; with what was counted since the start by its name and reason, and what became of it lately."""
         used = uses(self._config)
         out = []
         for one in self._config.sources:
@@ -136,6 +159,7 @@ class Listeners:
                     used[one.name] == "odometry" and one.type != TRANSFORMS and len(names) > 1,
                     "; ".join(filter(None, (self._mismatch(p, one.type) for p in told))),
                     self._border.unlinked(one.name),
+                    recent.get(one.name, Recent()),
                 )
             )
         return tuple(out)

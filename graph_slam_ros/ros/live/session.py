@@ -86,6 +86,8 @@ class Session:
         self._held: deque[list[Measurement]] = deque()  # for each run that is still to begin, what was accepted for it
         self._is_left = False
         self._has_news = False  # since the last save was asked for
+        self.recording_fails = False
+        self.loads = ""  # the run whose map is being loaded
         self.was_cut_off = self._folder is not None and is_cut_off(self._folder)
         self._begin()
 
@@ -95,8 +97,12 @@ class Session:
         if self._folder is not None:
             named = self._folder.with_name(load) if (load := self.config.output.load) else None
             keep_earlier(self._folder, self.config.output.keep_earlier, loaded or named)
-            self._recorder, self.recording_fails = None, True  # until there is another
-            recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start)
+            self._recorder = None
+            try:
+                recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start)
+            except Exception:
+                self.recording_fails = True
+                raise
         self.slam, self._recorder, self.recording_fails = slam, recorder, False
         self.slam.counters.on_first = self._tell
         self._refused_before = Counters()
@@ -278,6 +284,13 @@ class Session:
     def load(self, name: str) -> str:
         """Save, keep that, and go on from an earlier run: in its map, where the robot is now is to be found out."""
         run = self._earlier(name)
+        self.loads = run.name
+        try:
+            return self._load(run)
+        finally:
+            self.loads = ""
+
+    def _load(self, run: Path) -> str:
         loaded = run_config(run)
         if loaded.world != self.config.world:
             raise RunError(f"{run.name}: world.dimensions is {loaded.world.dimensions} there")
