@@ -8,11 +8,13 @@ first gives it to all.
 
 import contextlib
 import functools
+import math
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -35,11 +37,38 @@ from graph_slam_ros.graph import (
     Loss,
 )
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.lie.jit import COMPILED
+from graph_slam_ros.lie.jit import CACHE_DIR, COMPILED
+from graph_slam_ros.progress import report
 from graph_slam_ros.solver import METHODS, Settings, Solver
 
+_KERNELS = 115  # about so many there are; a test compares it with the cache
 
-def warmup(is_told_to_stop: Callable[[], bool] = lambda: False) -> float:
+
+@dataclass(frozen=True, slots=True)
+class Compiling:
+    """How far the compiler is: kernels in the cache, of about so many, after so long."""
+
+    done: int
+    elapsed_s: float
+    began_with: int = 0
+
+    def __str__(self) -> str:
+        done = min(self.done, _KERNELS - 1)
+        new = done - self.began_with
+        left_s = self.elapsed_s * (_KERNELS - done) / new if new > 0 else 0.0
+        left = "" if not left_s else f", about {10 * math.ceil(left_s / 10)} s more"
+        return f"compiling kernels, once per installation: {done} of about {_KERNELS}{left}"
+
+
+def are_compiled() -> bool:
+    """Whether all kernels are in the cache."""
+    return COMPILED.exists() or bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
+
+
+Tell = Callable[[Compiling], None]
+
+
+def warmup(is_told_to_stop: Callable[[], bool] = lambda: False, tell: Tell = lambda now: report(str(now))) -> float:
     """Compile what is not compiled yet, and load all; returns the seconds it took.
 
     Before anything is computed whose bytes are to be repeated.
@@ -47,6 +76,7 @@ def warmup(is_told_to_stop: Callable[[], bool] = lambda: False) -> float:
     Parameters
     ----------
     is_told_to_stop : asked while kernels are compiled, which may take minutes
+    tell : called meanwhile, several times a second
 
     Raises
     ------
@@ -54,24 +84,36 @@ def warmup(is_told_to_stop: Callable[[], bool] = lambda: False) -> float:
         Told to stop; the next warm-up goes on from there.
     """
     start = time.perf_counter()
-    if not COMPILED.exists() and not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-        _compile(is_told_to_stop)
+    compile_all(is_told_to_stop, tell)
     _use_all()
     return time.perf_counter() - start
 
 
-def _compile(is_told_to_stop: Callable[[], bool]) -> None:
+def compile_all(is_told_to_stop: Callable[[], bool] = lambda: False, tell: Tell = lambda now: report(str(now))) -> None:
+    """Compile what is not compiled yet, and load nothing; as ``warmup``."""
+    if not are_compiled():
+        _compile(is_told_to_stop, tell)
+
+
+def _compile(is_told_to_stop: Callable[[], bool], tell: Tell) -> None:
     """Once per installation, into the cache on disk."""
+    start, began_with = time.perf_counter(), _cached()
     command, path = [sys.executable, "-m", __name__], os.pathsep.join(filter(None, sys.path))
     with subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path}, start_new_session=True) as compiler:
         try:
             while (code := _ended(compiler)) is None:
+                tell(Compiling(_cached(), time.perf_counter() - start, began_with))
                 if is_told_to_stop():
                     raise GraphSlamError("told to stop before all kernels were compiled")
         finally:
             compiler.kill()  # Ctrl-C, which it does not hear itself
     if code:
         raise subprocess.CalledProcessError(code, command)
+
+
+def _cached() -> int:
+    """Kernels in the cache, each in a file of its own."""
+    return len({file.name for file in CACHE_DIR.rglob("*.nbi")})
 
 
 def _ended(process: "subprocess.Popen[bytes]") -> int | None:

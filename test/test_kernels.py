@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from reliability import times
 
+from graph_slam_ros import warmup
+
 TEST = Path(__file__).resolve().parent
 # Small, and between them they call every kernel.
 SMALL = [
@@ -105,6 +107,12 @@ for path in sys.argv[1:]:
     solver.update()
 print([name for name, count in signatures().items() if count != before.get(name, 0)])
 """
+
+
+def test_the_progress_of_the_compiler_counts_to_about_as_many_kernels_as_there_are():
+    warmup.warmup()
+    assert warmup._cached() == pytest.approx(warmup._KERNELS, rel=0.1)
+    assert str(warmup.Compiling(warmup._KERNELS // 2, 30.0)).endswith("about 40 s more")
 
 
 def test_the_warm_up_compiles_all_that_solving_a_graph_needs():

@@ -389,7 +389,7 @@ def test_a_node_that_got_nothing_may_start_again_in_its_folder_with_whole_number
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_during_start_shows_no_traceback(tmp_path, number):
     with node(f"output.folder:={tmp_path / 'run'}", module=False) as n:
-        until(lambda: "compiling kernels" in n.said, time.sleep, "start")
+        until(lambda: (tmp_path / "run").exists(), time.sleep, "start")
         assert n.stop(number)[0] == 0
     assert "Traceback" not in n.said
 

@@ -256,13 +256,16 @@ def test_X10_what_the_node_tells_has_neither_paths_nor_positions():
     for name, path in FILES.items():
         if name.startswith("ros/"):
             for node in ast.walk(ast.parse(path.read_text())):
-                if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("get_logger().info"):
+                if isinstance(node, ast.Call) and ast.unparse(node.func).endswith((".get_logger().info", "._log.info")):
                     told.append(ast.unparse(node.args[0]))
     assert sorted(told) == [
-        "'compiling kernels (once per installation)'",
-        "f'kernels ready after {warmup(self._is_told_to_stop):.1f} s'",
+        "'compiling kernels, once per installation: about a minute or two'",
+        "f'kernels ready after {took_s:.1f} s'",
         "f'saved {Path(folder).name}'",
+        "f'{run.name} was stopped while measurements waited: its results are being completed'",
+        "f'{self._run.name}: its results are complete'",
         "said",
+        "str(error)",
     ]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from live_drive import TAGS, Drive, distance, earlier_run
 from live_nodes import ENVIRONMENT, lenient, node, often, own_domain, replayed, results, robot, until
 from messages import detection, detections, pose
@@ -259,6 +260,27 @@ def test_P6_told_to_stop_while_kernels_are_compiled_it_does_not_wait_for_them(tm
     assert took_s < lenient(3.0)
     assert "Traceback" not in n.said
     check_room(tmp_path / "run")
+
+
+def test_while_kernels_are_compiled_the_node_answers_and_says_how_far_it_is(tmp_path, monkeypatch):
+    monkeypatch.setitem(ENVIRONMENT, "GRAPH_SLAM_CACHE", str(tmp_path / "cache"))
+    with managed(tmp_path / "run") as n, robot(hears=("/diagnostics",)) as r:
+        until(r.client("change_state", ChangeState).service_is_ready, r.spin, "service", 30.0)
+        since = time.monotonic()
+        assert r.change("configure")
+        assert time.monotonic() - since < lenient(4.0), "Nav2 waits no longer than 5 s"
+        r.until_it_says("INACTIVE", "compiling kernels, once per installation", " of about ")
+        assert r.change("activate")
+        r.until_it_says("WAITING", "compiling kernels")
+        assert r.get(["output.keep_earlier"]) == {"output.keep_earlier": 5}
+        Drive().go(r, 30)
+        r.until_it_says("WAITING", "compiling kernels")
+        code, took_s = n.stop(signal.SIGTERM)
+    assert code == 0, n.said
+    assert took_s < lenient(4.0)
+    assert "told to stop before all kernels were compiled" in n.said
+    assert not any(word in n.said for word in ("FATAL", "ERROR", "Traceback"))
+    assert len(accepted(tmp_path / "run")) > 30, "what came meanwhile is in the journal"
 
 
 def test_P6_told_to_stop_while_a_long_run_is_loaded_it_does_not_wait_for_it(tmp_path):

@@ -13,15 +13,23 @@ import sys
 import traceback
 from collections.abc import Sequence
 
+from graph_slam_ros import progress
 from graph_slam_ros.cli import console
 from graph_slam_ros.cli.parser import parser
 from graph_slam_ros.errors import GraphSlamError
+
+_COMPUTES = {"optimize", "solve", "influence"}  # with kernels, and without a warm-up of their own
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     args = parser().parse_args(arguments)
+    progress.listeners[:] = [console.Throttled()]
     try:
+        if args.run.__name__ in _COMPUTES:
+            from graph_slam_ros.warmup import compile_all
+
+            compile_all()
         return int(args.run(args))
     except GraphSlamError as error:
         console.tell(str(error))

@@ -4,6 +4,7 @@ import importlib.util
 import os
 import re
 import sys
+import time
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -36,6 +37,19 @@ def tell(what: str, programme: str = "graph_slam") -> None:
     if len(line) > _MOST_TOLD:
         line = f"{line[:_MOST_TOLD]} ..."
     print(f"{programme}: {line}", file=sys.stderr)
+
+
+class Throttled:
+    """Tells how far something is: at once, and then every few seconds."""
+
+    def __init__(self, period_s: float = 5.0) -> None:
+        self._period_s, self._due_s = period_s, 0.0
+
+    def __call__(self, said: str) -> None:
+        """Tell it, if it is time."""
+        if time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + self._period_s
+            tell(said)
 
 
 def told(losses: Sequence[str], warnings: Sequence[str] = ()) -> int:

@@ -145,7 +145,6 @@ def _has_matplotlib() -> bool:
 
 def warmup(args: argparse.Namespace) -> int:
     """Compile the kernels."""
-    console.tell("compiling kernels, once per installation")
     from graph_slam_ros.warmup import warmup as compiled
 
     console.tell(f"kernels ready after {compiled():.1f} s")

@@ -33,7 +33,6 @@ from graph_slam_ros.ros.live.outputs import LATCHED
 from graph_slam_ros.ros.live.params import changed, declare_parameters
 from graph_slam_ros.ros.live.worker import URGENT_S
 from graph_slam_ros.ros.message_class import message_class
-from graph_slam_ros.warmup import warmup
 
 _SUCCESS, _FAILURE, _ERROR = (getattr(TransitionCallbackReturn, name) for name in ("SUCCESS", "FAILURE", "ERROR"))
 _TICK_S = 0.1
@@ -44,8 +43,8 @@ _SWITCH_S = 5e-4  # a callback waits no longer than this for the worker's Python
 class GraphSlamNode(LifecycleNode):
     """Online pose-graph SLAM of odometry, landmark sightings, fixes and closures; ``ros/topics.py`` lists the topics.
 
-    Configured, it has read its parameters, compiled its kernels, opened its run folder and has its publishers; active,
-    it listens and broadcasts map -> odom.
+    Configured, it has read its parameters, opened its run folder and has its publishers; its kernels are loaded or
+    compiled meanwhile. Active, it listens and broadcasts map -> odom.
 
     Parameters
     ----------
@@ -85,7 +84,7 @@ class GraphSlamNode(LifecycleNode):
     # -- lifecycle ---------------------------------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Check the parameters and files, compile, make the publishers."""
+        """Check the parameters and files, begin to load or compile the kernels, make the publishers."""
         return self._transition(self._configure)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -127,9 +126,8 @@ class GraphSlamNode(LifecycleNode):
 
     def _configure(self) -> None:
         if self._run is None:
-            self._run = run = Configured(self)  # first what may be refused
-            self.get_logger().info("compiling kernels (once per installation)")
-            self.get_logger().info(f"kernels ready after {warmup(self._is_told_to_stop):.1f} s")
+            self._run = run = Configured(self)
+            run.prepare(self._is_told_to_stop)
             resumes = self.config.journal.resume and run.was_cut_off
             if resumes:
                 self.get_logger().warn("the last run was never ended: going on in its map")

@@ -28,6 +28,7 @@ from graph_slam_ros.ros.live.completion import Completion
 from graph_slam_ros.ros.live.listeners import Listeners
 from graph_slam_ros.ros.live.memory import is_short
 from graph_slam_ros.ros.live.outputs import Outputs
+from graph_slam_ros.ros.live.preparation import Preparation
 from graph_slam_ros.ros.live.recent import RecentInputs
 from graph_slam_ros.ros.live.reckoning import Reckoning
 from graph_slam_ros.ros.live.session import Estimate, Session
@@ -64,6 +65,7 @@ class Configured:
         self._session = Session(config, self.counters, self._on_update, self._tell)
         self._outputs = Outputs(node, config)
         self._worker = Worker(config.inputs.queue)
+        self._preparation = Preparation(node.get_logger())
         self._completion = Completion(self._session.incomplete, node.get_logger())
         self._listeners: Listeners | None = None
         self._broadcaster: Broadcaster | None = None
@@ -88,6 +90,15 @@ class Configured:
             10,
             raw=True,
         )
+
+    def prepare(self, is_told_to_stop: Callable[[], bool]) -> None:
+        """Have the worker load the kernels, compiled where they are not yet, before it does anything else."""
+
+        def prepare() -> None:
+            if not self._preparation.run(is_told_to_stop):
+                self._worker.leave()
+
+        self._worker.call(prepare)
 
     def activate(self) -> None:
         """Listen and broadcast; twice is as good as once."""
@@ -120,6 +131,7 @@ class Configured:
         patience_s, is_urgent : as of ``Worker.stop``
         """
         self.deactivate()
+        self._preparation.stop()
         self._watch()
         for some in self._ahead.give_up():
             self._hand_over(some)
@@ -418,6 +430,8 @@ class Configured:
             has_other_authority=rivals is not None,
             authorities=rivals or (),
             twins=twins,
+            preparing=self._preparation.said,
+            cannot_prepare=self._preparation.fault,
         )
 
 

@@ -64,6 +64,8 @@ class Facts:
     failing : why the last solve failed; empty where it did not
     memory_is_short : the process has more than ``health.memory_mib``
     authorities : other nodes that broadcast map -> odom, if somebody does
+    preparing : what keeps the pipeline from beginning: kernels are compiled or loaded; empty when they are ready
+    cannot_prepare : why that failed
     """
 
     lifecycle: str
@@ -88,6 +90,8 @@ class Facts:
     has_other_authority: bool = False
     authorities: tuple[str, ...] = ()
     twins: int = 0
+    preparing: str = ""
+    cannot_prepare: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +115,7 @@ class Verdict:
 def judge(facts: Facts, config: Config) -> Verdict:
     """The verdict."""
     if facts.lifecycle != "active":
-        return Verdict(facts.lifecycle.upper())
+        return Verdict(facts.lifecycle.upper(), tuple(filter(None, (facts.cannot_prepare or facts.preparing,))))
     for state, found in (("ERROR", _errors(facts)), ("WAITING", _missing(facts)), ("DEGRADED", _faults(facts, config))):
         if reasons := tuple(found):
             return Verdict(state, reasons)
@@ -119,7 +123,9 @@ def judge(facts: Facts, config: Config) -> Verdict:
 
 
 def _errors(facts: Facts) -> Iterator[str]:
-    if not facts.worker_is_alive:
+    if facts.cannot_prepare:
+        yield facts.cannot_prepare
+    elif not facts.worker_is_alive:
         yield "the solver's thread has ended"
     if facts.faults >= 100:
         yield f"{facts.faults} faults in callbacks in 10 s"
@@ -136,6 +142,8 @@ def _errors(facts: Facts) -> Iterator[str]:
 
 def _missing(facts: Facts) -> Iterator[str]:
     """What keeps the first estimate from coming; of landmarks, only what is wrong."""
+    if facts.preparing:
+        yield facts.preparing
     if facts.loads:
         yield f"loads the map of {facts.loads}"
         return

@@ -69,7 +69,7 @@ class Worker:
 
     def revive(self, first: Callable[[], Any]) -> bool:
         """Where the thread has died of a job, have another go on with the next, after ``first``; whether it had."""
-        if self._is_stopped or self._thread.is_alive():
+        if self._is_stopped or self._is_left or self._thread.is_alive():
             return False
         if self._future is not None and not self._future.done():
             self._future.set_exception(RuntimeError("the thread has died of it"))
@@ -80,6 +80,10 @@ class Worker:
     def has_room(self) -> bool:
         """Whether ``offer`` would take another job."""
         return self._jobs.qsize() < self._most
+
+    def leave(self) -> None:
+        """Begin no further job: what waits is not done."""
+        self._is_left = True
 
     def stop(self, timeout_s: float | None = None, is_urgent: Callable[[], bool] = lambda: False) -> bool:
         """Do what waits, then end; False if that takes longer: then no further job is begun.
@@ -96,8 +100,8 @@ class Worker:
             self._thread.join(min(_POLL_S, max(0.0, deadline - time.monotonic())))
             if deadline == math.inf and is_urgent():
                 deadline = time.monotonic() + URGENT_S
-        self._is_left = self._thread.is_alive()
-        return not self._is_left
+        self._is_left |= self._thread.is_alive()
+        return not self._thread.is_alive()
 
     def _started(self, first: Callable[[], Any] | None) -> threading.Thread:
         thread = threading.Thread(target=self._run, args=(first,), name="graph_slam_worker", daemon=True)
