@@ -307,6 +307,7 @@ def test_P4_that_the_disk_did_not_take_it_in_time_is_told_and_does_not_keep_it_f
     monkeypatch.setattr(os, "fsync", failing)
     session = session_in(tmp_path / "run", told)
     session.take(recorded()[:1])
+    session.flush_beside()
     assert failed.wait(10.0)
     assert not told
     session.save()
@@ -340,7 +341,11 @@ def test_P3_a_part_that_begins_while_the_disk_is_still_busy_with_another_is_not_
     monkeypatch.setattr(os, "fsync", slow)
     monkeypatch.setattr(AppendedFile, "flush", late)
     session._recorder._due_s = 0.0
-    session.take(recorded()[60:120])
+    first, *others = recorded()[60:120]
+    session.accept([first])
+    session._recorder.flush()  # it asks the disk for the new part
+    session.process([first])
+    session.take(others)
     assert begins.is_set()
     session.finish()
     assert not told

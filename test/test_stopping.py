@@ -63,7 +63,7 @@ def check_left(run, told):
     assert len(odometry) >= accepted > 300
     summary = json.loads((run / "run.json").read_text())
     assert summary["ended"]
-    assert summary["waiting"] > 100
+    assert summary["unprocessed"] > 100
     assert is_incomplete(run)
     assert not is_cut_off(run), "somebody ended it"
     return odometry

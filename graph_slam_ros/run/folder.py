@@ -58,7 +58,7 @@ def is_incomplete(folder: Path) -> bool:
 def was_saved_whole(folder: Path) -> bool:
     """Whether the map of a run has all of its journal, by its summary."""
     parts = list(_parts(folder))
-    return summary_of(folder).get("waiting") == 0 and bool(parts) and all(then == now for _, then, now in parts)
+    return summary_of(folder).get("unprocessed") == 0 and bool(parts) and all(then == now for _, then, now in parts)
 
 
 def _holds_something(folder: Path) -> bool:

@@ -195,7 +195,7 @@ class RunRecorder:
                 self._end_parts()
             parts = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}  # more of them: it went on
             waiting = max(0, self.accepted - slam.processed)
-            told = (summary or {}) | {"parts": parts, "waiting": waiting}
+            told = (summary or {}) | {"parts": parts, "unprocessed": waiting}
             save_results(self.folder, slam, told, self._refuse_if_ended)
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
@@ -225,7 +225,7 @@ class RunRecorder:
                 "keyframes": keyframes,
                 "ended": True,
                 "is_incomplete": bool(waiting or keyframes),
-                "waiting": waiting,
+                "unprocessed": waiting,
                 "parts": parts,
             }
             told = summary_of(self.folder) | now
