@@ -18,6 +18,7 @@ from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.input_config import InputConfig, default_input
 from graph_slam_ros.slam.measurements import from_record
+from graph_slam_ros.slam.reasons import warnings as mendable
 from graph_slam_ros.warmup import warmup
 
 TF_STATIC_TOPIC, TF_TOPIC = "/tf_static", "/tf"
@@ -180,7 +181,7 @@ def replay(
     one_by_one = chain.from_iterable(progress(items, total))
     name = recording_of(source) if is_run(source) else source.resolve().name
     slam, summary = record_run(out, config, one_by_one, losses, state, border=border, took=took, recording=name)
-    return Replayed(slam, summary, summary["losses"], warnings)
+    return Replayed(slam, summary, summary["losses"], warnings + mendable(summary["counters"]))
 
 
 def _with_end(items: Iterable[Sequence[Measurement]]) -> Iterator[Sequence[Measurement]]:

@@ -71,7 +71,8 @@ class SavedGraph:
         self.space, self._settings = config.space, config.solver_settings()
         self.entries = read_ledger(folder)
         self.graph, self._held = _graph(folder, self.entries)
-        self.keyframes = [k for e in self.entries if e.label in ("anchor", "odometry") for k in e.vertices[-1:]]
+        ends = (k for e in self.entries if e.label in ("anchor", "odometry") for k in e.vertices[-1:])
+        self.keyframes = list(dict.fromkeys(ends))  # an anchor that gave way has another after it
         for vertex in self.keyframes:
             if self.graph.kind_of(vertex) is not self.space.pose:
                 kind, wanted = self.graph.kind_of(vertex).name, self.space.pose.name

@@ -33,6 +33,7 @@ from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.ros.inputs.fixes import east_north_up
 from graph_slam_ros.ros.to_msg import make
 from graph_slam_ros.slam.measurements import Closure, Fix, Odometry, to_record
+from graph_slam_ros.slam.reasons import warnings
 
 IN_SPACE = {"world": {"dimensions": 3}}
 POSE, POSE_STAMPED = "PoseWithCovarianceStamped", "PoseStamped"
@@ -294,6 +295,22 @@ def test_the_covariance_of_a_fix_and_where_its_antenna_sits_are_kept():
     assert (matrix(m.covariance, 3), m.point) == (pytest.approx(covariance), (0.2, -0.3, 1.5))
     m = heard(receiver(2, antenna), "gps", gnss(covariance=covariance, frame="antenna"))
     assert (matrix(m.covariance, 2), m.point) == (pytest.approx(covariance[:2, :2]), (0.2, -0.3))
+
+
+def test_an_antenna_of_which_nothing_is_told_is_at_the_base_and_counted():
+    for frame in ("gps", ""):
+        b = listening("gps", "sensor_msgs/msg/NavSatFix")
+        (fix,) = [*b.take("gps", gnss(frame=frame)), *b.finish()]
+        assert (fix.kind, fix.point) == ("position", ())
+        assert counted(b) == {"gps": {"mount_unknown": 1}}
+    said = warnings({"gps": {"mount_unknown": 7, "no_altitude": 2}})
+    assert said == [
+        "gps: 7 times, no transform tells where the antenna is on the robot: it is taken to be at the base;"
+        ' mend it by --set gps.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there'
+    ]
+    told = listening("gps", "sensor_msgs/msg/NavSatFix", settings={"mount": "0 0 0 0 0 0"})
+    assert heard(told, "gps", gnss(frame="gps")).point == ()
+    assert counted(told) == {}
 
 
 # -- attitude -------------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from graph_slam_ros.slam.ledger import FINAL, Ledger, Reason
 from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.robust_config import RobustConfig
 from graph_slam_ros.slam.second_look import Frozen, Outcome, Rival, second_look
+from graph_slam_ros.slam.space import Numbers, Space
 from graph_slam_ros.solver import Report, Settings, Solver
 
 Array = NDArray[np.float64]
@@ -116,6 +117,19 @@ class Backend:
             report = self.solver.optimize(settings)
         self._background.cancel(self.ledger.outside_count)
         return report
+
+    def move(self, T_new_old: Numbers, space: Space) -> None:
+        """Move everything rigidly, what a second look works on besides: that is dropped."""
+        values, graph = self.solver.values, self.graph
+        for kind in (space.pose, space.point):
+            if kind not in graph.kinds:
+                continue
+            of_kind = graph.kind.values == graph.kinds.index(kind)
+            at = graph.offset.values[of_kind][:, None] + np.arange(kind.size)
+            move = space.group.compose if kind is space.pose else space.group.act
+            values[at] = np.stack(move(T_new_old, tuple(values[at].T)), axis=-1)
+        self.solver.start_at(values)
+        self._background.cancel(self.ledger.outside_count)
 
     def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
         """Take edges out for good."""

@@ -201,6 +201,12 @@ def fix(space: Space, m: Fix, where: Where, T_map_keyframe: Numbers) -> Carried:
     return Carried((m.measured[0] + float(yaw),), own + where.covariance[-1:, -1:])
 
 
+def axes_unknown(covariance: Array) -> NDArray[np.bool_]:
+    """Which axes (n,) a position (n, n) says nothing of."""
+    unknown: NDArray[np.bool_] = np.diag(covariance) >= 0.5 * _UNKNOWN_M2
+    return unknown
+
+
 def axes_known(covariance: Array) -> list[tuple[Array, float]]:
     """Directions (n,) in which a position was measured, and their variances, where some axis was not; else none."""
     if np.diag(covariance).max() < _UNKNOWN_M2:

@@ -33,6 +33,8 @@ from graph_slam_ros.slam.space import PLANE, SPACE, Numbers, Space
 from graph_slam_ros.slam.survey import Surveyed, surveyed
 from graph_slam_ros.solver import METHODS, Settings
 
+_LEAST_SIGMA = 1e-6  # of an anchor: nothing is certain
+
 
 @dataclass(frozen=True, slots=True)
 class FramesConfig:
@@ -203,15 +205,31 @@ class LandmarksConfig:
 
 @dataclass(frozen=True, slots=True)
 class AnchorConfig:
-    """The prior on the first keyframe, which fixes the gauge: map begins where odom begins, or where it is said to."""
+    """The prior on the first keyframe, which fixes the gauge: map begins where odom begins, or where it is said to.
+
+    While its sigmas are 0, it gives way to the first fix or surveyed landmark: the map is laid onto that.
+    """
 
     pose: str = setting(
         "",
         "where the robot starts in the map: x y yaw, or in space x y z roll pitch yaw; empty: where odometry begins",
         "m, rad",
     )
-    sigma_m: float = setting(1e-3, "standard deviation of its position", "m", low=1e-6)
-    sigma_rad: float = setting(1e-3, "standard deviation of its heading", "rad", low=1e-6)
+    sigma_m: float = setting(
+        0.0,
+        "standard deviation of its position; 0: 1 mm until a fix or a surveyed landmark tells where the map lies, then"
+        " 1 km, or initialpose.sigma_m of a pose that is given",
+        "m",
+        low=0.0,
+    )
+    sigma_rad: float = setting(
+        0.0, "standard deviation of its heading; 0: 1 mrad, then 3 rad, or initialpose.sigma_rad", "rad", low=0.0
+    )
+
+    def __post_init__(self) -> None:
+        for name, sigma in (("sigma_m", self.sigma_m), ("sigma_rad", self.sigma_rad)):
+            if 0.0 < sigma < _LEAST_SIGMA:
+                raise ConfigError(f"anchor.{name}: {sigma:g} is not 0 or in [{_LEAST_SIGMA:g}, 1e+09]")
 
 
 @dataclass(frozen=True, slots=True)

@@ -165,6 +165,8 @@ class Decisions:
                 self._solver.set_weight(edge, 0.0)
                 self._withdrawn[edge] = reason
             elif self.ledger.reason.values[edge] not in FINAL:
+                if self.ledger.verdict.values[edge] == Verdict.NOT_EVALUATED:
+                    self._solver.set_weight(edge, 0.0)
                 self._reject(edge, keyframe, reason, float(self.ledger.statistic.values[edge]))
 
     def follow(self, other: Ledger, keyframe: int) -> bool:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.errors import DivergedError, GraphSlamError
 from graph_slam_ros.slam import carry
+from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import Beside, when_asked
 from graph_slam_ros.slam.carry import Where
@@ -133,6 +134,7 @@ class GraphSlam:
         self.keyframes, self.segments = self._trail.keyframes, self._trail.segments
         self.drives = self._trail.drives  # the first keyframe of each; the last drive is the present one
         self._reach = Reach(self.space, self.config.sources)
+        self._anchor = Anchor(self.config, self.backend)
         self._edges = PoseEdges(self.space, self.graph, self.counters)
         self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
         self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over)
@@ -330,6 +332,7 @@ class GraphSlam:
             self._odometry.go_on(self.keyframes[-1].stamp_ns, self.keyframes[-1].T_odom_base, start.continues_with)
         for pose in start.sighting_poses:
             self.sighting_poses.append(pose.keyframe, pose.stamp_ns, pose.T_keyframe_base)
+        self._anchor.take_up()
         self._landmarks.take_up(start.landmarks, start.range_offsets)
         self._unnamed.take_up()
         self.report = self.backend.take_up(start.vertices, start.values)
@@ -380,8 +383,7 @@ class GraphSlam:
         """Map begins where odom begins, or the robot where it is said to: there the first pose is anchored."""
         T_map_base = self.config.start_pose or step.T_odom_base
         vertex = self.graph.add_vertex(self.space.pose, T_map_base)
-        anchor = self.config.anchor
-        self._covariance = self._edges.anchor(vertex, T_map_base, anchor.sigma_m, anchor.sigma_rad)
+        self._covariance = self._anchor.begin(vertex, T_map_base)
         self.segments.append(0)
         self._trail.append(vertex, step, self.config.ordering.late_s)
         self._solved_T_map_odom = self.T_map_odom
@@ -487,12 +489,30 @@ class GraphSlam:
                 self.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
                 m = replace(m, sightings=tuple(off_the_pole(self.space, s) for s in m.sightings))
                 for name, sighting in self._identified(m, where):
+                    self._lay_onto_survey(m.topic, name, sighting, where)
                     self._landmarks.add(m.topic, name, sighting, where)
             case Fix():
+                self._lay_onto_fix(m, where)
                 self._edges.fix(m, where, self._pose(where.vertex))
             case Closure():
                 self._add_closure(m, where)
         self._solve_if_due()
+
+    def _lay_onto_fix(self, m: Fix, where: Where) -> None:
+        """The first fix of its kind tells where the map lies."""
+        T_map_base = self.space.group.compose(self._pose(where.vertex), where.T_keyframe_base)
+        if self._anchor.give_way_to_fix(m, T_map_base, len(self.keyframes) - 1):
+            self._note_moved(m.topic)
+
+    def _lay_onto_survey(self, topic: str, name: str, s: Sighting, where: Where) -> None:
+        """The first sighting of a surveyed landmark does."""
+        found = self._landmarks.survey_of(name, s, where)
+        if found is not None and self._anchor.give_way_to_landmark(*found, len(self.keyframes) - 1):
+            self._note_moved(topic)
+
+    def _note_moved(self, topic: str) -> None:
+        self.counters.count(topic, "map_moved")
+        self._safeguard.note_moved()
 
     def _deserves_keyframe(self, m: Observation, where: Where, newest: Motion) -> bool:
         """Where the motion since the keyframe would be too much of the noise of what was measured."""

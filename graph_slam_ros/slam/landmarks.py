@@ -22,6 +22,7 @@ from graph_slam_ros.solver import Solver
 Array = NDArray[np.float64]
 
 LABEL = "landmarks"
+_SOMEWHERE_M = 3.0  # away, of what was seen by its bearing alone
 _MOST_WAITING = 60  # sightings of one landmark: every other is forgotten beyond
 
 
@@ -113,6 +114,19 @@ class Landmarks:
             self._begin(topic, name, s, where, self._survey[name].position)
         else:
             self._wait(topic, name, s, where)
+
+    def survey_of(self, name: str, s: Sighting, where: Where) -> tuple[Surveyed, Array] | None:
+        """The survey of a landmark that was not seen before, and where (n,) a sighting puts it, or may put it."""
+        if name not in self._survey or name in self.known:
+            return None
+        if s.kind in ("pose", "position"):
+            return self._survey[name], np.array(self._in_map(where, carry.position(self._space, s, where).measured))
+        measured = s.measured
+        if s.kind == "bearing":
+            measured = (_SOMEWHERE_M, *measured)
+        elif s.kind == "range":
+            measured = (*measured, *[0.0] * (self._space.dimensions - 1))
+        return self._survey[name], self._from_sensor(s, where, carry.point_of(self._space, measured))
 
     def take_up(self, known: dict[str, Landmark], offsets: dict[str, int]) -> None:
         """Go on with these, whose vertices and edges are in the graph."""

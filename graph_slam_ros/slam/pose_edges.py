@@ -1,4 +1,4 @@
-"""What is measured of poses, as edges of the graph: odometry, fixes, loop closures, and where the map begins."""
+"""What is measured of poses, as edges of the graph: odometry, fixes and loop closures."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,6 @@ class PoseEdges:
 
     def __init__(self, space: Space, graph: Graph, counters: Counters) -> None:
         self._space, self._graph, self._counters = space, graph, counters
-
-    def anchor(self, vertex: int, T_map_base: Numbers, sigma_m: float, sigma_rad: float) -> Array:
-        """Hold a pose where the map begins; returns its covariance."""
-        sigmas = self._space.sigmas(sigma_m, sigma_rad)
-        self._graph.add_edge(self._space.pose_prior, [vertex], T_map_base, Gaussian.from_sigmas(*sigmas), "anchor")
-        return np.diag(np.square(sigmas))
 
     def odometry(self, vertices: list[int], T_last_now: Numbers, covariance: Array, source: str) -> None:
         """The motion from one keyframe to the next."""

@@ -4,6 +4,7 @@
 all explain a reason by its row here.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -181,6 +182,16 @@ REASONS: dict[str, Reason] = {
     "not_on_earth": Reason(_REFUSED, "latitude or longitude is out of range", "degrees, not radians or 1e-7 degrees"),
     "far_from_datum": Reason(_REFUSED, "the fix is more than 100 km from the map's origin", "INPUT.datum"),
     "other_datum": Reason(_REFUSED, "the fix counts from another origin than the map", "the same INPUT.datum for all"),
+    "mount_unknown": Reason(
+        _REPAIRED,
+        "no transform tells where the antenna is on the robot: it is taken to be at the base",
+        '--set INPUT.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there',
+    ),
+    "map_moved": Reason(
+        _NOTED,
+        "the first to measure where the map lies, a fix or a surveyed landmark: the map was laid onto it",
+        "anchor.sigma_m and anchor.sigma_rad hold the map where it begins",
+    ),
     "no_altitude": Reason(_REPAIRED, "the fix has no altitude: it counts in the horizontal only"),
     "no_orientation": Reason(_REFUSED, "the IMU says that it has no orientation", "an IMU with a filter, or no input"),
     "not_in_this_space": Reason(_REFUSED, "such a fix does not exist in this many dimensions", "world.dimensions"),
@@ -215,6 +226,16 @@ REASONS: dict[str, Reason] = {
 def explain(reason: str) -> Reason:
     """The row of a reason; exceptions are counted by their type and share one."""
     return REASONS.get(reason, REASONS["fault"])
+
+
+def warnings(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """What was repaired and can be mended, of counts by source and reason: a line each."""
+    return [
+        f"{source}: {times} times, {explain(reason).meaning}; mend it by {remedy(source, reason)}"
+        for source, by_reason in counts.items()
+        for reason, times in by_reason.items()
+        if explain(reason).effect is Effect.REPAIRED and remedy(source, reason)
+    ]
 
 
 def remedy(source: str, reason: str) -> str:

@@ -69,6 +69,10 @@ class Safeguard:
         self._good, self._good_vertices = self._solver.values, self._graph.vertex_count
         self._good_edges, self._in_a_row, self.failing = self._graph.edge_count, 0, ""
 
+    def note_moved(self) -> None:
+        """The map was moved rigidly: so is the estimate to come back to."""
+        self._good = self._solver.values[: len(self._good)]
+
     def go_back(self) -> None:
         """Have the last good estimate, in a solver that is made anew."""
         self._solver.start_at(self._last_good())

@@ -92,7 +92,7 @@ def gnss(source: Source, m: Any) -> Iterator[Fix]:
         source.count("no_altitude")
         covariance[2, :] = covariance[:, 2] = 0.0
         covariance[2, 2] = _NOT_KNOWN_M2
-    arm = tuple(map(float, se3.position(source.T_base(source.frame(m.header.frame_id), stamp_ns))))[:n]
+    arm = tuple(map(float, source.mount_position(m.header.frame_id, stamp_ns)))[:n]
     block = source.checked(covariance[:n, :n], n)
     here = m.latitude, m.longitude, m.altitude if has_altitude else 0.0
     source.origin.datum = source.origin.datum or here

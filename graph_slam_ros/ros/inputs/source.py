@@ -111,10 +111,27 @@ class Source:
             return found
         if self._mount is not None and not self.transforms.knows(frame):
             return self._mount
-        now_ns = self.transforms.now_ns
-        if self.hurried or (now_ns is not None and now_ns > stamp_ns + self._wait_ns):
+        if not self._may_come(stamp_ns):
             raise self._not_linked("frame_unknown", frame, self.config.frames.base)
         raise NotYet
+
+    def mount_position(self, name: str, stamp_ns: int) -> tuple[float, float, float]:
+        """Where the sensor of a message was on the robot; the base, which is counted, where nobody tells of its frame.
+
+        Raises NotYet as ``T_base`` does.
+        """
+        if name or self.settings.frame or self._mount is not None:
+            frame = self.frame(name)
+            is_known = frame == self.config.frames.base or self._mount is not None or self.transforms.knows(frame)
+            if is_known or self._may_come(stamp_ns):
+                return se3.position(self.T_base(frame, stamp_ns))
+        self.count("mount_unknown")
+        return 0.0, 0.0, 0.0
+
+    def _may_come(self, stamp_ns: int) -> bool:
+        """Whether /tf may still tell of a stamp."""
+        now_ns = self.transforms.now_ns
+        return not (self.hurried or (now_ns is not None and now_ns > stamp_ns + self._wait_ns))
 
     def T_base_child(self, child: str) -> se3.Pose:
         """Where a frame always is on the robot; an empty one is where it is configured to be, or the base."""

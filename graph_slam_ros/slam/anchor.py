@@ -1,0 +1,163 @@
+"""Where the map begins: a prior on the first keyframe, which gives way to what measures where the map lies.
+
+A fix or a surveyed landmark has its own frame. The first one moves the whole map rigidly onto itself, and from then on
+the prior is loose in every direction that such a measurement determines. Parameters that are set are never loosened.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.carry import axes_unknown, square
+from graph_slam_ros.slam.config import Config
+from graph_slam_ros.slam.measurements import Fix
+from graph_slam_ros.slam.space import Numbers, Space
+from graph_slam_ros.slam.survey import Surveyed
+
+Array = NDArray[np.float64]
+
+_TIGHT = 1e-3  # m, rad: the map begins where odometry begins, which is as good as any other place
+_LOOSE_M, _LOOSE_RAD = 1e3, 3.0
+_TILT_RAD = 0.3  # of odometry in space, whose z axis points up; positions do not tell it before the robot has moved
+
+
+class Anchor:
+    """The prior on the first keyframe.
+
+    Parameters
+    ----------
+    backend : its graph gets the prior
+    """
+
+    def __init__(self, config: Config, backend: Backend) -> None:
+        self._config, self._space = config, config.space
+        self._backend, self._graph = backend, backend.graph
+        self._edge = self._vertex = -1
+        self._sigmas = np.full(self._space.dof, np.inf)  # along and about the axes of map; infinite: there is none
+
+    def begin(self, vertex: int, T_map_base: Numbers) -> Array:
+        """Hold the first keyframe; returns its covariance (dof, dof)."""
+        given = self._config.anchor
+        self._sigmas = np.array(self._space.sigmas(given.sigma_m or _TIGHT, given.sigma_rad or _TIGHT))
+        self._add(vertex, T_map_base, Gaussian.from_sigmas(*self._sigmas))
+        return np.diag(np.square(self._sigmas))
+
+    def take_up(self) -> None:
+        """Go on with the prior of a map that was loaded, if it can still be loosened."""
+        for edge in self._graph.edges_of("anchor").tolist():
+            table, row = self._graph.row(edge)
+            vertex = int(table.vertices.values[row][0])
+            if vertex >= self._backend.frozen and not self._backend.ledger.is_withdrawn(edge):
+                root = table.sqrt_information.values[row]
+                at = tuple(table.measured.values[row].tolist())
+                covariance = self._space.in_parent_axes(at, np.linalg.inv(root.T @ root))
+                self._edge, self._vertex, self._sigmas = edge, vertex, np.sqrt(np.diag(covariance))
+
+    def give_way_to_fix(self, m: Fix, T_map_base: Numbers, keyframe: int) -> bool:
+        """Loosen the prior for a fix, if that says more than was known; returns whether the map has moved.
+
+        Parameters
+        ----------
+        T_map_base : where the robot is thought to be at the fix's stamp
+        keyframe : the newest
+        """
+        looser = self._looser(self._told_by(m))
+        return looser is not None and self._move(self._onto_fix(m, T_map_base), looser, keyframe)
+
+    def give_way_to_landmark(self, known: Surveyed, at: Array, keyframe: int) -> bool:
+        """As for a fix. ``at`` (n,) is where the landmark is thought to be."""
+        looser = self._looser(self._position())
+        return looser is not None and self._move(self._shifted(np.array(known.position) - at), looser, keyframe)
+
+    # -- how far ---------------------------------------------------------------------------------------------------
+
+    def _looser(self, wanted: Array) -> Array | None:
+        """Sigmas (dof,) with all that is wanted; None where nothing changes."""
+        given, n = self._config.anchor, self._space.dimensions
+        if self._config.start_pose is not None:  # somebody has said roughly where the robot starts
+            roughly = self._config.initialpose
+            wanted = np.minimum(wanted, self._space.sigmas(roughly.sigma_m, roughly.sigma_rad))
+        wanted = np.where([bool(given.sigma_m)] * n + [bool(given.sigma_rad)] * (len(wanted) - n), 0.0, wanted)
+        return np.maximum(self._sigmas, wanted) if (wanted > self._sigmas).any() else None
+
+    def _position(self) -> Array:
+        """What positions determine."""
+        n, angles = self._space.dimensions, self._space.dof - self._space.dimensions
+        return np.array([_LOOSE_M] * n + [_TILT_RAD] * (angles - 1) + [_LOOSE_RAD])
+
+    def _told_by(self, m: Fix) -> Array:
+        """What a fix determines, by its kind: sigmas (dof,), zero where it says nothing."""
+        space, n = self._space, self._space.dimensions
+        out = self._position()
+        match m.kind:
+            case "pose":
+                out[n:] = _LOOSE_RAD
+            case "attitude":
+                out[:n], out[n:] = 0.0, _LOOSE_RAD
+            case "heading":
+                out[:-1] = 0.0
+            case _:
+                unknown = axes_unknown(square(m.covariance))
+                out[:n][unknown] = 0.0
+                out[n:] *= not unknown[:2].any()
+                out[n:-1] *= not unknown.any()
+        return out if m.kind in space.fixes else np.zeros(space.dof)
+
+    # -- the map moves ---------------------------------------------------------------------------------------------
+
+    def _onto_fix(self, m: Fix, T_map_base: Numbers) -> Numbers:
+        """``T_new_old`` of a map that agrees with the fix, as far as that says anything."""
+        space, group, n = self._space, self._space.group, self._space.dimensions
+        if m.kind == "pose":
+            return _floats(group.compose(m.measured, group.inverse(T_map_base)))
+        if m.kind == "position":
+            there = np.array(group.act(T_map_base, m.point or (0.0,) * n))
+            shift = np.array(m.measured) - there
+            shift[axes_unknown(square(m.covariance))] = 0.0
+            return self._shifted(shift)
+        if m.kind == "attitude":
+            turn = group.compose(
+                (*space.identity[:n], *m.measured), group.inverse((*space.identity[:n], *T_map_base[n:]))
+            )
+            return self._turned(turn)
+        return self._turned(_about_z(space, m.measured[0] - space.heading(T_map_base)))
+
+    def _shifted(self, shift: Array) -> Numbers:
+        return (*map(float, shift), *self._space.identity[self._space.dimensions :])
+
+    def _turned(self, turn: Numbers) -> Numbers:
+        """About where the map begins."""
+        n = self._space.dimensions
+        at = self._backend.solver.estimate([self._vertex])[0, :n]
+        there = np.array(self._space.group.act(turn, tuple(at.tolist())))
+        return (*map(float, at - there), *turn[n:])
+
+    def _move(self, T_new_old: Numbers, sigmas: Array, keyframe: int) -> bool:
+        """Move the map, unless somebody has said where it begins, and put a looser prior in the place of the old."""
+        moves = self._config.start_pose is None
+        if moves:
+            self._backend.move(T_new_old, self._space)
+        self._backend.hand_over()
+        self._backend.withdraw([self._edge], keyframe)
+        self._sigmas = sigmas
+        table, row = self._graph.row(self._edge)
+        begins = self._backend.solver.estimate([self._vertex])[0] if moves else table.measured.values[row]
+        at = tuple(begins.tolist())
+        covariance = self._space.in_tangent(at, np.diag(np.square(sigmas)))
+        self._add(self._vertex, at, Gaussian.from_covariance(covariance))
+        return moves
+
+    def _add(self, vertex: int, T_map_base: Numbers, noise: Gaussian) -> None:
+        self._vertex = vertex
+        self._edge = self._graph.add_edge(self._space.pose_prior, [vertex], T_map_base, noise, "anchor")
+
+
+def _about_z(space: Space, angle: float) -> Numbers:
+    if space.dimensions == 2:
+        return 0.0, 0.0, angle
+    return 0.0, 0.0, 0.0, 0.0, 0.0, float(np.sin(0.5 * angle)), float(np.cos(0.5 * angle))
+
+
+def _floats(numbers: tuple[float, ...]) -> Numbers:
+    return tuple(map(float, numbers))
