@@ -87,9 +87,12 @@ def test_three_surveyed_tags_hold_the_whole_map_and_the_others_follow():
     assert np.sqrt(of_surveyed[0, 0]) < SIGMA_M * 1.01
 
 
-def test_without_a_start_pose_a_loose_anchor_turns_into_the_plan_by_what_is_seen():
-    recording = simulate("warehouse", 4, **SMALL)
-    slam = driven(recording, landmarks__surveyed=plan_of(recording), anchor__sigma_m=1e3, anchor__sigma_rad=3.0)
+@pytest.mark.parametrize("anchor", [{}, {"anchor__sigma_m": 1e3, "anchor__sigma_rad": 3.0}], ids=["usual", "loose"])
+@pytest.mark.parametrize("sensor", ["pose", "position", "range_bearing"])
+def test_without_a_start_pose_the_map_turns_into_the_plan_by_what_is_seen(anchor, sensor):
+    recording = simulate("warehouse", 4, **SMALL, sensor=sensor)
+    slam = driven(recording, landmarks__surveyed=plan_of(recording), **anchor)
+    assert slam.ledger.outside_count == 0, "true sightings are not refused"
     metres, radians = errors(slam, recording)
     assert metres.max() < 0.15
     assert radians.max() < 0.03

@@ -89,6 +89,10 @@ class OdometryConfig:
         low=0.0,
     )
     still_rad_s: float = setting(1e-3, "see still_m_s", "rad/s", low=0.0)
+    still_m: float = setting(
+        5e-3, "a robot that stands may jitter by this: no noise is added, and no keyframe made", "m", low=0.0
+    )
+    still_rad: float = setting(0.01, "and by this", "rad", low=0.0, high=math.pi)
     timeout_s: float = setting(
         0.5,
         "an odometry that is silent for longer, in stamp time, gives way to the next of inputs.names",
@@ -118,6 +122,13 @@ class KeyframesConfig:
         "or at what is seen, where the motion since the last keyframe would add more than this to its variance, and the"
         " same to all that is seen at once",
         "part of variance",
+        low=0.0,
+        live=True,
+    )
+    min_interval_s: float = setting(
+        0.1,
+        "but what is seen sooner after a keyframe makes none: it is carried to that keyframe",
+        "s",
         low=0.0,
         live=True,
     )

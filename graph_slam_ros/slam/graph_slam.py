@@ -39,6 +39,7 @@ from graph_slam_ros.slam.reach import Reach, off_the_pole
 from graph_slam_ros.slam.safeguard import Safeguard
 from graph_slam_ros.slam.space import Numbers
 from graph_slam_ros.slam.stamp_order import StampOrder
+from graph_slam_ros.slam.thinning import Thinning
 from graph_slam_ros.slam.track import Track
 from graph_slam_ros.slam.trail import SightingPose, Trail
 from graph_slam_ros.slam.unnamed import Unnamed
@@ -134,6 +135,7 @@ class GraphSlam:
         self.keyframes, self.segments = self._trail.keyframes, self._trail.segments
         self.drives = self._trail.drives  # the first keyframe of each; the last drive is the present one
         self._reach = Reach(self.space, self.config.sources)
+        self._thinning = Thinning(self.config)
         self._anchor = Anchor(self.config, self.backend)
         self._edges = PoseEdges(self.space, self.graph, self.counters)
         self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
@@ -376,8 +378,7 @@ class GraphSlam:
         due, n = self.config.keyframes, self.space.dimensions
         at = motion.now.T_keyframe_base
         far = sum(x * x for x in at[:n]) >= due.min_distance_m**2 or self.space.angle(at) >= due.min_angle_rad
-        moving_s = motion.moving_ns / 1e9
-        return far or motion.is_long or (moving_s >= due.max_interval_s and not self._noise.stands(at, moving_s))
+        return far or motion.is_long or (motion.moving_ns >= due.max_interval_s * 1e9 and not self._noise.is_jitter(at))
 
     def _first_keyframe(self, step: Step) -> None:
         """Map begins where odom begins, or the robot where it is said to: there the first pose is anchored."""
@@ -439,6 +440,7 @@ class GraphSlam:
         self._order.forget()
         self._odometry.forget()
         self._trail.forget_time()
+        self._thinning.forget_time()
 
     # -- observations --------------------------------------------------------------------------------------------
 
@@ -480,6 +482,11 @@ class GraphSlam:
             self._observe_within_reach(within)
 
     def _observe_within_reach(self, m: Observation) -> None:
+        used = self._thinned(m)
+        if used is None:
+            self._count(m, "thinned")
+            return
+        m = used
         where = self._trail.where(m.stamp_ns)
         motion = self._trail.motion
         if motion is not None and self._deserves_keyframe(m, where, motion):
@@ -497,6 +504,12 @@ class GraphSlam:
             case Closure():
                 self._add_closure(m, where)
         self._solve_if_due()
+
+    def _thinned(self, m: Observation) -> Observation | None:
+        """As it is to be used; None where that before it says the same."""
+        if isinstance(m, Sightings):
+            return None if self._thinning.is_same_look(m, self._trail.rests) else m
+        return self._thinning.thinned(m) if isinstance(m, Fix) else m
 
     def _lay_onto_fix(self, m: Fix, where: Where) -> None:
         """The first fix of its kind tells where the map lies."""
@@ -518,6 +531,9 @@ class GraphSlam:
         """Where the motion since the keyframe would be too much of the noise of what was measured."""
         if where.keyframe != newest.keyframe or not newest.before_last_ns < where.stamp_ns:
             return False
+        is_soon = where.stamp_ns - newest.start_ns < self.config.keyframes.min_interval_s * 1e9
+        if is_soon or self._noise.is_jitter(where.T_keyframe_base):
+            return False
         most, added_sigma_m = self.config.keyframes.shared_noise, self.config.landmarks.added_sigma_m
         return carry.is_shared(self.space, m, where, most, added_sigma_m)
 
@@ -525,12 +541,13 @@ class GraphSlam:
         """A keyframe at a stamp within the last step of odometry, which is cut in two."""
         group, size = self.space.group, self.space.dof
         T_odom_base = group.compose(self.keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
+        stood = motion.now.stands
         rest = motion.cut(where.stamp_ns)
         step = Step(where.stamp_ns, self.space.identity, T_odom_base)
         self._add_keyframe(step, motion.now.T_keyframe_base, where.covariance)
         begun = self._trail.motion
         if rest is not None and begun is not None:
-            begun.step(rest)
+            begun.go_on_after_cut(rest, stood)
         vertex = self.keyframes[-1].vertex
         return Where(len(self.keyframes) - 1, vertex, where.stamp_ns, self.space.identity, np.zeros((size, size)))
 

@@ -38,6 +38,13 @@ class InputConfig:
     )
     sigma_per_m: float = setting(0.0, "added to sigma_m for each metre of distance", "m/m", low=0.0)
     sigma_rad: float = setting(0.0, "noise of an orientation or bearing; 0: unknown", "rad", low=0.0, high=math.pi)
+    correlation_s: float = setting(
+        1.0,
+        "how long an error of its fixes lasts (1/e): of what comes faster one is used each twice this long, or each"
+        " keyframes.max_interval_s with a larger noise; 0: errors are independent, all are used",
+        "s",
+        low=0.0,
+    )
     offset_s: float = setting(
         0.0,
         "added to the stamps of its messages: how far its clock is behind",

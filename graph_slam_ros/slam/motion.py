@@ -14,7 +14,6 @@ Array = NDArray[np.float64]
 
 _REST_NS = 10**9  # for so long a robot must have stood before what its odometry jitters is no motion
 _MOST = 10_000  # odometry messages that one motion remembers
-_JITTER = 3  # such motion may be so many times as fast as a robot that stands: it leads nowhere
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +55,11 @@ class OdometryNoise:
         turn = 2.0 * (step[3] ** 2 + step[4] ** 2 + step[5] ** 2) ** 0.5  # of a small rotation
         return step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < slow_m**2 and turn < slow_rad
 
+    def is_jitter(self, moved: Numbers) -> bool:
+        """Whether a motion is so small that it may be odometry's jitter, however long it took."""
+        c, n = self._config, self._space.dimensions
+        return bool(sum(x * x for x in moved[:n]) < c.still_m**2 and self._space.angle(moved) < c.still_rad)
+
     def of(self, dt: float, twist_covariance: Numbers | None) -> Array:
         """Covariance (dof, dof) of the velocities' integral over dt seconds."""
         if self._config.noise == "twist" and twist_covariance is not None:
@@ -68,17 +72,54 @@ class OdometryNoise:
         return self._square
 
 
+class Rest:
+    """Whether the robot stands: motion that is slow, or that leads nowhere."""
+
+    __slots__ = ("_T_odom_base", "_noise", "_since_ns", "_space", "is_on")
+
+    def __init__(self, noise: OdometryNoise, space: Space) -> None:
+        self._noise, self._space = noise, space
+        self._T_odom_base: Numbers | None = None  # where it has been since, but for jitter
+        self._since_ns = 0
+        self.is_on = False
+
+    def take(self, step: Step, dt: float) -> bool:
+        """Whether the robot stood during a step of dt seconds."""
+        stands = self._noise.stands(step.T_last_base, dt)
+        if self._T_odom_base is None or step.broken:
+            self._begin(step)
+            return stands and not step.broken
+        moved = self._space.group.between(self._T_odom_base, step.T_odom_base)
+        elapsed_ns, is_jitter = step.stamp_ns - self._since_ns, self._noise.is_jitter(moved)
+        if self.is_on:
+            stands = stands or is_jitter
+            if not stands:
+                self._begin(step)
+        elif elapsed_ns >= _REST_NS:
+            self.is_on = self._noise.stands(moved, elapsed_ns * 1e-9)
+            if not (self.is_on or is_jitter):  # else it may be either: time will tell
+                self._begin(step)
+        return stands
+
+    def _begin(self, step: Step) -> None:
+        self._T_odom_base, self._since_ns, self.is_on = step.T_odom_base, step.stamp_ns, False
+
+
 class Motion:
-    """The motion since a keyframe, remembered odometry by odometry."""
+    """The motion since a keyframe, remembered odometry by odometry.
 
-    __slots__ = ("_moved", "_noise", "_rest", "_rests", "_space", "keyframe", "moving_ns")
+    Parameters
+    ----------
+    rest : of the robot, which outlasts keyframes
+    """
 
-    def __init__(self, noise: OdometryNoise, space: Space, keyframe: int, start_ns: int) -> None:
+    __slots__ = ("_moved", "_noise", "_rest", "_space", "keyframe", "moving_ns")
+
+    def __init__(self, noise: OdometryNoise, space: Space, keyframe: int, start_ns: int, rest: Rest) -> None:
         self.keyframe = keyframe
         self.moving_ns = 0  # whole numbers: a sum of seconds would round
-        self._noise, self._space = noise, space
+        self._noise, self._space, self._rest = noise, space, rest
         self._moved = [Moved(start_ns, space.identity, np.zeros((space.dof, space.dof)))]
-        self._rest, self._rests = self._moved[0], False  # where it was a second ago, or stands since
 
     @property
     def now(self) -> Moved:
@@ -92,17 +133,19 @@ class Motion:
 
     def step(self, step: Step) -> None:
         """Go on by one step of odometry."""
-        before, moved = self.now, self._after(step)
+        self._go_on(step, self._rest.take(step, (step.stamp_ns - self.now.stamp_ns) * 1e-9))
+
+    def go_on_after_cut(self, rest: Step, stood: bool) -> None:
+        """Go on by what ``cut`` has left over of the motion before, in which the robot stood or not."""
+        self._go_on(rest, stood)
+
+    def _go_on(self, step: Step, stands: bool) -> None:
+        before, moved = self.now, self._after(step, stands)
         self.moving_ns += (moved.stamp_ns - before.stamp_ns) * (not moved.stands)
         if before.stands and moved.stands:  # of a robot that stands for hours, only the last is remembered
             self._moved[-1] = moved
         else:
             self._moved.append(moved)
-        self._look_whether_it_rests()
-
-    def after(self, step: Step) -> Moved:
-        """Where one more step of odometry would lead; it is not taken."""
-        return self._after(step)
 
     def at(self, stamp_ns: int) -> Moved:
         """At a stamp from the keyframe's to the newest odometry's, between two odometry messages by interpolation."""
@@ -136,10 +179,8 @@ class Motion:
         """Stamp of the last odometry but one, or of the keyframe."""
         return self._moved[-2].stamp_ns if len(self._moved) > 1 else self.start_ns
 
-    def _after(self, step: Step) -> Moved:
+    def _after(self, step: Step, stands: bool) -> Moved:
         to = self._space.group.compose(self.now.T_keyframe_base, step.T_last_base)
-        stands = self._noise.stands(step.T_last_base, (step.stamp_ns - self.now.stamp_ns) * 1e-9)
-        stands = stands or (self._rests and self._is_near_rest(to, _JITTER * _REST_NS))
         return self._extended(self.now, step.stamp_ns, to, step.T_last_base, step.twist_covariance, stands)
 
     def _extended(
@@ -149,17 +190,6 @@ class Motion:
         noise = self._noise.of(moving_ns * 1e-9, twist_covariance)
         covariance = self._space.group.propagate_during(a.covariance, T_a_b, noise)
         return Moved(stamp_ns, to, covariance, twist_covariance, stands)
-
-    def _look_whether_it_rests(self) -> None:
-        elapsed_ns = self.now.stamp_ns - self._rest.stamp_ns
-        left = self._rests and not self.now.stands
-        if left or (not self._rests and elapsed_ns >= _REST_NS):
-            self._rests = not left and self._is_near_rest(self.now.T_keyframe_base, elapsed_ns)
-            self._rest = self.now
-
-    def _is_near_rest(self, at: Numbers, elapsed_ns: int) -> bool:
-        """By what came of it, not step by step: jitter of 0.2 mm at 10 Hz is faster than a millimetre a second."""
-        return self._noise.stands(self._space.group.between(self._rest.T_keyframe_base, at), elapsed_ns * 1e-9)
 
 
 def _stamp(moved: Moved) -> int:

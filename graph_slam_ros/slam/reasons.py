@@ -182,6 +182,11 @@ REASONS: dict[str, Reason] = {
     "not_on_earth": Reason(_REFUSED, "latitude or longitude is out of range", "degrees, not radians or 1e-7 degrees"),
     "far_from_datum": Reason(_REFUSED, "the fix is more than 100 km from the map's origin", "INPUT.datum"),
     "other_datum": Reason(_REFUSED, "the fix counts from another origin than the map", "the same INPUT.datum for all"),
+    "thinned": Reason(
+        _NOTED,
+        "it came so soon after the last, of a fix or of what a resting robot sees, that both have the same error",
+        "INPUT.correlation_s of fixes; keyframes.max_interval_s",
+    ),
     "mount_unknown": Reason(
         _REPAIRED,
         "no transform tells where the antenna is on the robot: it is taken to be at the base",

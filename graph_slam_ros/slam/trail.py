@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graph_slam_ros.slam.carry import Where
-from graph_slam_ros.slam.motion import Motion, OdometryNoise
+from graph_slam_ros.slam.motion import Motion, OdometryNoise, Rest
 from graph_slam_ros.slam.odometry_choice import Step
 from graph_slam_ros.slam.space import Numbers, Space
 from graph_slam_ros.slam.track import Track
@@ -47,12 +47,18 @@ class Trail:
         self._is_new_drive = True
         self._noise, self._space = noise, space
         self._motions: deque[Motion] = deque()
+        self._rest = Rest(noise, space)
         self._epoch = 0  # the first keyframe since stamps began anew
 
     @property
     def motion(self) -> Motion | None:
         """Since the newest keyframe; none where stamps have begun anew since."""
         return self._motions[-1] if self._motions else None
+
+    @property
+    def rests(self) -> bool:
+        """Whether the robot has stood for a second or more."""
+        return self._rest.is_on
 
     @property
     def oldest_ns(self) -> int:
@@ -70,7 +76,8 @@ class Trail:
             self.drives.append(len(self.keyframes))
             self._is_new_drive = False
         self.keyframes.append(vertex, step.stamp_ns, step.T_odom_base)
-        self._motions.append(Motion(self._noise, self._space, len(self.keyframes) - 1, step.stamp_ns))
+        keyframe = len(self.keyframes) - 1
+        self._motions.append(Motion(self._noise, self._space, keyframe, step.stamp_ns, self._rest))
         oldest_ns = step.stamp_ns - round(late_s * 1e9)
         while len(self._motions) > 2 and self._motions[1].start_ns <= oldest_ns:
             self._motions.popleft()
@@ -89,11 +96,12 @@ class Trail:
         backwards = np.flatnonzero(np.diff(self.keyframes.stamps_ns) < 0)
         self._epoch = max(self.drives[-1], int(backwards[-1]) + 1 if len(backwards) else 0)
         self._is_new_drive = False
-        self._motions.append(Motion(self._noise, self._space, last, self.keyframes[last].stamp_ns))
+        self._motions.append(Motion(self._noise, self._space, last, self.keyframes[last].stamp_ns, self._rest))
 
     def forget_time(self) -> None:
         """Stamps begin anew: none before can be told from them."""
         self._motions.clear()
+        self._rest = Rest(self._noise, self._space)
         self._epoch = len(self.keyframes)
 
     def where(self, stamp_ns: int) -> Where:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from graph_slam_ros.ros.live.session import Estimate
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.measurements import Odometry
-from graph_slam_ros.slam.motion import Motion, OdometryNoise
+from graph_slam_ros.slam.motion import Motion, OdometryNoise, Rest
 from graph_slam_ros.slam.odometry_choice import Step
 from graph_slam_ros.slam.space import Numbers
 
@@ -51,7 +51,7 @@ class Reckoning:
         group = self._space.group
         if estimate is not self._estimate or self._motion is None:
             self._estimate, self._last = estimate, estimate.T_odom_keyframe
-            self._motion = Motion(self._noise, self._space, 0, estimate.stamp_ns)
+            self._motion = Motion(self._noise, self._space, 0, estimate.stamp_ns, Rest(self._noise, self._space))
             while len(self._since) > 1 and self._since[0].stamp_ns <= estimate.stamp_ns:
                 self._since.popleft()
         at_ns = self._motion.now.stamp_ns
