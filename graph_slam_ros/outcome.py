@@ -16,6 +16,9 @@ _MOST_REASONS, _MOST_WAITING = 5, 10  # that are listed
 _COLUMNS = ("received", "used", "believed")
 _OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does not move in a plane
 _MOSTLY = 0.5
+_CONTRADICT = (
+    "graph_slam explain RUN says why; if its noise is larger than told, --set {0}.noise=sigmas {0}.sigma_m=..."
+)
 
 
 def text(summary: Summary) -> list[str]:
@@ -75,6 +78,8 @@ def shortcomings(summary: Summary) -> Iterator[str]:
             yield _unused(summary, name, counts["received"])
         elif refused > _MOSTLY * (refused + counts["used"]):
             yield f"{name}: most of it was refused: {_because(name, counted)}"
+        elif not is_odometry and (counts["believed"] or 0) < _MOSTLY * counts["used"]:
+            yield f"{name}: only {counts['believed'] or 0} of {counts['used']} are believed: {_CONTRADICT.format(name)}"
         out_of_plane = summary["counters"].get(name, {}).get("out_of_plane", 0)
         if is_odometry and out_of_plane > _OUT_OF_PLANE * (counts["received"] or counts["used"]):
             yield f"{name} leaves the plane: these are three dimensions: --set world.dimensions=3"

@@ -240,6 +240,9 @@ class Suggestion:
             chosen: dict[str, Any] = {"sigma_rad": 0.02} if is_bearing and not has_sigma else {}
             if chosen:
                 self.notes.append(f"{one.topic.name} does not tell the noise of bearings: 0.02 rad is assumed")
+            if "range" in one.fields and "sigma" not in one.fields:
+                chosen["sigma_m"] = 0.5
+                self.notes.append(f"{one.topic.name} does not tell the noise of ranges: 0.5 m is assumed")
             if "id" not in one.fields:
                 self._join(one)
             self._add("ranges" if "range" in one.fields else "points", one, chosen)

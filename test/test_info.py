@@ -14,6 +14,7 @@ from recordings import definition, write_mcap
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.lie import se2
+from graph_slam_ros.outcome import shortcomings
 from graph_slam_ros.ros.bag import BagWriter
 from graph_slam_ros.ros.to_msg import header
 
@@ -363,3 +364,11 @@ def test_a_recovered_run_tells_what_is_in_it_by_input(info, capsys):
     assert main(["recover", words[-1], "--out", "again"]) == 0
     again = json.loads(Path("again/run.json").read_text())
     assert again["inputs"]["detections"]["used"] == told["inputs"]["detections"]["believed"] > 300
+
+
+def test_an_input_that_is_mostly_not_believed_is_said():
+    counts = {"use": "landmarks", "received": 9, "used": 90, "believed": 30}
+    summary = {"inputs": {"uwb": counts}, "counters": {}, "waiting": {}, "landmarks": 4, "sightings": 90}
+    (sentence,) = shortcomings(summary)
+    assert sentence.startswith("uwb: only 30 of 90 are believed: ")
+    assert not [*shortcomings(summary | {"inputs": {"uwb": counts | {"believed": 80}}})]
