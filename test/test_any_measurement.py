@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from reliability import times
+from scipy.optimize import least_squares
 
 from graph_slam_ros.lie import so3
 from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
@@ -205,3 +206,24 @@ def test_whatever_is_measured_nothing_is_raised_and_nothing_infinite_comes_out(d
     assert written(drive(0, dimensions, association)) == written(once)
     for seed in range(1, times(3, 20)):
         drive(seed, dimensions, association)
+
+
+def test_of_extreme_numbers_no_search_takes_more_steps_than_the_bound(monkeypatch):
+    """Where it had none, one mixture took a minute, in 15 searches of up to a thousand steps."""
+    evaluations = []
+
+    def counted(residual, start, **options):
+        evaluations.append(0)
+        most = 60 * (1 + len(start))
+
+        def one_more(x):
+            out = residual(x)
+            evaluations[-1] += 1
+            assert evaluations[-1] <= most
+            return out
+
+        return least_squares(one_more, start, **options)
+
+    monkeypatch.setattr("graph_slam_ros.slam.innovation.least_squares", counted)
+    drive(2, 3, "nearest")
+    assert max(evaluations) >= 60, "it is a drive on which a search would go on"

@@ -12,7 +12,12 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _ANGLES = {SE2: 1, SE3: 3}  # of a pose, its last coordinates
+_MOST_STEPS = 60  # of a search: with extreme numbers it would creep for seconds; the least it has found is taken
 _LINEAR_RAD2 = 0.1  # of a direction: beyond, a linear prediction is none
+
+
+class _Enough(Exception):
+    """A search has evaluated as much as it may."""
 
 
 def innovation(graph: Graph, solver: Solver, edge: int) -> float:
@@ -51,6 +56,15 @@ def _least_cost(
     first = np.cumsum([0] + [kind.dof for kind in kinds])
     before = [x[o : o + kind.size][None] for o, kind in zip(graph.offset.values[vertices].tolist(), kinds, strict=True)]
 
+    found: list[float] = []
+
+    def counted(units: Array) -> Array:
+        if len(found) >= _MOST_STEPS * (1 + len(sigmas)):
+            raise _Enough
+        out = cost(units)
+        found.append(float(out @ out))
+        return out
+
     def cost(units: Array) -> Array:
         step = sigmas @ units
         moved = [
@@ -60,7 +74,10 @@ def _least_cost(
         residual, _ = edge.linearize(np.concatenate(moved), at[None, :-1], measured[None])
         return np.concatenate((units, root @ residual[0]))
 
-    return float(2.0 * least_squares(cost, np.zeros(len(sigmas)), method="lm").cost)
+    try:
+        return float(2.0 * least_squares(counted, np.zeros(len(sigmas)), method="lm").cost)
+    except _Enough:
+        return min(found)
 
 
 def _spread(graph: Graph, x: Array, vertices: Index, joint: Array, predicted: Array) -> float:
