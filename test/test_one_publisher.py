@@ -138,6 +138,15 @@ def test_where_stamps_begin_anew_tracks_do():
     assert p.hear(used).used == [*used, *used]
 
 
+def test_what_is_an_hour_ahead_is_left_to_who_looks_at_the_clock_and_where_it_goes_on_tracks_begin_anew():
+    used, other = driven(20), driven(20, 10.0, 0.0, (5.0, 5.0, 1.0), late_s=0.01)
+    hour = [Odometry(m.stamp_ns + 3600 * NS, m.T_odom_base, None, "odom") for m in used]
+    p = Publisher().hear(mixed(used[:100], other[:100])).hear(hour[:1]).hear(mixed(used[100:], other[100:])).end()
+    assert p.used == [*used[:100], hour[0], *used[100:]]
+    p.hear(hour)
+    assert p.used[-len(hour) :] == hour
+
+
 # -- recordings --------------------------------------------------------------------------------------------------------
 
 

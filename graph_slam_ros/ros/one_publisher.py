@@ -20,6 +20,7 @@ _ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 10.0, 20.0  # of robots
 _START_M_S, _START_RAD_S = 3.0, 3.0  # speed of a track that has only one pose
 _LEAST_S, _MOST_S, _MOST_RATIO = 0.02, 1.0, 10.0  # stamps may crowd together; a track leads no farther than this
 _BACK_NS = 200_000_000  # what is older is left to the order of stamps
+_AHEAD_NS = 60_000_000_000  # what is newer is left to who looks at the clock, but where it goes on
 _SURE, _PERIODS = 3, 3.0  # messages of a new track, and periods of the track in use, before that is given up
 _NOISY, _NOISIEST = 3.0, 2.5  # of the usual misfit, and at most
 _MOST_LABELS = 8
@@ -109,7 +110,7 @@ class OnePublisher:
         self._timeout_ns, self._refuse = round(timeout_s * 1e9), refuse
         self._tracks: list[_Track] = []  # the first is in use
         self._held: deque[tuple[_Track, Odometry]] = deque()  # of tracks that are neither in use nor settled
-        self._labels = 1
+        self._labels, self._ahead = 1, 0
         self._usual = 0.0  # misfit of the odometry in use
 
     def take(self, m: Odometry) -> list[Odometry]:
@@ -121,6 +122,12 @@ class OnePublisher:
         used = self._tracks[0]
         if used.past and m.stamp_ns < used.newest_ns - _BACK_NS:
             return [m]
+        if used.past and m.stamp_ns > used.newest_ns + _AHEAD_NS:
+            self._ahead += 1
+            if self._ahead >= _SURE:
+                self.forget_time()
+            return [_labelled(m, used)]
+        self._ahead = 0
         track = self._continued(m)
         track.add(m)
         if track is used:
