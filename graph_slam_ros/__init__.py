@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from graph_slam_ros.formats.g2o import read_g2o
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.graph import Gaussian, Graph
+    from graph_slam_ros.replay import replay
+    from graph_slam_ros.saved_run import SavedRun, load_run
     from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
     from graph_slam_ros.solver import Settings, Solver
 
@@ -24,14 +26,17 @@ __all__ = [
     "Graph",
     "GraphSlam",
     "Odometry",
+    "SavedRun",
     "Settings",
     "Sighting",
     "Sightings",
     "Solution",
     "Solver",
     "certify",
+    "load_run",
     "optimize",
     "read_g2o",
+    "replay",
     "write_g2o",
 ]
 
@@ -41,6 +46,8 @@ _HOMES = {
     "formats.g2o": ("read_g2o",),
     "formats.g2o_writer": ("write_g2o",),
     "graph": ("Gaussian", "Graph"),
+    "replay": ("replay",),
+    "saved_run": ("SavedRun", "load_run"),
     "slam": ("Config", "Control", "GraphSlam", "Odometry", "Sighting", "Sightings"),
     "solver": ("Settings", "Solver"),
 }

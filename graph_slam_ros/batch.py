@@ -61,6 +61,11 @@ class Solution:
     suspicion: str = ""
     attempts: tuple[Attempt, ...] = ()
 
+    def __repr__(self) -> str:
+        poses, points = len(self.poses), len(self.points)
+        chi2, stop = self.report.chi2_final, "converged" if self.report.converged else self.report.stop
+        return f"Solution({poses} poses, {points} points, chi2 {chi2:.6g}, {stop}, start: {self.start})"
+
     @property
     def poses(self) -> Array:
         """Estimates of all poses in order of id: (n, 3) as x, y, theta, or (n, 7) as x, y, z and quaternion xyzw."""

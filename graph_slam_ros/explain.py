@@ -175,7 +175,8 @@ def _edge(run: SavedGraph, edge: int, changes: Iterable[Change], config: Config)
     history = [change for change in changes if change.edge == edge]
     kind, of, by = _KIND.get(e.label, e.label), e.landmark and f" of {e.landmark}", e.source and f" by {e.source}"
     yield f"edge {edge}: {kind}{of}{by}: {_state(e.verdict, e.reason)}"
-    yield from _line("judged", f"first at keyframe {e.keyframe}, stamp {e.stamp_ns / 1e9:.3f} s")
+    yield from _line("stamp", f"{e.stamp_ns / 1e9:.3f} s, of the newest keyframe that it is attached to")
+    yield from _line("judged", f"first at keyframe {e.keyframe}")
     yield from _line("between", " and ".join(_vertex(run, e, v) for v in e.vertices))
     yield from _line("measured", quantities.told(e, quantities.measured(e)))
     yield from _line("sigmas", quantities.told(e, quantities.sigmas(e)))

@@ -1,9 +1,14 @@
-"""Replay: a recording, or the ingest sequence of an earlier run, through ``GraphSlam`` as fast as the CPU allows."""
+"""Replay: a recording, or the ingest sequence of an earlier run, through ``GraphSlam`` as fast as the CPU allows.
 
+``graph_slam_ros.replay`` is this module and the function of that name in one: it can be called.
+"""
+
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from graph_slam_ros.formats.journal import read_ingest
@@ -189,3 +194,14 @@ def _with_end(items: Iterable[Sequence[Measurement]]) -> Iterator[Sequence[Measu
     yield from items
     yield [Control("end")]
     yield [Control("optimize")]
+
+
+class _CallableModule(ModuleType):
+    """Whoever has imported this module finds it where the function of its name is looked for."""
+
+    def __call__(self, *args: Any, **options: Any) -> Replayed:
+        """As ``replay``."""
+        return replay(*args, **options)
+
+
+sys.modules[__name__].__class__ = _CallableModule

@@ -31,7 +31,7 @@ def test_a_block_of_the_readme_prints_what_it_says(block, folder, capsys):
 
 
 def test_the_readme_has_every_way():
-    assert len(BLOCKS) == 4
+    assert len(BLOCKS) == 5
     assert all(re.search(rf"\b{name}\b", "".join(BLOCKS)) for name in ("optimize", "Solver", "GraphSlam"))
 
 

@@ -123,6 +123,13 @@ class Graph:
         self.table_of_edge = Column(np.int64)
         self.row_of_edge = Column(np.int64)
 
+    def __repr__(self) -> str:
+        codes, counts = np.unique(self.kind.values, return_counts=True)
+        kinds = [f"{n} {self.kinds[code].name}" for code, n in zip(codes.tolist(), counts.tolist(), strict=True)]
+        labels = [f"{len(self.edges_of(label))} {label}" for label in self.labels]
+        vertices = f"{self.vertex_count} vertices" + (f": {', '.join(kinds)}" if kinds else "")
+        return f"Graph({vertices}; {self.edge_count} edges" + (f": {', '.join(labels)})" if labels else ")")
+
     @property
     def vertex_count(self) -> int:
         """Number of vertices; their ids are below it."""

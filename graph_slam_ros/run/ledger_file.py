@@ -42,7 +42,8 @@ class Entry:
     source : the input that told it; empty where nobody did
     landmark : the name of the landmark it is about; empty where there is none
     vertices : as ``graph.g2o`` numbers them
-    keyframe, stamp_ns : at which it was judged first
+    keyframe : at which it was judged first
+    stamp_ns : of the newest keyframe that it is attached to: when it was measured, not when it was judged
     measured : with the sensor's place on the robot where the type has one
     information : of the measurement, the upper triangle row by row
     residual : how the measurement differed from what was expected when it was judged first, in its units
@@ -147,6 +148,8 @@ def _entries(slam: GraphSlam, ids: list[int]) -> Iterable[Entry]:
     names = {mark.vertex: name for name, mark in slam.landmarks.items()}
     chi2, _ = slam.solver.chi2_of(np.arange(len(ledger)))
     losses = slam.solver.settings.stages()[-1]
+    keyframe_of = {vertex: k for k, vertex in enumerate(slam.keyframes.ids.tolist())}
+    stamps_ns = slam.keyframes.stamps_ns
     judged = {change.edge: change.threshold for change in ledger.history}
     for edge in range(len(ledger)):
         table, row = graph.row(edge)
@@ -161,7 +164,7 @@ def _entries(slam: GraphSlam, ids: list[int]) -> Iterable[Entry]:
             next((names[v] for v in vertices if v in names), ""),
             tuple(ids[v] for v in vertices),
             keyframe,
-            Stamp(int(slam.keyframes.stamps_ns[keyframe])),
+            Stamp(int(stamps_ns[max((keyframe_of[v] for v in vertices if v in keyframe_of), default=keyframe)])),
             tuple(table.measured.values[row].tolist()),
             tuple((root.T @ root)[np.triu_indices(len(root))].tolist()),
             tuple(ledger.residual(edge).tolist()),

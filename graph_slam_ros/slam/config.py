@@ -320,7 +320,11 @@ class SolveConfig:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """All parameters."""
+    """All parameters, in sections. An object never changes; ``changed`` makes another.
+
+    ``Config()`` has the defaults. ``Config.from_mapping({"keyframes.min_distance_m": 0.5})`` takes nested or dotted
+    names; ``config.keyframes.min_distance_m`` reads one. An input has a section of its own name, see ``inputs.names``.
+    """
 
     world: WorldConfig = WorldConfig()
     frames: FramesConfig = FramesConfig()
@@ -340,6 +344,13 @@ class Config:
     health: HealthConfig = HealthConfig()
     node: NodeConfig = NodeConfig()
     sources: tuple[InputConfig, ...] = DEFAULT_INPUTS
+
+    def __repr__(self) -> str:
+        """What is not its default, as ``from_mapping`` takes it."""
+        given = dict(flatten(self.as_mapping()))
+        usual = {p.name: p.default for p in parameters(one.name for one in self.sources)}
+        changed = [f"{name}={value!r}" for name, value in given.items() if value != usual[name]]
+        return f"Config({', '.join(changed)})"
 
     def __post_init__(self) -> None:
         _ = self.start_pose, self.survey  # what they are made of is refused here, not later
@@ -480,3 +491,13 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield from flatten(value, f"{name}.")
         else:
             yield name, value
+
+
+def _described() -> str:
+    """The docstring of ``Config`` with every parameter: name, default, unit and meaning."""
+    meanings = notes()
+    lines = [f"    {p.name} = {p.default!r}\n        {meanings[p.name]}" for p in parameters()]
+    return f"{Config.__doc__}\n    Parameters with their defaults:\n\n" + "\n".join(lines) + "\n"
+
+
+Config.__doc__ = _described()

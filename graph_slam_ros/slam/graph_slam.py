@@ -89,6 +89,19 @@ class Update:
     def __bool__(self) -> bool:
         return bool(self.keyframes) or self.solved
 
+    def __repr__(self) -> str:
+        parts = [_counted(len(self.keyframes), "keyframe")] if self.keyframes else []
+        parts += [_counted(len(self.edges), "edge")] if self.edges else []
+        if self.solved:
+            moved = f", map -> odom moved {self.correction.distance_m:.3g} m"
+            parts.append(("solved everything" if self.report else "solved") + moved)
+        parts += [_counted(len(self.changes), "changed verdict")] if self.changes else []
+        return f"Update({', '.join(parts) or 'nothing'})"
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
 
 _NOTHING = Update()
 _BLAMED = 5  # edges that are named as the cause of a correction
@@ -152,6 +165,10 @@ class GraphSlam:
         if start is not None and start.keyframes:
             self._take_up(start)
         self.first_edge = self.graph.edge_count  # of this run: those before are of the map it began in
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.keyframes)} keyframes, {len(self.landmarks)} landmarks, {self.graph.edge_count} edges"
+        return f"GraphSlam({counts}, {self.solves} solves)"
 
     # -- the door ------------------------------------------------------------------------------------------------
 
