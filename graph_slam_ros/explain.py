@@ -33,6 +33,7 @@ _WHY = {
     Reason.OUTVOTED: "outvoted",
     Reason.WITHDRAWN: "withdrawn",
     Reason.QUARANTINED: "quarantined",
+    Reason.DISPLACED: "displaced",
 }
 _KIND = {"closures": "a loop closure", "landmarks": "a sighting", "fixes": "a fix", "odometry": "odometry"}
 _SHOWN = 5
@@ -218,6 +219,11 @@ def _decided(e: Entry, history: Sequence[Change], config: Config) -> str:
             return "not by how it fits: it was cleared, or association took it from its landmark"
         case Reason.QUARANTINED:
             return "not by how it fits: solves failed with it, again and again, and succeeded without"
+        case Reason.DISPLACED:
+            return (
+                f"{e.statistic:.0f} sightings more agreed on another pose of the robot than on this motion: it was"
+                " carried, or its wheels slipped; another edge with next to no trust in the motion is in its place"
+            )
     if e.verdict is Verdict.DOWN_WEIGHTED:
         return f"it stays in, but its loss leaves it little: {numbers}, above {e.threshold:.4g} ({chance})"
     return f"{'it came in later' if history else 'it fits as it came'}: {numbers}; {allowed}"

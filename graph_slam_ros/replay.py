@@ -186,7 +186,8 @@ def replay(
     one_by_one = chain.from_iterable(progress(items, total))
     name = recording_of(source) if is_run(source) else source.resolve().name
     slam, summary = record_run(out, config, one_by_one, losses, state, border=border, took=took, recording=name)
-    return Replayed(slam, summary, summary["losses"], warnings + mendable(summary["counters"]))
+    told = [*map(str, slam.alarms), *mendable(summary["counters"])]
+    return Replayed(slam, summary, summary["losses"], [*warnings, *told])
 
 
 def _with_end(items: Iterable[Sequence[Measurement]]) -> Iterator[Sequence[Measurement]]:

@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.graph import Loss
+from graph_slam_ros.graph import Gaussian, Loss
 from graph_slam_ros.slam.background import Background, Beside, Work, when_asked
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.decisions import Decisions
+from graph_slam_ros.slam.displacement import Elsewhere
 from graph_slam_ros.slam.ledger import FINAL, Ledger, Reason
 from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.robust_config import RobustConfig
@@ -36,6 +37,7 @@ class Backend:
     handed_over : vertices and edges of the graph that the solver has
     frozen : the first so many vertices stay where they are
     spares_memory : whether no second look is begun
+    holds_back : whether what does not fit stays out, and verdicts stay as they are, until somebody has decided
     rivals : other explanations of the same measurements that the last second look could not rule out
     """
 
@@ -55,9 +57,14 @@ class Backend:
         self.handed_over, self.frozen = (0, 0), start.frozen
         self._background = Background(config, beside)
         self.rivals: tuple[Rival, ...] = ()
-        self.spares_memory = False
+        self.spares_memory = self.holds_back = False
         self._reviewed = 0  # the keyframe of the last review
         self._doubtful: list[int] = []  # edges that have come and do not fit by themselves
+
+    @property
+    def decides(self) -> bool:
+        """Whether anything is held back and taken out at all."""
+        return self._config.decide
 
     @property
     def ledger(self) -> Ledger:
@@ -89,6 +96,9 @@ class Backend:
         """Take in what is new and believed, then what is believed of the rest."""
         self.hand_over()
         self._doubtful += self.decisions.take(self.handed_over[1], keyframe)
+        if self.holds_back:
+            self.solver.update()
+            return
         if self._config.decide and keyframe - self._reviewed >= self._config.review_every_keyframes:
             self._reviewed = keyframe
             self.decisions.review(keyframe)
@@ -106,7 +116,7 @@ class Backend:
         self.hand_over()
         self._doubtful += self.decisions.take(self.handed_over[1], keyframe)
         report = self.solver.optimize(settings)
-        if not self._config.decide:
+        if not self._config.decide or self.holds_back:
             return report
         self._admit(keyframe)
         outcome = self._looked(lambda: second_look(self._config, self._frozen(keyframe, settings)))
@@ -136,6 +146,35 @@ class Backend:
         self.decisions.withdraw(edges, keyframe, reason)
         self._doubtful = [edge for edge in self._doubtful if edge not in edges]
         self.rivals = self._standing(self.rivals)
+
+    def part(
+        self,
+        loose: tuple[int, Sequence[float], Gaussian],
+        initial_poses: Sequence[int],
+        values: Array,
+        found: Elsewhere,
+        keyframe: int,
+    ) -> None:
+        """Begin a segment in the past: of odometry nearly nothing is believed there, of the landmarks what fits.
+
+        Parameters
+        ----------
+        loose : the edge of odometry that leads there, and the motion and noise that it is to have instead
+        initial_poses : edges that are out from now on, until they fit
+        values : stored numbers of all vertices to go on from
+        """
+        link, motion, noise = loose
+        table, row = self.graph.row(link)
+        vertices, source = table.vertices.values[row].tolist(), self.graph.source_of(link)
+        self.graph.add_edge(table.type, vertices, motion, noise, "odometry", source)
+        self.hand_over()
+        self.decisions.take(self.handed_over[1], keyframe)
+        self.decisions.loosen(link, keyframe, found.evidence)
+        self.decisions.exchange(found.fitting, (*found.contradicting, *initial_poses), keyframe)
+        self._background.cancel(self.ledger.outside_count)
+        self.holds_back = False
+        self.solver.start_at(values)
+        self._make_fit(list(found.fitting), keyframe)
 
     def _admit(self, keyframe: int) -> None:
         """Compare with all that is known what has come and does not fit by itself."""

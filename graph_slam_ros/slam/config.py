@@ -427,7 +427,7 @@ class Config:
             s.max_iterations,
             s.step_tolerance,
             s.cost_tolerance,
-            {"landmarks": stages, "fixes": self.robust.stages, "closures": self.robust.stages},
+            {"landmarks": stages, **dict.fromkeys(("fixes", "closures", "initialpose"), self.robust.stages)},
             relinearize_above=s.relinearize_above,
             relinearize_error=s.relinearize_error,
             relinearize_every=s.relinearize_every,

@@ -23,7 +23,7 @@ from graph_slam_ros.solver import Solver
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-CANDIDATES = ("landmarks", "fixes", "closures")
+CANDIDATES = ("landmarks", "fixes", "closures", "initialpose")
 _TYPICAL = 30  # residuals tell what all are like
 _SLACK = 10.0  # times the residuals that are typical of a class its gate may be, where they are small
 _TIGHTEST = 0.1  # part of a gate that is left
@@ -168,6 +168,29 @@ class Decisions:
                 if self.ledger.verdict.values[edge] == Verdict.NOT_EVALUATED:
                     self._solver.set_weight(edge, 0.0)
                 self._reject(edge, keyframe, reason, float(self.ledger.statistic.values[edge]))
+
+    def are_beyond_noise(self, edges: Sequence[int]) -> bool:
+        """Whether most of some edges that are out are farther off than odometry's noise explains.
+
+        However good odometry has shown itself to be: it may be ``robust.noise_factor`` times worse than it is said.
+        """
+        factor, numbers = self._config.noise_factor**2, self.ledger.numbers.values
+        far = [self._innovation(edge) > factor * quantile(self._config.gate, int(numbers[edge])) for edge in edges]
+        return 2 * sum(far) > len(far)
+
+    def loosen(self, link: int, keyframe: int, evidence: float) -> None:
+        """Take an edge of odometry out: another with more noise is there in its place."""
+        self._solver.set_weight(link, 0.0)
+        self.ledger.note(link, keyframe, Verdict.REJECTED, Reason.DISPLACED, evidence)
+
+    def exchange(self, let_in: Sequence[int], taken_out: Sequence[int], keyframe: int) -> None:
+        """Believe some edges and not others, which may come back; by how they fit it is judged afterwards."""
+        for edge in let_in:
+            if not self.ledger.is_inside(edge):
+                self._readmit(edge, keyframe, float(self.ledger.statistic.values[edge]))
+        for edge in taken_out:
+            if self.ledger.is_inside(edge) and not self._is_needed(edge):
+                self._reject(edge, keyframe, Reason.DOES_NOT_FIT, float(self.ledger.statistic.values[edge]))
 
     def follow(self, other: Ledger, keyframe: int) -> bool:
         """Take over verdicts on the same edges from who has had a second look; whether that changed one."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.errors import DivergedError, GraphSlamError
 from graph_slam_ros.slam import carry
+from graph_slam_ros.slam.alarm import Alarm, Watch
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import Beside, when_asked
@@ -77,6 +78,7 @@ class Update:
     report : of a solve of everything
     correction : of the last solve
     changes : of verdicts, since the last update that told any
+    alarms : that began, were decided or ended since then: the landmarks say that the robot is elsewhere
     """
 
     keyframes: tuple[int, ...] = ()
@@ -85,6 +87,7 @@ class Update:
     report: Report | None = None
     correction: Correction = Correction()
     changes: tuple[Change, ...] = ()
+    alarms: tuple[Alarm, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.keyframes) or self.solved
@@ -104,6 +107,7 @@ def _counted(count: int, what: str) -> str:
 
 
 _NOTHING = Update()
+_LOOSE, _LOOSEST_M = 10.0, 1e5  # times as far as a given pose is away: so little odometry is trusted there
 _BLAMED = 5  # edges that are named as the cause of a correction
 
 
@@ -153,12 +157,14 @@ class GraphSlam:
         self._edges = PoseEdges(self.space, self.graph, self.counters)
         self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
         self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over)
+        self._watch = Watch(self.space, self.config.odometry, self.backend, self.counters, self.segments)
         self._safeguard = Safeguard(self.backend, self.counters, self._landmarks.forget)
         self._waiting: list[Observation] = []
         self._initial_pose: InitialPose | None = None  # for the next odometry
         self._covariance = np.zeros((self.space.dof, self.space.dof))
         self._taken_in = 0  # edges, by the last solve that succeeded
         self._told = 0  # changes of verdicts that updates have told
+        self._told_alarms: tuple[Alarm, ...] = ()
         self._solved_T_map_odom = self.space.identity  # to see how far a solve moves it
         self._solved_vertices = 0  # that the last solve took in: none where it failed
         self._unsolved_keyframes = 0
@@ -216,7 +222,14 @@ class GraphSlam:
         correction = self.correction if solved else Correction()
         edges = range(first_edge, self.backend.handed_over[1])
         changes, self._told = tuple(self.ledger.history[self._told :]), len(self.ledger.history)
-        return Update(tuple(range(first_new, len(self.keyframes))), edges, solved, new, correction, changes)
+        keyframes, alarms = tuple(range(first_new, len(self.keyframes))), self._changed_alarms()
+        return Update(keyframes, edges, solved, new, correction, changes, alarms)
+
+    def _changed_alarms(self) -> tuple[Alarm, ...]:
+        """Alarms that began, were decided or ended since they were told."""
+        before, self._told_alarms = self._told_alarms, self.alarms
+        known = {(one.began_ns, one.segment, one.ended_ns) for one in before}
+        return tuple(one for one in self.alarms if (one.began_ns, one.segment, one.ended_ns) not in known)
 
     def restart(self) -> None:
         """Go back to the last good estimate, after a fault outside."""
@@ -303,6 +316,16 @@ class GraphSlam:
     def failing(self) -> str:
         """Why the last solve failed; empty where it did not."""
         return self._safeguard.failing
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """When the landmarks said that the robot was elsewhere than odometry, in order; the last may go on."""
+        return tuple(self._watch.alarms)
+
+    @property
+    def displaced(self) -> Alarm | None:
+        """The alarm that goes on: the landmarks say that the robot is elsewhere."""
+        return self._watch.now
 
     @property
     def newest_odometry_ns(self) -> int | None:
@@ -424,7 +447,8 @@ class GraphSlam:
         T_last_now, covariance = self._motion_into(step)
         if said is None or self.config.initialpose.use == "segment":
             self.segments.append(len(self.keyframes))
-        covariance = covariance + np.diag(np.square(self.space.sigmas(*self._loose(said))))
+        self._watch.evidence.begin(self.graph.vertex_count)
+        covariance = covariance + np.diag(np.square(self.space.sigmas(*self._loose(said, T_last_now))))
         self._add_keyframe(step, T_last_now, covariance, said.T_map_base if said else None)
         if said:
             self._edges.initial_pose(self.keyframes[-1].vertex, said)
@@ -444,11 +468,20 @@ class GraphSlam:
         now = (self._trail.motion or motion).now  # of another keyframe, where one of these deserved it
         return now.T_keyframe_base, now.covariance
 
-    def _loose(self, said: InitialPose | None) -> tuple[float, float]:
-        """What is added to the noise of that motion, in metres and in radians."""
-        if said and self.config.initialpose.use == "prior":
+    def _loose(self, said: InitialPose | None, T_last_now: Numbers) -> tuple[float, float]:
+        """What is added to the noise of that motion, in metres and in radians.
+
+        A pose that is given far away must not pull on the path before: it may be wrong.
+        """
+        jump_m, jump_rad = self.config.odometry.jump_sigma_m, self.config.odometry.jump_sigma_rad
+        if said is None:
+            return jump_m, jump_rad
+        if self.config.initialpose.use == "prior":
             return self.config.initialpose.loosen_m, self.config.initialpose.loosen_rad
-        return self.config.odometry.jump_sigma_m, self.config.odometry.jump_sigma_rad
+        group, last = self.space.group, self._pose(self.keyframes[-1].vertex)
+        away = group.between(group.compose(last, T_last_now), said.T_map_base)
+        far_m = math.hypot(*away[: self.space.dimensions])
+        return max(jump_m, min(_LOOSE * far_m, _LOOSEST_M)), max(jump_rad, _LOOSE * math.pi)
 
     def _forget_time(self) -> None:
         """Stamps begin anew, the map stays: the next odometry begins a segment."""
@@ -613,10 +646,12 @@ class GraphSlam:
     ) -> tuple[list[tuple[float, int]], Report | None, Array]:
         """How new edges fitted before, the report of a solve of everything, and the newest pose's covariance."""
         self.backend.hand_over()
+        self._watch.evidence.take(self.backend.handed_over[1], self.keyframes[keyframe].stamp_ns)
         fits, report = self._fit_of(range(self._taken_in, self.backend.handed_over[1])), None
         if everything is None:
             self._review_if_due()
             self.backend.update(keyframe)
+            self._watch.look(keyframe, self.keyframes.ids, self.keyframes.stamps_ns)
         else:
             report = self.backend.optimize(keyframe, everything)
         (covariance,) = self.solver.marginal([self.keyframes[keyframe].vertex])

@@ -33,9 +33,10 @@ class Reason(IntEnum):
     OUTVOTED = 3  # a second look at everything found a better explanation without it
     WITHDRAWN = 4  # somebody, or association, took it out
     QUARANTINED = 5  # nothing could be solved with it
+    DISPLACED = 6  # odometry, where the landmarks showed that the robot was moved without its noticing
 
 
-FINAL = (Reason.WITHDRAWN, Reason.QUARANTINED)  # it is out for good
+FINAL = (Reason.WITHDRAWN, Reason.QUARANTINED, Reason.DISPLACED)  # it is out for good
 INSIDE = (Verdict.ACCEPTED, Verdict.DOWN_WEIGHTED)
 _ACCEPTED, _DOWN_WEIGHTED = _INSIDE = tuple(map(int, INSIDE))  # comparing with members of an enumeration is slow
 

@@ -209,6 +209,11 @@ REASONS: dict[str, Reason] = {
         _REFUSED, "a closure's earlier stamp is outside the odometry", "stamps by the robot's clock"
     ),
     "cleared": Reason(_NOTED, "loop closures that ~/clear_closures took out"),
+    "displaced": Reason(
+        _NOTED,
+        "the landmarks showed that the robot was elsewhere than odometry said: it slipped or was carried",
+        "graph_slam explain RUN; if it happens often, correct the odometry",
+    ),
     "quarantined": Reason(
         _REFUSED, "the solver failed with these measurements and works without them", "graph_slam explain RUN"
     ),

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 from graph_slam_ros.ros.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.slam import GraphSlam, Update
+from graph_slam_ros.slam.alarm import Alarm
 from graph_slam_ros.slam.ledger import Change, Verdict
 
 _EDGES = 1000  # of one update that are told one by one
@@ -33,6 +34,8 @@ def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
         )
     for change in update.changes[:_EDGES]:
         yield _verdict(slam, change)
+    for alarm in update.alarms:
+        yield _alarm(alarm)
     if update.solved and update.correction.distance_m + update.correction.angle_rad > 0.0:
         yield correction(slam, update)
 
@@ -52,6 +55,18 @@ def _verdict(slam: GraphSlam, change: Change) -> Status:
         statistic=f"{change.statistic:.6g}",
         threshold=f"{change.threshold:.6g}",
     )
+
+
+def _alarm(alarm: Alarm) -> Status:
+    """An alarm that began, was decided or ended."""
+    values: dict[str, object] = {"began_ns": alarm.began_ns, "evidence": alarm.evidence}
+    if alarm.segment is not None:
+        values |= {"segment": alarm.segment, "distance_m": f"{alarm.distance_m:.6f}"}
+        values |= {"angle_rad": f"{alarm.angle_rad:.6f}"}
+    if alarm.ended_ns is None:
+        return happened("displaced", str(alarm), WARN, **values)
+    agree = "the landmarks and odometry agree again"
+    return happened("displaced", f"{agree}: {alarm}", OK, **values, ended_ns=alarm.ended_ns)
 
 
 def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:

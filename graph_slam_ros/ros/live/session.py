@@ -47,6 +47,7 @@ class Estimate:
     is_confirmed : whether the robot knows where it is in a map that was loaded
     fit : chi2 per degree of freedom; NaN before it was looked at
     rivals : loop closures of other explanations that could not be ruled out
+    displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
     """
 
     T_map_odom: Numbers
@@ -65,6 +66,7 @@ class Estimate:
     slowest_solve_s: float
     fit: float
     rivals: int
+    displaced: str = ""
 
 
 class Session:
@@ -225,6 +227,7 @@ class Session:
             self._slowest_s,
             self._fit,
             sum(len(rival.only_here) for rival in slam.backend.rivals),
+            str(slam.displaced or ""),
         )
 
     def evaluate(self) -> None:

@@ -1,0 +1,158 @@
+"""The robot is elsewhere than odometry says: it slipped, was carried, or somebody gave a wrong pose."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.lie import se2
+from graph_slam_ros.run import map_of, record_run
+from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
+from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.slam.ledger import Reason, Verdict
+from graph_slam_ros.slam.map_state import MapState
+from graph_slam_ros.slam.measurements import InitialPose
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return simulate("warehouse", seed=1, aisle_m=10.0)
+
+
+def carried(recording, at=0.7, metres=10.0):
+    """A recording of a robot that is carried in no time while its odometry notices nothing; and the stamp of that."""
+    truth, stamps = recording.T_world_base, recording.stamps_ns
+    a = int(at * len(stamps))
+    b = a + int(np.argmax(np.linalg.norm(truth[a:, :2] - truth[a, :2], axis=1) >= metres))
+    assert np.linalg.norm(truth[b, :2] - truth[a, :2]) >= metres
+    shift = int(stamps[b] - stamps[a + 1])
+    odometry = recording.T_odom_base.copy()
+    back = se2.compose(tuple(odometry[a]), se2.inverse(tuple(odometry[b])))
+    odometry[b:] = [se2.compose(back, tuple(pose)) for pose in odometry[b:]]
+    kept, later = np.r_[: a + 1, b : len(stamps)], stamps.copy()
+    later[b:] -= shift
+    before = [one for one in recording.seen if one.stamp_ns <= stamps[a]]
+    after = [replace(one, stamp_ns=one.stamp_ns - shift) for one in recording.seen if one.stamp_ns >= stamps[b]]
+    parts = {"twist": recording.twist, "odom_covariance": recording.odom_covariance, "T_world_base": truth}
+    parts |= {"stamps_ns": later, "T_odom_base": odometry}
+    kept_parts = {name: part[kept] for name, part in parts.items()}
+    return replace(recording, seen=(*before, *after), **kept_parts), int(stamps[a])
+
+
+def errors(slam, recording):
+    """Distances of all keyframes from the truth, in the frame of the first pose."""
+    first = se2.compose(tuple(recording.T_odom_base[0]), se2.inverse(tuple(recording.T_world_base[0])))
+    at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns, side="right") - 1
+    true = np.array([se2.compose(first, tuple(pose)) for pose in recording.T_world_base[at]])
+    return np.linalg.norm((slam.trajectory() - true)[:, :2], axis=1)
+
+
+class Driven:
+    """A pipeline that has been driven through a recording.
+
+    Attributes
+    ----------
+    moved_m : how far the path before an event has moved at most, while the alarm was undecided
+    alarmed_s : from the event to the alarm
+    """
+
+    def __init__(self, recording, event_ns, given=None, config=None):
+        self.slam, self.moved_m, self.alarmed_s = GraphSlam(config or Config()), 0.0, None
+        reference = None
+        for m in measurements(recording):
+            if given is not None and m.stamp_ns > event_ns:
+                self.slam.process(given)
+                given = None
+            self.slam.process(m)
+            alarm = self.slam.displaced
+            if alarm is None:
+                reference = None
+                continue
+            self.alarmed_s = self.alarmed_s or (alarm.began_ns - event_ns) * 1e-9
+            before = self.slam.trajectory()[self.slam.keyframes.stamps_ns <= event_ns, :2]
+            reference = before if reference is None else reference
+            if alarm.segment is None:
+                self.moved_m = max(self.moved_m, float(np.linalg.norm(before - reference, axis=1).max()))
+        self.slam.process(Control("end"))
+
+
+def test_G23_a_robot_that_was_carried_is_found_and_the_path_before_stays(recording):
+    faulty, event_ns = carried(recording)
+    clean = errors(Driven(recording, event_ns).slam, recording)
+    driven = Driven(faulty, event_ns)
+    slam = driven.slam
+    assert 0.0 < driven.alarmed_s < 5.0
+    assert driven.moved_m < 0.05
+    (alarm,) = slam.alarms
+    assert alarm.distance_m == pytest.approx(10.0, abs=0.6)
+    assert slam.segments == [0, alarm.segment]
+    assert slam.counters["odometry", "displaced"] == 1
+    found, was_before = errors(slam, faulty), slam.keyframes.stamps_ns <= event_ns
+    assert found[was_before].max() < clean.max() + 0.1
+    assert found[~was_before].max() < clean.max() + 0.1
+    slam.process(Control("optimize"))
+    assert errors(slam, faulty).max() < clean.max() + 0.1
+    edges = slam.graph.edges_of("odometry")
+    out = [edge for edge in edges.tolist() if slam.ledger.reason.values[edge] == Reason.DISPLACED]
+    assert len(out) == 1
+    assert slam.ledger.verdict_of(out[0]) is Verdict.REJECTED
+
+
+def test_G23_slipping_wheels_are_found_and_the_path_before_stays(recording):
+    fault = Fault.named("slip", at=0.7, lasting=0.14, factor=1.5)
+    faulty, _ = faulty_recording(recording, [fault], seed=1)
+    event_ns = int(recording.stamps_ns[int(0.7 * len(recording.stamps_ns))])
+    driven = Driven(faulty, event_ns)
+    assert 0.0 < driven.alarmed_s < 5.0
+    assert driven.moved_m < 0.05
+    found, was_before = errors(driven.slam, faulty), driven.slam.keyframes.stamps_ns <= event_ns
+    assert found[was_before].max() < 0.6  # more than a metre where nobody doubts odometry
+    assert found.max() < 3.0
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.2])
+def test_G23_wrong_identities_are_no_displacement(recording, rate):
+    fault = Fault.named("wrong_ids", rate=rate)
+    faulty = faulty_recording(recording, [fault], seed=3)[0] if rate else recording
+    driven = Driven(faulty, 0)
+    assert driven.slam.segments == [0]
+    assert driven.slam.counters["odometry", "displaced"] == 0
+    assert rate > 0.1 or not driven.slam.alarms
+
+
+@pytest.mark.parametrize("away_m, sigma_m", [(3.0, 0.05), (48.0, 0.5), (1e6, 0.5)])
+def test_G24_a_wrong_pose_that_somebody_gives_is_found_out_by_the_landmarks(recording, away_m, sigma_m):
+    event_ns = int(recording.stamps_ns[int(0.7 * len(recording.stamps_ns))])
+    covariance = tuple(np.diag([sigma_m**2, sigma_m**2, 0.0025]).ravel().tolist())
+    driven = Driven(recording, event_ns, InitialPose((away_m, 0.0, 0.0), covariance))
+    slam = driven.slam
+    (given,) = slam.graph.edges_of("initialpose").tolist()
+    assert slam.ledger.verdict_of(given) is Verdict.REJECTED
+    assert errors(slam, recording).max() < 0.5
+    assert driven.moved_m < 0.05
+
+
+def test_G24_a_true_pose_that_somebody_gives_is_believed(recording):
+    event_ns = int(recording.stamps_ns[int(0.7 * len(recording.stamps_ns))])
+    pose = GraphSlam()
+    for m in measurements(recording):
+        if m.stamp_ns > event_ns:
+            break
+        pose.process(m)
+    said = InitialPose(tuple(pose.trajectory()[-1].tolist()), tuple((0.01 * np.eye(3)).ravel().tolist()))
+    slam = Driven(recording, event_ns, said).slam
+    assert slam.ledger.verdict_of(int(slam.graph.edges_of("initialpose")[0])) is Verdict.ACCEPTED
+    assert not slam.alarms
+    assert errors(slam, recording).max() < 0.5
+
+
+def test_an_alarm_is_in_the_summary_and_a_map_with_a_segment_in_the_past_is_taken_up(recording, tmp_path):
+    faulty, _ = carried(recording)
+    slam, summary = record_run(tmp_path / "run", Config(), [*measurements(faulty), Control("end")], [])
+    (told,) = summary["displacements"]
+    assert told["segment"] == slam.alarms[0].segment
+    state = map_of(tmp_path / "run", [])
+    assert isinstance(state, MapState)
+    assert state.segments == slam.segments
+    again = GraphSlam(Config(), start=state)
+    assert np.abs((again.trajectory() - slam.trajectory())[:, :2]).max() < 0.05  # solved anew, all of it

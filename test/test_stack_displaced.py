@@ -1,0 +1,60 @@
+"""The running node, where the landmarks say that the robot is elsewhere: on the real middleware."""
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from live_drive import Drive, distance
+from live_nodes import node, replayed, results, robot, until
+
+
+def off_by(r, drive):
+    at = r.heard["pose"][-1].pose.pose.position
+    return distance((at.x, at.y), drive.truth)
+
+
+def is_repeated(run, tmp_path):
+    place = tmp_path / "again"
+    place.mkdir()
+    return replayed(run, place) == results(run)
+
+
+def slowly(r, drive):
+    """For ``until``: the alarm must last for longer than diagnostics are apart."""
+    return lambda seconds: (drive.step(r), r.spin(0.1))
+
+
+@pytest.mark.parametrize("how", ["carried", "told"])
+def test_a_robot_that_is_elsewhere_is_degraded_until_it_is_found(tmp_path, how):
+    with (
+        node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n,
+        robot(hears=("pose", "/diagnostics", "events")) as r,
+    ):
+        r.wait_for_node()
+        given = r.publisher("initialpose", PoseWithCovarianceStamped)
+        until(given.get_subscription_count, r.spin, "subscriber of initialpose")
+        drive = Drive()
+        until(lambda: drive.steps > 150 and r.heard["pose"], drive.pace(r), "a map")
+        r.until_it_says("OK", spin=drive.pace(r))
+        if how == "carried":
+            drive.truth = drive.truth[0] + 30.0, drive.truth[1] - 2.0, drive.truth[2] + 1.0
+        else:
+            said = PoseWithCovarianceStamped()
+            said.header.frame_id = "map"
+            said.pose.pose.position.x, said.pose.pose.orientation.w = 48.0, 1.0
+            said.pose.covariance = (1e-2 * np.eye(6)).ravel()
+            given.publish(said)
+            until(lambda: off_by(r, drive) > 10.0, drive.pace(r), "the pose that was given")
+        r.until_it_says("DEGRADED", "elsewhere", spin=slowly(r, drive))
+        r.until_it_says("OK", spin=drive.pace(r))
+        until(lambda: off_by(r, drive) < 0.5, drive.pace(r), "the pose that the landmarks show")
+        assert r.graph()["segments"] == 2
+        told = [s for m in r.heard["events"] for s in m.status if s.name == "graph_slam: displaced"]
+        assert any("segment" in {v.key for v in s.values} for s in told)
+        assert n.stop()[0] == 0
+    assert is_repeated(tmp_path / "run", tmp_path)
+    assert math.isfinite(off_by(r, drive))
