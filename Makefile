@@ -34,7 +34,7 @@ endif
 install: $(VENV)/interfaces.stamp $(VENV)/kernels.stamp
 
 demo: install
-	@$(BIN)/graph_slam demo
+	@$(BIN)/graph_slam demo --force
 
 test: install lint
 	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist worksteal

@@ -1,7 +1,6 @@
 """The demonstration: the recording that comes with the source, through a live ROS graph into the node."""
 
 import json
-import shutil
 import tempfile
 import time
 from collections.abc import Callable
@@ -9,31 +8,31 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.evaluation import evaluate
+from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.replay import choose_inputs, replay
 from graph_slam_ros.report import draw_run
 from graph_slam_ros.ros.bag import open_bag
-from graph_slam_ros.run import SUMMARY, is_run
+from graph_slam_ros.run import SUMMARY, check_room
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
 
 _BAG = Path(__file__).resolve().parents[1] / "data" / "demo.mcap"
 
 
-def demo(out: Path, *, live: bool, progress: Callable[[str], Any], say: Callable[[str], None]) -> int:
+def demo(out: Path, *, live: bool, force: bool, progress: Callable[[str], Any], say: Callable[[str], None]) -> int:
     """Run it and say what happened; returns the exit code (3 if messages were lost)."""
-    if is_run(out):
-        shutil.rmtree(out)
+    check_room(out, force=force)
     with tempfile.TemporaryDirectory() as scratch:
         recording = _BAG
         if not recording.is_file():  # installed without the source tree
             recording = Path(scratch) / "demo.mcap"
             write_bag(simulate("warehouse", 8, aisle_m=9.0), recording)
         start = time.perf_counter()
-        lost = _live(recording, out, progress) if live else _offline(recording, out, progress)
+        lost = (_live if live else _offline)(recording, out, progress)
         took_s = time.perf_counter() - start
         scores = evaluate(out, str(recording))
         draw_run(out, str(recording), out / "path.png")
-    summary = json.loads((out / SUMMARY).read_text())
+    summary = json.loads(read_text(out / SUMMARY))
     through = "a live ROS graph (rclpy)" if live else "the pipeline directly: no ROS 2 here"
     say(f"replayed {recording.name} through {through} in {took_s:.1f} s")
     say(f"  keyframes        {summary['keyframes']}")
@@ -58,4 +57,4 @@ def _live(recording: Path, out: Path, progress: Callable[[str], Any]) -> int:
 
 
 def _offline(recording: Path, out: Path, progress: Callable[[str], Any]) -> int:
-    return len(replay(recording, out, progress=progress("replay")).losses)
+    return len(replay(recording, out, force=True, progress=progress("replay")).losses)

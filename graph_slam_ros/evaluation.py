@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.consistency import ClassNoise, Consistency, Nees, class_noise, landmark_nees, pose_nees
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.lie import se3
 from graph_slam_ros.path_error import (
     STATISTICS,
@@ -234,7 +235,7 @@ def _is_filled(path: Path) -> bool:
 def _drives(run: Path) -> list[dict[str, int]]:
     """Where each drive begins; one where the summary does not say."""
     try:
-        told = json.loads((run / SUMMARY).read_text(encoding="utf-8"))["drives"]
+        told = json.loads(read_text(run / SUMMARY))["drives"]
         drives = [{key: int(one[key]) for key in ("keyframe", "sighting")} for one in told]
     except (OSError, ValueError, KeyError, TypeError):
         return _ONE_DRIVE
@@ -326,7 +327,7 @@ def _left_out(
 def _classes(run: Path) -> tuple[bool, dict[str, ClassNoise]]:
     """Whether fixes hold the map, and what each class of edges says of its sigmas, by the summary of a run."""
     try:
-        summary = json.loads((run / SUMMARY).read_text(encoding="utf-8"))
+        summary = json.loads(read_text(run / SUMMARY))
         return "fixes" in summary["classes"], class_noise(summary["classes"], summary["leverage"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run ({type(error).__name__}: {error})") from None

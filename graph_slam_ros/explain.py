@@ -121,7 +121,10 @@ def _rivals(folder: Path) -> Iterator[str]:
     """What the last second look could not rule out."""
     file = folder / SUMMARY
     try:
-        told = [_rival(folder, rival) for rival in json.loads("".join(text for _, text in lines(file)))["rivals"]]
+        told = [
+            _rival(folder, rival)
+            for rival in json.loads("".join(text for _, text in lines(file, follow=False)))["rivals"]
+        ]
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise FormatError(f"{file}: not the summary of a run: {error!r}") from None
     yield from told

@@ -32,6 +32,14 @@ def export(folder: Path, out: Path, target: str, losses: list[str]) -> list[Path
     return TARGETS[target](taken_up(folder, losses), out)
 
 
+def files_of(out: Path, target: str) -> list[Path]:
+    """The files that ``export`` writes."""
+    if target != "g2o":
+        return [out]
+    whole = out.with_suffix("") if is_gzipped(out) else out
+    return [out, whole.with_name(f"{whole.stem}_vertices.csv")]
+
+
 def _tum(slam: GraphSlam, out: Path) -> list[Path]:
     """The keyframes."""
     write_text(out, tum_text(slam.keyframes.stamps_ns.tolist(), slam.trajectory()))
@@ -41,9 +49,8 @@ def _tum(slam: GraphSlam, out: Path) -> list[Path]:
 def _g2o(slam: GraphSlam, out: Path) -> list[Path]:
     """All that is believed; g2o has neither stamps nor names: these are in a table beside it."""
     ids, table = numbered(slam)
+    _, beside = files_of(out, "g2o")
     write_g2o(out, graph_file(slam, ids), slam.solver.estimate)
-    whole = out.with_suffix("") if is_gzipped(out) else out
-    beside = whole.with_name(f"{whole.stem}_vertices.csv")
     write_text(beside, table)
     return [out, beside]
 

@@ -44,7 +44,7 @@ class Merged:
     left_out: dict[str, tuple[float, float]]
 
 
-def merge(a: Path, b: Path, out: Path) -> Merged:
+def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     """Write the run folder of one map of two runs, with the configuration of the first.
 
     Raises
@@ -54,7 +54,7 @@ def merge(a: Path, b: Path, out: Path) -> Merged:
     """
     took = stopwatch()
     for folder in (a, b):
-        check_room(out, folder)
+        check_room(out, folder, force=force)
     losses: list[str] = []
     one, two = settled(a, losses), settled(b, losses)
     refuse_other_space(one, two, a, b)
@@ -68,7 +68,7 @@ def merge(a: Path, b: Path, out: Path) -> Merged:
     left_out = {name: aligned.distance(k) for k, name in enumerate(shared) if not aligned.fits[k]}
     chi2 = {one.landmarks[name].vertex: float(aligned.chi2[k]) for k, name in enumerate(shared) if name in left_out}
     _leave_out(state, first_edge, chi2, aligned.limit)
-    _, summary = record_run(out, one.config, [Control("optimize")], losses, state, took=took)
+    _, summary = record_run(out, one.config, [Control("optimize")], losses, state, took=took, force=force)
     return Merged(summary, summary["losses"], len(shared), left_out)
 
 

@@ -154,6 +154,7 @@ def replay(
     *,
     odometry: str | None = None,
     landmarks: str | None = None,
+    force: bool = False,
     progress: Progress = lambda items, total: items,
 ) -> Replayed:
     """Run a recording, or a run's own ingest sequence, and save a run folder.
@@ -162,11 +163,12 @@ def replay(
     ----------
     source : a bag, or a run folder: then exactly its events are repeated, nothing is added
     config : default: the run's own, or the defaults
+    force : a run in ``out`` may be replaced
     """
     took = stopwatch()
     source, out = Path(source), Path(out)
     border = Counters()
-    check_room(out, source)
+    check_room(out, source, force=force)
     state = None
     if is_run(source):
         config, own = with_survey(config or run_config(source)), run_config(source)
@@ -185,7 +187,9 @@ def replay(
     warmup()
     one_by_one = chain.from_iterable(progress(items, total))
     name = recording_of(source) if is_run(source) else source.resolve().name
-    slam, summary = record_run(out, config, one_by_one, losses, state, border=border, took=took, recording=name)
+    slam, summary = record_run(
+        out, config, one_by_one, losses, state, border=border, took=took, recording=name, force=force
+    )
     told = [*map(str, slam.alarms), *mendable(summary["counters"])]
     return Replayed(slam, summary, summary["losses"], [*warnings, *told])
 

@@ -1,5 +1,6 @@
 """Pictures of runs and of graphs, drawn into PNG files without a display."""
 
+import io
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.evaluation import Drive, dimensions_of, input_topics, scored_drive
-from graph_slam_ros.formats.durable import replaced
+from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.lie import se3
 from graph_slam_ros.path_error import matched
 from graph_slam_ros.run import COVARIANCES, recording_of
@@ -349,8 +350,9 @@ def _legend(axes: Any, *, at: float, side: str) -> None:
 def _save(figure: Any, out_png: Path) -> None:
     if Path(out_png).suffix != ".png":
         raise GraphSlamError(f"{out_png}: a picture is a .png file")
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", metadata={"Software": "graph_slam_ros"})
     try:
-        with replaced(Path(out_png)) as new:
-            figure.savefig(new, format="png", metadata={"Software": "graph_slam_ros"})
+        write_whole(Path(out_png), picture.getvalue())
     except OSError as error:
         raise GraphSlamError(f"{out_png}: {error.strerror or error}") from None

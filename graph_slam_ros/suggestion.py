@@ -14,6 +14,7 @@ from graph_slam_ros.replay import TF_TOPIC, choose_inputs
 from graph_slam_ros.ros.bag import Bag
 from graph_slam_ros.ros.from_msg import TRANSFORMS
 from graph_slam_ros.ros.inputs import CONVERTERS
+from graph_slam_ros.run import suggested_out
 from graph_slam_ros.slam import Config
 
 ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
@@ -88,7 +89,7 @@ class Suggestion:
             words += [option, self._topics[name]] if name in self._topics else []
         for key, value in self.settings.items():
             words += ["--set", _assignment(key, value)]
-        return shlex.join([*words, "--out", _out(self._path)])
+        return shlex.join([*words, "--out", str(suggested_out(self._path))])
 
     def _refused(self, bag: Bag) -> str:
         """Why the command would be; empty where it is not."""
@@ -356,14 +357,3 @@ def _is_zero(one: Contents) -> bool:
 def _assignment(key: str, value: Any) -> str:
     text = f"{key}={value}"
     return text if parse_setting(text) == (key, value) else f"{key}='{value}'"
-
-
-def _out(path: Path) -> str:
-    """A folder that is named after the recording, and not there yet."""
-    stem = re.sub(r"(\.(mcap|db3|bag|active|zstd|gz))+$", "", path.resolve().name)
-    name = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("._-") or "recording"
-    out, number = f"{name}_run", 1
-    while Path(out).exists():
-        number += 1
-        out = f"{name}_run_{number}"
-    return out

@@ -1,6 +1,7 @@
 """Paths and maps out of files: TUM trajectories, and a run's tables of landmarks and covariances."""
 
 import csv
+import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.lie import se3
 
 Array = NDArray[np.float64]
@@ -57,8 +59,8 @@ class Landmark:
     covariance: Array
 
 
-def read_tum(path: Path) -> Trajectory:
-    """Poses of a TUM file (stamp x y z qx qy qz qw).
+def read_tum(path: Path, *, follow: bool = False) -> Trajectory:
+    """Poses of a TUM file (stamp x y z qx qy qz qw); ``follow``: it may be a symbolic link.
 
     Raises
     ------
@@ -66,10 +68,12 @@ def read_tum(path: Path) -> Trajectory:
         No such file, nothing in it, or rows that are not eight numbers.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path, follow=follow).splitlines()
     except FileNotFoundError:
         raise GraphSlamError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise GraphSlamError(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError as error:
         raise GraphSlamError(f"{path}: not a readable text file ({type(error).__name__})") from None
     found = []
     for number, line in enumerate(lines, start=1):
@@ -97,11 +101,13 @@ def trajectory(stamps_s: Array, poses: Array, source: str) -> Trajectory:
 
 def read_landmarks(path: Path) -> dict[str, Landmark]:
     """Landmarks by id of a run's ``landmarks.csv``; empty where there is no such file."""
-    if not path.exists():
-        return {}
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            return {row["id"]: _landmark(row) for row in csv.DictReader(stream)}
+        table = io.StringIO(read_text(path), newline="")
+        return {row["id"]: _landmark(row) for row in csv.DictReader(table)}
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise GraphSlamError(f"{path}: {error.strerror}") from None
     except (KeyError, TypeError, ValueError) as error:
         raise GraphSlamError(f"{path}: not a table of landmarks ({error})") from None
 
@@ -124,10 +130,12 @@ def read_covariances(path: Path) -> Array:
         It is no such table.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()[1:]
+        lines = read_text(path).splitlines()[1:]
         rows = np.array([[float(word) for word in line.split(",")[1:]] for line in lines])
         dof = {6: 3, 21: 6}[rows.shape[-1]]
-    except (KeyError, ValueError, OSError) as error:
+    except OSError as error:
+        raise GraphSlamError(f"{path}: {error.strerror}") from None
+    except (KeyError, ValueError) as error:
         raise GraphSlamError(f"{path}: not a table of covariances ({error})") from None
     upper = np.triu_indices(dof)
     out = np.empty((len(rows), dof, dof))

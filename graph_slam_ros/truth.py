@@ -78,7 +78,7 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
     if path.suffix in (".tum", ".txt"):
         if topic:
             raise GraphSlamError(f"{path}: a TUM file has no topics: leave out {topic}")
-        return Truth(read_tum(path), {}, source=str(path))
+        return Truth(read_tum(path, follow=True), {}, source=str(path))
     bag = open_bag(path)
     name, _, frames = (topic or _only_topic(bag, path, not_these)).partition(":")
     if name not in bag.topics or bag.topics[name].type not in (*_POSE_TYPES, _TF):

@@ -184,7 +184,7 @@ class SavedGraph:
 
 def _graph(folder: Path, entries: Sequence[Entry]) -> tuple[Graph, list[int]]:
     """And the vertices that are held: those of a map that was frozen."""
-    file, out = read_g2o(folder / GRAPH), Graph()
+    file, out = read_g2o(folder / GRAPH, follow=False), Graph()
     if sorted(file.ids) != list(range(len(file.ids))):
         raise FormatError(f"{folder / GRAPH}: vertices are not numbered one after another from 0: is it of a run?")
     at, initial = file.graph.offset.values.tolist(), file.graph.initial.values

@@ -122,7 +122,7 @@ BUGS = (
         (
             (
                 "run/recorder.py",
-                "    with replaced(folder / name) as new:\n        new.write_bytes(data)\n",
+                "    write_whole(folder / name, data)\n",
                 "    (folder / name).write_bytes(data)\n",
             ),
         ),

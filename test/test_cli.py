@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -12,7 +13,9 @@ import pytest
 from executables import executable
 
 from graph_slam_ros import __version__, cli
+from graph_slam_ros.cli.parser import parser
 from graph_slam_ros.ros.bag import BagWriter, open_bag
+from graph_slam_ros.slam.config import parameters
 
 RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv", "ledger.csv", "ledger_changes.csv")
 COMMAND = executable("graph_slam")
@@ -100,6 +103,7 @@ def test_the_command_that_info_prints_works_as_it_is(bag, run, tmp_path, capsys,
     monkeypatch.chdir(tmp_path)
     program, *words = shlex.split(lines[-1])
     assert program == "graph_slam"
+    assert words[-2:] == ["--out", "drive_it_run"]
     assert told(capsys, *words)[0] == 0
     assert results(tmp_path / words[-1]) == results(run)
 
@@ -119,12 +123,100 @@ def test_simulate_replay_evaluate_end_to_end(bag, run, capsys):
     assert f"{scores['position_m']['rmse']:.3f}" in out
 
 
+def subcommands():
+    (found,) = (a for a in parser()._actions if a.dest == "==SUPPRESS==" and a.choices)
+    return found.choices
+
+
 def test_help_and_version_end_with_0(capsys):
     assert told(capsys, "--version") == (0, f"graph_slam_ros {__version__}\n", [])
-    for command in ("replay", "info", "optimize", "convert", "simulate", "evaluate", "demo", "warmup"):
-        code, out, _ = told(capsys, command, "--help")
-        assert code == 0
-        assert out.startswith(f"usage: graph_slam {command}")
+    code, out, _ = told(capsys, "--help")
+    assert code == 0
+    for command in subcommands():
+        assert re.search(rf"^    {command}\b", out, re.MULTILINE), command
+
+
+@pytest.mark.parametrize("command", subcommands())
+def test_every_help_has_an_example_that_the_command_line_takes(command, capsys):
+    code, out, _ = told(capsys, command, "--help")
+    assert code == 0
+    assert out.startswith(f"usage: graph_slam {command}")
+    assert "Exit codes: 0 done, 1 a fault of ours, 2 refused" in out.replace("\n", " ")
+    examples = re.findall(rf"^  graph_slam ({command}\b.*)$", out.partition("\nExample")[2], re.MULTILINE)
+    assert examples
+    for example in examples:
+        assert callable(parser().parse_args(shlex.split(example)).run)
+
+
+def test_params_tells_default_unit_bounds_meaning_and_when_it_may_change(capsys):
+    code, out, _ = told(capsys, "params")
+    lines = out.splitlines()
+    assert code == 0
+    names = [line.split(" = ")[0] for line in lines[:-1:2]]
+    assert names == [p.name for p in parameters()]
+    assert all(line.startswith("    ") and line.strip() for line in lines[1:-1:2])
+    code, out, _ = told(capsys, "params", "keyframes.min_distance_m")
+    first, meaning, _ = out.splitlines()
+    assert first == "keyframes.min_distance_m = 0.25 m   (in [0.001, 1e+09]; may change at any time)"
+    assert meaning == "    a keyframe after this distance"
+    only = told(capsys, "params", "odometry.*")[1].splitlines()[:-1:2]
+    assert [line.split(" = ")[0] for line in only] == [p.name for p in parameters() if p.name.startswith("odometry.")]
+    assert "one of twist, density; read at the start" in only[0]
+    assert "keyframes.min_distance_m" in told(capsys, "params", "after this DISTANCE")[1]
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        (("rep",), {"replay"}),
+        (("completion", ""), {"bash", "zsh"}),
+        (("optimize", "--init", "c"), {"chordal"}),
+        (("replay", "bag", "--fo"), {"--force"}),
+        (("export", "run", "--to", ""), {"tum", "g2o", "mcap"}),
+        (("info", "dr"), {"drive.mcap"}),
+    ],
+)
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_a_shell_completes_commands_options_choices_and_files(shell, typed, offered, tmp_path, capsys):
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    (tmp_path / "drive.mcap").touch()
+    code, script, _ = told(capsys, "completion", shell)
+    assert code == 0
+    if shell == "zsh":  # whose completion runs in its line editor alone: it loads without a complaint
+        done = subprocess.run(["zsh", "-f", "-c", script], capture_output=True, text=True, timeout=60)
+        assert (done.returncode, done.stderr) == (0, "")
+        return
+    words = " ".join(shlex.quote(word) for word in ("graph_slam", *typed))
+    ask = f"COMP_WORDS=({words}); COMP_CWORD={len(typed)}; _graph_slam; printf '%s\\n' \"${{COMPREPLY[@]}}\""
+    fallback = f'; [ -n "${{COMPREPLY[*]}}" ] || compgen -f -- {shlex.quote(typed[-1])}'  # -o default
+    done = subprocess.run(
+        ["bash", "-c", script + ask + fallback], capture_output=True, text=True, timeout=60, cwd=tmp_path
+    )
+    assert done.stderr == ""
+    assert set(done.stdout.split()) == offered
+
+
+def test_each_command_ends_with_a_line_of_what_to_do_next(bag, run, tmp_path, capsys):
+    for words in (
+        ("replay", bag, "--out", tmp_path / "a_run"),
+        ("recover", run, "--out", tmp_path / "recovered"),
+        ("freeze", run, "--out", tmp_path / "frozen"),
+        ("export", run, "--to", "g2o", "--out", tmp_path / "a.g2o"),
+        ("optimize", tmp_path / "a.g2o"),
+        ("convert", tmp_path / "a.g2o", tmp_path / "a.tum"),
+        ("simulate", "manhattan", "--poses", "20", "--out", tmp_path / "b.mcap"),
+        ("diff", run, tmp_path / "a_run"),
+        ("explain", run),
+        ("explain", run, "3"),
+        ("solve", run, "--loss", "none"),
+        ("influence", run, "--count", "1"),
+        ("params", "odometry"),
+    ):
+        code, out, _ = told(capsys, *words)
+        assert code in (0, 3), words
+        assert out.splitlines()[-1].startswith("next: "), words
+        assert out.count("next: ") == 1
 
 
 # -- 2 --------------------------------------------------------------------------------------------------------------
@@ -158,6 +250,12 @@ REFUSED = {
         "not empty and not an earlier run; nothing was written",
     ),
     "out is a file": (["replay", "{bag}", "--out", "{text}"], "text.mcap: Not a directory"),
+    "out is a run": (
+        ["recover", "{run}", "--out", "{there}"],
+        "holds a run already: choose another folder, or --force",
+    ),
+    "no parameter": (["params", "warp"], "no parameter matches 'warp'"),
+    "no such shell": (["completion", "fish"], "invalid choice: 'fish'"),
     "own source": (["replay", "{run}", "--out", "{run}"], "cannot be read from and written to at once"),
     "rate": (["replay", "{bag}", "--ros", "--rate", "-1"], "argument --rate: -1 is not a positive number"),
     "unknown world": (["simulate", "mars", "--out", "{out}"], "no world 'mars'; there are pythonrobotics"),
@@ -192,6 +290,7 @@ def test_what_is_refused_is_told_in_one_line_with_code_2_and_nothing_is_touched(
         names[name] = tmp_path / file
         names[name].parent.mkdir(exist_ok=True)
         names[name].write_text(content)
+    names["there"] = shutil.copytree(run, tmp_path / "there")
     names["foreign"], names["cut"] = tmp_path / "f", tmp_path / "cut.mcap"
     names["cut"].write_bytes(bag.read_bytes()[:5000])
     before = results(run)
@@ -274,9 +373,7 @@ def test_a_fifo_is_refused_and_not_waited_for(tmp_path):
     assert "neither a file nor a folder" in err
 
 
-def test_ctrl_c_during_a_replay_shows_no_traceback_and_leaves_a_run_that_may_be_replaced(
-    bag, long_bag, tmp_path, capsys
-):
+def test_ctrl_c_during_a_replay_is_one_line_and_code_130_and_leaves_nothing_behind(bag, long_bag, tmp_path, capsys):
     p = process("replay", long_bag, "--out", tmp_path / "run")
     deadline = time.monotonic() + 60
     while not (tmp_path / "run" / "ingest.mcap").exists():  # there from the first message on
@@ -284,8 +381,9 @@ def test_ctrl_c_during_a_replay_shows_no_traceback_and_leaves_a_run_that_may_be_
         time.sleep(0.001)
     p.send_signal(signal.SIGINT)
     _, err = p.communicate(timeout=30)
-    assert p.returncode == 2
-    assert "Traceback" not in err
+    assert p.returncode == 130
+    assert err.splitlines() == ["graph_slam: interrupted: nothing is left half-written"]
+    assert not list(tmp_path.iterdir())
     code, _, err = told(capsys, "replay", bag, "--out", tmp_path / "run")
     assert (code, err) == (0, [])
 

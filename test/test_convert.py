@@ -47,7 +47,7 @@ def convert(tmp_path, capsys):
             source = tmp_path / "a.g2o"
         target = tmp_path / f"b{ending}"
         try:
-            code = main(["convert", str(source), str(target), *options])
+            code = main(["convert", str(source), str(target), "--force", *options])
         except SystemExit as end:  # argparse
             code = end.code
         out, err = capsys.readouterr()

@@ -377,7 +377,7 @@ def test_a_recording_with_faults_has_their_table_beside_it(tmp_path, capsys):
     assert [row["fault"] for row in rows].count("false_closures") == 10
     assert open_bag(bag).topics["/closures"].count > 10
     table.unlink()
-    assert run(capsys, "simulate", "warehouse", "--out", bag)[0] == 0
+    assert run(capsys, "simulate", "warehouse", "--out", bag, "--force")[0] == 0
     assert not table.exists()
     assert "/closures" not in open_bag(bag).topics
 

@@ -45,10 +45,11 @@ class Recorded:
 
     def replayed(self, messages, to_recorded=lambda stamps: stamps):
         """RMSE of the keyframes' positions [m], the seconds in which there are any, and the segments."""
+        (self._folder / "bag.mcap").unlink(missing_ok=True)
         with BagWriter(self._folder / "bag.mcap") as bag:
             for m in messages:
                 bag.write(m.topic, self._types[m.topic], m.log_ns, m.cdr)
-        slam = replay(self._folder / "bag.mcap", self._folder / "run", self._config).slam
+        slam = replay(self._folder / "bag.mcap", self._folder / "run", self._config, force=True).slam
         path, stamps = slam.trajectory(), to_recorded(slam.keyframes.stamps_ns.astype(np.int64))
         assert np.isfinite(path).all()
         assert np.isfinite(slam.keyframe_covariances()).all()

@@ -82,7 +82,7 @@ def test_the_city_comes_to_the_value_that_its_readme_states(run, method, error_m
 def test_what_is_written_is_the_optimum_again(run, tmp_path, graph):
     for source in (graph, CITY):
         out = tmp_path / "out.g2o"
-        first = answer_of(run, source, "--out", out)
+        first = answer_of(run, source, "--out", out, "--force")
         again = answer_of(run, out)
         assert again["chi2_initial"] == pytest.approx(first["chi2_final"], rel=1e-9)
         assert again["classes"].keys() == first["classes"].keys()
@@ -99,16 +99,16 @@ def test_gzipped_graphs_are_solved_and_written(run, tmp_path, graph):
 
 def test_the_first_pose_is_held_where_nothing_else_fixes_the_graph(run, tmp_path, graph):
     out = tmp_path / "out.g2o"
-    run(graph, "--out", out)
+    run(graph, "--out", out, "--force")
     assert out.read_text().splitlines()[0].split() == ["VERTEX_SE2", "3", "0.5", "0.0", "0.0"]
     graph.write_text(SMALL + "FIX 5\n")
-    run(graph, "--out", out)
+    run(graph, "--out", out, "--force")
     lines = [line.split() for line in out.read_text().splitlines()]
     assert ["VERTEX_SE2", "5", "2.5", "0.0", "0.0"] in lines
     assert ["FIX", "5"] in lines
     assert lines[0] != ["VERTEX_SE2", "3", "0.5", "0.0", "0.0"]
     graph.write_text(SMALL + "EDGE_PRIOR_SE2 4 7 8 0.5 1 0 0 1 0 1\n")
-    run(graph, "--out", out)
+    run(graph, "--out", out, "--force")
     moved = [float(x) for x in out.read_text().splitlines()[1].split()[2:]]
     assert moved == pytest.approx([7.0, 8.0, 0.5], abs=1e-3)
 

@@ -80,7 +80,7 @@ def test_optimize_starts_where_it_is_told_and_as_it_is_told():
     assert solution.report.chi2_final == pytest.approx(465.969818, abs=1e-3)
 
 
-CASES = {"A": 33, "B": 23, "G": 22, "P": 24, "F": 32, "X": 10}
+CASES = {"A": 33, "B": 23, "G": 22, "P": 24, "F": 36, "X": 14}
 
 
 def test_every_case_of_what_can_go_wrong_is_told_with_a_test_that_is_there_or_a_reason():

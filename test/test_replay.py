@@ -353,11 +353,11 @@ def test_a_folder_with_other_things_in_it_is_refused_and_not_touched(tmp_path, b
 def test_an_earlier_run_is_replaced_but_what_else_is_in_its_folder_stays(tmp_path, bag, folder):
     out = tmp_path / "run"
     shutil.copytree(folder, out)
-    for name in ("ingest_3.mcap", "run_3.mcap"):
-        (out / name).write_bytes(b"of a longer run")
+    for name in ("ingest", "run"):  # of a longer run
+        shutil.copy(folder / f"{name}.mcap", out / f"{name}_3.mcap")
     for name in ("notes.txt", "run_of_last_year.mcap", "ingest_copy.mcap"):
         (out / name).write_bytes(b"mine")
-    replay(bag, out)
+    replay(bag, out, force=True)
     assert {f.name for f in out.iterdir()} == ALL | {"notes.txt", "run_of_last_year.mcap", "ingest_copy.mcap"}
     assert contents(out) == contents(folder)
     replay(out, tmp_path / "again")
@@ -385,7 +385,7 @@ def test_a_refused_recording_leaves_an_earlier_run_as_it_was(tmp_path, folder):
         writer.write("/pose", "geometry_msgs/msg/PoseStamped", 1, b"")
     before = contents(out, ALL)
     with pytest.raises(GraphSlamError, match="no topic of type nav_msgs/msg/Odometry"):
-        replay(bad, out)
+        replay(bad, out, force=True)
     assert contents(out, ALL) == before
 
 
@@ -468,7 +468,7 @@ def test_an_offset_that_ranges_share_is_a_vertex_of_its_own_in_the_saved_graph(t
 
 
 def a_run(folder):
-    recorder = RunRecorder(folder, Config())
+    recorder = RunRecorder(folder, Config(), force=True)
     slam = GraphSlam(sink=recorder.sink)
     slam.process(Odometry(1, (0.0, 0.0, 0.0)))
     recorder.save(slam)

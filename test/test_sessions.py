@@ -87,7 +87,7 @@ def test_a_reset_that_cannot_begin_anew_says_that_nothing_is_recorded(tmp_path, 
     told = []
     one = session(tmp_path / "run", told=told)
     one.take(WORLD[:60])
-    monkeypatch.setattr(RunRecorder, "__init__", lambda *_: (_ for _ in ()).throw(RunError("run: no room")))
+    monkeypatch.setattr(RunRecorder, "__init__", lambda *_, **__: (_ for _ in ()).throw(RunError("run: no room")))
     with pytest.raises(RunError, match="no room"):
         one.reset()
     monkeypatch.undo()

@@ -236,7 +236,7 @@ def test_P6_told_to_stop_at_any_moment_of_its_start_it_ends_with_0_and_may_begin
     assert code == 0, n.said
     assert took_s < lenient(3.0)
     assert "Traceback" not in n.said
-    check_room(tmp_path / "run")
+    check_room(tmp_path / "run", force=True)
 
 
 def test_P5_a_second_node_that_would_record_into_the_folder_of_the_first_does_not_start_and_says_why(tmp_path):
@@ -259,7 +259,7 @@ def test_P6_told_to_stop_while_kernels_are_compiled_it_does_not_wait_for_them(tm
     assert code == 0, n.said
     assert took_s < lenient(3.0)
     assert "Traceback" not in n.said
-    check_room(tmp_path / "run")
+    check_room(tmp_path / "run", force=True)
 
 
 def test_while_kernels_are_compiled_the_node_answers_and_says_how_far_it_is(tmp_path, monkeypatch):

@@ -1,7 +1,8 @@
 """The commands ``graph_slam`` and ``graph_slam_node``.
 
-Exit codes: 0 done, 1 a fault of ours, 2 refused (one line names the culprit), 3 done but something was lost;
-of ``optimize --certify`` also 4 not certified, 5 the certificate does not apply; of ``diff`` 4 they differ.
+Exit codes: 0 done, 1 a fault of ours, 2 refused (one line names the culprit), 3 done but something was lost, 130
+interrupted (Ctrl-C); of ``optimize --certify`` also 4 not certified, 5 the certificate does not apply; of ``diff`` 4
+they differ.
 """
 
 import os
@@ -15,7 +16,6 @@ from collections.abc import Sequence
 
 from graph_slam_ros import progress
 from graph_slam_ros.cli import console
-from graph_slam_ros.cli.parser import parser
 from graph_slam_ros.errors import GraphSlamError
 
 _COMPUTES = {"optimize", "solve", "influence"}  # with kernels, and without a warm-up of their own
@@ -23,9 +23,11 @@ _COMPUTES = {"optimize", "solve", "influence"}  # with kernels, and without a wa
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
-    args = parser().parse_args(arguments)
-    progress.listeners[:] = [console.Throttled()]
     try:
+        from graph_slam_ros.cli.parser import parser  # Ctrl-C while modules are imported is no traceback
+
+        args = parser().parse_args(arguments)
+        progress.listeners[:] = [console.Throttled()]
         if args.run.__name__ in _COMPUTES:
             from graph_slam_ros.warmup import compile_all
 
@@ -35,7 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         console.tell(str(error))
         return console.REFUSED
     except KeyboardInterrupt:
-        return console.REFUSED
+        console.tell("interrupted: nothing is left half-written")
+        return console.INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()
         return console.DONE

@@ -3,15 +3,20 @@
 import importlib.util
 import os
 import re
+import shlex
 import sys
 import time
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.files import is_regular
 
 # Control characters, and those that change the direction of a text or are not seen.
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
 _MOST_TOLD, _LINES_TOLD = 2000, 20  # characters of a message on standard error; lines of losses
-DONE, FAULT, REFUSED, LOSSES = 0, 1, 2, 3
+DONE, FAULT, REFUSED, LOSSES, INTERRUPTED = 0, 1, 2, 3, 130
 NOT_CERTIFIED, NOT_APPLICABLE = 4, 5  # of optimize --certify
 DIFFERENT = 4  # of diff
 
@@ -29,6 +34,35 @@ def say(*lines: str) -> None:
     """
     for line in lines:
         print(escaped(line))
+
+
+def then(what: str) -> None:
+    """The last line of an answer: what to do next."""
+    say(f"next: {what}")
+
+
+def command(*words: object) -> str:
+    """A command line of ``graph_slam`` as a person types it."""
+    return shlex.join(["graph_slam", *map(str, words)])
+
+
+def check_file(*paths: Path | None, force: bool, source: Path | None = None) -> None:
+    """Refuse to replace what is there, before anything is computed.
+
+    Raises
+    ------
+    GraphSlamError
+        A file exists and is not to be replaced, what has its name is not a regular file, or it is the source that is
+        about to be read.
+    """
+    for path in paths:
+        if path is not None and os.path.lexists(path):
+            if source is not None and path.exists() and source.exists() and path.samefile(source):
+                raise GraphSlamError(f"{path}: cannot be read from and written to at once")
+            if not is_regular(path):
+                raise GraphSlamError(f"{path}: not a regular file, and so not replaced: choose another name")
+            if not force:
+                raise GraphSlamError(f"{path}: exists already: choose another name, or --force replaces it")
 
 
 def tell(what: str, programme: str = "graph_slam") -> None:

@@ -21,6 +21,10 @@ def explain(args: argparse.Namespace) -> int:
     from graph_slam_ros.run import changed_since
 
     console.say(*(explain_edge(args.run_folder, args.edge) if args.edge else explain_run(args.run_folder)))
+    if args.edge:
+        console.then(f"{console.command('solve', args.run_folder, '--without', 'EDGE')} (the drive without an edge)")
+    else:
+        console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (all about one edge or landmark)")
     return console.told([], changed_since(args.run_folder))
 
 
@@ -36,6 +40,7 @@ def solve(args: argparse.Namespace) -> int:
     solver = run.solve(args.without, args.let_in, args.loss)
     took_s = time.perf_counter() - start
     console.say(*_moved_text(run, run.moved(solver)), f"solved in {1e3 * took_s:.0f} ms")
+    console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (why the run judged an edge as it did)")
     return console.told([], changed_since(args.run_folder))
 
 
@@ -53,6 +58,7 @@ def influence(args: argparse.Namespace) -> int:
         exact = f"{one.exact_m:10.4f} m" if math.isfinite(one.exact_m) else "undetermined"
         told = f"{one.first_order_m:10.4f} m {exact}"
         console.say(f"  {one.edge:<8d} {run.edge(one.edge).about:24s} {told}")
+    console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (all about one of them)")
     return console.told([], changed_since(args.run_folder))
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,7 @@ def optimize(args: argparse.Namespace) -> int:
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.solver import Settings
 
+    console.check_file(args.out, args.plot, force=args.force, source=args.graph)
     file = _read_graph(args, error_map=args.error_map)
     graph = file.graph
     settings = Settings(
@@ -59,7 +61,17 @@ def optimize(args: argparse.Namespace) -> int:
     _tell_unknown(file)
     for repair in file.repaired:
         console.tell(repair)
+    if not args.json:
+        console.then(_after(args, report.converged))
     return console.told(file.skipped) or (proof.code if proof else console.DONE)
+
+
+def _after(args: argparse.Namespace, converged: bool) -> str:
+    if not converged:
+        return f"{console.command('optimize', args.graph, '--init', 'chordal')} (another start)"
+    if args.out is None:
+        return f"{console.command('optimize', args.graph, '--out', 'SOLVED.g2o')} (the same, and write it)"
+    return f"{console.command('convert', args.out, 'POSES.tum')} (the poses as a trajectory)"
 
 
 def convert(args: argparse.Namespace) -> int:
@@ -71,8 +83,7 @@ def convert(args: argparse.Namespace) -> int:
     target = args.to or format_of(args.out)
     if ending(args.graph) == ".tum" and not args.source:
         raise GraphSlamError(f"{args.graph}: a trajectory has no edges, and so is no graph: TUM is only written")
-    if args.out.exists() and args.graph.exists() and args.out.samefile(args.graph):
-        raise GraphSlamError(f"{args.out}: cannot be read from and written to at once")
+    console.check_file(args.out, force=args.force, source=args.graph)
     file = _read_graph(args)
     if file.has_values or target != "gtsam":  # which alone needs no vertex lines
         solver, start = started(file, "file")
@@ -83,6 +94,8 @@ def convert(args: argparse.Namespace) -> int:
         written = write_graph(args.out, file, None, target)
     vertices = f"{written.vertices} of {file.graph.vertex_count} vertices"
     console.say(f"wrote {args.out} as {NAMES[target]}: {vertices}, {written.edges} of {file.graph.edge_count} edges")
+    reader = "evo_traj tum" if target == "tum" else "graph_slam optimize"
+    console.then(shlex.join([*reader.split(), str(args.out)]))
     if target == "g2o":
         _tell_unknown(file)
     return console.told(file.skipped + written.lost)

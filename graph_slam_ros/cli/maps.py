@@ -9,11 +9,23 @@ from graph_slam_ros.cli import console
 def export(args: argparse.Namespace) -> int:
     """Write what a run knows in another format."""
     from graph_slam_ros.export import export as exported
+    from graph_slam_ros.export import files_of
 
+    console.check_file(*files_of(args.out, args.to), force=args.force)
     losses: list[str] = []
     files = exported(args.run_folder, args.out, args.to, losses)
     console.say(*(f"wrote {file}" for file in files))
+    _then_use(args)
     return console.told(losses)
+
+
+def _then_use(args: argparse.Namespace) -> None:
+    use = {
+        "tum": f"evo_traj tum {args.out} --plot, or any reader of TUM trajectories",
+        "g2o": console.command("optimize", args.out),
+        "mcap": f"open {args.out} in Foxglove, or ros2 bag play {args.out}",
+    }
+    console.then(use[args.to])
 
 
 def diff(args: argparse.Namespace) -> int:
@@ -23,6 +35,9 @@ def diff(args: argparse.Namespace) -> int:
     losses: list[str] = []
     found = compared(args.a, args.b, losses)
     console.say(*([json.dumps(found.as_dict())] if args.json else found.lines()))
+    if not args.json:
+        merged = console.command("merge", args.a, args.b, "--out", "MERGED")
+        console.then("nothing: they are the same" if found.is_same else f"{merged} (one map of both)")
     return console.told(losses) or (console.DONE if found.is_same else console.DIFFERENT)
 
 
@@ -31,10 +46,11 @@ def merge(args: argparse.Namespace) -> int:
     from graph_slam_ros import outcome
     from graph_slam_ros.merge import merge as merged
 
-    done = merged(args.a, args.b, args.out)
+    done = merged(args.a, args.b, args.out, force=args.force)
     agree = done.shared - len(done.left_out)
     console.say(*outcome.text(done.summary), f"{agree} of {done.shared} landmarks of both lay B on A")
     console.say(f"results in {args.out}")
+    console.then(f"{console.command('freeze', args.out, '--out', 'SITE')} (a map that stays as it is)")
     moved = [
         f"landmark {name} is {metres:.2f} m ({sigmas:.0f} sigmas) elsewhere in B: what B saw of it is left out"
         for name, (metres, sigmas) in done.left_out.items()
@@ -47,6 +63,7 @@ def freeze(args: argparse.Namespace) -> int:
     from graph_slam_ros import outcome
     from graph_slam_ros.run import freeze as frozen
 
-    summary = frozen(args.run_folder, args.out)
+    summary = frozen(args.run_folder, args.out, force=args.force)
     console.say(*outcome.text(summary), f"results in {args.out}: what is there now stays, whatever is seen from now on")
+    console.then(f"the node locates itself in it with output.load:={args.out.name}, its folder beside output.folder")
     return console.told(summary["losses"])

@@ -28,15 +28,23 @@ def replay(args: argparse.Namespace) -> int:
         raise GraphSlamError("replay needs --out DIR, the folder for the results")
     own = config if args.config or args.set or not is_run(args.bag) else None
     done = replayed(
-        args.bag, args.out, own, odometry=args.odom, landmarks=args.landmarks, progress=console.progress("replay")
+        args.bag,
+        args.out,
+        own,
+        odometry=args.odom,
+        landmarks=args.landmarks,
+        force=args.force,
+        progress=console.progress("replay"),
     )
     code = _say_run(args.bag, done.summary)
     console.say(f"results in {args.out}")
     _draw(args.out)
+    _then_look(args.out)
     return console.told(done.losses, done.warnings) or code
 
 
 def _replay_live(args: argparse.Namespace, config: "Config") -> int:
+    from graph_slam_ros.formats.files import read_text
     from graph_slam_ros.replay import choose_inputs
     from graph_slam_ros.ros.bag import open_bag
 
@@ -53,14 +61,15 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
     if args.out is None:
         played = play(bag, inputs, node_name=node_name, **options)
     else:
-        check_room(args.out, args.bag)
+        check_room(args.out, args.bag, force=args.force)
         with own_node(args.out, inputs, config) as own:
             played = play(bag, inputs, own=own, **options)
-        summary = json.loads((args.out / SUMMARY).read_text())
+        summary = json.loads(read_text(args.out / SUMMARY))
         asked = {name: counts for name, counts in summary["inputs"].items() if name in inputs.topics}
         code = _say_run(args.bag, summary | {"inputs": asked})
         _draw(args.out)
     console.say(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
+    _then_look(Path(played.saved))
     losses = bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else [])
     return console.told(losses, bag.warnings) or code
 
@@ -70,9 +79,10 @@ def recover(args: argparse.Namespace) -> int:
     from graph_slam_ros.run import complete
     from graph_slam_ros.run import recover as recovered
 
-    summary = recovered(args.run_folder, args.out) if args.out else complete(args.run_folder)
+    summary = recovered(args.run_folder, args.out, force=args.force) if args.out else complete(args.run_folder)
     code = _say_run(args.run_folder, summary)
     console.say(f"results in {args.out or args.run_folder}")
+    _then_look(args.out or args.run_folder)
     return console.told(summary["losses"]) or code
 
 
@@ -80,10 +90,10 @@ def info(args: argparse.Namespace) -> int:
     """Say what a recording holds."""
     from graph_slam_ros.info import describe
     from graph_slam_ros.ros.bag import open_bag
-    from graph_slam_ros.run import is_run
+    from graph_slam_ros.run import is_run, suggested_out
 
     if is_run(args.bag):
-        console.say(f"an earlier run: graph_slam replay {args.bag} --out again")
+        console.say(f"an earlier run: {console.command('replay', args.bag, '--out', suggested_out(args.bag))}")
         return console.DONE
     bag = open_bag(args.bag)
     lines, fits = describe(bag, args.bag)
@@ -98,10 +108,13 @@ def evaluate(args: argparse.Namespace) -> int:
     from graph_slam_ros.run import changed_since
     from graph_slam_ros.truth import read_truth
 
+    console.check_file(args.plot, force=args.force)
     truth = read_truth(args.truth, args.topic, input_topics(args.run_folder))
     scores = compared(args.run_folder, truth, args.estimate, align=not args.no_align)
     console.say(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
     _draw(args.run_folder, truth, args.plot, align=not args.no_align, quiet=args.json)
+    if not args.json:
+        console.then(f"{console.command('explain', args.run_folder)} (what the run believed, and what not)")
     return console.told(scores.losses, [*scores.warnings, *changed_since(args.run_folder)])
 
 
@@ -114,9 +127,11 @@ def plot(args: argparse.Namespace) -> int:
         raise GraphSlamError("plot: no use for --topic or --no-align without --truth")
     if not _has_matplotlib():
         raise GraphSlamError(_NO_MATPLOTLIB)
+    console.check_file(args.out, force=args.force)
     picture = args.out or args.run_folder / PICTURE
     draw_run(args.run_folder, args.truth, picture, args.topic, align=not args.no_align)
     console.say(f"picture in {picture}")
+    _then_look(args.run_folder)
     return console.told([], changed_since(args.run_folder))
 
 
@@ -148,6 +163,7 @@ def warmup(args: argparse.Namespace) -> int:
     from graph_slam_ros.warmup import warmup as compiled
 
     console.tell(f"kernels ready after {compiled():.1f} s")
+    console.then(console.command("info", "RECORDING"))
     return console.DONE
 
 
@@ -155,7 +171,9 @@ def demo(args: argparse.Namespace) -> int:
     """Run the demonstration."""
     from graph_slam_ros.demo import demo as shown
 
-    return shown(args.out, live=console.has_ros(), progress=console.progress, say=console.say)
+    code = shown(args.out, live=console.has_ros(), force=args.force, progress=console.progress, say=console.say)
+    console.then(f"a recording of your own: {console.command('info', 'RECORDING')}")
+    return code
 
 
 def _refuse_idle_options(args: argparse.Namespace, of_run: bool) -> None:
@@ -182,7 +200,7 @@ def _config(args: argparse.Namespace) -> "Config":
     from graph_slam_ros.slam.config import flatten
 
     file = args.config or (args.bag / "config.yaml" if is_run(args.bag) else None)
-    values = dict(flatten(read_parameters(file))) if file else {}
+    values = dict(flatten(read_parameters(file, follow=file == args.config))) if file else {}
     try:
         return Config.from_mapping(values | dict(parse_setting(text) for text in args.set))
     except GraphSlamError as error:
@@ -200,3 +218,8 @@ def _say_run(source: Path, summary: dict[str, Any]) -> int:
     for sentence in shortcomings:
         console.tell(sentence)
     return console.LOSSES if shortcomings else console.DONE
+
+
+def _then_look(run: Path) -> None:
+    why, errors = console.command("explain", run), console.command("evaluate", run, "--truth", "TRUTH")
+    console.then(f"{why} (what was believed, and what not), or where there is a truth {errors}")

@@ -26,6 +26,9 @@ def simulate(args: argparse.Namespace) -> int:
     of_file = args.scenario not in (*WORLDS, CITY) and Path(args.scenario).is_file()
     if (of_file or args.scenario == CITY) and not as_graph:
         raise GraphSlamError(f"{args.out}: {args.scenario} is a graph: --out FILE.g2o")
+    beside = [".faults.csv"] * bool(faults) + [".truth.tum"] * (as_graph and not of_file)
+    written, source = [_beside(args.out, ending) for ending in beside], Path(args.scenario) if of_file else None
+    console.check_file(args.out, *written, force=args.force, source=source)
     if of_file:
         return _spoil(args, faults)
     try:
@@ -35,6 +38,7 @@ def simulate(args: argparse.Namespace) -> int:
             _write_bag(args, faults)
     except OSError as error:
         raise GraphSlamError(f"{args.out}: {error.strerror}") from None
+    console.then(console.command("optimize" if as_graph else "info", args.out))
     return console.DONE
 
 
@@ -82,12 +86,11 @@ def _spoil(args: argparse.Namespace, faults: "list[Fault]") -> int:
     for what, given in (("--set", args.set), ("--closures", args.closures), ("--poses", args.poses)):
         if given:
             raise GraphSlamError(f"{source}: no use for {what}: it is no world")
-    if args.out.exists() and args.out.samefile(source):
-        raise GraphSlamError(f"{args.out}: cannot be read from and written to at once")
     file = read_g2o(source)
     solver = optimize(file).solver
     truth = np.concatenate([solver.estimate([v])[0] for v in range(file.graph.vertex_count)])
     _write_faulty(args, file, truth, faults)
+    console.then(console.command("optimize", args.out))
     return console.DONE
 
 

@@ -1,23 +1,31 @@
-"""Files that outlive whoever writes them: one that only grows, and one that is replaced whole or not at all."""
+"""Files that outlive whoever writes them: one that only grows, and one that is replaced whole or not at all.
+
+No link is written through: a file is always created under a name that nothing had before.
+"""
 
 import contextlib
 import errno
 import fcntl
 import os
+import secrets
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+from graph_slam_ros.formats.files import created
+
 
 class AppendedFile:
-    """A file that is begun anew and only grows; what cannot be written is kept, and written the next time.
+    """A file that is new and only grows; what cannot be written is kept, and written the next time.
 
     What was flushed outlives the process, what was synced a power cut. There are no holes: a process that dies in the
-    middle leaves the first part of what it had to say. The first flush makes the file.
+    middle leaves the first part of what it had to say. The first flush makes the file: a name that exists is refused.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._fd = _NOT_MADE
+        self._is_named = False  # on the disk
         self._end = 0
         self._waiting = bytearray()
 
@@ -38,7 +46,10 @@ class AppendedFile:
     def flush(self) -> None:
         """Write what waits. Raises OSError: then some of it waits still."""
         if self._fd == _NOT_MADE:
-            self._fd = _made(self._path)
+            self._fd = created(self._path)
+        if not self._is_named and self._fd >= 0:
+            sync_folder(self._path.parent)
+            self._is_named = True
         while self._waiting:
             written = os.pwrite(self._fd, self._waiting, self._end)
             self._end += written
@@ -66,22 +77,23 @@ class AppendedFile:
 _NOT_MADE, _CLOSED = -1, -2
 
 
-def _made(path: Path) -> int:
-    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-    try:
-        sync_folder(path.parent)
-    except OSError:
-        os.close(fd)
-        raise
-    return fd
-
-
 @contextlib.contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """A new file to be written in its place; a reader sees the old one or the new one, whatever happens in between."""
-    new = path.with_name(path.name + NEW)
+    """The name of a new file to be written in its place; a reader sees the old file or the new one, at any time.
+
+    A link that has the name is replaced itself, not what it leads to.
+
+    Raises
+    ------
+    OSError
+        What has the name is neither a regular file nor a link, or the file cannot be written.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        mode = path.lstat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+            raise FileExistsError(errno.EEXIST, "not a regular file, and so not replaced", str(path))
+    new = path.with_name(f".{secrets.token_hex(4)}{NEW}")
     try:
-        new.unlink(missing_ok=True)  # left behind, or a link that leads elsewhere
         yield new
         fd = os.open(new, os.O_RDONLY | os.O_CLOEXEC)
         try:
@@ -93,6 +105,17 @@ def replaced(path: Path) -> Iterator[Path]:
         new.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all. Raises OSError as ``replaced``."""
+    with replaced(path) as new:
+        file = AppendedFile(new)
+        file.write(data)
+        try:
+            file.flush()
+        finally:
+            file.abandon()
 
 
 @contextlib.contextmanager
@@ -133,4 +156,4 @@ def sync_folder(folder: Path) -> None:
 
 
 NEW = ".new"
-"""How the name of a file ends that is still being written."""
+"""The name of a file that is still being written is a dot, eight hexadecimal digits, and this."""

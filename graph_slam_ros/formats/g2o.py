@@ -251,6 +251,7 @@ def read_g2o(
     lenient: bool = False,
     raw: bool = False,
     dialect: str | None = None,
+    follow: bool = True,
 ) -> G2oFile:
     """Read a g2o file, or a text of one of its dialects.
 
@@ -266,6 +267,7 @@ def read_g2o(
     dialect : ``g2o``, ``toro``, ``gtsam``, ``isam`` (square roots of the information) or ``rows`` (EDGE2 with its
         information in rows of the upper triangle): refuse lines of the others, and guess at nothing; by default each
         line is known by its tag
+    follow : the file may be a symbolic link
 
     Raises
     ------
@@ -278,10 +280,10 @@ def read_g2o(
     if dialect not in (None, *DIALECTS):
         raise FormatError(f"dialect {dialect!r}: choose {', '.join(DIALECTS)}")
     own_numbers = dialect in ("gtsam", "isam") or any(
-        text.lstrip().startswith(("LANDMARK ", "LANDMARK\t")) for _, text in lines(path)
+        text.lstrip().startswith(("LANDMARK ", "LANDMARK\t")) for _, text in lines(path, follow=follow)
     )
     reader = _Reader(path.name, lenient, Text(dialect, raw, LANDMARK_IDS_FROM if own_numbers else 0))
-    for number, text in lines(path):
+    for number, text in lines(path, follow=follow):
         reader.take(number, text)
     if not reader.vertices:
         reader.declare_all()

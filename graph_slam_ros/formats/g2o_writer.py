@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.formats.graph_file import (
     AT_OFFSET,
     EDGE_TAGS,
@@ -44,10 +45,10 @@ def weightless(graph: Graph) -> int:
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Write a file, gzipped where its name ends so. Raises FormatError."""
-    content = text.encode()
+    """Write a file whole or not at all, gzipped where its name ends so. Raises FormatError."""
+    path, content = Path(path), text.encode()
     try:
-        Path(path).write_bytes(gzip.compress(content, mtime=0) if is_gzipped(Path(path)) else content)
+        write_whole(path, gzip.compress(content, mtime=0) if is_gzipped(path) else content)
     except OSError as error:
         raise FormatError(f"{path}: {error.strerror}") from None
 

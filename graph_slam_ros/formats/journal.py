@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import AppendedFile
-from graph_slam_ros.formats.mcap_records import records
+from graph_slam_ros.formats.mcap_records import LIBRARY, records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
 INGEST, MAP = "ingest", "map"
@@ -33,7 +33,7 @@ class RecordWriter:
         self.file = AppendedFile(path)
         self._chunk = _Chunk()
         self._writer = Writer(self.file, chunk_size=self._chunk, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
-        self._writer.start(profile="", library="graph_slam_ros")
+        self._writer.start(profile="", library=LIBRARY)
         self._schema = self._writer.register_schema(schema, "jsonschema", _SCHEMA)
         self._channels: dict[str, int] = {}
         self._sequence = 0
@@ -149,7 +149,7 @@ def parts_of(folder: Path, name: str = INGEST) -> list[Path]:
     """The files of a recording in a run folder, in order."""
     pattern = re.compile(rf"{name}(?:_(\d+))?\.mcap")
     parts = {file: pattern.fullmatch(file.name) for file in folder.glob(f"{name}*.mcap")}
-    numbered = {file: int(part[1] or 0) for file, part in parts.items() if part and file.is_file()}
+    numbered = {file: int(part[1] or 0) for file, part in parts.items() if part}
     return sorted(numbered, key=lambda file: numbered[file])
 
 
@@ -209,7 +209,7 @@ def _messages(folder: Path, name: str, losses: list[str]) -> Iterator[tuple[str,
             return
         known: dict[int, str] = {}
         expected = 0
-        for record in records(file, losses):
+        for record in records(file, losses, follow=False):
             if isinstance(record, Channel):
                 if record.message_encoding != "json":
                     raise FormatError(f"{file.name}: channel {record.topic} is {record.message_encoding}, not json")

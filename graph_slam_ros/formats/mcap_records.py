@@ -21,11 +21,15 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema
 from mcap.stream_reader import MAGIC_SIZE
 from mcap.summary import Summary
+from mcap.writer import Writer
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.decompression import MOST_BYTES, decompressed
+from graph_slam_ros.formats.files import opened
 
 MAGIC = b"\x89MCAP0\r\n"
+LIBRARY = "graph_slam_ros"
+"""What the head of our own files names as the program that wrote them."""
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
 _READ: dict[Opcode, Any] = {
     Opcode.SCHEMA: Schema,
@@ -54,8 +58,8 @@ class Contents:
 class _Stream(io.BufferedReader):
     """A file that is never asked for more than there is, up to ``end``: a length in a damaged file may be 2^60."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(path))
+    def __init__(self, path: Path, follow: bool = True) -> None:
+        super().__init__(opened(path, follow=follow))
         self.size = self.end = os.fstat(self.fileno()).st_size
 
     def go(self, at: int, end: int | None = None) -> None:
@@ -67,6 +71,13 @@ class _Stream(io.BufferedReader):
         if size is not None and size > left:
             raise EndOfFile()
         return super().read(left if size is None or size < 0 else size)
+
+
+def begin(profile: str = "", library: str = LIBRARY) -> bytes:
+    """How a file of ours begins."""
+    head = io.BytesIO()
+    Writer(head, use_chunking=False).start(profile, library)
+    return head.getvalue()
 
 
 def contents(path: Path) -> Contents:
@@ -91,15 +102,18 @@ def contents(path: Path) -> Contents:
     return Contents(schemas, channels, counts, first_ns)
 
 
-def records(path: Path, losses: list[str], warnings: list[str] | None = None) -> Iterator[McapRecord]:
+def records(
+    path: Path, losses: list[str], warnings: list[str] | None = None, *, follow: bool = True
+) -> Iterator[McapRecord]:
     """Schemas, channels and messages in order of the file.
 
     What is damaged is passed over up to the next chunk; a cut tail ends it. Each adds a line to ``losses``; one in
-    ``warnings`` says where there is damage, and no checksum that would tell of more.
+    ``warnings`` says where there is damage, and no checksum that would tell of more. ``follow``: the file may be a
+    symbolic link.
     """
     known = len(losses)
     read, unchecked, loose = 0, False, False
-    with _Stream(path) as stream:
+    with _Stream(path, follow) as stream:
         at = MAGIC_SIZE
         while True:
             try:

@@ -15,6 +15,7 @@ from yaml.resolver import Resolver
 from yaml.scanner import Scanner
 
 from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.formats.files import opened
 
 _MAX_BYTES, _MAX_DEPTH, _MAX_NODES = 2**20, 50, 20_000
 _NODE = "graph_slam"
@@ -105,10 +106,10 @@ _StrictLoader.add_implicit_resolver(
 )
 
 
-def read_parameters(path: Path | str) -> dict[str, Any]:
+def read_parameters(path: Path | str, *, follow: bool = True) -> dict[str, Any]:
     """Nested values of a parameter file; a ROS wrapper (``/**: ros__parameters: ...``) is taken off.
 
-    Of a file for several nodes, the section of ``graph_slam``.
+    Of a file for several nodes, the section of ``graph_slam``. ``follow``: the file may be a symbolic link.
 
     Raises
     ------
@@ -117,11 +118,11 @@ def read_parameters(path: Path | str) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        if path.exists() and not path.is_file():
-            raise ConfigError("not a file")
-        if path.stat().st_size > _MAX_BYTES:
+        with opened(path, follow=follow) as stream:
+            content = stream.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
             raise ConfigError(f"larger than {_MAX_BYTES} bytes")
-        values = yaml.load(path.read_text(encoding="utf-8-sig"), Loader=_StrictLoader)
+        values = yaml.load(content.decode("utf-8-sig"), Loader=_StrictLoader)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     except ConfigError as error:

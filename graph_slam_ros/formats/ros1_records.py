@@ -7,12 +7,13 @@ import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from io import BytesIO
+from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.decompression import MOST_BYTES, decompressed
+from graph_slam_ros.formats.files import opened
 
 MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = b"\x02", b"\x03", b"\x05", b"\x06", b"\x07"
@@ -78,7 +79,7 @@ def messages(path: Path, losses: list[str]) -> Iterator[Message]:
 
 
 def _indexed(path: Path) -> Contents:
-    with path.open("rb") as stream:
+    with BufferedReader(opened(path, follow=True)) as stream:
         size = os.fstat(stream.fileno()).st_size
         stream.seek(len(MAGIC))
         fields, _ = _record(stream, size)
@@ -101,7 +102,7 @@ def _indexed(path: Path) -> Contents:
 def _records(path: Path, losses: list[str]) -> Iterator[tuple[Fields, bytes]]:
     """Connections and messages, those in chunks and those outside."""
     read = 0
-    with path.open("rb") as stream:
+    with BufferedReader(opened(path, follow=True)) as stream:
         size = os.fstat(stream.fileno()).st_size
         stream.seek(len(MAGIC))
         while (at := stream.tell()) < size:

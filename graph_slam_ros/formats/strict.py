@@ -1,7 +1,9 @@
 """Strict reading of text: what Python's own conversions would let through is refused by name."""
 
 import gzip
+import io
 import itertools
+import os
 import re
 import zlib
 from collections.abc import Iterator
@@ -12,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.files import opened
 
 # float() also accepts 1_0, inf, nan and digits of other scripts. No part can match what the one before it gave back:
 # time is linear in the length of a word.
@@ -27,19 +30,23 @@ _ID = re.compile(r"[+-]?\d{1,18}", re.ASCII)
 _STAMP = re.compile(r"\d{1,18}|[1-8]\d{18}", re.ASCII)
 
 
-def lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines of a text file, gzipped where its name ends so. Raises FormatError."""
+def lines(path: Path, *, follow: bool = True) -> Iterator[tuple[int, str]]:
+    """Numbered lines of a text file, gzipped where its name ends so; ``follow``: it may be a symbolic link.
+
+    Raises FormatError.
+    """
     try:
-        if not path.is_file():
-            raise FormatError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
-        opened = gzip.open if is_gzipped(path) else open
-        most = max(_FREE, MOST_TEXT_RATIO * path.stat().st_size) if is_gzipped(path) else None
-        with opened(path, "rt", encoding="utf-8-sig", newline="") as stream:  # a quoted field may have any line end
-            yield from _bounded(stream, path, most)
+        with opened(path, follow=follow) as raw:
+            most = max(_FREE, MOST_TEXT_RATIO * os.fstat(raw.fileno()).st_size) if is_gzipped(path) else None
+            plain = gzip.GzipFile(fileobj=raw) if is_gzipped(path) else io.BufferedReader(raw)
+            with io.TextIOWrapper(plain, encoding="utf-8-sig", newline="") as stream:  # a field may hold any line end
+                yield from _bounded(stream, path, most)
     except (gzip.BadGzipFile, zlib.error, EOFError):
         raise FormatError(f"{path.name}: damaged, or not a gzip file") from None
     except UnicodeDecodeError:
         raise FormatError(f"{path.name}: not a text file") from None
+    except FileNotFoundError:
+        raise FormatError(f"{path}: no such file") from None
     except OSError as error:
         raise FormatError(f"{path}: {error.strerror}") from None
 

@@ -20,6 +20,7 @@ from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats import mcap_records, ros1_records, sqlite_records
 from graph_slam_ros.formats.decompression import ZSTD_MAGIC, zstd_message
 from graph_slam_ros.formats.durable import AppendedFile
+from graph_slam_ros.formats.files import opened
 from graph_slam_ros.ros.interfaces import typestore
 
 _SUFFIXES = (".mcap", ".db3", ".bag", ".bag.active", ".mcap.zstd", ".db3.zstd")
@@ -153,7 +154,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 def _part(file: Path) -> "_Part":
     """By how the file begins: whatever its name says."""
-    with file.open("rb") as stream:
+    with opened(file, follow=True) as stream:
         begins = stream.read(16)
     if not begins:
         raise BagError(f"{file}: the file is empty")
@@ -341,7 +342,7 @@ class BagWriter:
     def __init__(self, path: Path | str) -> None:
         self._file = AppendedFile(Path(path))
         self._writer = Writer(self._file, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
-        self._writer.start(profile="ros2", library="graph_slam_ros")
+        self._writer.start(profile="ros2", library=mcap_records.LIBRARY)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}

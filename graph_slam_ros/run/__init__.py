@@ -28,6 +28,7 @@ from graph_slam_ros.run.folder import (
     missing,
     recording_of,
     run_config,
+    suggested_out,
 )
 from graph_slam_ros.run.recorder import RunRecorder
 from graph_slam_ros.run.saved import complete, freeze, map_of, record_run, recover, settled, stopwatch, taken_up
@@ -61,6 +62,7 @@ __all__ = [
     "run_config",
     "settled",
     "stopwatch",
+    "suggested_out",
     "summarize",
     "taken_up",
 ]

@@ -1,19 +1,32 @@
-"""Which folder is a run, which of several is the newest, and what of a folder may be replaced."""
+"""Which folder is a run, which of several is the newest, and what of a folder may be replaced.
+
+A folder is a run if its ``run.json`` says so (``format``); it does from the start of the run on. Only such a folder is
+ever cleared, and only of the files of a run: a recording in it is looked into before it is removed. Runs of earlier
+versions, whose ``run.json`` has no such mark or was never written, are known by their journal. They are read like any
+other, and never cleared.
+"""
 
 import contextlib
+import itertools
 import json
+import os
 import re
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from mcap.records import Channel, Schema
+
+from graph_slam_ros import __version__
 from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
-from graph_slam_ros.formats.durable import NEW, claimed, sync_folder
-from graph_slam_ros.formats.journal import INGEST, MAP, parts_of, read_ingest
+from graph_slam_ros.formats.durable import NEW, claimed, sync_folder, write_whole
+from graph_slam_ros.formats.files import is_regular, opened, read_bytes, read_text
+from graph_slam_ros.formats.journal import INGEST, MAP, MEASUREMENT, parts_of, read_ingest
+from graph_slam_ros.formats.mcap_records import begin, records
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.run.ledger_file import CHANGES, LEDGER
-from graph_slam_ros.run.map_log import grew
+from graph_slam_ros.run.map_log import GROWTH, grew
 from graph_slam_ros.slam import Config
 
 SUMMARY, CONFIG = "run.json", "config.yaml"
@@ -23,7 +36,15 @@ SIGHTINGS, ODOMETRY = "sightings.tum", "odometry.tum"  # the same at the stamps 
 LANDMARKS, PICTURE = "landmarks.csv", "path.png"
 _PATHS = {PATH, PATH_ODOMETRY, SIGHTINGS, ODOMETRY, COVARIANCES}
 _RESULTS = {SUMMARY, GRAPH, VERTICES, LEDGER, CHANGES, LANDMARKS, PICTURE, *_PATHS}
+MARK = "graph_slam_ros run"
+"""The ``format`` of the ``run.json`` of a run."""
+BEGUN = json.dumps({"format": MARK, "version": __version__, "ended": False}).encode()
+"""The ``run.json`` of a run until it is saved."""
 _RECORDED = re.compile(r"(ingest|map|run)(_\d+)?\.mcap")
+_UNFINISHED = re.compile(r"\.[0-9a-f]{8}" + re.escape(NEW))
+_SCHEMAS = {INGEST: MEASUREMENT, MAP: GROWTH}
+_OF_RECORDINGS = re.compile(r"(\.(mcap|db3|bag|active|zstd|gz))+$")
+_TOPICS = {"/tf", "/pose", "/path", "/landmarks"}
 
 
 class RunError(GraphSlamError):
@@ -31,8 +52,34 @@ class RunError(GraphSlamError):
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder holds a run: an ingest sequence and the configuration it was taken with."""
-    return folder.is_dir() and (folder / CONFIG).is_file() and bool(parts_of(folder))
+    """Whether a folder holds a run: its ``run.json`` says so, or it is of an earlier version and has our journal."""
+    if not folder.is_dir():
+        return False
+    try:
+        return _is_marked(folder) or (is_regular(folder / CONFIG) and any(map(_is_recorded, parts_of(folder)[:1])))
+    except OSError:  # its journal cannot be read
+        return False
+
+
+def _is_marked(folder: Path) -> bool:
+    return summary_of(folder).get("format") == MARK
+
+
+def _is_recorded(file: Path) -> bool:
+    """Whether a file with the name of a run's recording is one: its head and its first record say so."""
+    name = _RECORDED.fullmatch(file.name)
+    if name is None or not is_regular(file):
+        return False
+    head = begin("ros2" if name[1] == "run" else "")
+    with opened(file) as stream:
+        there = stream.read(len(head))
+    if there != head:
+        return head.startswith(there)  # torn as it began
+    first = next((r for r in records(file, [], follow=False) if isinstance(r, Schema | Channel)), None)
+    if name[1] == "run":
+        channels = (r for r in records(file, [], follow=False) if isinstance(r, Channel))
+        return first is None or getattr(next(channels, None), "topic", "") in _TOPICS
+    return first is None or getattr(first, "name", "") == _SCHEMAS[name[1]]
 
 
 def is_cut_off(folder: Path) -> bool:
@@ -66,15 +113,15 @@ def _holds_something(folder: Path) -> bool:
         return is_run(folder)
     try:
         return next(read_ingest(folder, []), None) is not None or grew(folder)
-    except FormatError:  # who knows
+    except (FormatError, OSError):  # who knows
         return True
 
 
 def summary_of(folder: Path) -> dict[str, Any]:
     """The summary; nothing where it cannot be read."""
     try:
-        told = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        told = json.loads(read_text(folder / SUMMARY))
+    except (OSError, ValueError, RecursionError):
         return {}
     return told if isinstance(told, dict) else {}
 
@@ -87,9 +134,9 @@ def recording_of(folder: Path) -> str:
 
 def run_config(folder: Path) -> Config:
     """The configuration a run was made with. Raises ConfigError naming the file."""
-    if not (folder / CONFIG).is_file():
+    if not os.path.lexists(folder / CONFIG):
         raise ConfigError(f"{folder}: not a run: no {CONFIG} in it")
-    values = read_parameters(folder / CONFIG)
+    values = read_parameters(folder / CONFIG, follow=False)
     try:
         return Config.from_mapping(values)
     except GraphSlamError as error:
@@ -101,7 +148,7 @@ def changed_since(folder: Path) -> list[str]:
     try:
         files = summary_of(folder)["files"]
         there = [name for name in sorted(_RESULTS & set(files)) if (folder / name).exists()]
-        changed = [name for name in there if checksum((folder / name).read_bytes()) != files[name]]
+        changed = [name for name in there if checksum(read_bytes(folder / name)) != files[name]]
     except (OSError, LookupError, TypeError):
         return []
     out = [f"{name} is not the one that {SUMMARY} was saved with" for name in changed]
@@ -129,8 +176,21 @@ def checksum(data: bytes) -> str:
     return f"{zlib.crc32(data):08x}"
 
 
-def check_room(folder: Path, source: Path | None = None) -> None:
-    """Refuse a folder that holds anything but an earlier run, or the source that is about to be read.
+def suggested_out(source: Path) -> Path:
+    """A free name here for the run of a recording (``drive_run``), or for the replay of a run (``drive_run_again``)."""
+    name = _OF_RECORDINGS.sub("", source.resolve().name)
+    name = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._-") or "recording"
+    name += "_again" if is_run(source) else "_run"
+    free = (Path(f"{name}_{k}" if k > 1 else name) for k in itertools.count(1))
+    return next(path for path in free if not os.path.lexists(path))
+
+
+def check_room(folder: Path, source: Path | None = None, *, force: bool = False) -> None:
+    """Refuse a folder that holds anything but a run that may be replaced, or the source that is about to be read.
+
+    Parameters
+    ----------
+    force : a run that holds something may be replaced, too
 
     Raises
     ------
@@ -140,11 +200,20 @@ def check_room(folder: Path, source: Path | None = None) -> None:
     try:
         if source is not None and folder.resolve() in (source.resolve(), source.resolve().parent):
             raise RunError(f"{folder}: cannot be read from and written to at once")
-        if folder.exists() and not is_run(folder) and not all(map(_is_of_a_start, folder.iterdir())):
+        if not folder.exists():
+            return
+        with claimed(folder):
+            pass
+        if _is_marked(folder):
+            _, foreign = _contents(folder)
+            if foreign:
+                raise RunError(f"{foreign[0]}: not written by this run, and so never removed: choose another folder")
+            if not force and _holds_something(folder):
+                raise RunError(f"{folder}: holds a run already: choose another folder, or --force replaces it")
+        elif is_run(folder):
+            raise RunError(f"{folder}: a run of an earlier version, which is never replaced: choose another folder")
+        elif not all(map(_is_unfinished, folder.iterdir())):
             raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
-        if folder.exists():
-            with claimed(folder):
-                pass
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None
 
@@ -152,14 +221,15 @@ def check_room(folder: Path, source: Path | None = None) -> None:
 def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> None:
     """Move an earlier run out of the way: to ``folder-1``, or one more than the last; so many of them are kept.
 
-    One that holds nothing is not kept; one that was never ended is in any case. Of older ones the files that a run has
-    are removed, and nothing else.
+    One that holds nothing is not kept; one that was never ended, or that an earlier version wrote, is in any case. Of
+    older ones the files of the run are removed, and nothing else.
 
     Parameters
     ----------
     loaded : the run whose map is gone on in, or is to be: it stays
     """
-    most = max(most, is_cut_off(folder) or is_incomplete(folder))
+    is_of_earlier_version = is_run(folder) and not _is_marked(folder)
+    most = max(most, is_cut_off(folder) or is_incomplete(folder) or is_of_earlier_version)
     if not _holds_something(folder) or not most:
         return
     earlier = earlier_runs(folder)
@@ -168,10 +238,8 @@ def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> None:
         with claimed(folder):
             folder.rename(target)
         for number in sorted(earlier)[: max(0, len(earlier) + 1 - most)]:
-            if earlier[number] != loaded:
-                _clear(earlier[number])
-                with contextlib.suppress(OSError):  # somebody has put more into it
-                    earlier[number].rmdir()
+            if earlier[number] != loaded and _is_marked(earlier[number]):
+                remove(earlier[number])
     except OSError as error:
         raise RunError(f"{folder}: cannot be moved to {target.name}: {error.strerror}") from None
 
@@ -188,36 +256,70 @@ def _numbered(folder: Path) -> dict[int, Path]:
     return {int(match[1]): run for run in there if (match := named.fullmatch(run.name))}
 
 
-def _is_of_a_start(file: Path) -> bool:
-    """What a run that was stopped as it began may have left, before its folder can be told for a run."""
-    return file.name.removesuffix(NEW) == CONFIG or _RECORDED.fullmatch(file.name) is not None
-
-
 @contextlib.contextmanager
-def room(folder: Path) -> Iterator[None]:
-    """Make a folder for a run, and have it for oneself; an earlier run in it is removed.
+def room(folder: Path, *, force: bool = False) -> Iterator[None]:
+    """Make a folder for a run, and have it for oneself; a run in it is replaced, if that is allowed.
+
+    From here on its ``run.json`` says that it is a run.
 
     Raises
     ------
     RunError
         Something else is there, or somebody else records there.
     """
-    check_room(folder)
+    check_room(folder, force=force)
     with contextlib.ExitStack() as held:
         try:
             if not folder.exists():
                 folder.mkdir(parents=True, exist_ok=True)
                 sync_folder(folder.parent)
             held.enter_context(claimed(folder))
+            write_whole(folder / SUMMARY, BEGUN)
             _clear(folder)
+        except KeyboardInterrupt:
+            discard(folder)
+            raise
         except OSError as error:
             raise RunError(f"{folder}: {error.strerror}") from None
         yield
 
 
+def discard(folder: Path) -> None:
+    """Remove a run that was begun and not saved yet; a saved one stays."""
+    with contextlib.suppress(OSError):
+        if read_bytes(folder / SUMMARY) == BEGUN:
+            remove(folder)
+        else:
+            folder.rmdir()  # if it was made and nothing more
+
+
+def remove(folder: Path) -> None:
+    """Remove the files of a run, and the folder if nothing else is in it. Raises OSError."""
+    _clear(folder)
+    (folder / SUMMARY).unlink()
+    with contextlib.suppress(OSError):  # somebody has put more into it
+        folder.rmdir()
+
+
 def _clear(folder: Path) -> None:
-    """What makes it a run goes last: who is stopped half-way leaves a folder that may be cleared again."""
-    there = sorted(folder.iterdir(), reverse=True)
-    results = [file for file in there if file.name.removesuffix(NEW) in _RESULTS]
-    for file in results + [file for file in there if _is_of_a_start(file)]:
+    """Remove the files of a run but for its mark: who is stopped half-way leaves a folder that may be cleared again."""
+    for file in _contents(folder)[0]:
         file.unlink()
+
+
+def _contents(folder: Path) -> tuple[list[Path], list[Path]]:
+    """The files that a run has made, without its mark, and what only has the name of one."""
+    ours, foreign = list[Path](), list[Path]()
+    for file in sorted(folder.iterdir(), reverse=True):
+        if _RECORDED.fullmatch(file.name):
+            (ours if _is_recorded(file) else foreign).append(file)
+        elif file.name in _RESULTS or file.name == CONFIG:
+            (ours if is_regular(file) else foreign).append(file)
+        elif _is_unfinished(file):
+            ours.append(file)
+    return [file for file in ours if file.name != SUMMARY], foreign
+
+
+def _is_unfinished(file: Path) -> bool:
+    """What a process that was killed while it wrote a file has left."""
+    return _UNFINISHED.fullmatch(file.name) is not None and is_regular(file)

@@ -5,6 +5,7 @@ Rows are in order of the edges' ids. A list of numbers is one field, with spaces
 
 import csv
 import io
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from enum import IntEnum
@@ -217,9 +218,9 @@ def _word(value: Any) -> str:
 def _read(kind: type[Row], file: Path) -> Iterator[tuple[int, Row]]:
     """Each row with the line it ends on."""
     hints = get_type_hints(kind)
-    if not file.exists():
+    if not os.path.lexists(file):
         raise FormatError(f"{file}: no such file: is it a run, and saved by this version?")
-    rows = csv.reader((text for _, text in lines(file)), strict=True)
+    rows = csv.reader((text for _, text in lines(file, follow=False)), strict=True)
     try:
         if next(rows, None) != list(hints):
             raise FormatError(f"{file}: not a ledger: its first line is not {','.join(hints)}")

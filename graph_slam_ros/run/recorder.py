@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from graph_slam_ros.formats.durable import AppendedFile, replaced
+from graph_slam_ros.formats.durable import AppendedFile, write_whole
 from graph_slam_ros.formats.journal import (
     BEGINS_IN_A_MAP,
     INGEST,
@@ -25,7 +25,7 @@ from graph_slam_ros.formats.journal import (
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.run.folder import CONFIG, SUMMARY, RunError, checksum, room, summary_of
+from graph_slam_ros.run.folder import CONFIG, MARK, SUMMARY, RunError, checksum, discard, room, summary_of
 from graph_slam_ros.run.map_log import GROWTH, Growth
 from graph_slam_ros.run.tables import result_texts, summarize
 from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
@@ -46,12 +46,21 @@ class RunRecorder:
 
     Parameters
     ----------
-    folder : made if it is not there; an earlier run in it is replaced, other contents are refused
+    folder : made if it is not there; anything in it is refused but a run that holds nothing
+    force : a run that holds something is replaced, too
     sync_s : so often at most the disk is asked to take the journal, in a thread of its own; 0: at the end
     start : the map that the run goes on in
     """
 
-    def __init__(self, folder: Path | str, config: Config, sync_s: float = 0.0, start: MapState | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path | str,
+        config: Config,
+        sync_s: float = 0.0,
+        start: MapState | None = None,
+        *,
+        force: bool = False,
+    ) -> None:
         self.folder = Path(folder)
         self._sync_s, self._due_s = sync_s, 0.0
         self._disk: ThreadPoolExecutor | None = None
@@ -70,12 +79,15 @@ class RunRecorder:
         self._ended_bags: list[AppendedFile] = []
         self._next_path_at = 1.0
         self._room = ExitStack()
-        self._room.enter_context(room(self.folder))
-        self._journal.begin()  # from the start: it makes the folder a run
-        self._journal.write([BEGINS_IN_A_MAP] if start is not None else [])
+        self._room.enter_context(room(self.folder, force=force))
         try:
+            self._journal.begin()
+            self._journal.write([BEGINS_IN_A_MAP] if start is not None else [])
             self._journal.flush()
             _put(self.folder, CONFIG, parameters_text(config.as_mapping()))
+        except KeyboardInterrupt:
+            self.discard()
+            raise
         except OSError as error:
             self.abandon()
             raise RunError(f"{self.folder}: {error.strerror}") from None
@@ -252,6 +264,7 @@ class RunRecorder:
         with self._writing:
             self._is_ended = True
             self._abandon()
+            self._room.close()
 
     def _abandon(self) -> None:
         if self._disk is not None:
@@ -262,7 +275,13 @@ class RunRecorder:
             bag.abandon()
         if self._bag is not None:
             self._bag.abandon()
-        self._room.close()
+
+    def discard(self) -> None:
+        """End the recording and remove what was written of it, if it was not saved yet."""
+        with self._writing, self._room:
+            self._is_ended = True
+            self._abandon()
+            discard(self.folder)
 
     def _end_parts(self) -> None:
         """What comes is of the next."""
@@ -307,13 +326,13 @@ def save_results(
         return _put(folder, name, text)
 
     files = {name: put(name, text) for name, text in result_texts(slam).items()}
-    told = summarize(slam) | summary | {"leverage": leverage(slam.solver) if slam.is_solved else {}, "files": files}
+    told = {"format": MARK} | summarize(slam) | summary | {"format": MARK, "files": files}
+    told["leverage"] = leverage(slam.solver) if slam.is_solved else {}
     put(SUMMARY, json.dumps(told, indent=2) + "\n")
 
 
 def _put(folder: Path, name: str, text: str) -> str:
     """Write a file whole or not at all; returns its CRC-32."""
     data = text.encode()
-    with replaced(folder / name) as new:
-        new.write_bytes(data)
+    write_whole(folder / name, data)
     return checksum(data)

@@ -101,6 +101,7 @@ def record_run(
     border: Counters | None = None,
     took: Took | None = None,
     recording: str = "",
+    force: bool = False,
 ) -> tuple[GraphSlam, Summary]:
     """Run the pipeline over measurements and save it all; returns the pipeline and the summary.
 
@@ -111,10 +112,17 @@ def record_run(
     border : counters of what was refused before it came here
     took : the time since whatever is told as its beginning
     recording : the name of the file or folder that the measurements are from
+    force : a run in the folder may be replaced
+
+    Raises
+    ------
+    KeyboardInterrupt
+        Nothing of it is left in the folder.
     """
     took = took or stopwatch()
-    recorder = RunRecorder(folder, config, start=start)
+    recorder: RunRecorder | None = None
     try:
+        recorder = RunRecorder(folder, config, start=start, force=force)
         slam = GraphSlam(config, recorder.sink, start=start)
         for measurement in measurements:
             recorder.record(slam, slam.process(measurement))
@@ -122,8 +130,15 @@ def record_run(
         summary = summarize(slam) | took() | {"losses": list(dict.fromkeys(losses))}
         summary |= {"recording": recording} if recording else {}
         recorder.save(slam, summary)
-    finally:
-        recorder.close()
+    except KeyboardInterrupt:
+        if recorder is not None:
+            recorder.discard()
+        raise
+    except BaseException:
+        if recorder is not None:
+            recorder.close()
+        raise
+    recorder.close()
     return slam, summary
 
 
@@ -133,13 +148,13 @@ def stopwatch() -> Took:
     return lambda: {"time_s": time.perf_counter() - start_s, "cpu_s": time.process_time() - cpu_s}
 
 
-def recover(folder: Path, out: Path) -> Summary:
+def recover(folder: Path, out: Path, *, force: bool = False) -> Summary:
     """Write the results of a run that was never ended, from its map: the drive is not repeated."""
     took = stopwatch()
-    check_room(out, folder)
+    check_room(out, folder, force=force)
     losses: list[str] = []
     state = map_of(folder, losses)
-    return record_run(out, config_of(folder, state), (), losses, state, took=took)[1]
+    return record_run(out, config_of(folder, state), (), losses, state, took=took, force=force)[1]
 
 
 def complete(folder: Path) -> Summary:
@@ -163,12 +178,12 @@ def complete(folder: Path) -> Summary:
     return summary
 
 
-def freeze(folder: Path, out: Path) -> Summary:
+def freeze(folder: Path, out: Path, *, force: bool = False) -> Summary:
     """Write a run that begins in the map of another, all of which then stays as it is."""
     took = stopwatch()
-    check_room(out, folder)
+    check_room(out, folder, force=force)
     losses: list[str] = []
     slam = settled(folder, losses)
     state = state_of(slam)
     state.freeze()
-    return record_run(out, slam.config, [Control("optimize")], losses, state, took=took)[1]
+    return record_run(out, slam.config, [Control("optimize")], losses, state, took=took, force=force)[1]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.durable import replaced
 from graph_slam_ros.ros.bag import BagWriter
 from graph_slam_ros.ros.to_msg import (
     covariance6,
@@ -40,7 +41,7 @@ _SURVEYED_M = 1e-3  # truth has no error; a covariance of zero would mean unknow
 
 
 def write_bag(recording: Recording, path: Path | str) -> None:
-    """Write a bag in order of stamp.
+    """Write a bag in order of stamp, whole or not at all.
 
     ``/odom`` nav_msgs/Odometry (odom, base_link), ``/landmarks`` vision_msgs/Detection3DArray (base_link),
     ``/ground_truth`` geometry_msgs/PoseStamped and, once, ``/landmarks_ground_truth`` Detection3DArray (world); where
@@ -65,7 +66,7 @@ def write_bag(recording: Recording, path: Path | str) -> None:
     twist_covariance = covariance6(recording.twist_covariance, _UNUSED)
     instruments = merge(gnss_messages(recording.gnss), imu_messages(recording.imu), key=_stamp_of)
     beside = next(instruments, None)
-    with BagWriter(path) as bag:
+    with replaced(Path(path)) as new, BagWriter(new) as bag:
         first_ns = int(recording.stamps_ns[0])
         for k, stamp_ns in enumerate(recording.stamps_ns.tolist()):
             if polar and stamp_ns == first_ns:

@@ -101,7 +101,7 @@ class Session:
             keep_earlier(self._folder, self.config.output.keep_earlier, loaded or named)
             self._recorder = None
             try:
-                recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start)
+                recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start, force=True)
             except Exception:
                 self.recording_fails = True
                 raise

@@ -1,0 +1,62 @@
+"""The command ``completion``: a script for bash or zsh that completes commands, options and their choices.
+
+It is made from the parser, so it knows what the parser knows, and needs no Python at each press of a key.
+"""
+
+import argparse
+import shlex
+from collections.abc import Iterator
+
+from graph_slam_ros.cli import console
+
+_SCRIPT = """\
+_graph_slam() {
+  local cur=${COMP_WORDS[COMP_CWORD]} prev=${COMP_WORDS[COMP_CWORD-1]} list=
+  if [ "$COMP_CWORD" -eq 1 ]; then
+    list=%(commands)s
+  else
+    case "${COMP_WORDS[1]} $prev" in
+%(choices)s
+    *)
+      case "${COMP_WORDS[1]}" in
+%(options)s
+      esac
+      case "$cur" in -*) ;; *) list=${list##*@} ;; esac ;;
+    esac
+  fi
+  COMPREPLY=($(compgen -W "${list//@/ }" -- "$cur"))
+}
+complete -o bashdefault -o default -F _graph_slam graph_slam
+"""
+_ZSH = "autoload -U +X compinit && compinit -u\nautoload -U +X bashcompinit && bashcompinit\n"
+
+
+def completion(args: argparse.Namespace) -> int:
+    """Print the script."""
+    console.say(*((_ZSH if args.shell == "zsh" else "") + script(args.parser())).splitlines())
+    return console.DONE
+
+
+def script(whole: argparse.ArgumentParser) -> str:
+    """The script for bash, which zsh runs, too."""
+    (commands,) = (a for a in whole._actions if isinstance(a, argparse._SubParsersAction))
+    names = [*commands.choices, *(option for a in whole._actions for option in a.option_strings)]
+    choices, options = [], []
+    for name, sub in commands.choices.items():
+        choices += [f"    {name}\\ {option}) list={_quoted(values)} ;;" for option, values in _choices(sub)]
+        of_command = [option for action in sub._actions for option in action.option_strings]
+        places = [str(c) for a in sub._actions if not a.option_strings for c in a.choices or ()]
+        options.append(f"      {name}) list={_quoted(of_command)}@{_quoted(places)} ;;")
+    lines = {"commands": _quoted(names), "choices": "\n".join(choices), "options": "\n".join(options)}
+    return _SCRIPT % lines
+
+
+def _choices(sub: argparse.ArgumentParser) -> Iterator[tuple[str, list[str]]]:
+    for action in sub._actions:
+        if action.choices:
+            for option in action.option_strings:
+                yield option, [str(choice) for choice in action.choices]
+
+
+def _quoted(words: list[str]) -> str:
+    return shlex.quote(" ".join(words))

@@ -1,0 +1,39 @@
+"""How the command line says what is wrong, and what its help looks like."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+from graph_slam_ros.cli.console import REFUSED
+
+CODES = "Exit codes: 0 done, 1 a fault of ours, 2 refused, 3 done but something was lost, 130 interrupted."
+
+
+class _Formatter(argparse.HelpFormatter):
+    """Paragraphs are wrapped; lines that begin with a space stay as they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        fill = super()._fill_text
+        return "\n".join(line if line.startswith(" ") else fill(line, width, indent) for line in text.splitlines())
+
+
+class CommandParser(argparse.ArgumentParser):
+    """Says what is wrong in one line; its help ends with examples and the exit codes."""
+
+    more: Callable[[], str] | None = None  # what the help tells besides, where it takes imports to know it
+    codes = CODES
+
+    def __init__(self, *args: Any, examples: Sequence[str] = (), **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.formatter_class = _Formatter
+        self.examples = examples
+
+    def format_help(self) -> str:
+        """The help."""
+        shown = [f"Example{'s' * (len(self.examples) > 1)}:", *(f"  {line}" for line in self.examples)]
+        self.epilog = "\n".join([self.more(), ""] if self.more else []) + "\n".join([*shown, self.codes])
+        return super().format_help()
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse the command line."""
+        self.exit(REFUSED, f"{self.prog}: {message} (--help shows what there is)\n")

@@ -1,0 +1,71 @@
+"""The one way to open a file: only regular files are opened, and opening never blocks.
+
+A FIFO without a writer would block for ever, a device may never end. In a run folder no symbolic link is followed,
+since a link may lead to any file of the user. A recording or a graph that the user names may be a link (``follow``).
+"""
+
+import errno
+import io
+import os
+import stat
+from pathlib import Path
+
+_READ = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
+_CREATE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+def opened(path: Path, *, follow: bool = False) -> io.FileIO:
+    """Open a regular file to read its bytes.
+
+    Raises
+    ------
+    OSError
+        There is no such file, it cannot be read, it is not a regular file, or it is a link that is not to be followed.
+    """
+    return io.FileIO(path, opener=_follow if follow else _no_follow)
+
+
+def read_bytes(path: Path, *, follow: bool = False) -> bytes:
+    """The whole content. Raises OSError as ``opened``."""
+    with opened(path, follow=follow) as stream:
+        return stream.read()
+
+
+def read_text(path: Path, *, follow: bool = False) -> str:
+    """The whole content as UTF-8. Raises OSError as ``opened``, and UnicodeDecodeError."""
+    return read_bytes(path, follow=follow).decode()
+
+
+def is_regular(path: Path) -> bool:
+    """Whether a regular file has this name; a link to one is not."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except OSError:
+        return False
+
+
+def created(path: Path) -> int:
+    """Create a file that does not exist yet; returns its descriptor. Raises OSError: also where a link has the name."""
+    return os.open(path, _CREATE, 0o644)
+
+
+def _follow(path: str, _: int) -> int:
+    return _checked(os.open(path, _READ), path)
+
+
+def _no_follow(path: str, _: int) -> int:
+    try:
+        return _checked(os.open(path, _READ | os.O_NOFOLLOW), path)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise OSError(error.errno, "a symbolic link, which is not followed here", path) from None
+        raise
+
+
+def _checked(fd: int, path: str) -> int:
+    mode = os.fstat(fd).st_mode
+    if stat.S_ISREG(mode):
+        return fd
+    os.close(fd)
+    what = "a folder" if stat.S_ISDIR(mode) else "a FIFO, socket or device"
+    raise OSError(errno.EINVAL, f"{what}, not a regular file", path)
