@@ -249,6 +249,7 @@ class Robot:
         for topic, publisher in self.publishers.items():
             until(lambda p=publisher: p.get_subscription_count(), self.spin, f"subscriber of {topic}")
         until(self._save.service_is_ready, self.spin, "service ~/save")
+        self.call("resume", patience_s=60.0)  # the worker answers, so its kernels are loaded
 
     def send(self, topic, cdr):
         self.publishers[topic].publish(cdr)
