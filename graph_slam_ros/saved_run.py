@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.run import COVARIANCES, SUMMARY, RunError, changed_since, is_run, run_config
 from graph_slam_ros.run.ledger_file import Entry, read_ledger
 from graph_slam_ros.slam import Config
@@ -140,7 +141,7 @@ def load_run(folder: Path | str) -> SavedRun:
     if not (folder / SUMMARY).is_file():
         raise RunError(f"{folder}: it has no results yet: graph_slam recover {folder} --out DIR")
     try:
-        summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+        summary = json.loads(read_text(folder / SUMMARY))
     except (OSError, ValueError) as error:
         raise RunError(f"{folder / SUMMARY}: {error}") from None
     if not isinstance(summary, dict):
