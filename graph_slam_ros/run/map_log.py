@@ -15,7 +15,8 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 * ``datum``: latitude, longitude and height that fixes are from; ``settings``: parameters that were changed on the way;
 * ``processed``: records of the ingest sequence that all of it came of; ``used``: stamp and input of the last odometry
   that was used by then;
-* ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are.
+* ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are; ``held``: the
+  same while ``map.localize`` is true, zeros when it ends.
 
 Now and then an ``estimate`` tells all values, end to end. A run that goes on in another's map has that first, as one
 ``growth`` and one ``estimate``, up to a record ``start``.
@@ -65,6 +66,7 @@ class Growth:
         self._vertices = self._edges = self._judged = self._changes = 0
         self._keyframes = self._segments = self._sightings = self._landmarks = self._offsets = 0
         self._frozen = self._drives = 0
+        self._held = (0, 0)
         self._datum: tuple[float, ...] = ()
         self._settings: dict[str, Any] = {}
         self._estimated = 0  # keyframes at the last estimate
@@ -104,7 +106,9 @@ class Growth:
         if len(a.range_offsets) > self._offsets:
             out["offsets"] = a.range_offsets
         if a.frozen > self._frozen:
-            out["frozen"] = [a.frozen, a.ledger.final]
+            out["frozen"] = [a.frozen, a.frozen_edges]
+        if a.held != self._held:
+            out["held"] = self._held = a.held
         if a.datum != self._datum:
             out["datum"] = self._datum = a.datum
         if keyframes:
@@ -312,12 +316,14 @@ def _grow(state: MapState, record: Mapping[str, Any]) -> None:
     state.settings.update(record.get("settings", {}))
     state.processed = _count(record.get("processed"))
     state.used_ns, state.source = record.get("used", (None, ""))
-    if "frozen" in record:
-        vertices, edges = record["frozen"]
+    for name in ("frozen", "held"):
+        vertices, edges = record.get(name, (0, 0))
         if not (_is_index(vertices, graph.vertex_count + 1) and _is_index(edges, len(ledger) + 1)):
-            raise ValueError(f"frozen {record['frozen']}: more than there is")
-        state.frozen = vertices
+            raise ValueError(f"{name} {record[name]}: more than there is")
+    if "frozen" in record:
+        state.frozen, edges = record["frozen"]
         ledger.finish(edges)
+    state.held = tuple(record.get("held", state.held))
 
 
 def _count(told: Any) -> int | None:

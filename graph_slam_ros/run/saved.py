@@ -79,7 +79,8 @@ def taken_up(folder: Path, losses: list[str]) -> GraphSlam:
     lost = len(losses)
     state = map_of(folder, losses)
     losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
-    return GraphSlam(config_of(folder, state), start=state)
+    config = config_of(folder, state).changed({"map.localize": False})  # what is asked of a map is asked of all of it
+    return GraphSlam(config, start=state)
 
 
 def settled(folder: Path, losses: list[str]) -> GraphSlam:

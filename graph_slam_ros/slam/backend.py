@@ -35,7 +35,8 @@ class Backend:
     ----------
     graph, solver, decisions
     handed_over : vertices and edges of the graph that the solver has
-    frozen : the first so many vertices stay where they are
+    frozen, frozen_edges : the first so many vertices, and verdicts on the first so many edges, stay for good
+    held : the same while the robot is only located (``hold_map``): vertices and edges; zeros otherwise
     spares_memory : whether no second look is begun
     holds_back : whether what does not fit stays out, and verdicts stay as they are, until somebody has decided
     rivals : other explanations of the same measurements that the last second look could not rule out
@@ -55,6 +56,8 @@ class Backend:
         self.solver = Solver(self.graph, settings)
         self.decisions = Decisions(config, self.graph, self.solver, start.ledger)
         self.handed_over, self.frozen = (0, 0), start.frozen
+        self.frozen_edges = start.ledger.final
+        self.held = (0, 0)
         self._background = Background(config, beside)
         self.rivals: tuple[Rival, ...] = ()
         self.spares_memory = self.holds_back = False
@@ -71,18 +74,45 @@ class Backend:
         """What was decided of each edge."""
         return self.decisions.ledger
 
-    def take_up(self, vertices: Sequence[int], values: Array) -> Report:
-        """Solve all that is believed in a graph that was taken over: some of its vertices, from some values."""
+    def take_up(self, vertices: Sequence[int], values: Array, held: tuple[int, int] = (0, 0)) -> Report:
+        """Solve all that is believed in a graph that was taken over: some of its vertices, from some values.
+
+        Parameters
+        ----------
+        held : so many vertices and edges are held, besides those of a frozen map
+        """
         self.solver.add(vertices, range(self.graph.edge_count))
         self.solver.start_at(values)
         for vertex in vertices:
             if vertex < self.frozen:
                 self.solver.hold(vertex)
+        if held[0]:
+            self._hold(*held)
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         report = self.solver.optimize(self.solver.settings.until_still())  # what is believed was decided before
         self.decisions.tighten()
         self._background.cancel(self.ledger.outside_count)
         return report
+
+    def hold_map(self) -> None:
+        """Keep all vertices of now where they are, and the verdicts on all edges of now."""
+        self.hand_over()
+        self._background.cancel(self.ledger.outside_count)
+        self._hold(self.graph.vertex_count, len(self.ledger))
+
+    def _hold(self, vertices: int, edges: int) -> None:
+        self.held = vertices, edges
+        inside = self.solver.vertices
+        for vertex in inside[inside < vertices].tolist():
+            self.solver.hold(vertex)
+        self.ledger.finish(edges)
+
+    def release_map(self) -> None:
+        """Undo ``hold_map``: everything but a frozen map is estimated again."""
+        held, self.held = self.solver.held, (0, 0)
+        self.solver.release(held[held >= self.frozen])
+        self.ledger.finish(self.frozen_edges)
+        self._background.cancel(self.ledger.outside_count)
 
     def hand_over(self) -> None:
         """Give the solver what is new in the graph."""

@@ -244,6 +244,17 @@ class AnchorConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class MapConfig:
+    """Whether the map grows."""
+
+    localize: bool = setting(
+        False,
+        "true: the map stays as it is and the robot is located in it; false: the map grows and is corrected",
+        live=True,
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class OrderingConfig:
     """The window in which messages are put in order of stamp."""
 
@@ -332,6 +343,7 @@ class Config:
     keyframes: KeyframesConfig = KeyframesConfig()
     landmarks: LandmarksConfig = LandmarksConfig()
     anchor: AnchorConfig = AnchorConfig()
+    map: MapConfig = MapConfig()
     ordering: OrderingConfig = OrderingConfig()
     solve: SolveConfig = SolveConfig()
     robust: RobustConfig = RobustConfig()

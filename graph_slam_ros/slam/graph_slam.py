@@ -19,6 +19,7 @@ from graph_slam_ros.slam.background import Beside, when_asked
 from graph_slam_ros.slam.carry import Where
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
+from graph_slam_ros.slam.edits import Edits
 from graph_slam_ros.slam.landmarks import Landmark, Landmarks
 from graph_slam_ros.slam.ledger import Change
 from graph_slam_ros.slam.map_state import MapState
@@ -159,6 +160,8 @@ class GraphSlam:
         self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over)
         self._watch = Watch(self.space, self.config.odometry, self.backend, self.counters, self.segments)
         self._safeguard = Safeguard(self.backend, self.counters, self._landmarks.forget)
+        self._edits = Edits(self.backend, self._landmarks, self.counters)
+        self._held_covariance: Array | None = None  # of the newest pose when the map was held, for the next odometry
         self._waiting: list[Observation] = []
         self._initial_pose: InitialPose | None = None  # for the next odometry
         self._covariance = np.zeros((self.space.dof, self.space.dof))
@@ -210,9 +213,13 @@ class GraphSlam:
             case Control("memory", values):
                 self.backend.spares_memory = bool(dict(values)["is_short"])
             case Control("set", values):
-                self.config = self.config.changed(dict(values))
+                before, self.config = self.config, self.config.changed(dict(values))
                 self.settings |= dict(values)
                 self.solver.settings = self.config.solver_settings()
+                if self.config.map.localize != before.map.localize:
+                    self._hold_map(self.config.map.localize)
+            case Control("remove", values):
+                self._remove(dict(values))
             case Control():
                 self.counters.count("control", "unknown_event")
         if len(self.keyframes) == first_new and self.solves == solves:
@@ -343,6 +350,16 @@ class GraphSlam:
         return self.backend.frozen
 
     @property
+    def frozen_edges(self) -> int:
+        """Verdicts on so many edges, the first, are of that map: they stay."""
+        return self.backend.frozen_edges
+
+    @property
+    def held(self) -> tuple[int, int]:
+        """So many vertices and edges stay as they are while ``map.localize`` is true; zeros otherwise."""
+        return self.backend.held
+
+    @property
     def range_offsets(self) -> dict[str, int]:
         """By input, the vertex of what all its ranges have in common."""
         return self._landmarks.offsets
@@ -377,12 +394,52 @@ class GraphSlam:
         self._anchor.take_up()
         self._landmarks.take_up(start.landmarks, start.range_offsets)
         self._unnamed.take_up()
-        self.report = self.backend.take_up(start.vertices, start.values)
+        localizes = self.config.map.localize
+        self.report = self.backend.take_up(start.vertices, start.values, start.held if localizes else (0, 0))
         self._safeguard.note_good()
         (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
         self._solved_vertices, self._taken_in = self.backend.handed_over
+        if localizes:
+            self.backend.hold_map()
+            self._landmarks.begins_new = False
         self._told = len(self.ledger.history)
         self._solved_T_map_odom = self.T_map_odom
+
+    # -- the map is held, or edited by hand ------------------------------------------------------------------------
+
+    def _hold_map(self, is_held: bool) -> None:
+        """Begin or end localization: the map of now stays where it is, and nothing is added to it but the drive.
+
+        How uncertain the robot's pose is when it begins is kept as noise of the next odometry edge.
+        """
+        if is_held:
+            self._solve(self.config.solver_settings())
+            self._held_covariance = self._covariance.copy() if self.keyframes else None
+            self.backend.hold_map()
+        else:
+            self._held_covariance = None
+            self.backend.release_map()
+        self._landmarks.begins_new = not is_held
+        self._safeguard.note_good()
+
+    def _begin_in_held_map(self, step: Step) -> None:
+        """The first keyframe that is free: as uncertain as the pose was when the map began to be held."""
+        T_last_now, covariance = self._motion_into(step)
+        held, self._held_covariance = self._held_covariance, None
+        if held is not None:
+            covariance = self.space.group.propagate(held, T_last_now, covariance)
+        self._add_keyframe(step, T_last_now, covariance)
+        self._solve_if_due()
+        self._use_waiting(step.stamp_ns)
+
+    def _remove(self, what: dict[str, bool | int | float | str]) -> None:
+        keyframe, is_removed = len(self.keyframes) - 1, False
+        if "edge" in what:
+            is_removed = self._edits.remove_edge(int(what["edge"]), keyframe)
+        if "landmark" in what:
+            is_removed |= self._edits.remove_landmark(str(what["landmark"]), keyframe)
+        if is_removed:
+            self._solve(self.config.solver_settings())
 
     # -- odometry ------------------------------------------------------------------------------------------------
 
@@ -406,6 +463,8 @@ class GraphSlam:
             self._first_keyframe(step)
         elif (motion := self._trail.motion) is None or step.broken or self._initial_pose:
             self._begin_segment(step)
+        elif self._held_covariance is not None:
+            self._begin_in_held_map(step)
         else:
             motion.step(step)
             self._use_waiting(step.stamp_ns)
@@ -443,7 +502,7 @@ class GraphSlam:
 
         Or somebody tells: an initial pose.
         """
-        said, self._initial_pose = self._initial_pose, None
+        said, self._initial_pose, self._held_covariance = self._initial_pose, None, None
         T_last_now, covariance = self._motion_into(step)
         if said is None or self.config.initialpose.use == "segment":
             self.segments.append(len(self.keyframes))
@@ -689,7 +748,11 @@ class GraphSlam:
     def _review_if_due(self) -> None:
         """Look at the unnamed landmarks again now and then; what that changes is part of the solve that follows."""
         due = self.config.landmarks.review_every_keyframes
-        if self.config.landmarks.association in ("nearest", "joint") and len(self.keyframes) % due == 0:
+        if (
+            self._landmarks.begins_new
+            and self.config.landmarks.association in ("nearest", "joint")
+            and len(self.keyframes) % due == 0
+        ):
             self._unnamed.review(self.keyframes[-1].stamp_ns)
 
     def _pose(self, vertex: int) -> Numbers:

@@ -78,6 +78,7 @@ class Landmarks:
     waiting : those that are not determined yet
     offsets : by input, the vertex of what all its ranges have in common
     touched : the name of a landmark of the graph for each change of it, in order
+    begins_new : whether what is not known begins a landmark; not so while the map is held
     """
 
     def __init__(
@@ -89,6 +90,7 @@ class Landmarks:
         withdraw: Callable[[Sequence[int]], None],
     ) -> None:
         self.known: dict[str, Landmark] = {}
+        self.begins_new = True
         self.waiting: dict[str, Waiting] = {}
         self._config, self._space = config, config.space
         self._graph, self._solver, self._counters, self._withdraw = graph, solver, counters, withdraw
@@ -103,6 +105,8 @@ class Landmarks:
         landmark = self.known.get(name)
         if landmark is not None:
             self._add_edge(topic, landmark, s, where)
+        elif not self.begins_new:
+            self._counters.count(topic, "not_in_map")
         elif s.kind == "pose":
             self._begin(topic, name, s, where, carry.pose(self._space, s, where).measured)
         elif s.kind == "position":

@@ -76,9 +76,11 @@ class Ledger:
         self._out: set[int] = set()
 
     def finish(self, edges: int) -> None:
-        """Verdicts of the first so many edges stay."""
+        """Verdicts of the first so many edges stay; those of all others may change."""
         self.final = edges
-        self._out = {edge for edge in self._out if edge >= edges}
+        verdict, reason = self.verdict.values[edges:], self.reason.values[edges:]
+        is_out = np.isin(verdict, (Verdict.PENDING, Verdict.REJECTED)) & ~np.isin(reason, FINAL)
+        self._out = set((edges + np.flatnonzero(is_out)).tolist())
 
     def __len__(self) -> int:
         return len(self.verdict)

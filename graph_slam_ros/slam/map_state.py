@@ -22,6 +22,7 @@ class MapState:
     ----------
     values : stored numbers of all vertices, as ``Graph.initial``: where solving begins
     frozen : the first so many vertices stay there, and verdicts on what is between them as they are
+    held : so many vertices and edges were held when localization began (``map.localize``); zeros where the map grows
     datum : of fixes on earth, as in ``Fix``
     settings : parameters that were changed on the way, by name
     processed : records of the ingest sequence that it came of; None where it does not tell
@@ -40,12 +41,18 @@ class MapState:
     landmarks: dict[str, Landmark] = field(default_factory=dict)
     range_offsets: dict[str, int] = field(default_factory=dict)
     frozen: int = 0
+    held: tuple[int, int] = (0, 0)
     datum: tuple[float, ...] = ()
     settings: dict[str, Any] = field(default_factory=dict)
     processed: int | None = 0
     used_ns: int | None = None
     source: str = ""
     continues_with: str = ""
+
+    @property
+    def frozen_edges(self) -> int:
+        """Verdicts of the first so many edges stay."""
+        return self.ledger.final
 
     @property
     def vertices(self) -> list[int]:

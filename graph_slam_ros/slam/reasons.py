@@ -208,6 +208,21 @@ REASONS: dict[str, Reason] = {
     "from_where_there_was_no_odometry": Reason(
         _REFUSED, "a closure's earlier stamp is outside the odometry", "stamps by the robot's clock"
     ),
+    # -- the map
+    "not_in_map": Reason(
+        _NOTED, "a landmark that the map does not have, while map.localize is true", "map.localize=false to add it"
+    ),
+    "removed": Reason(_NOTED, "an edge or a landmark that was removed by hand (~/remove)"),
+    "unknown_edge": Reason(
+        _NOTED, "~/remove named an edge that is not in the graph", "graph_slam explain RUN lists ids"
+    ),
+    "unknown_landmark": Reason(
+        _NOTED, "~/remove named a landmark that is not in the map", "ros2 topic echo ~/landmarks_estimate lists names"
+    ),
+    "needed_edge": Reason(_NOTED, "~/remove named odometry or a prior: without it poses are undetermined"),
+    "held_in_map": Reason(
+        _NOTED, "~/remove named a part of a map that is held", "map.localize=false; a frozen map never changes"
+    ),
     "cleared": Reason(_NOTED, "loop closures that ~/clear_closures took out"),
     "displaced": Reason(
         _NOTED,

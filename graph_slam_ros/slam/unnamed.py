@@ -31,6 +31,7 @@ _MOST_CANDIDATES = 24  # landmarks that one message is compared with: the neares
 _MOST_AT_ONCE = 8  # new landmarks whose pairings are weighed together: the latest
 _MOST_OPTIONS = 12  # older ones that each may be: the nearest
 _REACH_SIGMA = 5.0
+NOT_IN_MAP = ""  # in place of a name, where the map is held and nothing in it fits
 NAME = "unnamed"
 """What landmarks are called that have no name; a number follows."""
 _POSITIONED = ("position", "pose", "range_bearing")
@@ -105,7 +106,10 @@ class Unnamed:
         found = self._associated(unnamed, where) if unnamed else []
         if len(found) < len(unnamed):
             self._counters.count(m.topic, "unclear_which", len(unnamed) - len(found))
-        return out + found
+        in_map = [one for one in found if one[0] != NOT_IN_MAP]
+        if len(in_map) < len(found):
+            self._counters.count(m.topic, "not_in_map", len(found) - len(in_map))
+        return out + in_map
 
     def _associated(self, sightings: list[Sighting], where: Where) -> list[tuple[str, Sighting]]:
         seen = [self._position(s, where) for s in sightings]
@@ -117,7 +121,8 @@ class Unnamed:
         out = []
         for s, match in zip(sightings, matches, strict=True):
             if match.landmark == NEW:
-                out.append((self._new_name(), self._widened(s, where, None)))
+                name = self._new_name() if self._landmarks.begins_new else NOT_IN_MAP
+                out.append((name, self._widened(s, where, None)))
             elif match.landmark != UNCLEAR:
                 out.append((names[match.landmark], self._widened(s, where, match.spread)))
         return out

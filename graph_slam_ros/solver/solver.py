@@ -155,6 +155,12 @@ class Solver:
             self._waiting.again(on_it)
             self._take_out(one)
 
+    def release(self, vertices: ArrayLike) -> None:
+        """Estimate held vertices again. It makes the whole structure anew."""
+        self._grow()
+        self._held[_known(vertices, self._vertices, "vertex")] = False
+        self.rebuild()
+
     @property
     def held(self) -> Index:
         """Ids of the vertices that are kept where they are."""

@@ -1,0 +1,73 @@
+"""Edits by hand: an edge, or a landmark with all of its edges, is taken out of the graph while the robot drives."""
+
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.counters import Counters
+from graph_slam_ros.slam.decisions import CANDIDATES, landmark_of
+from graph_slam_ros.slam.landmarks import Landmarks
+
+SOURCE = "edit"
+
+
+class Edits:
+    """Removes edges and landmarks for good; whatever cannot be removed is counted under ``edit``.
+
+    Parameters
+    ----------
+    backend : has the graph, its solver and the ledger
+    landmarks : the landmarks of the graph, by name
+    """
+
+    def __init__(self, backend: Backend, landmarks: Landmarks, counters: Counters) -> None:
+        self._backend, self._landmarks, self._counters = backend, landmarks, counters
+
+    def remove_edge(self, edge: int, keyframe: int) -> bool:
+        """Remove a loop closure, a fix or an observation of a landmark, by its id; returns whether it was there.
+
+        A landmark is removed with the last of its edges.
+        """
+        backend = self._backend
+        backend.hand_over()
+        if not 0 <= edge < backend.graph.edge_count or backend.ledger.is_withdrawn(edge):
+            return self._refuse("unknown_edge")
+        if backend.graph.label_of(edge) not in CANDIDATES:
+            return self._refuse("needed_edge")
+        if edge < backend.ledger.final:
+            return self._refuse("held_in_map")
+        vertex = landmark_of(backend.graph, edge)
+        if vertex is not None and self._edges_of(vertex) == [edge]:
+            return self.remove_landmark(self._name_of(vertex), keyframe)
+        backend.withdraw([edge], keyframe)
+        self._counters.count(SOURCE, "removed")
+        return True
+
+    def remove_landmark(self, name: str, keyframe: int) -> bool:
+        """Remove a landmark and its edges, by its name; returns whether it was there.
+
+        What is observed of that name later begins another landmark.
+        """
+        backend = self._backend
+        backend.hand_over()
+        landmark = self._landmarks.known.get(name)
+        if landmark is None:
+            return self._refuse("unknown_landmark")
+        if backend.solver.is_held(landmark.vertex):
+            return self._refuse("held_in_map")
+        backend.withdraw(self._edges_of(landmark.vertex), keyframe)
+        backend.solver.remove(landmark.vertex)
+        self._landmarks.forget({landmark.vertex})
+        self._counters.count(SOURCE, "removed")
+        return True
+
+    def _name_of(self, vertex: int) -> str:
+        return next((name for name, mark in self._landmarks.known.items() if mark.vertex == vertex), "")
+
+    def _edges_of(self, vertex: int) -> list[int]:
+        """Edges of a vertex that have not been withdrawn, whether or not they are believed."""
+        tables = self._backend.graph.tables.values()
+        found = [table.id.values[(table.vertices.values == vertex).any(axis=1)] for table in tables]
+        edges = sorted(int(edge) for ids in found for edge in ids)
+        return [edge for edge in edges if not self._backend.ledger.is_withdrawn(edge)]
+
+    def _refuse(self, reason: str) -> bool:
+        self._counters.count(SOURCE, reason)
+        return False
