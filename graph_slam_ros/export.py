@@ -15,13 +15,14 @@ from graph_slam_ros.run import RunError, graph_file, is_run, numbered, taken_up
 from graph_slam_ros.slam import GraphSlam
 
 
-def export(folder: Path, out: Path, target: str, losses: list[str]) -> list[Path]:
+def export(folder: Path, out: Path, target: str, losses: list[str], *, last_drive: bool = False) -> list[Path]:
     """Write what a run knows; returns the files.
 
     Parameters
     ----------
     target : one of ``TARGETS``
     losses : what could not be read of the run is added
+    last_drive : of the path only the last drive, not those of the map that it began in; TUM only
     """
     if out.resolve().parent == folder.resolve():
         raise RunError(f"{out}: cannot be read from and written to at once")
@@ -29,7 +30,12 @@ def export(folder: Path, out: Path, target: str, losses: list[str]) -> list[Path
         raise RunError(f"{out}: a run is there, with files of its own")
     if target == "mcap" and out.suffix != ".mcap":
         raise RunError(f"{out}: what reads mcap wants a name that ends in .mcap")
-    return TARGETS[target](taken_up(folder, losses), out)
+    slam = taken_up(folder, losses)
+    if last_drive:
+        if target != "tum":
+            raise RunError(f"--last-drive: {target} holds a whole map; with --to tum it is the path of the last drive")
+        return _tum(slam, out, slam.drives[-1])
+    return TARGETS[target](slam, out)
 
 
 def files_of(out: Path, target: str) -> list[Path]:
@@ -40,9 +46,9 @@ def files_of(out: Path, target: str) -> list[Path]:
     return [out, whole.with_name(f"{whole.stem}_vertices.csv")]
 
 
-def _tum(slam: GraphSlam, out: Path) -> list[Path]:
-    """The keyframes."""
-    write_text(out, tum_text(slam.keyframes.stamps_ns.tolist(), slam.trajectory()))
+def _tum(slam: GraphSlam, out: Path, first: int = 0) -> list[Path]:
+    """The keyframes, from one on."""
+    write_text(out, tum_text(slam.keyframes.stamps_ns.tolist()[first:], slam.trajectory()[first:]))
     return [out]
 
 

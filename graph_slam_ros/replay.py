@@ -18,7 +18,18 @@ from graph_slam_ros.ros.from_msg import TF, TF_STATIC, TRANSFORMS, Border
 from graph_slam_ros.ros.inputs import Measured, uses
 from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.ros.survey import with_survey
-from graph_slam_ros.run import RunError, check_room, is_run, missing, record_run, recording_of, run_config, stopwatch
+from graph_slam_ros.run import (
+    RunError,
+    check_room,
+    config_of,
+    is_run,
+    map_of,
+    missing,
+    record_run,
+    recording_of,
+    run_config,
+    stopwatch,
+)
 from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.input_config import InputConfig, default_input
@@ -113,11 +124,17 @@ def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> 
     return ""
 
 
-def measurements(bag: Bag, inputs: Inputs, config: Config, counters: Counters) -> Iterator[list[Measured | Control]]:
+def measurements(
+    bag: Bag, inputs: Inputs, config: Config, counters: Counters, datum: tuple[float, ...] = ()
+) -> Iterator[list[Measured | Control]]:
     """What the border makes of each recorded message, in order, and at the end of what has waited.
 
     Where the stamps of odometry begin anew, a segment does. Static transforms are read first: they hold for the whole
     recording.
+
+    Parameters
+    ----------
+    datum : where on earth the map begins: latitude [deg], longitude [deg], height [m]; empty: at the first fix
 
     Raises
     ------
@@ -128,6 +145,8 @@ def measurements(bag: Bag, inputs: Inputs, config: Config, counters: Counters) -
     border = Border(config, counters, {topic.type: recorded_decoder(topic) for topic in used})
     for name in counters.received.keys() - inputs.topics.keys():
         del counters.received[name]  # nobody asked for it
+    if datum:
+        border.begin_at(datum)
     return _through(border, bag, inputs, StampJump(config.time.jump_back_s))
 
 
@@ -154,6 +173,7 @@ def replay(
     *,
     odometry: str | None = None,
     landmarks: str | None = None,
+    map_folder: Path | str | None = None,
     force: bool = False,
     progress: Progress = lambda items, total: items,
 ) -> Replayed:
@@ -162,8 +182,14 @@ def replay(
     Parameters
     ----------
     source : a bag, or a run folder: then exactly its events are repeated, nothing is added
-    config : default: the run's own, or the defaults
+    config : default: the run's own, that of the map, or the defaults
+    map_folder : the run whose map is gone on in: where the robot is in it shows when it recognises something
     force : a run in ``out`` may be replaced
+
+    Raises
+    ------
+    GraphSlamError
+        The source, the map or an input cannot be used.
     """
     took = stopwatch()
     source, out = Path(source), Path(out)
@@ -171,6 +197,8 @@ def replay(
     check_room(out, source, force=force)
     state = None
     if is_run(source):
+        if map_folder is not None:
+            raise RunError(f"{source}: a run is repeated in the map that it began in; a map is for a recording")
         config, own = with_survey(config or run_config(source)), run_config(source)
         if config.world != own.world:
             raise RunError(f"{source}: world.dimensions is {own.world.dimensions} there")
@@ -178,11 +206,16 @@ def replay(
         state = read_map(source, losses, start_only=True)
         items: Iterable[Sequence[Measurement]] = ([from_record(record)] for record in read_ingest(source, losses))
     else:
+        of_map: list[str] = []
+        if map_folder is not None:
+            state = map_of(Path(map_folder), of_map)
+            config = config or config_of(Path(map_folder), state)
         config = with_survey(config or Config())
         bag = open_bag(source)
         inputs = choose_inputs(bag, config, odometry, landmarks)
-        items = _with_end(measurements(bag, inputs, config, border))
+        items = _with_end(measurements(bag, inputs, config, border, state.datum if state is not None else ()))
         total = sum(bag.topics[topic].count for topic in inputs.by_topic()) + 3
+        bag.losses += of_map
         losses, warnings = bag.losses, bag.warnings
     warmup()
     one_by_one = chain.from_iterable(progress(items, total))

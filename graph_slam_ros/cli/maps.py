@@ -13,7 +13,7 @@ def export(args: argparse.Namespace) -> int:
 
     console.check_file(*files_of(args.out, args.to), force=args.force)
     losses: list[str] = []
-    files = exported(args.run_folder, args.out, args.to, losses)
+    files = exported(args.run_folder, args.out, args.to, losses, last_drive=args.last_drive)
     console.say(*(f"wrote {file}" for file in files))
     _then_use(args)
     return console.told(losses)

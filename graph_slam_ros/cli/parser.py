@@ -168,6 +168,9 @@ def _replay(sub: "CommandParser") -> None:
     sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: the only one, or /odom)")
     sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: the only one, or /landmarks)")
     _add_config(sub)
+    sub.add_argument(
+        "--map", type=Path, metavar="RUN", help="go on in the map of a run, frozen or not, and in its parameters"
+    )
     sub.add_argument("--ros", action="store_true", help="publish into a live ROS graph: a node of its own with --out")
     sub.add_argument(
         "--rate", type=values.positive, metavar="X", help="with --ros: times real time (default: all it takes)"
@@ -183,6 +186,7 @@ def _recover(sub: "CommandParser") -> None:
 def _export(sub: "CommandParser") -> None:
     _of_run(sub)
     sub.add_argument("--to", choices=("tum", "g2o", "mcap"), required=True, help="g2o: stamps and names beside it")
+    sub.add_argument("--last-drive", action="store_true", help="tum: only the last drive, not those of the loaded map")
     sub.add_argument("--out", type=Path, required=True, metavar="FILE")
     _add_force(sub)
 

@@ -27,15 +27,8 @@ def replay(args: argparse.Namespace) -> int:
     if args.out is None:
         raise GraphSlamError("replay needs --out DIR, the folder for the results")
     own = config if args.config or args.set or not is_run(args.bag) else None
-    done = replayed(
-        args.bag,
-        args.out,
-        own,
-        odometry=args.odom,
-        landmarks=args.landmarks,
-        force=args.force,
-        progress=console.progress("replay"),
-    )
+    topics = {"odometry": args.odom, "landmarks": args.landmarks, "map_folder": args.map}
+    done = replayed(args.bag, args.out, own, **topics, force=args.force, progress=console.progress("replay"))
     code = _say_run(args.bag, done.summary)
     console.say(f"results in {args.out}")
     _draw(args.out)
@@ -181,6 +174,8 @@ def _refuse_idle_options(args: argparse.Namespace, of_run: bool) -> None:
     idle = {
         "--odom or --landmarks: a run knows its own inputs": of_run and (args.odom or args.landmarks),
         "--ros: the events of a run cannot be played, only its recording": of_run and args.ros,
+        "--map: a run is repeated in the map that it began in": of_run and args.map,
+        "--map with --ros: the node loads a map by output.load": args.map and args.ros,
         "--rate without --ros": args.rate and not args.ros,
         "--node without --ros, or with --out": args.node and (args.out or not args.ros),
         "--config or --set with --ros and no --out: the running node has its own": args.ros
@@ -199,7 +194,10 @@ def _config(args: argparse.Namespace) -> "Config":
     from graph_slam_ros.slam import Config
     from graph_slam_ros.slam.config import flatten
 
-    file = args.config or (args.bag / "config.yaml" if is_run(args.bag) else None)
+    run = args.map or (args.bag if is_run(args.bag) else None)
+    if run is not None and not is_run(run):
+        raise GraphSlamError(f"--map: {run} is not a run folder")
+    file = args.config or (run / "config.yaml" if run is not None else None)
     values = dict(flatten(read_parameters(file, follow=file == args.config))) if file else {}
     try:
         return Config.from_mapping(values | dict(parse_setting(text) for text in args.set))

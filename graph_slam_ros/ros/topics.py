@@ -51,6 +51,7 @@ SUBSCRIPTIONS = (
     Interface("odom", "nav_msgs/msg/Odometry", "odometry"),
     Interface("landmarks", "vision_msgs/msg/Detection3DArray", "sightings of landmarks"),
     Interface("initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped", "where the robot is in the map"),
+    Interface("~/remove", "std_msgs/msg/String", "remove one edge or landmark: `edge 231` or `landmark dock`"),
     Interface("/tf", "tf2_msgs/msg/TFMessage", "sensors on moving joints, inputs on TF"),
     Interface("/tf_static", "tf2_msgs/msg/TFMessage", "where sensors are on the robot", latched=True),
     Interface("/clock", "rosgraph_msgs/msg/Clock", "time, with use_sim_time"),

@@ -31,7 +31,17 @@ from graph_slam_ros.run.folder import (
     suggested_out,
 )
 from graph_slam_ros.run.recorder import RunRecorder
-from graph_slam_ros.run.saved import complete, freeze, map_of, record_run, recover, settled, stopwatch, taken_up
+from graph_slam_ros.run.saved import (
+    complete,
+    config_of,
+    freeze,
+    map_of,
+    record_run,
+    recover,
+    settled,
+    stopwatch,
+    taken_up,
+)
 from graph_slam_ros.run.tables import account, graph_file, numbered, summarize
 
 __all__ = [
@@ -45,6 +55,7 @@ __all__ = [
     "changed_since",
     "check_room",
     "complete",
+    "config_of",
     "earlier_runs",
     "freeze",
     "graph_file",

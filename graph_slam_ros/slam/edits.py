@@ -1,11 +1,33 @@
 """Edits by hand: an edge, or a landmark with all of its edges, is taken out of the graph while the robot drives."""
 
+import re
+
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.decisions import CANDIDATES, landmark_of
 from graph_slam_ros.slam.landmarks import Landmarks
+from graph_slam_ros.slam.measurements import Control
 
 SOURCE = "edit"
+_EDIT = re.compile(r"\s*(edge|landmark)\s+(\S.{0,127}?)\s*", re.DOTALL)
+_ID = re.compile(r"\d{1,18}", re.ASCII)
+
+
+def removal(text: str) -> Control:
+    """The event that a text of ``~/remove`` asks for: ``edge 231`` or ``landmark dock``.
+
+    Raises
+    ------
+    GraphSlamError
+        It is neither.
+    """
+    found = _EDIT.fullmatch(text[:1000])
+    if found and found[1] == "landmark":
+        return Control("remove", (("landmark", found[2]),))
+    if found and _ID.fullmatch(found[2]):
+        return Control("remove", (("edge", int(found[2])),))
+    raise GraphSlamError(f"~/remove: {text[:40]!r} is neither 'edge ID' nor 'landmark NAME'")
 
 
 class Edits:

@@ -119,8 +119,8 @@ class Control:
 
     ``flush`` releases what waits for its turn, ``end`` also gives up what no odometry reached, ``optimize`` solves now,
     ``clear_closures`` takes all loop closures out, ``time_jump`` begins a segment whose stamps may be older, ``set``
-    changes parameters to ``values``, ``memory`` tells that it ``is_short`` or no more, ``restart`` goes back to the
-    last good estimate after a fault outside.
+    changes parameters to ``values``, ``remove`` takes an ``edge`` or a ``landmark`` out, ``memory`` tells that it
+    ``is_short`` or no more, ``restart`` goes back to the last good estimate after a fault outside.
     """
 
     event: str

@@ -16,7 +16,7 @@ from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
-from graph_slam_ros.errors import said
+from graph_slam_ros.errors import GraphSlamError, said
 from graph_slam_ros.ros import results, to_msg
 from graph_slam_ros.ros.from_msg import Border, Decoder, twist_of
 from graph_slam_ros.ros.inputs import Measured, uses
@@ -38,6 +38,7 @@ from graph_slam_ros.ros.message_class import message_class
 from graph_slam_ros.ros.stamp_jump import StampJump
 from graph_slam_ros.ros.survey import with_survey
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Update
+from graph_slam_ros.slam.edits import removal
 from graph_slam_ros.slam.measurements import Closure, InitialPose, Sightings
 
 _ACKNOWLEDGE = 32  # messages
@@ -90,6 +91,9 @@ class Configured:
             10,
             raw=True,
         )
+        self._removals = node.create_subscription(
+            message_class("std_msgs/msg/String"), "~/remove", node.guarded(self._on_remove), 10
+        )
 
     def prepare(self, is_told_to_stop: Callable[[], bool]) -> None:
         """Have the worker load the kernels, compiled where they are not yet, before it does anything else."""
@@ -136,6 +140,7 @@ class Configured:
         for some in self._ahead.give_up():
             self._hand_over(some)
         self._node.destroy_subscription(self._initial)
+        self._node.destroy_subscription(self._removals)
         self._hand_over(self._border.finish())
         saved = self._worker.call(self._session.finish)
         try:
@@ -226,6 +231,14 @@ class Configured:
     def _on_initial_pose(self, cdr: bytes) -> None:
         for pose in self._border.initial_pose(cdr):
             self.in_passing(self._in_sequence([pose]))
+
+    def _on_remove(self, message: Any) -> None:
+        try:
+            event = removal(message.data)
+        except GraphSlamError as error:
+            self._node.get_logger().warn(str(error))
+            return
+        self.in_passing(self._in_sequence([event]))
 
     def _in_sequence(self, events: Sequence[Control | InitialPose]) -> "Future[None]":
         """Accept and process what is no measurement, at its place among those."""
