@@ -262,7 +262,6 @@ class Suggestion:
             self._add("gps", one, {} if one.has_noise else {"sigma_m": 2.0})
             if not one.has_noise:
                 self.notes.append(f"{one.topic.name} does not tell its noise: 2 m is assumed")
-            self._loosen()
         self._choose_imu(self._of_type(IMU), is_needed=len(self._names) == 1)
         for one in self._of_type(POSE, POSE_WITH_COVARIANCE):
             name = one.topic.name
@@ -278,7 +277,6 @@ class Suggestion:
                 chosen: dict[str, Any] = {} if one.frame == "map" else {"frame": "map"}
                 self._add("pose", one, chosen | ({} if one.has_noise else {"sigma_m": 0.1}), linked=True)
                 self.notes.append(f"{name} is taken for a fix: if it is an estimate or the truth, leave it out")
-                self._loosen()
 
     def _choose_imu(self, found: Iterator[Contents], is_needed: bool) -> None:
         for one in sorted(found, key=lambda one: -one.usable):
@@ -288,11 +286,7 @@ class Suggestion:
                 self.unused[one.topic.name] = "its heading may drift, and there is better: --set imu.type=" + IMU
             else:
                 self._add("imu", one, {} if one.has_noise else {"sigma_rad": 0.05})
-                self.settings.setdefault("anchor.sigma_rad", 3.0)
                 is_needed = False
-
-    def _loosen(self) -> None:
-        self.settings |= {"anchor.sigma_m": 1000.0, "anchor.sigma_rad": 3.0}
 
     # -- what all inputs need --------------------------------------------------------------------------------------
 

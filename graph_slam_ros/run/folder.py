@@ -7,6 +7,7 @@ other, and never cleared.
 """
 
 import contextlib
+import errno
 import itertools
 import json
 import os
@@ -44,6 +45,7 @@ _RECORDED = re.compile(r"(ingest|map|run)(_\d+)?\.mcap")
 _UNFINISHED = re.compile(r"\.[0-9a-f]{8}" + re.escape(NEW))
 _SCHEMAS = {INGEST: MEASUREMENT, MAP: GROWTH}
 _OF_RECORDINGS = re.compile(r"(\.(mcap|db3|bag|active|zstd|gz))+$")
+_NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.EINVAL, errno.ELOOP)  # none, or not a regular one
 _TOPICS = {"/tf", "/pose", "/path", "/landmarks"}
 
 
@@ -52,7 +54,13 @@ class RunError(GraphSlamError):
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder holds a run: its ``run.json`` says so, or it is of an earlier version and has our journal."""
+    """Whether a folder holds a run: its ``run.json`` says so, or it is of an earlier version and has our journal.
+
+    Raises
+    ------
+    RunError
+        The disk fails to tell: a run may be there, which nobody may take for another thing.
+    """
     if not folder.is_dir():
         return False
     try:
@@ -118,10 +126,20 @@ def _holds_something(folder: Path) -> bool:
 
 
 def summary_of(folder: Path) -> dict[str, Any]:
-    """The summary; nothing where it cannot be read."""
+    """The summary; empty where there is none, or no JSON in it.
+
+    Raises
+    ------
+    RunError
+        It is there and the disk fails to give it: what it says must not be taken for missing.
+    """
     try:
         told = json.loads(read_text(folder / SUMMARY))
-    except (OSError, ValueError, RecursionError):
+    except OSError as error:
+        if error.errno not in _NO_FILE:
+            raise RunError(f"{folder / SUMMARY}: {error.strerror}") from None
+        return {}
+    except (ValueError, RecursionError):
         return {}
     return told if isinstance(told, dict) else {}
 
@@ -246,7 +264,13 @@ def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> None:
 
 def earlier_runs(folder: Path) -> dict[int, Path]:
     """Earlier runs beside a run folder, by number."""
-    return {number: run for number, run in _numbered(folder).items() if is_run(run)}
+    return {number: run for number, run in _numbered(folder).items() if _is_readable_run(run)}
+
+
+def _is_readable_run(folder: Path) -> bool:
+    with contextlib.suppress(RunError):  # it stays as it is
+        return is_run(folder)
+    return False
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
