@@ -5,6 +5,7 @@ import fcntl
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.measurements import Fix
+from graph_slam_ros.slam.measurements import Fix, Odometry
 
 WORLD = tuple(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0)))
 MUNICH, OSLO = (48.0, 11.0, 500.0), (60.0, 11.0, 100.0)
@@ -305,5 +306,97 @@ def test_a_replay_in_other_dimensions_is_refused_before_anything_is_replaced(tmp
         one.finish()
     before = (tmp_path / "out" / "path.tum").read_bytes()
     with pytest.raises(RunError, match=r"world\.dimensions is 2 there"):
-        replay(tmp_path / "run", tmp_path / "out", Config.from_mapping({"world.dimensions": 3}))
+        replay(tmp_path / "run", tmp_path / "out", Config.from_mapping({"world.dimensions": 3}), force=True)
     assert (tmp_path / "out" / "path.tum").read_bytes() == before
+
+
+# -- a drive that was cut off ------------------------------------------------------------------------------------------
+
+
+def straight(first, last, *, from_x=0.0, since_ns=0, source="odom"):
+    """Odometry along x, half a metre in half a second."""
+    return [Odometry(since_ns + k * 5 * 10**8, (from_x + 0.5 * k, 0.0, 0.0), None, source) for k in range(first, last)]
+
+
+def resumed(folder, *later, **config):
+    """Of a session that resumes after a drive of 20 m and is given these: whether the robot is located, and why."""
+    again = session(folder, **config)
+    again.resume()
+    assert not again.estimate.is_located
+    again.take(list(later))
+    return again, (again.estimate.is_confirmed, again.estimate.is_resumed)
+
+
+@pytest.mark.parametrize(
+    ("later", "goes_on"),
+    [
+        (straight(41, 43), True),
+        (straight(41, 43, since_ns=59 * 10**9), True),
+        (straight(41, 43, source="odom#1"), True),
+        (straight(41, 43, since_ns=61 * 10**9), False),
+        (straight(41, 43, source="wheels"), False),
+        (straight(39, 41), False),
+        (straight(0, 2, since_ns=30 * 10**9), False),
+        (straight(0, 2, from_x=5.0, since_ns=30 * 10**9), False),
+        (straight(41, 43, from_x=60.0), False),
+        ([*straight(41, 43), *straight(43, 45, from_x=60.0)], False),
+    ],
+    ids=[
+        "goes on",
+        "after a minute",
+        "other publisher",
+        "too late",
+        "other odometry",
+        "time before",
+        "anew at zero",
+        "anew and driven since",
+        "faster than robots",
+        "jumps later",
+    ],
+)
+def test_P12_a_drive_that_was_cut_off_is_resumed_where_its_odometry_goes_on(tmp_path, later, goes_on):
+    one = session(tmp_path / "run")
+    one.take(straight(0, 41))
+    before = one.slam.T_map_odom
+    one.abandon()
+    again, located = resumed(tmp_path / "run", *later)
+    assert located == (False, goes_on)
+    if goes_on:
+        assert again.estimate.T_map_odom == pytest.approx(before, abs=1e-6)
+
+
+def test_P12_after_standing_for_long_a_drive_is_resumed_too(tmp_path):
+    one = session(tmp_path / "run")
+    one.take(straight(0, 41))
+    stands = [replace(straight(40, 41)[0], stamp_ns=(20 + s) * 10**9) for s in range(1, 300)]
+    one.take(stands)
+    one.abandon()
+    assert resumed(tmp_path / "run", *straight(41, 43, since_ns=300 * 10**9))[1] == (False, True)
+
+
+def test_P12_a_drive_whose_place_was_not_known_is_not_resumed(tmp_path):
+    one = session(tmp_path / "run")
+    one.take(straight(0, 41))
+    one.abandon()
+    lost, _ = resumed(tmp_path / "run", *straight(0, 41, since_ns=100 * 10**9))
+    lost.abandon()
+    assert resumed(tmp_path / "run", *straight(41, 43, since_ns=100 * 10**9))[1] == (False, False)
+
+
+def test_P12_what_is_resumed_is_the_run_that_was_cut_off_also_where_another_is_named_to_be_loaded(tmp_path):
+    site = session(tmp_path / "site")
+    site.take(straight(0, 10))
+    site.finish()
+    one = session(tmp_path / "run", output__load="site", output__load_at_start=True)
+    one.take(straight(0, 41))
+    one.abandon()
+    again, located = resumed(tmp_path / "run", *straight(41, 43), output__load="site", output__load_at_start=True)
+    assert located == (False, True)
+    assert again.slam.keyframes.stamps_ns[-1] > 10 * 10**9
+    again.finish()
+    shutil.rmtree(tmp_path / "run-1")
+    last = session(tmp_path / "run", output__load="site", output__load_at_start=True)
+    for run in tmp_path.glob("run-*"):
+        shutil.rmtree(run)
+    last.resume()
+    assert len(last.slam.keyframes) == len(site.slam.keyframes), "where there is nothing to resume"

@@ -299,35 +299,76 @@ def test_P6_told_to_stop_while_a_long_run_is_loaded_it_does_not_wait_for_it(tmp_
 # -- what outlives it --------------------------------------------------------------------------------------------------
 
 
-def test_P2_P12_killed_it_goes_on_in_its_map_and_claims_no_pose_until_a_landmark_is_recognised(tmp_path):
-    hears = "pose", "/tf", "path", "/diagnostics", "landmarks"
-    parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true"
-    drive = Drive()
-    with node(*parameters) as n, robot(hears=hears) as r:
+RESUMED = "goes on by odometry alone since the restart, nothing recognised yet"
+
+
+def transform(r):
+    """The last ``map -> odom``, (x, y, yaw)."""
+    found = r.heard["tf"][-1].transforms[0].transform
+    return found.translation.x, found.translation.y, 2.0 * math.atan2(found.rotation.z, found.rotation.w)
+
+
+def killed_in_mid_drive(folder, drive):
+    """A node drives, sees, and is killed; returns the stamps of its path and its last ``map -> odom``."""
+    with node(f"output.folder:={folder}", "inputs.reliable:=true") as n, robot(hears=("/tf", "path", "pose")) as r:
         r.wait_for_node()
         drive.go(r, 120, every=3)
         r.settle()
-        known = [pose.header.stamp for pose in r.heard["path"][-1].poses]
+        r.heard["tf"].clear()
+        drive.step(r)
+        until(lambda: r.heard["tf"], r.spin, "transform of the newest estimate")
+        r.settle()
         n.process.kill()
         assert n.ended()[0] == -signal.SIGKILL
-    assert is_cut_off(tmp_path / "run")
-    with node(*parameters) as n, robot(hears=hears) as r:
+        assert is_cut_off(folder)
+        return [pose.header.stamp for pose in r.heard["path"][-1].poses], transform(r)
+
+
+def test_P2_P12_killed_it_goes_on_in_its_map_and_where_it_was_if_odometry_goes_on(tmp_path):
+    drive = Drive()
+    known, before = killed_in_mid_drive(tmp_path / "run", drive)
+    parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true"
+    with node(*parameters) as n, robot(hears=("pose", "/tf", "path", "/diagnostics", "landmarks")) as r:
         r.wait_for_node()
         drive.sees = False
         drive.stamp_ns += 10**9
-        r.until_it_says("DEGRADED", "where the robot is in the loaded map is not known yet", spin=drive.pace(r))
+        until(lambda: r.heard["tf"] and r.heard["pose"], drive.pace(r), "transform without any landmark")
+        assert transform(r) == pytest.approx(before, abs=0.1), "as it was"
+        until(lambda: off_by(r, drive) < 0.5, drive.pace(r), "the pose of now")
+        assert r.heard["pose"][-1].pose.covariance[0] > 10.0, "as far as odometry can be trusted over a restart"
+        r.until_it_says("DEGRADED", RESUMED, "drive past known landmarks", spin=drive.pace(r))
         until(lambda: r.heard["path"], drive.pace(r), "path")
         stamps = [pose.header.stamp for pose in r.heard["path"][-1].poses]
         assert stamps[: len(known)] == known, "what was published before is there"
         assert {m.text for m in r.heard["landmarks"][-1].markers if m.text} == set(TAGS)
-        assert not (r.heard["pose"] or r.heard["tf"])
         drive.sees = True
-        until(lambda: r.heard["pose"] and r.heard["tf"], drive.pace(r), "place in the map")
+        r.until_it_says("OK", spin=drive.pace(r))
         until(lambda: off_by(r, drive) < 0.5, drive.pace(r), "the pose of now")
         assert n.stop()[0] == 0
     assert "the last run was never ended: going on in its map" in n.said
     assert is_repeated(tmp_path / "run", tmp_path)
     assert not is_cut_off(tmp_path / "run")
+
+
+def test_P2_P12_killed_with_its_odometry_it_claims_no_pose_until_a_landmark_is_recognised(tmp_path):
+    drive = Drive()
+    killed_in_mid_drive(tmp_path / "run", drive)
+    parameters = f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true"
+    with node(*parameters) as n, robot(hears=("pose", "/tf", "odometry", "/diagnostics")) as r:
+        r.wait_for_node()
+        drive.sees = False
+        drive.stamp_ns += 10**9
+        drive.odom = (0.0, 0.0, 0.0)
+        unknown = "where the robot is in the loaded map is not known yet"
+        r.until_it_says("DEGRADED", unknown, spin=drive.pace(r))
+        drive.go(r, 20, every=2)
+        r.until_it_says("DEGRADED", unknown, spin=drive.pace(r))
+        assert not (r.heard["pose"] or r.heard["tf"] or r.heard["odometry"])
+        drive.sees = True
+        until(lambda: r.heard["pose"] and r.heard["tf"], drive.pace(r), "place in the map")
+        until(lambda: off_by(r, drive) < 0.5, drive.pace(r), "the pose of now")
+        assert n.stop()[0] == 0
+    assert is_repeated(tmp_path / "run", tmp_path)
 
 
 # -- parameters --------------------------------------------------------------------------------------------------------

@@ -131,7 +131,8 @@ class GraphSlamNode(LifecycleNode):
             resumes = self.config.journal.resume and run.was_cut_off
             if resumes:
                 self.get_logger().warn("the last run was never ended: going on in its map")
-            if resumes or self.config.output.load_at_start:
+                run.in_passing(run.resume())
+            elif self.config.output.load_at_start:
                 run.in_passing(run.load())
 
     def _configured(self) -> "Configured":

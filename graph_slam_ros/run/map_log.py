@@ -174,6 +174,7 @@ def state_of(slam: GraphSlam) -> MapState:
     state = MapState()
     extend(state, Growth().since(slam))
     state.values, state.settings = slam.solver.values, dict(slam.settings)
+    state.used_ns, state.source = slam.newest_odometry_ns, slam.odometry_source
     return state
 
 

@@ -69,13 +69,7 @@ class Broadcaster:
 
     def _tick(self) -> None:
         config, estimate, newest = self._look()
-        if (
-            self._is_closed
-            or estimate is None
-            or newest is None
-            or not config.tf.publish_tf
-            or not estimate.is_confirmed
-        ):
+        if self._is_closed or estimate is None or newest is None or not config.tf.publish_tf or not estimate.is_located:
             return
         if config.tf.second_authority == "yield" and self.has_rival:
             return

@@ -221,7 +221,7 @@ class Configured:
 
     def _send_odometry(self, m: Odometry, cdr: bytes) -> None:
         estimate, config = self._session.estimate, self._node.config
-        if estimate is None or not estimate.is_confirmed:
+        if estimate is None or not estimate.is_located:
             return
         frames, unused = config.frames, config.output.pose_covariance_max
         twist = twist_of(cdr, frames.base) if m.source.partition("#")[0] in self._with_twist else None
@@ -327,6 +327,10 @@ class Configured:
         """Go on from an earlier run."""
         return self._anew(partial(self._session.load, self._node.config.output.load))
 
+    def resume(self) -> "Future[str]":
+        """Go on from the last run, which was never ended."""
+        return self._anew(self._session.resume)
+
     def reset(self) -> "Future[str]":
         """Save, and begin anew."""
         return self._anew(self._session.reset)
@@ -390,7 +394,7 @@ class Configured:
 
     def _on_update(self, slam: GraphSlam, update: Update) -> None:
         estimate, tf = self._session.estimate, slam.config.tf
-        self._outputs.update(slam, update, is_confirmed=estimate is not None and estimate.is_confirmed)
+        self._outputs.update(slam, update, is_located=estimate is not None and estimate.is_located)
         moved = update.correction
         if update.solved and (moved.distance_m > tf.report_jump_m or moved.angle_rad > tf.report_jump_rad):
             slam.counters.count("tf", "jump")

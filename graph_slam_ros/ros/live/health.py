@@ -211,7 +211,12 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield f"{facts.overflows} messages refused: the queue is full (inputs.queue)"
     if facts.lag_s > health.lag_s:
         yield f"the solver is {facts.lag_s:.1f} s behind, {facts.waiting} messages wait"
-    if estimate and not estimate.is_confirmed:
+    if estimate and estimate.is_resumed:
+        yield (
+            "goes on by odometry alone since the restart, nothing recognised yet:"
+            " drive past known landmarks, or give initialpose"
+        )
+    elif estimate and not estimate.is_confirmed:
         yield "where the robot is in the loaded map is not known yet"
     if estimate and estimate.displaced:
         yield estimate.displaced

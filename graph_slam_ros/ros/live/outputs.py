@@ -83,9 +83,9 @@ class Outputs:
 
     # -- at once -----------------------------------------------------------------------------------------------------
 
-    def update(self, slam: GraphSlam, update: Update, *, is_confirmed: bool) -> None:
+    def update(self, slam: GraphSlam, update: Update, *, is_located: bool) -> None:
         """The pose, what has happened, and a note of what is to be sent."""
-        if is_confirmed:
+        if is_located:
             self._send("pose", results.pose(slam))
         self._has_something = True
         for name in ("path", "path_updates", "graph"):

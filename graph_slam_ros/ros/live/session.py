@@ -14,6 +14,7 @@ from typing import Any
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.ros.live.beside import in_a_thread
+from graph_slam_ros.ros.live.resumption import Resumption
 from graph_slam_ros.run import (
     RunError,
     RunRecorder,
@@ -48,6 +49,7 @@ class Estimate:
     fit : chi2 per degree of freedom; NaN before it was looked at
     rivals : loop closures of other explanations that could not be ruled out
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
+    is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
     """
 
     T_map_odom: Numbers
@@ -67,6 +69,12 @@ class Estimate:
     fit: float
     rivals: int
     displaced: str = ""
+    is_resumed: bool = False
+
+    @property
+    def is_located(self) -> bool:
+        """Whether pose and ``map -> odom`` may be published."""
+        return self.is_confirmed or self.is_resumed
 
 
 class Session:
@@ -113,6 +121,7 @@ class Session:
         self._is_saved, self._is_ended = True, False
         self._loaded = len(self.slam.keyframes)
         self._is_confirmed = not self._loaded
+        self._resumption: Resumption | None = None
         self._slowest_s = 0.0
         self._fit, self._fitted_at, self._fit_due_s = float("nan"), 0, 0.0
 
@@ -208,8 +217,7 @@ class Session:
         slam, newest = self.slam, self.slam.keyframes[-1]
         covariance = slam.pose_covariance
         if update.solved and not self._is_confirmed and len(slam.keyframes) > self._loaded:
-            unsure = float(covariance[0, 0] + covariance[1, 1]) ** 0.5
-            self._is_confirmed = unsure < _CONFIRMED * slam.config.odometry.jump_sigma_m
+            self._is_confirmed = self._is_sure
         self.estimate = Estimate(
             slam.T_map_odom,
             newest.T_odom_base,
@@ -228,7 +236,14 @@ class Session:
             self._fit,
             sum(len(rival.only_here) for rival in slam.backend.rivals),
             str(slam.displaced or ""),
+            not self._is_confirmed and self._resumption is not None and self._resumption.goes_on(slam),
         )
+
+    @property
+    def _is_sure(self) -> bool:
+        """Whether the newest keyframe's place in the map is known better than over a jump of odometry."""
+        covariance = self.slam.pose_covariance
+        return float(covariance[0, 0] + covariance[1, 1]) ** 0.5 < _CONFIRMED * self.slam.config.odometry.jump_sigma_m
 
     def evaluate(self) -> None:
         """Look at how well everything fits, when there is nothing else to do, for a fiftieth of the time at most."""
@@ -286,14 +301,25 @@ class Session:
 
     def load(self, name: str) -> str:
         """Save, keep that, and go on from an earlier run: in its map, where the robot is now is to be found out."""
-        run = self._earlier(name)
+        return self._load(self._earlier(name))
+
+    def resume(self) -> str:
+        """Go on from the run that was cut off: in its map, and where the robot was if its odometry goes on."""
+        try:
+            return self._load(self._earlier(""), resumes=True)
+        except GraphSlamError:
+            if not self.config.output.load_at_start:
+                raise
+            return self.load(self.config.output.load)
+
+    def _load(self, run: Path, *, resumes: bool = False) -> str:
         self.loads = run.name
         try:
-            return self._load(run)
+            return self._go_on_from(run, resumes=resumes)
         finally:
             self.loads = ""
 
-    def _load(self, run: Path) -> str:
+    def _go_on_from(self, run: Path, *, resumes: bool) -> str:
         loaded = run_config(run)
         if loaded.world != self.config.world:
             raise RunError(f"{run.name}: world.dimensions is {loaded.world.dimensions} there")
@@ -308,6 +334,8 @@ class Session:
         except Exception:
             self._begin(loaded=run)
             raise
+        if resumes and (len(start.drives) <= 1 or self._is_sure):  # else nobody knew where it was
+            self._resumption = Resumption(self.slam, start.used_ns, start.source)
         self._recorded(RunRecorder.flush)
         self._look(Update(), 0.0)
         return ": ".join([run.name, f"{len(self.slam.keyframes)} keyframes", *losses[:1]])
