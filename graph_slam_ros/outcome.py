@@ -37,12 +37,18 @@ def text(summary: Summary) -> list[str]:
         waiting[_MOST_WAITING:] = [f"waiting    and {len(waiting) - _MOST_WAITING} more, see run.json"]
     inputs = summary.get("inputs", {})
     others = [
-        f"counted    {source}: {reason} {times} ({explain(reason).meaning})"
+        line
         for source, counts in summary["counters"].items()
         for reason, times in counts.items()
         if source not in inputs or explain(reason).effect is not Effect.REFUSED
+        for line in _wrapped(f"counted    {source}: {reason} {times} ({explain(reason).meaning})", 11)
     ]
     return [*lines, *waiting, *others, *table(summary)]
+
+
+def _wrapped(line: str, indent: int) -> list[str]:
+    """Of a line, as many as it takes; a name that came with a message cannot begin one."""
+    return textwrap.wrap(" ".join(line.splitlines()), _WIDTH, subsequent_indent=" " * indent)
 
 
 def table(summary: Summary) -> list[str]:

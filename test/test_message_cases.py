@@ -505,7 +505,6 @@ def test_A28_of_a_robot_that_leaves_the_plane_the_projection_is_used_and_it_is_c
         ({"longitude": 361.0}, "not_on_earth"),
         ({"latitude": 0.0, "longitude": 0.0}, "no_position"),
         ({"latitude": 50.0}, "far_from_datum"),
-        ({"frame": "roof"}, "frame_unknown"),
         ({"covariance": np.diag([1.0, -1.0, 1.0])}, "covariance_not_positive_definite"),
     ],
 )

@@ -102,14 +102,15 @@ def test_P13_a_life_of_many_transitions_leaves_nothing_behind(tmp_path):
             assert r.change("deactivate")
             drive.go(r, 3)
             assert r.change("cleanup")
+            if weights:  # a thread that was told to end may take a moment for it
+                until(lambda: weight(n.process)[2] <= weights[0][2], r.spin, "the end of a thread")
             weights.append(weight(n.process))
         assert r.state() == "unconfigured"
         assert n.stop()[0] == 0
     assert "Traceback" not in n.said
-    memory, files, threads = zip(*weights[warm:], strict=True)
+    memory, files, _ = zip(*weights[warm:], strict=True)
     assert memory[-1] - memory[0] < 5.0 + 0.05 * times, memory
     assert max(files) <= files[0], files
-    assert max(threads) <= threads[0], threads
     last = warm + times - 1
     assert {run.name for run in tmp_path.iterdir()} == {"run", *(f"run-{last - k}" for k in range(5))}
 
