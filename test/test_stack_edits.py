@@ -4,11 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from live_drive import Drive, distance
+from live_drive import Drive, distance, earlier_run
 from live_nodes import ENVIRONMENT, node, own_domain, replayed, results, robot, until
 from std_msgs.msg import String
 
 from graph_slam_ros.cli import main
+from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.simulation import simulate
 from graph_slam_ros.simulation.bag import write_bag
 
@@ -58,6 +59,85 @@ def test_the_map_is_held_and_edited_while_the_node_runs_and_the_run_repeats(tmp_
     assert "neither 'edge ID' nor 'landmark NAME'" in n.said
     assert counters(tmp_path / "run")["edit"] == {"removed": 1, "unknown_landmark": 1}
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
+
+
+def text(pose):
+    return " ".join(f"{number:.3f}" for number in pose)
+
+
+def test_a_map_is_saved_by_name_and_loaded_with_the_pose_of_the_robot(tmp_path):
+    hears = "pose", "/tf", "/diagnostics", "landmarks_estimate"
+    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true") as n, robot(hears=hears) as r:
+        r.wait_for_node()
+        drive = Drive()
+        drive.go(r, 90, every=3)
+        r.settle()
+        for name, value, why in (
+            ("save_as", "../site", "output.save_as: '../site' is not the name of a run"),
+            ("load_pose", "1 2", "output.load_pose: '1 2' is not 3 numbers"),
+        ):
+            done, said = r.set({f"output.{name}": value})
+            assert not done and why in said
+        for name, why in (
+            ("run-3", "run is saved; run-3: earlier runs are called so"),
+            ("run", "run: is there already"),
+        ):
+            assert r.set({"output.save_as": name}) == (True, "")
+            answer = r.save()
+            assert not answer.success and why in answer.message
+        assert r.set({"output.save_as": "site"}) == (True, "")
+        answer = r.save()
+        assert (answer.success, answer.message) == (True, f"{tmp_path / 'run'}, {tmp_path / 'site'}")
+        assert np.allclose(landmarks(tmp_path / "site"), landmarks(tmp_path / "run"), atol=1e-6)
+        answer = r.save()
+        assert not answer.success and "run is saved; site: is there already" in answer.message
+        drive.sees = False
+        drive.stamp_ns += 10**9
+        assert r.set({"output.load": "site", "output.load_pose": text(drive.truth)}) == (True, "")
+        answer = r.call("load")
+        assert answer.success and "the robot is taken to be at" in answer.message
+        r.settle()  # the end of the run before has poses, too
+        r.heard["pose"].clear()
+        r.heard["tf"].clear()
+        located(r, drive)
+        assert n.stop()[0] == 0
+    assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
+    assert not (tmp_path / "run-3").exists()
+
+
+def located(r, drive):
+    """Nothing was seen: pose and transform are there with the first odometry, and the pose is the given one."""
+    at = drive.truth
+    until(lambda: r.heard["pose"] and r.heard["tf"], drive.pace(r), "place in the map")
+    said = r.heard["pose"][0].pose.pose.position
+    assert distance((said.x, said.y), at) < 0.01
+
+
+@pytest.mark.parametrize("use", ["segment", "prior"])
+def test_a_map_is_loaded_at_the_start_with_the_pose_of_the_robot(tmp_path, use):
+    earlier_run(tmp_path / "site", 100)
+    at = f"output.folder:={tmp_path / 'run'}", "output.load:=site", "output.load_at_start:=true"
+    drive = Drive(truth=(2.0, 1.0, 0.5))
+    given = f"output.load_pose:='{text(drive.truth)}'", f"initialpose.use:={use}", "inputs.reliable:=true"
+    with node(*at, *given) as n, robot(hears=("pose", "/tf", "/diagnostics")) as r:
+        r.wait_for_node()
+        drive.sees = False
+        located(r, drive)
+        drive.sees = True
+        drive.go(r, 60, every=3)
+        r.until_it_says("OK", spin=drive.pace(r))
+        n.process.kill()
+        n.ended()
+    with node(*at, *given) as n, robot(hears=("pose", "/diagnostics")) as r:
+        r.wait_for_node()
+        assert n.stop()[0] == 0
+    assert "going on in its map; output.load_pose is not used: it has driven since" in n.said
+    assert len(np.loadtxt(tmp_path / "run" / "path.tum")) >= len(read_map(tmp_path / "run-1", []).keyframes)
+
+
+def landmarks(folder):
+    rows = _positions((folder / "landmarks.csv").read_text())[1:]
+    return [list(map(float, row[2:])) for row in rows]
 
 
 def test_a_recording_is_located_in_a_map_that_stays(tmp_path, capsys):

@@ -128,9 +128,9 @@ class GraphSlamNode(LifecycleNode):
         if self._run is None:
             self._run = run = Configured(self)
             run.prepare(self._is_told_to_stop)
-            resumes = self.config.journal.resume and run.was_cut_off
-            if resumes:
-                self.get_logger().warn("the last run was never ended: going on in its map")
+            if self.config.journal.resume and run.was_cut_off:
+                unused = "" if self.config.load_pose is None else "; output.load_pose is not used: it has driven since"
+                self.get_logger().warn(f"the last run was never ended: going on in its map{unused}")
                 run.in_passing(run.resume())
             elif self.config.output.load_at_start:
                 run.in_passing(run.load())

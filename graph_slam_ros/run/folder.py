@@ -273,9 +273,18 @@ def _is_readable_run(folder: Path) -> bool:
     return False
 
 
+def is_name_of_earlier(folder: Path, name: str) -> bool:
+    """Whether an earlier run of a folder could have that name, and so be removed with the oldest of these."""
+    return _earlier_name(folder).fullmatch(name) is not None
+
+
+def _earlier_name(folder: Path) -> re.Pattern[str]:
+    return re.compile(re.escape(folder.name) + r"-([1-9]\d*)")
+
+
 def _numbered(folder: Path) -> dict[int, Path]:
     """Whatever is called as an earlier run is."""
-    named = re.compile(re.escape(folder.name) + r"-([1-9]\d*)")
+    named = _earlier_name(folder)
     there = folder.parent.iterdir() if folder.parent.is_dir() else ()
     return {int(match[1]): run for run in there if (match := named.fullmatch(run.name))}
 

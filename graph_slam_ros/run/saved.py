@@ -1,5 +1,6 @@
 """What becomes of a run after it: it is recorded again from its events, or its map is gone on in."""
 
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.durable import claimed
 from graph_slam_ros.formats.journal import read_ingest, read_rest
-from graph_slam_ros.run.folder import RunError, check_room, missing, run_config, summary_of, was_saved_whole
+from graph_slam_ros.run.folder import RunError, check_room, discard, missing, run_config, summary_of, was_saved_whole
 from graph_slam_ros.run.map_log import has_map, read_map, state_of
 from graph_slam_ros.run.recorder import RunRecorder, save_results
 from graph_slam_ros.run.tables import summarize
@@ -177,6 +178,27 @@ def complete(folder: Path) -> Summary:
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None
     return summary
+
+
+def save_copy(slam: GraphSlam, out: Path) -> None:
+    """Write the map of a pipeline as a run of its own, which others can load; the pipeline goes on as it was.
+
+    Raises
+    ------
+    RunError
+        Something of that name is there already, or there is no map that is solved. Nothing was written.
+    """
+    if os.path.lexists(out):
+        raise RunError(f"{out.name}: is there already, and nothing is replaced: choose another name")
+    if not slam.keyframes:
+        raise RunError(f"{out.name}: not written: there is no keyframe, so there is no map")
+    if not slam.is_solved:
+        raise RunError(f"{out.name}: not written: the map cannot be solved: {slam.failing}")
+    try:
+        record_run(out, slam.config, (), [], state_of(slam))
+    except Exception:
+        discard(out)
+        raise
 
 
 def freeze(folder: Path, out: Path, *, force: bool = False) -> Summary:

@@ -365,7 +365,7 @@ class Config:
         return f"Config({', '.join(changed)})"
 
     def __post_init__(self) -> None:
-        _ = self.start_pose, self.survey  # what they are made of is refused here, not later
+        _ = self.start_pose, self.load_pose, self.survey  # what they are made of is refused here, not later
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> "Config":
@@ -415,8 +415,16 @@ class Config:
     @property
     def start_pose(self) -> Numbers | None:
         """``T_map_base`` of the first keyframe; None where odometry says it."""
+        return self._pose("anchor.pose", self.anchor.pose)
+
+    @property
+    def load_pose(self) -> Numbers | None:
+        """``T_map_base`` of the robot when a map is loaded; None where it is unknown."""
+        return self._pose("output.load_pose", self.output.load_pose)
+
+    def _pose(self, name: str, text: str) -> Numbers | None:
         counts = (3,) if self.world.dimensions == 2 else (3, 6)
-        given = numbers("anchor.pose", self.anchor.pose, *counts)
+        given = numbers(name, text, *counts)
         if not given or self.world.dimensions == 2:
             return given or None
         return se3.from_xyz_rpy(given if len(given) == 6 else (*given[:2], 0.0, 0.0, 0.0, given[2]))

@@ -503,11 +503,14 @@ class GraphSlam:
         Or somebody tells: an initial pose.
         """
         said, self._initial_pose, self._held_covariance = self._initial_pose, None, None
+        has_motion = self._trail.motion is not None  # none of a loaded map: its odometry was that of another drive
+        is_prior = said is not None and has_motion and self.config.initialpose.use == "prior"
         T_last_now, covariance = self._motion_into(step)
-        if said is None or self.config.initialpose.use == "segment":
+        if not is_prior:
             self.segments.append(len(self.keyframes))
         self._watch.evidence.begin(self.graph.vertex_count)
-        covariance = covariance + np.diag(np.square(self.space.sigmas(*self._loose(said, T_last_now))))
+        loose = self._loose(said, T_last_now, is_prior=is_prior)
+        covariance = covariance + np.diag(np.square(self.space.sigmas(*loose)))
         self._add_keyframe(step, T_last_now, covariance, said.T_map_base if said else None)
         if said:
             self._edges.initial_pose(self.keyframes[-1].vertex, said)
@@ -527,7 +530,7 @@ class GraphSlam:
         now = (self._trail.motion or motion).now  # of another keyframe, where one of these deserved it
         return now.T_keyframe_base, now.covariance
 
-    def _loose(self, said: InitialPose | None, T_last_now: Numbers) -> tuple[float, float]:
+    def _loose(self, said: InitialPose | None, T_last_now: Numbers, *, is_prior: bool) -> tuple[float, float]:
         """What is added to the noise of that motion, in metres and in radians.
 
         A pose that is given far away must not pull on the path before: it may be wrong.
@@ -535,7 +538,7 @@ class GraphSlam:
         jump_m, jump_rad = self.config.odometry.jump_sigma_m, self.config.odometry.jump_sigma_rad
         if said is None:
             return jump_m, jump_rad
-        if self.config.initialpose.use == "prior":
+        if is_prior:
             return self.config.initialpose.loosen_m, self.config.initialpose.loosen_rad
         group, last = self.space.group, self._pose(self.keyframes[-1].vertex)
         away = group.between(group.compose(last, T_last_now), said.T_map_base)

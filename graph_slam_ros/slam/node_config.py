@@ -11,6 +11,18 @@ USUAL_INPUTS = tuple(one.name for one in DEFAULT_INPUTS)
 _FILE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,99}")
 
 
+def check_run_name(what: str, name: str) -> None:
+    """Refuse what is not empty and not the plain name of a run folder, a path above all.
+
+    Raises
+    ------
+    ConfigError
+        It begins with ``what``.
+    """
+    if name and not _FILE_NAME.fullmatch(name):
+        raise ConfigError(f"{what}: {name!r} is not the name of a run (letters, digits, . _ -)")
+
+
 @dataclass(frozen=True, slots=True)
 class NodeConfig:
     """The node as a process."""
@@ -101,6 +113,18 @@ class OutputConfig:
         "", "run that ~/load goes on from, a name beside the folder; empty: the newest earlier", live=True
     )
     load_at_start: bool = setting(False, "do so when configured")
+    load_pose: str = setting(
+        "",
+        "where the robot is in the map when it is loaded: x y yaw or, in space, x y z roll pitch yaw; as uncertain as"
+        " initialpose.* say; empty: unknown, until something is recognised",
+        live=True,
+    )
+    save_as: str = setting(
+        "",
+        "~/save also writes the map as a run of this name beside the folder, for output.load; nothing is replaced;"
+        " empty: no",
+        live=True,
+    )
     path_period_s: float = setting(0.2, "publish ~/path and ~/path_updates at most this often", "s", low=0.0, live=True)
     path_max_poses: int = setting(
         10_000, "poses of ~/path; a longer one is thinned out", "poses", low=2, high=10_000_000, live=True
@@ -128,8 +152,8 @@ class OutputConfig:
     )
 
     def __post_init__(self) -> None:
-        if self.load and not _FILE_NAME.fullmatch(self.load):
-            raise ConfigError(f"output.load: {self.load!r} is not the name of a run (letters, digits, . _ -)")
+        check_run_name("output.load", self.load)
+        check_run_name("output.save_as", self.save_as)
 
 
 @dataclass(frozen=True, slots=True)

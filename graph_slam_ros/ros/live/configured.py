@@ -314,9 +314,10 @@ class Configured:
     # -- services: begun here, done by the worker --------------------------------------------------------------------
 
     def save(self) -> "Future[str]":
-        """Solve everything and write the run folder."""
+        """Solve everything and write the run folder, and the map under the name that the parameters say."""
         self._hand_over(self._border.finish(is_end=False))
-        return self._worker.call(partial(self._session.save, self._session.accept_save()))
+        name = self._node.config.output.save_as
+        return self._worker.call(partial(self._session.save, self._session.accept_save(), name))
 
     @property
     def was_cut_off(self) -> bool:
@@ -324,8 +325,9 @@ class Configured:
         return self._session.was_cut_off
 
     def load(self) -> "Future[str]":
-        """Go on from an earlier run."""
-        return self._anew(partial(self._session.load, self._node.config.output.load))
+        """Go on from an earlier run, with the robot where the parameters say."""
+        config = self._node.config
+        return self._anew(partial(self._session.load, config.output.load, config.load_pose))
 
     def resume(self) -> "Future[str]":
         """Go on from the last run, which was never ended."""

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.ros.live.beside import in_a_thread
 from graph_slam_ros.ros.live.resumption import Resumption
@@ -22,15 +24,18 @@ from graph_slam_ros.run import (
     earlier_runs,
     incomplete_runs,
     is_cut_off,
+    is_name_of_earlier,
     is_run,
     keep_earlier,
     map_of,
     run_config,
+    save_copy,
     summarize,
 )
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.graph_slam import Correction
 from graph_slam_ros.slam.map_state import MapState
+from graph_slam_ros.slam.measurements import InitialPose
 from graph_slam_ros.slam.space import Numbers
 
 OnUpdate = Callable[[GraphSlam, Update], None]
@@ -270,16 +275,31 @@ class Session:
         self._has_news = False
         return events
 
-    def save(self, events: Sequence[Control] | None = None) -> str:
+    def save(self, events: Sequence[Control] | None = None, name: str = "") -> str:
         """Release what waits, solve, and write the run folder; returns its name.
 
         Parameters
         ----------
         events : that were accepted for it; None: they are accepted now
+        name : of a run beside the folder that the map is written as, too; empty: none
         """
         self._recorded(RunRecorder.wait_synced)  # what the disk refused before is told, and is no reason not to save
         self.process(self.accept_save() if events is None else events)
-        return self._write(ended=False)
+        folder = self._write(ended=False)
+        return f"{folder}, {self._save_as(Path(folder), name)}" if name else folder
+
+    def _save_as(self, folder: Path, name: str) -> Path:
+        """Write the map as a run beside the folder, which was saved already."""
+        if is_name_of_earlier(folder, name):
+            raise RunError(
+                f"{folder.name} is saved; {name}: earlier runs are called so, and are removed: choose another name"
+            )
+        out = folder.with_name(name)
+        try:
+            save_copy(self.slam, out)
+        except GraphSlamError as error:
+            raise RunError(f"{folder.name} is saved; {error}") from None
+        return out
 
     def _write(self, *, ended: bool) -> str:
         if self._recorder is None:
@@ -299,27 +319,32 @@ class Session:
         self._begin()
         return said
 
-    def load(self, name: str) -> str:
-        """Save, keep that, and go on from an earlier run: in its map, where the robot is now is to be found out."""
-        return self._load(self._earlier(name))
+    def load(self, name: str, T_map_base: Numbers | None = None) -> str:
+        """Save, keep that, and go on from an earlier run.
+
+        Parameters
+        ----------
+        T_map_base : where the robot is in its map; None: that is to be found out
+        """
+        return self._load(self.earlier(name), T_map_base)
 
     def resume(self) -> str:
         """Go on from the run that was cut off: in its map, and where the robot was if its odometry goes on."""
         try:
-            return self._load(self._earlier(""), resumes=True)
+            return self._load(self.earlier(""), resumes=True)
         except GraphSlamError:
             if not self.config.output.load_at_start:
                 raise
             return self.load(self.config.output.load)
 
-    def _load(self, run: Path, *, resumes: bool = False) -> str:
+    def _load(self, run: Path, T_map_base: Numbers | None = None, *, resumes: bool = False) -> str:
         self.loads = run.name
         try:
-            return self._go_on_from(run, resumes=resumes)
+            return self._go_on_from(run, T_map_base, resumes=resumes)
         finally:
             self.loads = ""
 
-    def _go_on_from(self, run: Path, *, resumes: bool) -> str:
+    def _go_on_from(self, run: Path, T_map_base: Numbers | None, *, resumes: bool) -> str:
         loaded = run_config(run)
         if loaded.world != self.config.world:
             raise RunError(f"{run.name}: world.dimensions is {loaded.world.dimensions} there")
@@ -336,11 +361,26 @@ class Session:
             raise
         if resumes and (len(start.drives) <= 1 or self._is_sure):  # else nobody knew where it was
             self._resumption = Resumption(self.slam, start.used_ns, start.source)
+        where = []
+        if T_map_base is not None:
+            self._place(T_map_base)
+            at = " ".join(f"{x:.6g}" for x in T_map_base[: self.config.space.dimensions])
+            where.append(f"the robot is taken to be at {at}")
         self._recorded(RunRecorder.flush)
         self._look(Update(), 0.0)
-        return ": ".join([run.name, f"{len(self.slam.keyframes)} keyframes", *losses[:1]])
+        return ": ".join([run.name, f"{len(self.slam.keyframes)} keyframes", *where, *losses[:1]])
 
-    def _earlier(self, name: str) -> Path:
+    def _place(self, T_map_base: Numbers) -> None:
+        """Begin the sequence with where the robot is, as uncertain as a pose on ``initialpose`` without covariance."""
+        said, space = self.config.initialpose, self.config.space
+        sigmas = np.array(space.sigmas(said.sigma_m, said.sigma_rad))
+        pose = InitialPose(T_map_base, tuple(np.diag(sigmas**2).ravel().tolist()))
+        if (recorder := self._recorder) is not None:
+            recorder.accept(pose)  # before what waits for ``release``
+        self._process(pose)
+
+    def earlier(self, name: str) -> Path:
+        """The run of that name beside the folder; of an empty name, the newest earlier. Raises RunError: none."""
         if self._folder is None:
             raise GraphSlamError("output.folder is empty: nothing to load")
         if not name:
