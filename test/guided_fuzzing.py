@@ -64,6 +64,7 @@ def target(name, file):
         """The lines as records of both files; beginning with mcap's magic, as the files themselves."""
         for part in (INGEST, MAP):
             path = file.with_name(f"{part}.mcap")
+            path.unlink(missing_ok=True)  # of the input before
             if data.startswith(b"\x89"):
                 path.write_bytes(data)
                 continue

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from graph_slam_ros.cli import main
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.convert import ENDINGS, format_of, write_graph
-from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, from_g2o_words, in_g2o_words
+from graph_slam_ros.formats.dialects import LANDMARK_IDS_FROM, Text, from_g2o_words, in_g2o_words
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
@@ -94,7 +94,7 @@ def test_toro_has_its_own_tags_and_its_own_order_of_the_information(convert):
     code, out, err, target = convert(PLANE, ".toro")
     assert code == 3
     assert err == ["graph_slam: lost: 1 VERTEX_XY, 1 EDGE_SE2_XY: TORO has no such line"]
-    assert out == f"wrote {target} as TORO: 2 of 3 vertices, 1 of 2 edges\n"
+    assert out == f"wrote {target} as TORO: 2 of 3 vertices, 1 of 2 edges\nnext: graph_slam optimize {target}\n"
     *words, numbers = target.read_text().splitlines()
     assert words == ["VERTEX2 10 0.1 -2e-07 3.0", "VERTEX2 11 1.5 -0.002 0.25"]
     tag, *numbers = numbers.split()
@@ -106,7 +106,10 @@ def test_toro_has_its_own_tags_and_its_own_order_of_the_information(convert):
 def test_gtsam_text_has_covariances_and_the_start(convert):
     code, out, err, target = convert(PLANE, ".gtsam")
     assert (code, err) == (0, [])
-    assert out == f"wrote {target} as GTSAM's text: 3 of 3 vertices, 2 of 2 edges\n"
+    assert out.splitlines() == [
+        f"wrote {target} as GTSAM's text: 3 of 3 vertices, 2 of 2 edges",
+        f"next: graph_slam optimize {target}",
+    ]
     lines = [line.split() for line in target.read_text().splitlines()]
     assert [line[0] for line in lines] == ["VERTEX_SE2", "VERTEX_SE2", "VERTEX_XY", "ODOMETRY", "LANDMARK"]
     covariance = np.linalg.inv([[10, 1, -2], [1, 20, 3], [-2, 3, 30]])[np.triu_indices(3)]
@@ -117,7 +120,7 @@ def test_gtsam_text_has_covariances_and_the_start(convert):
 def test_tum_has_the_poses_in_order_of_id_with_the_id_as_stamp(convert):
     code, out, err, target = convert("VERTEX_SE2 30 5 6 -1\n" + PLANE, ".tum")
     assert (code, err) == (0, [])
-    assert out == f"wrote {target} as TUM: 3 of 4 vertices, 0 of 2 edges\n"
+    assert out == f"wrote {target} as TUM: 3 of 4 vertices, 0 of 2 edges\nnext: evo_traj tum {target}\n"
     rows = [[float(v) for v in line.split()] for line in target.read_text().splitlines()]
     assert target.read_text().startswith("10.000000000 0.1 -2e-07 0.0 0.0 0.0 ")
     assert [row[0] for row in rows] == [10, 11, 30]
@@ -245,13 +248,14 @@ def test_edges_alone_start_from_their_tree_and_keep_their_numbers(convert, tmp_p
     source = GRAPHS / "victoria_park.txt"
     code, out, err, target = convert(source, ".g2o")
     assert (code, err) == (0, [])
-    told, _ = out.splitlines()
+    told, written, _ = out.splitlines()
+    assert written.startswith(f"wrote {target} as g2o: ")
     assert told == "the file has no vertex lines: those of the spanning tree are written"
     g2o = read_g2o(target)
     assert g2o.has_values
     assert np.array_equal(g2o.graph.initial.values, initial_values(read_g2o(source).graph, "tree", 0))
     code, out, err, again = convert(source, ".gtsam")
-    assert (code, err, len(out.splitlines())) == (0, [], 1)
+    assert (code, err, len(out.splitlines())) == (0, [], 2)
     assert not any(line.startswith("VERTEX") for line in again.read_text().splitlines())
     assert_same_graph(read_g2o(source), read_g2o(again))
     lines = [path.read_text().splitlines() for path in (source, again)]
@@ -277,7 +281,7 @@ def test_a_landmark_and_a_pose_of_one_number_are_two_vertices_in_gtsam_text(tmp_
 # -- weights ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("target", DIALECTS)
+@pytest.mark.parametrize("target", ["g2o", "toro", "gtsam"])
 def test_weights_multiply_the_information_and_edges_of_weight_0_are_left_out_and_counted(tmp_path, target):
     graph = Graph()
     graph.add_vertices(SE2, [[k, 0, 0] for k in range(3)])
@@ -320,7 +324,11 @@ def test_to_overrules_the_ending_and_from_refuses_other_lines(convert):
 
 def test_from_toro_guesses_at_no_other_order(convert):
     rows = "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0.5 4 0 0 3 0 9\n"
-    assert convert(rows, ".toro")[0] == 0
+    code, _, err, target = convert(rows, ".toro")  # nor is it taken for TORO's without being asked
+    assert (code, target.exists()) == (2, False)
+    assert err[0].startswith("graph_slam: a.g2o:3: EDGE2 is not in TORO's order: --from isam")
+    for source in ("isam", "rows"):
+        assert convert(rows, ".toro", "--from", source)[0] == 0
     code, _, err, _ = convert(rows, ".toro", "--from", "toro")
     assert code == 2
     assert err[0].startswith("graph_slam: a.g2o:3: information is not positive definite")
@@ -390,6 +398,15 @@ def test_lenient_reading_tells_what_was_left_out(convert):
     code, out, err, _ = convert(PLANE + "EDGE_SE2 1 2\n", ".out.g2o", "--lenient")
     assert (code, err) == (3, ["graph_slam: lost: a.g2o:6: EDGE_SE2 needs 11 fields after the tag, found 2"])
     assert "2 of 2 edges" in out
+
+
+@pytest.mark.parametrize("target", ["isam", "rows", "ros"])
+def test_formats_that_are_only_read_or_unknown_are_not_written(tmp_path, target):
+    (tmp_path / "a.g2o").write_text(PLANE)
+    file = read_g2o(tmp_path / "a.g2o")
+    with pytest.raises(FormatError, match=f"'{target}' is not written: choose g2o, toro, gtsam, tum"):
+        write_graph(tmp_path / "b", file, Solver(file.graph).estimate, target)
+    assert not (tmp_path / "b").exists()
 
 
 def test_unknown_formats_are_refused_with_the_choices(tmp_path):

@@ -409,4 +409,5 @@ def test_the_help_tells_every_fault_and_all_that_can_be_set(capsys):
     for name, kind in KINDS.items():
         assert f"  {name}: {kind.about}" in out
         for option in options_of(kind.options):
-            assert f"    {option.name}={option.default}  {option.meaning}" in out
+            unit = f" [{option.unit}]" if option.unit else ""
+            assert f"    {option.name}={option.default}{unit}  {option.meaning}" in out

@@ -841,7 +841,11 @@ def test_F31_50_levels_and_the_tag_of_a_text_are_read(tmp_path):
 
 def test_F31_what_is_no_file_of_parameters_is_refused_and_not_waited_for(tmp_path):
     make_fifo(tmp_path / "fifo.yaml")
-    for path, why in ((tmp_path / "fifo.yaml", "not a file"), (tmp_path, "not a file"), (tmp_path / "none", "No such")):
+    for path, why in (
+        (tmp_path / "fifo.yaml", "a FIFO, socket or device, not a regular file"),
+        (tmp_path, "a folder, not a regular file"),
+        (tmp_path / "none", "No such"),
+    ):
         with pytest.raises(ConfigError, match=f"{re.escape(str(path))}: {why}"):
             read_parameters(path)
 

@@ -245,7 +245,7 @@ def test_F5_a_damaged_gzip_file_is_refused_by_name(tmp_path, content):
 
 def test_what_cannot_be_opened_is_named(tmp_path):
     for path, why in (
-        (tmp_path, "not a file"),
+        (tmp_path, "a folder, not a regular file"),
         (tmp_path / "missing.g2o", "no such file"),
         (tmp_path / ("x" * 4096), "too long"),
     ):
@@ -256,7 +256,7 @@ def test_what_cannot_be_opened_is_named(tmp_path):
 
 def test_what_cannot_be_written_is_named(tmp_path, read):
     file = read(FINE)
-    for path, why in ((tmp_path / "no" / "where.g2o", "No such file"), (tmp_path, "directory")):
+    for path, why in ((tmp_path / "no" / "where.g2o", "No such file"), (tmp_path, "not a regular file")):
         with pytest.raises(FormatError, match=why):
             write_g2o(path, file, values_of(file.graph))
     file.graph.add_vertex(replace(R1, name="R1 of mine"), [0.0])

@@ -21,12 +21,14 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
 from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats import durable
 from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.journal import RecordWriter, part_name, read_ingest
 from graph_slam_ros.formats.mcap_records import MAGIC
 from graph_slam_ros.replay import replay
 from graph_slam_ros.ros.live.session import Session
 from graph_slam_ros.run import RunError, RunRecorder
+from graph_slam_ros.run.folder import BEGUN
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Odometry
 from graph_slam_ros.slam.measurements import to_record
 
@@ -193,7 +195,9 @@ def test_F19_a_length_of_2_to_the_60_in_a_journal_is_refused_before_memory_is_as
 
 def test_F18_a_kind_of_record_that_is_not_known_is_refused_by_its_name(tmp_path):
     RunRecorder(tmp_path / "run", Config()).close()
-    writer = RecordWriter(tmp_path / "run" / "ingest.mcap")
+    journal = tmp_path / "run" / "ingest.mcap"
+    journal.unlink()
+    writer = RecordWriter(journal)
     writer.write([to_record(Odometry(1, (0.0, 0.0, 0.0))), {"type": "sonar", "stamp_ns": 2}])
     writer.close()
     with pytest.raises(FormatError, match="sonar"):
@@ -276,7 +280,8 @@ def test_P4_no_room_for_the_journal_is_told_and_all_is_written_when_there_is_roo
                 with pytest.raises(RunError, match=os.strerror(errno.EFBIG)):
                     session.save()
                 there = {file.name for file in (tmp_path / "run").iterdir()}
-                assert there == {"config.yaml", "ingest.mcap", "map.mcap", "run.mcap"}
+                assert there == {"run.json", "config.yaml", "ingest.mcap", "map.mcap", "run.mcap"}
+                assert (tmp_path / "run" / "run.json").read_bytes() == BEGUN  # no result was saved
             if k == 90:
                 resource.setrlimit(resource.RLIMIT_FSIZE, before)
             session.take([measurement])
@@ -356,7 +361,8 @@ def as_read(measurements):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
-def test_P4_what_a_full_device_does_not_take_waits():
+def test_P4_what_a_full_device_does_not_take_waits(monkeypatch):
+    monkeypatch.setattr(durable, "created", lambda path: os.open(path, os.O_WRONLY))  # only new files otherwise
     file = AppendedFile(Path("/dev/full"))
     file.write(b"of use")
     for _ in range(2):
@@ -399,7 +405,7 @@ def test_P3_a_power_cut_finds_names_and_contents_on_the_disk_before_anything_han
 
     noted("fsync", of)
     noted("pwrite", of)
-    noted("replace", lambda old, new: str(old))
+    noted("replace", lambda old, new: (str(old), new.name))
     session = session_in(tmp_path / "run", [])
     for measurement in recorded()[:60]:
         session.take([measurement])
@@ -407,12 +413,15 @@ def test_P3_a_power_cut_finds_names_and_contents_on_the_disk_before_anything_han
     folder = str(tmp_path / "run")
     assert ("fsync", str(tmp_path)) in calls
     renamed = [k for k, (name, _) in enumerate(calls) if name == "replace"]
-    assert len(renamed) == 1 + 10
+    names = [calls[k][1][1] for k in renamed]
+    begun, results = names[:2], names[2:]
+    assert begun == ["run.json", "config.yaml"]
+    assert (len(results), len(set(results)), results[-1]) == (11, 11, "run.json")
     for k in renamed:
-        assert calls[k - 1] == ("fsync", calls[k][1])
+        assert calls[k - 1] == ("fsync", calls[k][1][0])
         assert calls[k + 1] == ("fsync", folder)
     for name in ("ingest.mcap", "run.mcap"):
         last = {call: k for k, call in enumerate(calls)}
-        assert last["pwrite", f"{folder}/{name}"] < last["fsync", f"{folder}/{name}"] < renamed[1]
+        assert last["pwrite", f"{folder}/{name}"] < last["fsync", f"{folder}/{name}"] < renamed[len(begun)]
         first = calls.index(("pwrite", f"{folder}/{name}"))
         assert ("fsync", folder) in calls[:first][-2:]

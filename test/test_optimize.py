@@ -171,7 +171,9 @@ def test_the_loss_is_of_every_class_but_odometry(run, graph):
 
 
 def test_the_text_shows_cost_and_chi2_side_by_side_where_a_loss_makes_them_two(run, graph):
-    assert "cost" not in run(graph)[1].replace("converged (cost)", "")
+    *told, after = run(graph)[1].replace("converged (cost)", "").splitlines()
+    assert "cost" not in "".join(told)
+    assert after.startswith("next: ")  # with the path of the graph, whatever words that has
     _, out, _ = run(graph, "--loss", "huber:0.1")
     answer = answer_of(run, graph, "--loss", "huber:0.1")
     last = [line for line in out.splitlines() if "largest step" in line][-1]

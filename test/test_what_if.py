@@ -138,6 +138,8 @@ def test_the_commands_say_what_moves(replayed, saved, capsys):
     assert f"edge {moved.worse[0][0]} (" in out
     code, out, _ = told(capsys, "influence", run, "--count", "3")
     assert code == 0
-    assert [int(line.split()[0]) for line in out.splitlines()[2:]] == [one.edge for one in saved.influences(3)]
+    *table, after = out.splitlines()
+    assert [int(line.split()[0]) for line in table[2:]] == [one.edge for one in saved.influences(3)]
+    assert after.startswith("next: graph_slam explain ")
     code, _, err = told(capsys, "solve", run)
     assert (code, "solve needs --without EDGE, --with EDGE or --loss NAME" in err) == (2, True)

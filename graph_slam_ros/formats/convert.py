@@ -45,8 +45,10 @@ def write_graph(path: Path, file: G2oFile, values: Values | None, target: str) -
     Raises
     ------
     FormatError
-        The format can say nothing of the graph, or the file cannot be written.
+        The format is not written, or can say nothing of the graph, or the file cannot be written.
     """
+    if target not in NAMES:
+        raise FormatError(f"format {target!r} is not written: choose {', '.join(NAMES)}")
     if target == "tum":
         return _write_trajectory(path, file, values)
     lines, missing = graph_lines(file, values), Counter[str]()
