@@ -157,9 +157,10 @@ def test_a_run_with_the_noise_it_was_told_of_is_consistent_and_its_sigmas_are_ri
     last, runs = [], 8
     for seed in range(runs):
         recording = simulate(world, seed, **options, correlation_time_s=0.0)
-        run(recording, tmp_path / "run", settings)
+        folder = tmp_path / f"run_{seed}"
+        run(recording, folder, settings)
         write_bag(recording, tmp_path / "truth.mcap")
-        scores = evaluate(tmp_path / "run", tmp_path / "truth.mcap")
+        scores = evaluate(folder, tmp_path / "truth.mcap")
         last.append(scores.consistency.last_pose.mean)
         for noise in scores.consistency.classes.values():
             assert noise.per_dof == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / noise.dof))

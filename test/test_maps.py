@@ -82,13 +82,19 @@ def test_export_as_messages_has_every_pose_at_its_stamp(cut_off, tmp_path):
 def test_export_of_a_map_that_is_cut_is_of_what_is_left_and_tells(cut_off, tmp_path, capsys):
     folder, slam = cut_off
     shutil.copytree(folder, tmp_path / "run")
-    whole = (folder / "map.mcap").read_bytes()
-    (tmp_path / "run" / "map.mcap").write_bytes(whole[: len(whole) // 2])
-    assert run("export", tmp_path / "run", "--to", "tum", "--out", tmp_path / "path.tum") == 3
-    assert "lost: " in capsys.readouterr().err
-    stamps = [line.split()[0] for line in (tmp_path / "path.tum").read_text().splitlines()]
-    assert 10 < len(stamps) < len(slam.keyframes)
-    assert stamps[0] == f"{slam.keyframes[0].stamp_ns / 1e9:.9f}"
+    expected = slam.keyframes.stamps_ns.tolist()
+
+    def exported_after_a_cut_of(name):
+        whole = (folder / name).read_bytes()
+        (tmp_path / "run" / name).write_bytes(whole[: len(whole) // 2])
+        assert run("export", tmp_path / "run", "--to", "tum", "--out", tmp_path / "path.tum", "--force") == 3
+        assert f"{name}: cut off" in capsys.readouterr().err
+        return [int(line.split()[0].replace(".", "")) for line in (tmp_path / "path.tum").read_text().splitlines()]
+
+    assert exported_after_a_cut_of("map.mcap") == expected, "the rest is made from the journal"
+    left = exported_after_a_cut_of("ingest.mcap")
+    assert 10 < len(left) < len(expected)
+    assert left == expected[: len(left)]
 
 
 def test_export_refuses_in_one_line(whole, tmp_path, capsys):

@@ -347,10 +347,8 @@ def test_where_the_anchor_is_loose_the_map_turns_into_the_frame_of_the_fixes(spa
 
 
 def test_a_path_that_is_cut_at_every_sighting_keeps_its_rotations():
-    pipeline, n = (
-        slam(SPACE, keyframes__shared_noise=0.0, keyframes__min_distance_m=1e3, keyframes__max_interval_s=1e3),
-        3,
-    )
+    at_every_sighting = {"keyframes__shared_noise": 0.0, "keyframes__min_interval_s": 0.0}
+    pipeline, n = slam(SPACE, **at_every_sighting, keyframes__min_distance_m=1e3, keyframes__max_interval_s=1e3), 3
     turned = floats(so3.exp((0.3, -0.2, 0.5)))
     off = tuple(x * (1.0 + 1e-9) for x in turned)  # as drivers round it
     for k in range(400):

@@ -70,7 +70,7 @@ def sigma_of_edges(pipeline):
 
 def saved(pipeline, folder):
     """The files of a run, but for what was counted."""
-    recorder = RunRecorder(folder, pipeline.config)
+    recorder = RunRecorder(folder, pipeline.config, force=True)
     recorder.save(pipeline, summarize(pipeline))
     recorder.close()
     names = "graph.g2o", "path.tum", "sightings.tum", "landmarks.csv", "ledger.csv", "ledger_changes.csv"
