@@ -29,6 +29,7 @@ from graph_slam_ros.ros import to_msg
 from graph_slam_ros.ros.live import health
 from graph_slam_ros.ros.live.configured import Configured
 from graph_slam_ros.ros.live.deferred import serve_later
+from graph_slam_ros.ros.live.map_services import serve_maps
 from graph_slam_ros.ros.live.outputs import LATCHED
 from graph_slam_ros.ros.live.params import changed, declare_parameters
 from graph_slam_ros.ros.live.worker import URGENT_S
@@ -78,6 +79,7 @@ class GraphSlamNode(LifecycleNode):
             ("clear_closures", lambda run: run.control("clear_closures")),
         ):
             serve_later(self, f"~/{name}", partial(self._serve, start))
+        serve_maps(self, serve_later)
         for service in self.services:
             service.callback = self._answered(service)
 
@@ -171,6 +173,10 @@ class GraphSlamNode(LifecycleNode):
             [Parameter(one.name, value=values[one.name]) if one.name in values else one for one in parameter_list]
         )
 
+    def change(self, values: dict[str, Any]) -> None:
+        """Set parameters, by name, as anybody may."""
+        self.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
+
     def _on_set(self, given: Sequence[Any]) -> SetParametersResult:
         """All of them or none, and what may change at work takes effect at its place among the measurements."""
         try:
@@ -201,10 +207,14 @@ class GraphSlamNode(LifecycleNode):
 
         return answered
 
-    def _serve(self, start: "Callable[[Configured], Future[str]]") -> "Future[str]":
+    def _serve(self, start: "Callable[[Configured], Future[str]]", _: Any) -> "Future[str]":
+        return start(self.configured())
+
+    def configured(self) -> Configured:
+        """What there is since configuration. Raises GraphSlamError before."""
         if self._run is None:
             raise GraphSlamError(f"not active: the node is {self._state}")
-        return start(self._run)
+        return self._run
 
     def acknowledge(self, count: int) -> None:
         """Tell a player how many messages were taken."""

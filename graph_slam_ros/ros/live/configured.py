@@ -313,10 +313,10 @@ class Configured:
 
     # -- services: begun here, done by the worker --------------------------------------------------------------------
 
-    def save(self) -> "Future[str]":
+    def save(self, config: Config | None = None) -> "Future[str]":
         """Solve everything and write the run folder, and the map under the name that the parameters say."""
         self._hand_over(self._border.finish(is_end=False))
-        name = self._node.config.output.save_as
+        name = (config or self._node.config).output.save_as
         return self._worker.call(partial(self._session.save, self._session.accept_save(), name))
 
     @property
@@ -324,9 +324,13 @@ class Configured:
         """Whether the last run was never ended: its map can be loaded."""
         return self._session.was_cut_off
 
-    def load(self) -> "Future[str]":
+    def check_map(self, name: str) -> None:
+        """Raise RunError where no run of that name can be loaded."""
+        self._session.earlier(name)
+
+    def load(self, config: Config | None = None) -> "Future[str]":
         """Go on from an earlier run, with the robot where the parameters say."""
-        config = self._node.config
+        config = config or self._node.config
         return self._anew(partial(self._session.load, config.output.load, config.load_pose))
 
     def resume(self) -> "Future[str]":

@@ -16,42 +16,44 @@ class _Later:
     future: "Future[str]"
 
 
-def serve_later(node: Any, name: str, start: Callable[[], "Future[str]"]) -> None:
-    """Serve a ``std_srvs/Trigger``: ``start`` begins the work, what comes of it is the message.
+def _triggered(response: Any, message: str, error: BaseException | None) -> Any:
+    response.success, response.message = error is None, said(error) if error is not None else message
+    return response
+
+
+Answer = Callable[[Any, str, BaseException | None], Any]
+
+
+def serve_later(
+    node: Any, name: str, start: Callable[[Any], "Future[str]"], kind: Any = Trigger, answer: Answer = _triggered
+) -> None:
+    """Serve requests, of ``std_srvs/Trigger`` by default: ``start`` begins the work, what comes of it is the message.
+
+    ``answer`` fills the response with the message or the error.
 
     rclpy's own way, a coroutine, holds up a single-threaded executor, and its events executor knows none.
     """
 
-    def on_request(_: Any, response: Any) -> Any:
+    def on_request(request: Any, response: Any) -> Any:
         try:
-            return _Later(response, start())
+            return _Later(response, start(request))
         except Exception as error:
-            return _failed(response, error)
+            return answer(response, "", error)
 
-    service = node.create_service(Trigger, name, on_request)
+    service = node.create_service(kind, name, on_request)
     send = service.send_response
 
     def send_when_done(response: Any, header: Any) -> None:
         if isinstance(response, _Later):
-            response.future.add_done_callback(lambda future: _send(send, _filled(response.response, future), header))
+            response.future.add_done_callback(lambda future: _send(send, filled(response.response, future), header))
         else:
             send(response, header)
 
+    def filled(response: Any, future: "Future[str]") -> Any:
+        error = future.exception()
+        return answer(response, future.result() if error is None else "", error)
+
     service.send_response = send_when_done
-
-
-def _filled(response: Any, future: "Future[str]") -> Any:
-    error = future.exception()
-    if error is not None:
-        return _failed(response, error)
-    response.success, response.message = True, future.result()
-    return response
-
-
-def _failed(response: Any, error: BaseException) -> Any:
-    response.success = False
-    response.message = said(error)
-    return response
 
 
 def _send(send: Callable[[Any, Any], None], response: Any, header: Any) -> None:
