@@ -78,7 +78,7 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     ----------
     counters : those of the pipeline and of what stands before it
     """
-    used_as = uses(slam.config)
+    used_as = dict.fromkeys(slam.odometry_sources, "odometry") | uses(slam.config)  # a source need not be an input
     is_of_map = not counters.used  # nothing was measured since: a run that is written from its map
     believed = _believed(slam, 0 if is_of_map else slam.first_edge)
     inputs = {}

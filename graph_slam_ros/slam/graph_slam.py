@@ -4,7 +4,7 @@ Its state is a function of the configuration and the sequence of accepted measur
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -343,6 +343,11 @@ class GraphSlam:
     def odometry_source(self) -> str:
         """The odometry in use, by the name of its input; empty before the first."""
         return self._odometry.used.source if self._odometry.used else ""
+
+    @property
+    def odometry_sources(self) -> Set[str]:
+        """Sources of odometry that have been used."""
+        return self._odometry.sources
 
     @property
     def frozen(self) -> int:

@@ -36,11 +36,16 @@ class OdometryChoice:
     Parameters
     ----------
     priority : names of sources, the best first; others follow in the order they come
+
+    Attributes
+    ----------
+    sources : those that have been used
     """
 
     def __init__(self, config: OdometryConfig, priority: Sequence[str], space: Space, counters: Counters) -> None:
         self._config, self._space, self._counters = config, space, counters
         self._silent_ns = round(config.timeout_s * 1e9)
+        self.sources: set[str] = set()
         self._order = list(priority)
         self._past: dict[str, deque[Odometry]] = {}
         self._used: Odometry | None = None
@@ -127,6 +132,7 @@ class OdometryChoice:
         if broken:
             self._counters.count(m.source, broken)
         self._counters.used[m.source] += 1
+        self.sources.add(m.source)
         self._used, self._last_step = m, self._space.identity if broken else step
         return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken))
 
