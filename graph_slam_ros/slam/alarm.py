@@ -51,7 +51,11 @@ class Alarm:
     def __str__(self) -> str:
         at = f"{self.began_ns * 1e-9:.1f} s"
         if self.segment is None:
-            return f"the landmarks say since {at} that the robot is elsewhere ({self.evidence} sightings more than not)"
+            why = f"{self.evidence} sightings more than not" if self.evidence else "most are held back"
+            if self.ended_ns is None:
+                return f"the landmarks say since {at} that the robot is elsewhere ({why})"
+            until = f"{self.ended_ns * 1e-9:.1f} s"
+            return f"from {at} to {until} the landmarks said that the robot is elsewhere ({why}); it was not so"
         moved = f"{self.distance_m:.2f} m and {np.rad2deg(self.angle_rad):.1f} degrees"
         return (
             f"the landmarks said at {at} that the robot is elsewhere, {moved} from where odometry had it: "
