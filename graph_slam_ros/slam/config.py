@@ -127,7 +127,7 @@ class KeyframesConfig:
     )
     min_interval_s: float = setting(
         0.1,
-        "but what is seen sooner after a keyframe makes none: it is carried to that keyframe",
+        "but what is seen sooner after a keyframe makes none, unless the motion would add more than its own variance",
         "s",
         low=0.0,
         live=True,

@@ -110,6 +110,7 @@ def _counted(count: int, what: str) -> str:
 _NOTHING = Update()
 _LOOSE, _LOOSEST_M = 10.0, 1e5  # times as far as a given pose is away: so little odometry is trusted there
 _BLAMED = 5  # edges that are named as the cause of a correction
+_SHARED_WHEN_SOON = 1.0  # of a variance: with more, what comes fast would seem better than it is
 
 
 class GraphSlam:
@@ -649,9 +650,11 @@ class GraphSlam:
         if where.keyframe != newest.keyframe or not newest.before_last_ns < where.stamp_ns:
             return False
         is_soon = where.stamp_ns - newest.start_ns < self.config.keyframes.min_interval_s * 1e9
-        if is_soon or self._noise.is_jitter(where.T_keyframe_base):
+        if self._noise.is_jitter(where.T_keyframe_base):
             return False
         most, added_sigma_m = self.config.keyframes.shared_noise, self.config.landmarks.added_sigma_m
+        if is_soon:
+            most = max(most, _SHARED_WHEN_SOON)
         return carry.is_shared(self.space, m, where, most, added_sigma_m)
 
     def _keyframe_at(self, where: Where, motion: Motion) -> Where:
