@@ -341,7 +341,9 @@ def _legend(axes: Any, *, at: float, side: str) -> None:
     if not handles:
         return
     look = {"frameon": False, "fontsize": 9.5, "columnspacing": 1.6, "handlelength": 1.6, "borderaxespad": 0.0}
-    legend = axes.legend(handles, labels, loc=f"lower {side}", bbox_to_anchor=(at, 1.01), ncols=len(handles), **look)
+    legend = axes.legend(
+        handles, labels, loc=f"lower {side}", bbox_to_anchor=(at, 1.01), ncols=min(len(handles), 4), **look
+    )
     for line in legend.get_lines():
         line.set_alpha(1.0)
         line.set_linewidth(max(1.2, line.get_linewidth()))
