@@ -66,7 +66,7 @@ def serve_maps(node: Any, serve_later: Callable[..., None]) -> None:
             node.get_logger().info(message)
         else:
             node.get_logger().error(said(error))
-        if hasattr(response, "result"):  # not in versions before 2.4
+        if hasattr(response, "result"):  # some versions answer with nothing
             response.result = _code(response, error)
         return response
 
