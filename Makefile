@@ -2,9 +2,10 @@
 #
 # install       .venv with everything of requirements.txt, real ROS 2 included where there is none (default)
 # demo          install, then the demonstration
-# test          install, then style, types and tests
+# check         style, types and the unit tests, in two minutes: after each change; no process, no ROS
+# test          install, then style, types and all tests; some of them: TESTS='-m "not process"', -m integration, a file
 # soak          what takes too long for every test run: up to three hours, resumed where it was; ONLY=name,name
-# colcon        build and test as ROS does, in a scratch folder; colcon goes into .venv-colcon; TESTS= what pytest is given
+# colcon        build and test as ROS does, in a scratch folder; colcon goes into .venv-colcon; TESTS=, too
 # test-oldest   the tests without ROS, in .venv-oldest with the lowest versions that setup.py allows
 # lint, format  style and types: tell, mend
 # lock          write requirements.txt and constraints-oldest.txt from setup.py; LOCK=--upgrade takes newer versions
@@ -28,7 +29,7 @@ ifeq ($(SYSTEM_ROS),)
 unexport LD_LIBRARY_PATH
 endif
 
-.PHONY: install demo test soak colcon test-oldest lint format lock bench robust clean
+.PHONY: install demo check test soak colcon test-oldest lint format lock bench robust clean
 .DELETE_ON_ERROR:
 
 install: $(VENV)/interfaces.stamp $(VENV)/kernels.stamp
@@ -36,8 +37,13 @@ install: $(VENV)/interfaces.stamp $(VENV)/kernels.stamp
 demo: install
 	@$(BIN)/graph_slam demo --force
 
+PYTEST := $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist worksteal
+
+check: lint $(VENV)/kernels.stamp
+	$(PYTEST) -m unit
+
 test: install lint
-	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist worksteal
+	$(PYTEST) $(TESTS)
 
 soak: install $(VENV)-fuzz/stamp
 	$(BIN)/python test/soak.py $(subst $(comma), ,$(ONLY))

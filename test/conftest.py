@@ -1,5 +1,9 @@
-"""Before any test: kernels are compiled in a process of their own and loaded in one order, as they are for users."""
+"""What kind of test a file has, and before any test: kernels are compiled and loaded in one order, as for users."""
 
+import functools
+import os
+import re
+import sys
 import tempfile
 from pathlib import Path
 
@@ -7,6 +11,76 @@ import pytest
 import reliability
 
 from graph_slam_ros.warmup import warmup
+
+# Where Python is asked to keep no bytecode, each worker and each process would compile all sources and tests anew.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+INTEGRATION = """anchor any_measurement any_message bag certificate consistency convert damaged_runs
+    data displacement evaluation explain false_closures faults graph_cases graph_slam info
+    initialization inputs_replay instruments life localize map_log maps message_cases nav2 nees
+    noise_and_losses online_graphs pipeline_kinds rates reach run_folder sessions simulation soak
+    timing_cases unnamed views what_if world_graphs"""
+SOAK = """any_measurement any_message fuzzing graph_cases journal kernels life mutated_recordings
+    recorded soak solver_faults stack stack_control stack_displaced stack_edits stack_time timing_cases"""
+"""Files, without ``test_`` and ``.py``."""
+STARTS_ONE = re.compile(
+    r"^ *(import|from) (confined|fuzzing|live_nodes|multiprocessing|rclpy|subprocess)\b|\bos\.fork\(|\bmrclam\(",
+    re.MULTILINE,
+)
+"""What a file has that starts processes."""
+STARTS = {"os.exec", "os.fork", "os.forkpty", "os.posix_spawn", "os.system", "subprocess.Popen"}
+
+
+def named(names):  # type: ignore[no-untyped-def]
+    files = {Path(__file__).with_name(f"test_{name}.py") for name in names.split()}
+    assert all(file.is_file() for file in files), [file.name for file in files if not file.is_file()]
+    return files
+
+
+INTEGRATES, IS_SOAKED = named(INTEGRATION), named(SOAK)
+
+
+@functools.cache
+def kind(file):  # type: ignore[no-untyped-def]
+    """Of the tests in a file."""
+    if STARTS_ONE.search(file.read_text(encoding="utf-8")):
+        return "process"
+    return "integration" if file in INTEGRATES else "unit"
+
+
+_running = []
+
+
+def pytest_ignore_collect(collection_path, config):  # type: ignore[no-untyped-def]
+    """For unit tests alone the others are not even imported: ROS, with which half of them begin, takes a second."""
+    is_other = collection_path.match("test_*.py") and kind(collection_path) != "unit"
+    return True if is_other and config.option.markexpr == "unit" else None
+
+
+def pytest_itemcollected(item) -> None:  # type: ignore[no-untyped-def]
+    """Its kind is that of its file."""
+    item.add_marker(kind(item.path))
+    if item.path in IS_SOAKED:
+        item.add_marker("soak")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):  # type: ignore[no-untyped-def]
+    """What is of another kind may start no process."""
+    _running[:] = [item.path]
+    try:
+        return (yield)
+    finally:
+        _running.clear()
+
+
+def _no_process(event: str, arguments: tuple) -> None:
+    if event in STARTS and _running and kind(_running[0]) != "process":
+        raise RuntimeError(f"{_running[0].name} starts a process, and nothing in it says so: STARTS_ONE in conftest.py")
+
+
+sys.addaudithook(_no_process)
 
 
 def pytest_sessionstart() -> None:

@@ -4,6 +4,7 @@ Limits of time are those of an idle machine; where it is busy they are as much l
 """
 
 import contextlib
+import functools
 import os
 import signal
 import socket
@@ -20,6 +21,7 @@ pytest.importorskip("vision_msgs")
 pytest.importorskip("tf2_msgs")
 
 from executables import executable
+from forked_nodes import Server
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
@@ -293,27 +295,39 @@ def robot(**options):
         r.close()
 
 
+@functools.cache
+def server():
+    """What nodes are forked from: with what was in the environment when the first was started."""
+    return Server(ENVIRONMENT)
+
+
+MODULE = [sys.executable, "-m", "graph_slam_ros.ros.node"]
+
+
 class Started:
     """A SLAM node in a process of its own.
 
     Parameters
     ----------
     parameters : ``name:=value``
-    module : run as a module, else as the installed script
+    by : the command that starts it, where its start is what is tested; default: it is forked where that can be
     remap : further ROS arguments for ``-r``
     words : further ROS arguments
     """
 
-    def __init__(self, *parameters, module=True, cwd=None, remap=(), words=()):
-        command = [sys.executable, "-m", "graph_slam_ros.ros.node"] if module else [executable("graph_slam_node")]
+    def __init__(self, *parameters, by=None, cwd=None, remap=(), words=()):
         words = [
+            "--ros-args",
             *words,
             *(word for p in parameters for word in ("-p", p)),
             *(word for r in remap for word in ("-r", r)),
         ]
-        self.process = subprocess.Popen(
-            [*command, "--ros-args", *words], env=ENVIRONMENT, cwd=cwd, stderr=subprocess.PIPE, text=True
-        )
+        if by is None and server().can_fork(ENVIRONMENT):
+            self.process = server().start(words, ENVIRONMENT, cwd)
+        else:
+            self.process = subprocess.Popen(
+                [*(by or MODULE), *words], env=ENVIRONMENT, cwd=cwd, stderr=subprocess.PIPE, text=True
+            )
         self._lines = []
         self._reader = threading.Thread(target=self._read, daemon=True)  # a pipe that is full would hold it up
         self._reader.start()

@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from executables import executable
 from live_nodes import ENVIRONMENT, graph_slam, lenient, node, replayed, results, robot, until
 from messages import record_drive
 from rclpy.qos import ReliabilityPolicy
@@ -19,6 +20,8 @@ from graph_slam_ros.ros.bag import BagWriter, open_bag
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
 from graph_slam_ros.warmup import warmup
+
+INSTALLED = [executable("graph_slam_node")]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -171,7 +174,7 @@ def test_a_node_with_an_input_of_a_package_that_is_not_installed_says_so(tmp_pat
 
 
 def test_a_recording_is_played_into_a_node_that_runs_already(bag, offline, tmp_path):
-    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", module=False) as n:
+    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", by=INSTALLED) as n:
         done = graph_slam("replay", bag, "--ros")
         assert done.returncode == 0, done.stderr
         assert f" 0 lost; results in {tmp_path / 'run'}" in done.stdout
@@ -340,7 +343,10 @@ def test_garbage_does_not_end_the_node(messages, tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_the_run_and_ends_the_node_with_0_within_3_seconds(messages, tmp_path, number):
-    with node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", module=False) as n, robot() as r:
+    with (
+        node(f"output.folder:={tmp_path / 'run'}", "inputs.reliable:=true", by=INSTALLED) as n,
+        robot() as r,
+    ):
         r.wait_for_node()
         r.drive(messages[:600])
         until(lambda: r.heard["path"], r.spin, "path")
@@ -388,7 +394,7 @@ def test_a_node_that_got_nothing_may_start_again_in_its_folder_with_whole_number
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_during_start_shows_no_traceback(tmp_path, number):
-    with node(f"output.folder:={tmp_path / 'run'}", module=False) as n:
+    with node(f"output.folder:={tmp_path / 'run'}", by=INSTALLED) as n:
         until(lambda: (tmp_path / "run").exists(), time.sleep, "start")
         assert n.stop(number)[0] == 0
     assert "Traceback" not in n.said

@@ -14,7 +14,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from live_drive import TAGS, Drive, distance, earlier_run
-from live_nodes import ENVIRONMENT, lenient, node, often, own_domain, replayed, results, robot, until
+from live_nodes import ENVIRONMENT, MODULE, lenient, node, often, own_domain, replayed, results, robot, until
 from messages import detection, detections, pose
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
@@ -230,7 +230,7 @@ def hears_signals(process):
 @pytest.mark.parametrize("seed", range(often(3)))
 def test_P6_told_to_stop_at_any_moment_of_its_start_it_ends_with_0_and_may_begin_again(tmp_path, seed):
     rng = random.Random(seed)
-    with node(f"output.folder:={tmp_path / 'run'}") as n:
+    with node(f"output.folder:={tmp_path / 'run'}", by=MODULE) as n:
         until(lambda: hears_signals(n.process), time.sleep, "handler of signals")
         time.sleep(rng.uniform(0.0, 1.2))
         code, took_s = n.stop(rng.choice(SIGNALS))
