@@ -57,7 +57,7 @@ class Compiling:
         new = done - self.began_with
         left_s = self.elapsed_s * (_KERNELS - done) / new if new > 0 else 0.0
         left = "" if not left_s else f", about {10 * math.ceil(left_s / 10)} s more"
-        return f"compiling kernels, once per installation: {done} of about {_KERNELS}{left}"
+        return f"compiling kernels, once per installation: {100 * done / _KERNELS:.0f} %{left}"
 
 
 def are_compiled() -> bool:

@@ -112,7 +112,8 @@ print([name for name, count in signatures().items() if count != before.get(name,
 def test_the_progress_of_the_compiler_counts_to_about_as_many_kernels_as_there_are():
     warmup.warmup()
     assert warmup._cached() == pytest.approx(warmup._KERNELS, rel=0.1)
-    assert str(warmup.Compiling(warmup._KERNELS // 2, 30.0)).endswith("about 40 s more")
+    assert str(warmup.Compiling(warmup._KERNELS // 2, 30.0)).endswith(": 50 %, about 40 s more")
+    assert str(warmup.Compiling(2 * warmup._KERNELS, 30.0)).endswith(": 99 %, about 10 s more")
 
 
 def test_the_warm_up_compiles_all_that_solving_a_graph_needs():

@@ -259,6 +259,7 @@ def test_X10_what_the_node_tells_has_neither_paths_nor_positions():
                 if isinstance(node, ast.Call) and ast.unparse(node.func).endswith((".get_logger().info", "._log.info")):
                     told.append(ast.unparse(node.args[0]))
     assert sorted(told) == [
+        "'bond with the lifecycle manager'",
         "'compiling kernels, once per installation: about a minute or two'",
         "f'kernels ready after {took_s:.1f} s'",
         "f'saved {Path(folder).name}'",

@@ -270,7 +270,7 @@ def test_while_kernels_are_compiled_the_node_answers_and_says_how_far_it_is(tmp_
         since = time.monotonic()
         assert r.change("configure")
         assert time.monotonic() - since < lenient(4.0), "Nav2 waits no longer than 5 s"
-        r.until_it_says("INACTIVE", "compiling kernels, once per installation", " of about ")
+        r.until_it_says("INACTIVE", "compiling kernels, once per installation: ", " %")
         assert r.change("activate")
         r.until_it_says("WAITING", "compiling kernels")
         assert r.get(["output.keep_earlier"]) == {"output.keep_earlier": 5}

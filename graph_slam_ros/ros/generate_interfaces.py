@@ -88,8 +88,8 @@ def write_sources(folder: Path, packages: list[str]) -> None:
         (folder / name / "package.xml").write_text(MANIFEST.format(name=name, version=__version__, depend=depend))
 
 
-def generate(packages: list[str], prefix: Path) -> None:
-    """Build the packages in a temporary folder and install them below `prefix`.
+def generate(packages: list[str], prefix: Path, into: Path | None = None) -> None:
+    """Build the packages with what is below `prefix`, in a temporary folder, and install them there or below `into`.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def generate(packages: list[str], prefix: Path) -> None:
     env["PATH"] = f"{prefix / 'bin'}{os.pathsep}{env.get('PATH', os.defpath)}"
     definitions = {
         "CMAKE_PREFIX_PATH": prefix,
-        "CMAKE_INSTALL_PREFIX": prefix,
+        "CMAKE_INSTALL_PREFIX": into or prefix,
         "Python3_EXECUTABLE": sys.executable,
         "CMAKE_BUILD_TYPE": "Release",
         "BUILD_TESTING": "OFF",

@@ -26,7 +26,7 @@ from std_msgs.msg import UInt64
 
 from graph_slam_ros.errors import ConfigError, GraphSlamError, said
 from graph_slam_ros.ros import to_msg
-from graph_slam_ros.ros.live import health
+from graph_slam_ros.ros.live import bond, health
 from graph_slam_ros.ros.live.configured import Configured
 from graph_slam_ros.ros.live.deferred import serve_later
 from graph_slam_ros.ros.live.map_services import serve_maps
@@ -58,6 +58,7 @@ class GraphSlamNode(LifecycleNode):
         self.config = declare_parameters(self)
         self.add_on_set_parameters_callback(self._on_set)
         self._run: Configured | None = None
+        self._bond: bond.Bond | None = None
         self._faults: deque[float] = deque(maxlen=1000)
         self._told: set[str] = set()
         self._verdict = health.Verdict("UNCONFIGURED")
@@ -80,6 +81,8 @@ class GraphSlamNode(LifecycleNode):
         ):
             serve_later(self, f"~/{name}", partial(self._serve, start))
         serve_maps(self, serve_later)
+        if not self.config.node.autostart and not bond.is_installed():
+            self.get_logger().warn(bond.MISSING)
         for service in self.services:
             service.callback = self._answered(service)
 
@@ -91,11 +94,11 @@ class GraphSlamNode(LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listen and broadcast."""
-        return self._transition(lambda: self._configured().activate())
+        return self._transition(self._activate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listen no more; what was taken stays."""
-        return self._transition(lambda: self._configured().deactivate())
+        return self._transition(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Save and forget the run."""
@@ -137,6 +140,20 @@ class GraphSlamNode(LifecycleNode):
             elif self.config.output.load_at_start:
                 run.in_passing(run.load())
 
+    def _activate(self) -> None:
+        self._configured().activate()
+        if self._bond is None and not self.config.node.autostart and bond.is_installed():
+            self._bond = bond.Bond(self)
+
+    def _deactivate(self) -> None:
+        self._end_bond()
+        self._configured().deactivate()
+
+    def _end_bond(self) -> None:
+        if self._bond is not None:
+            self._bond.end()
+            self._bond = None
+
     def _configured(self) -> "Configured":
         if self._run is None:
             raise GraphSlamError("not configured")
@@ -149,6 +166,7 @@ class GraphSlamNode(LifecycleNode):
         ----------
         patience_s : how long what waits may still take; None: as long as it takes, unless the node is told to stop
         """
+        self._end_bond()
         if self._run is not None:
             run, self._run = self._run, None
             run.finish(patience_s, self._is_told_to_stop)
