@@ -6,6 +6,7 @@ that both share at the run's first pose.
 """
 
 import json
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.consistency import ClassNoise, Consistency, Nees, class_noise, landmark_nees, pose_nees
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.files import read_text
+from graph_slam_ros.formats.files import is_empty, read_text
 from graph_slam_ros.lie import se3
 from graph_slam_ros.path_error import (
     STATISTICS,
@@ -27,7 +28,7 @@ from graph_slam_ros.path_error import (
     interpolated,
     path_error,
 )
-from graph_slam_ros.run import COVARIANCES, SUMMARY, is_run, run_config
+from graph_slam_ros.run import COVARIANCES, SUMMARY, is_run, run_config, summary_of
 from graph_slam_ros.trajectory import Point, Trajectory, read_covariances, read_landmarks, read_tum
 from graph_slam_ros.truth import Truth, read_truth
 
@@ -203,13 +204,13 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
     GraphSlamError
         The path of the run cannot be read.
     """
-    of_sightings = estimate == _SIGHTINGS[0] or (not estimate and _is_filled(run / _SIGHTINGS[0]))
+    of_sightings = estimate == _SIGHTINGS[0] or (not estimate and not is_empty(run / _SIGHTINGS[0]))
     default, odometry = _SIGHTINGS if of_sightings else _KEYFRAMES
     name = estimate or default
-    if not _is_filled(run / odometry):
+    if is_empty(run / odometry):
         odometry = _SIGHTINGS[1]
     whole = read_tum(run / name)
-    beside = read_tum(run / odometry) if _is_filled(run / odometry) else None
+    beside = None if is_empty(run / odometry) else read_tum(run / odometry)
     drives = _drives(run) if name in (*_SIGHTINGS, *_KEYFRAMES) else _ONE_DRIVE
     chosen = None
     for k in reversed(range(len(drives))):
@@ -228,16 +229,12 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
     return chosen or Drive(whole, beside, (name, odometry))
 
 
-def _is_filled(path: Path) -> bool:
-    return path.is_file() and path.stat().st_size > 0
-
-
 def _drives(run: Path) -> list[dict[str, int]]:
     """Where each drive begins; one where the summary does not say."""
     try:
-        told = json.loads(read_text(run / SUMMARY))["drives"]
+        told = summary_of(run)["drives"]
         drives = [{key: int(one[key]) for key in ("keyframe", "sighting")} for one in told]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         return _ONE_DRIVE
     return drives or _ONE_DRIVE
 
@@ -268,7 +265,7 @@ def _map_rmse(landmarks: dict[str, Point], true: dict[str, Point], dimensions: i
 
 def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
     """From what the run left; None where it left no covariances."""
-    if not (run / COVARIANCES).exists():
+    if not os.path.lexists(run / COVARIANCES):
         return None
     path, covariances = read_tum(run / "path.tum"), read_covariances(run / COVARIANCES)
     if len(covariances) != len(path.stamps_s):

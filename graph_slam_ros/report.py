@@ -1,6 +1,7 @@
 """Pictures of runs and of graphs, drawn into PNG files without a display."""
 
 import io
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,7 +147,7 @@ def _draw_paths(axes: Any, found: _Placed, whole: Trajectory, drive: Drive, show
 
 def _pose_spread(run: Path, drive: Drive, found: _Placed) -> list[tuple[Array, Array]]:
     """Position and covariance (3, 3) of some of the poses, in the axes that are drawn."""
-    if not (run / COVARIANCES).exists():
+    if not os.path.lexists(run / COVARIANCES):
         return []
     covariances = read_covariances(run / COVARIANCES)[drive.keyframes]
     if len(covariances) != len(found.path.poses):

@@ -9,6 +9,7 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small dense blocks: threads only cost, and reorder sums
 
+import io
 import signal
 import sys
 import traceback
@@ -23,6 +24,9 @@ _COMPUTES = {"optimize", "solve", "influence"}  # with kernels, and without a wa
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # what the terminal's encoding lacks is shown escaped
+            stream.reconfigure(errors="backslashreplace")
     try:
         from graph_slam_ros.cli.parser import parser  # Ctrl-C while modules are imported is no traceback
 

@@ -15,7 +15,9 @@ from graph_slam_ros.formats.files import is_regular
 
 # Control characters, and those that change the direction of a text or are not seen.
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
-_MOST_TOLD, _LINES_TOLD = 2000, 20  # characters of a message on standard error; lines of losses
+_MOST_TOLD, _LINES_TOLD = 200, 20  # characters of a line on standard error; lines of losses
+_LEAST_WORD = 40  # characters that a word keeps when it is shortened: the name of a file, and a part of its folder
+_GAP = "..."
 DONE, FAULT, REFUSED, LOSSES, INTERRUPTED = 0, 1, 2, 3, 130
 NOT_CERTIFIED, NOT_APPLICABLE = 4, 5  # of optimize --certify
 DIFFERENT = 4  # of diff
@@ -65,12 +67,30 @@ def check_file(*paths: Path | None, force: bool, source: Path | None = None) -> 
                 raise GraphSlamError(f"{path}: exists already: choose another name, or --force replaces it")
 
 
-def tell(what: str, programme: str = "graph_slam") -> None:
-    """What stands beside the answer, on standard error: a line, whatever is in the names that it tells."""
-    line = escaped(what)
-    if len(line) > _MOST_TOLD:
-        line = f"{line[:_MOST_TOLD]} ..."
-    print(f"{programme}: {line}", file=sys.stderr)
+def tell(what: str, programme: str = "graph_slam", most: int = _MOST_TOLD) -> None:
+    """What stands beside the answer, on standard error: a line, whatever is in the names that it tells.
+
+    Parameters
+    ----------
+    most : characters of the line; of a longer one the beginning is kept (the culprit) and the end (the remedy)
+    """
+    print(shortened(escaped(f"{programme}: {what}"), most), file=sys.stderr)
+
+
+def shortened(line: str, most: int) -> str:
+    """A line of at most so many characters: the longest words, such as paths, lose their middle first."""
+    for word in sorted(set(line.split(" ")), key=len, reverse=True)[:4]:
+        excess = len(line) - most
+        if excess > 0 and len(word) > _LEAST_WORD:
+            line = line.replace(word, _without_middle(word, max(_LEAST_WORD, len(word) - excess)), 1)
+    return _without_middle(line, most)
+
+
+def _without_middle(text: str, most: int) -> str:
+    if len(text) <= most:
+        return text
+    end = (most - len(_GAP)) // 2
+    return text[: most - len(_GAP) - end] + _GAP + text[len(text) - end :]
 
 
 class Throttled:

@@ -12,6 +12,7 @@ from graph_slam_ros.errors import GraphSlamError
 if TYPE_CHECKING:
     from graph_slam_ros.slam import Config
 
+_SENTENCE = 1000  # characters of what falls short: reason, meaning and the settings that mend it
 _NO_MATPLOTLIB = "matplotlib is not installed: pip install matplotlib"
 
 
@@ -214,7 +215,7 @@ def _say_run(source: Path, summary: dict[str, Any]) -> int:
         raise GraphSlamError(f"{source}: no odometry of it could be used, see what was counted and graph_slam info")
     shortcomings = list(outcome.shortcomings(summary))
     for sentence in shortcomings:
-        console.tell(sentence)
+        console.tell(sentence, most=_SENTENCE)
     return console.LOSSES if shortcomings else console.DONE
 
 

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from graph_slam_ros.cli.console import REFUSED
+from graph_slam_ros.cli import console
 
 CODES = "Exit codes: 0 done, 1 a fault of ours, 2 refused, 3 done but something was lost, 130 interrupted."
 
@@ -36,4 +36,5 @@ class CommandParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Refuse the command line."""
-        self.exit(REFUSED, f"{self.prog}: {message} (--help shows what there is)\n")
+        console.tell(f"{message} (--help shows what there is)", self.prog)
+        self.exit(console.REFUSED)

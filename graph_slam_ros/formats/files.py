@@ -1,7 +1,8 @@
 """The one way to open a file: only regular files are opened, and opening never blocks.
 
-A FIFO without a writer would block for ever, a device may never end. In a run folder no symbolic link is followed,
-since a link may lead to any file of the user. A recording or a graph that the user names may be a link (``follow``).
+A FIFO without a writer would block for ever, a device may never end, a file of a terabyte that is a hole would take all
+memory. In a run folder no symbolic link is followed, since a link may lead to any file of the user. A recording or a
+graph that the user names may be a link (``follow``).
 """
 
 import errno
@@ -11,6 +12,7 @@ import stat
 from pathlib import Path
 
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
+_FREE, _MOST_RATIO = 2**20, 1000  # bytes that may be a hole, and how often a longer file may be what is on the disk
 _CREATE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
@@ -20,7 +22,8 @@ def opened(path: Path, *, follow: bool = False) -> io.FileIO:
     Raises
     ------
     OSError
-        There is no such file, it cannot be read, it is not a regular file, or it is a link that is not to be followed.
+        There is no such file, it cannot be read, it is not a regular file, it is little but holes, or it is a link that
+        is not to be followed.
     """
     return io.FileIO(path, opener=_follow if follow else _no_follow)
 
@@ -44,6 +47,20 @@ def is_regular(path: Path) -> bool:
         return False
 
 
+def is_empty(path: Path) -> bool:
+    """Whether there is nothing to read: no such file, or a regular one of no bytes.
+
+    A FIFO or a link is not empty, nor is what cannot be looked at: to open it raises the reason.
+    """
+    try:
+        there = path.lstat()
+    except FileNotFoundError:
+        return True
+    except OSError:
+        return False
+    return stat.S_ISREG(there.st_mode) and there.st_size == 0
+
+
 def created(path: Path) -> int:
     """Create a file that does not exist yet; returns its descriptor. Raises OSError: also where a link has the name."""
     return os.open(path, _CREATE, 0o644)
@@ -63,9 +80,14 @@ def _no_follow(path: str, _: int) -> int:
 
 
 def _checked(fd: int, path: str) -> int:
-    mode = os.fstat(fd).st_mode
-    if stat.S_ISREG(mode):
+    about = os.fstat(fd)
+    on_disk = 512 * about.st_blocks
+    if not stat.S_ISREG(about.st_mode):
+        what = "a folder" if stat.S_ISDIR(about.st_mode) else "a FIFO, socket or device"
+        fault = f"{what}, not a regular file"
+    elif about.st_size > max(_FREE, _MOST_RATIO * on_disk):
+        fault = f"a sparse file: {about.st_size} bytes long, of which {on_disk} are on the disk; not read"
+    else:
         return fd
     os.close(fd)
-    what = "a folder" if stat.S_ISDIR(mode) else "a FIFO, socket or device"
-    raise OSError(errno.EINVAL, f"{what}, not a regular file", path)
+    raise OSError(errno.EINVAL, fault, path)

@@ -30,6 +30,7 @@ from graph_slam_ros.run.folder import (
     recording_of,
     run_config,
     suggested_out,
+    summary_of,
 )
 from graph_slam_ros.run.recorder import RunRecorder
 from graph_slam_ros.run.saved import (
@@ -79,5 +80,6 @@ __all__ = [
     "stopwatch",
     "suggested_out",
     "summarize",
+    "summary_of",
     "taken_up",
 ]

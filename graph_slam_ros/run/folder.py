@@ -13,7 +13,7 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,8 @@ _RECORDED = re.compile(r"(ingest|map|run)(_\d+)?\.mcap")
 _UNFINISHED = re.compile(r"\.[0-9a-f]{8}" + re.escape(NEW))
 _SCHEMAS = {INGEST: MEASUREMENT, MAP: GROWTH}
 _OF_RECORDINGS = re.compile(r"(\.(mcap|db3|bag|active|zstd|gz))+$")
-_NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.EINVAL, errno.ELOOP)  # none, or not a regular one
+_NO_FILE = (errno.ENOENT, errno.ENOTDIR)
+_ENDS = 2**16
 _TOPICS = {"/tf", "/pose", "/path", "/landmarks"}
 
 
@@ -131,7 +132,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
     Raises
     ------
     RunError
-        It is there and the disk fails to give it: what it says must not be taken for missing.
+        It is there and cannot be read: what it says must not be taken for missing.
     """
     try:
         told = json.loads(read_text(folder / SUMMARY))
@@ -162,22 +163,47 @@ def run_config(folder: Path) -> Config:
 
 
 def changed_since(folder: Path) -> list[str]:
-    """Results that are not those that ``run.json`` was written with: of a save that was cut off, or edited since."""
-    try:
-        files = summary_of(folder)["files"]
-        there = [name for name in sorted(_RESULTS & set(files)) if (folder / name).exists()]
-        changed = [name for name in there if checksum(read_bytes(folder / name)) != files[name]]
-    except (OSError, LookupError, TypeError):
-        return []
-    out = [f"{name} is not the one that {SUMMARY} was saved with" for name in changed]
+    """Files that are not those that ``run.json`` was written with: of a save that was cut off, exchanged, or edited."""
+    out = list(_not_as_saved(folder, "files", lambda file: checksum(read_bytes(file))))
+    out += list(_not_as_saved(folder, "recorded", ends_of))
     if any(now > then for _, then, now in _parts(folder)) or is_incomplete(folder):
         out.append("the run went on after its results were saved: graph_slam recover has those of its end")
     return out
 
 
 def missing(folder: Path) -> list[str]:
-    """Of its recordings, those that have fewer parts than when the run was saved."""
-    return [f"{name}: {then} parts when it was saved, {now} now" for name, then, now in _parts(folder) if now < then]
+    """Of its recordings, those that have fewer parts than when the run was saved, or are not those of then."""
+    fewer = [f"{name}: {then} parts when it was saved, {now} now" for name, then, now in _parts(folder) if now < then]
+    return fewer + list(_not_as_saved(folder, "recorded", ends_of))
+
+
+def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> Iterator[str]:
+    """Of the files whose marks the summary has: those that are gone, cannot be read, or have another mark."""
+    told = summary_of(folder).get(kind)
+    for name, mark in sorted(told.items()) if isinstance(told, dict) else ():
+        if name in _RESULTS or name == CONFIG or _RECORDED.fullmatch(name):  # no path out of the folder
+            try:
+                if mark_of(folder / name) != mark:
+                    yield f"{name} is not the one that {SUMMARY} was saved with"
+            except FileNotFoundError:
+                yield f"{name} is missing, with which {SUMMARY} was saved"
+            except OSError as error:
+                yield f"{name} cannot be read: {error.strerror}"
+
+
+def recorded_files(folder: Path) -> dict[str, str]:
+    """What tells the recordings and the configuration of a run from those of another. Raises OSError."""
+    parts = [file for name in (INGEST, MAP) for file in parts_of(folder, name)]
+    return {file.name: ends_of(file) for file in (*parts, folder / CONFIG)}
+
+
+def ends_of(file: Path) -> str:
+    """Size and CRC-32 of the first and the last 64 KiB: it takes no longer for a long recording. Raises OSError."""
+    with opened(file) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        first = stream.read(_ENDS)
+        stream.seek(max(0, size - _ENDS))
+        return f"{size}-{checksum(first + stream.read(_ENDS))}"
 
 
 def _parts(folder: Path) -> Iterator[tuple[str, int, int]]:

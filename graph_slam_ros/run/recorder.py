@@ -25,7 +25,17 @@ from graph_slam_ros.formats.journal import (
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.ros import results
 from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.run.folder import CONFIG, MARK, SUMMARY, RunError, checksum, discard, room, summary_of
+from graph_slam_ros.run.folder import (
+    CONFIG,
+    MARK,
+    SUMMARY,
+    RunError,
+    checksum,
+    discard,
+    recorded_files,
+    room,
+    summary_of,
+)
 from graph_slam_ros.run.map_log import GROWTH, Growth
 from graph_slam_ros.run.tables import result_texts, summarize
 from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
@@ -205,13 +215,18 @@ class RunRecorder:
                 if slam.keyframes:
                     self._record_map(slam)
                 self._end_parts()
-            parts = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}  # more of them: it went on
+                parts = self._ended_parts()
             waiting = max(0, self.accepted - slam.processed)
-            told = (summary or {}) | {"parts": parts, "unprocessed": waiting}
+            told = (summary or {}) | parts | {"unprocessed": waiting}
             save_results(self.folder, slam, told, self._refuse_if_ended)
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
         return self.folder
+
+    def _ended_parts(self) -> dict[str, Any]:
+        """For the summary: how many parts there are (with more of them it went on), and what tells them from others."""
+        parts = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}
+        return {"parts": parts, "recorded": recorded_files(self.folder)}
 
     def _refuse_if_ended(self) -> None:
         if self._is_ended:
@@ -232,15 +247,13 @@ class RunRecorder:
             if self._is_ended:
                 return 0
             self._end_parts()
-            parts = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}
             now = {
                 "keyframes": keyframes,
                 "ended": True,
                 "is_incomplete": bool(waiting or keyframes),
                 "unprocessed": waiting,
-                "parts": parts,
             }
-            told = summary_of(self.folder) | now
+            told = summary_of(self.folder) | now | self._ended_parts()
             _put(self.folder, SUMMARY, json.dumps(told, indent=2) + "\n")
             self._is_ended = True
             self._room.close()
