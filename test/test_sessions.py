@@ -15,7 +15,7 @@ from graph_slam_ros.formats.journal import RecordWriter, read_ingest
 from graph_slam_ros.merge import merge
 from graph_slam_ros.replay import replay
 from graph_slam_ros.ros.live.session import Session
-from graph_slam_ros.run import RunError, RunRecorder, changed_since, is_cut_off, is_run, recover, run_config
+from graph_slam_ros.run import RunError, RunRecorder, changed_since, complete, is_cut_off, is_run, recover, run_config
 from graph_slam_ros.run.map_log import read_map
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, Counters
@@ -242,6 +242,57 @@ def test_counters_of_the_border_are_those_of_the_run(tmp_path):
     one.finish()
     counters = [json.loads((tmp_path / name / "run.json").read_text())["counters"] for name in ("run-1", "run")]
     assert ["odom" in some for some in counters] == [True, False]
+
+
+def refused(run):
+    """What the summary of a run tells of its inputs."""
+    told = json.loads((run / "run.json").read_text())
+    return told["counters"], {name: (of["received"], of["used"]) for name, of in told["inputs"].items()}
+
+
+@pytest.mark.parametrize("make", ["saved", "left", "repeated", "cut off"])
+def test_what_was_refused_is_told_by_the_results_that_are_made_later(tmp_path, make):
+    """Of a run that was saved, stopped with a backlog, that has no map, or that was cut off after it was saved."""
+    run, border, source = tmp_path / "run", Counters(), next(m.source for m in WORLD if isinstance(m, Odometry))
+    one = session(run, border)
+    border.count("odom", "nonfinite", 7)
+    border.received["odom"] += len(WORLD)
+    far = Fix(WORLD[20].stamp_ns, "gps", "position", (0.0, 0.0), (1.0, 0.0, 0.0, 1.0), (), OSLO)
+    one.take([*with_fixes(MUNICH), far, *WORLD[60:100]])
+    if make == "left":
+        later = list(WORLD[100:140])
+        one.accept(later)
+        one.leave()
+    elif make == "cut off":
+        one.save()
+        one.take(WORLD[100:140])
+        one.abandon()
+    else:
+        one.finish()
+    counters, inputs = refused(run)
+    assert counters["odom"]["nonfinite"] == 7
+    assert counters["gps"]["other_datum"] == 1
+    if make == "repeated":
+        (run / "map.mcap").unlink()
+    recover(run, tmp_path / "out")
+    (run / "map.mcap").exists() and complete(run)
+    for made in (tmp_path / "out", run):
+        found, of = refused(made)
+        assert found["odom"]["nonfinite"] == 7, made
+        assert found["gps"]["other_datum"] == 1, made
+        assert of["odom"][0] == inputs["odom"][0] == len(WORLD), made
+        assert of[source][1] >= inputs[source][1] > 30, made
+    recover(tmp_path / "out", tmp_path / "again")
+    assert refused(tmp_path / "again") == refused(tmp_path / "out")
+
+
+def test_a_summary_that_tells_nonsense_of_what_was_refused_is_a_loss(tmp_path):
+    run = in_a_map(tmp_path)
+    told = json.loads((run / "run.json").read_text())
+    for k, wrong in enumerate(({"counters": {"a": {"b": "c"}}}, {"counters": 3}, {"inputs": {"odom": {"used": -1}}})):
+        (run / "run.json").write_text(json.dumps(told | wrong))
+        done = recover(run, tmp_path / f"out{k}")
+        assert any("what it had counted" in loss for loss in done["losses"]), wrong
 
 
 def test_results_are_kept_whose_recordings_are_gone(tmp_path):

@@ -37,8 +37,8 @@ from graph_slam_ros.run.folder import (
     summary_of,
 )
 from graph_slam_ros.run.map_log import GROWTH, Growth
-from graph_slam_ros.run.tables import result_texts, summarize
-from graph_slam_ros.slam import Config, GraphSlam, Measurement, Update
+from graph_slam_ros.run.tables import counted, result_texts, summarize
+from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.measurements import to_record
 from graph_slam_ros.solver.leverage import leverage
@@ -232,7 +232,7 @@ class RunRecorder:
         if self._is_ended:
             raise RunError(f"{self.folder}: its recording has been ended")
 
-    def leave(self, processed: int, keyframes: int) -> int:
+    def leave(self, processed: int, keyframes: int, counters: Counters) -> int:
         """End the recording before all of it was processed, and note that in the summary; returns what waits.
 
         What has been saved until now stays; ``complete`` makes the results of the whole.
@@ -253,7 +253,7 @@ class RunRecorder:
                 "is_incomplete": bool(waiting or keyframes),
                 "unprocessed": waiting,
             }
-            told = summary_of(self.folder) | now | self._ended_parts()
+            told = summary_of(self.folder) | now | counted(counters) | self._ended_parts()
             _put(self.folder, SUMMARY, json.dumps(told, indent=2) + "\n")
             self._is_ended = True
             self._room.close()

@@ -9,10 +9,20 @@ from typing import Any
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.durable import claimed
 from graph_slam_ros.formats.journal import read_ingest, read_rest
-from graph_slam_ros.run.folder import RunError, check_room, discard, missing, run_config, summary_of, was_saved_whole
+from graph_slam_ros.run.folder import (
+    SUMMARY,
+    RunError,
+    check_room,
+    discard,
+    missing,
+    recording_of,
+    run_config,
+    summary_of,
+    was_saved_whole,
+)
 from graph_slam_ros.run.map_log import has_map, read_map, state_of
 from graph_slam_ros.run.recorder import RunRecorder, save_results
-from graph_slam_ros.run.tables import summarize
+from graph_slam_ros.run.tables import counters_of, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.measurements import from_record
@@ -22,8 +32,12 @@ Summary = dict[str, Any]
 Took = Callable[[], dict[str, float]]
 
 
-def map_of(folder: Path, losses: list[str]) -> MapState:
+def map_of(folder: Path, losses: list[str], counters: Counters | None = None) -> MapState:
     """The map of a run: as it was written down, with what its journal holds besides; or by repeating the drive.
+
+    Parameters
+    ----------
+    counters : added to them is what the run has counted, by its summary and by what is processed here
 
     Raises
     ------
@@ -32,8 +46,13 @@ def map_of(folder: Path, losses: list[str]) -> MapState:
     """
     warmup()
     losses += missing(folder)
+    counters = Counters() if counters is None else counters
+    try:
+        counters.update(counters_of(summary_of(folder)))
+    except ValueError as error:
+        losses.append(f"{folder / SUMMARY}: what it had counted: {error}")
     state = read_map(folder, losses) if has_map(folder) else None
-    state = _repeated(folder, losses) if state is None else _with_rest(folder, state, losses)
+    state = _repeated(folder, losses, counters) if state is None else _with_rest(folder, state, losses, counters)
     if not state.keyframes:
         raise RunError(f"{folder}: no keyframe, so there is no map")
     space = run_config(folder).space
@@ -50,15 +69,16 @@ def config_of(folder: Path, state: MapState) -> Config:
         raise RunError(f"{folder}: changed on the way: {error}") from None
 
 
-def _repeated(folder: Path, losses: list[str]) -> MapState:
+def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapState:
     slam = GraphSlam(run_config(folder), start=read_map(folder, [], start_only=True))  # its losses are known
     for record in read_ingest(folder, losses):
         slam.process(from_record(record))
     slam.process(Control("end"))
+    counters.raise_to(slam.counters)
     return state_of(slam)
 
 
-def _with_rest(folder: Path, state: MapState, losses: list[str]) -> MapState:
+def _with_rest(folder: Path, state: MapState, losses: list[str], counters: Counters) -> MapState:
     """The map after those measurements, too, that were accepted and not processed any more."""
     if state.processed is None or was_saved_whole(folder):
         return state
@@ -70,23 +90,24 @@ def _with_rest(folder: Path, state: MapState, losses: list[str]) -> MapState:
     slam = GraphSlam(config_of(folder, state), start=state)
     for measurement in [*rest, Control("end")]:
         slam.process(measurement)
+    counters.update(slam.counters)
     out = state_of(slam)
     out.settings = settings | out.settings
     return out
 
 
-def taken_up(folder: Path, losses: list[str]) -> GraphSlam:
+def taken_up(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
     """The map of a run, solved; as ``map_of``."""
     lost = len(losses)
-    state = map_of(folder, losses)
+    state = map_of(folder, losses, counters)
     losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
     config = config_of(folder, state).changed({"map.localize": False})  # what is asked of a map is asked of all of it
     return GraphSlam(config, start=state)
 
 
-def settled(folder: Path, losses: list[str]) -> GraphSlam:
+def settled(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
     """The same with all of it judged. Raises GraphSlamError, too, where it cannot be solved."""
-    slam = taken_up(folder, losses)
+    slam = taken_up(folder, losses, counters)
     slam.process(Control("optimize"))
     if not slam.is_solved:
         raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
@@ -101,6 +122,7 @@ def record_run(
     start: MapState | None = None,
     *,
     border: Counters | None = None,
+    earlier: Counters | None = None,
     took: Took | None = None,
     recording: str = "",
     force: bool = False,
@@ -112,6 +134,7 @@ def record_run(
     losses : what could not be read, as known when the last measurement was
     start : the map to go on in
     border : counters of what was refused before it came here
+    earlier : counters of the run whose results these are, up to ``start``
     took : the time since whatever is told as its beginning
     recording : the name of the file or folder that the measurements are from
     force : a run in the folder may be replaced
@@ -129,7 +152,7 @@ def record_run(
         for measurement in measurements:
             recorder.record(slam, slam.process(measurement))
         slam.counters.update(border or Counters())
-        summary = summarize(slam) | took() | {"losses": list(dict.fromkeys(losses))}
+        summary = summarize(slam, earlier) | took() | {"losses": list(dict.fromkeys(losses))}
         summary |= {"recording": recording} if recording else {}
         recorder.save(slam, summary)
     except KeyboardInterrupt:
@@ -155,8 +178,10 @@ def recover(folder: Path, out: Path, *, force: bool = False) -> Summary:
     took = stopwatch()
     check_room(out, folder, force=force)
     losses: list[str] = []
-    state = map_of(folder, losses)
-    return record_run(out, config_of(folder, state), (), losses, state, took=took, force=force)[1]
+    counters = Counters()
+    state = map_of(folder, losses, counters)
+    told: dict[str, Any] = {"earlier": counters, "took": took, "recording": recording_of(folder)}
+    return record_run(out, config_of(folder, state), (), losses, state, force=force, **told)[1]
 
 
 def complete(folder: Path) -> Summary:
@@ -171,9 +196,11 @@ def complete(folder: Path) -> Summary:
     losses: list[str] = []
     try:
         with claimed(folder):
-            before = summary_of(folder)
-            slam = settled(folder, losses)
-            summary = before | summarize(slam) | took() | {"losses": losses, "ended": True, "is_incomplete": False}
+            before, counters = summary_of(folder), Counters()
+            slam = settled(folder, losses, counters)
+            summary = (
+                before | summarize(slam, counters) | took() | {"losses": losses, "ended": True, "is_incomplete": False}
+            )
             save_results(folder, slam, summary)
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}") from None

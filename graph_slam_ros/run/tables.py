@@ -2,7 +2,7 @@
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, TypeVar
 
@@ -43,8 +43,11 @@ def result_texts(slam: GraphSlam) -> dict[str, str]:
     }
 
 
-def summarize(slam: GraphSlam) -> dict[str, Any]:
-    """What happened, in numbers."""
+def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any]:
+    """What happened, in numbers; ``earlier`` was counted of the same run before this pipeline went on in it."""
+    counters = Counters()
+    for some in (earlier or Counters(), slam.counters):
+        counters.update(some)
     last = slam.report or (slam.solver.evaluate() if slam.is_solved else None)
     return {
         "version": __version__,
@@ -65,7 +68,7 @@ def summarize(slam: GraphSlam) -> dict[str, Any]:
         "rivals": [asdict(rival) for rival in slam.backend.rivals],
         "displacements": [asdict(alarm) for alarm in slam.alarms],
         "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
-    } | account(slam, slam.counters)
+    } | account(slam, counters)
 
 
 def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
@@ -76,18 +79,49 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
 
     Parameters
     ----------
-    counters : those of the pipeline and of what stands before it
+    counters : those of the pipeline, of what stands before it, and of an earlier part of the run
     """
     used_as = dict.fromkeys(slam.odometry_sources, "odometry") | uses(slam.config)  # a source need not be an input
-    is_of_map = not counters.used  # nothing was measured since: a run that is written from its map
+    is_of_map = not slam.counters.used  # nothing was measured since: a run that is written from its map
     believed = _believed(slam, 0 if is_of_map else slam.first_edge)
     inputs = {}
     for name in dict.fromkeys([*slam.config.inputs.names.split(), *counters.used, *believed]):
         if name in counters.received or counters.used[name] or name in believed:
-            used = believed.get(name, 0) if is_of_map else counters.used[name]
+            used = max(counters.used[name], believed.get(name, 0) if is_of_map else 0)
             of_input = {"received": counters.received.get(name), "used": used, "believed": believed.get(name)}
             inputs[name] = {"use": used_as.get(name, "")} | of_input
     return {"counters": counters.as_dict(), "inputs": inputs}
+
+
+def counted(counters: Counters) -> dict[str, Any]:
+    """The same of a pipeline that is still at work: its graph is not looked into."""
+    inputs = {
+        name: {"use": "", "received": counters.received.get(name), "used": counters.used[name], "believed": None}
+        for name in dict.fromkeys([*counters.received, *counters.used])
+    }
+    return {"counters": counters.as_dict(), "inputs": inputs}
+
+
+def counters_of(summary: Mapping[str, Any]) -> Counters:
+    """What ``account`` or ``counted`` was made of. Raises ValueError where a summary has anything else there."""
+    out = Counters()
+    try:
+        for source, counts in summary.get("counters", {}).items():
+            for reason, times in counts.items():
+                out.count(str(source), str(reason), _times(times))
+        for name, of in summary.get("inputs", {}).items():
+            out.used[name] += _times(of["used"])
+            if of["received"] is not None:
+                out.received[name] += _times(of["received"])
+    except (AttributeError, LookupError, TypeError) as error:
+        raise ValueError(str(error)) from None
+    return out
+
+
+def _times(told: Any) -> int:
+    if not isinstance(told, int) or isinstance(told, bool) or not 0 <= told < 2**63:
+        raise ValueError(f"{told!r:.20} is no count")
+    return told
 
 
 def _believed(slam: GraphSlam, first_edge: int) -> dict[str, int]:

@@ -35,6 +35,12 @@ class Counters:
         for own, more in self._with(other):
             own.update(more)
 
+    def raise_to(self, other: "Counters") -> None:
+        """Of each count take the larger: both have counted the same."""
+        for own, counts in self._with(other):
+            for key, times in counts.items():
+                own[key] = max(own[key], times)
+
     def since(self, before: "Counters") -> "Counters":
         """What was counted after there were these."""
         out = Counters()

@@ -305,9 +305,7 @@ class Session:
         if self._recorder is None:
             why = "recording was given up" if self._folder else "output.folder is empty"
             raise GraphSlamError(f"{why}: nowhere to save")
-        counters = self._border.since(self._refused_before)
-        counters.update(self.slam.counters)
-        summary = summarize(self.slam) | account(self.slam, counters) | {"ended": ended}
+        summary = summarize(self.slam) | account(self.slam, self._counters()) | {"ended": ended}
         folder = str(self._recorder.save(self.slam, summary))
         self._is_saved, self._is_ended, self.recording_fails = True, ended, False
         return folder
@@ -420,10 +418,16 @@ class Session:
         if recorder is None:
             return 0, lost
         try:
-            return recorder.leave(self.slam.processed, len(self.slam.keyframes)), lost
+            return recorder.leave(self.slam.processed, len(self.slam.keyframes), self._counters()), lost
         except OSError as error:
             recorder.abandon()
             raise RunError(f"{recorder.folder}: {error.strerror}") from None
+
+    def _counters(self) -> Counters:
+        """Of the run: those of the border since it began, and of the pipeline."""
+        counters = self._border.since(self._refused_before)
+        counters.update(self.slam.counters)
+        return counters
 
     def abandon(self) -> None:
         """End the recording as it is, where it was not finished."""
