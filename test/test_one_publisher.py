@@ -22,11 +22,14 @@ class Publisher:
     """What is handed on of messages, and how many were refused."""
 
     def __init__(self, timeout_s=0.5):
-        self.refused, self.used = 0, []
-        self._one = OnePublisher(timeout_s, self._refuse)
+        self.refused, self.ahead, self.used = 0, 0, []
+        self._one = OnePublisher(timeout_s, self._refuse, self._refuse_ahead)
 
     def _refuse(self):
         self.refused += 1
+
+    def _refuse_ahead(self):
+        self.ahead += 1
 
     def hear(self, messages):
         for m in messages:
@@ -138,13 +141,27 @@ def test_where_stamps_begin_anew_tracks_do():
     assert p.hear(used).used == [*used, *used]
 
 
-def test_what_is_an_hour_ahead_is_left_to_who_looks_at_the_clock_and_where_it_goes_on_tracks_begin_anew():
+@pytest.mark.parametrize("ahead_s", [3, 55, 3600])
+def test_what_is_far_ahead_is_refused_where_odometry_goes_on_without_it_and_used_where_it_goes_on_there(ahead_s):
     used, other = driven(20), driven(20, 10.0, 0.0, (5.0, 5.0, 1.0), late_s=0.01)
-    hour = [Odometry(m.stamp_ns + 3600 * NS, m.T_odom_base, None, "odom") for m in used]
-    p = Publisher().hear(mixed(used[:100], other[:100])).hear(hour[:1]).hear(mixed(used[100:], other[100:])).end()
-    assert p.used == [*used[:100], hour[0], *used[100:]]
-    p.hear(hour)
-    assert p.used[-len(hour) :] == hour
+    later = [Odometry(m.stamp_ns + (10 + ahead_s) * NS, m.T_odom_base, None, "odom") for m in used]
+    p = Publisher().hear(mixed(used[:100], other[:100]))
+    for k in range(100, 150):
+        p.hear(later[k - 100 : k - 99]).hear(mixed(used[k : k + 1], other[k : k + 1]))
+    assert (p.used, p.ahead) == (used[:150], 50)
+    p.hear(used[150:])
+    p.hear(later)
+    assert (p.used, p.ahead) == (used + later, 50)
+
+
+def test_after_a_gap_what_comes_out_of_order_or_seldom_is_used_and_what_is_last_of_all_and_alone_is_not():
+    used, gap = driven(20), driven(20, 40.0, 30.0)
+    p = Publisher().hear(used).hear([gap[1], gap[0], *gap[2:]])
+    assert (p.used, p.ahead) == ([*used, gap[1], gap[0], *gap[2:]], 0)
+    seldom = [Odometry(NS + k * 5 * NS // 2, (0.0, 0.0, 0.0), None, "odom") for k in range(10)]
+    assert Publisher().hear(seldom).end().used == seldom
+    p = Publisher().hear(used).hear(gap[:1]).end()
+    assert (p.used, p.ahead) == (used, 1)
 
 
 # -- recordings --------------------------------------------------------------------------------------------------------

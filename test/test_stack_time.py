@@ -14,6 +14,7 @@ from rclpy.parameter import Parameter
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
+from graph_slam_ros.ros.cdr import LATEST_NS
 from graph_slam_ros.ros.live.reckoning import Reckoning
 from graph_slam_ros.ros.node import GraphSlamNode
 from graph_slam_ros.slam import Odometry
@@ -282,6 +283,38 @@ def test_B6_odometry_from_the_future_is_refused_and_holds_no_transform_up(tmp_pa
     assert told["counters"]["odom"] == {"future": 1}
     assert "odom: future, ahead of the clock: is use_sim_time to be set" in n.said
     assert told["segments"] == 1
+    assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
+
+
+def test_B25_stamps_at_both_ends_of_time_count_and_the_robot_goes_on_by_a_clock_that_stops_leaps_and_is_zero(tmp_path):
+    with simulated(tmp_path / "run") as n, robot(hears=HEARS) as r:
+        r.wait_for_node()
+        played = Played(r, start_s=2**31 - 400)
+        r.until_it_says("OK", spin=played.step)
+        drive, right_ns = played.drive, played.drive.stamp_ns
+        for wrong_ns in (1, NS, right_ns + 300 * NS, LATEST_NS):
+            played.go(3)
+            right_ns, drive.stamp_ns = drive.stamp_ns, wrong_ns
+            r.send("/odom", drive.odometry())
+            r.send("/landmarks", drive.seen())
+            drive.stamp_ns = right_ns
+        for clock_ns in (drive.stamp_ns + 60 * NS, drive.stamp_ns + 120 * NS):
+            played.tell(clock_ns)  # forth, and with the next step back: a segment each
+            r.spin(0.1)
+            played.go(20)
+            r.until_it_says("OK", spin=played.step)
+        played.tell(0)
+        r.spin(0.1)
+        played.go(40)
+        r.until_it_says("OK", spin=played.step)
+        assert r.save().success
+        assert off_by(r, drive) < 1.0
+        assert n.stop()[0] == 0
+        assert "Traceback" not in n.said
+    counters = numbers(tmp_path / "run")["counters"]
+    assert counters["odom"]["late"] == 2
+    assert counters["odom"]["future"] == 2
+    assert "node" not in counters
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
 

@@ -7,11 +7,12 @@ from numpy.typing import ArrayLike, DTypeLike
 
 HEADER = b"\x00\x01\x00\x00"  # CDR, little endian
 NS = 1_000_000_000
+LATEST_NS = (2**31 - 1) * NS + 999_999_999  # that a builtin_interfaces/Time can say
 
 
 def stamp(stamp_ns: int) -> bytes:
-    """builtin_interfaces/Time."""
-    return struct.pack("<iI", *divmod(stamp_ns, NS))
+    """builtin_interfaces/Time; what is later is the latest that it can say."""
+    return struct.pack("<iI", *divmod(min(stamp_ns, LATEST_NS), NS))
 
 
 class CdrWriter:

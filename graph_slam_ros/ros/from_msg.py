@@ -84,7 +84,7 @@ class Border:
     def __init__(self, config: Config, counters: Counters, decoders: Mapping[str, Decoder] | None = None) -> None:
         self._config = config
         self._counters = counters
-        self._transforms = Transforms(round(config.inputs.tf_buffer_s * 1e9))
+        self._transforms = Transforms(round(config.inputs.tf_buffer_s * 1e9), self._is_far_in_time)
         self._sources: dict[str, Source] = {}
         self._convert: dict[str, Callable[[Any], Any]] = {}
         self._publishers: dict[str, OnePublisher] = {}  # of each odometry
@@ -99,7 +99,9 @@ class Border:
             self._types[name] = by_name[name].type
             self._convert[name] = partial(CONVERTERS[by_name[name].type][use], source)
             if use == "odometry":
-                self._publishers[name] = OnePublisher(config.odometry.timeout_s, partial(self._is_of_another, name))
+                self._publishers[name] = OnePublisher(
+                    config.odometry.timeout_s, partial(self._is_of_another, name), partial(self._is_ahead, name)
+                )
         for name, add in ((TF_STATIC, self._add_static), (TF, self._add_moving)):
             source = self._sources[name] = Source(InputConfig(name), "none", config, self._transforms)
             self._convert[name] = partial(self._transforms_of, source, add)
@@ -118,12 +120,10 @@ class Border:
             self._counters.count(name, "undecodable")
             return []
         out = self._converted(source, message)
-        for m in out:
-            if isinstance(m, Odometry):
-                self._transforms.now_ns = max(m.stamp_ns, self._transforms.now_ns or 0)
         if source.use == "odometry":
             publishers = self._publishers[name]
             out = [one for m in out if isinstance(m, Odometry) for one in publishers.take(m)]
+            self._transforms.now_ns = max([*(m.stamp_ns for m in out), self._transforms.now_ns or 0]) or None
         if name == TF or source.use == "odometry":
             for _ in range(len(self._waiting)):
                 out += self._converted(*self._waiting.popleft())
@@ -160,6 +160,12 @@ class Border:
 
     def _is_of_another(self, name: str) -> None:
         self._counters.count(name, "other_publisher")
+
+    def _is_ahead(self, name: str) -> None:
+        self._counters.count(name, "future")
+
+    def _is_far_in_time(self) -> None:
+        self._counters.count(TF, "far_in_time")
 
     def _hurried(self, source: Source, message: Any) -> list[Measured]:
         before, source.hurried = source.hurried, True

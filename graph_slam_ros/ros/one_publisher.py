@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any
 
+from graph_slam_ros.ros.stamp_leap import StampLeap
 from graph_slam_ros.slam.measurements import Odometry
 from graph_slam_ros.slam.space import Numbers
 
@@ -20,7 +21,8 @@ _ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 10.0, 20.0  # of robots
 _START_M_S, _START_RAD_S = 3.0, 3.0  # speed of a track that has only one pose
 _LEAST_S, _MOST_S, _MOST_RATIO = 0.02, 1.0, 10.0  # stamps may crowd together; a track leads no farther than this
 _BACK_NS = 200_000_000  # what is older is left to the order of stamps
-_AHEAD_NS = 60_000_000_000  # what is newer is left to who looks at the clock, but where it goes on
+_AHEAD_NS = 60_000_000_000  # where odometry goes on so much later, the tracks begin anew
+_GAP_NS, _GAP_PERIODS = 1_000_000_000, 10.0  # what is dated later than after so long a gap waits for the next to agree
 _SURE, _PERIODS = 3, 3.0  # messages of a new track, and periods of the track in use, before that is given up
 _NOISY, _NOISIEST = 3.0, 2.5  # of the usual misfit, and at most
 _MOST_LABELS = 8
@@ -104,30 +106,35 @@ class OnePublisher:
     ----------
     timeout_s : the publisher in use is silent for longer: another takes over
     refuse : called once for each message of another publisher, when it is certain that it is not used
+    refuse_leap : called once for each that is dated ahead of odometry that goes on without it
     """
 
-    def __init__(self, timeout_s: float, refuse: Callable[[], None]) -> None:
+    def __init__(self, timeout_s: float, refuse: Callable[[], None], refuse_leap: Callable[[], None]) -> None:
         self._timeout_ns, self._refuse = round(timeout_s * 1e9), refuse
+        self._leap = StampLeap[Odometry](refuse_leap)
         self._tracks: list[_Track] = []  # the first is in use
         self._held: deque[tuple[_Track, Odometry]] = deque()  # of tracks that are neither in use nor settled
-        self._labels, self._ahead = 1, 0
+        self._labels = 1
         self._usual = 0.0  # misfit of the odometry in use
 
     def take(self, m: Odometry) -> list[Odometry]:
         """What is to be used now that a message has come, in the order it came."""
+        newest_ns, room_ns = m.stamp_ns, _GAP_NS
+        if self._tracks and (used := self._tracks[0]).past:
+            newest_ns = min(m.stamp_ns, used.newest_ns)
+            room_ns = max(_GAP_NS, round(_GAP_PERIODS * used.period_ns))
+        return [out for _, one in self._leap.take(m.stamp_ns, m, newest_ns, room_ns) for out in self._take(one)]
+
+    def _take(self, m: Odometry) -> list[Odometry]:
         if self._labels > _MOST_LABELS:
             return [m]  # these are no publishers: whatever it is, it is used as it comes
+        if self._tracks and self._tracks[0].past and m.stamp_ns > self._tracks[0].newest_ns + _AHEAD_NS:
+            self._begin_anew()
         if not self._tracks:
             self._tracks.append(_Track(m.source))
         used = self._tracks[0]
-        if used.past and m.stamp_ns < used.newest_ns - _BACK_NS:
+        if self._is_older(m):
             return [m]
-        if used.past and m.stamp_ns > used.newest_ns + _AHEAD_NS:
-            self._ahead += 1
-            if self._ahead >= _SURE:
-                self.forget_time()
-            return [_labelled(m, used)]
-        self._ahead = 0
         track = self._continued(m)
         track.add(m)
         if track is used:
@@ -139,6 +146,11 @@ class OnePublisher:
         self._held.append((track, m))
         return self._jumped() if len(self._held) > _MOST_HELD or _has_jumped(track, used) else []
 
+    def _is_older(self, m: Odometry) -> bool:
+        """Whether it is left to the order of stamps."""
+        used = self._tracks[0]
+        return bool(used.past) and m.stamp_ns < used.newest_ns - _BACK_NS
+
     def finish(self) -> list[Odometry]:
         """No more messages come: what waits is what the odometry has jumped to."""
         out = self._jumped() if self._held else []
@@ -147,6 +159,10 @@ class OnePublisher:
 
     def forget_time(self) -> None:
         """Stamps begin anew, and with them the tracks."""
+        self._leap.forget()
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
         for track in self._tracks:
             self._drop(track.since, 0)
         self._drop(self._held, 0)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graph_slam_ros.lie import se3
-from graph_slam_ros.ros.cdr import HEADER, NS, CdrWriter, stamp
+from graph_slam_ros.ros.cdr import HEADER, LATEST_NS, NS, CdrWriter, stamp
 from graph_slam_ros.ros.interfaces import typestore
 from graph_slam_ros.slam.space import PLANE, SPACE
 
@@ -37,8 +37,9 @@ def make(name: str, /, **fields: Any) -> Any:
 
 
 def time(stamp_ns: int) -> Any:
-    """builtin_interfaces/Time."""
-    return make("builtin_interfaces/msg/Time", sec=int(stamp_ns // NS), nanosec=int(stamp_ns % NS))
+    """builtin_interfaces/Time; what is later is the latest that it can say."""
+    sec, nanosec = divmod(min(int(stamp_ns), LATEST_NS), NS)
+    return make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
 
 
 def header(stamp_ns: int, frame: str) -> Any:

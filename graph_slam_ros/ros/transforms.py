@@ -1,9 +1,11 @@
 """Transforms between frames: where sensors sit on the robot, fixed or on moving joints."""
 
 from bisect import bisect_left
+from collections.abc import Callable
 from typing import Any
 
 from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.ros.stamp_leap import StampLeap
 
 
 def pose(translation: Any, rotation: so3.Quaternion) -> se3.Pose:
@@ -18,14 +20,15 @@ class Transforms:
     Parameters
     ----------
     keep_ns : how much older than its newest a transform of /tf may get
+    refuse : called once for each of /tf that is dated farther than that from the others of its frame
 
     Attributes
     ----------
     now_ns : the newest stamp of odometry, None before the first: what may still come is judged by it
     """
 
-    def __init__(self, keep_ns: int = 10_000_000_000) -> None:
-        self._keep_ns = keep_ns
+    def __init__(self, keep_ns: int = 10_000_000_000, refuse: Callable[[], object] = lambda: None) -> None:
+        self._keep_ns, self._refuse = keep_ns, refuse
         self._fixed: dict[str, tuple[str, se3.Pose]] = {}
         self._moving: dict[str, _Joint] = {}
         self.now_ns: int | None = None
@@ -38,8 +41,8 @@ class Transforms:
         """Take one that holds at its stamp."""
         joint = self._moving.get(child)
         if joint is None or joint.parent != parent:
-            joint = self._moving[child] = _Joint(parent)
-        joint.add(stamp_ns, T_parent_child, self._keep_ns)
+            joint = self._moving[child] = _Joint(parent, self._keep_ns, self._refuse)
+        joint.take(stamp_ns, T_parent_child)
 
     def forget_time(self) -> None:
         """Stamps begin anew; what holds always stays."""
@@ -83,19 +86,28 @@ class Transforms:
 class _Joint:
     """The recent motion of one frame in its parent."""
 
-    def __init__(self, parent: str) -> None:
-        self.parent = parent
+    def __init__(self, parent: str, keep_ns: int, refuse: Callable[[], object]) -> None:
+        self.parent, self._keep_ns = parent, keep_ns
+        self._leap = StampLeap[se3.Pose](refuse)
         self._stamps_ns: list[int] = []
         self._poses: list[se3.Pose] = []
 
-    def add(self, stamp_ns: int, T_parent_child: se3.Pose, keep_ns: int) -> None:
+    def take(self, stamp_ns: int, T_parent_child: se3.Pose) -> None:
+        newest_ns = self._stamps_ns[-1] if self._stamps_ns else stamp_ns
+        for at_ns, pose in self._leap.take(stamp_ns, T_parent_child, newest_ns, self._keep_ns):
+            if self._stamps_ns and at_ns < self._stamps_ns[-1] - self._keep_ns:  # several agree that it is so early
+                self._stamps_ns.clear()
+                self._poses.clear()
+            self._add(at_ns, pose)
+
+    def _add(self, stamp_ns: int, T_parent_child: se3.Pose) -> None:
         at = bisect_left(self._stamps_ns, stamp_ns)
         if at < len(self._stamps_ns) and self._stamps_ns[at] == stamp_ns:
             self._poses[at] = T_parent_child
             return
         self._stamps_ns.insert(at, stamp_ns)
         self._poses.insert(at, T_parent_child)
-        old = bisect_left(self._stamps_ns, self._stamps_ns[-1] - keep_ns)
+        old = bisect_left(self._stamps_ns, self._stamps_ns[-1] - self._keep_ns)
         del self._stamps_ns[:old], self._poses[:old]
 
     def at(self, stamp_ns: int) -> se3.Pose | None:

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.slam.parameter import numbers, setting
 
+HIGHEST_M = 1e5
+"""Above the ellipsoid or below it: beyond is no place for a robot."""
+
 
 @dataclass(frozen=True, slots=True)
 class InputConfig:
@@ -72,9 +75,10 @@ class InputConfig:
 
     def __post_init__(self) -> None:
         self.numbers("mount", 6)
-        latitude, *_ = self.numbers("datum", 3) or (0.0,)
-        if abs(latitude) > 90.0:
-            raise ConfigError(f"{self.name}.datum: latitude {latitude:g} is not in [-90, 90]")
+        limits = ("latitude", 90.0, "deg"), ("longitude", 360.0, "deg"), ("altitude", HIGHEST_M, "m")
+        for (name, most, unit), number in zip(limits, self.numbers("datum", 3), strict=False):
+            if abs(number) > most:
+                raise ConfigError(f"{self.name}.datum: {name} {number:g} is not in [-{most:g}, {most:g}] {unit}")
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
         """Numbers of a text; none if it is empty. Raises ConfigError for anything else than ``count`` of them."""

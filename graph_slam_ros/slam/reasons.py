@@ -45,7 +45,9 @@ _SPACE = "world.dimensions=3"
 REASONS: dict[str, Reason] = {
     # -- stamps and order
     "bad_stamp": Reason(
-        _REFUSED, "the stamp is negative or has 1e9 nanoseconds or more", "correct the driver's stamps"
+        _REFUSED,
+        "the stamp is negative, has 1e9 nanoseconds or more, or is beyond 2^31 s with INPUT.offset_s",
+        "correct the driver's stamps",
     ),
     "zero_stamp": Reason(_REFUSED, "the stamp is zero", "have the driver fill in header.stamp"),
     "late": Reason(
@@ -55,8 +57,13 @@ REASONS: dict[str, Reason] = {
     ),
     "future": Reason(
         _REFUSED,
-        "the stamp is ahead of the node's clock by more than time.future_s",
+        "the stamp is ahead of the node's clock by more than time.future_s, or of odometry that goes on without it",
         "use_sim_time for a recording, INPUT.offset_s for a clock that differs",
+    ),
+    "far_in_time": Reason(
+        _REFUSED,
+        "the transform is dated more than inputs.tf_buffer_s before or after all others of its frame",
+        "one clock for all that publishes /tf",
     ),
     "before_jump": Reason(_REFUSED, "it was sent before the clock jumped back and arrived after"),
     "before_odometry": Reason(
@@ -179,7 +186,9 @@ REASONS: dict[str, Reason] = {
     # -- fixes
     "no_fix": Reason(_REFUSED, "the receiver has no fix", "wait for one: a clear view of the sky"),
     "no_position": Reason(_REFUSED, "latitude and longitude are zero", "wait for a fix"),
-    "not_on_earth": Reason(_REFUSED, "latitude or longitude is out of range", "degrees, not radians or 1e-7 degrees"),
+    "not_on_earth": Reason(
+        _REFUSED, "latitude, longitude or altitude is out of range", "degrees and metres, not radians or 1e-7 degrees"
+    ),
     "far_from_datum": Reason(_REFUSED, "the fix is more than 100 km from the map's origin", "INPUT.datum"),
     "other_datum": Reason(_REFUSED, "the fix counts from another origin than the map", "the same INPUT.datum for all"),
     "thinned": Reason(

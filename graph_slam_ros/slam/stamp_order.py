@@ -14,6 +14,11 @@ NS = 1_000_000_000
 _REMEMBERED = 100  # messages of each topic, by which one that comes again is known
 
 
+def _things(m: Observation) -> int:
+    """Each sighting counts."""
+    return len(m.sightings) if isinstance(m, Sightings) else 1
+
+
 class StampOrder:
     """A bounded queue that releases measurements by (stamp, odometry first, topic, arrival)."""
 
@@ -32,18 +37,32 @@ class StampOrder:
 
         Odometry newer than all before always has room: it is what makes others leave.
         """
-        full = len(self._heap) >= self._max_waiting
         if not isinstance(m, Odometry):
-            reason = "overflow" if full else "duplicate" if self._is_repeated(m) else ""
+            reason = "duplicate" if self._is_repeated(m) else "" if self._has_room(m.stamp_ns) else "overflow"
             if reason:
-                self._counters.count(m.topic, reason, len(m.sightings) if isinstance(m, Sightings) else 1)
+                self._counters.count(m.topic, reason, _things(m))
             return not reason
         if self._released_ns is not None and m.stamp_ns < self._released_ns:
             self._counters.count(m.source, "late")
             return False
-        if full and self._newest_odometry_ns is not None and m.stamp_ns <= self._newest_odometry_ns:
+        is_newest = self._newest_odometry_ns is None or m.stamp_ns > self._newest_odometry_ns
+        if not is_newest and not self._has_room(m.stamp_ns):
             self._counters.count(m.source, "overflow")
             return False
+        return True
+
+    def _has_room(self, stamp_ns: int) -> bool:
+        """Whether so many wait only, or what is dated latest of all can make room: its turn may never come."""
+        if len(self._heap) < self._max_waiting:
+            return True
+        latest = max(range(len(self._heap)), key=self._heap.__getitem__)
+        at_ns, _, _, _, m = self._heap[latest]
+        if at_ns <= stamp_ns or isinstance(m, Odometry):
+            return False
+        self._heap[latest] = self._heap[-1]
+        self._heap.pop()
+        heapq.heapify(self._heap)
+        self._counters.count(m.topic, "overflow", _things(m))
         return True
 
     def _is_repeated(self, m: Observation) -> bool:

@@ -12,6 +12,7 @@ from graph_slam_ros.ros.inputs import checks
 from graph_slam_ros.ros.inputs.checks import MessageError
 from graph_slam_ros.ros.inputs.source import Source
 from graph_slam_ros.ros.transforms import pose
+from graph_slam_ros.slam.input_config import HIGHEST_M
 from graph_slam_ros.slam.measurements import Closure, Fix, InitialPose
 from graph_slam_ros.slam.space import SPACE
 
@@ -79,12 +80,12 @@ def gnss(source: Source, m: Any) -> Iterator[Fix]:
         raise MessageError("no_fix")
     if not (math.isfinite(m.latitude) and math.isfinite(m.longitude)):
         raise MessageError("nonfinite")
-    if abs(m.latitude) > 90.0 or abs(m.longitude) > 360.0:
+    has_altitude = math.isfinite(m.altitude)
+    if abs(m.latitude) > 90.0 or abs(m.longitude) > 360.0 or (has_altitude and abs(m.altitude) > HIGHEST_M):
         raise MessageError("not_on_earth")
     if m.latitude == m.longitude == 0.0:  # off Africa: nobody drives there, and drivers without a position say so
         raise MessageError("no_position")
     n = source.space.dimensions
-    has_altitude = math.isfinite(m.altitude)
     covariance = np.array(m.position_covariance, dtype=float).reshape(3, 3)
     if m.position_covariance_type == _UNKNOWN or source.settings.noise == "sigmas":
         covariance = np.eye(3) * source.sigma_m() ** 2

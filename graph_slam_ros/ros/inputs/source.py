@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.ros.cdr import LATEST_NS
 from graph_slam_ros.ros.inputs import checks
 from graph_slam_ros.ros.inputs.checks import MessageError
 from graph_slam_ros.ros.transforms import Transforms
@@ -76,7 +77,7 @@ class Source:
     def stamp_ns(self, stamp: Any) -> int:
         """Of a header, by the clock of the robot."""
         out = checks.stamp_ns(stamp) + self._offset_ns
-        if out <= 0:
+        if not 0 < out <= LATEST_NS:
             raise MessageError("bad_stamp")
         return out
 

@@ -1,0 +1,152 @@
+"""Stamps at the ends of what a message can say: what is wrong counts, and what is right gives what it gives without."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from messages import (
+    STAMP_NS,
+    border,
+    counted,
+    detection,
+    detections,
+    gnss,
+    odometry,
+    pose,
+    quaternion,
+    record_drive,
+    transforms,
+)
+from reliability import tell
+
+from graph_slam_ros.replay import choose_inputs, measurements
+from graph_slam_ros.ros import to_msg
+from graph_slam_ros.ros.bag import open_bag
+from graph_slam_ros.ros.cdr import LATEST_NS
+from graph_slam_ros.ros.transforms import Transforms
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
+
+S = 1_000_000_000
+ODOMETRY, TF, FIX = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/NavSatFix"
+CONFIG = Config.from_mapping(
+    {"inputs.names": "odom detections gps", "gps.type": FIX, "gps.topic": "fix", "ordering.max_waiting": 100}
+)
+AT = 30  # odometry messages, before what is wrong comes
+TURRET = "base_link", "turret", (0.0, 0.0, 0.0), quaternion(yaw=1.0)
+
+
+class Recording:
+    """A drive of 6 s in memory, read as a bag is; what is wrong is put in after odometry messages."""
+
+    def __init__(self, bag, wrong, times):
+        self._bag, self._wrong, self._times = bag, wrong, times
+        self.topics = bag.topics
+
+    def messages(self, topics):
+        heard = 0
+        for m in self._bag.messages(topics):
+            yield m
+            heard += m.topic == "/odom"
+            if m.topic == "/odom" and AT <= heard < AT + self._times:
+                for topic, make in self._wrong:
+                    yield replace(m, topic=topic, cdr=make(heard))
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    return open_bag(record_drive(tmp_path_factory.mktemp("drive") / "drive.mcap", 6))
+
+
+def run(bag):
+    counters, slam = Counters(), GraphSlam(CONFIG)
+    for some in measurements(bag, choose_inputs(bag, CONFIG), CONFIG, counters):
+        for m in some:
+            slam.process(m)
+    for event in ("end", "optimize"):
+        slam.process(Control(event))
+    counters.update(slam.counters)
+    return slam, counters.as_dict()
+
+
+@pytest.fixture(scope="module")
+def clean(drive):
+    return run(drive)
+
+
+def odom(stamp_ns=STAMP_NS, **stamp):
+    return ("/odom", lambda k: odometry(pose(6.0, 0.3), stamp_ns=stamp_ns + k, **stamp))
+
+
+def seen(stamp_ns):
+    return ("/landmarks", lambda k: detections(detection(), frame="base_link", stamp_ns=stamp_ns + k))
+
+
+def turned(stamp_ns):
+    return ("/tf", lambda k: transforms(TURRET, stamp_ns=stamp_ns + k))
+
+
+def fixed(stamp_ns):
+    return ("/fix", lambda k: gnss(48.001, 11.001, stamp_ns=stamp_ns + k))
+
+
+END_NS = LATEST_NS - 1000
+WRONG = {
+    "odometry at the end of time": ([odom(END_NS)], 1, "odom", {"future": 1}),
+    "odometry an hour ahead": ([odom(STAMP_NS + 3600 * S)], 5, "odom", {"future": 5}),
+    "odometry half a minute ahead": ([odom(STAMP_NS + 33 * S)], 1, "odom", {"future": 1}),
+    "odometry at the beginning of time": ([odom(1)], 5, "odom", {"late": 5}),
+    "2^31 s as a signed number": ([odom(sec=-(2**31))], 3, "odom", {"bad_stamp": 3}),
+    "nanoseconds beyond a second": ([odom(nanosec=10**9)], 3, "odom", {"bad_stamp": 3}),
+    "all nanoseconds": ([odom(sec=0, nanosec=2**32 - 1)], 3, "odom", {"bad_stamp": 3}),
+    "zero": ([odom(sec=0, nanosec=0)], 3, "odom", {"zero_stamp": 3}),
+    "detections at the end of time": ([seen(END_NS)] , 3, "detections", {"after_odometry": 3}),
+    "so many that nothing else could wait": (
+        [seen(END_NS - 60 * j) for j in range(10)], 20, "detections", {"after_odometry": None, "overflow": None}
+    ),
+    "detections at the beginning of time": ([seen(1)], 3, "detections", {"before_odometry": 3}),
+    "a joint at the end of time": ([turned(END_NS)], 1, "tf", {"far_in_time": 1}),
+    "a joint again and again": ([turned(END_NS)], 20, "tf", {"far_in_time": 20}),
+    "a joint at the beginning of time": ([turned(1)], 1, "tf", {"far_in_time": 1}),
+    "fixes at the end of time": ([fixed(END_NS)], 3, "gps", {"after_odometry": 3}),
+    "fixes at the beginning of time": ([fixed(1)], 3, "gps", {"before_odometry": 3}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_B25_what_is_dated_beyond_all_else_counts_and_the_rest_gives_what_it_gives_without(drive, clean, name):
+    wrong, times, source, expected = WRONG[name]
+    slam, counts = run(Recording(drive, wrong, times))
+    found = {reason: n for reason, n in counts[source].items() if n != clean[1].get(source, {}).get(reason)}
+    assert found.keys() == expected.keys()
+    assert sum(found.values()) == times * len(wrong), "each is counted once"
+    assert all(n is None or n == found[reason] for reason, n in expected.items())
+    np.testing.assert_array_equal(slam.trajectory(), clean[0].trajectory())
+    tell("extreme_stamps", tried=times * len(wrong), failed=0)
+
+
+@pytest.mark.parametrize("start_ns", [1, S - 1, LATEST_NS - 7 * S], ids=["1 ns", "1 s", "2^31 s"])
+def test_B25_a_drive_that_begins_or_ends_where_time_does_is_the_same_drive(tmp_path, monkeypatch, clean, start_ns):
+    monkeypatch.setattr("messages.STAMP_NS", start_ns)
+    slam, counts = run(open_bag(record_drive(tmp_path / "drive.mcap", 6)))
+    assert counts == clean[1]
+    np.testing.assert_allclose(slam.trajectory(), clean[0].trajectory(), atol=1e-9)
+
+
+def test_B25_an_offset_does_not_lead_beyond_the_end_of_time_and_results_are_not_dated_there():
+    for offset_s, reason in ((2.0, "bad_stamp"), (-2.0, "")):
+        b = border(odom={"offset_s": offset_s})
+        assert len(b.take("odom", odometry(stamp_ns=LATEST_NS - S))) == (not reason)
+        assert counted(b) == ({"odom": {reason: 1}} if reason else {})
+    assert to_msg.time(LATEST_NS + 1) == to_msg.time(LATEST_NS)
+    assert to_msg.transform(LATEST_NS + 1, "map", "odom", (0.0,) * 3) == to_msg.transform(
+        LATEST_NS, "map", "odom", (0.0,) * 3
+    )
+
+
+def test_B25_a_joint_whose_first_stamp_is_wrong_is_known_from_the_second_right_one_on():
+    refused = []
+    t = Transforms(10 * S, lambda: refused.append(1))
+    for stamp_ns in (LATEST_NS, 100 * S, 101 * S, 102 * S):
+        t.add_at(stamp_ns, "base", "arm", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    assert t.lookup("base", "arm", 100 * S + 1) is not None
+    assert not refused, "it was the first, and nobody could know"
