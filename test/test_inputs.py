@@ -245,7 +245,7 @@ def test_a_pose_without_covariance_needs_configured_noise():
 def test_a_pose_in_a_frame_that_is_not_linked_to_the_map_is_refused():
     b = located()
     assert heard(b, "mocap", posed(POSE, pose(), "lab", np.eye(6))) is None
-    assert counted(b) == {"mocap": {"frame_unknown": 1}}
+    assert counted(b) == {"mocap": {"map_frame_unknown": 1}}
 
 
 def test_a_pose_may_be_a_landmark_of_configured_identity_or_odometry():
@@ -382,6 +382,28 @@ def test_the_transform_from_odom_to_the_base_is_odometry_and_no_other_is():
     assert m.T_odom_base == pytest.approx((3.0, 4.0, 0.5))
     assert heard(b, "odom", transforms(*others)) is None
     assert counted(b) == {}
+    assert b.not_found("odom") == ""
+
+
+@pytest.mark.parametrize(
+    ("link", "settings", "said"),
+    [
+        (("wheels", "base_link"), {}, "odom -> base_link has come, but wheels -> base_link: correct frames.odom"),
+        (
+            ("odom", "chassis"),
+            {},
+            "odom -> base_link has come, but odom -> chassis: correct frames.odom or frames.base",
+        ),
+        (("wheels", "foot"), {"frame": "ekf"}, "ekf -> base_link has come, but wheels -> foot: correct odom.frame or"),
+        (("map", "base_link"), {}, "odom -> base_link has come: correct frames.odom or frames.base"),
+    ],
+)
+def test_odometry_on_tf_by_other_names_is_said_to_be_missing_with_what_may_be_meant(link, settings, said):
+    b = border(("foot", "base_link", (0.0, 0.0, 0.2), quaternion()), odom={"type": TF, **settings})
+    assert heard(b, "odom", transforms(("base_link", "arm", (1.0, 0, 0), quaternion()))) is None
+    assert heard(b, "odom", transforms((*link, (1.0, 0, 0), quaternion()))) is None
+    assert f"no transform {said}" in b.not_found("odom")
+    assert b.not_found("detections") == ""
 
 
 # -- sensors that move ----------------------------------------------------------------------------------------------

@@ -220,9 +220,9 @@ def refused(came, **reasons):
         (Facts("active", (odom(),)), "WAITING", "/odom: /driver publishes it, but nothing has come yet"),
         (Facts("active", (odom(mismatch="best effort"),)), "WAITING", "/odom: best effort"),
         (
-            Facts("active", (odom(received=3, recent=refused(3, frame_unknown=3), frames=(("wheels", "base_link"),)),)),
+            Facts("active", (odom(received=3, recent=refused(3, odom_frame_unknown=3), frames=(("wheels", "odom"),)),)),
             "WAITING",
-            "/odom: all refused in 10 s (frame_unknown): no transform links wheels to base_link: publish the transform",
+            "/odom: all refused in 10 s (odom_frame_unknown): no transform links wheels to odom: frames.odom as its",
         ),
         (
             Facts("active", (odom(received=3, recent=refused(3, late=3)),)),

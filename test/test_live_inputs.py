@@ -8,7 +8,7 @@ import pytest
 from geometry_msgs.msg import TransformStamped
 from live_drive import TAGS, Drive, earlier_run
 from live_nodes import ENVIRONMENT, LATCHED, node, own_domain, robot, until
-from messages import detection, detections, odometry, pose, quaternion
+from messages import detection, detections, odometry, pose, quaternion, transforms
 from rclpy.qos import ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
@@ -97,6 +97,33 @@ def test_A35_an_input_that_is_refused_is_degraded_with_the_remedy_while_it_is_an
         until(lambda: len(r.said()) > 4, with_tags(covariance=0.0), "diagnostics")
         assert {values["state"] for _, values in r.said()} == {"OK"}, "a noise that was filled in is no refusal"
         assert int(r.said("input detections")[-1][1]["counted: covariance_unknown"]) > 20
+        assert n.stop()[0] == 0
+
+
+def test_A39_odometry_on_tf_that_never_comes_or_stops_is_missed_though_tf_goes_on():
+    with (
+        node("odom.type:=tf2_msgs/msg/TFMessage", "odom.topic:=/tf", "output.folder:=''") as n,
+        robot(hears=("/diagnostics", "pose"), sends=("/landmarks",)) as r,
+    ):
+        r.wait_for_node()
+        drive, tf = Drive(), r.publisher("/tf", TFMessage)
+
+        def tell(parent):
+            def step(seconds):
+                x, y, yaw = drive.odom
+                at = (parent, "base_link", (x, y, 0.0), quaternion(yaw=yaw))
+                arm = ("base_link", "arm", (0.0, 0.0, 1.0), quaternion())
+                tf.publish(transforms(*([at, arm] if parent else [arm]), stamp_ns=drive.stamp_ns))
+                drive.move()
+                r.spin(seconds)
+
+            return step
+
+        r.until_it_says("WAITING", "/tf: no transform odom -> base_link has come", spin=tell(""))
+        r.until_it_says("WAITING", "but wheels -> base_link: correct frames.odom or frames.base", spin=tell("wheels"))
+        r.until_it_says("OK", spin=tell("odom"))
+        r.until_it_says("DEGRADED", "/tf: silent for", spin=tell("wheels"))
+        r.until_it_says("OK", spin=tell("odom"))
         assert n.stop()[0] == 0
 
 

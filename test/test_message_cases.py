@@ -244,7 +244,7 @@ def test_A15_a_frame_that_is_not_the_odometrys_is_transformed_where_it_is_linked
     m = heard(b, "odom", odometry(pose(2.0, 1.0, 0.0, quaternion(yaw=0.3)), frame="start"))
     assert m.T_odom_base == pytest.approx((9.0, 7.0, math.pi / 2 + 0.3))
     assert counted(b) == {}
-    refused("frame_unknown", odometry(frame="world"))
+    refused("odom_frame_unknown", odometry(frame="world"))
     left_out("frame_unknown", detection(frame="camera"))
 
 
@@ -253,7 +253,7 @@ def test_A16_one_leading_slash_is_stripped_and_counted():
     assert heard(b, "odom", odometry(frame="/odom", child="/base_link")).T_odom_base == (0.0, 0.0, 0.0)
     assert counted(b) == {"odom": {"frame_slash_stripped": 2}}
     assert heard(b, "odom", odometry(frame="//odom")) is None
-    assert counted(b)["odom"]["frame_unknown"] == 1
+    assert counted(b)["odom"]["odom_frame_unknown"] == 1
     b = border(("/base_link", "/wheel", (0.5, 0.0, 0.0), quaternion()))
     assert heard(b, "odom", odometry(child="wheel")).T_odom_base == pytest.approx((-0.5, 0.0, 0.0))
     assert counted(b) == {"tf_static": {"frame_slash_stripped": 2}}

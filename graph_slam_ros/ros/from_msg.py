@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.ros.inputs import CONVERTERS, Measured, checks, fixes, uses
+from graph_slam_ros.ros.inputs import CONVERTERS, Measured, checks, fixes, odometry, uses
 from graph_slam_ros.ros.inputs.checks import MessageError
 from graph_slam_ros.ros.inputs.source import NotYet, Origin, Source
 from graph_slam_ros.ros.interfaces import typestore
@@ -141,6 +141,11 @@ class Border:
     def unlinked(self, name: str) -> tuple[tuple[str, str], ...]:
         """Frames of an input, each with the frame that nothing links it to, of the last messages refused for that."""
         return tuple(self._sources[name].unlinked)
+
+    def not_found(self, name: str) -> str:
+        """Of odometry on /tf of which no transform has come yet: which one, what mends it; else empty."""
+        source = self._sources[name]
+        return odometry.not_found(source) if source.use == "odometry" else ""
 
     def initial_pose(self, cdr: bytes) -> list[InitialPose]:
         """What a geometry_msgs/PoseWithCovarianceStamped of ``initialpose`` says, if it can be used."""

@@ -27,7 +27,7 @@ class Transforms:
     now_ns : the newest stamp of odometry, None before the first: what may still come is judged by it
     """
 
-    def __init__(self, keep_ns: int = 10_000_000_000, refuse: Callable[[], object] = lambda: None) -> None:
+    def __init__(self, keep_ns: int = 10_000_000_000, refuse: Callable[[], None] = lambda: None) -> None:
         self._keep_ns, self._refuse = keep_ns, refuse
         self._fixed: dict[str, tuple[str, se3.Pose]] = {}
         self._moving: dict[str, _Joint] = {}
@@ -86,7 +86,7 @@ class Transforms:
 class _Joint:
     """The recent motion of one frame in its parent."""
 
-    def __init__(self, parent: str, keep_ns: int, refuse: Callable[[], object]) -> None:
+    def __init__(self, parent: str, keep_ns: int, refuse: Callable[[], None]) -> None:
         self.parent, self._keep_ns = parent, keep_ns
         self._leap = StampLeap[se3.Pose](refuse)
         self._stamps_ns: list[int] = []

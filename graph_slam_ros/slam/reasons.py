@@ -90,6 +90,16 @@ REASONS: dict[str, Reason] = {
     "frame_empty": Reason(_REFUSED, "the message names no frame", "INPUT.frame, or INPUT.mount"),
     "frame_in_itself": Reason(_REFUSED, "a frame is its own parent", "correct the driver's frame names"),
     "frame_unknown": Reason(_REFUSED, "no transform links the message's frame to the robot", _FRAMES),
+    "odom_frame_unknown": Reason(
+        _REFUSED,
+        "no transform links the odometry's frame to frames.odom",
+        "frames.odom as its messages name it, or publish the transform on /tf_static",
+    ),
+    "map_frame_unknown": Reason(
+        _REFUSED,
+        "no transform links the pose's frame to frames.map",
+        "frames.map as its messages name it, or publish the transform on /tf_static",
+    ),
     "child_frame_unknown": Reason(_REFUSED, "no transform links the message's child frame to the robot", _FRAMES),
     # -- numbers
     "undecodable": Reason(_REFUSED, "the bytes are not a message of this type", "INPUT.type, or record it again"),

@@ -12,6 +12,7 @@ from graph_slam_ros.ros.inputs.source import Numbers, Source
 from graph_slam_ros.ros.transforms import pose
 from graph_slam_ros.slam.measurements import Odometry
 
+_MOST_SIMILAR, _LONGEST = 3, 80  # transforms that are named, and letters of a frame's name
 _UNUSED = 1e6  # [m^2/s^2, rad^2/s^2]: what drivers of wheels write for what these do not measure
 
 
@@ -39,15 +40,38 @@ def transforms(source: Source, m: Any) -> Iterator[Odometry]:
     frames = source.config.frames
     parent = source.settings.frame or frames.odom
     for t in m.transforms:
-        child = t.child_frame_id.lstrip("/")
-        if t.header.frame_id.lstrip("/") != parent or source.transforms.lookup(frames.base, child) is None:
+        above, child = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
+        is_of_robot = source.transforms.lookup(frames.base, child) is not None
+        if above != parent or not is_of_robot:
+            _note_similar(source, above, child, is_similar=above == parent or (is_of_robot and above != frames.map))
             continue  # /tf tells of everything
+        source.state["found"] = True
         try:
             stamp_ns = source.stamp_ns(t.header.stamp)
             at = _in_odom(source, frames.odom, child, t.transform.translation, t.transform.rotation)
             yield Odometry(stamp_ns, at, None, source.name)
         except MessageError as reason:
             source.count(str(reason))
+
+
+def _note_similar(source: Source, parent: str, child: str, *, is_similar: bool) -> None:
+    """Remember a transform that may be the odometry by other names."""
+    similar: dict[tuple[str, str], None] = source.state.setdefault("similar", {})
+    if is_similar and len(similar) < _MOST_SIMILAR and not source.state.get("found"):
+        similar[parent, child] = None
+
+
+def not_found(source: Source) -> str:
+    """Of odometry on /tf: what it waits for, as long as that has never come, and what may be meant; else empty."""
+    if source.settings.type != "tf2_msgs/msg/TFMessage" or source.state.get("found"):
+        return ""
+    frames, name = source.config.frames, source.name
+    key = f"{name}.frame" if source.settings.frame else "frames.odom"
+    has = ", ".join(f"{parent[:_LONGEST]} -> {child[:_LONGEST]}" for parent, child in source.state.get("similar", ()))
+    return (
+        f"no transform {source.settings.frame or frames.odom} -> {frames.base} has come{has and ', but '}{has}:"
+        f" correct {key} or frames.base, or have it published"
+    )
 
 
 def _in_odom(source: Source, parent: str, child: str, position: Any, orientation: Any) -> Numbers:

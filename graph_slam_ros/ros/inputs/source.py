@@ -144,10 +144,12 @@ class Source:
         return found
 
     def T_fixed(self, target: str, frame: str) -> se3.Pose:
-        """Between frames that do not move."""
+        """Between frames that do not move: a message's, and that of odometry or of the map."""
         found = self.transforms.lookup(target, frame)
+        if found is None and target == self.config.frames.odom:
+            raise self._not_linked("odom_frame_unknown", frame, target)
         if found is None:
-            raise self._not_linked("frame_unknown", frame, target)
+            raise self._not_linked("map_frame_unknown", frame, target)
         return found
 
     def _not_linked(self, reason: str, frame: str, target: str) -> MessageError:

@@ -16,7 +16,7 @@ from graph_slam_ros.slam.reasons import explain, remedy
 
 _LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them
 _LONGEST = 80  # of a frame's name
-_UNLINKED = ("frame_unknown", "child_frame_unknown")
+_UNLINKED = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +33,7 @@ class InputFacts:
     mismatch : what keeps publisher and subscription from connecting, in words; empty where nothing does
     frames : those of its messages that nothing links to the robot, the last ones, each with the robot's
     recent : what became of it in the last seconds
+    not_found : of odometry on /tf, the transform that has never come, and what mends that
     """
 
     name: str
@@ -47,6 +48,7 @@ class InputFacts:
     mismatch: str = ""
     frames: tuple[tuple[str, str], ...] = ()
     recent: Recent = field(default_factory=Recent)
+    not_found: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +167,8 @@ def _silence(one: InputFacts) -> Iterator[str]:
         yield f"{one.topic}: {', '.join(one.publishers)} publishes it, but nothing has come yet"
     elif one.recent.times:
         yield f"{one.topic}: {_refused(one)}"
+    elif one.not_found:
+        yield f"{one.topic}: {one.not_found}"
     else:
         yield f"{one.topic}: its first messages wait for their turn"
 
@@ -192,7 +196,7 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         if one.mismatch:
             yield f"{one.topic}: {one.mismatch}"
         elif one.received and most_s and one.silent_s > most_s:
-            yield f"{one.topic}: silent for {one.silent_s:.1f} s"
+            yield f"{one.topic}: {one.not_found or f'silent for {one.silent_s:.1f} s'}"
         elif one.recent.is_bad and not (one.is_contested and one.recent.worst == "other_publisher"):
             yield f"{one.topic}: {_refused(one)}"
     if facts.is_paused:

@@ -68,6 +68,7 @@ class Listeners:
         self._counters = counters
         self._topics: dict[str, _Heard] = {}
         self._of_input: dict[str, str] = {}
+        self._on_tf: dict[str, _Heard] = {}  # odometry there
         self._used: Counter[str] = Counter()
         kind = ReliabilityPolicy.RELIABLE if config.inputs.reliable else ReliabilityPolicy.BEST_EFFORT
         qos = QoSProfile(depth=config.inputs.depth, reliability=kind)
@@ -82,6 +83,8 @@ class Listeners:
                 topic = node.resolve_topic_name(one.topic)
                 topics.setdefault((one.type, topic), []).append(one.name)
                 self._of_input[one.name] = topic
+                if one.type == TRANSFORMS and used[one.name] == "odometry":
+                    self._on_tf[one.name] = _Heard(None)
         for (type_name, topic), names in topics.items():
             self._subscribe(type_name, topic, names, qos)
 
@@ -126,7 +129,14 @@ class Listeners:
     # -- facts -------------------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
-        """Note which topics have something new; by the clock of the node, so that a pause of it silences nobody."""
+        """Note which topics have something new; by the clock of the node, so that a pause of it silences nobody.
+
+        Of odometry on /tf, whether that has: /tf tells of everything.
+        """
+        for name, found in self._on_tf.items():
+            topic = self._topics[self._of_input[name]]
+            if (topic.received and found.at_ns is None) or self._used[name] != found.seen:
+                found.seen, found.at_ns = self._used[name], now_ns
         for heard in self._topics.values():
             if heard.received != heard.seen:
                 heard.seen, heard.at_ns = heard.received, now_ns
@@ -143,7 +153,8 @@ class Listeners:
             topic = self._of_input[one.name]
             heard = self._topics[topic]
             self.tick(now_ns)
-            silent_s = math.inf if heard.at_ns is None else max(0.0, (now_ns - heard.at_ns) * 1e-9)
+            at_ns = self._on_tf.get(one.name, heard).at_ns
+            silent_s = math.inf if at_ns is None else max(0.0, (now_ns - at_ns) * 1e-9)
             told = self._node.get_publishers_info_by_topic(topic)
             names = tuple(sorted(set(map(full_name, told))))
             out.append(
@@ -160,6 +171,7 @@ class Listeners:
                     "; ".join(filter(None, (self._mismatch(p, one.type) for p in told))),
                     self._border.unlinked(one.name),
                     recent.get(one.name, Recent()),
+                    self._border.not_found(one.name),
                 )
             )
         return tuple(out)
