@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from benchmarks import options, table
-from benchmarks.live import cities, drives, executors, paths
+from benchmarks.live import cities, drives, executors, lifecycle, paths
 from graph_slam_ros.warmup import warmup
 
 FIGURES: dict[str, Callable[[bool], Sequence[table.Row]]] = {
@@ -19,6 +19,7 @@ FIGURES: dict[str, Callable[[bool], Sequence[table.Row]]] = {
     **drives.FIGURES,
     "path": paths.measure,
     **cities.FIGURES,
+    "lifecycle": lifecycle.measure,
 }
 
 

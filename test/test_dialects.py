@@ -74,6 +74,22 @@ def test_the_information_of_edge3_is_never_scaled(tmp_path):
         assert np.allclose(information(file, RELATIVE_POSE_3D)[0], np.diag([1.0, 2, 3, 4, 5, 6]), rtol=1e-14)
 
 
+def test_edge3_may_be_isams_square_root_which_is_said_and_taken_where_it_is_asked_for(tmp_path):
+    root = np.triu(np.random.default_rng(1).uniform(0.1, 1.0, (6, 6))) + 5.0 * np.eye(6)
+
+    def text(of):
+        return "EDGE3 0 1 1 2 3 0.1 -0.2 0.3 " + " ".join(map(repr, of[np.triu_indices(6)].tolist())) + "\n"
+
+    assert np.allclose(information(read(tmp_path, text(root), dialect="isam"), RELATIVE_POSE_3D)[0], root.T @ root)
+    asked = "graph.txt:1: EDGE3 is read as TORO's information (--from toro says that it is)"
+    assert [note.startswith(asked) and note.endswith(": --from isam") for note in read(tmp_path, text(root)).notes] == [
+        True
+    ]
+    for dialect in ("isam", "toro"):
+        assert not read(tmp_path, text(root), dialect=dialect).notes
+    assert not read(tmp_path, text(np.eye(6))).notes, "the identity is its own root"
+
+
 def test_a_graph_of_edges_alone_starts_from_its_tree(tmp_path):
     file = read(tmp_path, "EDGE_SE2 0 1 1 0 1.5707963267948966 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n")
     assert np.allclose(initial_values(file.graph, "tree", 0).reshape(-1, 3)[:, :2], [[0, 0], [1, 0], [1, 1]])

@@ -290,8 +290,8 @@ def test_information_that_only_print_has_made_indefinite_is_repaired_by_its_trac
     (table,) = file.graph.tables.values()
     root = table.sqrt_information.values[0]
     assert np.allclose(root.T @ root, np.diag(expected))
-    assert len(file.repaired) == 1
-    assert file.repaired[0].startswith("printed.g2o:3: an information matrix not positive definite by the rounding")
+    assert len(file.notes) == 1
+    assert file.notes[0].startswith("printed.g2o:3: an information matrix not positive definite by the rounding")
     path.write_text(path.read_text().replace("2.0001", "2.1").replace("4.0001", "4.1"))
     with pytest.raises(FormatError, match="is not positive definite") as error:
         read_g2o(path)

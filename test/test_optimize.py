@@ -3,6 +3,7 @@
 import gzip
 import json
 import os
+import shlex
 import struct
 import subprocess
 import sys
@@ -180,6 +181,19 @@ def test_the_text_shows_cost_and_chi2_side_by_side_where_a_loss_makes_them_two(r
     assert f"{answer['chi2_final']:.6f}" in last
     assert f"{answer['cost_final']:.6f}" in last
     assert "method gn, loss huber:0.1\n" in out
+
+
+def test_what_comes_next_repeats_the_options(run, graph, tmp_path):
+    options = ["--method", "lm", "--loss", "cauchy:2", "--init", "tree", "--from", "g2o", "--max-iterations", "60"]
+    options += ["--tolerance", "1e-07", "--error-map", "seed", "--information", "raw", "--lenient"]
+    after = run(graph, *options)[1].splitlines()[-1].removeprefix("next: ").partition(" (")[0]
+    assert after == shlex.join(["graph_slam", "optimize", str(graph), *options, "--out", "SOLVED.g2o"])
+    bare = run(graph)[1].splitlines()[-1]
+    assert bare.startswith(f"next: {shlex.join(['graph_slam', 'optimize', str(graph), '--out', 'SOLVED.g2o'])} (")
+    for init, other in (("file", "chordal"), ("chordal", "online")):
+        after = run(graph, "--init", init, "--max-iterations", "1", "--tolerance", "1e-15")[1].splitlines()[-1]
+        words = shlex.split(after.removeprefix("next: ").partition(" (")[0])
+        assert words[3:] == ["--init", other, "--max-iterations", "1", "--tolerance", "1e-15"], after
 
 
 def test_the_start_is_told(run, graph):

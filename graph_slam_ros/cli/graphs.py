@@ -59,8 +59,8 @@ def optimize(args: argparse.Namespace) -> int:
     if args.plot:
         _plot_graph(args.plot, graph, _positions(graph, started(file, start)[0]), _positions(graph, solver))
     _tell_unknown(file)
-    for repair in file.repaired:
-        console.tell(repair)
+    for note in file.notes:
+        console.tell(note)
     if not args.json:
         console.then(_after(args, report.converged))
     return console.told(file.skipped) or (proof.code if proof else console.DONE)
@@ -68,10 +68,28 @@ def optimize(args: argparse.Namespace) -> int:
 
 def _after(args: argparse.Namespace, converged: bool) -> str:
     if not converged:
-        return f"{console.command('optimize', args.graph, '--init', 'chordal')} (another start)"
+        start = "online" if args.init == "chordal" else "chordal"
+        words = _options(argparse.Namespace(**vars(args) | {"init": start}))
+        return f"{console.command('optimize', args.graph, *words)} (another start)"
     if args.out is None:
-        return f"{console.command('optimize', args.graph, '--out', 'SOLVED.g2o')} (the same, and write it)"
+        words = _options(args)
+        return f"{console.command('optimize', args.graph, *words, '--out', 'SOLVED.g2o')} (the same, and write it)"
     return f"{console.command('convert', args.out, 'POSES.tum')} (the poses as a trajectory)"
+
+
+def _options(args: argparse.Namespace) -> Iterable[str]:
+    """What was asked for of the solution, as it was typed."""
+    values = {"--method": args.method, "--loss": _loss_text(args.loss), "--init": args.init, "--from": args.source}
+    usual = {"--method": "gn", "--loss": "none", "--init": "auto", "--from": None}
+    values |= {"--max-iterations": args.max_iterations, "--tolerance": args.tolerance}
+    usual |= {"--max-iterations": 100, "--tolerance": 1e-6}
+    values |= {"--error-map": args.error_map, "--information": args.information}
+    usual |= {"--error-map": "relative", "--information": "g2o"}
+    for option, value in values.items():
+        if value != usual[option]:
+            yield from (option, str(value))
+    if args.lenient:
+        yield "--lenient"
 
 
 def convert(args: argparse.Namespace) -> int:

@@ -67,6 +67,13 @@ def in_g2o_words(words: Words, text: Text) -> Words:
         return translate(words, text)
 
 
+def may_be_roots(words: Words, text: Text) -> bool:
+    """Whether a line may give the root of its information, and nobody said which: in EDGE3 both look the same."""
+    if text.dialect or words[0] != "EDGE3" or len(words) != 3 + 6 + 21:
+        return False
+    return not np.array_equal(numbers(words[9:]), np.eye(6)[_UPPER_3D])  # which is its own root
+
+
 def from_g2o_words(words: Words, text: Text) -> Words | None:
     """The g2o line in the words of the text's dialect; None where that has no line for it."""
     translate = _WRITTEN[text.dialect or "g2o"].get(words[0])
@@ -106,6 +113,8 @@ def _edge3(words: Words, text: Text) -> Words:
         expect(words, 29)
     values = numbers(words[3:])
     information = np.array(values[6:]) if len(values) > 6 else np.eye(6)[_UPPER_3D]
+    if text.dialect == "isam":
+        information = np.array(_squared(information.tolist()))
     if not text.raw:
         information = information / np.outer(_HALVED, _HALVED)[_UPPER_3D]
     return ["EDGE_SE3:QUAT", *words[1:3], *_written(_pose(values[:6])), *_written(information.tolist())]
@@ -206,7 +215,7 @@ _TAGS = {
     "g2o": frozenset(_WRITTEN["g2o"]),
     "toro": frozenset({"VERTEX2", "EDGE2", "VERTEX3", "EDGE3"}),
     "gtsam": frozenset({"VERTEX_SE2", "VERTEX2", "VERTEX_XY", "ODOMETRY", "LANDMARK"}),
-    "isam": frozenset({"VERTEX2", "EDGE2", "ODOMETRY", "LANDMARK"}),
+    "isam": frozenset({"VERTEX2", "EDGE2", "ODOMETRY", "LANDMARK", "VERTEX3", "EDGE3"}),
     "rows": frozenset({"VERTEX2", "EDGE2"}),
 }
 DIALECTS = tuple(_TAGS)
@@ -246,7 +255,7 @@ def _is_definite(upper: list[float]) -> bool:
 
 def _squared(rows: list[float]) -> list[float]:
     """The upper triangle of ``R'R``, of R by the rows of its upper triangle."""
-    size = 3 if len(rows) == 6 else 2
+    size = {3: 2, 6: 3, 21: 6}[len(rows)]
     at, root = np.triu_indices(size), np.zeros((size, size))
     root[at] = rows
     out: list[float] = (root.T @ root)[at].tolist()

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from graph_slam_ros.errors import FormatError, NoiseError
-from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, in_g2o_words
+from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, in_g2o_words, may_be_roots
 from graph_slam_ros.formats.graph_file import AT_OFFSET, EDGE_TAGS, HALVED, OFFSET, VERTEX_TAGS, Array, G2oFile, moved
 from graph_slam_ros.formats.strict import expect, integer, lines, numbers
 from graph_slam_ros.graph import (
@@ -64,6 +64,7 @@ class _Reader:
         self.unknown: list[str] = []
         self.skipped: list[str] = []
         self.repaired: list[int] = []
+        self.assumed = 0  # the first line whose information may have been meant otherwise
         self.has_values = True
         self.label = ""
 
@@ -80,6 +81,7 @@ class _Reader:
             self.label = labelled[1] if labelled else self.label
             return
         try:
+            self.assumed = self.assumed or line * may_be_roots(words, self.text)
             words = in_g2o_words(words, self.text)
             tag = words[0]
             if tag in VERTEX_TAGS:
@@ -165,17 +167,21 @@ class _Reader:
             self.skipped,
             self.text.raw,
             self.has_values,
-            self._repairs(),
+            list(self._notes()),
         )
 
-    def _repairs(self) -> list[str]:
-        if not self.repaired:
-            return []
-        what = f"{len(self.repaired)} information matrices" if len(self.repaired) > 1 else "an information matrix"
-        return [
-            f"{self.name}:{self.repaired[0]}: {what} not positive definite by the rounding of print alone:"
-            " weights from the traces of position and rotation are used instead"
-        ]
+    def _notes(self) -> Iterator[str]:
+        if self.repaired:
+            what = f"{len(self.repaired)} information matrices" if len(self.repaired) > 1 else "an information matrix"
+            yield (
+                f"{self.name}:{self.repaired[0]}: {what} not positive definite by the rounding of print alone:"
+                " weights from the traces of position and rotation are used instead"
+            )
+        if self.assumed:
+            yield (
+                f"{self.name}:{self.assumed}: EDGE3 is read as TORO's information (--from toro says that it is); iSAM"
+                " writes its square root: --from isam"
+            )
 
     def _known(self, tag: str, edges: Sequence[_Edge]) -> Iterator[_Edge]:
         """Edges whose vertices exist and are of the right kind, and whose information is positive definite."""

@@ -100,7 +100,7 @@ class G2oFile:
     offsets : the parameters, where on the robot sensors are: T_base_sensor (7,) by number
     seen_from : the number of the parameter of each edge that has one
     unknown : lines with tags that are not understood, in order
-    repaired : what was repaired, and where
+    notes : what was repaired or had to be assumed, and where
     skipped : in lenient reading, what was wrong with each line left out
     raw : whether the information of rotations in space was, and is to be written, unscaled
     has_values : whether the file gave initial values; without, all are at the origin
@@ -115,7 +115,7 @@ class G2oFile:
     skipped: list[str] = field(default_factory=list)
     raw: bool = False
     has_values: bool = True
-    repaired: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def moved(points: Array, root: Array, offsets: Sequence[se3.Pose]) -> tuple[Array, Gaussian]:
