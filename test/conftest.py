@@ -21,24 +21,20 @@ INTEGRATION = """anchor any_measurement any_message bag certificate consistency 
     initialization inputs_replay instruments life localize map_log maps message_cases nav2 nees
     noise_and_losses online_graphs pipeline_kinds rates reach run_folder sessions simulation soak
     timing_cases unnamed views what_if world_graphs"""
-SOAK = """any_measurement any_message fuzzing graph_cases journal kernels life mutated_recordings
-    recorded soak solver_faults stack stack_control stack_displaced stack_edits stack_time timing_cases"""
 """Files, without ``test_`` and ``.py``."""
 STARTS_ONE = re.compile(
-    r"^ *(import|from) (confined|fuzzing|live_nodes|multiprocessing|rclpy|subprocess)\b|\bos\.fork\(|\bmrclam\(",
+    r"^ *(import|from) (confined|fuzzing|multiprocessing|rclpy|subprocess)\b|\b(live_nodes\b|os\.fork\(|mrclam\()",
     re.MULTILINE,
 )
 """What a file has that starts processes."""
+TRIES = re.compile(r"\b(often|times)\(")
+"""What it has that tries more in ``make soak``."""
+_running = []
 STARTS = {"os.exec", "os.fork", "os.forkpty", "os.posix_spawn", "os.system", "subprocess.Popen"}
 
 
-def named(names):  # type: ignore[no-untyped-def]
-    files = {Path(__file__).with_name(f"test_{name}.py") for name in names.split()}
-    assert all(file.is_file() for file in files), [file.name for file in files if not file.is_file()]
-    return files
-
-
-INTEGRATES, IS_SOAKED = named(INTEGRATION), named(SOAK)
+INTEGRATES = {Path(__file__).with_name(f"test_{name}.py") for name in INTEGRATION.split()}
+assert all(file.is_file() for file in INTEGRATES), [file.name for file in INTEGRATES if not file.is_file()]
 
 
 @functools.cache
@@ -49,7 +45,10 @@ def kind(file):  # type: ignore[no-untyped-def]
     return "integration" if file in INTEGRATES else "unit"
 
 
-_running = []
+@functools.cache
+def is_soaked(file):  # type: ignore[no-untyped-def]
+    """Whether ``make soak`` tries more of it."""
+    return bool(TRIES.search(file.read_text(encoding="utf-8")))
 
 
 def pytest_ignore_collect(collection_path, config):  # type: ignore[no-untyped-def]
@@ -61,7 +60,7 @@ def pytest_ignore_collect(collection_path, config):  # type: ignore[no-untyped-d
 def pytest_itemcollected(item) -> None:  # type: ignore[no-untyped-def]
     """Its kind is that of its file."""
     item.add_marker(kind(item.path))
-    if item.path in IS_SOAKED:
+    if is_soaked(item.path):
         item.add_marker("soak")
 
 

@@ -1,7 +1,7 @@
-"""Nodes for tests, forked from one process that has Python and the kernels: each starts with a tenth of the work.
+"""Nodes and commands for tests, forked from one process that has Python and the kernels: a quarter of the work.
 
-What a node does from the import of rclpy, which starts threads, to the end of the interpreter is its own. One whose
-start is the subject of a test is started by a command (``live_nodes.Started``).
+What one does from its ``main``, or the import of rclpy, which starts threads, to the end of the interpreter is its own.
+One whose start is the subject of a test is started by a command (``live_nodes.Started``).
 """
 
 import contextlib
@@ -14,7 +14,9 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 
+MODULES = {"graph_slam": "graph_slam_ros.cli", "node": "graph_slam_ros.ros.node"}
 LONGEST = 2**16  # of a message: some parameters
 CAN_DIFFER = {"ROS_DOMAIN_ID"}  # all else may have been read when modules were imported
 
@@ -22,8 +24,8 @@ CAN_DIFFER = {"ROS_DOMAIN_ID"}  # all else may have been read when modules were 
 class Forked:
     """As ``subprocess.Popen``, of a child of another process."""
 
-    def __init__(self, pid, status, stderr):
-        self.pid, self.stderr, self.returncode = pid, stderr, None
+    def __init__(self, command, pid, status, stderr=None):
+        self.args, self.pid, self.stderr, self.returncode = command, pid, stderr, None
         self._status = status
 
     def poll(self):
@@ -34,7 +36,7 @@ class Forked:
     def wait(self, timeout=None):
         if self.returncode is None:
             if not select.select([self._status], [], [], timeout)[0]:
-                raise subprocess.TimeoutExpired("a forked node", timeout)
+                raise subprocess.TimeoutExpired(self.args, timeout)
             self.returncode = int(os.read(self._status, 20))
             os.close(self._status)
         return self.returncode
@@ -60,25 +62,45 @@ class Server:
             )
 
     def can_fork(self, environment):
-        """Whether a node of this environment may have been forked from one of ours."""
+        """Whether what is started with this environment may have been forked from one of ours."""
         different = dict(self._environment.items() ^ environment.items())
         return different.keys() <= CAN_DIFFER
 
-    def start(self, words, environment, cwd=None):
-        """Start a node with these words on its command line."""
-        (said, stderr), (status, ended) = os.pipe(), os.pipe()
+    def run(self, command, environment, timeout):
+        """As ``subprocess.run``, of a command whose output is kept."""
+        with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
+            process = self._started(command, environment, None, out.fileno(), err.fileno())
+            try:
+                code = process.wait(timeout)
+            finally:
+                process.kill()
+            for file in (out, err):
+                file.seek(0)
+            return subprocess.CompletedProcess(command, code, out.read(), err.read())
+
+    def start(self, command, environment, cwd=None):
+        """As ``subprocess.Popen``, of a command whose stderr is kept."""
+        said, stderr = os.pipe()
+        try:
+            process = self._started(command, environment, cwd, 1, stderr)
+        finally:
+            os.close(stderr)
+        process.stderr = os.fdopen(said)
+        return process
+
+    def _started(self, command, environment, cwd, out, err):
+        status, ended = os.pipe()
         own = {name: environment[name] for name in CAN_DIFFER & environment.keys()}
-        asked = {"words": words, "environment": own, "cwd": str(cwd or os.getcwd())}
-        socket.send_fds(self._socket, [json.dumps(asked).encode()], [stderr, ended])
-        os.close(stderr)
+        asked = {"command": command, "environment": own, "cwd": str(cwd or os.getcwd())}
+        socket.send_fds(self._socket, [json.dumps(asked).encode()], [out, err, ended])
         os.close(ended)
         answer = self._socket.recv(LONGEST)
         assert answer, f"the process that forks nodes has ended: {self._process.wait()}"
-        return Forked(int(answer), status, os.fdopen(said))
+        return Forked(command, int(answer), status)
 
 
 def serve(asked):
-    """Fork a node for each request; returns in the child, with the words for it, and never in this process."""
+    """Fork for each request; returns in the child, with its command, and never in this process."""
     waiting, (wakes, woken) = {}, os.pipe()  # where to say how each child ended
     os.set_blocking(woken, False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tests, and they end this
@@ -97,32 +119,34 @@ def serve(asked):
                 os.close(ended)
         if asked not in ready:
             continue
-        data, (*fds,), _, _ = socket.recv_fds(asked, LONGEST, 2)
+        data, fds, _, _ = socket.recv_fds(asked, LONGEST, 3)
         if not data:
             os._exit(0)
-        stderr, ended = fds
+        out, err, ended = fds
         pid = os.fork()
         if not pid:
-            os.dup2(stderr, 2)
+            os.dup2(out, 1)
+            os.dup2(err, 2)
             signal.set_wakeup_fd(-1)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             signal.signal(signal.SIGINT, signal.default_int_handler)
-            for fd in (stderr, ended, wakes, woken, *waiting.values()):
+            for fd in (*fds, wakes, woken, *waiting.values()):
                 os.close(fd)
             asked.close()
             request = json.loads(data)
             os.environ.update(request["environment"])
             os.chdir(request["cwd"])
-            return request["words"]
-        os.close(stderr)
+            return request["command"]
+        os.close(out)
+        os.close(err)
         waiting[pid] = ended
         asked.send(str(pid).encode())
 
 
 def main():
-    """What a node imports, but for ROS; then, in each child, the node."""
+    """What a node imports, but for ROS; then, in each child, the node or the command."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the node does
-    for name in ("replay", "ros.live.session"):
+    for name in ("cli", "replay", "ros.live.session"):
         importlib.import_module(f"graph_slam_ros.{name}")
     from graph_slam_ros.warmup import warmup
 
@@ -131,11 +155,8 @@ def main():
     assert threads == 1, f"{threads} threads: their locks would be held for ever in the children"
     gc.collect()
     gc.freeze()  # the children share it
-    words = serve(socket.socket(fileno=int(sys.argv[1])))
-    from graph_slam_ros.ros import node
-
-    sys.argv = [node.__file__, *words]
-    return node.main()
+    sys.argv = serve(socket.socket(fileno=int(sys.argv[1])))
+    return importlib.import_module(MODULES[sys.argv[0]]).main()
 
 
 if __name__ == "__main__":

@@ -20,7 +20,6 @@ pytest.importorskip("rclpy")
 pytest.importorskip("vision_msgs")
 pytest.importorskip("tf2_msgs")
 
-from executables import executable
 from forked_nodes import Server
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
@@ -97,15 +96,15 @@ def replayed(run, tmp_path):
     return results(tmp_path / "replayed")
 
 
-def graph_slam(*words, timeout=60.0, **options):
-    return subprocess.run(
-        [executable("graph_slam"), *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        env=ENVIRONMENT,
-        **options,
-    )
+@functools.cache
+def server():
+    """What nodes and commands are forked from: with what was in the environment when the first of them started."""
+    return Server(ENVIRONMENT)
+
+
+def graph_slam(*words, timeout=60.0):
+    """Run a command: what it said, and its exit code."""
+    return server().run(["graph_slam", *map(str, words)], ENVIRONMENT, timeout)
 
 
 def until(condition, spin, what, patience_s=PATIENCE_S):
@@ -295,12 +294,6 @@ def robot(**options):
         r.close()
 
 
-@functools.cache
-def server():
-    """What nodes are forked from: with what was in the environment when the first was started."""
-    return Server(ENVIRONMENT)
-
-
 MODULE = [sys.executable, "-m", "graph_slam_ros.ros.node"]
 
 
@@ -323,7 +316,7 @@ class Started:
             *(word for r in remap for word in ("-r", r)),
         ]
         if by is None and server().can_fork(ENVIRONMENT):
-            self.process = server().start(words, ENVIRONMENT, cwd)
+            self.process = server().start(["node", *words], ENVIRONMENT, cwd)
         else:
             self.process = subprocess.Popen(
                 [*(by or MODULE), *words], env=ENVIRONMENT, cwd=cwd, stderr=subprocess.PIPE, text=True

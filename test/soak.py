@@ -38,6 +38,12 @@ PROGRAMMES = {
     "recorded": tests("test/test_recorded.py"),
     "fuzzing": tests("test/test_fuzzing.py"),
     "kernels": tests("test/test_kernels.py"),
+    "drives": tests(
+        *(
+            f"test/test_{name}.py"
+            for name in ("consistency", "displacement", "extreme_fixes", "initialization", "unnamed")
+        )
+    ),
     **{f"guided_{name}": guided(name) for name in ("g2o", "yaml", "cdr", "journal")},
     "planted_bugs": [sys.executable, "test/planted_bugs.py"],
     "recovery": [sys.executable, "-m", "benchmarks.recovery"],

@@ -249,10 +249,10 @@ CASES = [(name, use, n) for name, uses in CONVERTERS.items() for use in uses for
 
 @pytest.mark.parametrize("type_name, use, dimensions", CASES)
 def test_whatever_comes_is_used_or_counted_and_nothing_is_raised(type_name, use, dimensions):
-    count = times(20_000, 500_000) // len(CASES) + 1
+    count = times(5_000, 500_000) // len(CASES) + 1
     for seed, sigma in enumerate((0.1, 0.0)):
         sent = count // 5 if seed else count - count // 5
         became, told = play(seed, type_name, use, dimensions, sent, sigma)
         assert became["accepted"] or not sigma, "some are good"
-        assert told["any"]["undecodable"], "some are not even messages"
+        assert told["any"].get("undecodable") or not sigma, "some are not even messages"
         tell("messages", tried=sent, rejected=became["rejected"], failed=0)

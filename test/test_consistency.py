@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from reliability import times
 from scipy.stats import chi2
 
 from graph_slam_ros.consistency import Nees, class_noise, landmark_nees, pose_nees
@@ -154,7 +155,7 @@ def test_a_run_with_the_noise_it_was_told_of_is_consistent_and_its_sigmas_are_ri
     options = {"warehouse": {"aisles": 2, "laps": 1, "aisle_m": 6.0}, "flight": {"laps": 1, "beacons": 3}}[world]
     # a keyframe at each look: what is carried from look to keyframe shares its noise, which is not modelled
     settings = CLEAN | {"world.dimensions": n // 3 + 1, "keyframes.max_interval_s": 0.15}
-    last, runs = [], 8
+    last, runs = [], times(4, 8)
     for seed in range(runs):
         recording = simulate(world, seed, **options, correlation_time_s=0.0)
         folder = tmp_path / f"run_{seed}"

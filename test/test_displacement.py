@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reliability import times
 
 from graph_slam_ros.lie import se2
 from graph_slam_ros.run import map_of, record_run
@@ -110,7 +111,7 @@ def test_G23_slipping_wheels_are_found_and_the_path_before_stays(recording):
     assert found.max() < 3.0
 
 
-@pytest.mark.parametrize("rate", [0.05, 0.2])
+@pytest.mark.parametrize("rate", times([0.05], [0.05, 0.2]))
 def test_G23_wrong_identities_are_no_displacement(recording, rate):
     fault = Fault.named("wrong_ids", rate=rate)
     faulty = faulty_recording(recording, [fault], seed=3)[0] if rate else recording
@@ -120,7 +121,7 @@ def test_G23_wrong_identities_are_no_displacement(recording, rate):
     assert rate > 0.1 or not driven.slam.alarms
 
 
-@pytest.mark.parametrize("away_m, sigma_m", [(3.0, 0.05), (48.0, 0.5), (1e6, 0.5)])
+@pytest.mark.parametrize("away_m, sigma_m", [(3.0, 0.05), *times([], [(48.0, 0.5)]), (1e6, 0.5)])
 def test_G24_a_wrong_pose_that_somebody_gives_is_found_out_by_the_landmarks(recording, away_m, sigma_m):
     event_ns = int(recording.stamps_ns[int(0.7 * len(recording.stamps_ns))])
     covariance = tuple(np.diag([sigma_m**2, sigma_m**2, 0.0025]).ravel().tolist())

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from reliability import times
 
 from graph_slam_ros.batch import optimize
 from graph_slam_ros.errors import GraphSlamError
@@ -113,6 +114,7 @@ def test_public_graphs_reach_their_optimum_from_a_chordal_start(name, optimum):
     )
 
 
+@pytest.mark.skipif(not times(0, 1), reason="only in make soak")
 @pytest.mark.skipif(not GRAPHS.exists(), reason=f"no public graphs under {GRAPHS}")
 def test_a_graph_of_landmarks_that_no_other_start_solves_is_driven_through():
     solution = optimize(GRAPHS / "victoria_park.txt", Settings(max_iterations=50), init="online")

@@ -19,6 +19,7 @@ import pytest
 from journal_torture import IS_LONG, KINDS, STATES, config_of, errors, recorded, row
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
+from reliability import times
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats import durable
@@ -32,8 +33,7 @@ from graph_slam_ros.run.folder import BEGUN
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Odometry
 from graph_slam_ros.slam.measurements import to_record
 
-CUTS, FLIPS = 2_000, 5_000 if IS_LONG else 500
-KILLS = 3_000 if IS_LONG else 200
+CUTS, FLIPS, KILLS = times((400, 150, 40), (None, 5_000, 3_000))  # None: at every byte
 
 
 # -- cut and flipped ---------------------------------------------------------------------------------------------------
@@ -126,7 +126,7 @@ def spread(total, count):
 
 def test_T9_F16_cut_anywhere_the_longest_prefix_of_whole_flushes_is_read(parts, tmp_path):
     sizes = [len(part.data) for part in parts]
-    wrong, places = [], spread(sum(sizes), sum(sizes) if IS_LONG else CUTS)
+    wrong, places = [], spread(sum(sizes), CUTS or sum(sizes))
     for k, place in enumerate(reversed(places)):
         number = next(n for n in range(len(parts)) if place < sum(sizes[: n + 1]))
         length, part = place - sum(sizes[:number]), parts[number]
@@ -245,10 +245,10 @@ def test_T11_a_crash_at_any_call_that_reaches_the_disk_loses_nothing_that_was_to
 
 
 def test_T12_P4_a_disk_that_fails_at_any_call_is_told_of_and_loses_nothing(memory):
-    def one_of(n):
-        return [(KINDS[n % len(KINDS)], n // len(KINDS) % 2 == 0)]
+    def one_of(k):
+        return [(KINDS[k % len(KINDS)], k // len(KINDS) % 2 == 0)]
 
-    def each(n):
+    def each(k):
         return itertools.product(KINDS, (False, True))
 
     tried, wrong, recovered = 0, [], 0

@@ -21,7 +21,7 @@ from graph_slam_ros.what_if import SavedGraph
 
 @pytest.fixture(scope="module")
 def world():
-    return list(measurements(simulate("warehouse", 0, aisles=2, laps=1)))
+    return list(measurements(simulate("warehouse", 0, aisles=2, laps=1, aisle_m=6.0)))
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +154,7 @@ def first(tmp_path_factory, world):
 @pytest.fixture(scope="module")
 def second(tmp_path_factory):
     """Of another drive, past the same landmarks."""
-    world = measurements(simulate("warehouse", 5, aisles=2, laps=1))
+    world = measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=6.0))
     return ended(tmp_path_factory.mktemp("runs") / "second", world)
 
 
@@ -250,7 +250,7 @@ def rmse(slam, *recordings):
 @pytest.fixture(scope="module")
 def elsewhere(tmp_path_factory):
     """Of another drive, in another map frame."""
-    world = measurements(simulate("warehouse", 5, aisles=2, laps=1))
+    world = measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=6.0))
     return ended(tmp_path_factory.mktemp("runs") / "elsewhere", world, ELSEWHERE)
 
 
@@ -271,7 +271,7 @@ def test_merge_lays_the_second_session_on_the_first(first, elsewhere, merged):
     assert both.graph.edge_count == one.graph.edge_count + two.graph.edge_count
     for name, mark in both.landmarks.items():
         assert mark.sightings == sum(m.landmarks[name].sightings for m in (one, two) if name in m.landmarks)
-    drives = [simulate("warehouse", seed, aisles=2, laps=1) for seed in (0, 5)]
+    drives = [simulate("warehouse", seed, aisles=2, laps=1, aisle_m=6.0) for seed in (0, 5)]
     assert rmse(both, *drives) < 0.05 + 0.5 * (rmse(one, drives[0]) + rmse(two, drives[1]))
     assert np.median(np.diag(both.landmark_covariances()[0])) < np.median(np.diag(one.landmark_covariances()[0]))
 
@@ -287,14 +287,14 @@ def test_a_merged_run_repeats_recovers_and_is_gone_on_in(merged, world, tmp_path
     known = set(start.landmarks)
     slam = drive(tmp_path / "third", run_config(merged), world, start)
     assert set(slam.landmarks) == known
-    drives = [simulate("warehouse", seed, aisles=2, laps=1) for seed in (0, 5, 0)]
+    drives = [simulate("warehouse", seed, aisles=2, laps=1, aisle_m=6.0) for seed in (0, 5, 0)]
     assert rmse(slam, *drives) < 0.15
 
 
 def test_merge_leaves_out_what_has_moved_and_tells(first, tmp_path, capsys):
     seen = taken_up(first, []).landmarks
     name = max(seen, key=lambda name: seen[name].sightings)
-    other = moved(measurements(simulate("warehouse", 5, aisles=2, laps=1)), name, 1.5)
+    other = moved(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=6.0)), name, 1.5)
     assert run("merge", first, ended(tmp_path / "other", other, ELSEWHERE), "--out", tmp_path / "out") == 0
     warning = capsys.readouterr().err
     assert f"landmark {name} is 1." in warning
@@ -308,14 +308,14 @@ def test_merge_leaves_out_what_has_moved_and_tells(first, tmp_path, capsys):
 
 
 def other_sightings():
-    return simulate("warehouse", 5, aisles=2, laps=1).seen
+    return simulate("warehouse", 5, aisles=2, laps=1, aisle_m=6.0).seen
 
 
 def test_merge_of_unnamed_landmarks_keeps_them_apart(first, elsewhere, tmp_path):
     config = Config.from_mapping({"landmarks.association": "joint"})
 
     def half_named(seed):
-        world = measurements(simulate("warehouse", seed, aisles=2, laps=1, sensor="position"))
+        world = measurements(simulate("warehouse", seed, aisles=2, laps=1, aisle_m=6.0, sensor="position"))
         for m in world:
             if isinstance(m, Sightings):
                 m = replace(m, sightings=tuple(replace(s, id=s.id if hash_of(s.id) % 2 else "") for s in m.sightings))
@@ -342,7 +342,7 @@ def test_merge_of_unnamed_landmarks_keeps_them_apart(first, elsewhere, tmp_path)
 
 @pytest.mark.parametrize("kind", ["flight", "ranges"])
 def test_merge_in_space_and_of_what_shares_an_offset(kind, tmp_path):
-    options = {"aisles": 2, "laps": 2, "sensor": "range"} if kind == "ranges" else {}
+    options = {"aisles": 2, "laps": 1, "aisle_m": 6.0, "sensor": "range"} if kind == "ranges" else {"laps": 1}
     settings = {"landmarks.range_offset_sigma_m": 0.5} if kind == "ranges" else {"world.dimensions": 3}
     name = "warehouse" if kind == "ranges" else "flight"
     recordings = [simulate(name, seed, **options) for seed in (0, 3)]
@@ -422,7 +422,7 @@ def assert_untouched(slam, source):
 
 
 def another_drive():
-    return simulate("warehouse", 5, aisles=2, laps=1)
+    return simulate("warehouse", 5, aisles=2, laps=1, aisle_m=6.0)
 
 
 def test_freeze_changes_nothing_and_is_a_run_like_any_other(first, frozen, tmp_path):
@@ -439,7 +439,7 @@ def test_in_a_frozen_map_the_robot_is_located_as_well_as_in_one_that_goes_on(fir
     slam = gone_on(tmp_path / "run", frozen, world)
     assert_untouched(slam, frozen)
     assert len(slam.keyframes) > 1.5 * slam.segments[1], "the drive is in the graph"
-    drives = [simulate("warehouse", 0, aisles=2, laps=1), another_drive()]
+    drives = [simulate("warehouse", 0, aisles=2, laps=1, aisle_m=6.0), another_drive()]
     open_map = gone_on(tmp_path / "open", first, world)
     assert rmse(slam, *drives) < 1.5 * rmse(open_map, *drives) + 0.02
     assert run("replay", tmp_path / "run", "--out", tmp_path / "again") == 0
@@ -508,10 +508,10 @@ def test_a_run_in_a_frozen_map_that_was_cut_off_is_taken_up_with_it_frozen(froze
 
 def test_without_names_and_with_closures_a_frozen_map_stays(tmp_path):
     config = Config.from_mapping({"landmarks.association": "joint"})
-    recording = with_closures(simulate("warehouse", 0, aisles=2, laps=2, sensor="position"), 60, 0)
+    recording = with_closures(simulate("warehouse", 0, aisles=2, laps=2, aisle_m=6.0, sensor="position"), 60, 0)
     source = ended(tmp_path / "run", without_names(measurements(recording)), config)
     assert run("freeze", source, "--out", tmp_path / "frozen") == 0
-    again = with_closures(simulate("warehouse", 5, aisles=2, laps=2, sensor="position"), 60, 1)
+    again = with_closures(simulate("warehouse", 5, aisles=2, laps=2, aisle_m=6.0, sensor="position"), 60, 1)
     world = [*without_names(measurements(again)), Control("clear_closures")]
     slam = gone_on(tmp_path / "more", tmp_path / "frozen", world)
     assert_untouched(slam, tmp_path / "frozen")

@@ -195,7 +195,7 @@ def test_without_a_node_the_player_says_so(bag, monkeypatch, capsys):
     from graph_slam_ros.ros import player
 
     monkeypatch.setattr(player, "_PATIENCE_S", 0.5)
-    monkeypatch.setattr(os, "environ", ENVIRONMENT)
+    monkeypatch.setattr(os, "environ", dict(ENVIRONMENT))
     assert main(["replay", str(bag), "--ros", "--node", "/nobody"]) == 2
     assert capsys.readouterr().err == "graph_slam: no parameters of /nobody: is the node running?\n"
 

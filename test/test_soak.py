@@ -1,4 +1,4 @@
-"""Hours of a robot's life: it drives for ten minutes of each, parks, and every six hours its computer dies."""
+"""Hours of a robot's life: it drives for a part of each, parks, and every six hours its computer dies."""
 
 import os
 import resource
@@ -16,7 +16,7 @@ from graph_slam_ros.simulation.recording import START_NS
 from graph_slam_ros.slam import Config, Counters, Odometry
 
 S = 1_000_000_000
-HOUR_NS, DRIVE_NS = 3600 * S, 600 * S
+HOUR_NS, DRIVE_NS = 3600 * S, times(200, 600) * S
 REBOOT_HOURS = 6.0
 JITTER_M = 2e-5
 """Of odometry while the robot is parked."""
@@ -77,7 +77,7 @@ def usage():
 def test_T19_hours_of_driving_parking_and_dying(tmp_path):
     hours = times(1, 24)
     every = REBOOT_HOURS if hours > REBOOT_HOURS else 0.5
-    recording = simulate("warehouse", 3, aisles=3, laps=-(-hours * 600 // 60))
+    recording = simulate("warehouse", 3, aisles=3, laps=-(-hours * DRIVE_NS // (60 * S)))
     assert recording.stamps_ns[-1] - recording.stamps_ns[0] >= hours * DRIVE_NS
     computer, reboots, lost = Computer(tmp_path / "run"), 1, 0
     before = None

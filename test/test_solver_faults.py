@@ -356,7 +356,7 @@ def test_T13_without_memory_a_solve_fails_and_with_memory_again_it_goes_on():
     """In children of this process, of which each lacks other memory."""
     p = run(pipeline(), many(0, 600))
     measurements, codes = [*many(600, 660), *END], {}
-    for seed in range(times(64, 1000)):
+    for seed in range(times(32, 1000)):
         child = os.fork()
         if not child:
             code = BAD + 2

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from live_drive import TAGS, Drive, distance, earlier_run
-from live_nodes import ENVIRONMENT, lenient, node, often, own_domain, replayed, results, robot, until
+from live_nodes import ENVIRONMENT, lenient, node, own_domain, replayed, results, robot, until
 from nav_msgs.msg import Path
 from rclpy.qos import ReliabilityPolicy
+from reliability import times
 from tf2_msgs.msg import TFMessage
 
 from graph_slam_ros.ros.interfaces import typestore
@@ -412,12 +413,16 @@ def test_odometry_in_the_map_comes_at_each_message_and_grows_less_certain_until_
 # -- a long life -------------------------------------------------------------------------------------------------------
 
 
+MOST = times(2_000, 10_000)
+PATH_AT_MOST = f"output.path_max_poses:={MOST}"
+
+
 @pytest.fixture(scope="module")
 def veteran(tmp_path_factory):
-    """A node with a life behind it: (its robot, a drive, keyframes of that life, the first and last stamp)."""
-    folder, keyframes = tmp_path_factory.mktemp("veteran"), 100_000 if often(1) > 1 else 12_000
+    """A node with a life behind it: (its robot, a drive, the first and last stamp of that life)."""
+    folder, keyframes = tmp_path_factory.mktemp("veteran"), times(3_000, 100_000)
     stamps = earlier_run(folder / "life", keyframes)
-    parameters = f"output.folder:={folder / 'run'}", "output.load:=life", "solve.every_keyframes:=200"
+    parameters = f"output.folder:={folder / 'run'}", "output.load:=life", "solve.every_keyframes:=200", PATH_AT_MOST
     hears = "path", "odometry", "/tf", "/diagnostics"
     with node(*parameters) as n, robot(hears=hears, raw=("path",)) as r:
         r.wait_for_node()
@@ -429,15 +434,15 @@ def veteran(tmp_path_factory):
         assert r.set({"solve.every_keyframes": 1}) == (True, "")
         drive = Drive()
         until(lambda: r.heard["tf"], drive.pace(r), "a place in the old map")
-        yield r, drive, keyframes, (stamps[0], stamps[-1])
+        yield r, drive, (stamps[0], stamps[-1])
         n.process.kill()  # to save all of it takes a while
 
 
 def test_P8_of_a_path_that_is_too_long_some_poses_are_published_the_first_and_last_among_them(veteran):
-    r, drive, keyframes, earlier = veteran
+    r, drive, earlier = veteran
     path = typestore().deserialize_cdr(r.heard["path"][0], "nav_msgs/msg/Path")
     stamps = [stamp_ns(one.header) for one in path.poses]
-    assert min(keyframes, 10_000) / 2 < len(stamps) <= 10_000
+    assert MOST / 2 < len(stamps) <= MOST
     assert (stamps[0], stamps[-1]) == earlier
     assert stamps == sorted(stamps)
     r.heard["path"].clear()
@@ -451,31 +456,31 @@ def test_P8_of_a_path_that_is_too_long_some_poses_are_published_the_first_and_la
 
 
 def test_P9_while_everything_is_solved_and_saved_transforms_odometry_and_diagnostics_go_on(veteran):
-    r, drive, *_ = veteran
+    r, drive, _ = veteran
     drive.go(r, 20)
     r.settle()
-    for heard in r.heard.values():
-        heard.clear()
-    futures, since, times = [r.ask("optimize"), r.ask("save")], time.monotonic(), []
+    for topic in r.heard.values():
+        topic.clear()
+    futures, since, heard = [r.ask("optimize"), r.ask("save")], time.monotonic(), []
 
     def step(seconds):
         drive.pace(r)(seconds)
-        times.append((time.monotonic() - since, len(r.heard["odometry"]), len(r.heard["tf"])))
+        heard.append((time.monotonic() - since, len(r.heard["odometry"]), len(r.heard["tf"])))
 
     until(lambda: all(future.done() for future in futures), step, "solution", 60.0)
-    took_s, counts = time.monotonic() - since, {topic: len(heard) for topic, heard in r.heard.items()}
+    took_s, counts = time.monotonic() - since, {topic: len(some) for topic, some in r.heard.items()}
     assert all(future.result().success for future in futures)
     assert took_s > 0.2, "or nothing is shown"
-    assert counts["odometry"] >= 0.9 * len(times) - 5, (counts, len(times))
-    assert counts["tf"] >= 0.5 * min(len(times), took_s / 0.05) - 5, (counts, len(times), took_s)
+    assert counts["odometry"] >= 0.9 * len(heard) - 5, (counts, len(heard))
+    assert counts["tf"] >= 0.5 * min(len(heard), took_s / 0.05) - 5, (counts, len(heard), took_s)
     assert counts["diagnostics"] >= 0.5 * took_s - 1, (counts, took_s)
-    assert longest_gap(times, 1) < lenient(0.5), "odometry comes evenly"
-    assert longest_gap(times, 2) < lenient(0.5), "and so do transforms"
+    assert longest_gap(heard, 1) < lenient(0.5), "odometry comes evenly"
+    assert longest_gap(heard, 2) < lenient(0.5), "and so do transforms"
 
 
-def longest_gap(times, column):
+def longest_gap(heard, column):
     """How long a count did not grow."""
-    at = [b[0] for a, b in itertools.pairwise(times) if b[column] > a[column]]
+    at = [b[0] for a, b in itertools.pairwise(heard) if b[column] > a[column]]
     return max(b - a for a, b in itertools.pairwise(at))
 
 

@@ -1,10 +1,6 @@
 """Surveyed landmarks and a start pose: the run lies in the frame of the floor plan, not where odometry began."""
 
 import json
-import os
-import random
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -268,34 +264,26 @@ def test_a_run_keeps_the_survey_it_was_made_with_and_repeats_without_the_file(tm
 
 # -- live -------------------------------------------------------------------------------------------------------------
 
-ENVIRONMENT = dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", ROS_DOMAIN_ID=str(random.randint(1, 100)))
-
-
-def command(*words, module="graph_slam_ros.cli"):
-    done = [sys.executable, "-m", module, *map(str, words)]
-    return subprocess.run(done, capture_output=True, text=True, timeout=120.0, env=ENVIRONMENT)
-
 
 def test_the_node_reads_the_file_and_saves_what_replay_saves(tmp_path):
-    for package in ("rclpy", "vision_msgs", "tf2_msgs"):
-        pytest.importorskip(package)
+    live = pytest.importorskip("live_nodes")
     recording = simulate("warehouse", 4, **SMALL)
     bag, plan = tmp_path / "drive.mcap", tmp_path / "plan.csv"
     write_bag(recording, bag)
     plan.write_text(plan_of(recording))
     words = ("--set", f"landmarks.surveyed_file={plan}", "--set", f"anchor.pose={start_of(recording)}")
     replay(bag, tmp_path / "offline", Config.from_mapping(dict(word.split("=", 1) for word in words[1::2])))
-    done = command("replay", bag, "--ros", "--out", tmp_path / "live", *words)
+    done = live.graph_slam("replay", bag, "--ros", "--out", tmp_path / "live", *words)
     assert done.returncode == 0, done.stderr
     for name in ("graph.g2o", "path.tum", "landmarks.csv"):
         assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "offline" / name).read_bytes()
 
 
 def test_a_node_whose_file_is_wrong_does_not_start_and_says_where(tmp_path):
-    pytest.importorskip("rclpy")
+    live = pytest.importorskip("live_nodes")
     plan = tmp_path / "plan.csv"
     plan.write_text(table([("a", 1, 2, 0)]))
-    words = ("--ros-args", "-p", "output.folder:=''", "-p", f"landmarks.surveyed_file:={plan}")
-    done = command(*words, module="graph_slam_ros.ros.node")
-    assert done.returncode == 2
-    assert f"{plan}: line 2: sigma 0 is not above 0" in done.stderr
+    with live.node("output.folder:=''", f"landmarks.surveyed_file:={plan}") as n:
+        code, said = n.ended(60.0)
+    assert code == 2
+    assert f"{plan}: line 2: sigma 0 is not above 0" in said
