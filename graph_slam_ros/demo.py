@@ -34,7 +34,7 @@ def demo(out: Path, *, live: bool, force: bool, progress: Callable[[str], Any], 
         draw_run(out, str(recording), out / "path.png")
     summary = json.loads(read_text(out / SUMMARY))
     through = "a live ROS graph (rclpy)" if live else "the pipeline directly: no ROS 2 here"
-    say(f"replayed {recording.name} through {through} in {took_s:.1f} s")
+    say(f"replayed {recording.name} through {through} in {took_s:.1f} s of wall time")
     say(f"  keyframes        {summary['keyframes']}")
     say(f"  landmarks        {summary['landmarks']}, from {summary['sightings']} sightings")
     say(f"  edges            {summary['edges']}")

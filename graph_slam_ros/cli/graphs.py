@@ -79,8 +79,13 @@ def _after(args: argparse.Namespace, converged: bool) -> str:
 
 def _options(args: argparse.Namespace) -> Iterable[str]:
     """What was asked for of the solution, as it was typed."""
-    values = {"--method": args.method, "--loss": _loss_text(args.loss), "--init": args.init, "--from": args.source}
-    usual = {"--method": "gn", "--loss": "none", "--init": "auto", "--from": None}
+    values: dict[str, object] = {
+        "--method": args.method,
+        "--loss": _loss_text(args.loss),
+        "--init": args.init,
+        "--from": args.source,
+    }
+    usual: dict[str, object] = {"--method": "gn", "--loss": "none", "--init": "auto", "--from": None}
     values |= {"--max-iterations": args.max_iterations, "--tolerance": args.tolerance}
     usual |= {"--max-iterations": 100, "--tolerance": 1e-6}
     values |= {"--error-map": args.error_map, "--information": args.information}

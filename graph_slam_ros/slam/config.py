@@ -6,8 +6,11 @@ types and values out of range are refused with the name of the culprit.
 
 import dataclasses
 import difflib
+import inspect
+import itertools
 import math
 import re
+import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -514,10 +517,22 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _described() -> str:
-    """The docstring of ``Config`` with every parameter: name, default, unit and meaning."""
+    """The docstring of ``Config`` with every parameter by section: name, default, unit and meaning, folded."""
     meanings = notes()
-    lines = [f"    {p.name} = {p.default!r}\n        {meanings[p.name]}" for p in parameters()]
-    return f"{Config.__doc__}\n    Parameters with their defaults:\n\n" + "\n".join(lines) + "\n"
+    sections = dict(_sections()) | {name: default_input(name) for name in USUAL_INPUTS}
+    lines = ["    Parameters with their defaults:"]
+    for section, own in itertools.groupby(parameters(), lambda p: p.name.partition(".")[0]):
+        meaning, _, _ = (inspect.getdoc(sections[section]) or "").partition("\n")
+        lines += ["", f"    {section}: {meaning}", ""]
+        for p in own:
+            lines.append(f"      {p.name} = {p.default!r}")
+            lines += textwrap.wrap(meanings[p.name], 100, initial_indent=" " * 10, subsequent_indent=" " * 10)
+    return f"{Config.__doc__}\n" + "\n".join(lines) + "\n"
 
 
 Config.__doc__ = _described()
+_sections_by_name = inspect.Parameter("sections", inspect.Parameter.VAR_KEYWORD)  # with all defaults it is a screenful
+Config.__signature__ = inspect.Signature([_sections_by_name])  # type: ignore[attr-defined]
+Config.__init__.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+    [inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY), _sections_by_name]
+)
