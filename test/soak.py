@@ -31,6 +31,8 @@ PROGRAMMES = {
     "lives": tests("test/test_life.py"),
     "mutated_bags": tests("test/test_mutated_recordings.py"),
     "soak": tests("test/test_soak.py"),
+    "large": tests("test/test_large.py"),
+    "bursts": tests("test/test_bursts.py", "test/test_extreme_fixes.py"),
     "journal": tests("test/test_journal.py"),
     "messages": tests("test/test_any_message.py", "test/test_any_measurement.py"),
     "permutations": tests("test/test_timing_cases.py", "-k", "B1"),

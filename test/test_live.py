@@ -4,6 +4,7 @@ import itertools
 import math
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,6 +48,15 @@ def test_dated_by_the_clock_it_is_silent_with_odometry_and_never_dated_back():
     assert correction.next(tf, 101 * NS, 5 * NS, (0.0, 0.0, 0.0), HERE) is None
     assert correction.next(tf, 99 * NS, 6 * NS, (0.0, 0.0, 0.0), HERE) is None
     assert correction.next(tf, 101 * NS, 6 * NS, (0.0, 0.0, 0.0), HERE) == (101 * NS + NS // 2, HERE)
+
+
+def test_what_would_be_dated_before_the_last_is_not_told_and_how_much_earlier_is_known():
+    policy, tf = MapToOdom(Config()), Config().tf
+    assert policy.next(replace(tf, transform_tolerance=9.0), 0, NS, (0.0,) * 3, (0.0,) * 3) is not None
+    assert policy.next(tf, 0, 2 * NS, (0.0,) * 3, (0.0,) * 3) is None
+    assert policy.behind_s == pytest.approx(8.0 - tf.transform_tolerance)
+    assert policy.next(tf, 0, 20 * NS, (0.0,) * 3, (0.0,) * 3) is not None
+    assert policy.behind_s == 0.0
 
 
 @pytest.mark.parametrize("T_odom_base", [(0.0, 0.0, 0.0), (-40.0, 70.0, 2.0)])
@@ -283,6 +293,12 @@ def test_what_is_wrong_before_the_first_estimate_is_named(facts, state, reason):
             " give each odometry a topic and an input of its own (inputs.names)",
         ),
         ({"is_paused": True}, (), "paused"),
+        (
+            {"tf_behind_s": 3600.0},
+            (),
+            "map -> odom is not sent: the last was dated 3600 s later (tf.stamp, tf.transform_tolerance);"
+            " deactivate and activate the node, and listeners with it",
+        ),
         ({"failures": 2}, (), "2 solves failed: the last good estimate stands"),
         ({"overflows": 5}, (), "5 messages refused: the queue is full (inputs.queue)"),
         ({"lag_s": 1.5, "waiting": 70}, (), "the solver is 1.5 s behind, 70 messages wait"),

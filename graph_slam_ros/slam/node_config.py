@@ -44,7 +44,9 @@ class TfConfig:
         choices=("odometry", "now"),
         live=True,
     )
-    transform_tolerance: float = setting(0.1, "how far ahead of that the transform is dated", "s", low=0.0, live=True)
+    transform_tolerance: float = setting(
+        0.1, "how far ahead of that the transform is dated", "s", low=0.0, high=10.0, live=True
+    )
     max_speed_m_s: float = setting(
         0.0, "corrections are followed no faster than this; 0: at once", "m/s", low=0.0, live=True
     )

@@ -57,6 +57,11 @@ class Broadcaster:
             self._others_s = time.monotonic()
 
     @property
+    def behind_s(self) -> float:
+        """How much earlier than the last the transform would be dated now: until then it is not sent."""
+        return self._policy.behind_s
+
+    @property
     def has_rival(self) -> bool:
         """Whether somebody else has broadcast it lately."""
         return time.monotonic() - self._others_s < _OTHERS_S

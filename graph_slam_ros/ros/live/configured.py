@@ -453,6 +453,7 @@ class Configured:
             has_other_authority=rivals is not None,
             authorities=rivals or (),
             twins=twins,
+            tf_behind_s=broadcaster.behind_s if broadcaster is not None else 0.0,
             preparing=self._preparation.said,
             cannot_prepare=self._preparation.fault,
         )

@@ -15,6 +15,7 @@ from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.reasons import explain, remedy
 
 _LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them
+_TF_BEHIND_S = 1.0
 _LONGEST = 80  # of a frame's name
 _UNLINKED = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
 
@@ -66,6 +67,7 @@ class Facts:
     failing : why the last solve failed; empty where it did not
     memory_is_short : the process has more than ``health.memory_mib``
     authorities : other nodes that broadcast map -> odom, if somebody does
+    tf_behind_s : how much earlier than the last map -> odom would be dated now, so that it is not sent
     preparing : what keeps the pipeline from beginning: kernels are compiled or loaded; empty when they are ready
     cannot_prepare : why that failed
     """
@@ -92,6 +94,7 @@ class Facts:
     has_other_authority: bool = False
     authorities: tuple[str, ...] = ()
     twins: int = 0
+    tf_behind_s: float = 0.0
     preparing: str = ""
     cannot_prepare: str = ""
 
@@ -201,6 +204,11 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
             yield f"{one.topic}: {_refused(one)}"
     if facts.is_paused:
         yield "paused"
+    if facts.tf_behind_s > _TF_BEHIND_S:
+        yield (
+            f"map -> odom is not sent: the last was dated {facts.tf_behind_s:.0f} s later"
+            " (tf.stamp, tf.transform_tolerance); deactivate and activate the node, and listeners with it"
+        )
     if facts.failing:
         yield f"solves fail, the last good estimate stands: {facts.failing}"
     elif facts.failures:

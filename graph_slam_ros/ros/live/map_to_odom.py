@@ -8,17 +8,24 @@ from graph_slam_ros.slam.space import Numbers, Space
 
 
 class MapToOdom:
-    """The correction as it is broadcast; it follows the estimate at once, or at a limited speed of the robot in map."""
+    """The correction as it is broadcast; it follows the estimate at once, or at a limited speed of the robot in map.
+
+    Attributes
+    ----------
+    behind_s : how much earlier than the last that was told it would be dated now, so that it is not told
+    """
 
     def __init__(self, config: Config) -> None:
         self._space: Space = config.space
         self._newest_ns: int | None = None  # odometry that has been told
         self._sent_ns: int | None = None
         self._told: Numbers | None = None
+        self.behind_s = 0.0
 
     def forget_time(self) -> None:
         """Stamps begin anew."""
         self._newest_ns = self._sent_ns = None
+        self.behind_s = 0.0
 
     def next(
         self, config: TfConfig, now_ns: int, odometry_ns: int, T_odom_base: Numbers, T_map_odom: Numbers
@@ -35,6 +42,7 @@ class MapToOdom:
             return None
         stamp_ns = odometry_ns if config.stamp == "odometry" else now_ns
         stamp_ns += round(config.transform_tolerance * 1e9)
+        self.behind_s = max(0.0, ((self._sent_ns or 0) - stamp_ns) * 1e-9)
         if self._sent_ns is not None and stamp_ns <= self._sent_ns:
             return None
         elapsed_s = 0.0 if self._newest_ns is None else (odometry_ns - self._newest_ns) * 1e-9
