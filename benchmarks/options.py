@@ -9,6 +9,7 @@ from pathlib import Path
 
 from benchmarks.fresh import ROOT
 from benchmarks.problem import Problem, read_problem
+from graph_slam_ros.cli import values
 from graph_slam_ros.errors import GraphSlamError
 
 PATIENCE_S = 600.0
@@ -38,34 +39,20 @@ def _names(text: str, known: Sequence[str]) -> list[str]:
     return names
 
 
-def count(text: str) -> int:
-    """A positive integer."""
-    if not text.isdecimal() or not 0 < int(text) < 10**9:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive integer")
-    return int(text)
-
-
-def seconds(text: str) -> float:
-    """A positive number."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
-    return value
-
-
 def add_files(options: argparse.ArgumentParser) -> None:
     """Graphs to race on, and how often."""
     options.add_argument("files", nargs="*", type=Path, metavar="FILE", help="graphs (default: all that are at hand)")
-    options.add_argument("--reps", type=count, default=3, metavar="N", help="repetitions; their medians are told")
-    options.add_argument("--poses", type=count, metavar="N", help="the first N poses of each graph only")
+    options.add_argument(
+        "--reps", type=values.count, default=3, metavar="N", help="repetitions; their medians are told"
+    )
+    options.add_argument("--poses", type=values.count, metavar="N", help="the first N poses of each graph only")
 
 
 def add_patience(options: argparse.ArgumentParser) -> None:
     """When to call a drive off."""
-    options.add_argument("--patience", type=seconds, default=PATIENCE_S, metavar="S", help="CPU seconds for a drive")
+    options.add_argument(
+        "--patience", type=values.positive, default=PATIENCE_S, metavar="S", help="CPU seconds for a drive"
+    )
 
 
 def problems(args: argparse.Namespace) -> Iterator[Problem]:

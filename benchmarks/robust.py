@@ -26,6 +26,7 @@ from benchmarks.kept import Kept, code_of, digest
 from benchmarks.robust_cells import Rates
 from benchmarks.scores import Row, Score, Stage, row, score, stages
 from benchmarks.trials import POLICIES, Trial
+from graph_slam_ros.cli import values
 from graph_slam_ros.errors import GraphSlamError
 
 SEEDS = 10
@@ -143,13 +144,13 @@ def main() -> None:
     parser.add_argument("--policy", type=_policies, metavar="NAME,...", help=f"of {', '.join(POLICIES)}")
     parser.add_argument("--rate", type=_rates, default=[0.3], metavar="R,...", help="false ones of all (0.3)")
     parser.add_argument(
-        "--seeds", type=options.count, default=SEEDS, metavar="N", help=f"default: {SEEDS}; peers: {FEW_SEEDS}"
+        "--seeds", type=values.count, default=SEEDS, metavar="N", help=f"default: {SEEDS}; peers: {FEW_SEEDS}"
     )
     parser.add_argument(
-        "--patience", type=options.seconds, default=PATIENCE_S, metavar="S", help="CPU seconds for a peer's run"
+        "--patience", type=values.positive, default=PATIENCE_S, metavar="S", help="CPU seconds for a peer's run"
     )
-    parser.add_argument("--jobs", type=options.count, default=1, metavar="N", help="seeds at a time")
-    parser.add_argument("--poses", type=options.count, metavar="N", help="the first N poses of each graph only")
+    parser.add_argument("--jobs", type=values.count, default=1, metavar="N", help="seeds at a time")
+    parser.add_argument("--poses", type=values.count, metavar="N", help="the first N poses of each graph only")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="of what was run; what is there is not run again")
     args = parser.parse_args()
     if args.keep is not None and args.keep.exists() and not args.keep.is_dir():

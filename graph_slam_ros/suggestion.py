@@ -259,7 +259,8 @@ class Suggestion:
             if not one.usable:
                 self.unused[one.topic.name] = "no message has a fix"
                 continue
-            self._add("gps", one, {} if one.has_noise else {"sigma_m": 2.0})
+            self._add("gps", one, {} if one.has_noise else {"sigma_m": 2.0}, linked=True)
+            self._mount(one.topic.name, one.frame)  # says what is assumed; the input itself assumes and counts it
             if not one.has_noise:
                 self.notes.append(f"{one.topic.name} does not tell its noise: 2 m is assumed")
         self._choose_imu(self._of_type(IMU), is_needed=len(self._names) == 1)

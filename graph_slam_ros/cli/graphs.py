@@ -79,20 +79,14 @@ def _after(args: argparse.Namespace, converged: bool) -> str:
 
 def _options(args: argparse.Namespace) -> Iterable[str]:
     """What was asked for of the solution, as it was typed."""
-    values: dict[str, object] = {
-        "--method": args.method,
-        "--loss": _loss_text(args.loss),
-        "--init": args.init,
-        "--from": args.source,
-    }
-    usual: dict[str, object] = {"--method": "gn", "--loss": "none", "--init": "auto", "--from": None}
-    values |= {"--max-iterations": args.max_iterations, "--tolerance": args.tolerance}
-    usual |= {"--max-iterations": 100, "--tolerance": 1e-6}
-    values |= {"--error-map": args.error_map, "--information": args.information}
-    usual |= {"--error-map": "relative", "--information": "g2o"}
-    for option, value in values.items():
-        if value != usual[option]:
-            yield from (option, str(value))
+    from graph_slam_ros.cli.parser import parser
+
+    usual = parser().parse_args(["optimize", "GRAPH"])
+    for option in ("method", "loss", "init", "from", "max-iterations", "tolerance", "error-map", "information"):
+        name = {"from": "source"}.get(option, option.replace("-", "_"))
+        value = getattr(args, name)
+        if value != getattr(usual, name):
+            yield from (f"--{option}", _loss_text(value) if name == "loss" else str(value))
     if args.lenient:
         yield "--lenient"
 
