@@ -269,7 +269,9 @@ def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
         return None
     path, covariances = read_tum(run / "path.tum"), read_covariances(run / COVARIANCES)
     if len(covariances) != len(path.stamps_s):
-        raise GraphSlamError(f"{run / COVARIANCES}: {len(covariances)} covariances of {len(path.stamps_s)} poses")
+        raise GraphSlamError(
+            f"{run / COVARIANCES}: {len(covariances)} rows, and path.tum has {len(path.stamps_s)} poses"
+        )
     path, covariances = path.at(drive.keyframes), covariances[drive.keyframes]
     truth = known.trajectory if covariances.shape[1] == 6 else known.trajectory.in_plane()
     true = interpolated(truth, path.stamps_s)

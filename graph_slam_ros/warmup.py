@@ -99,16 +99,19 @@ def _compile(is_told_to_stop: Callable[[], bool], tell: Tell) -> None:
     """Once per installation, into the cache on disk."""
     start, began_with = time.perf_counter(), _cached()
     command, path = [sys.executable, "-m", __name__], os.pathsep.join(filter(None, sys.path))
-    with subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path}, start_new_session=True) as compiler:
+    environment = os.environ | {"PYTHONPATH": path}
+    with subprocess.Popen(command, env=environment, start_new_session=True, stderr=subprocess.PIPE) as compiler:
         try:
-            while (code := _ended(compiler)) is None:
+            while (said := _ended(compiler)) is None:
                 tell(Compiling(_cached(), time.perf_counter() - start, began_with))
                 if is_told_to_stop():
                     raise GraphSlamError("told to stop before all kernels were compiled")
         finally:
             compiler.kill()  # Ctrl-C, which it does not hear itself
-    if code:
-        raise subprocess.CalledProcessError(code, command)
+    if compiler.returncode:
+        why = said.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {compiler.returncode}"]
+        remedy = "GRAPH_SLAM_CACHE names a folder with 100 MB of room"
+        raise GraphSlamError(f"{CACHE_DIR}: kernels could not be compiled: {why[0]}; {remedy}")
 
 
 def _cached() -> int:
@@ -116,10 +119,10 @@ def _cached() -> int:
     return len({file.name for file in CACHE_DIR.rglob("*.nbi")})
 
 
-def _ended(process: "subprocess.Popen[bytes]") -> int | None:
-    """The exit code, if it ends soon."""
+def _ended(process: "subprocess.Popen[bytes]") -> bytes | None:
+    """What it said on standard error, if it ends soon."""
     with contextlib.suppress(subprocess.TimeoutExpired):
-        return process.wait(0.1)
+        return process.communicate(timeout=0.1)[1]
     return None
 
 

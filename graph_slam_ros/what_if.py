@@ -195,7 +195,8 @@ def _graph(folder: Path, entries: Sequence[Entry]) -> tuple[Graph, list[int]]:
         try:
             _add(out, entry, entry.label)
         except GraphSlamError as error:
-            raise FormatError(f"{folder / LEDGER}: edge {entry.edge}: {error}") from None
+            told = f"edge {entry.edge}: {error} (or {GRAPH} is not of the same run)"
+            raise FormatError(f"{folder / LEDGER}: {told}") from None
     _check_same_run(folder, file, entries)
     return out, [file.ids[vertex] for vertex in file.fixed]
 

@@ -19,7 +19,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 INTEGRATION = """anchor any_measurement any_message bag certificate consistency convert damaged_runs
     data displacement evaluation explain false_closures faults graph_cases graph_slam info
     initialization inputs_replay instruments life localize map_log maps message_cases nav2 nees
-    noise_and_losses online_graphs pipeline_kinds rates reach run_folder sessions simulation soak
+    noise_and_losses odd_files online_graphs pipeline_kinds rates reach run_folder sessions simulation soak
     timing_cases unnamed views what_if world_graphs"""
 """Files, without ``test_`` and ``.py``."""
 STARTS_ONE = re.compile(

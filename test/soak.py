@@ -46,6 +46,7 @@ PROGRAMMES = {
             for name in ("consistency", "displacement", "extreme_fixes", "initialization", "unnamed")
         )
     ),
+    "odd_files": tests("test/test_odd_files.py"),
     **{f"guided_{name}": guided(name) for name in ("g2o", "yaml", "cdr", "journal")},
     "planted_bugs": [sys.executable, "test/planted_bugs.py"],
     "recovery": [sys.executable, "-m", "benchmarks.recovery"],

@@ -8,6 +8,9 @@ they differ.
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small dense blocks: threads only cost, and reorder sums
+os.environ["MPLBACKEND"] = (
+    "agg"  # pictures go into files: what a shell says of windows is not for them, and may be wrong
+)
 
 import io
 import signal

@@ -212,7 +212,8 @@ def _say_run(source: Path, summary: dict[str, Any]) -> int:
 
     console.say(*outcome.text(summary))
     if not summary["keyframes"]:
-        raise GraphSlamError(f"{source}: no odometry of it could be used, see what was counted and graph_slam info")
+        why = f": {summary['losses'][0]}" if summary.get("losses") else ", see what was counted and graph_slam info"
+        raise GraphSlamError(f"{source}: no odometry of it could be used{why}")
     shortcomings = list(outcome.shortcomings(summary))
     for sentence in shortcomings:
         console.tell(sentence, most=_SENTENCE)

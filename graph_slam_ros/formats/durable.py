@@ -101,8 +101,10 @@ def replaced(path: Path) -> Iterator[Path]:
         finally:
             os.close(fd)
         os.replace(new, path)
-    except BaseException:  # an interrupt, too, leaves nothing behind
+    except BaseException as error:  # an interrupt, too, leaves nothing behind
         new.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, str(new)):  # who reads it knows the other name
+            raise OSError(error.errno, error.strerror, str(path)) from None
         raise
     sync_folder(path.parent)
 

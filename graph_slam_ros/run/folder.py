@@ -165,7 +165,7 @@ def run_config(folder: Path) -> Config:
 def changed_since(folder: Path) -> list[str]:
     """Files that are not those that ``run.json`` was written with: of a save that was cut off, exchanged, or edited."""
     out = list(_not_as_saved(folder, "files", lambda file: checksum(read_bytes(file))))
-    out += list(_not_as_saved(folder, "recorded", ends_of))
+    out += [change for change in _not_as_saved(folder, "recorded", ends_of) if change not in out]
     if any(now > then for _, then, now in _parts(folder)) or is_incomplete(folder):
         out.append("the run went on after its results were saved: graph_slam recover has those of its end")
     return out
@@ -179,7 +179,10 @@ def missing(folder: Path) -> list[str]:
 
 def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> Iterator[str]:
     """Of the files whose marks the summary has: those that are gone, cannot be read, or have another mark."""
-    told = summary_of(folder).get(kind)
+    summary = summary_of(folder)
+    if not summary and os.path.lexists(folder / SUMMARY):
+        yield f"{SUMMARY} is not the summary of a run: whether its files belong together is not known"
+    told = summary.get(kind)
     for name, mark in sorted(told.items()) if isinstance(told, dict) else ():
         if name in _RESULTS or name == CONFIG or _RECORDED.fullmatch(name):  # no path out of the folder
             try:

@@ -142,7 +142,7 @@ def record_run(
     Raises
     ------
     KeyboardInterrupt
-        Nothing of it is left in the folder.
+        Nothing of it is left in the folder; so it is whatever is raised before the first measurement is accepted.
     """
     took = took or stopwatch()
     recorder: RunRecorder | None = None
@@ -160,8 +160,10 @@ def record_run(
             recorder.discard()
         raise
     except BaseException:
-        if recorder is not None:
+        if recorder is not None and recorder.accepted:
             recorder.close()
+        elif recorder is not None:  # the first that was read was refused
+            recorder.discard()
         raise
     recorder.close()
     return slam, summary
@@ -203,7 +205,7 @@ def complete(folder: Path) -> Summary:
             )
             save_results(folder, slam, summary)
     except OSError as error:
-        raise RunError(f"{folder}: {error.strerror}") from None
+        raise RunError(f"{error.filename or folder}: {error.strerror}") from None
     return summary
 
 

@@ -1,0 +1,291 @@
+"""Odd files in the folder of a run and odd values of settings: one line, its exit code, and nothing is changed."""
+
+import contextlib
+import io
+import os
+import re
+import shutil
+import time
+
+import pytest
+import reliability
+from plain_rights import plain_rights
+
+from graph_slam_ros import cli
+from graph_slam_ros.cli.console import shortened
+from graph_slam_ros.replay import replay
+from graph_slam_ros.simulation import simulate, write_bag
+from graph_slam_ros.slam import Config
+
+MOST = 200  # characters of a line on standard error
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A recording and the runs of two."""
+    folder = tmp_path_factory.mktemp("made")
+    for name, seed in (("drive", 5), ("other", 6)):
+        write_bag(simulate("warehouse", seed, aisles=2, laps=1, aisle_m=4.0), folder / f"{name}.mcap")
+        config = Config.from_mapping({"keyframes.min_distance_m": 0.01 * seed})
+        replay(folder / f"{name}.mcap", folder / f"{name}_run", config)
+    return folder
+
+
+def answer(*words):
+    """Exit code and the lines on standard error of a command, in this process."""
+    err, start = io.StringIO(), time.process_time()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
+        try:
+            code = cli.main([str(word) for word in words])
+        except SystemExit as end:
+            code = end.code
+    assert time.process_time() - start < 30.0, words
+    return code, err.getvalue().splitlines()
+
+
+def state(folder):
+    """Names and contents of what is below a folder."""
+    return {str(path.relative_to(folder)): (path.lstat().st_mode, path.lstat().st_size) for path in folder.rglob("*")}
+
+
+def check(code, err, codes, culprit, what):
+    """It is one line that names the culprit, or lines of 200 characters where something was lost."""
+    assert code in codes, (what, code, err)
+    assert not any("Traceback" in line or "a fault of ours" in line for line in err), (what, err)
+    assert all(len(line) <= MOST for line in err), (what, err)
+    assert code not in (1, 2) or len(err) == 1, (what, err)
+    assert any(re.search(culprit, line) for line in err), (what, culprit, err)
+
+
+# -- a line ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_line_of_an_error_keeps_its_beginning_and_its_end(tmp_path):
+    long = "/".join(["a" * 60] * 20)
+    for line in (f"graph_slam: {long}/path.tum: no such file", f"{long} {long} x", "y " * 999, "z" * 999, "", "short"):
+        out = shortened(line, MOST)
+        assert len(out) <= MOST
+        assert (out[:9], out[-9:]) == (line[:9], line[-9:])
+    told = shortened(f"graph_slam: {long}/run/path.tum: cannot be read: do this", MOST)
+    assert told.endswith("/run/path.tum: cannot be read: do this")
+    folder = tmp_path / ("b" * 90) / ("c" * 90) / ("d" * 200)
+    for words in (("plot", folder), ("info", folder), ("optimize", folder / "a.g2o"), ("info", "e" * 5000)):
+        code, err = answer(*words)
+        check(code, err, (2,), "graph_slam", words)
+    for words in (("plot", "a", "b\x1b[2J\n" * 99), ("influence", "a", "--count", "\x1b" * 999), ("\n" * 300,)):
+        code, err = answer(*words)
+        check(code, err, (2,), "--help shows what there is", words)
+        assert not set("".join(err)) & set("\x1b\n"), words
+
+
+# -- files of a run ----------------------------------------------------------------------------------------------------
+
+LEDGERS = ("ledger.csv", "ledger_changes.csv")
+SCORED = ("run.json", "config.yaml", "path.tum", "sightings.tum", "odometry.tum", "landmarks.csv", "covariances.csv")
+OF_MAP = ("run.json", "config.yaml", "map.mcap")
+NEEDS = {  # what each command reads of a run
+    ("explain", "RUN"): ("run.json", "config.yaml", *LEDGERS),
+    ("explain", "RUN", "3"): ("run.json", "config.yaml", "graph.g2o", *LEDGERS),
+    ("solve", "RUN", "--without", "3"): ("run.json", "config.yaml", "graph.g2o", "ledger.csv"),
+    ("influence", "RUN", "--count", "1"): ("run.json", "config.yaml", "graph.g2o", "ledger.csv"),
+    ("evaluate", "RUN", "--truth", "BAG"): SCORED,
+    ("plot", "RUN"): SCORED,
+    ("replay", "RUN", "--out", "OUT"): ("run.json", "config.yaml", "ingest.mcap"),
+    ("replay", "BAG", "--map", "RUN", "--out", "OUT"): OF_MAP,
+    ("recover", "RUN", "--out", "OUT"): OF_MAP,
+    ("recover", "RUN"): OF_MAP,
+    ("freeze", "RUN", "--out", "OUT"): OF_MAP,
+    ("export", "RUN", "--to", "tum", "--out", "OUT"): OF_MAP,
+    ("diff", "RUN", "OTHER"): OF_MAP,
+    ("merge", "OTHER", "RUN", "--out", "OUT"): OF_MAP,
+}
+CASES = [(words, name) for words, names in NEEDS.items() for name in names]
+
+
+def unreadable(path, other):
+    path.chmod(0)
+
+
+def sparse(path, other):
+    os.truncate(path, 2**40)
+
+
+def of_another_kind(path, other):
+    kinds = {".tum": "graph.g2o", ".g2o": "path.tum", ".csv": "run.json", ".json": "run.mcap"}
+    shutil.copy(other / kinds.get(path.suffix, "ledger.csv"), path)
+    if path.suffix == ".mcap":
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + 999 * b"\0")
+
+
+def of_another_run(path, other):
+    shutil.copy(other / path.name, path)
+
+
+def asked(words, made, folder):
+    """The answer of a command about the run of a folder, to somebody who is no superuser."""
+    names = {"RUN": folder / "run", "BAG": made / "drive.mcap", "OUT": folder / "out", "OTHER": made / "other_run"}
+    with plain_rights():
+        return answer(*(names.get(word, word) for word in words))
+
+
+def wrong_with(odd, words, name, made, folder):
+    """What a command does wrong where one file of a run is odd; empty: nothing."""
+    shutil.copytree(made / "drive_run", folder / "run")
+    odd(folder / "run" / name, made / "other_run")
+    before = state(folder)
+    code, err = asked(words, made, folder)
+    after = state(folder)
+    changed = {file for file in before if after.get(file) != before[file]}
+    completed = words == ("recover", "RUN") and code in (0, 3)
+    try:
+        check(
+            code, err, (0, 2, 3, 4), re.escape(name) + r"|run\.json|of the same drive in", (odd.__name__, words, name)
+        )
+        assert code != 0 or "beware" in "".join(err)
+        assert completed or changed <= {"run/path.png"}, changed
+        assert code in (0, 3, 4) or not (folder / "out").exists() or "no odometry of it could be used" in err[0]
+    except AssertionError as error:
+        return f"{odd.__name__} {words} {name}: {code} {err}: {error}"
+    finally:
+        (folder / "run" / name).chmod(0o600)
+        shutil.rmtree(folder)
+    return ""
+
+
+@pytest.mark.parametrize("odd", [unreadable, sparse, of_another_kind, of_another_run])
+def test_an_odd_file_in_the_folder_of_a_run_is_named_by_each_command_that_reads_it(made, tmp_path, odd):
+    """Each command with each file that it needs; a sixth of them in turn, all with ``make soak``."""
+    cases = CASES[len(odd.__name__) % 6 :: reliability.times(6, 1)]
+    wrong = [wrong_with(odd, *case, made, tmp_path / str(k)) for k, case in enumerate(cases)]
+    reliability.tell("odd_files", tried=len(cases), failed=sum(map(bool, wrong)))
+    assert not any(wrong), "\n".join(filter(None, wrong))
+
+
+# -- folders of somebody else ------------------------------------------------------------------------------------------
+
+
+def test_a_run_that_may_be_read_and_not_written_is_read_and_stays(made, tmp_path):
+    """Of another user, or of one's own that is write-protected: what would be written into it is refused."""
+    run = tmp_path / "run"
+    shutil.copytree(made / "drive_run", run)
+    os.chmod(run, 0o555)
+    refused = {("plot", "RUN"), ("recover", "RUN")}
+    before = state(tmp_path)
+    for words in (*NEEDS, ("replay", "BAG", "--out", "RUN", "--force"), ("diff", "RUN", "RUN")):
+        code, err = asked(words, made, tmp_path)
+        assert not any("a fault of ours" in line for line in err), (words, err)
+        if words in refused or words[-1] == "--force":
+            check(code, err, (2,), f"{run}.*: Permission denied", words)
+        else:
+            assert code == (4 if words == ("diff", "RUN", "OTHER") else 0), (words, err)
+            assert not err or "no picture" in err[0], (words, err)
+        out = tmp_path / "out"
+        shutil.rmtree(out) if out.is_dir() else out.unlink(missing_ok=True)
+        assert state(tmp_path) == before, words
+        reliability.tell("folders_of_others", tried=1, failed=0)
+    os.chmod(run, 0o700)
+
+
+def test_a_private_folder_of_somebody_else_is_refused_by_name(made, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(made / "drive_run", run)
+    if os.geteuid() == 0:
+        os.chown(run, 65534, 65534)
+    os.chmod(run, 0o700 if os.geteuid() == 0 else 0)
+    extra = [("info", "RUN"), ("replay", "BAG", "--out", "RUN"), ("replay", "BAG", "--out", "RUN", "--force")]
+    for words in (*NEEDS, *extra):
+        code, err = asked(words, made, tmp_path)
+        check(code, err, (2,), str(run), words)
+        assert not (tmp_path / "out").exists(), words
+        reliability.tell("folders_of_others", tried=1, failed=0)
+    os.chmod(run, 0o700)
+
+
+# -- settings ----------------------------------------------------------------------------------------------------------
+
+NUMBERS = [
+    "nan",
+    "-nan",
+    ".nan",
+    "inf",
+    "-.inf",
+    "1e999",
+    "-1",
+    "9" * 400,
+    "9" * 9999,
+    "0x" + "f" * 99,
+    "1_0",
+    "٣",
+    "1,5",
+]
+NUMBERS += [
+    "",
+    " ",
+    "null",
+    "~",
+    "[1]",
+    "{a: 1}",
+    "{a: {b: {c: 1}}}",
+    "[" * 99,
+    "{" * 9999,
+    "- 1",
+    "a: 1",
+    "1: 2: 3",
+    "true",
+]
+NUMBERS += ["*a", "!!python/object/apply:os.system [id]", "!!float x", "!x 1", "<<: {a: 1}", "{a: 1, a: 2}"]
+NUMBERS += [
+    "1\n2",
+    "1\0",
+    "\x1b[2J",
+    "\u202e1",
+    "\ufeff1\ufeff",
+    "\udcff",
+    "\U0001f916",
+    "%TAG ! x",
+    "2001-99-99",
+    "@",
+    "`",
+    "'",
+]
+KEYS = [
+    "",
+    "=",
+    "a",
+    "a.b",
+    "keyframes",
+    "keyframes.",
+    ".min_distance_m",
+    "keyframes..min_distance_m",
+    "ключ",
+    "\0",
+    "\x1b]0;x\x07",
+]
+KEYS += [
+    "keyframes.min_distance_m.x",
+    "k" * 99999,
+    "keyframes.min_distanc\u0435_m",
+    "min_distance_m",
+    "__class__",
+    "odom.\udcff",
+]
+OTHERS = [f"world.dimensions={v}" for v in ("2.0", "4", "9" * 30, "two", "-2", "[2]")]
+OTHERS += [f"odom.topic={v}" for v in ("x" * 99999, "a b", "\x1b[2J", "/a//b", "{a: 1}", "1", "\u202e")]
+OTHERS += [f"inputs.names={v}" for v in ("a " * 9999, "odom odom", "/", "\x1b[2J", "a.b")]
+SETTINGS = [f"keyframes.min_distance_m={v}" for v in NUMBERS] + [f"{key}=1" for key in KEYS] + KEYS[1:3] + OTHERS
+
+
+def test_a_setting_that_is_none_is_refused_by_name_before_anything_is_read_or_written(made, tmp_path):
+    wrong = []
+    for text in SETTINGS:
+        try:
+            code, err = answer("replay", made / "drive.mcap", "--out", tmp_path / "out", "--set", text)
+            key = re.escape(ascii(text.partition("=")[0])[1:9])
+            check(code, err, (2,), f"{key}|--set|KEY=VALUE|unknown parameter|no topic /", text[:99])
+            assert not set("".join(err)) & set("\x1b\u202e\x07\udcff"), text[:99]
+            assert not (tmp_path / "out").exists(), text[:99]
+        except AssertionError as error:
+            wrong.append(str(error)[:300])
+            shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    reliability.tell("settings", tried=len(SETTINGS), failed=len(wrong))
+    assert not wrong, "\n".join(wrong)
