@@ -20,6 +20,8 @@ _CONTRADICT = (
     "graph_slam explain RUN says why; if its noise is larger than told, --set {0}.noise=sigmas {0}.sigma_m=..."
 )
 
+_EXTREME = "distances or noise that no robot means do that: --set INPUT.max_distance_m=... or INPUT.noise=sigmas"
+
 
 def text(summary: Summary) -> list[str]:
     """Numbers of a run, what waits, and what came of each input."""
@@ -76,6 +78,8 @@ def table(summary: Summary) -> list[str]:
 def shortcomings(summary: Summary) -> Iterator[str]:
     """Why the result is less than what was asked for, a sentence each; nothing where it is not."""
     inputs: Mapping[str, Any] = summary.get("inputs", {})
+    if summary.get("failing"):
+        yield f"the last solve failed ({summary['failing']}), and the estimate is the one before it: {_EXTREME}"
     for name, counts in inputs.items():
         counted = _counted(summary, name, Effect.REFUSED)
         refused = sum(counted.values())

@@ -12,6 +12,7 @@ from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, SE2, TAG_POSITION
 from graph_slam_ros.lie import se2
+from graph_slam_ros.outcome import shortcomings
 from graph_slam_ros.run import summarize
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
@@ -514,9 +515,12 @@ def test_G7_a_solve_that_fails_is_counted_and_the_last_estimate_stays(monkeypatc
     assert p.counters["solver", "SingularError"] == 3  # nothing was tried again
     assert p.trajectory() == pytest.approx(np.array([k.T_odom_base for k in p.keyframes]), abs=1e-12)
     assert np.isfinite(p.pose_covariance).all()
-    assert summarize(p)["solves"] == 0
+    told = summarize(p)
+    assert told["solves"] == 0
+    assert any("the last solve failed" in one and p.failing in one for one in shortcomings(told))
     failing.works = True
     assert p.process(Control("optimize")).report.converged
+    assert not any("the last solve failed" in one for one in shortcomings(summarize(p)))
     assert all(np.isfinite(c).all() for c in p.landmark_covariances())
     assert p.counters["solver", "SingularError"] == 3
 

@@ -64,6 +64,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
         "ended": True,
         "converged": last.converged if last else True,
         "stop": last.stop if last else "nothing_to_do",
+        "failing": slam.failing,
         "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
         "rivals": [asdict(rival) for rival in slam.backend.rivals],
         "displacements": [asdict(alarm) for alarm in slam.alarms],
