@@ -14,6 +14,8 @@ from graph_slam_ros.slam.ledger import Reason, Verdict
 from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.measurements import InitialPose
 
+DISPLACED = ("odometry", "displaced")
+
 
 @pytest.fixture(scope="module")
 def recording():
@@ -53,7 +55,7 @@ class Driven:
 
     Attributes
     ----------
-    moved_m : how far the path before an event has moved at most, while the alarm was undecided
+    moved_m : how far the path before an event has moved at most, from then until it was decided
     alarmed_s : from the event to the alarm
     """
 
@@ -66,13 +68,11 @@ class Driven:
                 given = None
             self.slam.process(m)
             alarm = self.slam.displaced
-            if alarm is None:
-                reference = None
-                continue
-            self.alarmed_s = self.alarmed_s or (alarm.began_ns - event_ns) * 1e-9
-            before = self.slam.trajectory()[self.slam.keyframes.stamps_ns <= event_ns, :2]
-            reference = before if reference is None else reference
-            if alarm.segment is None:
+            if alarm is not None:
+                self.alarmed_s = self.alarmed_s or (alarm.began_ns - event_ns) * 1e-9
+            if m.stamp_ns > event_ns > 0 and not (alarm and alarm.segment) and not self.slam.counters[DISPLACED]:
+                before = self.slam.trajectory()[self.slam.keyframes.stamps_ns <= event_ns, :2]
+                reference = before if reference is None else reference
                 self.moved_m = max(self.moved_m, float(np.linalg.norm(before - reference, axis=1).max()))
         self.slam.process(Control("end"))
 
@@ -87,7 +87,7 @@ def test_G23_a_robot_that_was_carried_is_found_and_the_path_before_stays(recordi
     (alarm,) = slam.alarms
     assert alarm.distance_m == pytest.approx(10.0, abs=0.6)
     assert slam.segments == [0, alarm.segment]
-    assert slam.counters["odometry", "displaced"] == 1
+    assert slam.counters[DISPLACED] == 1
     found, was_before = errors(slam, faulty), slam.keyframes.stamps_ns <= event_ns
     assert found[was_before].max() < clean.max() + 0.1
     assert found[~was_before].max() < clean.max() + 0.1
@@ -111,13 +111,40 @@ def test_G23_slipping_wheels_are_found_and_the_path_before_stays(recording):
     assert found.max() < 3.0
 
 
+def test_G23_a_robot_that_is_carried_while_it_looks_is_found_and_the_path_before_stays(recording):
+    faulty, _ = faulty_recording(recording, [Fault.named("carried", at=0.7, distance_m=4.0)], seed=1)
+    event_ns = int(recording.stamps_ns[round(0.7 * (len(recording.stamps_ns) - 1))])
+    driven = Driven(faulty, event_ns)
+    assert 0.0 < driven.alarmed_s < 5.0  # while odometry stands still
+    assert driven.moved_m < 0.05
+    assert errors(driven.slam, faulty)[-1] < 0.5
+
+
+@pytest.mark.parametrize("sensor", times(["bearing"], ["range", "bearing"]))
+def test_G23_ranges_or_bearings_alone_raise_the_alarm_and_a_given_pose_ends_it(sensor):
+    faulty, event_ns = carried(simulate("warehouse", seed=1, aisle_m=10.0, sensor=sensor), metres=8.0)
+    until = faulty.stamps_ns <= event_ns + 15 * 10**9
+    names = ("stamps_ns", "T_odom_base", "twist", "odom_covariance", "T_world_base")
+    driven = Driven(replace(faulty, **{name: getattr(faulty, name)[until] for name in names}), event_ns)
+    slam, odometry = driven.slam, list(measurements(faulty))
+    assert 0.0 < driven.alarmed_s < 5.0  # and none in the drive before
+    assert driven.moved_m < 0.05
+    assert "do not tell where: give initialpose" in str(slam.displaced)
+    assert slam.segments == [0]
+    slam.process(InitialPose((0.0, 0.0, 0.0), tuple((0.01 * np.eye(3)).ravel().tolist())))
+    for m in [m for m in odometry if m.stamp_ns > faulty.stamps_ns[until][-1]][:20]:
+        slam.process(m)
+    assert slam.displaced is None
+    assert "then a segment began" in str(slam.alarms[0])
+
+
 @pytest.mark.parametrize("rate", times([0.05], [0.05, 0.2]))
 def test_G23_wrong_identities_are_no_displacement(recording, rate):
     fault = Fault.named("wrong_ids", rate=rate)
     faulty = faulty_recording(recording, [fault], seed=3)[0] if rate else recording
     driven = Driven(faulty, 0)
     assert driven.slam.segments == [0]
-    assert driven.slam.counters["odometry", "displaced"] == 0
+    assert driven.slam.counters[DISPLACED] == 0
     assert rate > 0.1 or not driven.slam.alarms
 
 

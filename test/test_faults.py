@@ -45,6 +45,7 @@ PUT = {
     "moved_landmarks": {"count": 2},
     "outliers": {"rate": 0.1},
     "slip": {"lasting": 0.1},
+    "carried": {"distance_m": 3.0},
     "jump": {},
 }
 
@@ -93,7 +94,7 @@ def test_the_same_seed_puts_the_same_faults_and_one_more_changes_none_of_the_oth
     assert faulty_recording(recording, [fault], seed=5)[1] == wrong
     both = faulty_recording(recording, [fault, jump], seed=5)[1]
     assert [row for row in both if "jump" not in row.fault.split("+")] == [row for row in wrong if row.fault != "jump"]
-    if kind not in ("slip", "jump"):  # which draw nothing
+    if kind not in ("slip", "carried", "jump"):  # which draw nothing
         assert faulty_recording(recording, [fault], seed=6)[1] != wrong
 
 
@@ -217,6 +218,18 @@ def test_slipping_odometry_tells_a_longer_way_for_a_while_and_then_goes_on_as_it
     assert np.array_equal(faulty.twist, twist)
 
 
+def test_odometry_stands_still_while_the_robot_is_carried_and_then_goes_on_as_it_would(recording):
+    faulty, wrong = faulty_recording(recording, [Fault.named("carried", at=0.25, distance_m=2.0)], seed=2)
+    first, n = round(0.25 * (len(recording.stamps_ns) - 1)), space_of(recording.T_world_base[0]).dimensions
+    away = np.linalg.norm(recording.T_world_base[first:, :n] - recording.T_world_base[first, :n], axis=1)
+    last = first + int(np.argmax(away >= 2.0))
+    assert [row.stamp_ns for row in wrong] == recording.stamps_ns[first + 1 : last + 1].tolist()
+    assert motions(faulty)[first:last, :n] == pytest.approx(np.zeros((last - first, n)), abs=1e-12)
+    assert motions(faulty)[last:] == pytest.approx(motions(recording)[last:], abs=1e-9)
+    assert not faulty.twist[first + 1 : last + 1].any()
+    assert np.array_equal(faulty.twist[last + 1 :], recording.twist[last + 1 :])
+
+
 def test_a_jump_is_one_motion_and_the_measured_velocity_knows_nothing_of_it(recording):
     fault = Fault.named("jump", at=0.5, ahead_m=1.0, left_m=-0.5, turn_rad=0.2)
     faulty, (row,) = faulty_recording(recording, [fault], seed=2)
@@ -246,6 +259,7 @@ def test_a_measurement_that_two_faults_hit_stands_once_with_both_and_with_what_w
         ("slip:at", "'at' is not key=value"),
         ("slip:at=0.1,factor=2,at=0.2", "slip: at is given twice"),
         ("slip:at=1.0", "nothing is driven any more"),
+        ("carried:at=0.9,distance_m=1000", "carried: after 0.9 of the whole it comes no farther than"),
         ("swapped_ids:at=0.0", r"swapped_ids: needs 2 landmarks that are seen often enough; there are 0"),
         ("reused_ids:pairs=40", "needs 80 landmarks"),
         ("false_closures", "there is no true one to be like"),

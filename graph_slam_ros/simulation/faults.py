@@ -85,6 +85,14 @@ class Slip:
 
 
 @dataclass(frozen=True, slots=True)
+class Carried:
+    """A robot that is carried along its way, its wheels in the air: odometry stands still, its sensors see on."""
+
+    at: float = option(0.5, _HALFWAY, "", 0, 1)
+    distance_m: float = option(10.0, "how far from where it was lifted it is set down, at least", "m", 1e-3, 1e5)
+
+
+@dataclass(frozen=True, slots=True)
 class Jump:
     """Odometry that jumps from one pose to the next, and does not know it."""
 
@@ -178,6 +186,21 @@ def _slip(draft: Draft, fault: Slip, _rng: Generator) -> None:
     draft.spoil_odometry(range(first + 1, last + 1), "slip")
 
 
+def _carried(draft: Draft, fault: Carried, _rng: Generator) -> None:
+    first, n = draft.pose_at(fault.at), draft.space.dimensions
+    away = np.linalg.norm(draft.truth[first:, :n] - draft.truth[first, :n], axis=1)
+    if not (away >= fault.distance_m).any():
+        raise GraphSlamError(f"carried: after {fault.at:g} of the whole it comes no farther than {away.max():.1f} m")
+    last = first + int(np.argmax(away >= fault.distance_m))
+    lifted = draft.odometry[first].copy()
+    draft.odometry = _moved_after(draft, last, tuple(lifted.tolist()))
+    draft.odometry[first:last] = lifted
+    if draft.twist is not None:
+        draft.twist = draft.twist.copy()
+        draft.twist[first + 1 : last + 1] = 0.0
+    draft.spoil_odometry(range(first + 1, last + 1), "carried")
+
+
 def _jump(draft: Draft, fault: Jump, _rng: Generator) -> None:
     later = max(1, draft.pose_at(fault.at))
     if later >= len(draft):
@@ -246,6 +269,7 @@ KINDS: dict[str, Kind] = {
     "moved_landmarks": Kind(MovedLandmarks, _moved_landmarks),
     "outliers": Kind(Outliers, _outliers),
     "slip": Kind(Slip, _slip),
+    "carried": Kind(Carried, _carried),
     "jump": Kind(Jump, _jump),
 }
 

@@ -10,7 +10,7 @@ from graph_slam_ros.graph import Gaussian, Loss
 from graph_slam_ros.slam.background import Background, Beside, Work, when_asked
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.decisions import Decisions
-from graph_slam_ros.slam.displacement import Elsewhere
+from graph_slam_ros.slam.displacement import DisplacementHypothesis
 from graph_slam_ros.slam.ledger import FINAL, Ledger, Reason
 from graph_slam_ros.slam.map_state import MapState
 from graph_slam_ros.slam.robust_config import RobustConfig
@@ -20,6 +20,7 @@ from graph_slam_ros.solver import Report, Settings, Solver
 
 Array = NDArray[np.float64]
 
+_WAITING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
 _UPDATES = 6  # until what was let in fits, before everything is solved for it
 
 
@@ -39,6 +40,7 @@ class Backend:
     held : the same while the robot is only located (``hold_map``): vertices and edges; zeros otherwise
     spares_memory : whether no second look is begun
     holds_back : whether what does not fit stays out, and verdicts stay as they are, until somebody has decided
+    trusts_sightings : whether a new sighting that fits is believed; else it waits until it is compared with all else
     rivals : other explanations of the same measurements that the last second look could not rule out
     """
 
@@ -61,6 +63,7 @@ class Backend:
         self._background = Background(config, beside)
         self.rivals: tuple[Rival, ...] = ()
         self.spares_memory = self.holds_back = False
+        self.trusts_sightings = True
         self._reviewed = 0  # the keyframe of the last review
         self._doubtful: list[int] = []  # edges that have come and do not fit by themselves
 
@@ -125,7 +128,8 @@ class Backend:
     def update(self, keyframe: int) -> None:
         """Take in what is new and believed, then what is believed of the rest."""
         self.hand_over()
-        self._doubtful += self.decisions.take(self.handed_over[1], keyframe)
+        new = self.decisions.take(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
+        self._doubtful = [*self._doubtful, *new][-_WAITING:]
         if self.holds_back:
             self.solver.update()
             return
@@ -144,7 +148,8 @@ class Backend:
     def optimize(self, keyframe: int, settings: Settings) -> Report:
         """Solve everything, and have a second look at all that was decided."""
         self.hand_over()
-        self._doubtful += self.decisions.take(self.handed_over[1], keyframe)
+        new = self.decisions.take(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
+        self._doubtful = [*self._doubtful, *new][-_WAITING:]
         report = self.solver.optimize(settings)
         if not self._config.decide or self.holds_back:
             return report
@@ -177,12 +182,12 @@ class Backend:
         self._doubtful = [edge for edge in self._doubtful if edge not in edges]
         self.rivals = self._standing(self.rivals)
 
-    def part(
+    def split(
         self,
         loose: tuple[int, Sequence[float], Gaussian],
         initial_poses: Sequence[int],
         values: Array,
-        found: Elsewhere,
+        found: DisplacementHypothesis,
         keyframe: int,
     ) -> None:
         """Begin a segment in the past: of odometry nearly nothing is believed there, of the landmarks what fits.

@@ -46,15 +46,16 @@ class Decisions:
         self.is_calibrated = False  # whether enough was measured twice to tell how good odometry is
         self._looseness = config.noise_factor**2  # of the gate of what all else predicts
         self._withdrawn: dict[int, Reason] = {}  # before they were taken
+        self._vertices = 0  # of the graph, at the last solve
         self._next = 0  # of the accepted, where the next review goes on
         self._next_out = 0  # and of those that are out
 
     # -- what is new -------------------------------------------------------------------------------------------------
 
-    def take(self, count: int, keyframe: int) -> list[int]:
+    def take(self, count: int, keyframe: int, *, trusts_sightings: bool = True) -> list[int]:
         """Look at the edges that are new, up to a count, by their own noise.
 
-        Those that fit are accepted; the others, which are told, wait outside.
+        Those that fit are accepted; the others, which are told, wait outside, and all sightings where none is trusted.
         """
         ids = np.arange(len(self.ledger), count)
         chi2, numbers = self._solver.chi2_of(ids)
@@ -67,12 +68,20 @@ class Decisions:
             self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, self.ledger.statistic.values[edge])
         self._withdrawn.clear()
         waiting = []
-        for edge in ids[judged & (chi2 > limit) & self._config.decide].tolist():
-            if not self._is_needed(edge):
-                self._take_out(edge)
-                self.ledger.hold_back(edge)
-                waiting.append(edge)
+        held = [edge for edge in ids[judged & (chi2 > limit)].tolist() if not self._is_needed(edge)]
+        if not trusts_sightings:
+            held = sorted({*held, *(edge for edge in ids[judged].tolist() if self._is_of_known(edge))})
+        for edge in held if self._config.decide else ():
+            self._take_out(edge)
+            self.ledger.hold_back(edge)
+            waiting.append(edge)
+        self._vertices = self._graph.vertex_count
         return waiting
+
+    def _is_of_known(self, edge: int) -> bool:
+        """Whether it is of a landmark that the last solve had: without it that is as determined as it was."""
+        landmark = landmark_of(self._graph, edge)
+        return landmark is not None and landmark < self._vertices
 
     def admit(self, waiting: Sequence[int], keyframe: int) -> list[int]:
         """Compare with all that is known: the likeliest first, then the others with that; who is let in."""
@@ -169,6 +178,14 @@ class Decisions:
                     self._solver.set_weight(edge, 0.0)
                 self._reject(edge, keyframe, reason, float(self.ledger.statistic.values[edge]))
 
+    @property
+    def looseness(self) -> float:
+        """By what the gate of what all else predicts is wider than a quantile of chi2.
+
+        ``robust.noise_factor`` squared, times how good odometry has shown itself to be.
+        """
+        return self._looseness
+
     def are_beyond_noise(self, edges: Sequence[int]) -> bool:
         """Whether most of some edges that are out are farther off than odometry's noise explains.
 
@@ -177,6 +194,10 @@ class Decisions:
         factor, numbers = self._config.noise_factor**2, self.ledger.numbers.values
         far = [self._innovation(edge) > factor * quantile(self._config.gate, int(numbers[edge])) for edge in edges]
         return 2 * sum(far) > len(far)
+
+    def innovations(self, edges: Sequence[int]) -> list[float]:
+        """What believing each of some edges that are out would cost, given all that is in."""
+        return [self._innovation(edge) for edge in edges]
 
     def loosen(self, link: int, keyframe: int, evidence: float) -> None:
         """Take an edge of odometry out: another with more noise is there in its place."""

@@ -18,6 +18,7 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import carry
 from graph_slam_ros.slam.association import quantile
+from graph_slam_ros.slam.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.ledger import FINAL, Ledger
 from graph_slam_ros.slam.space import Numbers, Space
 from graph_slam_ros.solver import Solver
@@ -33,14 +34,12 @@ _FIT = 0.999  # probability with which a true sighting fits the other pose
 _MAP_SIGMA_M = 0.1  # error of a landmark of the map, beside its neighbours
 _LEAST_APART_M = 0.5  # two landmarks nearer to each other tell little of a heading
 _VAGUE_M, _VAGUE = 0.2, 0.3  # a sighting that fits within more than this, and this part of its distance, tells nothing
-_SUPPORT, _FIRST = 4, 20  # believed sightings, of the first so many, that make a landmark one to compare with
-_DOUBTED = 0.3  # part of them that may be held back: else the landmark itself stands at the wrong place
 _HEADING_SIGMA_RAD = 0.05  # error of a landmark's heading in the map
 _RIVAL_M, _RIVAL_RAD = 1.0, 0.3  # poses farther from each other are two
 
 
 @dataclass(frozen=True, slots=True)
-class Elsewhere:
+class DisplacementHypothesis:
     """Another pose of the robot, and the evidence for it.
 
     Attributes
@@ -102,7 +101,7 @@ class _Window:
     fits_now: Flags  # the present estimate, but for what the map may be wrong by
 
 
-class Evidence:
+class DisplacementSearch:
     """The newest sightings of landmarks, laid out along odometry alone.
 
     Parameters
@@ -110,8 +109,8 @@ class Evidence:
     graph, solver, ledger : of the back-end
     """
 
-    def __init__(self, space: Space, graph: Graph, solver: Solver, ledger: Ledger) -> None:
-        self._space = space
+    def __init__(self, space: Space, graph: Graph, solver: Solver, ledger: Ledger, history: LandmarkHistory) -> None:
+        self._space, self._history = space, history
         self._graph, self._solver, self._ledger = graph, solver, ledger
         self._seen: deque[_Seen] = deque(maxlen=WINDOW)
         self._chain: dict[int, Numbers] = {}  # of each keyframe since the segment began
@@ -119,12 +118,8 @@ class Evidence:
         self._drift: dict[int, Array] = {}
         self._links: dict[int, int] = {}  # odometry's edge to each of them
         self._poses: dict[int, list[int]] = {}  # edges of initial poses, by their keyframe
-        self._surveyed: set[int] = set()
-        self._earliest: dict[int, list[tuple[int, int]]] = {}  # (edge, keyframe) of each landmark's first sightings
-        self._start = graph.vertex_count  # landmarks of a map that was loaded are known
         self._first = 0  # vertex of the segment's first keyframe
         self._is_supported = False  # whether a sighting of a landmark that was known is believed since then
-        self._taken = graph.edge_count
 
     # -- what came -----------------------------------------------------------------------------------------------
 
@@ -135,23 +130,8 @@ class Evidence:
             self._seen.popleft()
         self._forget_before(vertex)
 
-    def take(self, count: int, stamp_ns: int) -> None:
-        """Note the edges that are new, up to a count, in order; ``stamp_ns`` is of the newest keyframe."""
-        edges, self._taken = range(self._taken, count), count
-        for edge in edges:
-            table, row = self._graph.row(edge)
-            vertices = table.vertices.values[row].tolist()
-            match self._graph.labels[int(table.label.values[row])]:
-                case "odometry":
-                    self._follow(edge, vertices, tuple(table.measured.values[row].tolist()), stamp_ns)
-                case "initialpose":
-                    self._poses.setdefault(vertices[0], []).append(edge)
-                case "surveyed":
-                    self._surveyed.add(vertices[0])
-                case "landmarks":
-                    self._see(edge, *vertices[:2])
-
-    def _follow(self, edge: int, vertices: Sequence[int], T_last_now: Numbers, stamp_ns: int) -> None:
+    def add_odometry(self, edge: int, vertices: Sequence[int], T_last_now: Numbers, stamp_ns: int) -> None:
+        """The motion from one keyframe to the next, whose stamp it is."""
         self._links[vertices[1]] = edge
         if vertices[1] not in self._chain:
             before = self._chain.get(vertices[0], self._space.identity)
@@ -173,10 +153,12 @@ class Evidence:
         covariance = np.linalg.inv(root.T @ root)
         return np.array([np.diag(covariance)[:n].max(), np.diag(covariance)[n:].max()])
 
-    def _see(self, edge: int, keyframe: int, landmark: int) -> None:
-        earliest = self._earliest.setdefault(landmark, [])
-        if len(earliest) < _FIRST:
-            earliest.append((edge, keyframe))
+    def add_initial_pose(self, edge: int, keyframe: int) -> None:
+        """A pose that was given at a keyframe."""
+        self._poses.setdefault(keyframe, []).append(edge)
+
+    def add_sighting(self, edge: int, keyframe: int, landmark: int) -> None:
+        """A sighting of a landmark; of use is one that tells a position."""
         base, point = self._chain.get(keyframe), self._point(edge)
         if base is None or point is None or keyframe < self._first:
             return
@@ -220,19 +202,20 @@ class Evidence:
 
     # -- what it tells -------------------------------------------------------------------------------------------
 
-    def held_back(self) -> list[bool]:
-        """Of the newest sightings of landmarks that are well known, in order, whether each is held back."""
+    @property
+    def held_back_count(self) -> int:
+        """Of the newest sightings of landmarks that are well known, how many are held back."""
         known = [one for one in self._standing() if self._known_from(one.landmark) < one.keyframe]
         held_back = [not self._ledger.is_inside(one.edge) for one in known]
         self._is_supported |= not all(held_back)
-        return held_back
+        return sum(held_back)
 
-    def elsewhere(self) -> Elsewhere | None:
+    def hypothesis(self) -> DisplacementHypothesis | None:
         """The other pose for which the evidence is greatest; None where there is none."""
         window = self._window()
         if window is None:
             return None
-        found = list[tuple[Elsewhere, Flags]]()
+        found = list[tuple[DisplacementHypothesis, Flags]]()
         for motion, at in self._motions(window):
             fits = self._fits(window, motion, at)
             one = self._evidence(window, fits, motion)
@@ -244,7 +227,7 @@ class Evidence:
         rivals = [np.count_nonzero(fits & same) for one, fits in found if self._are_two(best, one, newest)]
         return replace(best, rival=int(max(rivals, default=0)))
 
-    def _are_two(self, a: Elsewhere, b: Elsewhere, keyframe: int) -> bool:
+    def _are_two(self, a: DisplacementHypothesis, b: DisplacementHypothesis, keyframe: int) -> bool:
         """Whether they put a keyframe at two different poses."""
         group, chain = self._space.group, self._chain[keyframe]
         apart = group.between(group.compose(a.T_map_chain, chain), group.compose(b.T_map_chain, chain))
@@ -334,17 +317,9 @@ class Evidence:
         return np.asarray(fits & ~(off**2 > quantile(_FIT, 1) * spread))
 
     def _known_from(self, landmark: int) -> int:
-        """The keyframe, by its vertex, from which on a landmark was well known."""
-        if landmark < self._start or landmark in self._surveyed:
-            return -1
-        ledger, earliest, newest = self._ledger, self._earliest[landmark], self._seen[0].edge
-        believed = [k for edge, k in earliest if edge < len(ledger) and ledger.is_inside(edge)]
-        doubted = sum(edge < newest and not ledger.is_inside(edge) for edge, _ in earliest)
-        if doubted > _DOUBTED * (doubted + len(believed)):
-            return self._graph.vertex_count
-        return believed[_SUPPORT - 1] if len(believed) >= _SUPPORT else self._graph.vertex_count
+        return self._history.known_from(landmark, self._seen[0].edge)
 
-    def _evidence(self, window: _Window, fits: Flags, motion: tuple[Array, Array]) -> Elsewhere | None:
+    def _evidence(self, window: _Window, fits: Flags, motion: tuple[Array, Array]) -> DisplacementHypothesis | None:
         """From which keyframe on there is most: landmarks that are newer than it tell nothing."""
         for_it, against = fits & ~window.is_in & ~window.fits_now, ~fits & window.is_in
         starts = np.flatnonzero(np.diff(window.keyframes, prepend=-1) != 0)
@@ -359,7 +334,7 @@ class Evidence:
         if not self._is_supported or (is_all and not window.is_in[window.keyframes < first].any()):
             first = self._first  # nothing supports what came before in this segment
         agreeing, both = since[best] & known[best] & for_it, since[best] & known[best]
-        return Elsewhere(
+        return DisplacementHypothesis(
             first,
             self._pose(motion),
             int(counted[best]),

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.errors import DivergedError, GraphSlamError
 from graph_slam_ros.slam import carry
-from graph_slam_ros.slam.alarm import Alarm, Watch
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.background import Beside, when_asked
@@ -20,6 +19,7 @@ from graph_slam_ros.slam.carry import Where
 from graph_slam_ros.slam.config import Config
 from graph_slam_ros.slam.counters import Counters
 from graph_slam_ros.slam.edits import Edits
+from graph_slam_ros.slam.kidnap_detector import Alarm, KidnapDetector
 from graph_slam_ros.slam.landmarks import Landmark, Landmarks
 from graph_slam_ros.slam.ledger import Change
 from graph_slam_ros.slam.map_state import MapState
@@ -159,7 +159,7 @@ class GraphSlam:
         self._edges = PoseEdges(self.space, self.graph, self.counters)
         self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
         self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over)
-        self._watch = Watch(self.space, self.config.odometry, self.backend, self.counters, self.segments)
+        self._kidnaps = KidnapDetector(self.space, self.config.odometry, self.backend, self.counters, self.segments)
         self._safeguard = Safeguard(self.backend, self.counters, self._landmarks.forget)
         self._edits = Edits(self.backend, self._landmarks, self.counters)
         self._held_covariance: Array | None = None  # of the newest pose when the map was held, for the next odometry
@@ -171,7 +171,7 @@ class GraphSlam:
         self._told_alarms: tuple[Alarm, ...] = ()
         self._solved_T_map_odom = self.space.identity  # to see how far a solve moves it
         self._solved_vertices = 0  # that the last solve took in: none where it failed
-        self._unsolved_keyframes = 0
+        self._unsolved_keyframes = self._unsolved_looks = 0
         if start is not None and start.keyframes:
             self._take_up(start)
         self.first_edge = self.graph.edge_count  # of this run: those before are of the map it began in
@@ -328,12 +328,12 @@ class GraphSlam:
     @property
     def alarms(self) -> tuple[Alarm, ...]:
         """When the landmarks said that the robot was elsewhere than odometry, in order; the last may go on."""
-        return tuple(self._watch.alarms)
+        return tuple(self._kidnaps.alarms)
 
     @property
     def displaced(self) -> Alarm | None:
         """The alarm that goes on: the landmarks say that the robot is elsewhere."""
-        return self._watch.now
+        return self._kidnaps.now
 
     @property
     def newest_odometry_ns(self) -> int | None:
@@ -378,6 +378,11 @@ class GraphSlam:
     def landmark_changes(self) -> int:
         """How often one has changed."""
         return len(self._landmarks.touched)
+
+    @property
+    def _now_ns(self) -> int:
+        """Stamp of the newest odometry, or keyframe."""
+        return max(self.newest_odometry_ns or 0, self.keyframes[-1].stamp_ns)
 
     def _is_of_this_map(self, fix: Fix) -> bool:
         """Whether its numbers are from where all others of the map are."""
@@ -514,7 +519,7 @@ class GraphSlam:
         T_last_now, covariance = self._motion_into(step)
         if not is_prior:
             self.segments.append(len(self.keyframes))
-        self._watch.evidence.begin(self.graph.vertex_count)
+        self._kidnaps.begin_segment(self.graph.vertex_count, step.stamp_ns)
         loose = self._loose(said, T_last_now, is_prior=is_prior)
         covariance = covariance + np.diag(np.square(self.space.sigmas(*loose)))
         self._add_keyframe(step, T_last_now, covariance, said.T_map_base if said else None)
@@ -592,28 +597,21 @@ class GraphSlam:
     def _count(self, m: Observation, reason: str) -> None:
         self.counters.count(m.topic, reason, len(m.sightings) if isinstance(m, Sightings) else 1)
 
-    def _observe(self, m: Observation) -> None:
-        within, beyond = self._reach.split(m)
-        if beyond:
-            self.counters.count(m.topic, "beyond_max_distance", beyond)
-        if within is not None:
-            self._observe_within_reach(within)
-
-    def _observe_within_reach(self, m: Observation) -> None:
-        used = self._thinned(m)
-        if used is None:
-            self._count(m, "thinned")
+    def _observe(self, observed: Observation) -> None:
+        within = self._within_reach(observed)
+        m = self._thinned(within) if within else None
+        if m is None:
             return
-        m = used
         where = self._trail.where(m.stamp_ns)
         motion = self._trail.motion
         if motion is not None and self._deserves_keyframe(m, where, motion):
             where = self._keyframe_at(where, motion)
         match m:
             case Sightings():
+                self._unsolved_looks += self._trail.rests
                 self.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
                 m = replace(m, sightings=tuple(off_the_pole(self.space, s) for s in m.sightings))
-                for name, sighting in self._identified(m, where):
+                for name, sighting in self._of_known_while_lost(m.topic, self._identified(m, where)):
                     self._lay_onto_survey(m.topic, name, sighting, where)
                     self._landmarks.add(m.topic, name, sighting, where)
             case Fix():
@@ -623,11 +621,23 @@ class GraphSlam:
                 self._add_closure(m, where)
         self._solve_if_due()
 
+    def _within_reach(self, m: Observation) -> Observation | None:
+        """What of it is not too far away for its sensor."""
+        within, beyond = self._reach.split(m)
+        if beyond:
+            self.counters.count(m.topic, "beyond_max_distance", beyond)
+        return within
+
     def _thinned(self, m: Observation) -> Observation | None:
         """As it is to be used; None where that before it says the same."""
-        if isinstance(m, Sightings):
-            return None if self._thinning.is_same_look(m, self._trail.rests) else m
-        return self._thinning.thinned(m) if isinstance(m, Fix) else m
+        used: Observation | None = m
+        if isinstance(m, Sightings) and self._thinning.is_same_look(m, self._trail.rests):
+            used = None
+        elif isinstance(m, Fix):
+            used = self._thinning.thinned(m)
+        if used is None:
+            self._count(m, "thinned")
+        return used
 
     def _lay_onto_fix(self, m: Fix, where: Where) -> None:
         """The first fix of its kind tells where the map lies."""
@@ -684,6 +694,15 @@ class GraphSlam:
             return named
         return self._unnamed.identified(m, where)
 
+    def _of_known_while_lost(self, topic: str, found: list[tuple[str, Sighting]]) -> list[tuple[str, Sighting]]:
+        """All; but while an alarm cannot be decided, those of landmarks that are in the map."""
+        if self.backend.trusts_sightings:
+            return found
+        known = [(name, sighting) for name, sighting in found if name in self._landmarks.known]
+        if len(known) < len(found):
+            self.counters.count(topic, "new_while_elsewhere", len(found) - len(known))
+        return known
+
     def _add_closure(self, m: Closure, where: Where) -> None:
         if not self._trail.oldest_ns <= m.from_stamp_ns <= (self.newest_odometry_ns or 0):
             self.counters.count(m.topic, "from_where_there_was_no_odometry")
@@ -693,12 +712,12 @@ class GraphSlam:
     # -- solving -------------------------------------------------------------------------------------------------
 
     def _solve_if_due(self) -> None:
-        if self._unsolved_keyframes >= self.config.solve.every_keyframes:
+        if self._unsolved_keyframes + self._unsolved_looks >= self.config.solve.every_keyframes:
             self._solve()
 
     def _solve(self, everything: Settings | None = None) -> None:
         """Take in what is new, or solve everything; where that fails the last estimate stays, and it is counted."""
-        self._unsolved_keyframes = self._solved_vertices = 0
+        self._unsolved_keyframes = self._unsolved_looks = self._solved_vertices = 0
         if not self.keyframes:
             return
         keyframe = len(self.keyframes) - 1
@@ -716,12 +735,12 @@ class GraphSlam:
     ) -> tuple[list[tuple[float, int]], Report | None, Array]:
         """How new edges fitted before, the report of a solve of everything, and the newest pose's covariance."""
         self.backend.hand_over()
-        self._watch.evidence.take(self.backend.handed_over[1], self.keyframes[keyframe].stamp_ns)
+        self._kidnaps.add(self.backend.handed_over[1], self._now_ns)
         fits, report = self._fit_of(range(self._taken_in, self.backend.handed_over[1])), None
         if everything is None:
             self._review_if_due()
             self.backend.update(keyframe)
-            self._watch.look(keyframe, self.keyframes.ids, self.keyframes.stamps_ns)
+            self._kidnaps.check(self.keyframes.ids, self._now_ns)
         else:
             report = self.backend.optimize(keyframe, everything)
         (covariance,) = self.solver.marginal([self.keyframes[keyframe].vertex])

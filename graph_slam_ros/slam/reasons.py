@@ -248,6 +248,11 @@ REASONS: dict[str, Reason] = {
         "the landmarks showed that the robot was elsewhere than odometry said: it slipped or was carried",
         "graph_slam explain RUN; if it happens often, correct the odometry",
     ),
+    "new_while_elsewhere": Reason(
+        _REFUSED,
+        "a landmark that is not known, while ranges or bearings contradict odometry: where the robot is, nobody knows",
+        "give initialpose",
+    ),
     "quarantined": Reason(
         _REFUSED, "the solver failed with these measurements and works without them", "graph_slam explain RUN"
     ),

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from graph_slam_ros.ros.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.slam import GraphSlam, Update
-from graph_slam_ros.slam.alarm import Alarm
+from graph_slam_ros.slam.kidnap_detector import Alarm
 from graph_slam_ros.slam.ledger import Change, Verdict
 
 _EDGES = 1000  # of one update that are told one by one

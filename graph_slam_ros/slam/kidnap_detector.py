@@ -1,0 +1,270 @@
+"""The landmarks say that the robot is elsewhere: an alarm, which protects the map until that is decided.
+
+While the evidence is weak, what does not fit stays held back and verdicts on the past are not changed: nothing of it
+moves. When the evidence is strong, odometry's link to where the robot was moved is replaced by a loose one: a segment
+begins there, at the pose that the landmarks show, and the path before it stays as it is.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.config import OdometryConfig
+from graph_slam_ros.slam.counters import Counters
+from graph_slam_ros.slam.displacement import DisplacementHypothesis, DisplacementSearch
+from graph_slam_ros.slam.innovation_monitor import InnovationMonitor
+from graph_slam_ros.slam.landmark_history import LandmarkHistory
+from graph_slam_ros.slam.space import Numbers, Space
+
+Array = NDArray[np.float64]
+
+_ALARM = 4  # sightings more for another pose than for odometry's
+_ALARM_LANDMARKS, _ALARM_KEYFRAMES = 2, 2
+_DECIDED = 10
+_DECIDED_LANDMARKS, _DECIDED_KEYFRAMES = 3, 4  # two landmarks with headings tell as much as three without
+_TRIED = 5  # sightings that are compared with odometry's noise
+_MOST = 0.8  # part of the sightings since then that fit the other pose
+_CALM_S = 5.0  # after the decision the alarm goes on for so long at least
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """A time when the landmarks said that the robot was elsewhere than odometry.
+
+    Attributes
+    ----------
+    began_ns, ended_ns : stamps of odometry; None while it goes on
+    evidence : sightings more for another pose than for odometry's, at most; 0 where none was found
+    segment : the keyframe, by its index, at which a segment begins since it was decided so; None where it was not
+    distance_m, angle_rad : how far the robot was moved there, against odometry
+    held_back, looked_at : when it began, of the newest sightings how many were held back, and all
+    tells_pose : whether what is held back can tell a pose; ranges and bearings alone do not
+    superseded : whether it ended undecided because a segment began, by a pose that was given or a jump
+    """
+
+    began_ns: int
+    evidence: int
+    ended_ns: int | None = None
+    segment: int | None = None
+    distance_m: float = 0.0
+    angle_rad: float = 0.0
+    held_back: int = 0
+    looked_at: int = 0
+    tells_pose: bool = True
+    superseded: bool = False
+
+    def __str__(self) -> str:
+        at = f"{self.began_ns * 1e-9:.1f} s"
+        if self.segment is not None:
+            moved = f"{self.distance_m:.2f} m and {np.rad2deg(self.angle_rad):.1f} degrees"
+            return (
+                f"the landmarks said at {at} that the robot is elsewhere, {moved} from where odometry had it: "
+                f"a segment begins at keyframe {self.segment}"
+            )
+        why = f"{self.evidence} sightings more than not"
+        if not self.evidence:
+            why = f"{self.held_back} of the last {self.looked_at} sightings contradict odometry"
+        if self.ended_ns is None:
+            remedy = "" if self.tells_pose else "; ranges or bearings alone do not tell where: give initialpose"
+            return f"the landmarks say since {at} that the robot is elsewhere ({why}){remedy}"
+        outcome = "then a segment began" if self.superseded else "it was not so"
+        until = f"{self.ended_ns * 1e-9:.1f} s"
+        return f"from {at} to {until} the landmarks said that the robot is elsewhere ({why}); {outcome}"
+
+
+class KidnapDetector:
+    """Detects displacements of the robot that odometry has not noticed, after each solve.
+
+    Parameters
+    ----------
+    segments : indices of the keyframes at which segments begin; one that begins in the past is appended
+
+    Attributes
+    ----------
+    alarms : in order; the last may go on
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        odometry: OdometryConfig,
+        backend: Backend,
+        counters: Counters,
+        segments: list[int],
+    ) -> None:
+        self._space, self._odometry, self._backend, self._counters = space, odometry, backend, counters
+        self._segments = segments
+        graph, solver = backend.graph, backend.solver
+        self._history = LandmarkHistory(graph, backend.ledger)
+        self._search = DisplacementSearch(space, graph, solver, backend.ledger, self._history)
+        self._monitor = InnovationMonitor(solver, backend.decisions, self._history)
+        self._next = graph.edge_count
+        self.alarms: list[Alarm] = []
+
+    @property
+    def now(self) -> Alarm | None:
+        """The alarm that goes on."""
+        return self.alarms[-1] if self.alarms and self.alarms[-1].ended_ns is None else None
+
+    def begin_segment(self, vertex: int, stamp_ns: int) -> None:
+        """A segment begins at a keyframe, by a jump or a given pose: sightings before tell nothing of where it is."""
+        self._search.begin(vertex)
+        self._monitor.begin(vertex)
+        if (now := self.now) is not None and now.segment is None:
+            self.alarms[-1] = replace(now, ended_ns=stamp_ns, superseded=True)
+            self._protect()
+
+    def add(self, count: int, stamp_ns: int) -> None:
+        """Note the edges that are new, up to a count, in order, at the stamp of the newest odometry."""
+        graph, search = self._backend.graph, self._search
+        edges, self._next = range(self._next, count), count
+        for edge in edges:
+            table, row = graph.row(edge)
+            vertices = table.vertices.values[row].tolist()
+            match graph.labels[int(table.label.values[row])]:
+                case "odometry":
+                    search.add_odometry(edge, vertices, tuple(table.measured.values[row].tolist()), stamp_ns)
+                case "initialpose":
+                    search.add_initial_pose(edge, vertices[0])
+                case "surveyed":
+                    self._history.add_survey(vertices[0])
+                case "landmarks":
+                    self._history.add(edge, vertices[0], vertices[1])
+                    search.add_sighting(edge, vertices[0], vertices[1])
+                    self._monitor.add(edge, vertices[0], vertices[1], stamp_ns)
+
+    def check(self, vertices: NDArray[np.int64], stamp_ns: int) -> None:
+        """Look at the evidence after a solve.
+
+        Parameters
+        ----------
+        vertices : of all keyframes
+        stamp_ns : of the newest odometry
+        """
+        if not self._backend.decides:
+            return
+        found = self._significant()
+        if found is not None and self._is_decided(found):
+            self._decide(found, vertices, stamp_ns)
+            found = None
+        self._note(found, stamp_ns)
+        self._protect()
+
+    def _protect(self) -> None:
+        """Keep the map as it is while it is not decided; ranges or bearings fit a wrong pose by chance, too."""
+        undecided = self.now if self.now and self.now.segment is None else None
+        self._backend.holds_back = undecided is not None
+        self._backend.trusts_sightings = undecided is None or undecided.tells_pose
+
+    def _significant(self) -> DisplacementHypothesis | None:
+        """Another pose for which more sightings are than chance and noise explain."""
+        if self._search.held_back_count < _ALARM:
+            return None
+        found = self._search.hypothesis()
+        return found if found and self._is_doubtful(found) and self._is_beyond_noise(found) else None
+
+    def _note(self, found: DisplacementHypothesis | None, stamp_ns: int) -> None:
+        """Begin an alarm, go on with it, or end it."""
+        now, sum_of = self.now, self._monitor.contradiction()
+        is_contradicted = sum_of is not None and sum_of.is_significant
+        evidence = found.evidence if found else 0
+        if now is None and (found or is_contradicted):
+            counts = (sum_of.held_back, sum_of.count) if sum_of else (0, 0)
+            tells_pose = found is not None or self._search.held_back_count > 0
+            self.alarms.append(Alarm(stamp_ns, evidence, None, None, 0.0, 0.0, *counts, tells_pose))
+        elif now is not None and evidence > now.evidence:
+            self.alarms[-1] = replace(now, evidence=evidence)
+        elif now is not None and not found and not is_contradicted and self._is_calm(now, stamp_ns):
+            self.alarms[-1] = replace(now, ended_ns=stamp_ns)
+
+    @staticmethod
+    def _is_doubtful(found: DisplacementHypothesis) -> bool:
+        return found.evidence >= _ALARM and found.landmarks >= _ALARM_LANDMARKS and found.keyframes >= _ALARM_KEYFRAMES
+
+    def _is_beyond_noise(self, found: DisplacementHypothesis) -> bool:
+        """Else it is a loop closure that odometry's noise explains."""
+        held_back = [edge for edge in found.fitting if not self._backend.ledger.is_inside(edge)]
+        return self._backend.decisions.are_beyond_noise(held_back[-_TRIED:])
+
+    @staticmethod
+    def _is_decided(found: DisplacementHypothesis) -> bool:
+        return (
+            found.evidence >= max(_DECIDED, 2 * found.rival)
+            and len(found.fitting) >= _MOST * (len(found.fitting) + len(found.contradicting))
+            and found.landmarks + found.has_headings >= _DECIDED_LANDMARKS
+            and found.keyframes >= _DECIDED_KEYFRAMES
+        )
+
+    def _is_calm(self, now: Alarm, stamp_ns: int) -> bool:
+        """Where it was decided, the landmarks must have agreed for a while."""
+        if now.segment is not None and (stamp_ns - now.began_ns) * 1e-9 < _CALM_S:
+            return False
+        return self._monitor.is_calm
+
+    def _decide(self, found: DisplacementHypothesis, vertices: NDArray[np.int64], stamp_ns: int) -> None:
+        """Begin a segment where the landmarks say that the robot is."""
+        index = int(np.searchsorted(vertices, found.first))
+        group, before = self._space.group, self._estimate(found.first)
+        there = group.compose(found.T_map_chain, self._search.chain(found.first))
+        moved = group.between(before, there)
+        distance_m = float(np.linalg.norm(moved[: self._space.dimensions]))
+        angle_rad = float(self._space.angle(moved))
+        self._backend.split(
+            self._loose(found.first, there),
+            self._search.initial_poses(found.first),
+            self._moved(found),
+            found,
+            len(vertices) - 1,
+        )
+        self._counters.count("odometry", "displaced")
+        if index not in self._segments:  # where a pose was given, one begins already
+            self._segments.append(index)
+        self._search.begin(found.first)
+        self._monitor.begin(found.first)
+        now = self.now
+        began_ns = now.began_ns if now is not None else stamp_ns
+        alarm = Alarm(began_ns, found.evidence, None, index, distance_m, angle_rad)
+        if now is not None and now.segment is None:
+            self.alarms[-1] = alarm
+        else:
+            if now is not None:
+                self.alarms[-1] = replace(now, ended_ns=stamp_ns)
+            self.alarms.append(replace(alarm, began_ns=stamp_ns))
+
+    def _estimate(self, vertex: int) -> Numbers:
+        return tuple(self._backend.solver.estimate([vertex])[0].tolist())
+
+    def _loose(self, first: int, there: Numbers) -> tuple[int, Numbers, Gaussian]:
+        """Odometry's edge to a keyframe, the motion that the landmarks show instead, and next to no trust in it."""
+        link, c = self._search.link(first), self._odometry
+        table, row = self._backend.graph.row(link)
+        before = self._estimate(int(table.vertices.values[row, 0]))
+        motion = tuple(map(float, self._space.group.between(before, there)))
+        return link, motion, Gaussian.from_sigmas(*self._space.sigmas(c.jump_sigma_m, c.jump_sigma_rad))
+
+    def _moved(self, found: DisplacementHypothesis) -> Array:
+        """The stored numbers of all vertices, with the robot and what it saw first since then where it is now."""
+        graph, solver, space = self._backend.graph, self._backend.solver, self._space
+        values, keyframes = solver.values, self._search.chained(found.first)
+        motions = {}
+        for vertex in keyframes:
+            at = int(graph.offset.values[vertex])
+            before = tuple(values[at : at + space.pose.size].tolist())
+            there = space.group.compose(found.T_map_chain, self._search.chain(vertex))
+            motions[vertex] = space.group.compose(there, space.group.inverse(before))
+            values[at : at + space.pose.size] = there
+        newest = found.first
+        for vertex in range(found.first, graph.vertex_count):
+            newest = vertex if vertex in motions else newest
+            at, kind = int(graph.offset.values[vertex]), graph.kind_of(vertex)
+            numbers = tuple(values[at : at + kind.size].tolist())
+            if vertex in motions:
+                continue
+            if kind is space.pose:
+                values[at : at + kind.size] = space.group.compose(motions[newest], numbers)
+            elif kind is space.point:
+                values[at : at + kind.size] = space.group.act(motions[newest], numbers)
+        return values
