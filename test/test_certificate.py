@@ -495,6 +495,16 @@ OPTIMAL = {
 
 
 @pytest.mark.skipif(not GRAPHS.exists(), reason=f"no public graphs under {GRAPHS}")
+@pytest.mark.parametrize("start", ["file", "chordal", "online"])
+def test_half_the_rotation_vector_and_g2os_half_sine_have_optima_of_their_own(start):
+    solution = optimize(GRAPHS / "smallGrid3D.g2o", init=start)
+    certificate = certify(solution)
+    assert certificate.verdict == CERTIFIED
+    assert solution.report.chi2_final == pytest.approx(462.4825, abs=1e-3), "in our residual"
+    assert certificate.chi2_bound == pytest.approx(458.1538, abs=1e-3), "the chordal cost, which is g2o's chi2 here"
+
+
+@pytest.mark.skipif(not GRAPHS.exists(), reason=f"no public graphs under {GRAPHS}")
 @pytest.mark.parametrize("name", OPTIMAL)
 def test_public_graphs_come_to_the_optimal_value_in_se_syncs_weights(name):
     solution = optimize(read_g2o(GRAPHS / name, raw=True), init="chordal")

@@ -29,7 +29,10 @@ class InputConfig:
     )
     frame: str = setting("", "frame it is measured in, whatever its messages say; empty: as they say")
     mount: str = setting(
-        "", "where that frame is on the robot if TF does not tell: x y z roll pitch yaw; empty: refused then", "m, rad"
+        "",
+        "where that frame is on the robot if TF does not tell: x y z roll pitch yaw; empty: refused then, but for an"
+        " antenna, which is taken to be at the base",
+        "m, rad",
     )
     noise: str = setting(
         "message",
