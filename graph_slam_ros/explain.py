@@ -34,6 +34,7 @@ _WHY = {
     Reason.WITHDRAWN: "withdrawn",
     Reason.QUARANTINED: "quarantined",
     Reason.DISPLACED: "displaced",
+    Reason.REVOKED: "revoked",
 }
 _KIND = {"closures": "a loop closure", "landmarks": "a sighting", "fixes": "a fix", "odometry": "odometry"}
 _SHOWN = 5

@@ -184,3 +184,35 @@ def test_an_alarm_is_in_the_summary_and_a_map_with_a_segment_in_the_past_is_take
     assert state.segments == slam.segments
     again = GraphSlam(Config(), start=state)
     assert np.abs((again.trajectory() - slam.trajectory())[:, :2]).max() < 0.05  # solved anew, all of it
+
+
+def test_a_displacement_that_later_sightings_contradict_is_taken_back(recording):
+    """For some seconds the robot sees copies of tags, as they would be seen from 4.5 m away; then unique ones."""
+    rng, stamps = np.random.default_rng(1), recording.stamps_ns
+    begin_ns, end_ns = (int(stamps[int(part * len(stamps))]) for part in (0.7, 0.76))
+    known = {s.id for one in recording.seen if one.stamp_ns < begin_ns for s in one.sightings}
+    true = dict(zip(stamps.tolist(), recording.T_world_base.tolist(), strict=True))
+
+    def copies(one):
+        if not begin_ns <= one.stamp_ns < end_ns:
+            return one
+        x, y, heading = true[one.stamp_ns]
+        seen = []
+        for name in sorted(known):
+            at = np.array(se2.between((x - 4.0, y + 2.0, heading), recording.landmarks[name]))
+            if 0.5 < np.hypot(*at[:2]) < 5.0:
+                measured = tuple((at + 0.03 * rng.standard_normal(3)).tolist())
+                covariance = tuple((0.03**2 * np.eye(3)).ravel().tolist())
+                seen.append(replace(one.sightings[0], id=name, measured=measured, covariance=covariance))
+        return replace(one, sightings=tuple(seen[:3]))
+
+    faulty = replace(recording, seen=tuple(copies(one) for one in recording.seen if one.sightings))
+    slam = Driven(faulty, begin_ns).slam
+    assert slam.counters[DISPLACED] == 1
+    assert slam.counters["odometry", "displacement_taken_back"] == 1
+    assert slam.segments == [0]
+    assert "taken back: later sightings contradict it" in str(slam.alarms[0])
+    edges = slam.graph.edges_of("odometry").tolist()
+    reasons = {Reason(int(slam.ledger.reason.values[edge])) for edge in edges}
+    assert reasons == {Reason.NONE, Reason.REVOKED}
+    assert errors(slam, recording).max() < 0.5

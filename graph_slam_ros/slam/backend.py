@@ -189,8 +189,10 @@ class Backend:
         values: Array,
         found: DisplacementHypothesis,
         keyframe: int,
-    ) -> None:
+    ) -> int:
         """Begin a segment in the past: of odometry nearly nothing is believed there, of the landmarks what fits.
+
+        Returns the edge that stands in odometry's place.
 
         Parameters
         ----------
@@ -201,14 +203,32 @@ class Backend:
         link, motion, noise = loose
         table, row = self.graph.row(link)
         vertices, source = table.vertices.values[row].tolist(), self.graph.source_of(link)
-        self.graph.add_edge(table.type, vertices, motion, noise, "odometry", source)
+        edge = self.graph.add_edge(table.type, vertices, motion, noise, "odometry", source)
         self.hand_over()
         self.decisions.take(self.handed_over[1], keyframe)
         self.decisions.loosen(link, keyframe, found.evidence)
         self.decisions.exchange(found.fitting, (*found.contradicting, *initial_poses), keyframe)
+        self.solver.start_at(values)
+        self._go_on(found, keyframe)
+        return edge
+
+    def rejoin(self, link: int, loose: int, values: Array, found: DisplacementHypothesis, keyframe: int) -> None:
+        """Undo ``split``: odometry's edge is in again, that in its place is out, all else is judged by how it fits.
+
+        Parameters
+        ----------
+        values : stored numbers of all vertices to go on from
+        """
+        self.decisions.withdraw([loose], keyframe, Reason.REVOKED)
+        self.decisions.restore(link, keyframe, found.evidence)
+        self.solver.start_at(values)
+        self.decisions.settle(keyframe)
+        self.decisions.exchange(found.fitting, found.contradicting, keyframe)
+        self._go_on(found, keyframe)
+
+    def _go_on(self, found: DisplacementHypothesis, keyframe: int) -> None:
         self._background.cancel(self.ledger.outside_count)
         self.holds_back = False
-        self.solver.start_at(values)
         self._make_fit(list(found.fitting), keyframe)
 
     def _admit(self, keyframe: int) -> None:

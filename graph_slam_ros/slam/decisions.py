@@ -204,6 +204,11 @@ class Decisions:
         self._solver.set_weight(link, 0.0)
         self.ledger.note(link, keyframe, Verdict.REJECTED, Reason.DISPLACED, evidence)
 
+    def restore(self, link: int, keyframe: int, evidence: float) -> None:
+        """Undo ``loosen``."""
+        self._solver.set_weight(link, 1.0)
+        self.ledger.note(link, keyframe, Verdict.NOT_EVALUATED, Reason.NONE, evidence)
+
     def exchange(self, let_in: Sequence[int], taken_out: Sequence[int], keyframe: int) -> None:
         """Believe some edges and not others, which may come back; by how they fit it is judged afterwards."""
         for edge in let_in:

@@ -35,7 +35,7 @@ _MAP_SIGMA_M = 0.1  # error of a landmark of the map, beside its neighbours
 _LEAST_APART_M = 0.5  # two landmarks nearer to each other tell little of a heading
 _VAGUE_M, _VAGUE = 0.2, 0.3  # a sighting that fits within more than this, and this part of its distance, tells nothing
 _HEADING_SIGMA_RAD = 0.05  # error of a landmark's heading in the map
-_RIVAL_M, _RIVAL_RAD = 1.0, 0.3  # poses farther from each other are two
+SAME_M, SAME_RAD = 1.0, 0.3  # poses farther from each other are two
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,15 +224,12 @@ class DisplacementSearch:
             return None
         best, _ = max(found, key=lambda one: one[0].evidence)
         same, newest = window.keyframes >= best.first, int(window.keyframes[-1])
-        rivals = [np.count_nonzero(fits & same) for one, fits in found if self._are_two(best, one, newest)]
+        rivals = [
+            np.count_nonzero(fits & same)
+            for one, fits in found
+            if self.are_apart(best.T_map_chain, one.T_map_chain, newest)
+        ]
         return replace(best, rival=int(max(rivals, default=0)))
-
-    def _are_two(self, a: DisplacementHypothesis, b: DisplacementHypothesis, keyframe: int) -> bool:
-        """Whether they put a keyframe at two different poses."""
-        group, chain = self._space.group, self._chain[keyframe]
-        apart = group.between(group.compose(a.T_map_chain, chain), group.compose(b.T_map_chain, chain))
-        far = float(np.linalg.norm(apart[: self._space.dimensions]))
-        return far > _RIVAL_M or bool(self._space.angle(apart) > _RIVAL_RAD)
 
     def _standing(self) -> list[_Seen]:
         ledger = self._ledger
@@ -356,6 +353,27 @@ class DisplacementSearch:
     def chain(self, keyframe: int) -> Numbers:
         """Where the evidence's own frame of odometry has a keyframe, by its vertex."""
         return self._chain[keyframe]
+
+    def apart(self, T_map_chain: Numbers, other: Numbers, keyframe: int) -> tuple[float, float]:
+        """Distance [m] and angle [rad] of a keyframe, by its vertex, by two places of the evidence's own frame."""
+        group, chain = self._space.group, self._chain[keyframe]
+        apart = group.between(group.compose(T_map_chain, chain), group.compose(other, chain))
+        return float(np.linalg.norm(apart[: self._space.dimensions])), float(self._space.angle(apart))
+
+    def are_apart(self, T_map_chain: Numbers, other: Numbers, keyframe: int) -> bool:
+        """Whether these are two different poses."""
+        far_m, turned_rad = self.apart(T_map_chain, other, keyframe)
+        return far_m > SAME_M or turned_rad > SAME_RAD
+
+    def drift_of(self, keyframe: int) -> Array:
+        """Variances [m^2, rad^2] of odometry since the evidence's own frame began."""
+        return self._drift[keyframe]
+
+    def drift(self, variances: Array, chain: Numbers, keyframe: int) -> tuple[float, float]:
+        """Sigmas [m, rad] of odometry up to a keyframe, since there were these variances and it was there."""
+        since, n = self._drift[keyframe] - variances, self._space.dimensions
+        lever = float(np.linalg.norm(np.subtract(self._chain[keyframe][:n], chain[:n])))
+        return float(np.sqrt(since[0] + since[1] * lever**2)), float(np.sqrt(since[1]))
 
     def chained(self, first: int) -> list[int]:
         """Vertices of the keyframes from one on, in order."""

@@ -236,8 +236,9 @@ class GraphSlam:
     def _changed_alarms(self) -> tuple[Alarm, ...]:
         """Alarms that began, were decided or ended since they were told."""
         before, self._told_alarms = self._told_alarms, self.alarms
-        known = {(one.began_ns, one.segment, one.ended_ns) for one in before}
-        return tuple(one for one in self.alarms if (one.began_ns, one.segment, one.ended_ns) not in known)
+        known = {(one.began_ns, one.segment, one.ended_ns, one.outcome) for one in before}
+        now = [((one.began_ns, one.segment, one.ended_ns, one.outcome), one) for one in self.alarms]
+        return tuple(one for key, one in now if key not in known)
 
     def restart(self) -> None:
         """Go back to the last good estimate, after a fault outside."""

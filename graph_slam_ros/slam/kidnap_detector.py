@@ -14,7 +14,7 @@ from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.config import OdometryConfig
 from graph_slam_ros.slam.counters import Counters
-from graph_slam_ros.slam.displacement import DisplacementHypothesis, DisplacementSearch
+from graph_slam_ros.slam.displacement import SAME_M, SAME_RAD, DisplacementHypothesis, DisplacementSearch
 from graph_slam_ros.slam.innovation_monitor import InnovationMonitor
 from graph_slam_ros.slam.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.space import Numbers, Space
@@ -27,6 +27,7 @@ _DECIDED = 10
 _DECIDED_LANDMARKS, _DECIDED_KEYFRAMES = 3, 4  # two landmarks with headings tell as much as three without
 _TRIED = 5  # sightings that are compared with odometry's noise
 _MOST = 0.8  # part of the sightings since then that fit the other pose
+_DRIFT = 3.0  # sigmas
 _CALM_S = 5.0  # after the decision the alarm goes on for so long at least
 
 
@@ -42,7 +43,7 @@ class Alarm:
     distance_m, angle_rad : how far the robot was moved there, against odometry
     held_back, looked_at : when it began, of the newest sightings how many were held back, and all
     tells_pose : whether what is held back can tell a pose; ranges and bearings alone do not
-    superseded : whether it ended undecided because a segment began, by a pose that was given or a jump
+    outcome : what came of it otherwise: it ended undecided since a segment began, or what was decided was taken back
     """
 
     began_ns: int
@@ -54,7 +55,7 @@ class Alarm:
     held_back: int = 0
     looked_at: int = 0
     tells_pose: bool = True
-    superseded: bool = False
+    outcome: str = ""
 
     def __str__(self) -> str:
         at = f"{self.began_ns * 1e-9:.1f} s"
@@ -62,7 +63,7 @@ class Alarm:
             moved = f"{self.distance_m:.2f} m and {np.rad2deg(self.angle_rad):.1f} degrees"
             return (
                 f"the landmarks said at {at} that the robot is elsewhere, {moved} from where odometry had it: "
-                f"a segment begins at keyframe {self.segment}"
+                f"a segment begins at keyframe {self.segment}{self.outcome and '; '}{self.outcome}"
             )
         why = f"{self.evidence} sightings more than not"
         if not self.evidence:
@@ -70,9 +71,34 @@ class Alarm:
         if self.ended_ns is None:
             remedy = "" if self.tells_pose else "; ranges or bearings alone do not tell where: give initialpose"
             return f"the landmarks say since {at} that the robot is elsewhere ({why}){remedy}"
-        outcome = "then a segment began" if self.superseded else "it was not so"
         until = f"{self.ended_ns * 1e-9:.1f} s"
+        outcome = self.outcome or "it was not so"
         return f"from {at} to {until} the landmarks said that the robot is elsewhere ({why}); {outcome}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Split:
+    """A displacement that was decided.
+
+    Attributes
+    ----------
+    first : vertex of the keyframe at which the segment begins
+    index : of that keyframe; None where a segment began there before
+    link, loose : odometry's edge to it, which is out, and that with next to no trust in its place
+    T_map_chain_before, T_map_chain : where the frame of odometry lay before, and lies since
+    chain, drift : where that frame had the keyframe, and the variances [m^2, rad^2] of odometry up to it
+    alarm : its index
+    """
+
+    first: int
+    index: int | None
+    link: int
+    loose: int
+    T_map_chain_before: Numbers
+    T_map_chain: Numbers
+    chain: Numbers
+    drift: Array
+    alarm: int
 
 
 class KidnapDetector:
@@ -102,6 +128,8 @@ class KidnapDetector:
         self._search = DisplacementSearch(space, graph, solver, backend.ledger, self._history)
         self._monitor = InnovationMonitor(solver, backend.decisions, self._history)
         self._next = graph.edge_count
+        self._splits: list[_Split] = []  # of the present frame of odometry
+        self._refuted: list[Numbers] = []  # where that frame does not lie: it was decided and taken back
         self.alarms: list[Alarm] = []
 
     @property
@@ -113,8 +141,10 @@ class KidnapDetector:
         """A segment begins at a keyframe, by a jump or a given pose: sightings before tell nothing of where it is."""
         self._search.begin(vertex)
         self._monitor.begin(vertex)
+        self._splits.clear()
+        self._refuted.clear()
         if (now := self.now) is not None and now.segment is None:
-            self.alarms[-1] = replace(now, ended_ns=stamp_ns, superseded=True)
+            self.alarms[-1] = replace(now, ended_ns=stamp_ns, outcome="then a segment began")
             self._protect()
 
     def add(self, count: int, stamp_ns: int) -> None:
@@ -146,12 +176,23 @@ class KidnapDetector:
         """
         if not self._backend.decides:
             return
-        found = self._significant()
+        found = self._significant(int(vertices[-1]))
         if found is not None and self._is_decided(found):
-            self._decide(found, vertices, stamp_ns)
+            last = self._splits[-1] if self._splits else None
+            if last and self._is_refuted(last, found, int(vertices[-1])):
+                self._take_back(last, found, vertices, stamp_ns)
+            else:
+                self._decide(found, vertices, stamp_ns)
             found = None
         self._note(found, stamp_ns)
         self._protect()
+
+    def _is_refuted(self, split: _Split, found: DisplacementHypothesis, newest: int) -> bool:
+        """Whether the robot is where it would be without a segment, but for odometry's drift since it began."""
+        before_m, before_rad = self._search.apart(split.T_map_chain_before, found.T_map_chain, newest)
+        after_m, _ = self._search.apart(split.T_map_chain, found.T_map_chain, newest)
+        drift_m, drift_rad = self._search.drift(split.drift, split.chain, newest)
+        return before_m < min(after_m, SAME_M + _DRIFT * drift_m) and before_rad < SAME_RAD + _DRIFT * drift_rad
 
     def _protect(self) -> None:
         """Keep the map as it is while it is not decided; ranges or bearings fit a wrong pose by chance, too."""
@@ -159,11 +200,13 @@ class KidnapDetector:
         self._backend.holds_back = undecided is not None
         self._backend.trusts_sightings = undecided is None or undecided.tells_pose
 
-    def _significant(self) -> DisplacementHypothesis | None:
+    def _significant(self, newest: int) -> DisplacementHypothesis | None:
         """Another pose for which more sightings are than chance and noise explain."""
         if self._search.held_back_count < _ALARM:
             return None
         found = self._search.hypothesis()
+        if found and not all(self._search.are_apart(one, found.T_map_chain, newest) for one in self._refuted):
+            return None
         return found if found and self._is_doubtful(found) and self._is_beyond_noise(found) else None
 
     def _note(self, found: DisplacementHypothesis | None, stamp_ns: int) -> None:
@@ -212,27 +255,62 @@ class KidnapDetector:
         moved = group.between(before, there)
         distance_m = float(np.linalg.norm(moved[: self._space.dimensions]))
         angle_rad = float(self._space.angle(moved))
-        self._backend.split(
-            self._loose(found.first, there),
+        T_map_chain_before = group.compose(before, group.inverse(self._search.chain(found.first)))
+        link, motion, noise = self._loose(found.first, there)
+        loose = self._backend.split(
+            (link, motion, noise),
             self._search.initial_poses(found.first),
-            self._moved(found),
+            self._moved(self._motions(found)),
             found,
             len(vertices) - 1,
         )
         self._counters.count("odometry", "displaced")
-        if index not in self._segments:  # where a pose was given, one begins already
+        is_new = index not in self._segments  # where a pose was given, one begins already
+        if is_new:
             self._segments.append(index)
         self._search.begin(found.first)
         self._monitor.begin(found.first)
-        now = self.now
-        began_ns = now.began_ns if now is not None else stamp_ns
-        alarm = Alarm(began_ns, found.evidence, None, index, distance_m, angle_rad)
+        now, alarm = self.now, Alarm(stamp_ns, found.evidence, None, index, distance_m, angle_rad)
         if now is not None and now.segment is None:
-            self.alarms[-1] = alarm
+            self.alarms[-1] = replace(alarm, began_ns=now.began_ns)
         else:
             if now is not None:
                 self.alarms[-1] = replace(now, ended_ns=stamp_ns)
-            self.alarms.append(replace(alarm, began_ns=stamp_ns))
+            self.alarms.append(alarm)
+        self._splits.append(
+            _Split(
+                found.first,
+                index if is_new else None,
+                link,
+                loose,
+                T_map_chain_before,
+                found.T_map_chain,
+                self._search.chain(found.first),
+                self._search.drift_of(found.first),
+                len(self.alarms) - 1,
+            )
+        )
+
+    def _take_back(
+        self, split: _Split, found: DisplacementHypothesis, vertices: NDArray[np.int64], stamp_ns: int
+    ) -> None:
+        """Believe odometry again where the last segment begins: the landmarks show that it was right."""
+        group = self._space.group
+        back = group.compose(split.T_map_chain_before, group.inverse(split.T_map_chain))
+        values = self._moved({split.first: back})
+        self._backend.rejoin(split.link, split.loose, values, found, len(vertices) - 1)
+        self._counters.count("odometry", "displacement_taken_back")
+        if split.index is not None:
+            self._segments.remove(split.index)
+        self._search.begin(found.first)
+        self._monitor.begin(found.first)
+        wrong = self.alarms[split.alarm]
+        if self.now is not None and self.now != wrong:
+            self.alarms[-1] = replace(self.now, ended_ns=stamp_ns, outcome="the displacement before is taken back")
+        outcome = "taken back: later sightings contradict it"
+        self.alarms[split.alarm] = replace(wrong, ended_ns=wrong.ended_ns or stamp_ns, outcome=outcome)
+        self._splits.pop()
+        self._refuted.append(split.T_map_chain)
 
     def _estimate(self, vertex: int) -> Numbers:
         return tuple(self._backend.solver.estimate([vertex])[0].tolist())
@@ -245,24 +323,25 @@ class KidnapDetector:
         motion = tuple(map(float, self._space.group.between(before, there)))
         return link, motion, Gaussian.from_sigmas(*self._space.sigmas(c.jump_sigma_m, c.jump_sigma_rad))
 
-    def _moved(self, found: DisplacementHypothesis) -> Array:
-        """The stored numbers of all vertices, with the robot and what it saw first since then where it is now."""
-        graph, solver, space = self._backend.graph, self._backend.solver, self._space
-        values, keyframes = solver.values, self._search.chained(found.first)
-        motions = {}
-        for vertex in keyframes:
-            at = int(graph.offset.values[vertex])
-            before = tuple(values[at : at + space.pose.size].tolist())
-            there = space.group.compose(found.T_map_chain, self._search.chain(vertex))
-            motions[vertex] = space.group.compose(there, space.group.inverse(before))
-            values[at : at + space.pose.size] = there
-        newest = found.first
-        for vertex in range(found.first, graph.vertex_count):
+    def _motions(self, found: DisplacementHypothesis) -> dict[int, Numbers]:
+        """How each keyframe from the first displaced one on is moved in map, by its vertex."""
+        group, motions = self._space.group, dict[int, Numbers]()
+        for vertex in self._search.chained(found.first):
+            there = group.compose(found.T_map_chain, self._search.chain(vertex))
+            motions[vertex] = group.compose(there, group.inverse(self._estimate(vertex)))
+        return motions
+
+    def _moved(self, motions: dict[int, Numbers]) -> Array:
+        """The stored numbers of all vertices, with each from the first of these on moved as the last of these before.
+
+        The robot is moved, and what it saw first since then with it.
+        """
+        graph, space = self._backend.graph, self._space
+        values, newest = self._backend.solver.values, min(motions)
+        for vertex in range(newest, graph.vertex_count):
             newest = vertex if vertex in motions else newest
             at, kind = int(graph.offset.values[vertex]), graph.kind_of(vertex)
             numbers = tuple(values[at : at + kind.size].tolist())
-            if vertex in motions:
-                continue
             if kind is space.pose:
                 values[at : at + kind.size] = space.group.compose(motions[newest], numbers)
             elif kind is space.point:

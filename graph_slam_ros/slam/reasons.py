@@ -248,6 +248,11 @@ REASONS: dict[str, Reason] = {
         "the landmarks showed that the robot was elsewhere than odometry said: it slipped or was carried",
         "graph_slam explain RUN; if it happens often, correct the odometry",
     ),
+    "displacement_taken_back": Reason(
+        _NOTED,
+        "a displacement was decided, and later sightings contradict it: landmarks repeat, or ids are used twice",
+        "graph_slam explain RUN; give each landmark an id of its own",
+    ),
     "new_while_elsewhere": Reason(
         _REFUSED,
         "a landmark that is not known, while ranges or bearings contradict odometry: where the robot is, nobody knows",
