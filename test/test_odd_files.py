@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import os
 import re
 import shutil
@@ -289,3 +290,42 @@ def test_a_setting_that_is_none_is_refused_by_name_before_anything_is_read_or_wr
             shutil.rmtree(tmp_path / "out", ignore_errors=True)
     reliability.tell("settings", tried=len(SETTINGS), failed=len(wrong))
     assert not wrong, "\n".join(wrong)
+
+
+# -- arguments ---------------------------------------------------------------------------------------------------------
+
+LONG = [
+    "x" * 99999,
+    ":" * 5000,
+    "a:" * 5000,
+    "../" * 2000,
+    "*a" * 200,
+    "[" * 5000,
+    "(a+)+" * 50,
+    "\x1b[2J" * 999,
+    "é" * 5000,
+]
+ODD = ["1e" + "9" * 5000, "landmark:" * 999, "/dev/zero", "/proc/kmsg", "\udcff", "%s%n", "\n"]
+TAKING = [  # what takes it, whatever it is for
+    ("info", "X"),
+    ("evaluate", "RUN", "--truth", "X"),
+    ("evaluate", "RUN", "--truth", "BAG", "--estimate", "X"),
+    ("explain", "RUN", "X"),
+    ("solve", "RUN", "--loss", "X"),
+    ("replay", "BAG", "--out", "OUT", "--config", "X"),
+    ("merge", "RUN", "X", "--out", "OUT"),
+    ("simulate", "warehouse", "--out", "OUT", "--fault", "X"),
+    ("convert", "X", "OUT"),
+]
+
+
+def test_a_long_or_odd_argument_is_refused_in_a_line_and_in_no_time(made, tmp_path):
+    for words, odd in itertools.product(TAKING, LONG + ODD):
+        names = {"RUN": made / "drive_run", "BAG": made / "drive.mcap", "OUT": tmp_path / "out", "X": odd}
+        start = time.process_time()
+        code, err = answer(*(names.get(word, word) for word in words))
+        check(code, err, (2,), "graph_slam", (words, odd[:20]))
+        assert time.process_time() - start < 2.0, (words, odd[:20])
+        assert not set("".join(err)) & set("\x1b\udcff"), (words, odd[:20])
+        assert not any(tmp_path.iterdir()), (words, odd[:20])
+        reliability.tell("arguments", tried=1, failed=0)

@@ -344,7 +344,7 @@ def test_a_file_is_written_whole_or_not_at_all_whatever_interrupts(tmp_path):
 OPENING = {"open", "read_text", "read_bytes", "write_text", "write_bytes", "unlink", "remove", "rename", "replace"}
 OPENING |= {"rmtree", "rmdir", "FileIO", "fdopen", "savefig", "touch", "move", "copy", "copyfile", "copytree"}
 OF_FILES = {
-    "formats/files.py": {"os.open", "io.FileIO"},
+    "formats/files.py": {"os.open"},
     "formats/durable.py": {"os.open", "os.replace", "new.unlink"},
     "run/folder.py": {"folder.rename", "file.unlink", "(folder / SUMMARY).unlink", "folder.rmdir"},
     # not of runs, nor of the user's

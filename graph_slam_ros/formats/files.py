@@ -16,6 +16,16 @@ _FREE, _MOST_RATIO = 2**20, 1000  # bytes that may be a hole, and how often a lo
 _CREATE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
+class _Regular(io.FileIO):
+    """Some files of the kernel say that they are regular, and have nothing to read until something happens."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        found: bytes | None = super().read(-1 if size is None else size)
+        if found is None:
+            raise OSError(errno.EAGAIN, "nothing to read, and whoever reads it waits", self.name)
+        return found
+
+
 def opened(path: Path, *, follow: bool = False) -> io.FileIO:
     """Open a regular file to read its bytes.
 
@@ -25,7 +35,7 @@ def opened(path: Path, *, follow: bool = False) -> io.FileIO:
         There is no such file, it cannot be read, it is not a regular file, it is little but holes, or it is a link that
         is not to be followed.
     """
-    return io.FileIO(path, opener=_follow if follow else _no_follow)
+    return _Regular(path, opener=_follow if follow else _no_follow)
 
 
 def read_bytes(path: Path, *, follow: bool = False) -> bytes:
