@@ -27,6 +27,7 @@ def guided(name):
     return [str(ROOT / ".venv-fuzz/bin/python"), str(HERE / "guided_fuzzing.py"), name, "600"]
 
 
+DRIVES = "consistency", "displacement", "extreme_fixes", "initialization", "nees", "simulation", "unnamed"
 PROGRAMMES = {
     "lives": tests("test/test_life.py"),
     "mutated_bags": tests("test/test_mutated_recordings.py"),
@@ -40,12 +41,7 @@ PROGRAMMES = {
     "recorded": tests("test/test_recorded.py"),
     "fuzzing": tests("test/test_fuzzing.py"),
     "kernels": tests("test/test_kernels.py"),
-    "drives": tests(
-        *(
-            f"test/test_{name}.py"
-            for name in ("consistency", "displacement", "extreme_fixes", "initialization", "unnamed")
-        )
-    ),
+    "drives": tests(*(f"test/test_{name}.py" for name in DRIVES)),
     "odd_files": tests("test/test_odd_files.py"),
     **{f"guided_{name}": guided(name) for name in ("g2o", "yaml", "cdr", "journal")},
     "planted_bugs": [sys.executable, "test/planted_bugs.py"],

@@ -35,7 +35,7 @@ def bag(tmp_path_factory):
 def long_bag(tmp_path_factory):
     """Of several chunks."""
     file = tmp_path_factory.mktemp("long") / "long.mcap"
-    assert cli.main(["simulate", "manhattan", "--out", str(file), "--poses", "350"]) == 0
+    assert cli.main(["simulate", "manhattan", "--out", str(file), "--poses", "200"]) == 0
     return file
 
 

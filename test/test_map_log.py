@@ -35,9 +35,11 @@ def run(request, tmp_path_factory):
     """The folder of such a run, and its pipeline."""
     folder = tmp_path_factory.mktemp("run") / "run"
     if request.param == "flight":
-        return folder, drive(folder, Config.from_mapping({"world.dimensions": 3}), measurements(simulate("flight", 0)))
+        return folder, drive(
+            folder, Config.from_mapping({"world.dimensions": 3}), measurements(simulate("flight", 0, laps=1))
+        )
     settings, options = WORLDS[request.param]
-    world = measurements(simulate("warehouse", 0, aisles=2, laps=2, **options))
+    world = measurements(simulate("warehouse", 0, aisles=2, laps=2, aisle_m=4.0, **options))
     return folder, drive(
         folder, Config.from_mapping(settings), without_names(world) if request.param == "unnamed" else world
     )
@@ -90,7 +92,7 @@ def test_a_map_that_is_taken_up_is_written_down_as_it_was_read(run):
 
 
 def test_a_run_that_goes_on_in_a_map_knows_its_landmarks_and_is_repeated_byte_by_byte(tmp_path):
-    world = list(measurements(simulate("warehouse", 0, aisles=2, laps=1)))
+    world = list(measurements(simulate("warehouse", 0, aisles=2, laps=1, aisle_m=6.0)))
     before = drive(tmp_path / "before", Config(), world)
     start = map_of(tmp_path / "before", [])
     recorder = RunRecorder(tmp_path / "after", Config(), start=start)
@@ -153,7 +155,7 @@ def test_what_is_no_map_is_refused_by_record(tmp_path, record, complaint):
 
 
 def test_a_run_of_an_earlier_version_is_taken_up_by_repeating_it(tmp_path):
-    world = measurements(simulate("warehouse", 0, aisles=2, laps=1))
+    world = measurements(simulate("warehouse", 0, aisles=2, laps=1, aisle_m=6.0))
     slam = drive(tmp_path / "run", Config(), with_a_wrong_sighting(world))
     (tmp_path / "run" / "map.mcap").unlink()
     state = map_of(tmp_path / "run", [])
@@ -187,7 +189,7 @@ def test_a_run_is_cut_off_until_it_is_ended_and_kept_whatever_is_asked(tmp_path)
 
 
 def test_recover_gives_the_results_of_a_run_that_was_cut_off(tmp_path, capsys):
-    slam = drive(tmp_path / "run", Config(), measurements(simulate("warehouse", 0, aisles=2, laps=1)))
+    slam = drive(tmp_path / "run", Config(), measurements(simulate("warehouse", 0, aisles=2, laps=1, aisle_m=6.0)))
     assert cli.main(["recover", str(tmp_path / "run"), "--out", str(tmp_path / "out")]) == 3, "its end is missing"
     assert capsys.readouterr().out.split()[:2] == ["keyframes", str(len(slam.keyframes))]
     lines = (tmp_path / "out" / "path.tum").read_text().splitlines()

@@ -342,7 +342,7 @@ def test_merge_of_unnamed_landmarks_keeps_them_apart(first, elsewhere, tmp_path)
 
 @pytest.mark.parametrize("kind", ["flight", "ranges"])
 def test_merge_in_space_and_of_what_shares_an_offset(kind, tmp_path):
-    options = {"aisles": 2, "laps": 1, "aisle_m": 6.0, "sensor": "range"} if kind == "ranges" else {"laps": 1}
+    options = {"aisles": 2, "laps": 2, "aisle_m": 6.0, "sensor": "range"} if kind == "ranges" else {"laps": 1}
     settings = {"landmarks.range_offset_sigma_m": 0.5} if kind == "ranges" else {"world.dimensions": 3}
     name = "warehouse" if kind == "ranges" else "flight"
     recordings = [simulate(name, seed, **options) for seed in (0, 3)]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reliability import times
 from scipy.stats import chi2
 
 from graph_slam_ros.consistency import landmark_nees, pose_nees
@@ -70,7 +71,7 @@ def test_errors_are_as_large_as_the_covariances_say(dimensions, dof):
     assert usual(dimensions)[0] < landmarks < usual(dimensions)[1]
 
 
-@pytest.mark.parametrize("dimensions, dof", [(2, 3), (3, 6)])
+@pytest.mark.parametrize("dimensions, dof", [(2, 3), *times([], [(3, 6)])])
 def test_sigmas_that_are_told_too_small_are_noticed(dimensions, dof):
     last, landmarks = mean_nees(dimensions, told=0.4)
     assert last > usual(dof)[1]

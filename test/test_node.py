@@ -136,7 +136,7 @@ def test_a_recording_with_late_and_broken_messages_is_the_same_live_and_offline(
 
 
 def test_several_inputs_and_a_sensor_on_a_joint_are_saved_byte_for_byte_as_offline(tmp_path):
-    drive = record_drive(tmp_path / "drive.mcap")
+    drive = record_drive(tmp_path / "drive.mcap", seconds=10)
     inputs = {
         "inputs.names": "odom detections gps tags",
         "gps.topic": "/fix",
