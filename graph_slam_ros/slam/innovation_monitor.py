@@ -115,7 +115,9 @@ class InnovationMonitor:
         is_out = np.array([not ledger.is_inside(edge) for edge in edges.tolist()])
         innovations = np.where(is_out, ledger.statistic.values[edges], fits)
         order = np.argsort(innovations / numbers, kind="stable")
-        kept = order[: max(1, len(order) - self._by_chance(len(order)))]
+        kept = order[: max(0, len(order) - self._by_chance(len(order)))]
+        if not len(kept):  # all may be wrong by chance
+            return None
         limit = self._decisions.looseness * quantile(_SURE, int(numbers[kept].sum()))
         landmarks = {window[k].landmark for k in np.flatnonzero(is_out).tolist()}
         count = int(np.count_nonzero(is_out))
