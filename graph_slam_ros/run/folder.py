@@ -197,7 +197,8 @@ def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> It
 def recorded_files(folder: Path) -> dict[str, str]:
     """What tells the recordings and the configuration of a run from those of another. Raises OSError."""
     parts = [file for name in (INGEST, MAP) for file in parts_of(folder, name)]
-    return {file.name: ends_of(file) for file in (*parts, folder / CONFIG)}
+    config = [folder / CONFIG] if (folder / CONFIG).exists() else []  # somebody may have removed it: results are saved
+    return {file.name: ends_of(file) for file in (*parts, *config)}
 
 
 def ends_of(file: Path) -> str:
