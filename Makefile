@@ -92,7 +92,7 @@ $(VENV)/package.stamp: setup.py setup.cfg pyproject.toml graph_slam_ros/__init__
 
 # Without the stamp it is tried, and what is missing is said, every time.
 $(VENV)/interfaces.stamp: $(VENV)/package.stamp
-	@if $(BIN)/python -m graph_slam_ros.ros.generate_interfaces; then touch $@; fi
+	@if $(BIN)/python -m graph_slam_ros.node.generate_interfaces; then touch $@; fi
 
 $(VENV)/kernels.stamp: $(SOURCES) $(VENV)/package.stamp
 	@$(BIN)/graph_slam warmup

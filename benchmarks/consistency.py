@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from benchmarks import options, table
-from graph_slam_ros.consistency import Nees, landmark_errors, pose_errors
+from graph_slam_ros.analysis.consistency import Nees, landmark_errors, pose_errors
 from graph_slam_ros.lie import se3
-from graph_slam_ros.ros.results import landmark_estimates
+from graph_slam_ros.messages.results import landmark_estimates
 from graph_slam_ros.simulation import Recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
 

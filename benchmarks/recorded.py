@@ -23,12 +23,12 @@ from benchmarks.fresh import ROOT
 from benchmarks.kept import Kept, code_of, digest
 from benchmarks.problem import Array, Index, Problem, landmark_problem
 from benchmarks.trials import in_order_of_sighting
+from graph_slam_ros.analysis.path_error import interpolated
+from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.path_error import interpolated
-from graph_slam_ros.replay import choose_inputs, measurements
-from graph_slam_ros.ros.bag import open_bag
+from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.runs.replay import choose_inputs, measurements
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
-from graph_slam_ros.truth import read_truth
 
 _ROBOTS = range(1, 6)
 

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from benchmarks.problem import Array, Edges, Problem, joined
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph.geometry import PLANE
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.simulation import Fault
 from graph_slam_ros.simulation import false_closures as generator
 from graph_slam_ros.simulation.draft import Draft
 from graph_slam_ros.simulation.faults import put_faults
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.slam.space import PLANE
 
 ID_POLICIES = ("wrong_ids", "swapped_ids")
 POLICIES = (*generator.POLICIES, *ID_POLICIES)

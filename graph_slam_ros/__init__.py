@@ -8,13 +8,13 @@ __version__ = "0.1.0"
 
 TYPE_CHECKING = False  # type checkers take it for true; typing itself is slow to import
 if TYPE_CHECKING:
-    from graph_slam_ros.batch import Solution, optimize
     from graph_slam_ros.certificate import Certificate, certify
     from graph_slam_ros.formats.g2o import read_g2o
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.graph import Gaussian, Graph
-    from graph_slam_ros.replay import replay
-    from graph_slam_ros.saved_run import SavedRun, load_run
+    from graph_slam_ros.optimization import Solution, optimize
+    from graph_slam_ros.runs.replay import replay
+    from graph_slam_ros.runs.saved_run import SavedRun, load_run
     from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
     from graph_slam_ros.solver import Settings, Solver
 
@@ -41,13 +41,13 @@ __all__ = [
 ]
 
 _HOMES = {
-    "batch": ("Solution", "optimize"),
+    "optimization": ("Solution", "optimize"),
     "certificate": ("Certificate", "certify"),
     "formats.g2o": ("read_g2o",),
     "formats.g2o_writer": ("write_g2o",),
     "graph": ("Gaussian", "Graph"),
-    "replay": ("replay",),
-    "saved_run": ("SavedRun", "load_run"),
+    "runs.replay": ("replay",),
+    "runs.saved_run": ("SavedRun", "load_run"),
     "slam": ("Config", "Control", "GraphSlam", "Odometry", "Sighting", "Sightings"),
     "solver": ("Settings", "Solver"),
 }

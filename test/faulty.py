@@ -3,7 +3,7 @@
 import csv
 
 from graph_slam_ros import cli
-from graph_slam_ros.replay import replay
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
 
 CONFIG = Config.from_mapping(

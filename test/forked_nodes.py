@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 
-MODULES = {"graph_slam": "graph_slam_ros.cli", "node": "graph_slam_ros.ros.node"}
+MODULES = {"graph_slam": "graph_slam_ros.cli", "node": "graph_slam_ros.node.node"}
 LONGEST = 2**16  # of a message: some parameters
 CAN_DIFFER = {"ROS_DOMAIN_ID"}  # all else may have been read when modules were imported
 

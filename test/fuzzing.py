@@ -24,13 +24,13 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
 from recordings import TOPICS, short_drive, to_ros1, to_sqlite, write_mcap
 
-from graph_slam_ros.batch import started
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.convert import write_graph
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.parameters import read_parameters
-from graph_slam_ros.replay import choose_inputs, measurements
-from graph_slam_ros.ros.bag import open_bag
+from graph_slam_ros.optimization import started
+from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.runs.replay import choose_inputs, measurements
 from graph_slam_ros.slam import Config, Counters
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -26,7 +26,8 @@ INPUTS = {
     "tf": "tf2_msgs/msg/TFMessage",
     "initialpose": "geometry_msgs/msg/PoseWithCovarianceStamped",
 }
-INSTRUMENTED = ["graph_slam_ros.formats", "graph_slam_ros.run.map_log", "graph_slam_ros.ros", "yaml"]
+FOLDERS = ("formats", "runs.map_journal", "messages", "recordings", "node")
+INSTRUMENTED = [*(f"graph_slam_ros.{name}" for name in FOLDERS), "yaml"]
 """Without what is compiled."""
 OF_THE_NODE = ("tf", "initialpose")
 
@@ -35,12 +36,12 @@ def target(name, file):
     """What takes the bytes of one input; the file is where those are put that a reader wants in one."""
     from graph_slam_ros.errors import GraphSlamError
     from graph_slam_ros.formats.g2o import read_g2o
-    from graph_slam_ros.formats.journal import INGEST, RecordWriter, read_ingest
     from graph_slam_ros.formats.parameters import read_parameters
-    from graph_slam_ros.ros.from_msg import Border
-    from graph_slam_ros.run.map_log import MAP, read_map
+    from graph_slam_ros.measurements.types import from_record
+    from graph_slam_ros.messages.from_msg import Border
+    from graph_slam_ros.runs.journal import INGEST, RecordWriter, read_ingest
+    from graph_slam_ros.runs.map_journal import MAP, read_map
     from graph_slam_ros.slam import Config, Counters, GraphSlam
-    from graph_slam_ros.slam.measurements import from_record
 
     def g2o(data):
         file.write_bytes(data)

@@ -22,17 +22,17 @@ from pathlib import Path
 import numpy as np
 from reliability import times
 
-import graph_slam_ros.run.folder
-import graph_slam_ros.run.recorder
+import graph_slam_ros.runs.folder
+import graph_slam_ros.runs.recorder
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import NEW, AppendedFile
-from graph_slam_ros.formats.journal import read_ingest
-from graph_slam_ros.ros.live.session import Session
-from graph_slam_ros.run import RunError, RunRecorder, check_room, earlier_runs, is_run, run_config
-from graph_slam_ros.run.folder import BEGUN
+from graph_slam_ros.measurements.types import from_record
+from graph_slam_ros.node.session import Session
+from graph_slam_ros.runs import RunError, RunRecorder, check_room, earlier_runs, is_run, run_config
+from graph_slam_ros.runs.folder import BEGUN
+from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Counters, GraphSlam
-from graph_slam_ros.slam.measurements import from_record
 from graph_slam_ros.warmup import warmup
 
 RESULTS = ("graph.g2o", "graph_vertices.csv", "ledger.csv", "path.tum", "covariances.csv", "landmarks.csv", "run.json")
@@ -228,7 +228,7 @@ def drive_naively(folder, tell, keep_earlier):
         flush(self)
         close(self)
 
-    graph_slam_ros.run.recorder.write_whole = graph_slam_ros.run.folder.write_whole = naive
+    graph_slam_ros.runs.recorder.write_whole = graph_slam_ros.runs.folder.write_whole = naive
     AppendedFile.flush = AppendedFile.sync = lambda self: None
     AppendedFile.close = flush_and_close
     drive(folder, tell, keep_earlier)

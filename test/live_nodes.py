@@ -32,9 +32,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 from vision_msgs.msg import Detection3DArray
 
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros import topics
-from graph_slam_ros.ros.message_class import message_class
+from graph_slam_ros.messages import topics
+from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.runs.replay import replay
 
 RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv", "ledger.csv", "ledger_changes.csv")
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -294,7 +294,7 @@ def robot(**options):
         r.close()
 
 
-MODULE = [sys.executable, "-m", "graph_slam_ros.ros.node"]
+MODULE = [sys.executable, "-m", "graph_slam_ros.node.node"]
 
 
 class Started:

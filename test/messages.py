@@ -6,11 +6,11 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from graph_slam_ros.lie import se2
-from graph_slam_ros.ros.bag import BagWriter, Topic
-from graph_slam_ros.ros.definitions import recorded_decoder
-from graph_slam_ros.ros.from_msg import Border
-from graph_slam_ros.ros.interfaces import typestore
-from graph_slam_ros.ros.to_msg import covariance6, encode, header, make, point, vector
+from graph_slam_ros.messages.from_msg import Border
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.messages.to_msg import covariance6, encode, header, make, point, vector
+from graph_slam_ros.recordings.bag import BagWriter, Topic
+from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.slam import Config, Counters
 
 STAMP_NS = 1_700_000_000_123_456_789

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graph_slam_ros.ros.bag import BagMessage
+from graph_slam_ros.recordings.bag import BagMessage
 
 S = 1_000_000_000
 _STAMP = struct.Struct("<iI")  # a header comes first, after four bytes of encoding

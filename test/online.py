@@ -3,7 +3,7 @@
 import numpy as np
 
 from graph_slam_ros.graph import R1, R2, SE2, EdgeType
-from graph_slam_ros.solver import tree as t
+from graph_slam_ros.solver.clique_tree import storage as t
 
 # everything is linearised anew until nothing moves: the optimum of all there is
 EXACT = {

@@ -57,7 +57,7 @@ BUGS = (
     Bug(
         "undetermined_landmark",
         "one landmark by bearing alone makes the whole problem singular",
-        (("slam/landmarks.py", "        if not waiting.reason:\n", "        if waiting.places:\n"),),
+        (("slam/landmarks/landmark_map.py", "        if not waiting.reason:\n", "        if waiting.places:\n"),),
         ("test_pipeline_kinds.py::test_G3_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why",),
     ),
     Bug(  # all of the check: a cost that is not finite fails its second half, too
@@ -65,7 +65,7 @@ BUGS = (
         "a solve that returns what is not finite counts as done",
         (
             (
-                "slam/safeguard.py",
+                "slam/failure_guard.py",
                 "        values, before = self._solver.values, self._last_good()\n",
                 "        return\n",
             ),
@@ -80,12 +80,12 @@ BUGS = (
         "a covariance that is zero or not positive definite is taken as it is",
         (
             (
-                "ros/inputs/source.py",
+                "messages/inputs/source.py",
                 "        if lengths and not block[:lengths, :lengths].any():\n",
                 "        if False:\n",
             ),
-            ("ros/inputs/checks.py", "    repairs = []\n", "    return block, []\n"),
-            ("ros/inputs/checks.py", "    if not block.any():\n", "    if False:\n"),
+            ("messages/inputs/checks.py", "    repairs = []\n", "    return block, []\n"),
+            ("messages/inputs/checks.py", "    if not block.any():\n", "    if False:\n"),
         ),
         (
             "test_message_cases.py::test_A7_zero_covariance_means_unknown",
@@ -95,7 +95,7 @@ BUGS = (
     Bug(  # of two: what is singular in the eyes of the graph is mended after this
         "no_condition_limit",
         "odometry that is too sure of itself breaks the factorisation",
-        (("slam/edge_noise.py", "    least = covariance + ", "    least = covariance + 0.0 * "),),
+        (("measurements/edge_noise.py", "    least = covariance + ", "    least = covariance + 0.0 * "),),
         (
             "test_graph_cases.py::"
             "test_A12_however_certain_odometry_says_it_is_its_edges_are_not_and_what_they_are_part_of_is_solved",
@@ -104,7 +104,7 @@ BUGS = (
     Bug(  # below the node, whose worker would count and go on without a solution
         "fatal_solve",
         "a solve that raises ends the node",
-        (("slam/safeguard.py", "            self._fail(error)\n", "            raise error\n"),),
+        (("slam/failure_guard.py", "            self._fail(error)\n", "            raise error\n"),),
         (
             "test_graph_cases.py::"
             "test_G7_where_nothing_that_has_come_is_to_blame_the_last_good_estimate_is_held_until_it_heals",
@@ -121,7 +121,7 @@ BUGS = (
         "results are written straight over those of before",
         (
             (
-                "run/recorder.py",
+                "runs/recorder.py",
                 "    write_whole(folder / name, data)\n",
                 "    (folder / name).write_bytes(data)\n",
             ),
@@ -131,7 +131,13 @@ BUGS = (
     Bug(
         "journal_at_the_end",
         "what was told is not on the disk when the node is killed",
-        (("run/recorder.py", "            self._fill()\n            self._journal.flush()\n", "            return\n"),),
+        (
+            (
+                "runs/recorder.py",
+                "            self._fill()\n            self._journal.flush()\n",
+                "            return\n",
+            ),
+        ),
         ("test_journal.py::test_T11_a_crash_at_any_call_that_reaches_the_disk_loses_nothing_that_was_told",),
     ),
     Bug(
@@ -139,7 +145,7 @@ BUGS = (
         "a damaged recording reads well, with other messages",
         (
             (
-                "formats/mcap_records.py",
+                "recordings/mcap_records.py",
                 "    if chunk.uncompressed_crc not in (0, zlib.crc32(plain)):\n",
                 "    if False:\n",
             ),
@@ -153,9 +159,9 @@ BUGS = (
         "every_closure_believed",
         "false closures destroy the map",
         (
-            ("slam/robust_config.py", "    decide: bool = setting(True, ", "    decide: bool = setting(False, "),
+            ("config/robust.py", "    decide: bool = setting(True, ", "    decide: bool = setting(False, "),
             (
-                "slam/robust_config.py",
+                "config/robust.py",
                 '        "dcs", "of closures and fixes; ',
                 '        "none", "of closures and fixes; ',
             ),

@@ -8,8 +8,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from graph_slam_ros.ros.bag import open_bag
-from graph_slam_ros.ros.interfaces import INTERFACES, typestore
+from graph_slam_ros.messages.interfaces import INTERFACES, typestore
+from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.simulation import simulate, write_bag
 
 ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"

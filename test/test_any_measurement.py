@@ -8,8 +8,8 @@ from reliability import times
 from scipy.optimize import least_squares
 
 from graph_slam_ros.lie import so3
+from graph_slam_ros.measurements.types import InitialPose
 from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.measurements import InitialPose
 
 S = 1_000_000_000
 LAST_NS = (2**31 - 100) * S
@@ -224,6 +224,6 @@ def test_of_extreme_numbers_no_search_takes_more_steps_than_the_bound(monkeypatc
 
         return least_squares(one_more, start, **options)
 
-    monkeypatch.setattr("graph_slam_ros.slam.innovation.least_squares", counted)
+    monkeypatch.setattr("graph_slam_ros.slam.robust.innovation.least_squares", counted)
     drive(2, 3, "nearest")
     assert max(evaluations) >= 60, "it is a drive on which a search would go on"

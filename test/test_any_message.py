@@ -12,9 +12,9 @@ from reliability import tell, times
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.base import Nodetype
 
-from graph_slam_ros.ros.inputs import CONVERTERS
-from graph_slam_ros.ros.interfaces import typestore
-from graph_slam_ros.slam.measurements import to_record
+from graph_slam_ros.measurements.types import to_record
+from graph_slam_ros.messages.inputs import CONVERTERS
+from graph_slam_ros.messages.interfaces import typestore
 
 S = 1_000_000_000
 FRAMES = {  # those that make sense where a message is used so, and those of what it tells of

@@ -5,9 +5,9 @@ from itertools import product
 import numpy as np
 import pytest
 
-from graph_slam_ros.slam import association
-from graph_slam_ros.slam.association import NEW, UNCLEAR, Candidates, Expected, Gates, likely_pairings
-from graph_slam_ros.slam.carry import Carried
+from graph_slam_ros.slam.frontend.motion_compensation import Carried
+from graph_slam_ros.slam.landmarks import association
+from graph_slam_ros.slam.landmarks.association import NEW, UNCLEAR, Candidates, Expected, Gates, likely_pairings
 
 GATES = Gates(same=0.999, other=0.99999, density=0.03**2, margin=6.0, close_m=0.5)
 SIGMA = 0.1

@@ -10,8 +10,8 @@ from mcap.stream_reader import StreamReader
 from recordings import DETECTIONS, ODOMETRY, TOPICS, read, short_drive, write_mcap
 
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.replay import choose_inputs, replay
-from graph_slam_ros.ros.bag import BagError, BagWriter, open_bag
+from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
+from graph_slam_ros.runs.replay import choose_inputs, replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
 

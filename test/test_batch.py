@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graph_slam_ros.batch import optimize
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import (
@@ -28,6 +27,7 @@ from graph_slam_ros.graph import (
     Loss,
 )
 from graph_slam_ros.lie import se3
+from graph_slam_ros.optimization import optimize
 from graph_slam_ros.solver import Settings, initial_values
 
 CITY = Path(__file__).resolve().parents[1] / "data/city.g2o"

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from live_nodes import ENVIRONMENT, lenient, node, own_domain, robot, until
 
-from graph_slam_ros.ros import generate_interfaces
-from graph_slam_ros.ros.live.bond import MISSING, is_installed
+from graph_slam_ros.node import generate_interfaces
+from graph_slam_ros.node.bond import MISSING, is_installed
 
 MANAGER = Path(__file__).with_name("bond_manager.py")
 # bond/msg/Status.msg of bond_core 4

@@ -21,9 +21,9 @@ from reliability import tell, times
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from graph_slam_ros.ros.node import GraphSlamNode
+from graph_slam_ros.config.config import flatten, parameters
+from graph_slam_ros.node.node import GraphSlamNode
 from graph_slam_ros.slam import Config
-from graph_slam_ros.slam.config import flatten, parameters
 
 NUMBERS = [0.0, -0.0, 1.0, -1.0, 1e-308, 5e-324, 1e9, 1e12, 1.7e308, -1.7e308, math.nan, math.inf, -math.inf]
 NAMES = [

@@ -14,8 +14,8 @@ from executables import executable
 
 from graph_slam_ros import __version__, cli
 from graph_slam_ros.cli.parser import parser
-from graph_slam_ros.ros.bag import BagWriter, open_bag
-from graph_slam_ros.slam.config import parameters
+from graph_slam_ros.config.config import parameters
+from graph_slam_ros.recordings.bag import BagWriter, open_bag
 
 RESULTS = ("graph.g2o", "path.tum", "sightings.tum", "landmarks.csv", "ledger.csv", "ledger_changes.csv")
 COMMAND = executable("graph_slam")
@@ -336,7 +336,7 @@ def test_a_fault_of_ours_is_one_line_with_code_1(bag, tmp_path, capsys, monkeypa
     def broken(*arguments, **options):
         raise ZeroDivisionError("division\nby zero")
 
-    monkeypatch.setattr("graph_slam_ros.replay.replay", broken)
+    monkeypatch.setattr("graph_slam_ros.runs.replay.replay", broken)
     code, _, err = told(capsys, "replay", bag, "--out", tmp_path / "run")
     assert code == 1
     assert err == [

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from graph_slam_ros.cli import main
+from graph_slam_ros.config.config import SolveConfig, notes, parameters
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.parameters import parameters_text, parse_setting, read_parameters
 from graph_slam_ros.slam import Config
-from graph_slam_ros.slam.config import SolveConfig, notes, parameters
 from graph_slam_ros.solver import Settings
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"

@@ -7,17 +7,17 @@ import pytest
 from reliability import times
 from scipy.stats import chi2
 
-from graph_slam_ros.consistency import Nees, class_noise, landmark_nees, pose_nees
+from graph_slam_ros.analysis.consistency import Nees, class_noise, landmark_nees, pose_nees
+from graph_slam_ros.analysis.evaluation import evaluate
+from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.evaluation import evaluate
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.path_error import interpolated
-from graph_slam_ros.replay import replay
-from graph_slam_ros.run import RunRecorder
+from graph_slam_ros.runs import RunRecorder
+from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.runs.trajectory import Trajectory, read_covariances
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.solver.leverage import leverage
-from graph_slam_ros.trajectory import Trajectory, read_covariances
 
 
 def spread(rng, dof):

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from graph_slam_ros import cli
-from graph_slam_ros.replay import replay
-from graph_slam_ros.run import GRAPH, SUMMARY
-from graph_slam_ros.run.ledger_file import CHANGES, LEDGER, read_changes, read_ledger
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.runs import GRAPH, SUMMARY
+from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, read_changes, read_ledger
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
-from graph_slam_ros.what_if import SavedGraph
 
 CONFIG = "config.yaml"
 READ = (LEDGER, CHANGES, GRAPH, SUMMARY, CONFIG)

@@ -11,8 +11,8 @@ from scipy.optimize import least_squares
 
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.lie import se2
-from graph_slam_ros.ros.bag import open_bag
-from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.solver import Settings, Solver
 
 DATA = Path(__file__).resolve().parents[1] / "data"

@@ -7,12 +7,12 @@ import pytest
 
 from graph_slam_ros.graph import LANDMARK_POSITION, POSE_PRIOR, R2, RELATIVE_POSE, SE2, Gaussian
 from graph_slam_ros.lie import se2
-from graph_slam_ros.ros.live.beside import in_a_thread
+from graph_slam_ros.node.threads import in_a_thread
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.background import when_asked
-from graph_slam_ros.slam.innovation import innovation
-from graph_slam_ros.slam.ledger import Reason, Verdict
+from graph_slam_ros.slam.robust.background import when_asked
+from graph_slam_ros.slam.robust.innovation import innovation
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 
 SIGMAS = (0.05, 0.05, 0.02)
 NOISE = Gaussian.from_sigmas(*SIGMAS)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_triangular
 
-from graph_slam_ros.solver.dense import WIDE, partial_cholesky, solve_upper
-from graph_slam_ros.solver.tree import NOTHING
+from graph_slam_ros.solver.clique_tree.dense import WIDE, partial_cholesky, solve_upper
+from graph_slam_ros.solver.clique_tree.storage import NOTHING
 
 SIZES = [(1, 1), (3, 3), (6, 2), (7, 7), (12, 5), (26, 2), (26, 3), (27, 3), (40, 33), (90, 47)]
 SIZES += [(3 * WIDE - 1, WIDE), (3 * WIDE, WIDE - 1), (3 * WIDE, WIDE), (3 * WIDE + 1, WIDE + 3)]

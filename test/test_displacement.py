@@ -7,12 +7,12 @@ import pytest
 from reliability import times
 
 from graph_slam_ros.lie import se2
-from graph_slam_ros.run import map_of, record_run
+from graph_slam_ros.measurements.types import InitialPose
+from graph_slam_ros.runs import map_of, record_run
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
-from graph_slam_ros.slam.ledger import Reason, Verdict
-from graph_slam_ros.slam.map_state import MapState
-from graph_slam_ros.slam.measurements import InitialPose
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
+from graph_slam_ros.slam.snapshot import MapState
 
 DISPLACED = ("odometry", "displaced")
 

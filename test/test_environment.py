@@ -15,7 +15,7 @@ from plain_rights import plain_rights
 
 from graph_slam_ros import cli, warmup
 from graph_slam_ros.lie import jit
-from graph_slam_ros.replay import replay
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
 
 MOST = 200

@@ -5,19 +5,19 @@ from dataclasses import replace as changed
 import numpy as np
 import pytest
 
+from graph_slam_ros.analysis.evaluation import evaluate
+from graph_slam_ros.analysis.path_error import alignment, associate, path_error
+from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.evaluation import evaluate
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.path_error import alignment, associate, path_error
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.ros.to_msg import encode, header, heading, make, point, pose, pose_stamped, vector
-from graph_slam_ros.run import map_of, record_run
+from graph_slam_ros.messages.to_msg import encode, header, heading, make, point, pose, pose_stamped, vector
+from graph_slam_ros.recordings.bag import BagWriter
+from graph_slam_ros.runs import map_of, record_run
+from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.runs.trajectory import Trajectory, read_tum
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control
-from graph_slam_ros.trajectory import Trajectory, read_tum
-from graph_slam_ros.truth import read_truth
 
 START_S = 1_700_000_000
 

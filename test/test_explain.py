@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from faulty import faulty_run
 
-from graph_slam_ros import cli, quantities
+from graph_slam_ros import cli
+from graph_slam_ros.analysis import measurement_text
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
-from graph_slam_ros.replay import replay
-from graph_slam_ros.run.ledger_file import LEDGER, Entry, read_ledger
+from graph_slam_ros.runs.ledger_file import LEDGER, Entry, read_ledger
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
-from graph_slam_ros.slam.ledger import Reason, Verdict
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,7 @@ def test_what_was_expected_is_what_the_map_says(run):
     a, b = (rows[vertex] for vertex in false.vertices)
     heading = 2.0 * np.arctan2(a[6], a[7])
     turn = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
-    assert quantities.expected(false)[:2] == pytest.approx(turn @ (b[1:3] - a[1:3]), abs=0.5)
+    assert measurement_text.expected(false)[:2] == pytest.approx(turn @ (b[1:3] - a[1:3]), abs=0.5)
 
 
 def test_a_landmark_is_explained_by_name_and_an_unknown_one_is_refused(run, capsys):
@@ -127,8 +128,8 @@ def test_every_type_of_edge_can_be_told(tag):
     information = np.eye(m)[np.triu_indices(m)]
     entry = dataclasses.replace(_ENTRY, tag=tag, measured=tuple(measured), information=tuple(information), dof=m)
     entry = dataclasses.replace(entry, residual=tuple(np.full(m, 0.25)))
-    assert quantities.expected(entry) == pytest.approx([0.25] * m)
-    assert len(quantities.told(entry, quantities.sigmas(entry)).split(", ")) == m
+    assert measurement_text.expected(entry) == pytest.approx([0.25] * m)
+    assert len(measurement_text.told(entry, measurement_text.sigmas(entry)).split(", ")) == m
 
 
 _ENTRY = Entry(0, "", "", "", "", (0,), 0, 0, (), (), (), 0.0, 0, 1.0, 0.0, 1.0, Verdict.ACCEPTED, Reason.NONE)

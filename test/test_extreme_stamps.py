@@ -19,11 +19,11 @@ from messages import (
 )
 from reliability import tell
 
-from graph_slam_ros.replay import choose_inputs, measurements
-from graph_slam_ros.ros import to_msg
-from graph_slam_ros.ros.bag import open_bag
-from graph_slam_ros.ros.cdr import LATEST_NS
-from graph_slam_ros.ros.transforms import Transforms
+from graph_slam_ros.messages import to_msg
+from graph_slam_ros.messages.cdr import LATEST_NS
+from graph_slam_ros.messages.inputs.transforms import Transforms
+from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.runs.replay import choose_inputs, measurements
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam
 
 S = 1_000_000_000

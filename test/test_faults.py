@@ -9,9 +9,9 @@ import pytest
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.ros.bag import open_bag
-from graph_slam_ros.ros.from_msg import Border
-from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.messages.from_msg import Border
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.simulation import (
     KINDS,
     Fault,

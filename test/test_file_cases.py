@@ -38,16 +38,16 @@ from recordings import (
 )
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from graph_slam_ros.batch import optimize
 from graph_slam_ros.cli import main
 from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
-from graph_slam_ros.formats import mcap_records
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.parameters import parse_setting, read_parameters
-from graph_slam_ros.replay import choose_inputs, replay
-from graph_slam_ros.ros.bag import BagError, Topic, open_bag
-from graph_slam_ros.ros.definitions import recorded_decoder
-from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.optimization import optimize
+from graph_slam_ros.recordings import mcap_records
+from graph_slam_ros.recordings.bag import BagError, Topic, open_bag
+from graph_slam_ros.recordings.definitions import recorded_decoder
+from graph_slam_ros.runs.replay import choose_inputs, replay
 from graph_slam_ros.slam import Config
 
 

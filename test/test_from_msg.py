@@ -23,8 +23,8 @@ from messages import (
 )
 
 from graph_slam_ros.lie import se2
-from graph_slam_ros.ros.interfaces import typestore
-from graph_slam_ros.ros.to_msg import covariance6, make
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.messages.to_msg import covariance6, make
 from graph_slam_ros.slam import Config, GraphSlam, Odometry, Sightings
 
 # -- odometry: what is refused, what is repaired --------------------------------------------------------------------

@@ -26,10 +26,10 @@ from graph_slam_ros.graph import (
     Graph,
 )
 from graph_slam_ros.lie import se2, so3
-from graph_slam_ros.run import RunRecorder, map_of
+from graph_slam_ros.measurements.types import Closure
+from graph_slam_ros.runs import RunRecorder, map_of
 from graph_slam_ros.slam import Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.ledger import Reason, Verdict
-from graph_slam_ros.slam.measurements import Closure
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.solver import Settings, Solver
 
 S = 1_000_000_000

@@ -12,11 +12,11 @@ from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, SE2, TAG_POSITION
 from graph_slam_ros.lie import se2
-from graph_slam_ros.outcome import shortcomings
-from graph_slam_ros.run import summarize
+from graph_slam_ros.measurements.types import from_record, to_record
+from graph_slam_ros.runs import summarize
+from graph_slam_ros.runs.outcome import shortcomings
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.measurements import from_record, to_record
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S

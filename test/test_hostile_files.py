@@ -15,10 +15,10 @@ from confined import confined
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.errors import ConfigError, FormatError
-from graph_slam_ros.formats import mcap_records
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.parameters import read_parameters
-from graph_slam_ros.ros.bag import BagError, open_bag
+from graph_slam_ros.recordings import mcap_records
+from graph_slam_ros.recordings.bag import BagError, open_bag
 
 # A word, or lines, of n characters that a careless pattern matches in n^2 steps.
 SHAPES = {

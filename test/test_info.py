@@ -14,9 +14,9 @@ from recordings import definition, write_mcap
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.lie import se2
-from graph_slam_ros.outcome import shortcomings
-from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.ros.to_msg import header
+from graph_slam_ros.messages.to_msg import header
+from graph_slam_ros.recordings.bag import BagWriter
+from graph_slam_ros.runs.outcome import shortcomings
 
 NS = 10**9
 START_NS = 1_700_000_000 * NS

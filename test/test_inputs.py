@@ -30,10 +30,10 @@ from messages import (
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import se2, se3, so3
-from graph_slam_ros.ros.inputs.fixes import east_north_up
-from graph_slam_ros.ros.to_msg import make
-from graph_slam_ros.slam.measurements import Closure, Fix, Odometry, to_record
-from graph_slam_ros.slam.reasons import warnings
+from graph_slam_ros.measurements.reasons import warnings
+from graph_slam_ros.measurements.types import Closure, Fix, Odometry, to_record
+from graph_slam_ros.messages.inputs.fixes import east_north_up
+from graph_slam_ros.messages.to_msg import make
 
 IN_SPACE = {"world": {"dimensions": 3}}
 POSE, POSE_STAMPED = "PoseWithCovarianceStamped", "PoseStamped"

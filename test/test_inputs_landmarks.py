@@ -26,9 +26,9 @@ from messages import (
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import so3
-from graph_slam_ros.ros.bag import BagError, Topic
-from graph_slam_ros.ros.definitions import recorded_decoder
-from graph_slam_ros.ros.to_msg import encode, header, make, vector
+from graph_slam_ros.messages.to_msg import encode, header, make, vector
+from graph_slam_ros.recordings.bag import BagError, Topic
+from graph_slam_ros.recordings.definitions import recorded_decoder
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 
@@ -380,7 +380,7 @@ def test_a_recorded_definition_that_lacks_what_is_read_is_refused_by_field():
 
 
 def test_a_package_that_is_not_installed_is_refused_by_name():
-    from graph_slam_ros.ros.message_class import message_class
+    from graph_slam_ros.messages.message_class import message_class
 
     with pytest.raises(ConfigError, match=r"^nobodys_msgs/msg/Thing: nobodys_msgs is not installed here"):
         message_class("nobodys_msgs/msg/Thing")

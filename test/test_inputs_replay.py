@@ -11,15 +11,15 @@ from foreign import DEFINITIONS
 from messages import DATUM, LANDMARKS, STAMP_NS, odometry, pose, quaternion, record_drive, recorded
 
 from graph_slam_ros.cli import main
-from graph_slam_ros.formats.journal import read_ingest
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.lie import se2
-from graph_slam_ros.replay import choose_inputs, replay
-from graph_slam_ros.ros.bag import BagError, BagWriter, open_bag
-from graph_slam_ros.ros.inputs import CONVERTERS, uses
-from graph_slam_ros.ros.to_msg import header
+from graph_slam_ros.measurements.types import from_record
+from graph_slam_ros.messages.inputs import CONVERTERS, uses
+from graph_slam_ros.messages.to_msg import header
+from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
+from graph_slam_ros.runs.journal import read_ingest
+from graph_slam_ros.runs.replay import choose_inputs, replay
 from graph_slam_ros.slam import Config, Fix, Odometry, Sightings
-from graph_slam_ros.slam.measurements import from_record
 
 TF = "tf2_msgs/msg/TFMessage"
 EVERYTHING = {

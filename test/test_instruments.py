@@ -6,9 +6,9 @@ import pytest
 from graph_slam_ros.cli import main
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.replay import choose_inputs
-from graph_slam_ros.replay import measurements as measured
-from graph_slam_ros.ros.bag import open_bag
+from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.runs.replay import choose_inputs
+from graph_slam_ros.runs.replay import measurements as measured
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.simulation.instruments import ANTENNA_M, DATUM, geodetic
 from graph_slam_ros.simulation.motion import space_of
@@ -78,7 +78,7 @@ def test_the_drive_is_the_same_with_and_without_instruments():
 
 
 def test_latitude_and_longitude_lead_back_to_metres():
-    from graph_slam_ros.ros.inputs.fixes import east_north_up
+    from graph_slam_ros.messages.inputs.fixes import east_north_up
 
     points = np.array([[0.0, 0.0, 0.0], [5000.0, -3000.0, 120.0]])
     for here, point in zip(geodetic(points, DATUM).tolist(), points, strict=True):

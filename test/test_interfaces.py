@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graph_slam_ros.ros import generate_interfaces
-from graph_slam_ros.ros.interfaces import INTERFACES, typestore
+from graph_slam_ros.messages.interfaces import INTERFACES, typestore
+from graph_slam_ros.node import generate_interfaces
 
 MESSAGES = [(package, message) for package, messages in INTERFACES.items() for message in messages]
 DETECTIONS = "vision_msgs/msg/Detection3DArray"

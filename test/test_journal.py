@@ -24,14 +24,14 @@ from reliability import times
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats import durable
 from graph_slam_ros.formats.durable import AppendedFile
-from graph_slam_ros.formats.journal import RecordWriter, part_name, read_ingest
-from graph_slam_ros.formats.mcap_records import MAGIC
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros.live.session import Session
-from graph_slam_ros.run import RunError, RunRecorder
-from graph_slam_ros.run.folder import BEGUN
+from graph_slam_ros.measurements.types import to_record
+from graph_slam_ros.node.session import Session
+from graph_slam_ros.recordings.mcap_records import MAGIC
+from graph_slam_ros.runs import RunError, RunRecorder
+from graph_slam_ros.runs.folder import BEGUN
+from graph_slam_ros.runs.journal import RecordWriter, part_name, read_ingest
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Odometry
-from graph_slam_ros.slam.measurements import to_record
 
 CUTS, FLIPS, KILLS = times((400, 150, 40), (None, 5_000, 3_000))  # None: at every byte
 

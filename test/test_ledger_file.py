@@ -5,12 +5,12 @@ import pytest
 from faulty import CONFIG, faulty_run
 
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.formats.journal import read_ingest
-from graph_slam_ros.ros.live.events import of_update
-from graph_slam_ros.run.ledger_file import LEDGER, read_changes, read_ledger
+from graph_slam_ros.measurements.types import from_record
+from graph_slam_ros.node.events import of_update
+from graph_slam_ros.runs.journal import read_ingest
+from graph_slam_ros.runs.ledger_file import LEDGER, read_changes, read_ledger
 from graph_slam_ros.slam import GraphSlam, Update
-from graph_slam_ros.slam.ledger import Reason, Verdict
-from graph_slam_ros.slam.measurements import from_record
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 
 
 @pytest.fixture(scope="module")

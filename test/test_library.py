@@ -12,12 +12,12 @@ import pytest
 import graph_slam_ros
 from graph_slam_ros import Config, Control, Graph, GraphSlam, load_run, optimize
 from graph_slam_ros import graph as edge_module
+from graph_slam_ros.config.config import parameters
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.graph import EdgeType
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Update
-from graph_slam_ros.slam.config import parameters
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def done(tmp_path_factory):
     folder = tmp_path_factory.mktemp("library")
     write_bag(simulate("warehouse", 1, aisles=2, laps=1, aisle_m=4.0), folder / "bag.mcap")
-    replayed = graph_slam_ros.replay(str(folder / "bag.mcap"), str(folder / "run"))
+    replayed = graph_slam_ros.runs.replay(str(folder / "bag.mcap"), str(folder / "run"))
     return replayed.slam, folder / "run"
 
 
@@ -86,10 +86,10 @@ def test_what_is_no_run_or_has_no_results_is_refused(done, tmp_path):
 
 def test_replay_is_a_function_even_where_its_module_was_imported_before():
     script = """
-import graph_slam_ros.replay, graph_slam_ros, inspect
-from graph_slam_ros.replay import choose_inputs
+import graph_slam_ros.runs.replay, graph_slam_ros, inspect
+from graph_slam_ros.runs.replay import choose_inputs
 try:
-    graph_slam_ros.replay("none.mcap", "out")
+    graph_slam_ros.runs.replay("none.mcap", "out")
 except graph_slam_ros.errors.GraphSlamError as error:
     print(error)
 """

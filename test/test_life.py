@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from reliability import tell, times
 
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros.live.session import Session
-from graph_slam_ros.run.map_log import read_map
+from graph_slam_ros.measurements.types import Fix, InitialPose
+from graph_slam_ros.node.session import Session
+from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Closure, Config, Control, Counters, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.measurements import Fix, InitialPose
 
 S = 1_000_000_000
 TAGS = {"a": (2.0, 1.0), "b": (-1.0, 3.0), "c": (0.0, -2.0)}

@@ -11,15 +11,15 @@ import pytest
 from messages import STAMP_NS
 
 from graph_slam_ros.lie import so3
-from graph_slam_ros.ros.live import health
-from graph_slam_ros.ros.live.ahead import Ahead
-from graph_slam_ros.ros.live.health import Facts, InputFacts, judge, statuses
-from graph_slam_ros.ros.live.map_to_odom import MapToOdom
-from graph_slam_ros.ros.live.recent import Recent, RecentInputs
-from graph_slam_ros.ros.live.reckoning import Reckoning
-from graph_slam_ros.ros.live.session import Session
-from graph_slam_ros.ros.live.throttle import Throttle
-from graph_slam_ros.ros.live.worker import Worker
+from graph_slam_ros.node import diagnostics
+from graph_slam_ros.node.diagnostics import Facts, InputFacts, judge, statuses
+from graph_slam_ros.node.future_stamps import Ahead
+from graph_slam_ros.node.map_to_odom import MapToOdom
+from graph_slam_ros.node.pose_extrapolator import Reckoning
+from graph_slam_ros.node.recent import Recent, RecentInputs
+from graph_slam_ros.node.session import Session
+from graph_slam_ros.node.throttle import Throttle
+from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Config, Counters, Odometry, Sighting, Sightings
 
 NS = 1_000_000_000
@@ -259,7 +259,7 @@ def refused(came, **reasons):
 def test_what_is_wrong_before_the_first_estimate_is_named(facts, state, reason):
     verdict = judge(facts, Config())
     assert verdict.state == state
-    assert verdict.level == {"WAITING": health.WARN, "ERROR": health.ERROR}.get(state, health.OK)
+    assert verdict.level == {"WAITING": diagnostics.WARN, "ERROR": diagnostics.ERROR}.get(state, diagnostics.OK)
     assert ("; ".join(verdict.reasons)).startswith(reason)
     assert not verdict.is_healthy
 
@@ -307,7 +307,7 @@ def test_what_is_wrong_before_the_first_estimate_is_named(facts, state, reason):
 def test_at_work_it_is_well_or_degraded_with_the_reason(values, inputs, reason):
     estimate = round_a_curve(2, 3.2).estimate
     verdict = judge(Facts("active", inputs or (odom(received=9, silent_s=0.0),), estimate, **values), Config())
-    assert verdict == health.Verdict("DEGRADED", (reason,)) if reason else verdict == health.Verdict("OK")
+    assert verdict == diagnostics.Verdict("DEGRADED", (reason,)) if reason else verdict == diagnostics.Verdict("OK")
     told = list(statuses(Facts("active", inputs, estimate, **values), verdict, "slam"))
     assert told[0].values["healthy"] == str(not reason)
     assert told[0].message == "; ".join(("DEGRADED", reason) if reason else ("OK",))

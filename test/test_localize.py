@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from driven import without_names
 
-from graph_slam_ros.run.map_log import state_of
+from graph_slam_ros.runs.map_journal import state_of
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
-from graph_slam_ros.slam.ledger import Verdict
+from graph_slam_ros.slam.robust.ledger import Verdict
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ from driven import drive, with_a_wrong_sighting, without_names
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.formats.journal import RecordWriter, read_records
-from graph_slam_ros.replay import replay
-from graph_slam_ros.run import RunError, RunRecorder, is_cut_off, keep_earlier, map_of, run_config
-from graph_slam_ros.run.map_log import MAP, Growth, read_map, state_of
+from graph_slam_ros.runs import RunError, RunRecorder, is_cut_off, keep_earlier, map_of, run_config
+from graph_slam_ros.runs.journal import RecordWriter, read_records
+from graph_slam_ros.runs.map_journal import MAP, Growth, read_map, state_of
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 

@@ -8,7 +8,7 @@ from live_drive import Drive, distance
 from live_nodes import ENVIRONMENT, node, own_domain, robot, until
 
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.ros.live.map_services import MatchTypeError, loaded_from, saved_as
+from graph_slam_ros.node.map_services import MatchTypeError, loaded_from, saved_as
 from graph_slam_ros.slam import Config
 
 YAW = 0.7

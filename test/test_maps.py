@@ -9,14 +9,14 @@ import pytest
 from driven import drive, with_a_wrong_sighting, without_names
 
 from graph_slam_ros import cli, read_g2o
-from graph_slam_ros.alignment import laid_on
-from graph_slam_ros.ros.bag import open_bag
-from graph_slam_ros.ros.interfaces import typestore
-from graph_slam_ros.run import RunRecorder, map_of, run_config, taken_up
-from graph_slam_ros.run.map_log import read_map
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.maps.alignment import laid_on
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.runs import RunRecorder, map_of, run_config, taken_up
+from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.simulation import measurements, simulate, with_closures
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
-from graph_slam_ros.what_if import SavedGraph
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.lie import so3
-from graph_slam_ros.ros import markers, to_msg
-from graph_slam_ros.ros.interfaces import typestore
-from graph_slam_ros.ros.markers import Lines
+from graph_slam_ros.messages import markers, to_msg
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.messages.markers import Lines
 
 STAMP_NS = 1_700_000_000_987_654_321
 MARKERS = "visualization_msgs/msg/MarkerArray"

@@ -8,13 +8,13 @@ from datasets import HAS_MRCLAM, WITHOUT_MRCLAM, mrclam
 from mutations import KINDS
 from reliability import tell, times
 
+from graph_slam_ros.analysis.path_error import alignment, interpolated
+from graph_slam_ros.analysis.trajectories import TRUE_LANDMARKS_TOPIC, TRUTH_TOPIC, read_truth
 from graph_slam_ros.lie import se3
-from graph_slam_ros.path_error import alignment, interpolated
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros.bag import BagWriter, open_bag
+from graph_slam_ros.recordings.bag import BagWriter, open_bag
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
-from graph_slam_ros.truth import TRUE_LANDMARKS_TOPIC, TRUTH_TOPIC, read_truth
 
 MOST, MOST_WITH_LOSS = 1.2, 2.0  # times the error of the recording as it was
 LONG_S = 300.0  # of a public recording

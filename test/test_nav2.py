@@ -9,7 +9,7 @@ import yaml
 
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.lie import se2
-from graph_slam_ros.replay import replay
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
 

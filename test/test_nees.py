@@ -7,9 +7,9 @@ import pytest
 from reliability import times
 from scipy.stats import chi2
 
-from graph_slam_ros.consistency import landmark_nees, pose_nees
+from graph_slam_ros.analysis.consistency import landmark_nees, pose_nees
 from graph_slam_ros.lie import se3
-from graph_slam_ros.ros.results import landmark_estimates
+from graph_slam_ros.messages.results import landmark_estimates
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 

@@ -15,8 +15,8 @@ from messages import record_drive
 from rclpy.qos import ReliabilityPolicy
 
 from graph_slam_ros.cli import main
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros.bag import BagWriter, open_bag
+from graph_slam_ros.recordings.bag import BagWriter, open_bag
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
 from graph_slam_ros.warmup import warmup
@@ -192,7 +192,7 @@ def test_playing_at_a_rate_takes_its_time(bag, messages, tmp_path):
 
 
 def test_without_a_node_the_player_says_so(bag, monkeypatch, capsys):
-    from graph_slam_ros.ros import player
+    from graph_slam_ros.node import player
 
     monkeypatch.setattr(player, "_PATIENCE_S", 0.5)
     monkeypatch.setattr(os, "environ", dict(ENVIRONMENT))

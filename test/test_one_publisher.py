@@ -9,9 +9,9 @@ from live_drive import TAGS, Drive
 from messages import DETECTIONS, odometry, pose, quaternion
 
 from graph_slam_ros.lie import se2, se3, so3
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.ros.one_publisher import OnePublisher
+from graph_slam_ros.messages.one_publisher import OnePublisher
+from graph_slam_ros.recordings.bag import BagWriter
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Odometry
 
 NS = 10**9

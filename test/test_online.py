@@ -33,7 +33,7 @@ from graph_slam_ros.graph import (
 )
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.solver import Change, Settings, Solver
-from graph_slam_ros.solver.tree import TAIL_END
+from graph_slam_ros.solver.clique_tree.storage import TAIL_END
 
 KINDS = (R1, R2, R3, SE2, SE3)
 PRIOR = POINT_PRIOR | {SE2: POSE_PRIOR, SE3: POSE_PRIOR_3D}

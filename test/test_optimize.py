@@ -237,7 +237,7 @@ def test_a_picture_is_drawn(run, tmp_path, graph):
 def test_the_picture_shows_the_start_that_was_used(run, tmp_path, graph, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        "graph_slam_ros.report.draw_graph", lambda out, initial, final, *_: drawn.append((initial, final))
+        "graph_slam_ros.analysis.plots.draw_graph", lambda out, initial, final, *_: drawn.append((initial, final))
     )
     graph.write_text("".join(line + "\n" for line in SMALL.splitlines() if line.startswith("EDGE")))
     assert run(graph, "--plot", tmp_path / "graph.png")[0] == 0

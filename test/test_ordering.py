@@ -7,8 +7,17 @@ from online import check_tree
 from graph_slam_ros.graph import POSE_PRIOR, RELATIVE_POSE, SE2, Gaussian, Graph
 from graph_slam_ros.simulation import city_graph
 from graph_slam_ros.solver import Settings, Solver
-from graph_slam_ros.solver.separator import HEAVIEST, separate
-from graph_slam_ros.solver.tree import CLIQUE, FRONTS_TOP, FULL_DOF, LIVE, LIVE_MADE, NOTHING, PARENT, R_MADE
+from graph_slam_ros.solver.clique_tree.separator import HEAVIEST, separate
+from graph_slam_ros.solver.clique_tree.storage import (
+    CLIQUE,
+    FRONTS_TOP,
+    FULL_DOF,
+    LIVE,
+    LIVE_MADE,
+    NOTHING,
+    PARENT,
+    R_MADE,
+)
 
 
 def arrays(n, pairs, weight=None):

@@ -96,7 +96,7 @@ def session(tmp_path_factory):
     warmup()  # so that no patience is spent on compiling
     folder = tmp_path_factory.mktemp("other_vendor") / "run"
     words = ("-p", f"output.folder:={folder}", "-p", "inputs.reliable:=true")
-    command = [sys.executable, "-m", "graph_slam_ros.ros.node", "--ros-args", *words]
+    command = [sys.executable, "-m", "graph_slam_ros.node.node", "--ros-args", *words]
     node = subprocess.Popen(command, env=ENVIRONMENT)
     clients = [Client("drive")]
     try:

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from graph_slam_ros.graph.geometry import PLANE, SPACE
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.ros import results
-from graph_slam_ros.ros.interfaces import typestore
-from graph_slam_ros.ros.path_updates import PathUpdates
+from graph_slam_ros.messages import results
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.messages.path_updates import PathUpdates
 from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry
-from graph_slam_ros.slam.space import PLANE, SPACE
 
 STAMP_NS = 1_700_000_000_000_000_000
 

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from graph_slam_ros.graph.geometry import PLANE, SPACE
 from graph_slam_ros.lie import se2, se3, so3
-from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings, carry
-from graph_slam_ros.slam.carry import seen_as
-from graph_slam_ros.slam.measurements import from_record, to_record
-from graph_slam_ros.slam.space import PLANE, SPACE
+from graph_slam_ros.measurements.types import from_record, to_record
+from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.frontend import motion_compensation
+from graph_slam_ros.slam.frontend.motion_compensation import seen_as
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -209,7 +210,7 @@ def test_a_fix_that_lacks_an_axis_tells_of_the_others(space):
 @pytest.mark.parametrize("angle", np.linspace(0.1, 1.5, 8))
 def test_beside_an_axis_of_which_nearly_nothing_is_known_the_variance_of_another_is_never_below_rounding(angle):
     away = np.array([np.cos(angle), np.sin(angle)])
-    ((axis, variance),) = carry.axes_known(1e18 * np.outer(away, away) + 1e-30 * np.eye(2))
+    ((axis, variance),) = motion_compensation.axes_known(1e18 * np.outer(away, away) + 1e-30 * np.eye(2))
     assert abs(axis @ away) < 1e-9
     assert 0.0 < variance < 1e6
 

@@ -18,12 +18,12 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 
-from graph_slam_ros.ros.live.memory import resident_mib
-from graph_slam_ros.ros.live.session import Session
-from graph_slam_ros.ros.live.worker import Worker
-from graph_slam_ros.ros.node import GraphSlamNode
+from graph_slam_ros.measurements.types import Closure
+from graph_slam_ros.node.memory import resident_mib
+from graph_slam_ros.node.node import GraphSlamNode
+from graph_slam_ros.node.session import Session
+from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.measurements import Closure
 
 HEARS = "/diagnostics", "/tf", "pose"
 NUMBERS = itertools.count()  # of nodes: who was there before in this process may be heard for a while
@@ -259,7 +259,7 @@ def test_P21_exceptions_of_callbacks_are_counted_told_once_and_an_error_from_a_h
 
 def test_P24_numpy_has_one_thread_in_the_node():
     """As many threads in all as where one is asked for, and fewer than where two are."""
-    code = "import graph_slam_ros.ros.node, pathlib; print(len(list(pathlib.Path('/proc/self/task').iterdir())))"
+    code = "import graph_slam_ros.node.node, pathlib; print(len(list(pathlib.Path('/proc/self/task').iterdir())))"
     nothing_said = {k: v for k, v in ENVIRONMENT.items() if not k.endswith("_NUM_THREADS")}
 
     def threads(**said):

@@ -95,7 +95,7 @@ def test_errors_that_last_do_not_average_out():
 
 
 def test_the_noise_of_a_recorded_imu_is_honest_and_its_drive_better_than_odometry(tmp_path):
-    from graph_slam_ros.replay import replay
+    from graph_slam_ros.runs.replay import replay
 
     settings = {"inputs.names": "odom imu", "imu.type": "sensor_msgs/msg/Imu", "imu.correlation_s": 5.0}
     inside, off, odometry_off = [], [], []

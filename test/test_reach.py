@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry, Sighting, Sightings, edge_noise
-from graph_slam_ros.slam.reach import Reach, off_the_pole
-from graph_slam_ros.slam.space import PLANE, SPACE
+from graph_slam_ros.graph.geometry import PLANE, SPACE
+from graph_slam_ros.measurements import edge_noise
+from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.frontend.max_distance import Reach, off_the_pole
 
 S, RATE = 10**9, 10
 SOURCE = "detections"

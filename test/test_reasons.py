@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import graph_slam_ros
-from graph_slam_ros.slam.config import parameters
-from graph_slam_ros.slam.input_config import InputConfig
-from graph_slam_ros.slam.reasons import REASONS, Effect, explain, remedy
+from graph_slam_ros.config.config import parameters
+from graph_slam_ros.config.inputs import InputConfig
+from graph_slam_ros.measurements.reasons import REASONS, Effect, explain, remedy
 
 PACKAGE = Path(graph_slam_ros.__file__).parent
 VARIABLES = {"repair", "reason", "why", "broken", "str(reason)", "type(error).__name__"}  # what else is counted

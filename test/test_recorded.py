@@ -4,8 +4,8 @@ import pytest
 from datasets import HAS_MRCLAM, WITHOUT_MRCLAM, mrclam
 from reliability import times
 
-from graph_slam_ros.evaluation import evaluate
-from graph_slam_ros.replay import replay
+from graph_slam_ros.analysis.evaluation import evaluate
+from graph_slam_ros.runs.replay import replay
 
 # Batch least squares with known ids reaches 0.107, 0.100, 0.089, 0.187, 0.094 m; robot 4's camera has a bias.
 MOST_M = {1: 0.15, 2: 0.15, 3: 0.15, 4: 0.25, 5: 0.15}

@@ -15,16 +15,16 @@ from rosbags.highlevel import AnyReader
 
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.formats.journal import RecordWriter, parts_of, read_ingest
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros import results
-from graph_slam_ros.ros.bag import BagWriter, open_bag
-from graph_slam_ros.ros.interfaces import typestore
-from graph_slam_ros.run import RunError, RunRecorder, earlier_runs, is_run, keep_earlier, run_config
+from graph_slam_ros.measurements.types import from_record, to_record
+from graph_slam_ros.messages import results
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.recordings.bag import BagWriter, open_bag
+from graph_slam_ros.runs import RunError, RunRecorder, earlier_runs, is_run, keep_earlier, run_config
+from graph_slam_ros.runs.journal import RecordWriter, parts_of, read_ingest
+from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
-from graph_slam_ros.slam.measurements import from_record, to_record
-from graph_slam_ros.trajectory import read_tum
 
 RESULTS = (
     "graph.g2o",
@@ -96,7 +96,7 @@ def test_replay_of_a_runs_own_sequence_gives_its_bytes_again(tmp_path, folder):
 ONE_AFTER_THE_OTHER = """
 import sys
 from pathlib import Path
-from graph_slam_ros.replay import replay
+from graph_slam_ros.runs.replay import replay
 for source, out in zip(sys.argv[1::2], sys.argv[2::2]):
     replay(Path(source), Path(out))
 """

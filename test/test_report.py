@@ -7,15 +7,15 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from graph_slam_ros.analysis.path_error import path_error
+from graph_slam_ros.analysis.plots import draw_graph, draw_run
 from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.lie import se3
-from graph_slam_ros.path_error import path_error
-from graph_slam_ros.report import draw_graph, draw_run
+from graph_slam_ros.runs.trajectory import Trajectory, read_tum
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
-from graph_slam_ros.trajectory import Trajectory, read_tum
 
 COLUMNS = "id,kind,x,y,theta,sightings,cov_xx,cov_xy,cov_yy"
 
@@ -280,7 +280,7 @@ import numpy as np
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.lie import se3
-from graph_slam_ros.report import draw_graph
+from graph_slam_ros.analysis.plots import draw_graph
 assert "matplotlib" not in sys.modules
 draw_graph({str(tmp_path / "graph.png")!r}, np.zeros((2, 3)), np.eye(2, 3), {{"odometry": np.array([[0, 1]])}})
 assert "matplotlib.pyplot" not in sys.modules

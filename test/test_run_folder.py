@@ -16,10 +16,10 @@ from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import AppendedFile, replaced, write_whole
 from graph_slam_ros.formats.files import opened, read_text
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.run import RunError, RunRecorder, check_room, is_run, keep_earlier, suggested_out
-from graph_slam_ros.run.folder import MARK, remove
+from graph_slam_ros.recordings.bag import BagWriter
+from graph_slam_ros.runs import RunError, RunRecorder, check_room, is_run, keep_earlier, suggested_out
+from graph_slam_ros.runs.folder import MARK, remove
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config, Odometry
 
@@ -346,14 +346,14 @@ OPENING |= {"rmtree", "rmdir", "FileIO", "fdopen", "savefig", "touch", "move", "
 OF_FILES = {
     "formats/files.py": {"os.open"},
     "formats/durable.py": {"os.open", "os.replace", "new.unlink"},
-    "run/folder.py": {"folder.rename", "file.unlink", "(folder / SUMMARY).unlink", "folder.rmdir"},
+    "runs/folder.py": {"folder.rename", "file.unlink", "(folder / SUMMARY).unlink", "folder.rmdir"},
     # not of runs, nor of the user's
-    "ros/generate_interfaces.py": None,
-    "ros/player.py": {"parameters.write_text", "subprocess.Popen"},
+    "node/generate_interfaces.py": None,
+    "node/player.py": {"parameters.write_text", "subprocess.Popen"},
     "lie/jit.py": None,
     "warmup.py": {"COMPILED.touch", "subprocess.Popen"},
-    "ros/live/memory.py": {"_STATM.read_text"},
-    "report.py": {"figure.savefig"},  # into memory
+    "node/memory.py": {"_STATM.read_text"},
+    "analysis/plots.py": {"figure.savefig"},  # into memory
     "solver/solver.py": {"self._waiting.touch"},
 }
 
@@ -384,7 +384,7 @@ def test_a_reader_of_a_run_folder_follows_no_link():
                 (value,) = (ast.unparse(k.value) for k in node.keywords if k.arg == "follow")
                 if value == "True":
                     found.add(f"{path.relative_to(PACKAGE).as_posix()}: {ast.unparse(node.args[0])}")
-    assert found == {"formats/ros1_records.py: path", "ros/bag.py: file", "truth.py: path"}
+    assert found == {"recordings/ros1_records.py: path", "recordings/bag.py: file", "analysis/trajectories.py: path"}
 
 
 def test_the_recordings_of_a_run_are_told_from_those_of_a_simulation(tmp_path, bag):

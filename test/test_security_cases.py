@@ -18,15 +18,15 @@ import pytest
 from yaml.constructor import BaseConstructor, SafeConstructor
 
 import graph_slam_ros
+from graph_slam_ros.config.config import parameters
 from graph_slam_ros.errors import ConfigError, GraphSlamError
 from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.parameters import _StrictLoader
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros.live.session import Session
-from graph_slam_ros.ros.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS, Interface
+from graph_slam_ros.messages.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS, Interface
+from graph_slam_ros.node.session import Session
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config, Counters, Odometry
-from graph_slam_ros.slam.config import parameters
 
 PACKAGE = Path(graph_slam_ros.__file__).parent
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
@@ -205,7 +205,7 @@ def test_F27_a_link_out_of_the_data_folder_is_not_followed_and_a_run_in_it_is_lo
 def test_X2_folders_and_files_are_named_at_the_start_alone():
     """No service takes a path; a parameter that is one is read-only, but for the name of a run to load."""
     pytest.importorskip("rclpy")
-    from graph_slam_ros.ros.live.params import _AT_START, _descriptor
+    from graph_slam_ros.node.parameters import _AT_START, _descriptor
 
     paths = {p.name for p in parameters() if "folder" in p.name or "file" in p.name}
     assert paths == {"output.folder", "landmarks.surveyed_file"} <= _AT_START
@@ -254,7 +254,7 @@ def test_X10_what_the_node_tells_has_neither_paths_nor_positions():
     """Whatever is logged at INFO is in this list: a folder by its name alone, no position, no fix."""
     told = []
     for name, path in FILES.items():
-        if name.startswith("ros/"):
+        if name.startswith("node/"):
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.Call) and ast.unparse(node.func).endswith((".get_logger().info", "._log.info")):
                     told.append(ast.unparse(node.args[0]))
@@ -307,7 +307,9 @@ def running():
     domain = random.randint(1, 100)
     environment = dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", ROS_DOMAIN_ID=str(domain))
     words = ("-p", "output.folder:=''", "-p", "use_sim_time:=true")
-    process = subprocess.Popen([sys.executable, "-m", "graph_slam_ros.ros.node", "--ros-args", *words], env=environment)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "graph_slam_ros.node.node", "--ros-args", *words], env=environment
+    )
     context = Context()
     context.init(args=[], domain_id=domain)
     node = rclpy.create_node("auditor", context=context)

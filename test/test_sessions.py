@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 
 from graph_slam_ros.errors import FormatError, GraphSlamError
-from graph_slam_ros.formats.journal import RecordWriter, read_ingest
-from graph_slam_ros.merge import merge
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros.live.session import Session
-from graph_slam_ros.run import RunError, RunRecorder, changed_since, complete, is_cut_off, is_run, recover, run_config
-from graph_slam_ros.run.map_log import read_map
+from graph_slam_ros.maps.merge import merge
+from graph_slam_ros.measurements.types import Fix, Odometry
+from graph_slam_ros.node.session import Session
+from graph_slam_ros.runs import RunError, RunRecorder, changed_since, complete, is_cut_off, is_run, recover, run_config
+from graph_slam_ros.runs.journal import RecordWriter, read_ingest
+from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.measurements import Fix, Odometry
 
 WORLD = tuple(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0)))
 MUNICH, OSLO = (48.0, 11.0, 500.0), (60.0, 11.0, 100.0)

@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 from reliability import times
 
+from graph_slam_ros.analysis.path_error import path_error
+from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import RELATIVE_POSE
 from graph_slam_ros.lie import se2, se3, so3
-from graph_slam_ros.path_error import path_error
-from graph_slam_ros.ros.bag import open_bag
-from graph_slam_ros.ros.from_msg import Border
-from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.messages.from_msg import Border
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.runs.trajectory import Trajectory
 from graph_slam_ros.simulation import (
     WORLDS,
     city_graph,
@@ -24,8 +26,6 @@ from graph_slam_ros.simulation import (
 )
 from graph_slam_ros.simulation.motion import VelocityNoise, accumulated, integrate, space_of
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry
-from graph_slam_ros.trajectory import Trajectory
-from graph_slam_ros.truth import read_truth
 
 SMALL = {
     "pythonrobotics": {},

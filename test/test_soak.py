@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from reliability import tell, times
 
+from graph_slam_ros.analysis.path_error import alignment
 from graph_slam_ros.lie import se3
-from graph_slam_ros.path_error import alignment
-from graph_slam_ros.ros.live.session import Session
+from graph_slam_ros.node.session import Session
 from graph_slam_ros.simulation import simulate
 from graph_slam_ros.simulation.recording import START_NS
 from graph_slam_ros.slam import Config, Counters, Odometry

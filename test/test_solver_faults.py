@@ -17,10 +17,10 @@ from reliability import tell, times
 
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.lie import se2
+from graph_slam_ros.measurements.types import Closure
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.ledger import Reason, Verdict
-from graph_slam_ros.slam.measurements import Closure
-from graph_slam_ros.solver.tree import LOCAL, NOTHING, TAKEN
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
+from graph_slam_ros.solver.clique_tree.storage import LOCAL, NOTHING, TAKEN
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S

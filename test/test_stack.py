@@ -19,8 +19,8 @@ from rclpy.qos import ReliabilityPolicy
 from reliability import times
 from tf2_msgs.msg import TFMessage
 
-from graph_slam_ros.ros.interfaces import typestore
-from graph_slam_ros.run import is_run
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.runs import is_run
 
 NS = 10**9
 STATES = ("path", "pose", "landmarks", "landmarks_estimate", "graph", "path_updates")

@@ -20,13 +20,13 @@ from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from vision_msgs.msg import Detection3DArray
 
-from graph_slam_ros.formats.journal import read_ingest
-from graph_slam_ros.merge import merge
-from graph_slam_ros.run import check_room, freeze, is_cut_off
-from graph_slam_ros.run.map_log import read_map
+from graph_slam_ros.config.config import parameters
+from graph_slam_ros.maps.merge import merge
+from graph_slam_ros.measurements.types import from_record
+from graph_slam_ros.runs import check_room, freeze, is_cut_off
+from graph_slam_ros.runs.journal import read_ingest
+from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.slam import Control
-from graph_slam_ros.slam.config import parameters
-from graph_slam_ros.slam.measurements import from_record
 
 SERVICES = "save", "load", "reset", "pause", "resume", "optimize", "clear_closures"
 

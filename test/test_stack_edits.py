@@ -9,7 +9,7 @@ from live_nodes import ENVIRONMENT, node, own_domain, replayed, results, robot, 
 from std_msgs.msg import String
 
 from graph_slam_ros.cli import main
-from graph_slam_ros.run.map_log import read_map
+from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.simulation import simulate
 from graph_slam_ros.simulation.bag import write_bag
 

@@ -14,9 +14,9 @@ from rclpy.parameter import Parameter
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
-from graph_slam_ros.ros.cdr import LATEST_NS
-from graph_slam_ros.ros.live.reckoning import Reckoning
-from graph_slam_ros.ros.node import GraphSlamNode
+from graph_slam_ros.messages.cdr import LATEST_NS
+from graph_slam_ros.node.node import GraphSlamNode
+from graph_slam_ros.node.pose_extrapolator import Reckoning
 from graph_slam_ros.slam import Odometry
 
 NS = 10**9

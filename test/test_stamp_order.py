@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graph_slam_ros.slam import Config, Counters, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.stamp_order import StampOrder
+from graph_slam_ros.slam.frontend.stamp_order import StampOrder
 
 MS = 1_000_000
 T0 = 1_700_000_000_000 * MS

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.cli import main
+from graph_slam_ros.config.survey import Surveyed, surveyed
 from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
 from graph_slam_ros.graph import POINT_PRIOR, POSITION_PRIOR, R2, R3, SE2
 from graph_slam_ros.lie import se2, se3, so3
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros.survey import with_survey
-from graph_slam_ros.run import run_config
+from graph_slam_ros.messages.survey import with_survey
+from graph_slam_ros.runs import run_config
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.survey import Surveyed, surveyed
 
 END = (Control("end"), Control("optimize"))
 T_PLAN_WORLD = (12.0, -5.0, 2.0)

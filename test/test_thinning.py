@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from graph_slam_ros.ros.thinning import thinned, worst_and_some
+from graph_slam_ros.messages.path_thinning import thinned, worst_and_some
 
 
 @pytest.mark.parametrize(

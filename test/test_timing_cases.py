@@ -24,10 +24,10 @@ from messages import (
 from reliability import tell, times
 
 from graph_slam_ros.graph import RELATIVE_POSE
-from graph_slam_ros.ros.stamp_jump import StampJump
-from graph_slam_ros.run import RunRecorder, summarize
+from graph_slam_ros.runs import RunRecorder, summarize
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.frontend.time_jump import StampJump
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from graph_slam_ros.graph import R2
-from graph_slam_ros.ros import results, to_msg
-from graph_slam_ros.ros.from_msg import twist_of
-from graph_slam_ros.ros.interfaces import typestore
+from graph_slam_ros.messages import results, to_msg
+from graph_slam_ros.messages.from_msg import twist_of
+from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 
 STAMP_NS = 1_700_000_000_987_654_321

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.ros.transforms import Transforms
+from graph_slam_ros.messages.inputs.transforms import Transforms
 
 
 def at(x=0.0, y=0.0, z=0.0, yaw=0.0):

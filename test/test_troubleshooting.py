@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from graph_slam_ros.formats.parameters import read_parameters
-from graph_slam_ros.ros.inputs import uses
+from graph_slam_ros.measurements.reasons import REASONS
+from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.slam import Config
-from graph_slam_ros.slam.reasons import REASONS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs/troubleshooting.md"
@@ -36,7 +36,7 @@ def test_every_counter_is_on_the_page():
 
 def reasons_of_states():
     """What the verdict can say, as the constant pieces of each text."""
-    tree = ast.parse((ROOT / "graph_slam_ros/ros/live/health.py").read_text())
+    tree = ast.parse((ROOT / "graph_slam_ros/node/diagnostics.py").read_text())
     for function in ast.walk(tree):
         if isinstance(function, ast.FunctionDef) and ast.unparse(function.returns) in ("str", "Iterator[str]"):
             for node in ast.walk(function):

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from graph_slam_ros.replay import replay
-from graph_slam_ros.ros.bag import open_bag
-from graph_slam_ros.ros.topics import PUBLICATIONS, SUBSCRIPTIONS
+from graph_slam_ros.config.config import FramesConfig
+from graph_slam_ros.messages.topics import PUBLICATIONS, SUBSCRIPTIONS
+from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
-from graph_slam_ros.slam.config import FramesConfig
 from graph_slam_ros.slam.graph_slam import Correction
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
@@ -73,7 +73,7 @@ def test_every_topic_of_foxglove_is_the_nodes_or_of_a_runs_recording(tmp_path):
 
 
 def test_what_foxglove_plots_is_among_the_nodes_diagnostics():
-    health = pytest.importorskip("graph_slam_ros.ros.live.health")
+    health = pytest.importorskip("graph_slam_ros.node.diagnostics")
     given = {field.name: 0 for field in dataclasses.fields(health.Estimate)}
     estimate = health.Estimate(**given | {"correction": Correction()})
     facts = health.Facts("active", estimate=estimate)

@@ -7,12 +7,12 @@ import pytest
 from faulty import faulty_run
 
 from graph_slam_ros import cli
+from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Loss
-from graph_slam_ros.run import RunRecorder
-from graph_slam_ros.run.ledger_file import read_ledger
+from graph_slam_ros.runs import RunRecorder
+from graph_slam_ros.runs.ledger_file import read_ledger
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.what_if import SavedGraph
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from benchmarks import options
 from benchmarks.live.processes import Process, asked, reply, ros, running, until
 from benchmarks.table import Row
 from graph_slam_ros.lie import se2
-from graph_slam_ros.ros import results
+from graph_slam_ros.messages import results
 from graph_slam_ros.slam import Config, GraphSlam, Odometry
 
 _HERE = "benchmarks.live.paths"

@@ -19,7 +19,7 @@ class Node(Process):
         self._folder = folder
         given = {"output.folder": folder} | parameters
         words = [word for key, value in given.items() for word in ("-p", f"{key}:={_text(value)}")]
-        super().__init__("graph_slam_ros.ros.node", "--ros-args", "--log-level", "error", *words, name="the node")
+        super().__init__("graph_slam_ros.node.node", "--ros-args", "--log-level", "error", *words, name="the node")
 
     def finished(self) -> dict[str, Any]:
         """What it tells of its run, once it has ended."""

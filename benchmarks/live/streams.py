@@ -10,8 +10,8 @@ from numpy.random import PCG64, Generator
 
 from benchmarks.problem import Array, city_problem
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.ros import to_msg
-from graph_slam_ros.ros.bag import BagMessage, open_bag
+from graph_slam_ros.messages import to_msg
+from graph_slam_ros.recordings.bag import BagMessage, open_bag
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.simulation import warehouse as slower
 from graph_slam_ros.simulation.recording import START_NS

@@ -10,12 +10,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from graph_slam_ros.batch import Solution
 from graph_slam_ros.certificate.polish import polish
 from graph_slam_ros.certificate.spectrum import least_eigenvalue
 from graph_slam_ros.certificate.synchronization import RELATIVE, Edges, Poses, Synchronization
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import POSE_PRIOR, POSE_PRIOR_3D, SE2, SE3, Graph
+from graph_slam_ros.optimization import Solution
 from graph_slam_ros.solver import Solver
 
 Array = NDArray[np.float64]

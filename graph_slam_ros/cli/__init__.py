@@ -66,6 +66,6 @@ def node_main() -> int:
     if not console.has_ros():
         console.tell("ROS 2 is not installed here (no rclpy); replay works without it", "graph_slam_node")
         return console.REFUSED
-    from graph_slam_ros.ros.node import main as run
+    from graph_slam_ros.node.node import main as run
 
     return run()

@@ -12,10 +12,10 @@ from graph_slam_ros.cli import console
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
-    from graph_slam_ros.batch import Solution
     from graph_slam_ros.certificate import Certificate
     from graph_slam_ros.formats.graph_file import G2oFile
     from graph_slam_ros.graph import Graph, Loss
+    from graph_slam_ros.optimization import Solution
     from graph_slam_ros.solver import Report, Settings, Solver
 
 _START = {
@@ -30,9 +30,9 @@ _SAME = 1e-6  # of chi2: what one optimum may differ by from another run to it
 
 def optimize(args: argparse.Namespace) -> int:
     """Solve a graph, say how it went, write it and draw it."""
-    from graph_slam_ros.batch import optimize as solve
-    from graph_slam_ros.batch import started
     from graph_slam_ros.formats.g2o_writer import write_g2o
+    from graph_slam_ros.optimization import optimize as solve
+    from graph_slam_ros.optimization import started
     from graph_slam_ros.solver import Settings
 
     console.check_file(args.out, args.plot, force=args.force, source=args.graph)
@@ -93,9 +93,9 @@ def _options(args: argparse.Namespace) -> Iterable[str]:
 
 def convert(args: argparse.Namespace) -> int:
     """Write a graph in another format."""
-    from graph_slam_ros.batch import started
     from graph_slam_ros.formats.convert import NAMES, format_of, write_graph
     from graph_slam_ros.formats.strict import ending
+    from graph_slam_ros.optimization import started
 
     target = args.to or format_of(args.out)
     if ending(args.graph) == ".tum" and not args.source:
@@ -164,8 +164,8 @@ class _Proof:
 
 def _certify(solution: "Solution", settings: "Settings") -> _Proof:
     """Ask for the certificate; where it is not given, though it could be, try another start."""
-    from graph_slam_ros.batch import optimize
     from graph_slam_ros.certificate import CERTIFIED, certify, other_start
+    from graph_slam_ros.optimization import optimize
 
     first = certify(solution)
     if first.verdict == CERTIFIED or not first.computed:
@@ -252,7 +252,7 @@ def _positions(graph: "Graph", solver: "Solver") -> Any:
 def _plot_graph(out: Path, graph: "Graph", initial: Any, final: Any) -> None:
     import numpy as np
 
-    from graph_slam_ros.report import draw_graph
+    from graph_slam_ros.analysis.plots import draw_graph
 
     edges: dict[str, list[Any]] = {}
     for table in graph.tables.values():

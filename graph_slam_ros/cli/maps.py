@@ -8,8 +8,8 @@ from graph_slam_ros.cli import console
 
 def export(args: argparse.Namespace) -> int:
     """Write what a run knows in another format."""
-    from graph_slam_ros.export import export as exported
-    from graph_slam_ros.export import files_of
+    from graph_slam_ros.maps.export import export as exported
+    from graph_slam_ros.maps.export import files_of
 
     console.check_file(*files_of(args.out, args.to), force=args.force)
     losses: list[str] = []
@@ -30,7 +30,7 @@ def _then_use(args: argparse.Namespace) -> None:
 
 def diff(args: argparse.Namespace) -> int:
     """Say what differs between two runs' maps."""
-    from graph_slam_ros.diff import diff as compared
+    from graph_slam_ros.maps.diff import diff as compared
 
     losses: list[str] = []
     found = compared(args.a, args.b, losses)
@@ -43,8 +43,8 @@ def diff(args: argparse.Namespace) -> int:
 
 def merge(args: argparse.Namespace) -> int:
     """Make one map of two runs."""
-    from graph_slam_ros import outcome
-    from graph_slam_ros.merge import merge as merged
+    from graph_slam_ros.maps.merge import merge as merged
+    from graph_slam_ros.runs import outcome
 
     done = merged(args.a, args.b, args.out, force=args.force)
     agree = done.shared - len(done.left_out)
@@ -60,8 +60,8 @@ def merge(args: argparse.Namespace) -> int:
 
 def freeze(args: argparse.Namespace) -> int:
     """Make a map in which to be located, and which nothing changes."""
-    from graph_slam_ros import outcome
-    from graph_slam_ros.run import freeze as frozen
+    from graph_slam_ros.runs import freeze as frozen
+    from graph_slam_ros.runs import outcome
 
     summary = frozen(args.run_folder, args.out, force=args.force)
     console.say(*outcome.text(summary), f"results in {args.out}: what is there now stays, whatever is seen from now on")

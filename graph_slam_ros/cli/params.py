@@ -5,9 +5,9 @@ import fnmatch
 from collections.abc import Iterator
 
 from graph_slam_ros.cli import console
+from graph_slam_ros.config.config import parameters
+from graph_slam_ros.config.parameter import Parameter
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.slam.config import parameters
-from graph_slam_ros.slam.parameter import Parameter
 
 
 def params(args: argparse.Namespace) -> int:

@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 
 from graph_slam_ros import __version__
-from graph_slam_ros.cli import decided, graphs, maps, recordings, values, worlds
+from graph_slam_ros.cli import audit, graphs, maps, recordings, simulate, values
 from graph_slam_ros.cli.usage import CODES, CommandParser
 
 Run = Callable[[argparse.Namespace], int]
@@ -91,20 +91,20 @@ def _commands() -> "dict[str, tuple[Run, Options, str, *tuple[str, ...]]]":
             "drive_run --truth drive.mcap:/ground_truth --out drive.png",
         ),
         "explain": (
-            decided.explain,
+            audit.explain,
             _explain,
             "why: what a run believed and what not, or all about one edge of it",
             "drive_run",
             "drive_run 142",
         ),
         "solve": (
-            decided.solve,
+            audit.solve,
             _solve,
             "what if: a run's graph without some edges, with others, under another loss",
             "drive_run --without 142 143",
         ),
         "influence": (
-            decided.influence,
+            audit.influence,
             _influence,
             "the edges of a run that its last pose hangs on most",
             "drive_run --count 5",
@@ -122,7 +122,7 @@ def _commands() -> "dict[str, tuple[Run, Options, str, *tuple[str, ...]]]":
             "graph.g2o graph.toro",
         ),
         "simulate": (
-            worlds.simulate,
+            simulate.simulate,
             _simulate,
             "record a synthetic world with truth: pythonrobotics, manhattan, warehouse, flight; put faults into it",
             "warehouse --out world.mcap --seed 7",

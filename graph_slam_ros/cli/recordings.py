@@ -18,8 +18,8 @@ _NO_MATPLOTLIB = "matplotlib is not installed: pip install matplotlib"
 
 def replay(args: argparse.Namespace) -> int:
     """Run a recording, or an earlier run, through the pipeline, or play it into a live ROS graph."""
-    from graph_slam_ros.replay import replay as replayed
-    from graph_slam_ros.run import is_run
+    from graph_slam_ros.runs import is_run
+    from graph_slam_ros.runs.replay import replay as replayed
 
     _refuse_idle_options(args, is_run(args.bag))
     config = _config(args)
@@ -39,14 +39,14 @@ def replay(args: argparse.Namespace) -> int:
 
 def _replay_live(args: argparse.Namespace, config: "Config") -> int:
     from graph_slam_ros.formats.files import read_text
-    from graph_slam_ros.replay import choose_inputs
-    from graph_slam_ros.ros.bag import open_bag
+    from graph_slam_ros.recordings.bag import open_bag
+    from graph_slam_ros.runs.replay import choose_inputs
 
     if not console.has_ros():
         raise GraphSlamError("--ros needs ROS 2 (no rclpy here); without --ros the same replay runs without it")
     bag, code = open_bag(args.bag), console.DONE
-    from graph_slam_ros.ros.player import config_of, own_node, play
-    from graph_slam_ros.run import SUMMARY, check_room
+    from graph_slam_ros.node.player import config_of, own_node, play
+    from graph_slam_ros.runs import SUMMARY, check_room
 
     node_name = args.node or "/graph_slam"
     config = config_of(node_name) if args.out is None else config
@@ -70,8 +70,8 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
 
 def recover(args: argparse.Namespace) -> int:
     """Write the results of a run that was never ended, or before all was processed."""
-    from graph_slam_ros.run import complete
-    from graph_slam_ros.run import recover as recovered
+    from graph_slam_ros.runs import complete
+    from graph_slam_ros.runs import recover as recovered
 
     summary = recovered(args.run_folder, args.out, force=args.force) if args.out else complete(args.run_folder)
     code = _say_run(args.run_folder, summary)
@@ -82,9 +82,9 @@ def recover(args: argparse.Namespace) -> int:
 
 def info(args: argparse.Namespace) -> int:
     """Say what a recording holds."""
-    from graph_slam_ros.info import describe
-    from graph_slam_ros.ros.bag import open_bag
-    from graph_slam_ros.run import is_run, suggested_out
+    from graph_slam_ros.cli.info import describe
+    from graph_slam_ros.recordings.bag import open_bag
+    from graph_slam_ros.runs import is_run, suggested_out
 
     if is_run(args.bag):
         console.say(f"an earlier run: {console.command('replay', args.bag, '--out', suggested_out(args.bag))}")
@@ -97,10 +97,10 @@ def info(args: argparse.Namespace) -> int:
 
 def evaluate(args: argparse.Namespace) -> int:
     """Compare a run with the truth."""
-    from graph_slam_ros.evaluation import evaluate as compared
-    from graph_slam_ros.evaluation import input_topics
-    from graph_slam_ros.run import changed_since
-    from graph_slam_ros.truth import read_truth
+    from graph_slam_ros.analysis.evaluation import evaluate as compared
+    from graph_slam_ros.analysis.evaluation import input_topics
+    from graph_slam_ros.analysis.trajectories import read_truth
+    from graph_slam_ros.runs import changed_since
 
     console.check_file(args.plot, force=args.force)
     truth = read_truth(args.truth, args.topic, input_topics(args.run_folder))
@@ -114,8 +114,8 @@ def evaluate(args: argparse.Namespace) -> int:
 
 def plot(args: argparse.Namespace) -> int:
     """Draw a run."""
-    from graph_slam_ros.report import draw_run
-    from graph_slam_ros.run import PICTURE, changed_since
+    from graph_slam_ros.analysis.plots import draw_run
+    from graph_slam_ros.runs import PICTURE, changed_since
 
     if not args.truth and (args.topic or args.no_align):
         raise GraphSlamError("plot: no use for --topic or --no-align without --truth")
@@ -131,11 +131,11 @@ def plot(args: argparse.Namespace) -> int:
 
 def _draw(run: Path, truth: Any = None, out: Path | None = None, *, align: bool = True, quiet: bool = False) -> None:
     """Draw a run besides something else, which does not fail where this cannot be done."""
-    from graph_slam_ros.run import PICTURE
+    from graph_slam_ros.runs import PICTURE
 
     if not _has_matplotlib():
         return console.tell(f"no picture: {_NO_MATPLOTLIB}")
-    from graph_slam_ros.report import draw_run
+    from graph_slam_ros.analysis.plots import draw_run
 
     picture = out or run / PICTURE
     try:
@@ -163,7 +163,7 @@ def warmup(args: argparse.Namespace) -> int:
 
 def demo(args: argparse.Namespace) -> int:
     """Run the demonstration."""
-    from graph_slam_ros.demo import demo as shown
+    from graph_slam_ros.cli.demo import demo as shown
 
     code = shown(args.out, live=console.has_ros(), force=args.force, progress=console.progress, say=console.say)
     console.then(f"a recording of your own: {console.command('info', 'RECORDING')}")
@@ -190,10 +190,10 @@ def _refuse_idle_options(args: argparse.Namespace, of_run: bool) -> None:
 
 def _config(args: argparse.Namespace) -> "Config":
     """Defaults, then the run's own or the given file, then single settings."""
+    from graph_slam_ros.config.config import flatten
     from graph_slam_ros.formats.parameters import parse_setting, read_parameters
-    from graph_slam_ros.run import is_run
+    from graph_slam_ros.runs import is_run
     from graph_slam_ros.slam import Config
-    from graph_slam_ros.slam.config import flatten
 
     run = args.map or (args.bag if is_run(args.bag) else None)
     if run is not None and not is_run(run):
@@ -208,7 +208,7 @@ def _config(args: argparse.Namespace) -> "Config":
 
 def _say_run(source: Path, summary: dict[str, Any]) -> int:
     """What came of a run; returns the exit code, 3 where that is less than what was asked for."""
-    from graph_slam_ros import outcome
+    from graph_slam_ros.runs import outcome
 
     console.say(*outcome.text(summary))
     if not summary["keyframes"]:

@@ -26,14 +26,14 @@ _SETTINGS = ("BOUNDSCHECK", "OPT")
 
 
 def _sources() -> list[Path]:
-    return [path for folder in _KERNEL_FOLDERS for path in sorted((_PACKAGE / folder).glob("*.py"))]
+    return [path for folder in _KERNEL_FOLDERS for path in sorted((_PACKAGE / folder).rglob("*.py"))]
 
 
 def _digest() -> str:
     settings = [getattr(numba.config, name, None) for name in _SETTINGS]
     sha = hashlib.sha256(f"{numba.__version__} {settings}".encode())
     for path in _sources():
-        sha.update(path.name.encode())
+        sha.update(path.relative_to(_PACKAGE).as_posix().encode())
         sha.update(path.read_bytes())
     return sha.hexdigest()[:16]
 

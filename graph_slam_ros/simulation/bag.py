@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import replaced
-from graph_slam_ros.ros.bag import BagWriter
-from graph_slam_ros.ros.to_msg import (
+from graph_slam_ros.graph.geometry import Space
+from graph_slam_ros.messages.to_msg import (
     covariance6,
     encode,
     header,
@@ -22,11 +22,11 @@ from graph_slam_ros.ros.to_msg import (
     transform,
     vector,
 )
+from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.simulation.instrument_messages import Message, gnss_messages, imu_messages
 from graph_slam_ros.simulation.motion import space_of
 from graph_slam_ros.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Recording
 from graph_slam_ros.slam import Closure, Sighting, Sightings
-from graph_slam_ros.slam.space import Space
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.graph.geometry import Space
 from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.false_closures import Closures
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.slam.space import Space
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

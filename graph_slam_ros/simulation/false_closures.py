@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph.geometry import Space
 from graph_slam_ros.simulation.motion import space_of
-from graph_slam_ros.slam.space import Space
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -10,6 +10,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o_writer import graph_lines
 from graph_slam_ros.formats.graph_file import EDGE_TAGS, G2oFile
 from graph_slam_ros.graph import EdgeType, Gaussian, Graph
+from graph_slam_ros.graph.geometry import PLANE, SPACE, Space
 from graph_slam_ros.simulation.draft import Draft
 from graph_slam_ros.simulation.false_closures import Closures
 from graph_slam_ros.simulation.fault_table import WrongLine
@@ -17,7 +18,6 @@ from graph_slam_ros.simulation.faults import Fault, put_faults
 from graph_slam_ros.simulation.pose_graph import values_of
 from graph_slam_ros.simulation.recording import Numbers
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.slam.space import PLANE, SPACE, Space
 
 Array = NDArray[np.float64]
 

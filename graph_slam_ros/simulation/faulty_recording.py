@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.graph.geometry import Space
 from graph_slam_ros.simulation.bag import ODOMETRY_TOPIC, recorded_names
 from graph_slam_ros.simulation.closures import places
 from graph_slam_ros.simulation.draft import Draft
@@ -20,7 +21,6 @@ from graph_slam_ros.simulation.faults import Fault, put_faults
 from graph_slam_ros.simulation.motion import space_of
 from graph_slam_ros.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Recording
 from graph_slam_ros.slam import Closure
-from graph_slam_ros.slam.space import Space
 
 
 def faulty_recording(recording: Recording, faults: Sequence[Fault], seed: int) -> tuple[Recording, list[WrongMessage]]:

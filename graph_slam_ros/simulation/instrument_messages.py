@@ -6,7 +6,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.ros.to_msg import encode, header, make, quaternion, transform, vector
+from graph_slam_ros.messages.to_msg import encode, header, make, quaternion, transform, vector
 from graph_slam_ros.simulation.recording import Gnss, Imu, Numbers
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from numpy.random import PCG64, Generator, SeedSequence
 from numpy.typing import NDArray
 
 from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.ros.inputs.fixes import east_north_up
+from graph_slam_ros.messages.inputs.fixes import east_north_up
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
 from graph_slam_ros.simulation.recording import Gnss, Imu, Numbers, Recording, Stamps

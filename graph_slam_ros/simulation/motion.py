@@ -7,8 +7,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from graph_slam_ros.graph.geometry import PLANE, SPACE, Space
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.slam.space import PLANE, SPACE, Space
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]

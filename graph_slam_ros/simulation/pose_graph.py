@@ -13,13 +13,13 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile, Values
 from graph_slam_ros.graph import RELATIVE_POSE, SE2, Gaussian, Graph
+from graph_slam_ros.graph.geometry import Space
 from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.manhattan import STEP_M, stroll
 from graph_slam_ros.simulation.motion import space_of, step_covariance
 from graph_slam_ros.simulation.options import fill, option
 from graph_slam_ros.simulation.recording import Numbers, Recording
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.slam.space import Space
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

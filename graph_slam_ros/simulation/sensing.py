@@ -7,9 +7,9 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from graph_slam_ros.graph.geometry import SPACE
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.slam.space import SPACE
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
+from graph_slam_ros.graph.geometry import PLANE
 from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
@@ -14,7 +15,6 @@ from graph_slam_ros.simulation.options import option
 from graph_slam_ros.simulation.recording import Numbers, Recording
 from graph_slam_ros.simulation.sensing import KINDS, RangeBearing, sightings
 from graph_slam_ros.slam import Sighting
-from graph_slam_ros.slam.space import PLANE
 
 Array = NDArray[np.float64]
 

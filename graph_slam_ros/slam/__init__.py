@@ -1,11 +1,11 @@
 """What the robot does: measurements in order of stamp become keyframes, edges and updates."""
 
-from graph_slam_ros.slam.config import Config
-from graph_slam_ros.slam.counters import Counters
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import Closure, Control, Fix, Measurement, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.graph_slam import GraphSlam, Update
-from graph_slam_ros.slam.landmarks import Landmark
-from graph_slam_ros.slam.measurements import Closure, Control, Fix, Measurement, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.trail import Keyframe
+from graph_slam_ros.slam.landmarks.landmark_map import Landmark
 
 __all__ = [
     "Closure",

@@ -7,13 +7,13 @@ the prior is loose in every direction that such a measurement determines. Parame
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.config.survey import Surveyed
 from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.measurements.types import Fix
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.carry import axes_unknown, square
-from graph_slam_ros.slam.config import Config
-from graph_slam_ros.slam.measurements import Fix
-from graph_slam_ros.slam.space import Numbers, Space
-from graph_slam_ros.slam.survey import Surveyed
+from graph_slam_ros.slam.frontend.motion_compensation import axes_unknown, square
 
 Array = NDArray[np.float64]
 

@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.graph import Gaussian, Loss
-from graph_slam_ros.slam.background import Background, Beside, Work, when_asked
-from graph_slam_ros.slam.counters import Counters
-from graph_slam_ros.slam.decisions import Decisions
-from graph_slam_ros.slam.displacement import DisplacementHypothesis
-from graph_slam_ros.slam.ledger import FINAL, Ledger, Reason
-from graph_slam_ros.slam.map_state import MapState
-from graph_slam_ros.slam.robust_config import RobustConfig
-from graph_slam_ros.slam.second_look import Frozen, Outcome, Rival, second_look
-from graph_slam_ros.slam.space import Numbers, Space
+from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.robust.background import Background, Beside, Work, when_asked
+from graph_slam_ros.slam.robust.displacement import DisplacementHypothesis
+from graph_slam_ros.slam.robust.gating import Decisions
+from graph_slam_ros.slam.robust.hypotheses import Frozen, Outcome, Rival, second_look
+from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason
+from graph_slam_ros.slam.snapshot import MapState
 from graph_slam_ros.solver import Report, Settings, Solver
 
 Array = NDArray[np.float64]

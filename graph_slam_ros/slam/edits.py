@@ -3,11 +3,11 @@
 import re
 
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import Control
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.counters import Counters
-from graph_slam_ros.slam.decisions import CANDIDATES, landmark_of
-from graph_slam_ros.slam.landmarks import Landmarks
-from graph_slam_ros.slam.measurements import Control
+from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
+from graph_slam_ros.slam.robust.gating import CANDIDATES, landmark_of
 
 SOURCE = "edit"
 _EDIT = re.compile(r"\s*(edge|landmark)\s+(\S.{0,127}?)\s*", re.DOTALL)

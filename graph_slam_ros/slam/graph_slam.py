@@ -10,20 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import DivergedError, GraphSlamError
-from graph_slam_ros.slam import carry
-from graph_slam_ros.slam.anchor import Anchor
-from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.background import Beside, when_asked
-from graph_slam_ros.slam.carry import Where
-from graph_slam_ros.slam.config import Config
-from graph_slam_ros.slam.counters import Counters
-from graph_slam_ros.slam.edits import Edits
-from graph_slam_ros.slam.kidnap_detector import Alarm, KidnapDetector
-from graph_slam_ros.slam.landmarks import Landmark, Landmarks
-from graph_slam_ros.slam.ledger import Change
-from graph_slam_ros.slam.map_state import MapState
-from graph_slam_ros.slam.measurements import (
+from graph_slam_ros.graph.geometry import Numbers
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import (
     Closure,
     Control,
     Fix,
@@ -34,17 +25,26 @@ from graph_slam_ros.slam.measurements import (
     Sighting,
     Sightings,
 )
-from graph_slam_ros.slam.motion import Motion, OdometryNoise
-from graph_slam_ros.slam.odometry_choice import OdometryChoice, Step
-from graph_slam_ros.slam.pose_edges import PoseEdges
-from graph_slam_ros.slam.reach import Reach, off_the_pole
-from graph_slam_ros.slam.safeguard import Safeguard
-from graph_slam_ros.slam.space import Numbers
-from graph_slam_ros.slam.stamp_order import StampOrder
-from graph_slam_ros.slam.thinning import Thinning
-from graph_slam_ros.slam.track import Track
-from graph_slam_ros.slam.trail import SightingPose, Trail
-from graph_slam_ros.slam.unnamed import Unnamed
+from graph_slam_ros.slam.anchor import Anchor
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.edits import Edits
+from graph_slam_ros.slam.failure_guard import Safeguard
+from graph_slam_ros.slam.frontend import motion_compensation
+from graph_slam_ros.slam.frontend.keyframes import SightingPose, Trail
+from graph_slam_ros.slam.frontend.max_distance import Reach, off_the_pole
+from graph_slam_ros.slam.frontend.motion_compensation import Where
+from graph_slam_ros.slam.frontend.odometry_integration import Motion, OdometryNoise
+from graph_slam_ros.slam.frontend.odometry_selector import OdometryChoice, Step
+from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
+from graph_slam_ros.slam.frontend.stamp_order import StampOrder
+from graph_slam_ros.slam.frontend.stamped_poses import Track
+from graph_slam_ros.slam.frontend.thinning import Thinning
+from graph_slam_ros.slam.kidnap_detector import Alarm, KidnapDetector
+from graph_slam_ros.slam.landmarks.anonymous import Unnamed
+from graph_slam_ros.slam.landmarks.landmark_map import Landmark, Landmarks
+from graph_slam_ros.slam.robust.background import Beside, when_asked
+from graph_slam_ros.slam.robust.ledger import Change
+from graph_slam_ros.slam.snapshot import MapState
 from graph_slam_ros.solver import Report, Settings
 
 Array = NDArray[np.float64]
@@ -666,7 +666,7 @@ class GraphSlam:
         most, added_sigma_m = self.config.keyframes.shared_noise, self.config.landmarks.added_sigma_m
         if is_soon:
             most = max(most, _SHARED_WHEN_SOON)
-        return carry.is_shared(self.space, m, where, most, added_sigma_m)
+        return motion_compensation.is_shared(self.space, m, where, most, added_sigma_m)
 
     def _keyframe_at(self, where: Where, motion: Motion) -> Where:
         """A keyframe at a stamp within the last step of odometry, which is cut in two."""

@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.config.config import OdometryConfig
 from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.config import OdometryConfig
-from graph_slam_ros.slam.counters import Counters
-from graph_slam_ros.slam.displacement import SAME_M, SAME_RAD, DisplacementHypothesis, DisplacementSearch
-from graph_slam_ros.slam.innovation_monitor import InnovationMonitor
-from graph_slam_ros.slam.landmark_history import LandmarkHistory
-from graph_slam_ros.slam.space import Numbers, Space
+from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, DisplacementHypothesis, DisplacementSearch
+from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
+from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """How the problem is solved: linearisation, ordering, the clique tree, online updates and batch optimisation."""
 
-from graph_slam_ros.solver.descent import METHODS, Settings
+from graph_slam_ros.solver.batch import METHODS, Settings
 from graph_slam_ros.solver.initialization import initial_values
 from graph_slam_ros.solver.report import Change, ClassCost, Iteration, Report
 from graph_slam_ros.solver.solver import Solver

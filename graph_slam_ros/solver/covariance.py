@@ -6,9 +6,8 @@ After Kaess and Dellaert, "Covariance recovery from a square root information ma
 import numpy as np
 
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.numeric import front_of
-from graph_slam_ros.solver.symbolic import mark
-from graph_slam_ros.solver.tree import (
+from graph_slam_ros.solver.clique_tree.numeric import front_of
+from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUE,
     DOF,
     FRONT_DOF,
@@ -25,6 +24,7 @@ from graph_slam_ros.solver.tree import (
     Index,
     Tree,
 )
+from graph_slam_ros.solver.clique_tree.symbolic import mark
 
 
 @kernel

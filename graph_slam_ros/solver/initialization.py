@@ -33,7 +33,7 @@ from graph_slam_ros.graph import (
 )
 from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.lie import so3
-from graph_slam_ros.solver.replayed_start import replayed_values
+from graph_slam_ros.solver.incremental_initialization import replayed_values
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

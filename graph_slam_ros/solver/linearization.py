@@ -11,9 +11,9 @@ from graph_slam_ros.graph import EdgeType, Graph, Loss
 from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.numeric import add_to_diagonal, clear_block
+from graph_slam_ros.solver.clique_tree.numeric import add_to_diagonal, clear_block
+from graph_slam_ros.solver.clique_tree.storage import BLOCK, Tree
 from graph_slam_ros.solver.report import ClassCost
-from graph_slam_ros.solver.tree import BLOCK, Tree
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

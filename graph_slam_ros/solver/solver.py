@@ -9,27 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import SE2, SE3, Graph
 from graph_slam_ros.graph.graph import EdgeTable, whole_numbers
-from graph_slam_ros.solver import incremental
-from graph_slam_ros.solver.covariance import joint, marginals
-from graph_slam_ros.solver.descent import Problem, Settings, minimise
-from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole, undetermined
-from graph_slam_ros.solver.linearization import (
-    Losses,
-    chi2_of,
-    costs,
-    information,
-    linearize,
-    refuse_nonfinite,
-    residuals_of,
-    rows_of,
-    store,
-)
-from graph_slam_ros.solver.numeric import keep, settle
-from graph_slam_ros.solver.report import Change, Report
-from graph_slam_ros.solver.schedule import BY_FAR, Schedule
-from graph_slam_ros.solver.stages import Stages
-from graph_slam_ros.solver.symbolic import compact
-from graph_slam_ros.solver.tree import (
+from graph_slam_ros.solver.batch import Problem, Settings, minimise
+from graph_slam_ros.solver.clique_tree import incremental
+from graph_slam_ros.solver.clique_tree.numeric import keep, settle
+from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
     AFFECTED,
     BLOCKS_TOP,
@@ -48,7 +31,24 @@ from graph_slam_ros.solver.tree import (
     longer,
     with_room,
 )
-from graph_slam_ros.solver.waiting import NONE, Waiting
+from graph_slam_ros.solver.clique_tree.symbolic import compact
+from graph_slam_ros.solver.covariance import joint, marginals
+from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole, undetermined
+from graph_slam_ros.solver.linearization import (
+    Losses,
+    chi2_of,
+    costs,
+    information,
+    linearize,
+    refuse_nonfinite,
+    residuals_of,
+    rows_of,
+    store,
+)
+from graph_slam_ros.solver.loss_stages import Stages
+from graph_slam_ros.solver.pending import NONE, Waiting
+from graph_slam_ros.solver.relinearization import BY_FAR, Schedule
+from graph_slam_ros.solver.report import Change, Report
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

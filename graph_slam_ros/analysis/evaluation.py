@@ -1,0 +1,332 @@
+"""How far a run is from the truth: position, orientation, drift and map; and whether it knows how far.
+
+For the errors the estimate is moved onto the truth by the rigid motion that fits best, of the plane or of space as the
+run was made, without scale; poses are compared where both have a stamp within 0.05 s. Consistency is told in the frame
+that both share at the run's first pose.
+"""
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.analysis.consistency import ClassNoise, Consistency, Nees, class_noise, landmark_nees, pose_nees
+from graph_slam_ros.analysis.path_error import (
+    STATISTICS,
+    Drift,
+    PathError,
+    Statistics,
+    alignment,
+    associate,
+    interpolated,
+    path_error,
+)
+from graph_slam_ros.analysis.trajectories import Truth, read_truth
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.files import is_empty, read_text
+from graph_slam_ros.lie import se3
+from graph_slam_ros.runs import COVARIANCES, SUMMARY, is_run, run_config, summary_of
+from graph_slam_ros.runs.trajectory import Point, Trajectory, read_covariances, read_landmarks, read_tum
+
+Array = NDArray[np.float64]
+
+_KEYFRAMES = ("path.tum", "path_odometry.tum")  # estimate and dead reckoning
+_SIGHTINGS = ("sightings.tum", "odometry.tum")
+_ONE_DRIVE = [{"keyframe": 0, "sighting": 0}]
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """Errors of a run.
+
+    Attributes
+    ----------
+    odometry : the same for dead reckoning, or None where the run has none
+    map_rmse_m : of landmarks with the same id, aligned by themselves; None with too few to align or without truth
+    consistency : of the run, or None where it left no covariances
+    dimensions : 2 or 3
+    losses : what of the truth could not be read
+    warnings : why the errors may mean less than they seem to
+    scored : what was compared with what, in words
+    """
+
+    estimate: PathError
+    odometry: PathError | None
+    map_rmse_m: float | None
+    consistency: Consistency | None = None
+    dimensions: int = 2
+    losses: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    scored: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def _angle(self) -> str:
+        return "heading" if self.dimensions == 2 else "angle"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values; what there is not is None. Angles are ``heading_rad`` in the plane, ``angle_rad`` in space."""
+
+        def drift(one: Drift | None, unit: str) -> dict[str, Any] | None:
+            angle = f"{self._angle}_rad_per_{unit}"
+            return None if one is None else {f"position_m_per_{unit}": one.position, angle: one.angle, "n": one.n}
+
+        def plain(error: PathError) -> dict[str, Any]:
+            return {
+                "position_m": error.position_m,
+                f"{self._angle}_rad": error.angle_rad,
+                "drift": {"per_s": drift(error.per_s, "s"), "per_m": drift(error.per_m, "m")},
+                "n": error.n,
+                "of": error.of,
+            }
+
+        return plain(self.estimate) | {
+            "map_m": None if self.map_rmse_m is None else {"rmse": self.map_rmse_m},
+            "odometry": self.odometry and plain(self.odometry),
+            "consistency": self.consistency and self.consistency.as_dict(),
+            "scored": self.scored,
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{name:30s}{what}" for name, what in self.scored.items()]
+        title = f"error at {self.estimate.n} of {self.estimate.of} stamps"
+        lines.append(f"{title:30s}{'rmse':>10s}{'median':>10s}{'max':>10s}")
+        for name, error in (("estimate", self.estimate), ("dead reckoning", self.odometry)):
+            if error is not None:
+                lines += self._rows(name, error)
+        if self.map_rmse_m is not None:
+            lines.append(f"{'landmarks, position [m]':30s}{self.map_rmse_m:10.3f}")
+        if self.consistency is not None:
+            lines.append(str(self.consistency))
+        return "\n".join(lines)
+
+    def _rows(self, name: str, error: PathError) -> list[str]:
+        degrees = 180.0 / np.pi
+        rows = [
+            (f"{name}, position [m]", error.position_m, 1.0, 3),
+            (f"{name}, {self._angle} [deg]", error.angle_rad, degrees, 2),
+        ]
+        for one, unit in ((error.per_s, "s"), (error.per_m, "m")):
+            if one is not None:
+                rows.append((f"{name}, drift [m/{unit}]", one.position, 1.0, 4))
+                rows.append((f"{name}, drift [deg/{unit}]", one.angle, degrees, 3))
+        return [_line(*row) for row in rows if row[1] is not None]  # type: ignore[arg-type]
+
+
+def _line(name: str, values: Statistics, factor: float, digits: int) -> str:
+    return f"{name:30s}" + "".join(f"{factor * values[key]:10.{digits}f}" for key in STATISTICS)
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """The part of a run's folder that is scored: the paths of one drive.
+
+    Attributes
+    ----------
+    estimate, odometry : with the names of their files; odometry is None where there is none
+    number, count : which of how many, from 1; the others were in the map that was loaded
+    first_keyframe, end_keyframe : its rows in ``path.tum``, the second not included; None: to the end
+    """
+
+    estimate: Trajectory
+    odometry: Trajectory | None
+    names: tuple[str, str]
+    number: int = 1
+    count: int = 1
+    first_keyframe: int = 0
+    end_keyframe: int | None = None
+
+    @property
+    def keyframes(self) -> slice:
+        """Its rows in ``path.tum``."""
+        return slice(self.first_keyframe, self.end_keyframe)
+
+
+def evaluate(
+    run: Path | str, truth: Truth | str | Path, estimate: str = "", topic: str = "", *, align: bool = True
+) -> Scores:
+    """Compare a run's folder with the truth.
+
+    Parameters
+    ----------
+    truth : ``BAG``, ``BAG:TOPIC`` or ``FILE.tum``, or what ``read_truth`` has read
+    estimate : which path of the run is scored; default: ``sightings.tum``, or ``path.tum`` where nothing was seen
+    topic : of the truth, as in ``read_truth``
+    align : without, the map is taken to be in the frame of the truth
+
+    Raises
+    ------
+    GraphSlamError
+        A file or topic that is missing or unreadable, or too few common stamps.
+    """
+    run = Path(run)
+    inputs = input_topics(run)
+    known = truth if isinstance(truth, Truth) else read_truth(truth, topic, inputs)
+    dimensions = dimensions_of(run)
+    drive = scored_drive(run, known.trajectory, estimate)
+    landmarks = {name: landmark.position for name, landmark in read_landmarks(run / "landmarks.csv").items()}
+    scored = {"truth": known.source, "estimate": _described(drive)}
+    scored["frame"] = "the run lies on the truth as well as can be" if align else "as they are, not aligned"
+    warnings = []
+    if known.topic in inputs:
+        warnings.append(f"{known.topic} was an input of the run: the error says how well it fits, not how true it is")
+    odometry = drive.odometry
+    return Scores(
+        path_error(drive.estimate, known.trajectory, dimensions, align=align),
+        None if odometry is None else path_error(odometry, known.trajectory, dimensions),
+        _map_rmse(landmarks, known.landmarks, dimensions),
+        _consistency(run, known, drive),
+        dimensions,
+        known.losses,
+        tuple(warnings),
+        scored,
+    )
+
+
+def dimensions_of(run: Path) -> int:
+    """In how many dimensions a run was made: 2 where it does not say."""
+    return run_config(run).world.dimensions if is_run(run) else 2
+
+
+def input_topics(run: Path) -> set[str]:
+    """Topics that a run listened to, by its configuration."""
+    return {f"/{one.topic.lstrip('/')}" for one in run_config(run).sources} if is_run(run) else set()
+
+
+def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Drive:
+    """The last drive of a run that was under way while the truth was recorded; the last where there is no truth.
+
+    Raises
+    ------
+    GraphSlamError
+        The path of the run cannot be read.
+    """
+    of_sightings = estimate == _SIGHTINGS[0] or (not estimate and not is_empty(run / _SIGHTINGS[0]))
+    default, odometry = _SIGHTINGS if of_sightings else _KEYFRAMES
+    name = estimate or default
+    if is_empty(run / odometry):
+        odometry = _SIGHTINGS[1]
+    whole = read_tum(run / name)
+    beside = None if is_empty(run / odometry) else read_tum(run / odometry)
+    drives = _drives(run) if name in (*_SIGHTINGS, *_KEYFRAMES) else _ONE_DRIVE
+    chosen = None
+    for k in reversed(range(len(drives))):
+        follows = drives[k + 1] if k + 1 < len(drives) else {}
+        rows = {key: slice(drives[k][key], follows.get(key)) for key in ("keyframe", "sighting")}
+        estimated = whole.at(rows["sighting" if name in _SIGHTINGS else "keyframe"])
+        reckoned = beside and beside.at(rows["sighting" if odometry in _SIGHTINGS else "keyframe"])
+        if not len(estimated.stamps_s):
+            continue
+        part = Drive(
+            estimated, reckoned, (name, odometry), k + 1, len(drives), drives[k]["keyframe"], follows.get("keyframe")
+        )
+        chosen = chosen or part
+        if truth is None or _overlap(estimated, truth):
+            return part
+    return chosen or Drive(whole, beside, (name, odometry))
+
+
+def _drives(run: Path) -> list[dict[str, int]]:
+    """Where each drive begins; one where the summary does not say."""
+    try:
+        told = summary_of(run)["drives"]
+        drives = [{key: int(one[key]) for key in ("keyframe", "sighting")} for one in told]
+    except (ValueError, KeyError, TypeError):
+        return _ONE_DRIVE
+    return drives or _ONE_DRIVE
+
+
+def _overlap(path: Trajectory, truth: Trajectory) -> bool:
+    try:
+        return len(associate(path, truth)[0].stamps_s) > 1
+    except GraphSlamError:
+        return False
+
+
+def _described(drive: Drive) -> str:
+    if drive.count == 1:
+        return drive.names[0]
+    return f"{drive.names[0]}, drive {drive.number} of {drive.count} alone: the others are of other recordings"
+
+
+def _map_rmse(landmarks: dict[str, Point], true: dict[str, Point], dimensions: int) -> float | None:
+    """RMSE in metres of the landmarks whose ids both have."""
+    shared = sorted(set(landmarks) & set(true))
+    if len(shared) < dimensions:
+        return None
+    flat = np.array([1.0, 1.0, 0.0 if dimensions == 2 else 1.0])
+    points, reference = (np.array([where[name] for name in shared]) * flat for where in (landmarks, true))
+    moved = np.stack(se3.act(alignment(points[:, :dimensions], reference[:, :dimensions]), tuple(points.T)), axis=1)
+    return float(np.sqrt(np.mean(np.sum((moved - reference) ** 2, axis=1))))
+
+
+def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
+    """From what the run left; None where it left no covariances."""
+    if not os.path.lexists(run / COVARIANCES):
+        return None
+    path, covariances = read_tum(run / "path.tum"), read_covariances(run / COVARIANCES)
+    if len(covariances) != len(path.stamps_s):
+        raise GraphSlamError(
+            f"{run / COVARIANCES}: {len(covariances)} rows, and path.tum has {len(path.stamps_s)} poses"
+        )
+    path, covariances = path.at(drive.keyframes), covariances[drive.keyframes]
+    truth = known.trajectory if covariances.shape[1] == 6 else known.trajectory.in_plane()
+    true = interpolated(truth, path.stamps_s)
+    is_held, noise = _classes(run)
+    reason = _why_no_nees(known, drive, path, true, is_held)
+    if reason:
+        return Consistency(None, None, None, noise, {"poses and landmarks": reason})
+    landmarks = read_landmarks(run / "landmarks.csv")
+    unknown = (np.nan, np.nan, np.nan)
+    of_landmarks = landmark_nees(
+        np.array([landmark.position for landmark in landmarks.values()]).reshape(-1, 3),
+        np.array([known.landmarks.get(name, unknown) for name in landmarks]).reshape(-1, 3),
+        np.array([landmark.covariance for landmark in landmarks.values()]).reshape(-1, 3, 3),
+        path.poses[0],
+        true[0],
+        covariances[0],
+    )
+    last, poses = pose_nees(path.poses, true, covariances)
+    return Consistency(last, poses, of_landmarks, noise, _left_out(last, poses, of_landmarks, known, len(landmarks)))
+
+
+def _why_no_nees(known: Truth, drive: Drive, path: Trajectory, true: Array, is_held: bool) -> str:
+    """Why errors and covariances cannot be compared at all; empty where they can."""
+    if not known.trajectory.has_orientation:
+        return f"{known.source} has no orientation, which says how the map lies in its frame"
+    if is_held:
+        return "fixes hold the map, not its first pose, and how their frame lies in that of the truth is not known"
+    if drive.number > 1:
+        return "the map was there before the drive, so the first pose of the drive does not hold it"
+    if not np.isfinite(true[0]).all():
+        return f"the first keyframe, at {path.stamps_s[0]:.3f} s, has no truth within 0.05 s: both frames meet there"
+    return ""
+
+
+def _left_out(
+    last: Nees | None, poses: Nees | None, of_landmarks: Nees | None, known: Truth, landmarks: int
+) -> dict[str, str]:
+    out = {}
+    if poses is None:
+        out["poses"] = "none but the first has a truth within 0.05 s and a covariance"
+    elif last is None:
+        out["last pose"] = "it has no truth within 0.05 s, or no covariance"
+    if of_landmarks is None and landmarks:
+        out["landmarks"] = (
+            "none of them has a covariance and is among the true ones"
+            if known.landmarks
+            else "the truth has none (/landmarks_ground_truth)"
+        )
+    return out
+
+
+def _classes(run: Path) -> tuple[bool, dict[str, ClassNoise]]:
+    """Whether fixes hold the map, and what each class of edges says of its sigmas, by the summary of a run."""
+    try:
+        summary = json.loads(read_text(run / SUMMARY))
+        return "fixes" in summary["classes"], class_noise(summary["classes"], summary["leverage"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run ({type(error).__name__}: {error})") from None

@@ -1,0 +1,279 @@
+"""Why: what was decided in a saved run, as a whole or about one edge, in sentences."""
+
+import json
+import textwrap
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from scipy.special import gammainc
+
+from graph_slam_ros.analysis import measurement_text
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
+from graph_slam_ros.formats.strict import integer, lines
+from graph_slam_ros.runs import SUMMARY, run_config
+from graph_slam_ros.runs.ledger_file import Entry, read_changes, read_ledger
+from graph_slam_ros.slam import Config
+from graph_slam_ros.slam.landmarks.association import quantile
+from graph_slam_ros.slam.robust.ledger import FINAL, Change, Reason, Verdict
+
+_STATE = {
+    Verdict.NOT_EVALUATED: "taken for granted",
+    Verdict.ACCEPTED: "accepted",
+    Verdict.DOWN_WEIGHTED: "down-weighted",
+    Verdict.PENDING: "held back",
+    Verdict.REJECTED: "taken out",
+}
+_WHY = {
+    Reason.NONE: "",
+    Reason.UNLIKELY: "unlikely",
+    Reason.DOES_NOT_FIT: "does not fit",
+    Reason.OUTVOTED: "outvoted",
+    Reason.WITHDRAWN: "withdrawn",
+    Reason.QUARANTINED: "quarantined",
+    Reason.DISPLACED: "displaced",
+    Reason.REVOKED: "revoked",
+}
+_KIND = {"closures": "a loop closure", "landmarks": "a sighting", "fixes": "a fix", "odometry": "odometry"}
+_SHOWN = 5
+_WIDTH = 110
+_SAME = 0.99
+_FAR = 0.5  # of the gate is the largest statistic that was ever seen
+_CHANCE = 1e-4  # that so many would all stay below that, were their noise as it is told
+
+
+# -- the whole ---------------------------------------------------------------------------------------------------------
+
+
+def explain_run(folder: Path) -> Iterator[str]:
+    """How many of each class are in and out and why, what is most surprising, and whether the gates decide anything.
+
+    Raises
+    ------
+    FormatError
+        A file of the run is missing, or is not what it should be.
+    """
+    entries, config = read_ledger(folder), run_config(folder)
+    changes = read_changes(folder, len(entries))
+    judged = [entry for entry in entries if entry.verdict]
+    yield f"{len(entries)} edges, {len(judged)} of them judged; {len(entries) - len(judged)} are taken for granted"
+    if judged:
+        yield from _table(judged)
+    yield from _worst(e for e in judged if not e.is_in and e.reason not in FINAL)
+    yield from _least(e for e in judged if e.is_in)
+    yield from _gates(judged, changes, config)
+    yield from _rivals(folder)
+
+
+def _table(entries: Sequence[Entry]) -> Iterator[str]:
+    counts = Counter((e.label, _state(e.verdict, e.reason)) for e in entries)
+    labels, states = dict.fromkeys(e.label for e in entries), sorted({state for _, state in counts})
+    widths = [max(8, len(state)) for state in states]
+    yield "  " + f"{'':12s}" + "".join(f"  {state:>{width}s}" for state, width in zip(states, widths, strict=True))
+    for label in labels:
+        numbers = [f"  {counts[label, state]:{width}d}" for state, width in zip(states, widths, strict=True)]
+        yield f"  {label:12s}" + "".join(numbers)
+
+
+def _worst(entries: Iterable[Entry]) -> Iterator[str]:
+    """Of what is out: where the statistic is farthest above what it was held against."""
+    worst = sorted(entries, key=lambda e: -e.statistic / e.threshold)[:_SHOWN]
+    if worst:
+        yield "farthest off, of what is out:"
+    yield from (_row(e, f"chi2 {e.statistic:10.4g} against {e.threshold:6.4g}") for e in worst)
+
+
+def _least(entries: Iterable[Entry]) -> Iterator[str]:
+    """Of what is in: what fits least now."""
+    least = sorted(entries, key=lambda e: -e.chi2 / e.dof)[:_SHOWN]
+    if least:
+        yield "fits least, of what is in:"
+    yield from (_row(e, f"chi2 {e.chi2:10.4g} of {e.dof} number{'s' * (e.dof > 1)}") for e in least)
+
+
+def _row(e: Entry, numbers: str) -> str:
+    return f"  edge {e.edge:<7d} {e.about:24s} keyframe {e.keyframe:<6d} {numbers}   {_state(e.verdict, e.reason)}"
+
+
+def _gates(entries: Sequence[Entry], changes: Sequence[Change], config: Config) -> Iterator[str]:
+    """Gates that decide nothing: all that was ever seen is far below them, more so than noise that is told right."""
+    if not config.robust.decide:
+        yield "warning: robust.decide is false: nothing was held back or taken out, whatever it said"
+        return
+    gate = {e.edge: quantile(config.robust.gate, e.dof) for e in entries}
+    seen = {e.edge: e.statistic for e in entries}
+    for change in changes:
+        if change.edge in seen:
+            seen[change.edge] = max(seen[change.edge], change.statistic)
+    for label in dict.fromkeys(e.label for e in entries):
+        of_label = [e for e in entries if e.label == label]
+        largest = max(seen[e.edge] / gate[e.edge] for e in of_label)
+        below = gammainc([0.5 * e.dof for e in of_label], [0.5 * largest * gate[e.edge] for e in of_label])
+        if largest < _FAR and below.prod() < _CHANCE:
+            yield (
+                f"warning: the gate of {label} is inert: of {len(of_label)} the largest chi2 ever seen is"
+                f" {largest:.2g} of it; their noise is told too large, and what is false may pass"
+            )
+
+
+def _rivals(folder: Path) -> Iterator[str]:
+    """What the last second look could not rule out."""
+    file = folder / SUMMARY
+    try:
+        told = [
+            _rival(folder, rival)
+            for rival in json.loads("".join(text for _, text in lines(file, follow=False)))["rivals"]
+        ]
+    except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise FormatError(f"{file}: not the summary of a run: {error!r}") from None
+    yield from told
+
+
+def _rival(folder: Path, rival: Mapping[str, Any]) -> str:
+    here, there = (" ".join(f"{edge:d}" for edge in rival[which]) for which in ("only_here", "only_there"))
+    tried = f"graph_slam solve {folder} --with {here}" + (f" --without {there}" if there else "")
+    costs = f"this explanation costs {rival['best_cost']:.4g}, another {rival['cost']:.4g}"
+    return f"warning: ambiguous: {costs}: {tried}"
+
+
+# -- one edge, or a landmark's -----------------------------------------------------------------------------------------
+
+
+def explain_edge(folder: Path, which: str) -> Iterator[str]:
+    """Everything about an edge, by id, or about the sightings of a landmark, by name.
+
+    Where its name is a number, ``landmark:7`` is not edge 7.
+
+    Raises
+    ------
+    FormatError
+        A file of the run is missing, or is not what it should be.
+    GraphSlamError
+        There is no such edge or landmark.
+    """
+    if which.isdecimal():
+        run = SavedGraph(folder)
+        return _edge(run, integer(which), read_changes(folder, len(run.entries)), run_config(folder))
+    return _landmark(folder, which.removeprefix("landmark:"))
+
+
+def _landmark(folder: Path, name: str) -> Iterator[str]:
+    entries = read_ledger(folder)
+    seen = [e for e in entries if e.landmark == name]
+    if not seen:
+        names = sorted({e.landmark for e in entries} - {""})
+        there = ", ".join(names[:20]) + (", ..." if len(names) > 20 else "")
+        raise GraphSlamError(f"{name}: neither the id of an edge nor a landmark; there are {there or 'no landmarks'}")
+    yield f"landmark {name}: {len(seen)} edges, from keyframe {seen[0].keyframe} to {seen[-1].keyframe}"
+    yield from _table(seen)
+    out = [e for e in seen if not e.is_in]
+    yield from _worst(out)
+    yield from _least(e for e in seen if e.is_in)
+    if out:
+        yield f"graph_slam explain {folder} {out[0].edge} tells more of the first"
+
+
+def _edge(run: SavedGraph, edge: int, changes: Iterable[Change], config: Config) -> Iterator[str]:
+    e = run.edge(edge)
+    history = [change for change in changes if change.edge == edge]
+    kind, of, by = _KIND.get(e.label, e.label), e.landmark and f" of {e.landmark}", e.source and f" by {e.source}"
+    yield f"edge {edge}: {kind}{of}{by}: {_state(e.verdict, e.reason)}"
+    yield from _line("stamp", f"{e.stamp_ns / 1e9:.3f} s, of the newest keyframe that it is attached to")
+    yield from _line("judged", f"first at keyframe {e.keyframe}")
+    yield from _line("between", " and ".join(_vertex(run, e, v) for v in e.vertices))
+    yield from _line("measured", measurement_text.told(e, measurement_text.measured(e)))
+    yield from _line("sigmas", measurement_text.told(e, measurement_text.sigmas(e)))
+    yield from _line("expected", f"{measurement_text.told(e, measurement_text.expected(e))}, when it was judged first")
+    yield from _line("decided", _decided(e, history, config))
+    if not e.verdict:
+        return
+    yield from _line("now", f"chi2 {e.chi2:.4g} by its own noise; {100.0 * e.weight:.3g} % of its weight counts")
+    for c in history:
+        text = (
+            f"at keyframe {c.keyframe}: {_state(c.verdict, c.reason)}, chi2 {c.statistic:.4g} against {c.threshold:.4g}"
+        )
+        yield from _line("changed", text)
+    if e.reason not in FINAL:
+        yield from _what_if(run, e)
+    if not e.is_in:
+        yield from _line("to change", _remedy(e))
+
+
+def _decided(e: Entry, history: Sequence[Change], config: Config) -> str:
+    limit = quantile(config.robust.gate, e.dof)
+    chance = f"noise alone exceeds {limit:.4g} once in {1.0 / (1.0 - config.robust.gate):.0f} times"
+    if e.threshold < _SAME * limit:
+        chance += f", and what was accepted of {e.label} is much smaller than its noise tells"
+    elif limit < _SAME * e.threshold:
+        chance += ", but all noise may be larger than it is told to be, robust.noise_factor"
+    numbers = f"chi2 {e.statistic:.4g} with {e.dof} degree{'s' * (e.dof > 1)} of freedom"
+    allowed = f"up to {e.threshold:.4g} would have been let pass ({chance})"
+    if not e.verdict:
+        return "nothing: what is odometry, or says where the map begins, is never doubted"
+    match e.reason:
+        case Reason.UNLIKELY:
+            return f"to believe it would have cost {numbers}, all that must give way for it included; {allowed}"
+        case Reason.DOES_NOT_FIT:
+            return f"with everything solved it was off by {numbers}; {allowed}"
+        case Reason.OUTVOTED:
+            return f"in the cheapest explanation of everything it is off by {numbers}; {allowed}"
+        case Reason.WITHDRAWN:
+            return "not by how it fits: it was cleared, or association took it from its landmark"
+        case Reason.QUARANTINED:
+            return "not by how it fits: solves failed with it, again and again, and succeeded without"
+        case Reason.DISPLACED:
+            return (
+                f"{e.statistic:.0f} sightings more agreed on another pose of the robot than on this motion: it was"
+                " carried, or its wheels slipped; another edge with next to no trust in the motion is in its place"
+            )
+    if e.verdict is Verdict.DOWN_WEIGHTED:
+        return f"it stays in, but its loss leaves it little: {numbers}, above {e.threshold:.4g} ({chance})"
+    return f"{'it came in later' if history else 'it fits as it came'}: {numbers}; {allowed}"
+
+
+def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
+    """What believing it, or doing without it, would do to the map."""
+    which = "out" if e.is_in else "in and fully believed"
+    try:
+        moved = run.moved(run.solve([e.edge] if e.is_in else [], [] if e.is_in else [e.edge]))
+    except (GaugeError, SingularError) as error:
+        yield from _line("what if", f"it were {which}: nothing could be solved: {error}")
+        return
+    grown, (most, most_m) = moved.after.chi2_final - moved.before.chi2_final, moved.most
+    text = f"it were {which}: chi2 {grown:+.4g}, the last pose moves by {moved.final[0]:.3f} m"
+    yield from _line("what if", f"{text}, keyframe {run.keyframe(most)} the most, by {most_m:.3f} m")
+    if not e.is_in:
+        for edge, before, after in [w for w in moved.worse if w[0] != e.edge][:_SHOWN]:
+            other = f"edge {edge} ({run.edge(edge).about})"
+            yield from _line("against", f"{other}, whose chi2 would go from {before:.3g} to {after:.3g}")
+
+
+def _remedy(e: Entry) -> str:
+    if e.reason in FINAL:
+        return f"nothing: what was {_WHY[e.reason]} stays out; replay the run with another configuration"
+    factor = (e.statistic / e.threshold) ** 0.5
+    return (
+        "it comes back by itself once the map agrees with it. If you know that it is true, noise is told too small,"
+        f" its own or that of what stands against it: with all sigmas {factor:.3g} times as large it would pass"
+        " (robust.noise_factor). robust.decide=false holds nothing back"
+    )
+
+
+# -- words -------------------------------------------------------------------------------------------------------------
+
+
+def _state(verdict: Verdict, reason: Reason) -> str:
+    return f"{_STATE[verdict]}: {_WHY[reason]}" if reason else _STATE[verdict]
+
+
+def _line(what: str, text: str) -> Iterator[str]:
+    """A paragraph beside its name."""
+    yield from textwrap.wrap(text, _WIDTH, initial_indent=f"{what:11s}", subsequent_indent=" " * 11)
+
+
+def _vertex(run: SavedGraph, e: Entry, vertex: int) -> str:
+    if run.keyframe(vertex) is not None:
+        return f"keyframe {run.keyframe(vertex)}"
+    return f"landmark {e.landmark}" if e.landmark else f"vertex {vertex}"

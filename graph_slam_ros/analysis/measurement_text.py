@@ -1,0 +1,76 @@
+"""What the numbers of a measurement mean, for who reads them: their names and units, and what was expected instead."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.runs.ledger_file import Entry
+
+_XY, _XYZ = ("x m", "y m"), ("x m", "y m", "z m")
+_POSE, _POSE_3D = (*_XY, "heading rad"), (*_XYZ, "turn x rad", "turn y rad", "turn z rad")
+_NAMES = {
+    "EDGE_SE2": _POSE,
+    "EDGE_PRIOR_SE2": _POSE,
+    "EDGE_SE3:QUAT": _POSE_3D,
+    "EDGE_SE3_PRIOR": _POSE_3D,
+    "EDGE_ATTITUDE_SE3": _POSE_3D[3:],
+    "EDGE_HEADING_SE2": _POSE[2:],
+    "EDGE_HEADING_SE3": _POSE[2:],
+    "EDGE_COORDINATE_SE2": ("coordinate m",),
+    "EDGE_COORDINATE_SE3": ("coordinate m",),
+    "EDGE_RANGE_SE2_XY": ("range m",),
+    "EDGE_RANGE_SE3_XYZ": ("range m",),
+    "EDGE_RANGE_OFFSET_SE2_XY": ("range m",),
+    "EDGE_RANGE_OFFSET_SE3_XYZ": ("range m",),
+    "EDGE_PRIOR_OFFSET": ("offset m",),
+    "EDGE_BEARING_SE2_XY": ("bearing rad",),
+    "EDGE_RANGE_BEARING_SE2_XY": ("range m", "bearing rad"),
+    "EDGE_BEARING_SE3_XYZ": ("azimuth rad", "elevation rad"),
+    "EDGE_RANGE_BEARING_SE3_XYZ": ("range m", "azimuth rad", "elevation rad"),
+}
+
+
+def told(entry: Entry, numbers: Sequence[float]) -> str:
+    """One number for each that the edge measures, with their names; angles in degrees."""
+    names = _NAMES.get(entry.tag) or (_XY if len(numbers) == 2 else _XYZ)
+    words = []
+    for name, number in zip(names, numbers, strict=True):
+        what, unit = name.rsplit(" ", 1)
+        words.append(f"{what} {np.degrees(number):.2f} deg" if unit == "rad" else f"{what} {number:.3f} {unit}")
+    return ", ".join(words)
+
+
+def measured(entry: Entry) -> tuple[float, ...]:
+    """What was measured, as many numbers as the residual has; rotations in space as vectors."""
+    z = entry.measured
+    if entry.tag == "EDGE_ATTITUDE_SE3":
+        return _floats(so3.log(z))
+    if entry.dof == 6:
+        return _floats((*z[:3], *so3.log(z[3:])))
+    if entry.tag.startswith("EDGE_COORDINATE"):  # behind its direction, before the place on the robot
+        return z[len(z) // 2 : len(z) // 2 + 1]
+    return z[: entry.dof]
+
+
+def expected(entry: Entry) -> tuple[float, ...]:
+    """What was expected when it was judged first, in the same numbers."""
+    z, r = entry.measured, entry.residual
+    if entry.tag in ("EDGE_SE2", "EDGE_PRIOR_SE2"):
+        x, y, heading = se2.compose(z, r)
+        return _floats((x, y, se2.wrap(heading)))
+    if entry.tag == "EDGE_ATTITUDE_SE3":
+        return _floats(so3.log(so3.compose(z, so3.exp(r))))
+    if entry.dof == 6:
+        pose = se3.compose(z, (*r[:3], *so3.exp(r[3:])))
+        return _floats((*pose[:3], *so3.log(pose[3:])))
+    return tuple(a + b for a, b in zip(measured(entry), r, strict=True))
+
+
+def sigmas(entry: Entry) -> tuple[float, ...]:
+    """Standard deviation of each of these numbers."""
+    return _floats(np.sqrt(np.diag(np.linalg.inv(entry.information_matrix))).tolist())
+
+
+def _floats(numbers: Sequence[float]) -> tuple[float, ...]:
+    return tuple(float(x) for x in numbers)

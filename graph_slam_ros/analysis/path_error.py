@@ -1,0 +1,212 @@
+"""How far a path is from the truth: absolute and relative errors of position and angle.
+
+The absolute error (ATE) is that of each pose once a rigid motion, without scale, has laid the whole path on the truth.
+The relative error (RPE) is that of the motion over one second and over one metre: what drift is.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph.geometry import PLANE, SPACE
+from graph_slam_ros.lie import se3
+from graph_slam_ros.maps.alignment import laid_on
+from graph_slam_ros.runs.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Statistics = dict[str, float]
+
+MAX_STAMP_DIFFERENCE_S = 0.05
+STATISTICS = ("rmse", "median", "max")
+_LONGEST = 3.0  # a motion is over one second, or one metre, where it is over up to three
+_ROUNDING = 1e-6  # of stamps, which are seconds since 1970
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """Relative errors (RPE) of n motions, for each second or for each metre of the true path.
+
+    Attributes
+    ----------
+    position : [m/s] or [m/m]; angle : [rad/s] or [rad/m], None where the truth has no orientation
+    """
+
+    position: Statistics
+    angle: Statistics | None
+    n: int
+
+
+@dataclass(frozen=True, slots=True)
+class PathError:
+    """Errors of a path.
+
+    Attributes
+    ----------
+    position_m, angle_rad : absolute errors (ATE), each as {rmse, median, max}; no angle without true orientations
+    n : poses that have a truth within 0.05 s
+    of : poses of the path
+    per_s, per_m : relative errors (RPE); None where no two poses are one to three seconds, or metres, apart
+    """
+
+    position_m: Statistics
+    angle_rad: Statistics | None
+    n: int
+    of: int = 0
+    per_s: Drift | None = None
+    per_m: Drift | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Matched:
+    """Poses of a path in the frame of the truth, and the truth at the same stamps."""
+
+    path: Trajectory
+    truth: Trajectory
+    T_truth_path: se3.Pose
+
+    @property
+    def position_errors_m(self) -> Array:
+        """Of each pose, (n,)."""
+        return np.linalg.norm(self.path.poses[:, :3] - self.truth.poses[:, :3], axis=1)
+
+
+def path_error(estimate: Trajectory, truth: Trajectory, dimensions: int = 2, *, align: bool = True) -> PathError:
+    """Errors of one path.
+
+    Parameters
+    ----------
+    dimensions : 2: height, roll and pitch of both are left out
+    align : lay the path on the truth first; without, both are taken to be in one frame
+
+    Raises
+    ------
+    GraphSlamError
+        Fewer than two common stamps, or positions that leave the alignment open.
+    """
+    found = matched(estimate, truth, dimensions, align=align)
+    path, reference = found.path, found.truth
+    angles = angle_between(reference.poses, path.poses) if truth.has_orientation else None
+    way = np.linalg.norm(np.diff(reference.poses[:, :3], axis=0), axis=1)
+    return PathError(
+        statistics(found.position_errors_m),
+        None if angles is None else statistics(angles),
+        len(path.stamps_s),
+        len(estimate.stamps_s),
+        drift(path, reference, reference.stamps_s),
+        drift(path, reference, np.concatenate([[0.0], np.cumsum(way)])),
+    )
+
+
+def matched(estimate: Trajectory, truth: Trajectory, dimensions: int = 2, *, align: bool = True) -> Matched:
+    """The poses of both that belong together, in the frame of the truth. As ``path_error``."""
+    if dimensions == 2:
+        estimate, truth = estimate.in_plane(), truth.in_plane()
+    mine, reference = associate(estimate, truth)
+    T = se3.IDENTITY
+    if align:
+        T = alignment(mine.poses[:, :dimensions], reference.poses[:, :dimensions])
+    return Matched(mine.moved(T), reference, T)
+
+
+def associate(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
+    """The poses of both that belong together: nearest stamps, within 0.05 s, none before or after the truth.
+
+    Raises
+    ------
+    GraphSlamError
+        Fewer than two.
+    """
+    stamps_s, known_s = estimate.stamps_s, truth.stamps_s
+    after = np.clip(np.searchsorted(known_s, stamps_s), 1, max(1, len(known_s) - 1))
+    after = np.minimum(after, len(known_s) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(stamps_s - known_s[before] <= known_s[after] - stamps_s, before, after)
+    inside = (stamps_s >= known_s[0]) & (stamps_s <= known_s[-1])
+    near = np.abs(known_s[nearest] - stamps_s) <= MAX_STAMP_DIFFERENCE_S + _ROUNDING
+    mine = np.flatnonzero(inside & near)
+    if len(mine) < 2:
+        raise GraphSlamError(
+            f"{len(mine)} of {len(stamps_s)} stamps are within {MAX_STAMP_DIFFERENCE_S} s of the truth's:"
+            f" the estimate spans {_span(estimate)}, the truth {_span(truth)}"
+        )
+    return estimate.at(mine), truth.at(nearest[mine])
+
+
+def alignment(points: Array, reference: Array) -> se3.Pose:
+    """The rigid motion that takes points (n, 2) or (n, 3) nearest to their reference.
+
+    Of the plane where they have two coordinates: a rotation there cannot turn into the mirror image that turning over
+    in space would allow.
+
+    Raises
+    ------
+    GraphSlamError
+        All points are in one place, or in space on a line.
+    """
+    dimensions = points.shape[1]
+    moved = laid_on(PLANE if dimensions == 2 else SPACE, reference, points)
+    if moved is None:
+        where = "in one place" if dimensions == 2 else "on a line"
+        raise GraphSlamError(f"cannot align: all positions are {where}")
+    pose: se3.Pose = tuple(se3.in_space(moved).tolist()) if dimensions == 2 else moved  # type: ignore[assignment]
+    return pose
+
+
+def drift(path: Trajectory, truth: Trajectory, at: Array) -> Drift | None:
+    """Errors of the motions over one unit of ``at`` (n,), which never decreases, for each unit; None without any.
+
+    Where the truth has no orientation, the difference of both displacements in the axes of the truth.
+    """
+    first = np.arange(len(at))
+    last = np.searchsorted(at, at + 1.0 - _ROUNDING)
+    ends = last < len(at)
+    first, last = first[ends], last[ends]
+    length = at[last] - at[first]
+    near = length <= _LONGEST
+    first, last, length = first[near], last[near], length[near]
+    if not len(first):
+        return None
+    if not truth.has_orientation:
+        (moved, true) = (t.poses[last, :3] - t.poses[first, :3] for t in (path, truth))
+        return Drift(statistics(np.linalg.norm(moved - true, axis=1) / length), None, len(first))
+    moved, true = (np.stack(_motions(t.poses, first, last), axis=1) for t in (path, truth))
+    off = np.stack(se3.between(tuple(true.T), tuple(moved.T)), axis=1)
+    angles = angle_between(true, moved)
+    return Drift(statistics(np.linalg.norm(off[:, :3], axis=1) / length), statistics(angles / length), len(first))
+
+
+def _motions(poses: Array, first: Any, last: Any) -> se3.Pose:
+    return se3.between(tuple(poses[first].T), tuple(poses[last].T))
+
+
+def angle_between(a: Array, b: Array) -> Array:
+    """Angles (n,) of the rotations between poses (n, 7)."""
+    turn = np.stack(se3.between(tuple(a.T), tuple(b.T)), axis=1)[:, 3:]
+    return 2.0 * np.arctan2(np.linalg.norm(turn[:, :3], axis=1), np.abs(turn[:, 3]))
+
+
+def statistics(errors: Array) -> Statistics:
+    """Root mean square, median and largest."""
+    values = (np.sqrt(np.mean(np.square(errors))), np.median(errors), np.max(errors))
+    return dict(zip(STATISTICS, map(float, values), strict=True))
+
+
+def interpolated(truth: Trajectory, stamps_s: Array) -> Array:
+    """True poses (n, 7) at stamps (n,), between neighbours at most twice 0.05 s apart; elsewhere NaN."""
+    after = np.clip(np.searchsorted(truth.stamps_s, stamps_s), 1, max(1, len(truth.stamps_s) - 1))
+    before = after - 1
+    after = np.minimum(after, len(truth.stamps_s) - 1)
+    first, gap = truth.stamps_s[before], truth.stamps_s[after] - truth.stamps_s[before]
+    fraction = (stamps_s - first) / np.where(gap > 0.0, gap, 1.0)
+    out = np.stack(se3.interpolate(tuple(truth.poses[before].T), tuple(truth.poses[after].T), fraction), axis=1)
+    off_s = np.minimum(np.abs(stamps_s - first), np.abs(truth.stamps_s[after] - stamps_s))
+    between = (fraction >= 0.0) & (fraction <= 1.0) & (gap <= 2.0 * MAX_STAMP_DIFFERENCE_S)
+    out[~(between | (off_s <= _ROUNDING))] = np.nan
+    return out
+
+
+def _span(t: Trajectory) -> str:
+    return f"{t.stamps_s[0]:.3f} to {t.stamps_s[-1]:.3f} s"

@@ -1,0 +1,207 @@
+"""The truth that a run is compared with: a TUM file, or a topic of a recording.
+
+A recording may have the robot's pose (PoseStamped, PoseWithCovarianceStamped, TransformStamped, Odometry, a transform
+on TF) or its position alone (PointStamped; NavSatFix, then east, north and up of its first fix).
+"""
+
+import math
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.lie import se3
+from graph_slam_ros.messages.inputs.fixes import east_north_up
+from graph_slam_ros.recordings.bag import Bag, open_bag
+from graph_slam_ros.recordings.definitions import recorded_decoder
+from graph_slam_ros.runs.trajectory import Point, Trajectory, read_tum, trajectory
+
+Array = NDArray[np.float64]
+
+TRUTH_TOPIC = "/ground_truth"
+TRUE_LANDMARKS_TOPIC = "/landmarks_ground_truth"
+_ODOMETRY_TOPIC = "/odom"
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_FIX = "sensor_msgs/msg/NavSatFix"
+_POINT = "geometry_msgs/msg/PointStamped"
+_TF = "tf2_msgs/msg/TFMessage"
+_POSE_TYPES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+    _POINT,
+    _FIX,
+    _ODOMETRY,
+)
+Row = tuple[int, tuple[float, ...]]  # stamp [ns] and pose (7,)
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What is known to be true.
+
+    Attributes
+    ----------
+    landmarks : positions in metres by id, where they are known
+    losses : what of the recording could not be read
+    source : the file, or the topic with its type
+    """
+
+    trajectory: Trajectory
+    landmarks: dict[str, Point]
+    losses: tuple[str, ...] = ()
+    source: str = ""
+    topic: str = ""
+
+
+def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = ()) -> Truth:
+    """True poses and landmarks.
+
+    Parameters
+    ----------
+    truth : ``BAG``, ``BAG:TOPIC`` or ``FILE.tum``
+    topic : of the recording; of a topic of transforms also ``TOPIC:PARENT:CHILD``, the names of two frames.
+        Default: ``/ground_truth``, else the only topic that can be the truth
+    not_these : topics that are not chosen by themselves
+
+    Raises
+    ------
+    GraphSlamError
+        No such file, or no such topic; those that exist are named.
+    """
+    path, named = _file_and_topic(str(truth))
+    topic = topic or named
+    if path.suffix in (".tum", ".txt"):
+        if topic:
+            raise GraphSlamError(f"{path}: a TUM file has no topics: leave out {topic}")
+        return Truth(read_tum(path, follow=True), {}, source=str(path))
+    bag = open_bag(path)
+    name, _, frames = (topic or _only_topic(bag, path, not_these)).partition(":")
+    if name not in bag.topics or bag.topics[name].type not in (*_POSE_TYPES, _TF):
+        raise GraphSlamError(f"{path}: no topic {name} of poses; {_listed(bag)}")
+    kind = bag.topics[name].type
+    rows = _transforms(bag, path, name, frames) if kind == _TF else list(_rows(bag, name, kind))
+    finite = [row for row in rows if all(map(math.isfinite, row[1]))]
+    if len(finite) < len(rows):
+        bag.losses.append(f"{len(rows) - len(finite)} of {len(rows)} poses on {name} are not finite")
+    rows = finite
+    if not rows:
+        raise GraphSlamError(f"{path}: nothing on {name} that tells where the robot was")
+    # One rounding, as of the decimal text in a TUM file: equal stamps stay equal.
+    stamps_s = np.array([stamp_ns / 10**9 for stamp_ns, _ in rows])
+    found = trajectory(stamps_s, np.array([pose for _, pose in rows], dtype=float), f"{path}, {name}")
+    has_orientation = kind not in (_FIX, _POINT)
+    found = Trajectory(found.stamps_s, found.poses, has_orientation)
+    landmarks = _recorded_landmarks(bag)
+    return Truth(found, landmarks, tuple(bag.losses), f"{topic or name} ({kind})", name)
+
+
+def _file_and_topic(truth: str) -> tuple[Path, str]:
+    """Before the first colon that a file ends at; a name may hold colons itself."""
+    path = Path(truth)
+    at = truth.find(":")
+    while not path.exists() and at >= 0:
+        if at and (Path(truth[:at]).exists() or truth.find(":", at + 1) < 0 or truth[at + 1] == "/"):
+            return Path(truth[:at]), truth[at + 1 :]
+        at = truth.find(":", at + 1)
+    return path, ""
+
+
+def _only_topic(bag: Bag, path: Path, not_these: Collection[str]) -> str:
+    """``/ground_truth``, or the only topic that can be the truth: one of odometry only where there is no other."""
+    if TRUTH_TOPIC in bag.topics:
+        return TRUTH_TOPIC
+    left_out = {_ODOMETRY_TOPIC, *not_these}
+    found = [t for t in bag.topics.values() if t.type in _POSE_TYPES and t.name not in left_out]
+    best = [t.name for t in found if t.type != _ODOMETRY] or [t.name for t in found]
+    if len(best) == 1:
+        return best[0]
+    if best:
+        raise GraphSlamError(f"{path}: several topics may be the truth: {', '.join(sorted(best))}; choose with --topic")
+    raise GraphSlamError(f"{path}: no topic {TRUTH_TOPIC}; name the truth with --topic TOPIC, {_listed(bag)}")
+
+
+def _listed(bag: Bag) -> str:
+    names = sorted(t.name for t in bag.topics.values() if t.type in _POSE_TYPES)
+    names += [f"{t.name}:PARENT:CHILD" for t in bag.topics.values() if t.type == _TF and t.name != "/tf_static"]
+    return f"with poses there are {', '.join(names)}" if names else "but no topic has poses"
+
+
+def _rows(bag: Bag, topic: str, kind: str) -> Iterator[Row]:
+    datum: tuple[float, float, float] | None = None
+    for message in _decoded(bag, topic):
+        stamp_ns = _nanoseconds(message.header.stamp)
+        if kind == _FIX:
+            here = (message.latitude, message.longitude, message.altitude)
+            if message.status.status < 0 or not all(map(math.isfinite, here[:2])) or here[0] == here[1] == 0.0:
+                continue
+            here = (*here[:2], here[2] if math.isfinite(here[2]) else datum[2] if datum else 0.0)
+            datum = datum or here
+            yield stamp_ns, (*east_north_up(here, datum), *se3.IDENTITY[3:])
+        elif kind == _POINT:
+            yield stamp_ns, (message.point.x, message.point.y, message.point.z, *se3.IDENTITY[3:])
+        else:
+            yield stamp_ns, _numbers(*_position_and_orientation(message))
+
+
+def _transforms(bag: Bag, path: Path, topic: str, frames: str) -> list[Row]:
+    """Of one pair of frames: the named one, or the only one that does not begin or end in a frame of the robot."""
+    found: dict[tuple[str, str], list[Row]] = {}
+    for message in _decoded(bag, topic):
+        for one in message.transforms:
+            pair = (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/"))
+            row = (_nanoseconds(one.header.stamp), _numbers(one.transform.translation, one.transform.rotation))
+            found.setdefault(pair, []).append(row)
+    names = ", ".join(f"{topic}:{parent}:{child}" for parent, child in sorted(found))
+    if frames:
+        parent, _, child = frames.partition(":")
+        pair = (parent.lstrip("/"), child.lstrip("/"))
+        if pair not in found:
+            raise GraphSlamError(f"{path}: no transform {topic}:{frames}; there are {names or 'none'}")
+        return found[pair]
+    if len(found) == 1:
+        return next(iter(found.values()))
+    raise GraphSlamError(f"{path}: {topic} has several transforms: choose with --topic one of {names or 'none'}")
+
+
+def _decoded(bag: Bag, topic: str) -> Iterator[Any]:
+    decode = recorded_decoder(bag.topics[topic])
+    for record in bag.messages([topic]):
+        try:
+            message = decode(record.cdr)
+        except Exception:  # of damaged bytes rosbags raises almost anything
+            loss = f"a message on {topic} cannot be decoded"
+            bag.losses += [loss] if loss not in bag.losses else []
+            continue
+        yield message
+
+
+def _nanoseconds(stamp: Any) -> int:
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def _position_and_orientation(message: Any) -> tuple[Any, Any]:
+    if hasattr(message, "transform"):
+        return message.transform.translation, message.transform.rotation
+    pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
+    return pose.position, pose.orientation
+
+
+def _numbers(p: Any, q: Any) -> tuple[float, ...]:
+    return p.x, p.y, p.z, q.x, q.y, q.z, q.w
+
+
+def _recorded_landmarks(bag: Bag) -> dict[str, Point]:
+    kind = "vision_msgs/msg/Detection3DArray"
+    if TRUE_LANDMARKS_TOPIC not in bag.topics or bag.topics[TRUE_LANDMARKS_TOPIC].type != kind:
+        return {}
+    out = {}
+    for message in _decoded(bag, TRUE_LANDMARKS_TOPIC):
+        for detection in message.detections:
+            at = detection.bbox.center.position
+            out[detection.id] = (float(at.x), float(at.y), float(at.z))
+    return out

@@ -1,0 +1,76 @@
+"""The commands on what a run has decided: ``explain``, ``solve`` and ``influence``."""
+
+import argparse
+import math
+import time
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from graph_slam_ros.cli import console
+from graph_slam_ros.errors import GraphSlamError
+
+if TYPE_CHECKING:
+    from graph_slam_ros.analysis.what_if import Moved, SavedGraph
+
+_SHOWN = 10  # edges that fit worse
+
+
+def explain(args: argparse.Namespace) -> int:
+    """Say why."""
+    from graph_slam_ros.analysis.explain import explain_edge, explain_run
+    from graph_slam_ros.runs import changed_since
+
+    console.say(*(explain_edge(args.run_folder, args.edge) if args.edge else explain_run(args.run_folder)))
+    if args.edge:
+        console.then(f"{console.command('solve', args.run_folder, '--without', 'EDGE')} (the drive without an edge)")
+    else:
+        console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (all about one edge or landmark)")
+    return console.told([], changed_since(args.run_folder))
+
+
+def solve(args: argparse.Namespace) -> int:
+    """Solve a run's graph again with other edges in, or another loss; say what moves."""
+    from graph_slam_ros.analysis.what_if import SavedGraph
+    from graph_slam_ros.runs import changed_since
+
+    if not (args.without or args.let_in or args.loss):
+        raise GraphSlamError("solve needs --without EDGE, --with EDGE or --loss NAME: what would be otherwise")
+    run = SavedGraph(args.run_folder)
+    start = time.process_time()
+    solver = run.solve(args.without, args.let_in, args.loss)
+    took_s = time.process_time() - start
+    console.say(*_moved_text(run, run.moved(solver)), f"solved in {1e3 * took_s:.0f} ms of CPU time")
+    console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (why the run judged an edge as it did)")
+    return console.told([], changed_since(args.run_folder))
+
+
+def influence(args: argparse.Namespace) -> int:
+    """Say which edges the last pose hangs on."""
+    from graph_slam_ros.analysis.what_if import SavedGraph
+    from graph_slam_ros.runs import changed_since
+
+    run = SavedGraph(args.run_folder)
+    console.say(
+        f"the last pose without each edge, the {args.count} of most influence to first order",
+        f"  {'edge':<8s} {'':24s} {'first order':>12s} {'solved again':>12s}",
+    )
+    for one in run.influences(args.count):
+        exact = f"{one.exact_m:10.4f} m" if math.isfinite(one.exact_m) else "undetermined"
+        told = f"{one.first_order_m:10.4f} m {exact}"
+        console.say(f"  {one.edge:<8d} {run.edge(one.edge).about:24s} {told}")
+    console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (all about one of them)")
+    return console.told([], changed_since(args.run_folder))
+
+
+def _moved_text(run: "SavedGraph", moved: "Moved") -> Iterable[str]:
+    (final_m, final_rad), (most, most_m) = moved.final, moved.most
+    yield f"chi2       {moved.before.chi2_final:14.4f}  ->  {moved.after.chi2_final:14.4f}"
+    yield f"cost       {moved.before.cost_final:14.4f}  ->  {moved.after.cost_final:14.4f}"
+    for name in dict.fromkeys((*moved.before.classes, *moved.after.classes)):
+        parts = [report.classes.get(name) for report in (moved.before, moved.after)]
+        numbers = [f"{part.chi2:14.4f}" if part else f"{'-':>14s}" for part in parts]
+        yield f"  {name:8s} {'  ->  '.join(numbers)}"
+    yield f"last pose  moves by {final_m:.4f} m, {math.degrees(final_rad):.3f} deg"
+    yield f"most       keyframe {run.keyframe(most)}, by {most_m:.4f} m"
+    for edge, before, after in moved.worse[:_SHOWN]:
+        yield f"worse      edge {edge} ({run.edge(edge).about}): chi2 {before:.4g} -> {after:.4g}"

@@ -1,0 +1,39 @@
+"""What a recording holds, and the replay command that fits."""
+
+import textwrap
+from pathlib import Path
+
+from graph_slam_ros.recordings.bag import Bag
+from graph_slam_ros.recordings.contents import Contents, look
+from graph_slam_ros.runs.suggestion import Suggestion
+
+
+def describe(bag: Bag, path: Path) -> tuple[list[str], bool]:
+    """Topics, types, rates, frames and span of a recording, then what is to be known of the command that fits, then it.
+
+    Returns
+    -------
+    lines : the command is the last
+    fits : whether there is one
+    """
+    recording = look(bag)
+    lines = [_line(one) for _, one in sorted(recording.topics.items())]
+    read = [one for one in recording.topics.values() if one.last_ns]
+    if read:
+        first, last = min(one.first_ns for one in read), max(one.last_ns for one in read)
+        lines.append(f"span {(last - first) * 1e-9:.3f} s, from {first * 1e-9:.3f}")
+    suggestion = Suggestion(bag, recording, path)
+    if suggestion.trouble:
+        return [*lines, f"not ready for replay: {suggestion.trouble}"], False
+    for text in suggestion.notes:
+        lines += textwrap.wrap(f"note: {text}", 100, subsequent_indent="  ", break_on_hyphens=False)
+    for name, why in suggestion.unused.items():
+        lines += textwrap.wrap(f"not used: {name}: {why}", 100, subsequent_indent="  ", break_on_hyphens=False)
+    return [*lines, suggestion.command()], True
+
+
+def _line(one: Contents) -> str:
+    topic, took_s = one.topic, (one.last_ns - one.first_ns) * 1e-9
+    rate = f"{(topic.count - 1) / took_s:.1f} Hz" if took_s > 0 else "-"
+    frames = " -> ".join(filter(None, (one.frame, one.child)))
+    return f"{topic.name:28s} {topic.type:40s} {topic.count:8d}  {rate:>10s}  {one.trouble or frames}".rstrip()

@@ -1,0 +1,134 @@
+"""The command ``simulate``: worlds as recordings or graphs, and faults in them, or in the graph of a file."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from graph_slam_ros.cli import console
+from graph_slam_ros.errors import GraphSlamError
+
+if TYPE_CHECKING:
+    from graph_slam_ros.formats.graph_file import G2oFile
+    from graph_slam_ros.simulation import Fault, Recording
+
+CITY = "city"  # a world that is a graph from the first
+
+
+def simulate(args: argparse.Namespace) -> int:
+    """Record a synthetic world, or write it as a graph; put faults into it."""
+    from graph_slam_ros.formats.strict import ending
+    from graph_slam_ros.simulation import WORLDS, Fault
+
+    faults = [Fault.parsed(text) for text in args.fault]
+    as_graph = ending(args.out) == ".g2o"
+    of_file = args.scenario not in (*WORLDS, CITY) and Path(args.scenario).is_file()
+    if (of_file or args.scenario == CITY) and not as_graph:
+        raise GraphSlamError(f"{args.out}: {args.scenario} is a graph: --out FILE.g2o")
+    beside = [".faults.csv"] * bool(faults) + [".truth.tum"] * (as_graph and not of_file)
+    written, source = [_beside(args.out, ending) for ending in beside], Path(args.scenario) if of_file else None
+    console.check_file(args.out, *written, force=args.force, source=source)
+    if of_file:
+        return _spoil(args, faults)
+    try:
+        if as_graph:
+            _write_graph(args, faults)
+        else:
+            _write_bag(args, faults)
+    except OSError as error:
+        raise GraphSlamError(f"{args.out}: {error.strerror}") from None
+    console.then(console.command("optimize" if as_graph else "info", args.out))
+    return console.DONE
+
+
+def _write_bag(args: argparse.Namespace, faults: "list[Fault]") -> None:
+    from graph_slam_ros.simulation import WrongMessage, faulty_recording, write_bag, write_table
+
+    recording, wrong = faulty_recording(_recorded(args), faults, args.seed)
+    write_bag(recording, args.out)
+    console.say(f"wrote {args.out}")
+    if faults:
+        write_table(_beside(args.out, ".faults.csv"), WrongMessage, wrong)
+        console.say(f"wrote {_beside(args.out, '.faults.csv')}: {len(wrong)} measurements are wrong")
+
+
+def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
+    from graph_slam_ros.formats.convert import write_graph
+    from graph_slam_ros.formats.graph_file import G2oFile
+    from graph_slam_ros.simulation import city_graph, landmark_graph
+    from graph_slam_ros.simulation.pose_graph import truth_of, values_of
+
+    if args.scenario == CITY:
+        if args.closures is not None:
+            raise GraphSlamError("city: no use for --closures: it has them")
+        graph, poses = city_graph(args.seed, **_options(args))
+        truth = poses.ravel()
+    else:
+        recording = _recorded(args)
+        if recording.gnss or recording.imu:
+            raise GraphSlamError(f"{args.out}: a graph has no use for gnss or imu: --out FILE.mcap")
+        graph = landmark_graph(recording)
+        truth = truth_of(recording, graph)
+    file = G2oFile(graph, list(range(graph.vertex_count)), [0])
+    _write_faulty(args, file, truth, faults)
+    path = _beside(args.out, ".truth.tum")
+    write_graph(path, file, values_of(graph, truth), "tum")
+    console.say(f"wrote {path}: the true poses")
+
+
+def _spoil(args: argparse.Namespace, faults: "list[Fault]") -> int:
+    """The graph of a file; its optimum is taken for the truth."""
+    from graph_slam_ros.formats.g2o import read_g2o
+    from graph_slam_ros.optimization import optimize
+
+    source = Path(args.scenario)
+    for what, given in (("--set", args.set), ("--closures", args.closures), ("--poses", args.poses)):
+        if given:
+            raise GraphSlamError(f"{source}: no use for {what}: it is no world")
+    file = read_g2o(source)
+    solver = optimize(file).solver
+    truth = np.concatenate([solver.estimate([v])[0] for v in range(file.graph.vertex_count)])
+    _write_faulty(args, file, truth, faults)
+    console.then(console.command("optimize", args.out))
+    return console.DONE
+
+
+def _write_faulty(args: argparse.Namespace, file: "G2oFile", truth: Any, faults: "list[Fault]") -> None:
+    from graph_slam_ros.formats.g2o_writer import write_g2o
+    from graph_slam_ros.simulation import WrongLine, faulty_graph, write_table
+    from graph_slam_ros.simulation.pose_graph import values_of
+
+    out, wrong = faulty_graph(file, truth, faults, args.seed)
+    write_g2o(args.out, out, values_of(out.graph, out.graph.initial.values))
+    console.say(f"wrote {args.out}")
+    if faults:
+        write_table(_beside(args.out, ".faults.csv"), WrongLine, wrong)
+        console.say(f"wrote {_beside(args.out, '.faults.csv')}: {len(wrong)} edges are wrong")
+
+
+def _recorded(args: argparse.Namespace) -> "Recording":
+    from graph_slam_ros.simulation import simulate as recorded
+    from graph_slam_ros.simulation import with_closures
+
+    recording = recorded(args.scenario, args.seed, **_options(args))
+    return recording if args.closures is None else with_closures(recording, args.closures, args.seed)
+
+
+def _options(args: argparse.Namespace) -> dict[str, Any]:
+    from graph_slam_ros.formats.parameters import parse_setting
+
+    options = dict(parse_setting(text) for text in args.set)
+    if "seed" in options:
+        raise GraphSlamError("--set seed: no option of a world; --seed N")
+    if args.as_original:
+        options["as_original"] = True
+    if args.poses is not None:
+        options["poses"] = args.poses
+    return options
+
+
+def _beside(out: Path, ending: str) -> Path:
+    """``world.mcap`` and ``world.g2o.gz`` have a ``world.faults.csv``."""
+    whole = out.with_suffix("") if out.suffix.lower() == ".gz" else out
+    return whole.with_suffix(ending)

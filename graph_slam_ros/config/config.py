@@ -1,0 +1,538 @@
+"""The one tree of parameters: every default (but the solver's own), unit, meaning and bound is here and nowhere else.
+
+YAML files, command-line settings and ROS parameters are all read through ``Config.from_mapping``; unknown names, wrong
+types and values out of range are refused with the name of the culprit.
+"""
+
+import dataclasses
+import difflib
+import inspect
+import itertools
+import math
+import re
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from graph_slam_ros.config.inputs import DEFAULT_INPUTS, InputConfig, default_input
+from graph_slam_ros.config.node import (
+    USUAL_INPUTS,
+    HealthConfig,
+    InitialPoseConfig,
+    InputsConfig,
+    JournalConfig,
+    NodeConfig,
+    OutputConfig,
+    TfConfig,
+    TimeConfig,
+)
+from graph_slam_ros.config.parameter import Parameter, numbers, section_parameters, setting
+from graph_slam_ros.config.robust import LOSSES, RobustConfig
+from graph_slam_ros.config.survey import Surveyed, surveyed
+from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.graph import Loss
+from graph_slam_ros.graph.geometry import PLANE, SPACE, Numbers, Space
+from graph_slam_ros.lie import se3
+from graph_slam_ros.solver import METHODS, Settings
+
+_LEAST_SIGMA = 1e-6  # of an anchor: nothing is certain
+
+
+@dataclass(frozen=True, slots=True)
+class FramesConfig:
+    """Names of frames, REP-105."""
+
+    map: str = setting("map", "frame of the corrected path")
+    odom: str = setting("odom", "frame the odometry is given in")
+    base: str = setting("base_link", "frame of the robot")
+
+
+@dataclass(frozen=True, slots=True)
+class WorldConfig:
+    """Where the robot moves."""
+
+    dimensions: int = setting(2, "2: in a plane, of what is seen only that part is used; 3: in space", low=2, high=3)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryConfig:
+    """Noise of the motion between keyframes."""
+
+    noise: str = setting(
+        "twist",
+        "twist: from each message's twist covariance where it has one, else the densities; density: always these",
+        choices=("twist", "density"),
+    )
+    translation_density: float = setting(
+        0.02, "random walk of the position along x of the base", "m/sqrt(s)", low=1e-6, high=10.0
+    )
+    lateral_density: float = setting(
+        0.005,
+        "random walk across; small for wheels, raise it for what can slide or hover",
+        "m/sqrt(s)",
+        low=1e-6,
+        high=10.0,
+    )
+    vertical_density: float = setting(0.005, "random walk upwards, in space", "m/sqrt(s)", low=1e-6, high=10.0)
+    rotation_density: float = setting(0.05, "random walk of the heading", "rad/sqrt(s)", low=1e-6, high=10.0)
+    tilt_density: float = setting(
+        0.02, "random walk of roll and of pitch, in space", "rad/sqrt(s)", low=1e-6, high=10.0
+    )
+    twist_correlation_s: float = setting(
+        0.25,
+        "how long the error of a velocity lasts: the noise of a step is covariance * dt * max(dt, this)",
+        "s",
+        low=0.0,
+    )
+    still_m_s: float = setting(
+        1e-3,
+        "slower than this and the next, or by no more within a second, the robot stands: no noise is added",
+        "m/s",
+        low=0.0,
+    )
+    still_rad_s: float = setting(1e-3, "see still_m_s", "rad/s", low=0.0)
+    still_m: float = setting(
+        5e-3, "a robot that stands may jitter by this: no noise is added, and no keyframe made", "m", low=0.0
+    )
+    still_rad: float = setting(0.01, "and by this", "rad", low=0.0, high=math.pi)
+    timeout_s: float = setting(
+        0.5,
+        "an odometry that is silent for longer, in stamp time, gives way to the next of inputs.names",
+        "s",
+        low=1e-3,
+    )
+    max_speed_m_s: float = setting(50.0, "faster than this, odometry has jumped: a new segment begins", "m/s", low=1e-3)
+    jump_sigma_m: float = setting(10.0, "what is known of the motion over a jump: standard deviation", "m", low=1e-3)
+    jump_sigma_rad: float = setting(3.0, "and of the rotation", "rad", low=1e-3)
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframesConfig:
+    """When the robot's motion earns a new vertex."""
+
+    min_distance_m: float = setting(0.25, "a keyframe after this distance", "m", low=1e-3, live=True)
+    min_angle_rad: float = setting(0.25, "or after this change of heading", "rad", low=1e-3, high=math.pi, live=True)
+    max_interval_s: float = setting(
+        1.0,
+        "or after this much time in motion: odometry's noise grows with time, and sightings in between share it",
+        "s",
+        low=1e-3,
+        live=True,
+    )
+    shared_noise: float = setting(
+        0.05,
+        "or at what is seen, where the motion since the last keyframe would add more than this to its variance, and the"
+        " same to all that is seen at once",
+        "part of variance",
+        low=0.0,
+        live=True,
+    )
+    min_interval_s: float = setting(
+        0.1,
+        "but what is seen sooner after a keyframe makes none, unless the motion would add more than its own variance",
+        "s",
+        low=0.0,
+        live=True,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarksConfig:
+    """Landmark sightings."""
+
+    id_from: str = setting("id", "which field of a detection is the landmark's identity", choices=("id", "class_id"))
+    sigma_m: float = setting(0.1, "position noise where a message's covariance is all zero (unknown)", "m", low=1e-4)
+    added_sigma_m: float = setting(
+        0.05, "position noise added to every sighting for what messages leave out: clocks, mounting, size", "m", low=0.0
+    )
+    max_per_message: int = setting(
+        1000, "of more in one message the nearest are taken and the others counted", "landmarks", low=1
+    )
+    orientation_known_below_rad: float = setting(
+        0.5, "a landmark is a full pose where its heading's standard deviation is below this", "rad", low=0.0
+    )
+    association: str = setting(
+        "id",
+        "none: landmarks are not used; id: by their identity; nearest, joint: those without one are associated, each by"
+        " itself or all of a message together",
+        choices=("none", "id", "nearest", "joint"),
+    )
+    gate_same: float = setting(
+        0.999, "a sighting without identity is of a landmark within this probability", "probability", low=0.5, high=1.0
+    )
+    gate_other: float = setting(
+        0.99999, "and of a new one outside this; between the two it is not used", "probability", low=0.5, high=1.0
+    )
+    close_m: float = setting(
+        0.5, "landmarks this close are not told apart by force: what may be of either says less", "m", low=0.0
+    )
+    unnamed_sigma_m: float = setting(
+        0.1, "position noise added to sightings without identity: they may be of one close by", "m", low=0.0
+    )
+    density_per_m: float = setting(
+        0.03,
+        "landmarks that there may be to a metre along each axis: a sighting must be likelier to be of a known one",
+        "1/m",
+        low=1e-4,
+    )
+    ambiguity_chi2: float = setting(6.0, "and all else must fit worse by this much", "chi2", low=0.0)
+    confirm_sightings: int = setting(5, "a new landmark is believed after so many sightings", "sightings", low=1)
+    confirm_s: float = setting(2.0, "over so much time", "s", low=0.0)
+    follow_s: float = setting(
+        10.0,
+        "a sighting is compared with landmarks seen not longer ago; what is seen again later is merged",
+        "s",
+        low=0.0,
+    )
+    give_up_s: float = setting(60.0, "or given up where it has not been seen for so long", "s", low=0.0)
+    review_every_keyframes: int = setting(10, "look for all that after so many keyframes", "keyframes", low=1)
+    determined_below: float = setting(
+        0.2,
+        "a landmark seen by range or bearing waits until its standard deviation is below this part of its distance",
+        "m/m",
+        low=1e-3,
+        high=10.0,
+    )
+    mirror_chi2: float = setting(
+        12.0, "and until every other place it may be at fits worse by this much", "chi2", low=0.0
+    )
+    surveyed: str = setting(
+        "",
+        "landmarks whose place in the map is known: a header id,x,y,sigma or id,x,y,z,sigma and a line for each",
+        "m",
+    )
+    surveyed_file: str = setting("", "file of these lines, read at the start where there are none above")
+    range_offset_sigma_m: float = setting(
+        0.0,
+        "standard deviation of an offset that all ranges of a topic share and that is estimated; 0: there is none",
+        "m",
+        low=0.0,
+    )
+    loss: str = setting(
+        "huber_then_cauchy",
+        "robust loss of sightings; huber_then_cauchy converges with the first, then with the second",
+        choices=(*LOSSES, "huber_then_cauchy", "huber_then_dcs"),
+    )
+    loss_scale: float = setting(3.0, "residuals well below this many standard deviations count fully", "sigma", low=0.1)
+
+
+@dataclass(frozen=True, slots=True)
+class AnchorConfig:
+    """The prior on the first keyframe, which fixes the gauge: map begins where odom begins, or where it is said to.
+
+    While its sigmas are 0, it gives way to the first fix or surveyed landmark: the map is laid onto that.
+    """
+
+    pose: str = setting(
+        "",
+        "where the robot starts in the map: x y yaw, or in space x y z roll pitch yaw; empty: where odometry begins",
+        "m, rad",
+    )
+    sigma_m: float = setting(
+        0.0,
+        "standard deviation of its position; 0: 1 mm until a fix or a surveyed landmark tells where the map lies, then"
+        " 1 km, or initialpose.sigma_m of a pose that is given",
+        "m",
+        low=0.0,
+    )
+    sigma_rad: float = setting(
+        0.0, "standard deviation of its heading; 0: 1 mrad, then 3 rad, or initialpose.sigma_rad", "rad", low=0.0
+    )
+
+    def __post_init__(self) -> None:
+        for name, sigma in (("sigma_m", self.sigma_m), ("sigma_rad", self.sigma_rad)):
+            if 0.0 < sigma < _LEAST_SIGMA:
+                raise ConfigError(f"anchor.{name}: {sigma:g} is not 0 or in [{_LEAST_SIGMA:g}, 1e+09]")
+
+
+@dataclass(frozen=True, slots=True)
+class MapConfig:
+    """Whether the map grows."""
+
+    localize: bool = setting(
+        False,
+        "true: the map stays as it is and the robot is located in it; false: the map grows and is corrected",
+        live=True,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OrderingConfig:
+    """The window in which messages are put in order of stamp."""
+
+    window_s: float = setting(
+        0.05, "how much later than newer odometry a message may come, in stamp time", "s", low=0.0
+    )
+    late_s: float = setting(
+        10.0, "sightings, fixes and closures up to this much older than odometry go where they belong", "s", low=0.0
+    )
+    max_waiting: int = setting(
+        1000, "messages that may wait for their turn, or for odometry", "messages", low=1, high=1_000_000
+    )
+
+
+_SOLVER = Settings()  # its defaults are ours, but for when the solve at the end has converged
+
+
+@dataclass(frozen=True, slots=True)
+class SolveConfig:
+    """When and how the graph is solved: a little at each keyframe, and everything at the end."""
+
+    every_keyframes: int = setting(
+        1, "update the estimate after this many keyframes", "keyframes", low=1, high=1_000_000, live=True
+    )
+    relinearize_above: float = setting(
+        _SOLVER.relinearize_above,
+        "linearise a pose or landmark anew when it has moved by more since",
+        "m, rad",
+        low=0.0,
+        live=True,
+    )
+    relinearize_error: float = setting(
+        _SOLVER.relinearize_error,
+        "or when the square of that is more of the standard deviation of its strongest measurement",
+        "sigma",
+        low=0.0,
+        live=True,
+    )
+    relinearize_every: int = setting(
+        _SOLVER.relinearize_every,
+        "look for those at every so many updates (at each for ten times that far)",
+        "updates",
+        low=1,
+        high=1_000_000,
+        live=True,
+    )
+    tolerance: float = setting(
+        _SOLVER.tolerance, "changes up to this are not followed through the graph", "m, rad", low=0.0, live=True
+    )
+    tolerance_sigmas: float = setting(
+        _SOLVER.tolerance_sigmas,
+        "nor are those up to so many standard deviations of a pose or landmark given its neighbours",
+        "sigma",
+        low=0.0,
+        live=True,
+    )
+    method: str = setting(
+        _SOLVER.method,
+        "of the solve at the end: gn (damped only where it fails to converge), lm or dogleg",
+        choices=METHODS,
+        live=True,
+    )
+    max_iterations: int = setting(
+        _SOLVER.max_iterations,
+        "of the solve at the end, of each stage of the losses",
+        "",
+        low=1,
+        high=10_000,
+        live=True,
+    )
+    step_tolerance: float = setting(1e-5, "it has converged when no step is larger", "m, rad", low=0.0, live=True)
+    cost_tolerance: float = setting(1e-9, "or when the cost changes by a smaller fraction", "", low=0.0, live=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """All parameters, in sections. An object never changes; ``changed`` makes another.
+
+    ``Config()`` has the defaults. ``Config.from_mapping({"keyframes.min_distance_m": 0.5})`` takes nested or dotted
+    names; ``config.keyframes.min_distance_m`` reads one. An input has a section of its own name, see ``inputs.names``.
+    """
+
+    world: WorldConfig = WorldConfig()
+    frames: FramesConfig = FramesConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    keyframes: KeyframesConfig = KeyframesConfig()
+    landmarks: LandmarksConfig = LandmarksConfig()
+    anchor: AnchorConfig = AnchorConfig()
+    map: MapConfig = MapConfig()
+    ordering: OrderingConfig = OrderingConfig()
+    solve: SolveConfig = SolveConfig()
+    robust: RobustConfig = RobustConfig()
+    initialpose: InitialPoseConfig = InitialPoseConfig()
+    tf: TfConfig = TfConfig()
+    inputs: InputsConfig = InputsConfig()
+    output: OutputConfig = OutputConfig()
+    journal: JournalConfig = JournalConfig()
+    time: TimeConfig = TimeConfig()
+    health: HealthConfig = HealthConfig()
+    node: NodeConfig = NodeConfig()
+    sources: tuple[InputConfig, ...] = DEFAULT_INPUTS
+
+    def __repr__(self) -> str:
+        """What is not its default, as ``from_mapping`` takes it."""
+        given = dict(flatten(self.as_mapping()))
+        usual = {p.name: p.default for p in parameters(one.name for one in self.sources)}
+        changed = [f"{name}={value!r}" for name, value in given.items() if value != usual[name]]
+        return f"Config({', '.join(changed)})"
+
+    def __post_init__(self) -> None:
+        _ = self.start_pose, self.load_pose, self.survey  # what they are made of is refused here, not later
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> "Config":
+        """From nested or dotted names to values; what is not named keeps its default.
+
+        Raises
+        ------
+        ConfigError
+            Unknown name (the nearest known one is suggested), wrong type, or a value out of range.
+        """
+        given = dict(flatten(values))
+        names = _input_names(given.get("inputs.names", InputsConfig().names))
+        known = {p.name: p for p in parameters(names)}
+        sections: dict[str, dict[str, Any]] = {}
+        for name, value in given.items():
+            if name not in known:
+                near = difflib.get_close_matches(name, known, 1, 0.0)
+                raise ConfigError(f"unknown parameter {name!r}; did you mean {near[0]!r}?{_unlisted(name, names)}")
+            section, key = name.split(".")
+            sections.setdefault(section, {})[key] = known[name].check(value)
+        trees = {name: type(default)(**sections.get(name, {})) for name, default in _sections()}
+        inputs = (dataclasses.replace(default_input(name), **sections.get(name, {})) for name in names)
+        return cls(**trees, sources=tuple(inputs))
+
+    def changed(self, values: Mapping[str, Any]) -> "Config":
+        """With other values of some parameters, by dotted name; all of them or none.
+
+        Raises
+        ------
+        ConfigError
+            As for ``from_mapping``.
+        """
+        return Config.from_mapping(dict(flatten(self.as_mapping())) | dict(values))
+
+    def as_mapping(self) -> dict[str, dict[str, Any]]:
+        """Nested plain values, every parameter named."""
+        out = dataclasses.asdict(self)
+        for section in out.pop("sources"):
+            out[section.pop("name")] = section
+        return out
+
+    @property
+    def space(self) -> Space:
+        """The plane or space."""
+        return PLANE if self.world.dimensions == 2 else SPACE
+
+    @property
+    def start_pose(self) -> Numbers | None:
+        """``T_map_base`` of the first keyframe; None where odometry says it."""
+        return self._pose("anchor.pose", self.anchor.pose)
+
+    @property
+    def load_pose(self) -> Numbers | None:
+        """``T_map_base`` of the robot when a map is loaded; None where it is unknown."""
+        return self._pose("output.load_pose", self.output.load_pose)
+
+    def _pose(self, name: str, text: str) -> Numbers | None:
+        counts = (3,) if self.world.dimensions == 2 else (3, 6)
+        given = numbers(name, text, *counts)
+        if not given or self.world.dimensions == 2:
+            return given or None
+        return se3.from_xyz_rpy(given if len(given) == 6 else (*given[:2], 0.0, 0.0, 0.0, given[2]))
+
+    @property
+    def survey(self) -> dict[str, Surveyed]:
+        """Landmarks whose place is known, by identity."""
+        try:
+            return surveyed(self.landmarks.surveyed, self.world.dimensions)
+        except ConfigError as error:
+            raise ConfigError(f"landmarks.surveyed: {error}") from None
+
+    def solver_settings(self) -> Settings:
+        """How the solver is to be run, online and at the end."""
+        scale = self.landmarks.loss_scale
+        stages = [Loss.named(name, scale) for name in self.landmarks.loss.split("_then_")]
+        s = self.solve
+        return Settings(
+            s.method,
+            s.max_iterations,
+            s.step_tolerance,
+            s.cost_tolerance,
+            {"landmarks": stages, **dict.fromkeys(("fixes", "closures", "initialpose"), self.robust.stages)},
+            relinearize_above=s.relinearize_above,
+            relinearize_error=s.relinearize_error,
+            relinearize_every=s.relinearize_every,
+            tolerance=s.tolerance,
+            tolerance_sigmas=s.tolerance_sigmas,
+        )
+
+
+def _sections() -> Iterator[tuple[str, Any]]:
+    """Name and defaults of each section but those of inputs."""
+    for section in dataclasses.fields(Config):
+        if section.name != "sources":
+            yield section.name, section.default
+
+
+def _input_names(text: Any) -> list[str]:
+    """Names that are separated by spaces. Raises ConfigError for what cannot be the name of a section of its own."""
+    if not isinstance(text, str):
+        raise ConfigError(f"inputs.names: {text!r} is not a text of names")
+    names, taken = text.split(), {name for name, _ in _sections()} | {"tf_static"}
+    for name in names:
+        if not re.fullmatch(r"[a-zA-Z]\w*", name, re.ASCII):
+            raise ConfigError(f"inputs.names: {name!r} is not a name (letters, digits, _)")
+        if name in taken:
+            raise ConfigError(f"inputs.names: {name!r} is taken or given twice")
+        taken.add(name)
+    return names
+
+
+def _unlisted(name: str, names: list[str]) -> str:
+    """A hint where a parameter looks like one of an input."""
+    section, _, key = name.partition(".")
+    if section in names or section in dict(_sections()) or key not in InputConfig.__slots__:
+        return ""
+    return f" {section!r} is not in inputs.names ({' '.join(names)})"
+
+
+def parameters(names: Iterable[str] = USUAL_INPUTS) -> Iterator[Parameter]:
+    """Every parameter, in the order of the tree, named ``section.key``, with a section for each named input."""
+    for name, defaults in _sections():
+        yield from section_parameters(name, defaults)
+    for name in names:
+        yield from section_parameters(name, default_input(name))
+
+
+def notes() -> dict[str, str]:
+    """Meaning, unit and choices of every parameter by name, as a parameter file says them."""
+    out = {}
+    for p in parameters():
+        unit = f" [{p.unit}]" if p.unit else ""
+        choices = f"; one of {', '.join(p.choices)}" if p.choices else ""
+        out[p.name] = p.meaning + unit + choices
+    return out
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names and values of nested mappings."""
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from flatten(value, f"{name}.")
+        else:
+            yield name, value
+
+
+def _described() -> str:
+    """The docstring of ``Config`` with every parameter by section: name, default, unit and meaning, folded."""
+    meanings = notes()
+    sections = dict(_sections()) | {name: default_input(name) for name in USUAL_INPUTS}
+    lines = ["    Parameters with their defaults:"]
+    for section, own in itertools.groupby(parameters(), lambda p: p.name.partition(".")[0]):
+        meaning, _, _ = (inspect.getdoc(sections[section]) or "").partition("\n")
+        lines += ["", f"    {section}: {meaning}", ""]
+        for p in own:
+            lines.append(f"      {p.name} = {p.default!r}")
+            lines += textwrap.wrap(meanings[p.name], 100, initial_indent=" " * 10, subsequent_indent=" " * 10)
+    return f"{Config.__doc__}\n" + "\n".join(lines) + "\n"
+
+
+Config.__doc__ = _described()
+_sections_by_name = inspect.Parameter("sections", inspect.Parameter.VAR_KEYWORD)  # with all defaults it is a screenful
+Config.__signature__ = inspect.Signature([_sections_by_name])  # type: ignore[attr-defined]
+Config.__init__.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+    [inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY), _sections_by_name]
+)

@@ -1,0 +1,1 @@
+"""Maps of several runs: aligned, compared, merged, exported."""

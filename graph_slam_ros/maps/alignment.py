@@ -1,0 +1,178 @@
+"""Two maps, one laid on the other: by points that both know, robustly, for some may have moved."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.lie import so3
+from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.landmarks.association import quantile
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_MOST_TRIALS = 2000  # minimal sets of points that are tried
+_ROUNDS = 20
+_ROUNDING_M = 1e-4  # nobody knows where anything is to less
+_SPREAD = 3.0  # standard deviations of a point, so far the points must spread to tell how a map is turned
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Where map b is in map a, and how far its points then are from where a has them.
+
+    Attributes
+    ----------
+    apart : a less b, in the axes of a (k, n)
+    covariance : of each of these (k, n, n), of both maps and of the alignment
+    chi2, limit : of each by that (k,), and what it may be
+    fits : which agree with one another (k,)
+    """
+
+    T_a_b: Numbers
+    apart: Array
+    covariance: Array
+    chi2: Array
+    limit: float
+    fits: Mask
+
+    def distance(self, k: int) -> tuple[float, float]:
+        """How far a point has moved in metres, and in standard deviations that way."""
+        metres = float(np.linalg.norm(self.apart[k]))
+        if metres < _ROUNDING_M:
+            return metres, 0.0
+        way = self.apart[k] / metres
+        return metres, metres / math.sqrt(float(way @ self.covariance[k] @ way) + _ROUNDING_M**2)
+
+
+def positions(slam: GraphSlam, names: Sequence[str]) -> tuple[Array, Array]:
+    """Of landmarks (k, n), and their covariance together (k n, k n), in the axes of map."""
+    space, n = slam.space, slam.space.dimensions
+    vertices = [slam.landmarks[name].vertex for name in names]
+    values = [tuple(slam.solver.estimate([vertex])[0].tolist()) for vertex in vertices]
+    if not names:
+        return np.empty((0, n)), np.empty((0, 0))
+    joint, at = slam.solver.joint_marginal(vertices), 0
+    axes = np.zeros((len(names) * n, len(joint)))
+    for k, (vertex, value) in enumerate(zip(vertices, values, strict=True)):
+        dof = slam.graph.kind_of(vertex).dof
+        axes[k * n : (k + 1) * n, at : at + n] = space.turn(value) if dof == space.dof else np.eye(n)
+        at += dof
+    return np.array([value[:n] for value in values]), axes @ joint @ axes.T
+
+
+def align(space: Space, a: tuple[Array, Array], b: tuple[Array, Array], gate: float, factor: float) -> Alignment | None:
+    """Lay points of b on the same of a; None where too few agree to tell how: two in the plane, three in space.
+
+    Parameters
+    ----------
+    a, b : positions and covariances as ``positions`` has them
+    gate : part of all points that have not moved that is to fit
+    factor : so many times worse than told noise may be
+    """
+    n, count = space.dimensions, len(a[0])
+    if count < n:
+        return None
+    limit = factor**2 * quantile(gate, n)
+    fits = _first(a, b, limit)
+    for _ in range(_ROUNDS):
+        if not _is_determined(a, b, fits):
+            return None
+        turn, shift = _motion(a[0][fits], b[0][fits])
+        apart = a[0] - b[0] @ turn.T - shift
+        covariance = _covariance(a, b, turn, fits)
+        chi2 = np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart)
+        before, fits = fits, chi2 <= limit
+        if (fits == before).all():
+            break
+    return Alignment(_pose(space, turn, shift), apart, covariance, chi2, limit, fits)
+
+
+def as_they_are(space: Space, a: tuple[Array, Array], b: tuple[Array, Array], T_a_b: Numbers) -> Alignment:
+    """Points that are not laid on one another, where b is in a by other means."""
+    count, n = a[0].shape
+    moved = np.stack(space.group.act(T_a_b, tuple(b[0].T)), axis=-1).reshape(count, n)
+    turn, variances = space.turn(T_a_b), [np.einsum("kikj->kij", c.reshape(count, n, count, n)) for _, c in (a, b)]
+    covariance = variances[0] + turn @ variances[1] @ turn.T
+    unknown, none = np.full(count, np.nan), np.zeros(count, dtype=bool)
+    return Alignment(T_a_b, a[0] - moved, covariance, unknown, math.nan, none)
+
+
+def laid_on(space: Space, a: Array, b: Array) -> Numbers | None:
+    """Where map b is in map a, by points of which none has moved; None where they are too few, or on a line."""
+    spread = np.linalg.svd(b - b.mean(axis=0), compute_uv=False) if len(b) else np.empty(0)
+    n = space.dimensions
+    if len(spread) < n - 1 or len(b) < n or spread[n - 2] < 1e-6 * len(b):
+        return None
+    return _pose(space, *_motion(a, b))
+
+
+def _motion(a: Array, b: Array) -> tuple[Array, Array]:
+    """Rotations (..., n, n) and translations (..., n) that take points (..., k, n) of b nearest to those of a."""
+    middle_a, middle_b = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
+    u, _, vt = np.linalg.svd(np.swapaxes(a - middle_a, -1, -2) @ (b - middle_b))
+    u[..., -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    turn: Array = u @ vt
+    return turn, (middle_a - middle_b @ np.swapaxes(turn, -1, -2))[..., 0, :]
+
+
+def _pose(space: Space, turn: Array, shift: Array) -> Numbers:
+    if space.dimensions == 2:
+        return (*shift.tolist(), math.atan2(turn[1, 0], turn[0, 0]))
+    return (*shift.tolist(), *Rotation.from_matrix(turn).as_quat().tolist())
+
+
+def _variances(*maps: tuple[Array, Array]) -> Array:
+    """Of each point, along an axis, in all maps together (k,)."""
+    return sum(np.diagonal(c).reshape(p.shape).mean(axis=1) for p, c in maps) + _ROUNDING_M**2
+
+
+def _first(a: tuple[Array, Array], b: tuple[Array, Array], limit: float) -> Mask:
+    """Those that agree best: of as few as tell a motion, tried in turn, or by chance where there are many."""
+    count, n = a[0].shape
+    if math.comb(count, n) <= _MOST_TRIALS:
+        sets = np.array(list(combinations(range(count), n)))
+    else:
+        sets = np.random.default_rng(0).random((_MOST_TRIALS, count)).argpartition(n, axis=1)[:, :n]
+    turns, shifts = _motion(a[0][sets], b[0][sets])
+    apart = a[0] - np.einsum("tij,kj->tki", turns, b[0]) - shifts[:, None]
+    chi2 = np.einsum("tki,tki->tk", apart, apart) / _variances(a, b)
+    best = int(np.minimum(chi2, limit).sum(axis=1).argmin())
+    fits: Mask = chi2[best] <= limit
+    return fits
+
+
+def _is_determined(a: tuple[Array, Array], b: tuple[Array, Array], fits: Mask) -> bool:
+    """Whether points tell all of a motion: enough of them, not in one place, in space not on a line."""
+    count, n = int(fits.sum()), a[0].shape[1]
+    if count < n:
+        return False
+    spread = np.linalg.svd(b[0][fits] - b[0][fits].mean(axis=0), compute_uv=False)[n - 2] / math.sqrt(count)
+    return bool(spread > _SPREAD * math.sqrt(float(np.median(_variances(a, b)[fits]))))
+
+
+def _covariance(a: tuple[Array, Array], b: tuple[Array, Array], turn: Array, fits: Mask) -> Array:
+    """Of each difference, once those that fit are laid on one another as well as can be (k, n, n)."""
+    count, n = a[0].shape
+    axes = np.kron(np.eye(count), turn)
+    total = a[1] + axes @ b[1] @ axes.T
+    j, used = _derivative(b[0] @ turn.T), np.repeat(fits, n)
+    left = np.eye(count * n)
+    left[:, used] -= j @ np.linalg.pinv(j[used])
+    blocks = (left @ total @ left.T).reshape(count, n, count, n)
+    out: Array = np.einsum("kikj->kij", blocks) + _ROUNDING_M**2 * np.eye(n)
+    return out
+
+
+def _derivative(points: Array) -> Array:
+    """Of points that are moved and turned, by how (k n, dof)."""
+    count, n = points.shape
+    about = [(0.0, 0.0, 1.0)] if n == 2 else [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
+    turned = [(points @ so3.hat(axis)[:n, :n].T).reshape(-1, 1) for axis in about]
+    return np.hstack([np.tile(np.eye(n), (count, 1)), *turned])

@@ -1,0 +1,260 @@
+"""What differs between the maps of two runs."""
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.graph.geometry import Numbers
+from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on, positions
+from graph_slam_ros.runs import taken_up
+from graph_slam_ros.slam import GraphSlam
+
+Array = NDArray[np.float64]
+
+_SAME_M = 1e-3  # nobody calls that moved
+_DIGITS = 6  # of what was measured
+_SHOWN = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """In each map, and those that are in both."""
+
+    a: int
+    b: int
+    both: int
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """A landmark that is elsewhere in B: by how many metres, and how many standard deviations of both."""
+
+    landmark: str
+    distance_m: float
+    sigmas: float
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A measurement that both have and do not judge alike: its class, its edge in each, what each says."""
+
+    about: str
+    edge_a: int
+    edge_b: int
+    verdict_a: str
+    verdict_b: str
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """What differs.
+
+    Attributes
+    ----------
+    keyframes, landmarks, edges : of one stamp, of one name, of one measurement between the same
+    aligned_by : landmarks, stamps, or nothing: then both are taken as they are
+    T_a_b : where the map of B is in that of A
+    keyframes_m : how far keyframes of one stamp are apart, of half of them and at most; none: not a number
+    moved : landmarks, the farthest in standard deviations first
+    """
+
+    keyframes: Counts
+    landmarks: Counts
+    edges: Counts
+    chi2: tuple[float, float]
+    aligned_by: str
+    T_a_b: Numbers
+    keyframes_m: tuple[float, float]
+    only_in_a: list[str]
+    only_in_b: list[str]
+    moved: list[Moved]
+    verdicts: list[Judged]
+
+    @property
+    def is_same(self) -> bool:
+        """Whether both tell the same, to a millimetre."""
+        counted = (self.keyframes, self.landmarks, self.edges)
+        is_there = all(one.a == one.b == one.both for one in counted)
+        is_moved = any(one.distance_m > _SAME_M for one in self.moved) or self.keyframes_m[1] > _SAME_M
+        return is_there and not is_moved and not self.verdicts
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values; what there is not is None."""
+        apart = [None if math.isnan(metres) else metres for metres in self.keyframes_m]
+        return asdict(self) | {"keyframes_m": apart, "same": self.is_same}
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+    def lines(self) -> Iterator[str]:
+        """What differs, for people."""
+        yield f"{'':10s}{'A':>14s}{'B':>14s}{'both':>14s}"
+        for name in ("keyframes", "landmarks", "edges"):
+            one: Counts = getattr(self, name)
+            yield f"{name:10s}{one.a:14d}{one.b:14d}{one.both:14d}"
+        yield f"{'chi2':10s}{self.chi2[0]:14.3f}{self.chi2[1]:14.3f}"
+        n = 2 if len(self.T_a_b) == 3 else 3
+        where = ", ".join(f"{x:.3f}" for x in self.T_a_b[:n])
+        yield f"aligned by {self.aligned_by}" + (
+            f": B begins at ({where}) m in A" if self.aligned_by != "nothing" else ""
+        )
+        if self.keyframes.both:
+            half, most = self.keyframes_m
+            yield f"keyframes of one stamp are {half:.3f} m apart (median), {most:.3f} m at most"
+        moved = [one for one in self.moved if one.distance_m > _SAME_M]
+        yield from _shown(f"only in A  landmark {name}" for name in self.only_in_a)
+        yield from _shown(f"only in B  landmark {name}" for name in self.only_in_b)
+        yield from _shown(
+            f"moved      landmark {m.landmark}: {m.distance_m:.3f} m, {m.sigmas:.1f} sigmas" for m in moved
+        )
+        yield from _shown(
+            f"judged     {j.about}: {j.verdict_a} (edge {j.edge_a} of A), {j.verdict_b} (edge {j.edge_b} of B)"
+            for j in self.verdicts
+        )
+        yield "no difference" if self.is_same else "they differ"
+
+
+def _shown(lines: Iterable[str]) -> Iterator[str]:
+    whole = list(lines)
+    yield from whole[:_SHOWN]
+    if len(whole) > _SHOWN:
+        yield f"{whole[0][:11]}and {len(whole) - _SHOWN} more (--json has all)"
+
+
+def diff(a: Path, b: Path, losses: list[str]) -> Difference:
+    """Compare the maps of two runs; what could not be read of them is added to ``losses``.
+
+    Raises
+    ------
+    GraphSlamError
+        One of them has no map, or another number of dimensions.
+    """
+    one, two = (taken_up(folder, losses) for folder in (a, b))
+    refuse_other_space(one, two, a, b)
+    common = shared_landmarks(one, two)
+    aligned, by, T_a_b = _aligned(one, two, common)
+    apart = _keyframes_apart(one, two, T_a_b)
+    known = [set(slam.landmarks) for slam in (one, two)]
+    edges, verdicts = _edges(one, two)
+    moved = [Moved(name, *aligned.distance(k)) for k, name in enumerate(common)]
+    return Difference(
+        Counts(len(one.keyframes), len(two.keyframes), len(apart)),
+        Counts(len(known[0]), len(known[1]), len(known[0] & known[1])),
+        edges,
+        (_chi2(one), _chi2(two)),
+        by,
+        T_a_b,
+        (float(np.median(apart)), float(apart.max())) if len(apart) else (math.nan, math.nan),
+        sorted(known[0] - known[1]),
+        sorted(known[1] - known[0]),
+        sorted(moved, key=lambda one: (-one.sigmas, one.landmark)),
+        verdicts,
+    )
+
+
+def refuse_other_space(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
+    """Raise GraphSlamError where one is in the plane and one in space."""
+    if one.space is not two.space:
+        dimensions = (slam.space.dimensions for slam in (one, two))
+        told = " and ".join(f"{folder}: {n}" for folder, n in zip((a, b), dimensions, strict=True))
+        raise GraphSlamError(f"world.dimensions differ ({told})")
+
+
+def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
+    """Those of one name that were seen to have it, in both."""
+    return [
+        name
+        for name, mark in one.landmarks.items()
+        if name in two.landmarks and not (mark.is_unnamed or two.landmarks[name].is_unnamed)
+    ]
+
+
+def _aligned(one: GraphSlam, two: GraphSlam, common: list[str]) -> tuple[Alignment, str, Numbers]:
+    """By landmarks, else by stamps, else not at all."""
+    space, robust = one.space, one.config.robust
+    a, b = positions(one, common), positions(two, common)
+    found = align(space, a, b, robust.gate, robust.noise_factor)
+    if found is not None:
+        return found, f"{int(found.fits.sum())} of {len(common)} landmarks", found.T_a_b
+    at = [poses[:, : space.dimensions] for poses in _of_one_stamp(one, two)]
+    T_a_b = laid_on(space, *at)
+    by = f"{len(at[0])} stamps" if T_a_b is not None else "nothing"
+    T_a_b = T_a_b or space.identity
+    return as_they_are(space, a, b, T_a_b), by, T_a_b
+
+
+def _of_one_stamp(one: GraphSlam, two: GraphSlam) -> tuple[Array, Array]:
+    """Poses of the keyframes of one stamp; where there are several the first and the first, and so on."""
+    a, b = _by_stamp(one), _by_stamp(two)
+    common = [stamp for stamp in a if stamp in b]
+    return one.trajectory()[[a[stamp] for stamp in common]], two.trajectory()[[b[stamp] for stamp in common]]
+
+
+def _by_stamp(slam: GraphSlam) -> dict[tuple[int, int], int]:
+    times = Counter[int]()
+    out = {}
+    for k, stamp in enumerate(slam.keyframes.stamps_ns.tolist()):
+        out[stamp, times[stamp]] = k
+        times[stamp] += 1
+    return out
+
+
+def _keyframes_apart(one: GraphSlam, two: GraphSlam, T_a_b: Numbers) -> Array:
+    a, b = _of_one_stamp(one, two)
+    n = one.space.dimensions
+    moved = np.stack(one.space.group.act(T_a_b, tuple(b[:, :n].T)), axis=-1).reshape(-1, n)
+    return np.linalg.norm(moved - a[:, :n], axis=1)
+
+
+def _chi2(slam: GraphSlam) -> float:
+    return slam.report.chi2_final if slam.report else math.nan
+
+
+# -- edges -------------------------------------------------------------------------------------------------------------
+
+
+def _edges(one: GraphSlam, two: GraphSlam) -> tuple[Counts, list[Judged]]:
+    """Those of one type between the same with the same measurement, and those of them that are not judged alike."""
+    a, b, names = _by_meaning(one), _by_meaning(two), _names(one)
+    pairs = [pair for key in a if key in b for pair in zip(a[key], b[key], strict=False)]
+    verdicts = []
+    for in_a, in_b in pairs:
+        said = one.ledger.verdict_of(in_a), two.ledger.verdict_of(in_b)
+        if said[0] is not said[1]:
+            words = [verdict.name.lower() for verdict in said]
+            verdicts.append(Judged(_about(one, names, in_a), in_a, in_b, *words))
+    return Counts(one.graph.edge_count, two.graph.edge_count, len(pairs)), verdicts
+
+
+def _by_meaning(slam: GraphSlam) -> dict[Any, list[int]]:
+    names = _names(slam)
+    tags = {edge_type: tag for tag, edge_type in EDGE_TAGS.items()}
+    out: dict[Any, list[int]] = defaultdict(list)
+    for edge in range(slam.graph.edge_count):
+        table, row = slam.graph.row(edge)
+        ends = tuple(names.get(vertex) for vertex in table.vertices.values[row].tolist())
+        measured = tuple(round(x, _DIGITS) + 0.0 for x in table.measured.values[row].tolist())
+        out[tags[table.type], slam.graph.label_of(edge), ends, measured].append(edge)
+    return out
+
+
+def _names(slam: GraphSlam) -> dict[int, int | str]:
+    """What a vertex is in any map: a stamp, or a name."""
+    poses = dict(zip(slam.keyframes.ids.tolist(), slam.keyframes.stamps_ns.tolist(), strict=True))
+    return poses | {mark.vertex: name for name, mark in slam.landmarks.items()}
+
+
+def _about(slam: GraphSlam, names: dict[int, int | str], edge: int) -> str:
+    """Its class, and the landmark it is about or the stamp that it is of."""
+    table, row = slam.graph.row(edge)
+    name = names.get(int(table.vertices.values[row, -1]), "")
+    what = f"{name / 1e9:.3f} s" if isinstance(name, int) else name
+    return f"{slam.graph.label_of(edge)} {what}"

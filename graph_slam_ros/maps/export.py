@@ -1,0 +1,79 @@
+"""What a run knows, in the formats of others: its path as TUM, its graph as g2o, both for viewers as mcap.
+
+All is from the run's map, so it works where the run was never ended, too.
+"""
+
+from pathlib import Path
+
+from graph_slam_ros.formats.durable import replaced
+from graph_slam_ros.formats.g2o_writer import write_g2o, write_text
+from graph_slam_ros.formats.strict import is_gzipped
+from graph_slam_ros.formats.tum import tum_text
+from graph_slam_ros.messages import results, to_msg
+from graph_slam_ros.recordings.bag import BagWriter
+from graph_slam_ros.runs import RunError, graph_file, is_run, numbered, taken_up
+from graph_slam_ros.slam import GraphSlam
+
+
+def export(folder: Path, out: Path, target: str, losses: list[str], *, last_drive: bool = False) -> list[Path]:
+    """Write what a run knows; returns the files.
+
+    Parameters
+    ----------
+    target : one of ``TARGETS``
+    losses : what could not be read of the run is added
+    last_drive : of the path only the last drive, not those of the map that it began in; TUM only
+    """
+    if out.resolve().parent == folder.resolve():
+        raise RunError(f"{out}: cannot be read from and written to at once")
+    if is_run(out.resolve().parent):
+        raise RunError(f"{out}: a run is there, with files of its own")
+    if target == "mcap" and out.suffix != ".mcap":
+        raise RunError(f"{out}: what reads mcap wants a name that ends in .mcap")
+    slam = taken_up(folder, losses)
+    if last_drive:
+        if target != "tum":
+            raise RunError(f"--last-drive: {target} holds a whole map; with --to tum it is the path of the last drive")
+        return _tum(slam, out, slam.drives[-1])
+    return TARGETS[target](slam, out)
+
+
+def files_of(out: Path, target: str) -> list[Path]:
+    """The files that ``export`` writes."""
+    if target != "g2o":
+        return [out]
+    whole = out.with_suffix("") if is_gzipped(out) else out
+    return [out, whole.with_name(f"{whole.stem}_vertices.csv")]
+
+
+def _tum(slam: GraphSlam, out: Path, first: int = 0) -> list[Path]:
+    """The keyframes, from one on."""
+    write_text(out, tum_text(slam.keyframes.stamps_ns.tolist()[first:], slam.trajectory()[first:]))
+    return [out]
+
+
+def _g2o(slam: GraphSlam, out: Path) -> list[Path]:
+    """All that is believed; g2o has neither stamps nor names: these are in a table beside it."""
+    ids, table = numbered(slam)
+    _, beside = files_of(out, "g2o")
+    write_g2o(out, graph_file(slam, ids), slam.solver.estimate)
+    write_text(beside, table)
+    return [out, beside]
+
+
+def _mcap(slam: GraphSlam, out: Path) -> list[Path]:
+    """Every keyframe at its stamp with its covariance; at the last stamp the path and the landmarks."""
+    frame, unused = slam.config.frames.map, slam.config.output.pose_covariance_max
+    poses = zip(slam.keyframes.stamps_ns.tolist(), slam.trajectory(), slam.keyframe_covariances(), strict=True)
+    last_ns, landmarks = slam.keyframes[-1].stamp_ns, results.landmark_estimates(slam)
+    with replaced(out) as new, BagWriter(new) as bag:
+        for stamp_ns, at, covariance in poses:
+            pose = to_msg.pose_with_covariance_stamped(stamp_ns, frame, tuple(at.tolist()), covariance, unused)
+            bag.write("/pose", results.POSE, stamp_ns, pose)
+        bag.write("/path", results.PATH, last_ns, results.path(slam))
+        bag.write("/landmarks", results.LANDMARKS, last_ns, results.landmarks(slam, landmarks))
+        bag.write("/landmarks_estimate", results.ESTIMATES, last_ns, results.landmarks_estimate(slam, landmarks))
+    return [out]
+
+
+TARGETS = {"tum": _tum, "g2o": _g2o, "mcap": _mcap}

@@ -1,0 +1,209 @@
+"""One map of two sessions: landmarks that both know lay the second on the first, then all is solved together.
+
+The drive of the second follows as a new segment, as after a jump of time: nothing but landmarks tells how the robot
+came there.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.maps.alignment import Alignment, align, positions
+from graph_slam_ros.maps.diff import refuse_other_space, shared_landmarks
+from graph_slam_ros.runs import check_room, record_run, settled, stopwatch
+from graph_slam_ros.runs.map_journal import Growth, Record, extend, state_of
+from graph_slam_ros.slam import Control, GraphSlam
+from graph_slam_ros.slam.landmarks.anonymous import NAME, last_number
+from graph_slam_ros.slam.robust.gating import landmark_of
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
+from graph_slam_ros.slam.snapshot import MapState
+
+_ABSOLUTE = ("fixes", "surveyed")  # told in the axes of map, whoever tells them
+_ONCE = ("surveyed", "range_offset")  # what both sessions were told is told once
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """What came of a merger.
+
+    Attributes
+    ----------
+    shared : landmarks that both know
+    left_out : what B saw of those of them that have moved, by name in metres and standard deviations
+    """
+
+    summary: dict[str, Any]
+    losses: list[str]
+    shared: int
+    left_out: dict[str, tuple[float, float]]
+
+
+def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
+    """Write the run folder of one map of two runs, with the configuration of the first.
+
+    Raises
+    ------
+    GraphSlamError
+        They cannot be laid on one another.
+    """
+    took = stopwatch()
+    for folder in (a, b):
+        check_room(out, folder, force=force)
+    losses: list[str] = []
+    one, two = settled(a, losses), settled(b, losses)
+    refuse_other_space(one, two, a, b)
+    _refuse_other_datum(one, two, a, b)
+    shared = _shared(one, two, a, b)
+    aligned = _aligned(one, two, shared)
+    _refuse_same_drive(one, two, a, b)
+    state = state_of(one)
+    first_edge = state.graph.edge_count
+    extend(state, _Second(one, two, aligned, shared).record())
+    left_out = {name: aligned.distance(k) for k, name in enumerate(shared) if not aligned.fits[k]}
+    chi2 = {one.landmarks[name].vertex: float(aligned.chi2[k]) for k, name in enumerate(shared) if name in left_out}
+    _leave_out(state, first_edge, chi2, aligned.limit)
+    _, summary = record_run(out, one.config, [Control("optimize")], losses, state, took=took, force=force)
+    return Merged(summary, summary["losses"], len(shared), left_out)
+
+
+def _refuse_other_datum(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
+    if one.datum and two.datum and one.datum != two.datum:
+        raise GraphSlamError(
+            f"fixes of {a} are from {one.datum}, of {b} from {two.datum}: configure one datum for both"
+        )
+
+
+def _refuse_same_drive(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
+    """What was measured once would count twice."""
+    driven = {(k.stamp_ns, k.T_odom_base) for k in one.keyframes}
+    same = sum((k.stamp_ns, k.T_odom_base) in driven for k in two.keyframes)
+    if same > 1:  # two robots may begin at one time
+        raise GraphSlamError(f"{same} keyframes are of the same drive in {a} and {b}: nothing new is in one of them")
+
+
+def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:
+    """Landmarks of both. Raises GraphSlamError where they cannot be one."""
+    for name, mark in two.landmarks.items():
+        other = one.landmarks.get(name)
+        if other is None or (mark.is_unnamed and other.is_unnamed):
+            continue
+        if mark.is_unnamed is not other.is_unnamed:
+            raise GraphSlamError(f"landmark {name} has an identity in one of {a} and {b}, and none in the other")
+        if one.graph.kind_of(other.vertex) is not two.graph.kind_of(mark.vertex):
+            raise GraphSlamError(f"landmark {name} is a point in one of {a} and {b}, and a pose in the other")
+    for label in _ABSOLUTE:
+        if len(two.graph.edges_of(label)) and not any(len(one.graph.edges_of(other)) for other in _ABSOLUTE):
+            raise GraphSlamError(f"{b} has {label}, which say where its map is, and {a} has none: merge {b} {a}")
+    return shared_landmarks(one, two)
+
+
+def _aligned(one: GraphSlam, two: GraphSlam, shared: list[str]) -> Alignment:
+    needed, robust = one.space.dimensions, one.config.robust
+    if len(shared) < needed:
+        raise GraphSlamError(f"{len(shared)} landmarks are in both maps: it takes {needed} to lay one on the other")
+    found = align(one.space, positions(one, shared), positions(two, shared), robust.gate, robust.noise_factor)
+    agree = 0 if found is None else int(found.fits.sum())
+    if found is None or 2 * agree < len(shared):
+        told = f"{agree} of them agree" if agree else "too few agree, or they stand too close together"
+        raise GraphSlamError(f"{len(shared)} landmarks are in both maps, and {told} on how one lies on the other")
+    return found
+
+
+def _leave_out(state: MapState, first_edge: int, chi2: Mapping[int, float], limit: float) -> None:
+    """Take out what the second session saw of landmarks that are elsewhere in it; what fits after all comes back."""
+    last, inside = len(state.keyframes) - 1, state.ledger.inside
+    for edge in inside[inside >= first_edge].tolist():
+        statistic = chi2.get(landmark_of(state.graph, edge) or 0)
+        if statistic is not None:
+            state.graph.set_weights(np.array([edge]), 0.0)
+            state.ledger.note(edge, last, Verdict.REJECTED, Reason.OUTVOTED, statistic, limit)
+
+
+class _Second:
+    """The map of the second session as growth of the first."""
+
+    def __init__(self, one: GraphSlam, two: GraphSlam, aligned: Alignment, shared: list[str]) -> None:
+        self._one, self._two, self._T = one, two, aligned.T_a_b
+        self._keyframes = len(one.keyframes)
+        same = {two.landmarks[name].vertex: one.landmarks[name].vertex for name in shared}
+        same |= {v: one.range_offsets[name] for name, v in two.range_offsets.items() if name in one.range_offsets}
+        self._vertex: dict[int, int] = same
+        self._new = [vertex for vertex in range(two.graph.vertex_count) if vertex not in same]
+        self._vertex |= {vertex: one.graph.vertex_count + k for k, vertex in enumerate(self._new)}
+        self._shared = set(shared)
+
+    def record(self) -> Record:
+        """With the numbers that vertices, edges and keyframes have after those of the first."""
+        told, first = Growth().since(self._two), self._keyframes
+        others = Growth().since(self._one)["edges"]
+        known = {(label, *vertices) for _, vertices, *_, label, _ in others if label in _ONCE}
+        edges = [self._edge(edge) for edge in told["edges"]]
+        kept = [k for k, (_, vertices, *_, label, _) in enumerate(edges) if (label, *vertices) not in known]
+        number = {edge: self._one.graph.edge_count + k for k, edge in enumerate(kept)}
+        return {
+            "vertices": [self._value(vertex, told["vertices"][vertex][0]) for vertex in self._new],
+            "edges": [edges[k] for k in kept],
+            "judged": [[first + keyframe, *rest] for keyframe, *rest in (told["judged"][k] for k in kept)],
+            "changes": [[number[edge], first + keyframe, *rest] for edge, keyframe, *rest in told.get("changes", ())],
+            "keyframes": [[self._vertex[vertex], *rest] for vertex, *rest in told["keyframes"]],
+            "segments": [first + keyframe for keyframe in told["segments"]],
+            "drives": [first + keyframe for keyframe in told["drives"]],
+            "sightings": [[first + keyframe, *rest] for keyframe, *rest in told.get("sightings", ())],
+            "landmarks": self._landmarks(told.get("landmarks", {})),
+            "seen": [
+                [number[edge], topic, sighting, first + keyframe, self._vertex[vertex], *rest]
+                for edge, topic, sighting, keyframe, vertex, *rest in told.get("seen", ())
+            ],
+            "datum": told.get("datum", self._one.datum),
+            "offsets": {name: self._vertex[vertex] for name, vertex in told.get("offsets", {}).items()},
+        }
+
+    def _value(self, vertex: int, kind: str) -> list[Any]:
+        """Where it is in the first map."""
+        space, value = self._one.space, tuple(self._two.solver.estimate([vertex])[0].tolist())
+        of = self._two.graph.kind_of(vertex)
+        if of is space.pose:
+            value = space.group.compose(self._T, value)
+        elif of is space.point:
+            value = space.group.act(self._T, value)
+        return [kind, [float(x) for x in value]]
+
+    def _edge(self, edge: list[Any]) -> list[Any]:
+        tag, vertices, measured, root, label, source = edge
+        if label == "anchor":
+            return self._bridge()
+        if label == "initialpose":  # it was told in the axes of the second
+            measured = [float(x) for x in self._one.space.group.compose(self._T, tuple(measured))]
+        return [tag, [self._vertex[vertex] for vertex in vertices], measured, root, label, source]
+
+    def _bridge(self) -> list[Any]:
+        """From the last keyframe of the first to the first of the second, where it begins its drive: nearly nothing."""
+        space, config = self._one.space, self._one.config.odometry
+        ends = [int(self._one.keyframes.ids[-1]), self._vertex[int(self._two.keyframes.ids[0])]]
+        last = tuple(self._one.trajectory()[-1].tolist())
+        begun = space.group.compose(self._T, tuple(self._two.trajectory()[0].tolist()))
+        measured = [float(x) for x in space.group.between(last, begun)]
+        root = Gaussian.from_sigmas(*space.sigmas(config.jump_sigma_m, config.jump_sigma_rad)).sqrt_information
+        tag = next(tag for tag, edge_type in EDGE_TAGS.items() if edge_type is space.relative_pose)
+        return [tag, ends, measured, np.ravel(root).tolist(), "odometry", ""]
+
+    def _landmarks(self, told: Mapping[str, Any]) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        known = self._one.touched_landmarks(0)
+        number = last_number({*known, *told})
+        for name, (vertex, is_unnamed, is_tentative, sightings, first_ns, last_ns) in told.items():
+            if name in self._shared:
+                mark = self._one.landmarks[name]
+                sightings += mark.sightings
+                first_ns, last_ns = min(first_ns, mark.first_seen_ns), max(last_ns, mark.last_seen_ns)
+            elif name in known:
+                number += 1
+                name = f"{NAME}{number}"
+            out[name] = [self._vertex[vertex], is_unnamed, is_tentative, sightings, first_ns, last_ns]
+        return out

@@ -1,0 +1,172 @@
+"""What can be handed to ``GraphSlam.process``: frozen values, checked at the border, exact in JSON.
+
+A pose is (x, y, theta) in the plane and (x, y, z, qx, qy, qz, qw) in space. Covariances are flat, row-major, in tangent
+order: (x, y, theta), or (x, y, z, rotation vector). Nothing here tells which message it came from.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any, TypeAlias
+
+from graph_slam_ros.errors import FormatError
+
+Numbers: TypeAlias = tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """Absolute pose in the odometry frame; only the motion between two of them is ever used.
+
+    Attributes
+    ----------
+    twist_covariance : 9 (36) numbers, (m/s, rad/s) in the base frame, or None where unknown
+    source : which odometry it is, where there are several; their priority is in the configuration
+    """
+
+    stamp_ns: int
+    T_odom_base: Numbers
+    twist_covariance: Numbers | None = None
+    source: str = "odometry"
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """A landmark, seen by a sensor of the robot.
+
+    Attributes
+    ----------
+    id : its identity; empty where the sensor does not know it
+    kind : what was measured
+    measured : by ``kind``: of ``position`` and ``pose``, the point or pose in the base frame; else in the sensor's:
+        of ``range_bearing`` (range, bearing) or (range, azimuth, elevation), of ``bearing`` the same without the range,
+        of ``range`` one number
+    covariance : of ``measured``: of a position in the axes of the base frame, of a pose in its tangent space
+    T_base_sensor : where the sensor is, for the kinds that are measured in its frame; None: at the base
+    """
+
+    id: str
+    kind: str
+    measured: Numbers
+    covariance: Numbers
+    T_base_sensor: Numbers | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """All landmarks of one message, at the stamp they were seen."""
+
+    stamp_ns: int
+    topic: str
+    sightings: tuple[Sighting, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """What is known of the robot in the map frame itself: a receiver's position, a compass, a pose from elsewhere.
+
+    Attributes
+    ----------
+    measured : by ``kind``: of ``pose``, T_map_base; of ``position``, the coordinates of ``point`` in map; of
+        ``heading``, one angle; of ``attitude``, the quaternion (x, y, z, w) of R_map_base, in space only
+    covariance : of ``measured``: of a position in the axes of map, where a variance of 1e6 m^2 or more says that an
+        axis is not known; of a pose or attitude in its tangent space
+    point : of ``position``, the antenna in the base frame; empty: its origin
+    datum : of a position on earth, latitude [deg], longitude [deg] and height [m] of the map's origin
+    """
+
+    stamp_ns: int
+    topic: str
+    kind: str
+    measured: Numbers
+    covariance: Numbers
+    point: Numbers = ()
+    datum: Numbers = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """A loop closure: where the robot at one stamp was, seen from where it was at an earlier one.
+
+    Attributes
+    ----------
+    from_stamp_ns : the earlier (or later) stamp
+    T_from_base : the base at ``stamp_ns`` in the base at ``from_stamp_ns``
+    covariance : of that pose in its tangent space
+    """
+
+    stamp_ns: int
+    from_stamp_ns: int
+    topic: str
+    T_from_base: Numbers
+    covariance: Numbers
+
+
+@dataclass(frozen=True, slots=True)
+class InitialPose:
+    """Where somebody says that the robot is; it holds from the next odometry on.
+
+    Attributes
+    ----------
+    covariance : of ``T_map_base`` in its tangent space
+    """
+
+    T_map_base: Numbers
+    covariance: Numbers
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """An event that is not a measurement.
+
+    ``flush`` releases what waits for its turn, ``end`` also gives up what no odometry reached, ``optimize`` solves now,
+    ``clear_closures`` takes all loop closures out, ``time_jump`` begins a segment whose stamps may be older, ``set``
+    changes parameters to ``values``, ``remove`` takes an ``edge`` or a ``landmark`` out, ``memory`` tells that it
+    ``is_short`` or no more, ``restart`` goes back to the last good estimate after a fault outside.
+    """
+
+    event: str
+    values: tuple[tuple[str, bool | int | float | str], ...] = ()
+
+
+Observation: TypeAlias = Sightings | Fix | Closure
+Measured: TypeAlias = Odometry | Sightings | Fix | Closure
+Measurement: TypeAlias = Odometry | Observation | InitialPose | Control
+
+_TYPES = {
+    "odometry": Odometry,
+    "sightings": Sightings,
+    "fix": Fix,
+    "closure": Closure,
+    "initial_pose": InitialPose,
+    "control": Control,
+}
+_NAMES = {cls: name for name, cls in _TYPES.items()}
+
+
+def to_record(measurement: Measurement) -> dict[str, Any]:
+    """Plain dictionary of a measurement; floats survive JSON exactly."""
+    match measurement:
+        case Odometry(stamp_ns, pose, covariance, source):  # by hand: thousands a second
+            out = {"type": "odometry", "stamp_ns": stamp_ns, "T_odom_base": pose, "twist_covariance": covariance}
+            return out | {"source": source}
+        case _:
+            return {"type": _NAMES[type(measurement)], **asdict(measurement)}
+
+
+def from_record(record: dict[str, Any]) -> Measurement:
+    """Inverse of ``to_record``. Raises FormatError naming the field that is missing or unknown."""
+    fields = dict(record)
+    cls = _TYPES.get(fields.pop("type", ""))
+    if cls is None:
+        raise FormatError(f"unknown kind of measurement {record.get('type')!r}")
+    try:
+        if cls is Sightings:
+            fields["sightings"] = tuple(Sighting(**_tuples(one)) for one in fields["sightings"])
+        if cls is Control:
+            fields["values"] = tuple((name, value) for name, value in fields.get("values", ()))
+        return cls(**_tuples(fields))
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(f"{record['type']}: {error}") from None
+
+
+def _tuples(fields: dict[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}

@@ -1,0 +1,224 @@
+"""The border: messages come in as CDR bytes and leave as measurements, or are counted and refused.
+
+Works on the bytes of live subscriptions and of bags alike; needs no ROS. Every refusal and every repair adds to a
+counter by (input, reason).
+"""
+
+import struct
+from collections import deque
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.config.inputs import InputConfig
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import InitialPose, Measured, Odometry
+from graph_slam_ros.messages.inputs import CONVERTERS, checks, fixes, odometry, uses
+from graph_slam_ros.messages.inputs.checks import MessageError
+from graph_slam_ros.messages.inputs.source import NotYet, Origin, Source
+from graph_slam_ros.messages.inputs.transforms import Transforms, pose
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.messages.one_publisher import OnePublisher
+
+Decoder = Callable[[bytes], Any]
+
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+TF_STATIC, TF, INITIAL_POSE = "tf_static", "tf", "initialpose"
+_POSE_SIZE = 8 * (7 + 36)  # of a geometry_msgs/PoseWithCovariance
+
+
+def decoder(type_name: str) -> Decoder:
+    """From CDR bytes to a message object of our own type store."""
+    store = typestore()
+    return lambda cdr: store.deserialize_cdr(cdr, type_name)
+
+
+def is_correction(cdr: bytes, map_frame: str) -> bool:
+    """Whether a tf2_msgs/TFMessage is about the map frame, by its first transform, without decoding it."""
+    if len(cdr) < 20:
+        return False
+    order = "<" if cdr[1] & 1 else ">"
+    (length,) = struct.unpack_from(order + "I", cdr, 16)  # after the encoding, the count and a stamp
+    return cdr[20 : 20 + length].rstrip(b"\0").lstrip(b"/") == map_frame.encode()
+
+
+def twist_of(cdr: bytes, base_frame: str) -> bytes | None:
+    """The geometry_msgs/TwistWithCovariance, little endian, of a nav_msgs/Odometry, without decoding the rest.
+
+    None where it is of another frame than the base: what a wheel or a sensor does is not what the robot does.
+    """
+    if len(cdr) < 16:
+        return None
+    order = "<" if cdr[1] & 1 else ">"
+    try:
+        (length,) = struct.unpack_from(order + "I", cdr, 12)  # after the encoding and a stamp
+        start = 16 + length + -length % 4
+        (length,) = struct.unpack_from(order + "I", cdr, start)
+        child = cdr[start + 4 : start + 4 + length].rstrip(b"\0").lstrip(b"/")
+        start += 4 + length
+        start += (4 - start) % 8 + _POSE_SIZE
+        numbers = struct.unpack_from(f"{order}42d", cdr, start)
+    except struct.error:
+        return None
+    return struct.pack("<42d", *numbers) if child == base_frame.encode() else None
+
+
+class Border:
+    """Turns messages into measurements.
+
+    Parameters
+    ----------
+    config : the inputs, frames, and the defaults for what messages leave unknown
+    counters : where refusals and repairs are counted
+    decoders : by message type, where a recording's own definition or an installed package is to be used
+
+    Raises
+    ------
+    ConfigError
+        An input of a type, or for a use, that is not there.
+    """
+
+    def __init__(self, config: Config, counters: Counters, decoders: Mapping[str, Decoder] | None = None) -> None:
+        self._config = config
+        self._counters = counters
+        self._transforms = Transforms(round(config.inputs.tf_buffer_s * 1e9), self._is_far_in_time)
+        self._sources: dict[str, Source] = {}
+        self._convert: dict[str, Callable[[Any], Any]] = {}
+        self._publishers: dict[str, OnePublisher] = {}  # of each odometry
+        self._waiting: deque[tuple[Source, Any]] = deque()  # for /tf to tell where their sensors were
+        self._types = {TF_STATIC: TRANSFORMS, TF: TRANSFORMS}
+        by_name = {settings.name: settings for settings in config.sources}
+        told = (settings.numbers("datum", 3) for settings in config.sources)
+        self._origin = Origin(next(filter(None, told), ()))
+        for name, use in uses(config).items():
+            counters.received[name] += 0
+            source = self._sources[name] = Source(by_name[name], use, config, self._transforms, self._origin)
+            self._types[name] = by_name[name].type
+            self._convert[name] = partial(CONVERTERS[by_name[name].type][use], source)
+            if use == "odometry":
+                self._publishers[name] = OnePublisher(
+                    config.odometry.timeout_s, partial(self._is_of_another, name), partial(self._is_ahead, name)
+                )
+        for name, add in ((TF_STATIC, self._add_static), (TF, self._add_moving)):
+            source = self._sources[name] = Source(InputConfig(name), "none", config, self._transforms)
+            self._convert[name] = partial(self._transforms_of, source, add)
+        self._add_initial_pose()
+        known = typestore().types
+        ours = {name: decoder(name) for name in self._types.values() if name in known}
+        self._decode = ours | dict(decoders or {})
+
+    def take(self, name: str, cdr: bytes) -> list[Measured]:
+        """What a message of an input, of ``tf_static`` or ``tf`` gives, itself or by what has waited for it."""
+        source = self._sources[name]
+        self._counters.received[name] += 1
+        try:
+            message = self._decode[self._types[name]](cdr)
+        except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors
+            self._counters.count(name, "undecodable")
+            return []
+        out = self._converted(source, message)
+        if source.use == "odometry":
+            publishers = self._publishers[name]
+            out = [one for m in out if isinstance(m, Odometry) for one in publishers.take(m)]
+            self._transforms.now_ns = max([*(m.stamp_ns for m in out), self._transforms.now_ns or 0]) or None
+        if name == TF or source.use == "odometry":
+            for _ in range(len(self._waiting)):
+                out += self._converted(*self._waiting.popleft())
+        elif len(self._waiting) > self._config.ordering.max_waiting:
+            out += self._hurried(*self._waiting.popleft())
+        return out
+
+    def finish(self, *, is_end: bool = True) -> list[Measured]:
+        """What waits for /tf is used or refused; at the end of all messages, odometry that waits, too."""
+        out: list[Measured] = [m for one in self._publishers.values() for m in one.finish()] if is_end else []
+        out += [one for waiting in self._waiting for one in self._hurried(*waiting)]
+        self._waiting.clear()
+        return out
+
+    def unlinked(self, name: str) -> tuple[tuple[str, str], ...]:
+        """Frames of an input, each with the frame that nothing links it to, of the last messages refused for that."""
+        return tuple(self._sources[name].unlinked)
+
+    def not_found(self, name: str) -> str:
+        """Of odometry on /tf of which no transform has come yet: which one, what mends it; else empty."""
+        source = self._sources[name]
+        return odometry.not_found(source) if source.use == "odometry" else ""
+
+    def initial_pose(self, cdr: bytes) -> list[InitialPose]:
+        """What a geometry_msgs/PoseWithCovarianceStamped of ``initialpose`` says, if it can be used."""
+        out: list[Any] = self.take(INITIAL_POSE, cdr)
+        return out
+
+    def begin_at(self, datum: tuple[float, ...]) -> None:
+        """Fixes are of a map that begins at this latitude, longitude and height, where no input says another."""
+        self._origin.datum = datum
+
+    def forget_time(self) -> None:
+        """Stamps begin anew: what /tf has told of moving joints is of another time."""
+        self._waiting.clear()
+        for publishers in self._publishers.values():
+            publishers.forget_time()
+        self._transforms.forget_time()
+
+    def _is_of_another(self, name: str) -> None:
+        self._counters.count(name, "other_publisher")
+
+    def _is_ahead(self, name: str) -> None:
+        self._counters.count(name, "future")
+
+    def _is_far_in_time(self) -> None:
+        self._counters.count(TF, "far_in_time")
+
+    def _hurried(self, source: Source, message: Any) -> list[Measured]:
+        before, source.hurried = source.hurried, True
+        out = self._converted(source, message)
+        source.hurried = before
+        return out
+
+    def _converted(self, source: Source, message: Any) -> list[Measured]:
+        out: list[Measured] = []
+        try:
+            with np.errstate(invalid="ignore"):  # a signalling NaN warns where it is compared; it is refused by name
+                out += self._convert[source.name](message)
+        except NotYet:
+            source.tally.clear()
+            self._waiting.append((source, message))
+            return []
+        except MessageError as reason:
+            source.count(str(reason))
+        for why, times in source.tally.items():
+            self._counters.count(source.name, why, times)
+        source.tally.clear()
+        return out
+
+    def _add_initial_pose(self) -> None:
+        said = self._config.initialpose
+        settings = InputConfig(INITIAL_POSE, sigma_m=said.sigma_m, sigma_rad=said.sigma_rad)
+        source = self._sources[INITIAL_POSE] = Source(settings, "none", self._config, self._transforms)
+        self._types[INITIAL_POSE] = "geometry_msgs/msg/PoseWithCovarianceStamped"
+        self._convert[INITIAL_POSE] = partial(fixes.initial_pose, source)
+
+    # -- transforms --------------------------------------------------------------------------------------------------
+
+    def _transforms_of(self, source: Source, add: Callable[[Any, str, str, Any], None], message: Any) -> list[Measured]:
+        for t in message.transforms:
+            try:
+                checks.point(t.transform.translation)
+                q = source.unit(t.transform.rotation)
+                parent, child = source.frame(t.header.frame_id), source.frame(t.child_frame_id)
+                if parent == child:
+                    raise MessageError("frame_in_itself")
+                add(t, parent, child, pose(t.transform.translation, q))
+            except MessageError as reason:
+                source.count(str(reason))
+        return []
+
+    def _add_static(self, t: Any, parent: str, child: str, T_parent_child: Any) -> None:
+        self._transforms.add(parent, child, T_parent_child)
+
+    def _add_moving(self, t: Any, parent: str, child: str, T_parent_child: Any) -> None:
+        if parent != self._config.frames.map:  # that is what we estimate: nothing may be measured by it
+            self._transforms.add_at(checks.stamp_ns(t.header.stamp), parent, child, T_parent_child)

@@ -1,0 +1,74 @@
+"""Types of messages that can be inputs, what each can be used as, and how it is converted: one table.
+
+A converter is a function of an input (``Source``) and a decoded message; it raises ``MessageError`` where the whole
+message is refused, and ``NotYet`` where it is to be tried again when /tf has told more.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.config.inputs import InputConfig
+from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.measurements.types import Measured
+from graph_slam_ros.messages.inputs import detections, fixes, odometry, ranges
+from graph_slam_ros.messages.inputs.landmarks import Seen, sightings
+from graph_slam_ros.messages.inputs.source import Source
+
+Converter = Callable[[Source, Any], Iterable[Measured]]
+
+
+def _landmarks(read: Callable[[Source, Any], Iterable[Seen]]) -> Converter:
+    return lambda source, message: sightings(source, read(source, message))
+
+
+_POSE: Mapping[str, Converter] = {
+    "fix": fixes.pose_fix,
+    "landmarks": _landmarks(detections.pose_stamped),
+    "odometry": odometry.pose_stamped,
+}
+
+CONVERTERS: Mapping[str, Mapping[str, Converter]] = {
+    "nav_msgs/msg/Odometry": {"odometry": odometry.odometry, "fix": fixes.pose_fix},
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _POSE,
+    "geometry_msgs/msg/PoseStamped": _POSE,
+    "tf2_msgs/msg/TFMessage": {"odometry": odometry.transforms, "landmarks": _landmarks(detections.transforms)},
+    "sensor_msgs/msg/NavSatFix": {"fix": fixes.gnss},
+    "sensor_msgs/msg/Imu": {"fix": fixes.imu},
+    "vision_msgs/msg/Detection3DArray": {"landmarks": _landmarks(detections.detections), "closure": fixes.closures},
+    "sensor_msgs/msg/PointCloud2": {"landmarks": _landmarks(ranges.point_cloud)},
+    "visualization_msgs/msg/MarkerArray": {"landmarks": _landmarks(detections.markers)},
+    "apriltag_msgs/msg/AprilTagDetectionArray": {"landmarks": _landmarks(detections.apriltags)},
+    "aruco_msgs/msg/MarkerArray": {"landmarks": _landmarks(detections.aruco_markers)},
+    "ros2_aruco_interfaces/msg/ArucoMarkers": {"landmarks": _landmarks(detections.ros2_aruco)},
+    "aruco_opencv_msgs/msg/ArucoDetection": {"landmarks": _landmarks(detections.aruco_opencv)},
+    "rtabmap_msgs/msg/LandmarkDetections": {"landmarks": _landmarks(detections.rtabmap)},
+    "cartographer_ros_msgs/msg/LandmarkList": {"landmarks": _landmarks(detections.cartographer)},
+    "mrpt_msgs/msg/ObservationRangeBearing": {"landmarks": _landmarks(ranges.range_bearing)},
+    "mrpt_msgs/msg/ObservationRangeBeacon": {"landmarks": _landmarks(ranges.range_beacon)},
+}
+"""By type, then by use; the first use is that of ``auto``."""
+
+
+def uses(config: Config) -> dict[str, str]:
+    """What each input is used as, by its name; those that are not used are left out.
+
+    Raises
+    ------
+    ConfigError
+        An input of a type that is not in the table or cannot be used so, or none is odometry.
+    """
+    out = {settings.name: _use(settings) for settings in config.sources if settings.use != "none"}
+    if "odometry" not in out.values():
+        raise ConfigError(f"inputs.names: none of {config.inputs.names!r} is used as odometry")
+    return out
+
+
+def _use(settings: InputConfig) -> str:
+    there = CONVERTERS.get(settings.type)
+    if there is None:
+        raise ConfigError(f"{settings.name}.type: {settings.type!r} is not one of {', '.join(CONVERTERS)}")
+    use = next(iter(there)) if settings.use == "auto" else settings.use
+    if use not in there:
+        raise ConfigError(f"{settings.name}.use: {settings.type} can be {' or '.join(there)}, not {use}")
+    return use

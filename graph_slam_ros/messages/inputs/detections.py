@@ -1,0 +1,117 @@
+"""Messages of landmarks with a position or a pose: only read here, judged in ``landmarks``."""
+
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.messages.inputs.checks import MessageError
+from graph_slam_ros.messages.inputs.landmarks import Seen
+from graph_slam_ros.messages.inputs.source import Source
+
+_ADD, _DELETE, _DELETEALL = 0, 2, 3
+_NOTHING = np.zeros(36)  # all zero is unknown by custom
+_ORIGIN = SimpleNamespace(x=0.0, y=0.0, z=0.0)
+_UNTURNED = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+
+
+def detections(source: Source, m: Any) -> Iterator[Seen]:
+    """vision_msgs/Detection3DArray: the first result's pose, or the centre of the box."""
+    by_class = source.config.landmarks.id_from == "class_id"
+    for one in m.detections:
+        first = one.results[0] if len(one.results) else None
+        name = (first.hypothesis.class_id if first else "") if by_class else one.id
+        at, covariance = (first.pose.pose, first.pose.covariance) if first else (one.bbox.center, _NOTHING)
+        frame = one.header.frame_id or m.header.frame_id
+        yield Seen(m.header.stamp, frame, name, at.position, at.orientation, covariance)
+
+
+def pose_stamped(source: Source, m: Any) -> Iterator[Seen]:
+    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped: one landmark, of configured identity."""
+    has_covariance = hasattr(m.pose, "covariance")
+    at, covariance = (m.pose.pose, m.pose.covariance) if has_covariance else (m.pose, None)
+    yield Seen(m.header.stamp, m.header.frame_id, "", at.position, at.orientation, covariance)
+
+
+def transforms(source: Source, m: Any) -> Iterator[Seen]:
+    """tf2_msgs/TFMessage: frames whose names begin as configured; a stamp that is sent again is left out."""
+    last = source.state.setdefault("stamps", {})
+    for t in m.transforms:
+        child = t.child_frame_id.lstrip("/")
+        if not source.settings.frame_prefix or not child.startswith(source.settings.frame_prefix):
+            continue
+        sent = last.get(child)
+        if sent is not None and sent is not t and sent.header.stamp == t.header.stamp:
+            source.count("sent_again")
+            continue
+        last[child] = t
+        at = t.transform
+        yield Seen(t.header.stamp, t.header.frame_id, child, at.translation, at.rotation)
+
+
+def markers(source: Source, m: Any) -> Iterator[Seen]:
+    """visualization_msgs/MarkerArray: identity is namespace and id; only what is added (or modified) is seen."""
+    for one in m.markers:
+        if one.action in (_DELETE, _DELETEALL):
+            continue
+        if one.action != _ADD:
+            source.count("unknown_action")
+            continue
+        name = f"{one.ns}/{one.id}" if one.ns else str(one.id)
+        yield Seen(one.header.stamp, one.header.frame_id, name, one.pose.position, one.pose.orientation)
+
+
+# -- of packages that need not be there -----------------------------------------------------------------------------
+
+
+def apriltags(source: Source, m: Any) -> Iterator[Seen]:
+    """apriltag_msgs/AprilTagDetectionArray: poses are on /tf, as frames that are named by family and id."""
+    settings = source.settings
+    for one in m.detections:
+        if one.hamming > settings.hamming_max or one.decision_margin < settings.decision_margin_min:
+            source.count("poor_tag")
+            continue
+        name = f"{one.family}:{one.id}"
+        yield Seen(m.header.stamp, name, name, _ORIGIN, _UNTURNED)
+
+
+def aruco_markers(source: Source, m: Any) -> Iterator[Seen]:
+    """aruco_msgs/MarkerArray: each with a header of its own, else that of the array."""
+    for one in m.markers:
+        has_own = one.header.stamp.sec or one.header.stamp.nanosec
+        stamp = one.header.stamp if has_own else m.header.stamp
+        frame = one.header.frame_id or m.header.frame_id
+        yield Seen(stamp, frame, str(one.id), one.pose.pose.position, one.pose.pose.orientation, one.pose.covariance)
+
+
+def ros2_aruco(source: Source, m: Any) -> Iterator[Seen]:
+    """ros2_aruco_interfaces/ArucoMarkers: two parallel arrays."""
+    if len(m.marker_ids) != len(m.poses):
+        raise MessageError("lengths_differ")
+    for name, at in zip(m.marker_ids, m.poses, strict=True):
+        yield Seen(m.header.stamp, m.header.frame_id, str(int(name)), at.position, at.orientation)
+
+
+def aruco_opencv(source: Source, m: Any) -> Iterator[Seen]:
+    """aruco_opencv_msgs/ArucoDetection: single markers by number and boards by name."""
+    named = [(str(one.marker_id), one.pose) for one in m.markers] + [(one.board_name, one.pose) for one in m.boards]
+    for name, at in named:
+        yield Seen(m.header.stamp, m.header.frame_id, name, at.position, at.orientation)
+
+
+def rtabmap(source: Source, m: Any) -> Iterator[Seen]:
+    """rtabmap_msgs/LandmarkDetections: an id of zero or less is none."""
+    for one in m.landmarks:
+        name = str(one.id) if one.id > 0 else ""
+        frame, at = one.header.frame_id or m.header.frame_id, one.pose.pose
+        yield Seen(m.header.stamp, frame, name, at.position, at.orientation, one.pose.covariance)
+
+
+def cartographer(source: Source, m: Any) -> Iterator[Seen]:
+    """cartographer_ros_msgs/LandmarkList: a residual times its weight is one, so sigma is 1 / weight; 0: unknown."""
+    for one in m.landmarks:
+        at = one.tracking_from_landmark_transform
+        sigmas = [1.0 / w if w else 0.0 for w in (one.translation_weight, one.rotation_weight)]
+        covariance = np.diag([sigma * sigma for sigma in sigmas for _ in range(3)]).ravel()
+        yield Seen(m.header.stamp, m.header.frame_id, one.id, at.position, at.orientation, covariance)

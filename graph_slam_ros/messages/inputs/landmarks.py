@@ -1,0 +1,228 @@
+"""What a message says of landmarks becomes sightings: one rule for all types.
+
+A converter of a type only reads: it yields one ``Seen`` for each landmark of a message.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph.geometry import SPACE
+from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.measurements.types import Sighting, Sightings
+from graph_slam_ros.messages.inputs import checks
+from graph_slam_ros.messages.inputs.checks import MessageError
+from graph_slam_ros.messages.inputs.source import Numbers, Source
+
+Array = NDArray[np.float64]
+
+_AGREE_SIGMA = 3.0
+_LONGEST_ID = 128  # bytes
+_UPRIGHT = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One landmark, as a message says it.
+
+    Attributes
+    ----------
+    stamp, frame : of its header
+    id : its identity; empty where unknown
+    position : Point or Vector3 message in the frame, or None where ``polar`` is given
+    orientation : Quaternion message, or None
+    covariance : 36 numbers in the axes of the frame, or None where the message has none
+    polar : (kind, measured) in the sensor's frame, kinds as of ``Sighting``
+    sigmas : standard deviations of ``polar``, one for each number of it; None or zero where unknown
+    T_frame_sensor : where the sensor is in the frame
+    """
+
+    stamp: Any
+    frame: str
+    id: str
+    position: Any = None
+    orientation: Any = None
+    covariance: Any = None
+    polar: tuple[str, Numbers] | None = None
+    sigmas: Sequence[float] | None = None
+    T_frame_sensor: se3.Pose = se3.IDENTITY
+
+
+def sightings(source: Source, found: Iterable[Seen]) -> Iterator[Sightings]:
+    """One measurement for each stamp of a message; what cannot be used of it is counted."""
+    by_stamp: dict[tuple[int, int], list[Seen]] = {}
+    for one in _nearest(source, list(found)):
+        by_stamp.setdefault((one.stamp.sec, one.stamp.nanosec), []).append(one)
+    for same in by_stamp.values():
+        try:
+            stamp_ns = source.stamp_ns(same[0].stamp)
+        except MessageError as reason:
+            source.count(str(reason))
+            continue
+        seen = []
+        for one in same:
+            try:
+                seen.append(_sighting(source, stamp_ns, one))
+            except MessageError as reason:
+                source.count(str(reason))
+        usable = _agreed(source, seen)
+        if usable:
+            yield Sightings(stamp_ns, source.name, tuple(usable))
+
+
+def _nearest(source: Source, found: list[Seen]) -> list[Seen]:
+    """Of a message's landmarks, as many as are taken."""
+    if len(found) <= (most := source.config.landmarks.max_per_message):
+        return found
+    source.count("too_many", len(found) - most)
+    nearest = np.argsort([_reach(one) for one in found], kind="stable")[:most]  # no number sorts last
+    return [found[k] for k in sorted(nearest.tolist())]
+
+
+def _reach(seen: Seen) -> float:
+    """From the frame it is told in; a bearing alone is as good as near."""
+    if seen.polar is None:
+        return math.hypot(seen.position.x, seen.position.y, seen.position.z)
+    kind, measured = seen.polar
+    return 0.0 if kind == "bearing" else abs(measured[0])
+
+
+def _sighting(source: Source, stamp_ns: int, seen: Seen) -> Sighting:
+    name = _identity(source, seen.id)
+    T_base_frame = source.T_base(source.frame(seen.frame), stamp_ns)
+    if seen.polar is not None:
+        kind, measured = seen.polar
+        return _polar(source, name, kind, measured, seen.sigmas, se3.compose(T_base_frame, seen.T_frame_sensor))
+    p = checks.point(seen.position)
+    x, y, z = map(float, se3.act(T_base_frame, p))
+    distance_m = math.hypot(x, y, z)
+    covariance = SPACE.in_parent_axes(T_base_frame, source.pose_covariance(seen.covariance, distance_m))
+    n = source.space.dimensions
+    if seen.orientation is not None and source.orientation_known(covariance):
+        q = so3.compose(se3.rotation(T_base_frame), source.unit(seen.orientation))
+        T_base_seen = (x, y, z, *q)
+        if source.has_heading(T_base_seen):
+            at = source.projected(T_base_seen)
+            block = np.reshape(source.checked(source.block(covariance), n, distance_m), (source.space.dof, -1))
+            return Sighting(name, "pose", at, tuple(source.space.in_tangent(at, block).ravel().tolist()))
+    return Sighting(name, "position", (x, y, z)[:n], source.checked(covariance[:n, :n], n, distance_m))
+
+
+def _identity(source: Source, name: str) -> str:
+    name = name or source.settings.id
+    if not name:  # what becomes of it is the pipeline's to say
+        return ""
+    name = source.settings.id_prefix + name
+    if len(name.encode()) > _LONGEST_ID:
+        raise MessageError("id_too_long")
+    return str(name)
+
+
+# -- ranges and bearings ---------------------------------------------------------------------------------------------
+
+
+def _polar(
+    source: Source, name: str, kind: str, measured: Numbers, sigmas: Sequence[float] | None, T_base_sensor: se3.Pose
+) -> Sighting:
+    if not all(map(math.isfinite, measured)):
+        raise MessageError("nonfinite")
+    has_range = kind != "bearing"
+    if has_range and not 0.0 < measured[0] < 1e9:
+        raise MessageError("range_not_positive")
+    if kind != "range":
+        angles, is_wrapped = checks.direction(*measured[int(has_range) :])
+        if is_wrapped:
+            source.count("bearing_wrapped")
+        measured = (*measured[: int(has_range)], *angles[: len(measured) - int(has_range)])
+    told = sigmas is not None and source.settings.noise == "message"
+    out = [float(s) for s in sigmas] if told and sigmas is not None else [0.0] * len(measured)
+    for k, sigma in enumerate(out):
+        if not math.isfinite(sigma) or sigma < 0.0:
+            raise MessageError("nonfinite_covariance")
+        if sigma == 0.0:
+            out[k] = source.sigma_m(measured[0]) if has_range and k == 0 else source.settings.sigma_rad
+            if out[k] == 0.0:
+                raise MessageError("noise_unknown")
+            if told:
+                source.count("covariance_unknown")
+    if source.space.dimensions == 2 and kind != "range":
+        measured, out = _levelled(kind, measured, out, T_base_sensor)
+        T_base_sensor = (*se3.position(T_base_sensor), *so3.IDENTITY)
+    elif source.space.dimensions == 3 and len(measured) == (2 if has_range else 1) and kind != "range":
+        raise MessageError("no_elevation")
+    covariance = source.checked(np.diag([sigma * sigma for sigma in out]), int(has_range))
+    return Sighting(name, kind, tuple(map(float, measured)), covariance, source.projected(T_base_sensor))
+
+
+def _levelled(
+    kind: str, measured: Numbers, sigmas: list[float], T_base_sensor: se3.Pose
+) -> tuple[Numbers, list[float]]:
+    """The horizontal part, as a sensor at the same place whose axes are the base's would measure it."""
+    angles = 1 if kind == "range_bearing" else 0
+    azimuth, elevation = (*measured[angles:], 0.0)[:2]
+    up = so3.act(se3.rotation(T_base_sensor), (0.0, 0.0, 1.0))
+    if len(measured) == angles + 1 and abs(up[2]) < 1.0 - _UPRIGHT:
+        raise MessageError("sensor_tilted")  # then an azimuth alone is no direction in the plane
+    level = math.cos(elevation)
+    towards = (level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation))
+    x, y, _ = map(float, so3.act(se3.rotation(T_base_sensor), towards))
+    horizontal = math.hypot(x, y)
+    if horizontal < 0.1:
+        raise MessageError("overhead")
+    bearing, sigma_rad = math.atan2(y, x), sigmas[angles] / horizontal
+    if kind == "range_bearing":
+        return (measured[0] * horizontal, bearing), [sigmas[0], sigma_rad]
+    return (bearing,), [sigma_rad]
+
+
+# -- the same landmark twice -----------------------------------------------------------------------------------------
+
+
+def _agreed(source: Source, seen: list[Sighting]) -> list[Sighting]:
+    """One sighting per id: repeats that agree within 3 sigma are merged, others are all dropped."""
+    by_id: dict[str, list[Sighting]] = {}
+    for k, one in enumerate(seen):
+        by_id.setdefault(one.id or f"\n{k}", []).append(one)  # those without an id are each their own
+    out = []
+    for same in by_id.values():
+        merged = same[0]
+        for other in same[1:]:
+            fused = _merge(source, merged, other)
+            if fused is None:
+                source.count("id_conflict", len(same))
+                break
+            merged = fused
+        else:
+            if len(same) > 1:
+                source.count("id_merged", len(same) - 1)
+            out.append(merged)
+    return out
+
+
+def _merge(source: Source, a: Sighting, b: Sighting) -> Sighting | None:
+    """Information-weighted mean of two sightings that agree, else None."""
+    if a.kind != b.kind:
+        return None
+    group, m = source.space.group, math.isqrt(len(a.covariance))
+    if a.kind == "pose":
+        difference = np.array(group.local(b.measured, a.measured))
+    else:
+        difference = np.subtract(b.measured, a.measured)
+        if "bearing" in a.kind:
+            angles = slice(1 if a.kind == "range_bearing" else 0, None)
+            difference[angles] = se2.wrap(difference[angles])
+    cov_a, cov_b = np.array(a.covariance).reshape(m, m), np.array(b.covariance).reshape(m, m)
+    gain = cov_a @ np.linalg.inv(cov_a + cov_b)
+    if difference @ np.linalg.solve(cov_a + cov_b, difference) > _AGREE_SIGMA**2:
+        return None
+    if a == b:
+        return a
+    step = (gain @ difference).tolist()
+    at = group.retract(a.measured, tuple(step)) if a.kind == "pose" else np.add(a.measured, step).tolist()
+    merged = cov_a - gain @ cov_a
+    covariance = tuple((0.5 * (merged + merged.T)).ravel().tolist())
+    return Sighting(a.id, a.kind, tuple(map(float, at)), covariance, a.T_base_sensor)

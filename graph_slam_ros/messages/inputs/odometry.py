@@ -1,0 +1,123 @@
+"""Messages that become odometry: absolute poses in a frame that drifts."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.lie import se3
+from graph_slam_ros.measurements.types import Odometry
+from graph_slam_ros.messages.inputs import checks
+from graph_slam_ros.messages.inputs.checks import MessageError
+from graph_slam_ros.messages.inputs.source import Numbers, Source
+from graph_slam_ros.messages.inputs.transforms import pose
+
+_MOST_SIMILAR, _LONGEST = 3, 80  # transforms that are named, and letters of a frame's name
+_UNUSED = 1e6  # [m^2/s^2, rad^2/s^2]: what drivers of wheels write for what these do not measure
+
+
+def odometry(source: Source, m: Any) -> Iterator[Odometry]:
+    """nav_msgs/Odometry."""
+    stamp_ns = source.stamp_ns(m.header.stamp)
+    p, parent = m.pose.pose, source.frame(m.header.frame_id)
+    at = _in_odom(source, parent, _named(source, m.child_frame_id), p.position, p.orientation)
+    twist = None
+    if source.config.odometry.noise == "twist" and m.child_frame_id.lstrip("/") == source.config.frames.base:
+        twist = _twist_covariance(source, m.twist.covariance)  # that of another point of the robot says nothing
+    yield Odometry(stamp_ns, at, twist, source.name)
+
+
+def pose_stamped(source: Source, m: Any) -> Iterator[Odometry]:
+    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped: of the base, or of the configured mount."""
+    stamp_ns = source.stamp_ns(m.header.stamp)
+    p = m.pose.pose if hasattr(m.pose, "pose") else m.pose
+    parent = source.frame(m.header.frame_id)
+    yield Odometry(stamp_ns, _in_odom(source, parent, "", p.position, p.orientation), None, source.name)
+
+
+def transforms(source: Source, m: Any) -> Iterator[Odometry]:
+    """tf2_msgs/TFMessage: the transform from odometry's frame, or the one configured in its place, to the base."""
+    frames = source.config.frames
+    parent = source.settings.frame or frames.odom
+    for t in m.transforms:
+        above, child = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
+        is_of_robot = source.transforms.lookup(frames.base, child) is not None
+        if above != parent or not is_of_robot:
+            _note_similar(source, above, child, is_similar=above == parent or (is_of_robot and above != frames.map))
+            continue  # /tf tells of everything
+        source.state["found"] = True
+        try:
+            stamp_ns = source.stamp_ns(t.header.stamp)
+            at = _in_odom(source, frames.odom, child, t.transform.translation, t.transform.rotation)
+            yield Odometry(stamp_ns, at, None, source.name)
+        except MessageError as reason:
+            source.count(str(reason))
+
+
+def _note_similar(source: Source, parent: str, child: str, *, is_similar: bool) -> None:
+    """Remember a transform that may be the odometry by other names."""
+    similar: dict[tuple[str, str], None] = source.state.setdefault("similar", {})
+    if is_similar and len(similar) < _MOST_SIMILAR and not source.state.get("found"):
+        similar[parent, child] = None
+
+
+def not_found(source: Source) -> str:
+    """Of odometry on /tf: what it waits for, as long as that has never come, and what may be meant; else empty."""
+    if source.settings.type != "tf2_msgs/msg/TFMessage" or source.state.get("found"):
+        return ""
+    frames, name = source.config.frames, source.name
+    key = f"{name}.frame" if source.settings.frame else "frames.odom"
+    has = ", ".join(f"{parent[:_LONGEST]} -> {child[:_LONGEST]}" for parent, child in source.state.get("similar", ()))
+    return (
+        f"no transform {source.settings.frame or frames.odom} -> {frames.base} has come{has and ', but '}{has}:"
+        f" correct {key} or frames.base, or have it published"
+    )
+
+
+def _in_odom(source: Source, parent: str, child: str, position: Any, orientation: Any) -> Numbers:
+    """T_odom_base from the pose of a child frame in its parent."""
+    if parent == child:
+        raise MessageError("frame_in_itself")
+    checks.point(position)
+    q = source.unit(orientation)
+    frames = source.config.frames
+    if parent == frames.odom and child == frames.base:
+        return source.of_robot(pose(position, q))
+    T_odom_parent = source.T_fixed(frames.odom, parent)
+    T_child_base = se3.inverse(source.T_base_child(child))
+    return source.of_robot(se3.compose(se3.compose(T_odom_parent, pose(position, q)), T_child_base))
+
+
+def _named(source: Source, child: str) -> str:
+    if child.startswith("/"):
+        source.count("frame_slash_stripped")
+        child = child[1:]
+    if not child and not source.has_mount:
+        raise MessageError("frame_empty")
+    return child
+
+
+def _twist_covariance(source: Source, flat: Any) -> Numbers | None:
+    """Of a twist in the base frame; None where it is unknown, in part or altogether."""
+    raw = flat.tobytes()
+    if raw != source.state.get("raw"):  # drivers repeat the same one
+        source.state.update(raw=raw, judged=_judged(source, np.asarray(flat, dtype=float).reshape(6, 6)))
+    covariance, repairs = source.state["judged"]
+    if isinstance(covariance, MessageError):
+        raise covariance
+    for repair in repairs:
+        source.count(repair)
+    return covariance
+
+
+def _judged(source: Source, full: Any) -> tuple[Numbers | MessageError | None, list[str]]:
+    block, variances = source.block(full), np.diag(full)
+    if not block.any():
+        return None, ["covariance_unknown"]
+    if source.space.dimensions == 3 and ((variances == 0.0) | (variances >= _UNUSED)).any():
+        return None, ["covariance_of_some_axes_unknown"]
+    try:
+        covariance, repairs = checks.covariance(block, source.space.dimensions)
+    except MessageError as reason:
+        return reason, []
+    return tuple(covariance.ravel().tolist()), repairs

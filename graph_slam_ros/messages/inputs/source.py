@@ -1,0 +1,243 @@
+"""One input at the border: its settings, where its sensor is, and the noise its messages do not tell."""
+
+import math
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.config.inputs import InputConfig
+from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.messages.cdr import LATEST_NS
+from graph_slam_ros.messages.inputs import checks
+from graph_slam_ros.messages.inputs.checks import MessageError
+from graph_slam_ros.messages.inputs.transforms import Transforms
+
+Array = NDArray[np.float64]
+Numbers = tuple[float, ...]
+
+_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+_BEYOND_MEANING = 1e12  # [m^2, rad^2]: larger numbers could not be turned into other axes
+_FLAT = 0.5  # the horizontal part of an x axis that is too short to have a heading
+_LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # of a robot that moves in a plane
+
+
+@dataclass(slots=True)
+class Origin:
+    """Where on earth the map begins, for all inputs that do not say it themselves; empty before the first fix."""
+
+    datum: Numbers = ()
+
+
+class NotYet(Exception):
+    """/tf may still tell where the sensor was: the message is to be tried again."""
+
+
+class Source:
+    """What a converter knows besides the message.
+
+    Parameters
+    ----------
+    use : what the input is used as
+    origin : of the map, which all inputs share
+
+    Attributes
+    ----------
+    tally : refusals and repairs of the present message by reason
+    hurried : whether nothing is waited for any more
+    state : what converters have to remember between messages
+    unlinked : frames of the last messages and the frames that nothing links them to
+    """
+
+    def __init__(
+        self, settings: InputConfig, use: str, config: Config, transforms: Transforms, origin: Origin | None = None
+    ) -> None:
+        self.name = settings.name
+        self.settings = settings
+        self.use = use
+        self.config = config
+        self.space = config.space
+        self.transforms = transforms
+        self.origin = origin or Origin()
+        self.tally: Counter[str] = Counter()
+        self.hurried = not config.inputs.tf
+        self.state: dict[str, Any] = {}
+        self.unlinked: deque[tuple[str, str]] = deque(maxlen=4)
+        self._offset_ns = round(settings.offset_s * 1e9)
+        self._wait_ns = round(config.inputs.tf_wait_s * 1e9)
+        self._mount = _mount(settings)
+
+    def count(self, reason: str, times: int = 1) -> None:
+        """A refusal or a repair."""
+        self.tally[reason] += times
+
+    def stamp_ns(self, stamp: Any) -> int:
+        """Of a header, by the clock of the robot."""
+        out = checks.stamp_ns(stamp) + self._offset_ns
+        if not 0 < out <= LATEST_NS:
+            raise MessageError("bad_stamp")
+        return out
+
+    # -- frames ------------------------------------------------------------------------------------------------------
+
+    def frame(self, name: str) -> str:
+        """The frame as configured, else as the message says."""
+        if self.settings.frame:
+            return self.settings.frame
+        if name.startswith("/"):
+            self.count("frame_slash_stripped")
+            name = name[1:]
+        if not name and self._mount is None:
+            raise MessageError("frame_empty")
+        return name
+
+    @property
+    def has_mount(self) -> bool:
+        """Whether it is configured where its frame is on the robot."""
+        return self._mount is not None
+
+    def T_base(self, frame: str, stamp_ns: int) -> se3.Pose:
+        """Where a frame was on the robot: by TF, else as configured.
+
+        Raises
+        ------
+        NotYet
+            Neither tells, and odometry is not much newer than the stamp.
+        """
+        found = self.transforms.lookup(self.config.frames.base, frame, stamp_ns)
+        if found is not None:
+            return found
+        if self._mount is not None and not self.transforms.knows(frame):
+            return self._mount
+        if not self._may_come(stamp_ns):
+            raise self._not_linked("frame_unknown", frame, self.config.frames.base)
+        raise NotYet
+
+    def mount_position(self, name: str, stamp_ns: int) -> tuple[float, float, float]:
+        """Where the sensor of a message was on the robot; the base, which is counted, where nobody tells of its frame.
+
+        Raises NotYet as ``T_base`` does.
+        """
+        if name or self.settings.frame or self._mount is not None:
+            frame = self.frame(name)
+            is_known = frame == self.config.frames.base or self._mount is not None or self.transforms.knows(frame)
+            if is_known or self._may_come(stamp_ns):
+                return se3.position(self.T_base(frame, stamp_ns))
+        self.count("mount_unknown")
+        return 0.0, 0.0, 0.0
+
+    def _may_come(self, stamp_ns: int) -> bool:
+        """Whether /tf may still tell of a stamp."""
+        now_ns = self.transforms.now_ns
+        return not (self.hurried or (now_ns is not None and now_ns > stamp_ns + self._wait_ns))
+
+    def T_base_child(self, child: str) -> se3.Pose:
+        """Where a frame always is on the robot; an empty one is where it is configured to be, or the base."""
+        found = self.transforms.lookup(self.config.frames.base, child) if child else None
+        if found is None:
+            found = self._mount if self._mount is not None or child else se3.IDENTITY
+        if found is None:
+            raise self._not_linked("child_frame_unknown", child, self.config.frames.base)
+        return found
+
+    def T_fixed(self, target: str, frame: str) -> se3.Pose:
+        """Between frames that do not move: a message's, and that of odometry or of the map."""
+        found = self.transforms.lookup(target, frame)
+        if found is None and target == self.config.frames.odom:
+            raise self._not_linked("odom_frame_unknown", frame, target)
+        if found is None:
+            raise self._not_linked("map_frame_unknown", frame, target)
+        return found
+
+    def _not_linked(self, reason: str, frame: str, target: str) -> MessageError:
+        if (frame, target) not in self.unlinked:
+            self.unlinked.append((frame, target))
+        return MessageError(reason)
+
+    # -- rotations ---------------------------------------------------------------------------------------------------
+
+    def unit(self, q: Any) -> so3.Quaternion:
+        """Unit quaternion (x, y, z, w) of a message."""
+        out, repaired = checks.quaternion(q)
+        if repaired:
+            self.count("quaternion_normalized")
+        return out
+
+    def projected(self, T: se3.Pose) -> Numbers:
+        """A pose of the plane or of space; in the plane the heading is that of the x axis."""
+        if self.space.dimensions == 3:
+            return tuple(map(float, T))
+        ahead = so3.act(se3.rotation(T), (1.0, 0.0, 0.0))
+        return float(T[0]), float(T[1]), math.atan2(ahead[1], ahead[0])
+
+    def of_robot(self, T: se3.Pose) -> Numbers:
+        """A pose of the robot; in the plane it is counted where it leaves that of the first."""
+        if self.space.dimensions == 2:
+            up = so3.act(se3.rotation(T), (0.0, 0.0, 1.0))
+            if abs(T[2] - self.state.setdefault("height", T[2])) > _LEVEL_M or up[2] < _UPRIGHT:
+                self.count("out_of_plane")
+        return self.projected(T)
+
+    def has_heading(self, T: se3.Pose) -> bool:
+        """In space always; in the plane where the x axis does not point up."""
+        ahead = so3.act(se3.rotation(T), (1.0, 0.0, 0.0))
+        return self.space.dimensions == 3 or bool(math.hypot(ahead[0], ahead[1]) >= _FLAT)
+
+    # -- noise -------------------------------------------------------------------------------------------------------
+
+    def block(self, covariance: Array) -> Array:
+        """Of a pose's covariance (6, 6), what the space has of it: (3, 3) or all."""
+        return covariance if self.space.dimensions == 3 else covariance[_PLANAR]
+
+    def orientation_known(self, covariance: Array) -> bool:
+        """Whether a pose's covariance (6, 6) says so: of the heading in the plane, of all three axes in space."""
+        variances = np.diag(covariance)[5 if self.space.dimensions == 2 else 3 :]
+        most = self.config.landmarks.orientation_known_below_rad**2
+        return bool(((variances > 0.0) & (variances < most)).all())
+
+    def pose_covariance(self, flat: Any, distance_m: float) -> Array:
+        """Covariance (6, 6) in the axes of the frame: of the message, or of the settings where it has none."""
+        if flat is None or self.settings.noise == "sigmas":
+            sigmas = [self.sigma_m(distance_m)] * 3 + [self.settings.sigma_rad] * 3
+            return np.diag(np.square(sigmas))
+        covariance: Array = np.asarray(flat, dtype=float).reshape(6, 6)
+        if not np.isfinite(covariance).all():
+            raise MessageError("nonfinite_covariance")
+        return np.clip(covariance, -_BEYOND_MEANING, _BEYOND_MEANING)
+
+    def sigma_m(self, distance_m: float = 0.0) -> float:
+        """Standard deviation of a position at a distance where the message does not tell it."""
+        sigma_m = self.settings.sigma_m
+        if sigma_m == 0.0 and self.use == "landmarks":
+            sigma_m = self.config.landmarks.sigma_m
+        if sigma_m == 0.0:
+            raise MessageError("noise_unknown")
+        return sigma_m + self.settings.sigma_per_m * distance_m
+
+    def checked(self, block: Array, lengths: int, distance_m: float = 0.0) -> Numbers:
+        """Flat covariance; positions' part is that of the settings where all of it is zero.
+
+        Parameters
+        ----------
+        block : (n, n), the first ``lengths`` in m^2, the others in rad^2
+        """
+        if lengths and not block[:lengths, :lengths].any():
+            filled = np.zeros_like(block)
+            filled[:lengths, :lengths] = np.eye(lengths) * self.sigma_m(distance_m) ** 2
+            self.count("covariance_unknown")
+            filled[lengths:, lengths:] = block[lengths:, lengths:]
+            block = filled
+        covariance, repairs = checks.covariance(block, lengths)
+        for repair in repairs:
+            self.count(repair)
+        return tuple(covariance.ravel().tolist())
+
+
+def _mount(settings: InputConfig) -> se3.Pose | None:
+    given = settings.numbers("mount", 6)
+    if not given:
+        return None
+    return se3.from_xyz_rpy(given)

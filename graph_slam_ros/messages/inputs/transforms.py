@@ -1,0 +1,124 @@
+"""Transforms between frames: where sensors sit on the robot, fixed or on moving joints."""
+
+from bisect import bisect_left
+from collections.abc import Callable
+from typing import Any
+
+from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.messages.inputs.stamp_leap import StampLeap
+
+
+def pose(translation: Any, rotation: so3.Quaternion) -> se3.Pose:
+    """From a translation or position message and a unit quaternion."""
+    x, y, z, w = rotation
+    return float(translation.x), float(translation.y), float(translation.z), x, y, z, w
+
+
+class Transforms:
+    """What /tf_static and /tf have said so far.
+
+    Parameters
+    ----------
+    keep_ns : how much older than its newest a transform of /tf may get
+    refuse : called once for each of /tf that is dated farther than that from the others of its frame
+
+    Attributes
+    ----------
+    now_ns : the newest stamp of odometry, None before the first: what may still come is judged by it
+    """
+
+    def __init__(self, keep_ns: int = 10_000_000_000, refuse: Callable[[], None] = lambda: None) -> None:
+        self._keep_ns, self._refuse = keep_ns, refuse
+        self._fixed: dict[str, tuple[str, se3.Pose]] = {}
+        self._moving: dict[str, _Joint] = {}
+        self.now_ns: int | None = None
+
+    def add(self, parent: str, child: str, T_parent_child: se3.Pose) -> None:
+        """Take one that holds always; a later one for the same child replaces it."""
+        self._fixed[child] = (parent, T_parent_child)
+
+    def add_at(self, stamp_ns: int, parent: str, child: str, T_parent_child: se3.Pose) -> None:
+        """Take one that holds at its stamp."""
+        joint = self._moving.get(child)
+        if joint is None or joint.parent != parent:
+            joint = self._moving[child] = _Joint(parent, self._keep_ns, self._refuse)
+        joint.take(stamp_ns, T_parent_child)
+
+    def forget_time(self) -> None:
+        """Stamps begin anew; what holds always stays."""
+        self._moving.clear()
+        self.now_ns = None
+
+    def knows(self, frame: str) -> bool:
+        """Whether the frame has a parent."""
+        return frame in self._fixed or frame in self._moving
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> se3.Pose | None:
+        """``T_target_source`` at a stamp, or of what never moves; None where the frames are not linked then."""
+        if target == source:
+            return se3.IDENTITY
+        to_root_target, to_root_source = self._to_root(target, stamp_ns), self._to_root(source, stamp_ns)
+        for frame, T_frame_source in to_root_source.items():
+            if frame in to_root_target:
+                return se3.compose(se3.inverse(to_root_target[frame]), T_frame_source)
+        return None
+
+    def _to_root(self, frame: str, stamp_ns: int | None) -> dict[str, se3.Pose]:
+        """``T_ancestor_frame`` of the frame itself and each ancestor, nearest first."""
+        out: dict[str, se3.Pose] = {frame: se3.IDENTITY}
+        at, T_at_frame = frame, se3.IDENTITY
+        while (link := self._link(at, stamp_ns)) is not None:
+            at, T_parent_at = link
+            if at in out:  # a loop
+                break
+            T_at_frame = se3.compose(T_parent_at, T_at_frame)
+            out[at] = T_at_frame
+        return out
+
+    def _link(self, child: str, stamp_ns: int | None) -> tuple[str, se3.Pose] | None:
+        if child in self._fixed:
+            return self._fixed[child]
+        joint = self._moving.get(child)
+        T = None if joint is None or stamp_ns is None else joint.at(stamp_ns)
+        return None if joint is None or T is None else (joint.parent, T)
+
+
+class _Joint:
+    """The recent motion of one frame in its parent."""
+
+    def __init__(self, parent: str, keep_ns: int, refuse: Callable[[], None]) -> None:
+        self.parent, self._keep_ns = parent, keep_ns
+        self._leap = StampLeap[se3.Pose](refuse)
+        self._stamps_ns: list[int] = []
+        self._poses: list[se3.Pose] = []
+
+    def take(self, stamp_ns: int, T_parent_child: se3.Pose) -> None:
+        newest_ns = self._stamps_ns[-1] if self._stamps_ns else stamp_ns
+        for at_ns, pose in self._leap.take(stamp_ns, T_parent_child, newest_ns, self._keep_ns):
+            if self._stamps_ns and at_ns < self._stamps_ns[-1] - self._keep_ns:  # several agree that it is so early
+                self._stamps_ns.clear()
+                self._poses.clear()
+            self._add(at_ns, pose)
+
+    def _add(self, stamp_ns: int, T_parent_child: se3.Pose) -> None:
+        at = bisect_left(self._stamps_ns, stamp_ns)
+        if at < len(self._stamps_ns) and self._stamps_ns[at] == stamp_ns:
+            self._poses[at] = T_parent_child
+            return
+        self._stamps_ns.insert(at, stamp_ns)
+        self._poses.insert(at, T_parent_child)
+        old = bisect_left(self._stamps_ns, self._stamps_ns[-1] - self._keep_ns)
+        del self._stamps_ns[:old], self._poses[:old]
+
+    def at(self, stamp_ns: int) -> se3.Pose | None:
+        """Interpolated; None before the first and after the last: nothing is extrapolated."""
+        after = bisect_left(self._stamps_ns, stamp_ns)
+        if after == len(self._stamps_ns):
+            return None
+        if self._stamps_ns[after] == stamp_ns:
+            return self._poses[after]
+        if after == 0:
+            return None
+        start, end = self._stamps_ns[after - 1 : after + 1]
+        a, b = self._poses[after - 1 : after + 1]
+        return se3.interpolate(a, b, (stamp_ns - start) / (end - start))

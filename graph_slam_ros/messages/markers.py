@@ -1,0 +1,161 @@
+"""visualization_msgs/MarkerArray: landmarks with their uncertainty, the graph with how well its edges fit.
+
+An array deletes all markers before it draws its own: what is not in it any more is gone.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from graph_slam_ros.lie import se3
+from graph_slam_ros.messages.cdr import CdrWriter
+
+Array = NDArray[np.float64]
+Numbers = tuple[float, ...]
+
+_ADD, _DELETE_ALL = 0, 3
+_ARROW, _SPHERE, _CYLINDER, _LINE_LIST, _POINTS, _TEXT = 0, 2, 3, 5, 8, 9
+_NONE = np.empty((0, 3))
+_PLAIN = np.empty((0, 4), dtype=np.float32)  # colours, where points have none of their own
+
+_OF_LANDMARKS, _OF_POSES, _OF_REJECTED = (0.9, 0.5, 0.1, 0.8), (0.3, 0.6, 1.0, 1.0), (0.8, 0.1, 0.1, 0.6)
+# Green over yellow to red in even steps of hue in OKLCH and ever a little darker, for those to whom they are alike.
+_RAMP = np.array([[0.38, 0.90, 0.42], [0.69, 0.75, 0.03], [0.80, 0.60, 0.0], [0.85, 0.44, 0.0], [0.87, 0.23, 0.24]])
+_DASHES = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """Edges to be drawn, from ``start`` to ``end``, (n, 3) each; ``misfit`` (n,) is chi2 per number measured."""
+
+    start: Array
+    end: Array
+    misfit: Array
+
+
+def landmark_markers(
+    stamp_ns: int, frame: str, names: Sequence[str], positions: Array, covariances: Sequence[Array]
+) -> bytes:
+    """A 2-sigma ellipse or ellipsoid and a name for each landmark.
+
+    Parameters
+    ----------
+    positions : (n, 2) or (n, 3); covariances : n of (2, 2) or (3, 3), both in ``frame``
+    """
+    out = _Array(stamp_ns, frame, 2 * len(names))
+    at, sizes = np.zeros((len(names), 7)), np.empty((len(names), 3))
+    if len(names):
+        at[:, : positions.shape[1]] = positions
+        at[:, 3:], sizes = _two_sigma(np.array(covariances))
+    flat = positions.shape[1] == 2
+    for k, (name, pose, size) in enumerate(zip(names, at, sizes.tolist(), strict=True)):
+        out.add("landmarks", k, _CYLINDER if flat else _SPHERE, at=pose, size=size)
+        out.add("names", k, _TEXT, at=pose, size=(0.0, 0.0, 0.25), text=name)
+    return out.message()
+
+
+def graph_markers(
+    stamp_ns: int, frame: str, poses: Array, landmarks: Array, classes: Mapping[str, Lines], rejected: Lines
+) -> bytes:
+    """Vertices as points (n, 3), the edges of each class as lines of the colour of their misfit, those out dashed.
+
+    The namespaces are ``poses``, ``landmarks``, ``edges/CLASS`` and ``rejected``, where there is something to draw:
+    RViz calls a marker without points an error.
+    """
+    shapes = [
+        ("poses", _POINTS, 0.06, poses, _OF_POSES, _PLAIN),
+        ("landmarks", _POINTS, 0.15, landmarks, _OF_LANDMARKS, _PLAIN),
+    ]
+    for name, lines in classes.items():
+        points = np.stack((lines.start, lines.end), axis=1).reshape(-1, 3)
+        colours = np.repeat(misfit_colours(lines.misfit), 2, axis=0)
+        shapes.append((f"edges/{name}", _LINE_LIST, 0.02, points, _OF_LANDMARKS, colours))
+    shapes.append(("rejected", _LINE_LIST, 0.01, _dashed(rejected), _OF_REJECTED, _PLAIN))
+    shapes = [shape for shape in shapes if len(shape[3])]
+    out = _Array(stamp_ns, frame, len(shapes))
+    for name, type_, size, points, colour, colours in shapes:
+        out.add(name, 0, type_, size=(size, size, 0.0), colour=colour, points=points, colours=colours)
+    return out.message()
+
+
+def misfit_colours(misfit: ArrayLike) -> NDArray[np.float32]:
+    """Colours (n, 4): green up to 1, what is expected, by the root of the misfit to red from 9, three sigmas, on."""
+    place = (len(_RAMP) - 1) * np.clip(0.5 * (np.sqrt(np.asarray(misfit)) - 1.0), 0.0, 1.0)
+    out = np.ones((len(place), 4), dtype=np.float32)
+    for channel in range(3):
+        out[:, channel] = np.interp(place, np.arange(len(_RAMP)), _RAMP[:, channel])
+    return out
+
+
+def _dashed(lines: Lines) -> Array:
+    """The ends of the dashes of lines, which begin and end with one."""
+    along = np.arange(2 * _DASHES) / (2 * _DASHES - 1)
+    return (lines.start[:, None] + along[:, None] * (lines.end - lines.start)[:, None]).reshape(-1, 3)
+
+
+def _two_sigma(covariances: Array) -> tuple[Array, Array]:
+    """Of (n, 2, 2) or (n, 3, 3) the orientations (n, 4) and diameters (n, 3) [m].
+
+    These are never too small to see, also where a covariance is unknown.
+    """
+    count, n, _ = covariances.shape
+    known = np.isfinite(covariances).all(axis=(1, 2), keepdims=True)
+    variances, directions = np.linalg.eigh(np.where(known, covariances, 0.0))
+    axes, sizes = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    axes[:, :n, :n], sizes[:, :n] = directions, 4.0 * np.sqrt(np.maximum(variances, 0.0))
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # rotations, not their mirror images
+    return Rotation.from_matrix(axes).as_quat(), np.maximum(sizes, 0.05)
+
+
+class _Array:
+    """Writes a visualization_msgs/MarkerArray, marker by marker, after one that deletes all."""
+
+    def __init__(self, stamp_ns: int, frame: str, count: int) -> None:
+        self._stamp_ns, self._frame = stamp_ns, frame
+        self._out = CdrWriter()
+        self._out.numbers("I", 1 + count)
+        self.add("", 0, _ARROW, action=_DELETE_ALL)
+
+    def message(self) -> bytes:
+        return self._out.message()
+
+    def add(
+        self,
+        namespace: str,
+        number: int,
+        type_: int,
+        *,
+        action: int = _ADD,
+        at: ArrayLike = se3.IDENTITY,
+        size: Sequence[float] = (1.0, 1.0, 1.0),
+        colour: Numbers = _OF_LANDMARKS,
+        points: Array = _NONE,
+        colours: NDArray[np.float32] = _PLAIN,
+        text: str = "",
+    ) -> None:
+        """A marker; with ``points`` (n, 3) and, where each has its own, their ``colours`` (n, 4)."""
+        out = self._out
+        out.header(self._stamp_ns, self._frame)
+        out.text(namespace)
+        out.numbers("i", number, type_, action)
+        out.array(at)
+        out.numbers("d", *size)
+        out.numbers("f", *colour)
+        out.numbers("i", 0, 0)  # it lives until it is deleted
+        out.numbers("?", False)  # not locked to its frame
+        out.numbers("I", len(points))
+        out.array(points)
+        out.numbers("I", len(colours))
+        out.array(colours, "<f4")
+        out.text("")  # texture_resource, texture and uv_coordinates
+        out.header(0, "")
+        out.text("")
+        out.numbers("I", 0, 0)
+        out.text(text)
+        out.text("")  # mesh_resource, mesh_file and mesh_use_embedded_materials
+        out.text("")
+        out.numbers("I", 0)
+        out.numbers("?", False)

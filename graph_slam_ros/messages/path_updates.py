@@ -1,0 +1,73 @@
+"""The path as it changes: for who cannot take all of it each time.
+
+A message holds the keyframes that are new or have moved. Each pose is named by its own stamp: who receives it puts it
+where it has a pose of this stamp, else between its neighbours. A message without poses says to forget all, before all
+are sent again. Messages are counted, as those of interactive markers are (``seq_num``), and ``/diagnostics`` tells the
+count, for nav_msgs/Path has no room for a number: who has received fewer since the path began anew lacks some poses.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.messages import to_msg
+from graph_slam_ros.slam import GraphSlam
+
+Array = NDArray[np.float64]
+
+
+class PathUpdates:
+    """Remembers what was sent of one path. What has moved since is found by comparing: 20,000 poses take under 1 ms.
+
+    Parameters
+    ----------
+    moved_m, moved_rad : a keyframe that has moved and turned by no more than this since it was sent is not sent again
+
+    Attributes
+    ----------
+    version : how many messages there were since the path began anew, that which said so included
+    """
+
+    def __init__(self, moved_m: float, moved_rad: float) -> None:
+        self.version = 0
+        self._moved_m, self._moved_rad = moved_m, moved_rad
+        self._sent: Array = np.empty((0, 0))
+
+    def restart(self, slam: GraphSlam) -> bytes:
+        """nav_msgs/Path without poses: forget all; the next update tells of every keyframe.
+
+        It is due where somebody has just joined, and where another ``GraphSlam`` follows.
+        """
+        self.version = 1
+        self._sent = np.empty((0, 0))
+        return to_msg.path(slam.config.frames.map, [], self._sent)
+
+    def update(self, slam: GraphSlam) -> bytes | None:
+        """nav_msgs/Path of the keyframes that are new or have moved, in order of time, dated as the newest of all.
+
+        None where there are none.
+        """
+        now, old = slam.trajectory(), self._sent
+        changed = np.ones(len(now), dtype=bool)
+        if len(old):
+            changed[: len(old)] = self._moved(slam.space.dimensions, old, now[: len(old)])
+        which = np.flatnonzero(changed)
+        if not len(which):
+            return None
+        self._sent = np.concatenate((old.reshape(-1, now.shape[1]), now[len(old) :]))
+        self._sent[which] = now[which]
+        self.version += 1
+        newest_ns = int(slam.keyframes.stamps_ns[-1])
+        return to_msg.path(slam.config.frames.map, slam.keyframes.stamps_ns[which], now[which], newest_ns)
+
+    def _moved(self, n: int, old: Array, now: Array) -> NDArray[np.bool_]:
+        """Whether poses have moved or turned too far; n is the number of coordinates of a position."""
+        step = now - old
+        far = np.einsum("ij,ij->i", step[:, :n], step[:, :n]) > self._moved_m**2
+        if n == 2:
+            turn = step[:, 2] - 2.0 * np.pi * np.round(step[:, 2] / (2.0 * np.pi))
+            return far | (np.abs(turn) > self._moved_rad)
+        # the chord between two unit quaternions, of which one is as good as its negative, is 2 sin(angle / 4)
+        sign = np.where(np.einsum("ij,ij->i", old[:, 3:], now[:, 3:]) < 0.0, -1.0, 1.0)
+        chord = now[:, 3:] - sign[:, None] * old[:, 3:]
+        most = 2.0 * np.sin(0.25 * min(self._moved_rad, np.pi))
+        return far | (np.einsum("ij,ij->i", chord, chord) > most**2)

@@ -1,0 +1,112 @@
+"""The state of a run as messages: what the node publishes and what a run's recording holds are the same bytes."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.lie import se3
+from graph_slam_ros.messages import markers, to_msg
+from graph_slam_ros.messages.graph_markers import graph_view
+from graph_slam_ros.messages.path_thinning import thinned
+from graph_slam_ros.slam import GraphSlam
+
+Array = NDArray[np.float64]
+Numbers = tuple[float, ...]
+Estimate = tuple[str, Numbers, Array]
+
+PATH, POSE, ODOMETRY, LANDMARKS, ESTIMATES, TF = (
+    "nav_msgs/msg/Path",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "nav_msgs/msg/Odometry",
+    "visualization_msgs/msg/MarkerArray",
+    "vision_msgs/msg/Detection3DArray",
+    "tf2_msgs/msg/TFMessage",
+)
+
+
+def newest_pose(slam: GraphSlam) -> Numbers:
+    """Estimated ``T_map_base`` at the newest keyframe."""
+    out: Numbers = slam.config.space.group.compose(slam.T_map_odom, slam.keyframes[-1].T_odom_base)
+    return out
+
+
+def path(slam: GraphSlam, most: int = 0) -> bytes:
+    """The corrected path: every keyframe at its own stamp, or so many of them as ``thinned`` chooses."""
+    kept = thinned(len(slam.keyframes), most)
+    return to_msg.path(slam.config.frames.map, slam.keyframes.stamps_ns[kept], slam.trajectory()[kept])
+
+
+def pose(slam: GraphSlam) -> bytes:
+    """The newest keyframe's pose and covariance."""
+    return to_msg.pose_with_covariance_stamped(
+        slam.keyframes[-1].stamp_ns,
+        slam.config.frames.map,
+        newest_pose(slam),
+        slam.pose_covariance,
+        slam.config.output.pose_covariance_max,
+    )
+
+
+def map_to_odom(slam: GraphSlam, stamp_ns: int) -> bytes:
+    """The correction as a transform."""
+    return to_msg.transform(stamp_ns, slam.config.frames.map, slam.config.frames.odom, slam.T_map_odom)
+
+
+def odom_to_base(slam: GraphSlam) -> bytes:
+    """The newest keyframe's odometry as a transform: recorded, never published (the robot's driver does that)."""
+    newest, frames = slam.keyframes[-1], slam.config.frames
+    return to_msg.transform(newest.stamp_ns, frames.odom, frames.base, newest.T_odom_base)
+
+
+def landmarks(slam: GraphSlam, estimates: Sequence[Estimate] | None = None) -> bytes:
+    """Landmarks as 2-sigma ellipses, in space ellipsoids, with names; of all, or of ``landmark_estimates``."""
+    n = slam.config.space.dimensions
+    known = landmark_estimates(slam) if estimates is None else estimates
+    positions = np.array([value[:n] for _, value, _ in known]).reshape(-1, n)
+    spreads = [covariance[:n, :n] for _, _, covariance in known]
+    names = [name for name, _, _ in known]
+    return markers.landmark_markers(_stamp_ns(slam), slam.config.frames.map, names, positions, spreads)
+
+
+def landmarks_estimate(slam: GraphSlam, estimates: Sequence[Estimate] | None = None) -> bytes:
+    """Landmarks with identity, pose and covariance in the map's axes; of all, or of ``landmark_estimates``.
+
+    What a point does not have, in the plane also height, roll and pitch, is zero with the variance ``to_msg.UNKNOWN``;
+    so is all of a covariance that is unknown.
+    """
+    known = landmark_estimates(slam) if estimates is None else estimates
+    space, unused = slam.space, to_msg.UNKNOWN
+    poses, covariances = np.empty((len(known), 7)), np.empty((len(known), 36))
+    for k, (_, value, covariance) in enumerate(known):
+        full, size = unused * np.eye(space.dof), len(covariance)
+        if np.isfinite(covariance).all():
+            full[:size, :size] = covariance
+        covariances[k] = to_msg.covariance6(full, unused)
+        poses[k] = se3.in_space((*value, *space.identity[len(value) :]))
+    names = [name for name, _, _ in known]
+    return to_msg.detections(_stamp_ns(slam), slam.config.frames.map, names, poses, covariances)
+
+
+def graph(slam: GraphSlam, most: int) -> bytes:
+    """The graph: at most so many keyframes, landmarks and edges, these coloured by how well they fit."""
+    view = graph_view(slam, most)
+    frame = slam.config.frames.map
+    return markers.graph_markers(_stamp_ns(slam), frame, view.poses, view.landmarks, view.classes, view.rejected)
+
+
+def landmark_estimates(slam: GraphSlam) -> list[Estimate]:
+    """(id, point or pose, its covariance), all in the axes of the map frame; NaN where a covariance is unknown."""
+    space, out = slam.config.space, []
+    marginals = slam.landmark_covariances() if slam.landmarks else []
+    for (name, landmark), marginal in zip(slam.landmarks.items(), marginals, strict=True):
+        value = tuple(slam.solver.estimate([landmark.vertex])[0].tolist())
+        if slam.graph.kind_of(landmark.vertex) is space.pose:
+            marginal = space.in_parent_axes(value, marginal)
+        out.append((name, value, marginal))
+    return out
+
+
+def _stamp_ns(slam: GraphSlam) -> int:
+    """Of the newest keyframe; 0 before the first."""
+    return int(slam.keyframes.stamps_ns[-1]) if slam.keyframes else 0

@@ -1,0 +1,242 @@
+"""Results to messages, as CDR bytes: the node publishes them as they are, replay and simulation write them into bags.
+
+A pose is (x, y, theta) or (x, y, z, qx, qy, qz, qw) throughout, its covariance (3, 3) or (6, 6). One encoder for all,
+rosbags' type store, so nothing here needs ROS. A path is written with NumPy: 10,000 poses as
+message objects would cost a tenth of a second each time.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from graph_slam_ros.graph.geometry import PLANE, SPACE
+from graph_slam_ros.lie import se3
+from graph_slam_ros.messages.cdr import HEADER, LATEST_NS, NS, CdrWriter, stamp
+from graph_slam_ros.messages.interfaces import typestore
+
+Array = NDArray[np.float64]
+Numbers = tuple[float, ...]
+
+UNKNOWN = 1e6  # variance [m^2, rad^2] of what is not known at all
+_IN_PLANE = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])  # of the 36 numbers: x, y and yaw
+_OUT_OF_PLANE = np.array([14, 21, 28])  # the variances of z, roll and pitch
+
+
+def encode(message: Any) -> bytes:
+    """CDR bytes of a message object of rosbags' type store."""
+    return bytes(typestore().serialize_cdr(message, message.__msgtype__))
+
+
+def make(name: str, /, **fields: Any) -> Any:
+    """A message object, ``make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=0.0)``."""
+    return typestore().types[name](**fields)
+
+
+def time(stamp_ns: int) -> Any:
+    """builtin_interfaces/Time; what is later is the latest that it can say."""
+    sec, nanosec = divmod(min(int(stamp_ns), LATEST_NS), NS)
+    return make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+
+
+def header(stamp_ns: int, frame: str) -> Any:
+    """std_msgs/Header."""
+    return make("std_msgs/msg/Header", stamp=time(stamp_ns), frame_id=frame)
+
+
+def point(x: float, y: float, z: float = 0.0) -> Any:
+    """geometry_msgs/Point."""
+    return make("geometry_msgs/msg/Point", x=float(x), y=float(y), z=float(z))
+
+
+def vector(x: float, y: float, z: float = 0.0) -> Any:
+    """geometry_msgs/Vector3."""
+    return make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
+
+
+def quaternion(x: float, y: float, z: float, w: float) -> Any:
+    """geometry_msgs/Quaternion."""
+    return make("geometry_msgs/msg/Quaternion", x=float(x), y=float(y), z=float(z), w=float(w))
+
+
+def heading(theta: float) -> Any:
+    """geometry_msgs/Quaternion of a rotation about z."""
+    return quaternion(0.0, 0.0, np.sin(0.5 * theta), np.cos(0.5 * theta))
+
+
+def pose(p: ArrayLike) -> Any:
+    """geometry_msgs/Pose."""
+    x, y, z, *quat_xyzw = se3.in_space(p).tolist()
+    return make("geometry_msgs/msg/Pose", position=point(x, y, z), orientation=quaternion(*quat_xyzw))
+
+
+def covariance6(covariance: Array, unused: float) -> Array:
+    """ROS's row-major 6x6, of (6, 6), or of (3, 3) over (x, y, yaw): z, roll and pitch get the variance ``unused``."""
+    if len(covariance) == 6:
+        return np.ravel(covariance)
+    full = np.zeros(36)
+    full[_IN_PLANE], full[_OUT_OF_PLANE] = np.ravel(covariance), unused
+    return full
+
+
+def pose_with_covariance(p: Numbers, covariance: Array, unused: float) -> Any:
+    """geometry_msgs/PoseWithCovariance, in the axes of the parent frame, from a covariance in the pose's tangent space.
+
+    In the plane z, roll and pitch get the variance ``unused``.
+    """
+    space = PLANE if len(p) == 3 else SPACE
+    full = covariance6(space.in_parent_axes(p, covariance), unused)
+    return make("geometry_msgs/msg/PoseWithCovariance", pose=pose(p), covariance=full)
+
+
+def pose_stamped(stamp_ns: int, frame: str, p: Numbers) -> bytes:
+    """geometry_msgs/PoseStamped."""
+    return encode(make("geometry_msgs/msg/PoseStamped", header=header(stamp_ns, frame), pose=pose(p)))
+
+
+def pose_with_covariance_stamped(stamp_ns: int, frame: str, p: Numbers, covariance: Array, unused: float) -> bytes:
+    """geometry_msgs/PoseWithCovarianceStamped; see ``pose_with_covariance``."""
+    inner = pose_with_covariance(p, covariance, unused)
+    return encode(make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(stamp_ns, frame), pose=inner))
+
+
+def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Numbers) -> bytes:
+    """tf2_msgs/TFMessage with one transform; quick, for it is sent with every odometry message."""
+    one, motion = np.uint32(1).tobytes(), se3.in_space(T_parent_child).tobytes()
+    return b"".join((HEADER, one, stamp(stamp_ns), _frames(12, parent, child), motion))
+
+
+def odometry(
+    stamp_ns: int, frame: str, child: str, p: Numbers, covariance: Array, unused: float, twist: bytes | None = None
+) -> bytes:
+    """nav_msgs/Odometry; quick, for it is sent with every odometry message.
+
+    Parameters
+    ----------
+    covariance : of the pose, in its tangent space
+    unused : variance of what a pose in the plane does not have
+    twist : geometry_msgs/TwistWithCovariance as ``from_msg.twist_of`` gives it
+    """
+    space = PLANE if len(p) == 3 else SPACE
+    numbers = se3.in_space(p).tobytes(), covariance6(space.in_parent_axes(p, covariance), unused).tobytes()
+    moving = _unknown_twist(UNKNOWN) if twist is None else twist
+    return b"".join((HEADER, stamp(stamp_ns), _frames(8, frame, child), *numbers, moving))
+
+
+@cache
+def _frames(start: int, *names: str) -> bytes:
+    """Strings, each at a multiple of 4 from the head of the message, and padding to a multiple of 8."""
+    out = b""
+    for name in names:
+        out += b"\x00" * (-(start + len(out)) % 4) + np.uint32(len(name.encode()) + 1).tobytes()
+        out += name.encode() + b"\x00"
+    return out + b"\x00" * (-(start + len(out)) % 8)
+
+
+@cache
+def _unknown_twist(variance: float) -> bytes:
+    """geometry_msgs/TwistWithCovariance."""
+    return np.concatenate((np.zeros(6), variance * np.eye(6).ravel())).tobytes()
+
+
+OK, WARN, ERROR, STALE = range(4)
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """diagnostic_msgs/DiagnosticStatus: ``level`` is one of ``OK``, ``WARN``, ``ERROR``, ``STALE``."""
+
+    level: int
+    name: str
+    message: str = ""
+    hardware_id: str = ""
+    values: Mapping[str, str] = field(default_factory=dict)
+
+
+def diagnostics(stamp_ns: int, statuses: Iterable[Status]) -> bytes:
+    """diagnostic_msgs/DiagnosticArray; it is about no frame."""
+    return encode(
+        make(
+            "diagnostic_msgs/msg/DiagnosticArray",
+            header=header(stamp_ns, ""),
+            status=[
+                make(
+                    "diagnostic_msgs/msg/DiagnosticStatus",
+                    level=one.level,
+                    name=one.name,
+                    message=one.message,
+                    hardware_id=one.hardware_id,
+                    values=[
+                        make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in one.values.items()
+                    ],
+                )
+                for one in statuses
+            ],
+        )
+    )
+
+
+def clock(stamp_ns: int) -> bytes:
+    """rosgraph_msgs/Clock."""
+    return encode(make("rosgraph_msgs/msg/Clock", clock=time(stamp_ns)))
+
+
+def path(frame: str, stamps_ns: ArrayLike, poses: Array, newest_ns: int | None = None) -> bytes:
+    """nav_msgs/Path of poses (n, 3) or (n, 7) and their stamps (n,); its header carries the newest stamp: the last.
+
+    All poses after the first take the same number of bytes; the first is preceded by its own padding.
+    """
+    stamps = np.asarray(stamps_ns, dtype=np.int64)
+    name = frame.encode() + b"\x00"
+    if newest_ns is None:
+        newest_ns = int(stamps[-1]) if len(stamps) else 0
+    head = stamp(newest_ns) + np.uint32(len(name)).tobytes() + name
+    head += b"\x00" * (-len(head) % 4) + np.uint32(len(stamps)).tobytes()
+    if not len(stamps):
+        return HEADER + head
+    first, others = _pose_rows(name, stamps[:1], poses[:1], len(head)), _pose_rows(name, stamps[1:], poses[1:], 0)
+    return b"".join((HEADER, head, first.data, others.data))  # a megabyte, copied once
+
+
+def _pose_rows(name: bytes, stamps: NDArray[np.int64], poses: Array, start: int) -> NDArray[np.uint8]:
+    """PoseStamped rows, as bytes, that begin at a multiple of 8 plus ``start`` from the head of the message."""
+    text = 12 + len(name)
+    row = np.dtype(
+        [
+            ("sec", "<i4"),
+            ("nanosec", "<u4"),
+            ("length", "<u4"),
+            ("frame", f"S{len(name)}"),
+            ("padding", f"V{-(start + text) % 8}"),
+            ("values", "<f8", 7),
+        ]
+    )
+    rows = np.zeros(len(stamps), dtype=row)
+    rows["sec"], rows["nanosec"] = np.divmod(stamps, NS)
+    rows["length"], rows["frame"] = len(name), name
+    rows["values"] = se3.in_space(poses)
+    return rows.view(np.uint8)
+
+
+def detections(stamp_ns: int, frame: str, names: Sequence[str], poses: Array, covariances: Array) -> bytes:
+    """vision_msgs/Detection3DArray: things seen, or known, by their identity, each with one hypothesis of no class.
+
+    Parameters
+    ----------
+    poses : (n, 7); covariances : (n, 6, 6) in the axes of ``frame``
+    """
+    certain, size = np.ones((len(names), 1)), np.zeros((len(names), 3))
+    rows = np.concatenate((certain, poses, covariances.reshape(-1, 36), poses, size), axis=1)
+    out = CdrWriter()
+    out.header(stamp_ns, frame)
+    out.numbers("I", len(names))
+    for name, row in zip(names, rows, strict=True):
+        out.header(stamp_ns, frame)
+        out.numbers("I", 1)  # hypothesis
+        out.text("")
+        out.array(row)  # its score, pose and covariance; centre and size of the box
+        out.text(name)
+    return out.message()

@@ -1,0 +1,1 @@
+"""The ROS 2 node: subscriptions, publishers, services, /tf, diagnostics, and the thread that solves."""

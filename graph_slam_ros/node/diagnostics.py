@@ -1,0 +1,275 @@
+"""Whether all is well, and if not, why: one verdict with its reasons, from facts that the node gathers.
+
+States: UNCONFIGURED, INACTIVE and FINALIZED by lifecycle; WAITING for what is missing; OK; DEGRADED, where the estimate
+goes on but is not what it could be; ERROR, where somebody must act.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.measurements.reasons import explain, remedy
+from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
+from graph_slam_ros.node.recent import WINDOW_S, Recent
+from graph_slam_ros.node.session import Estimate
+
+_LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them
+_TF_BEHIND_S = 1.0
+_LONGEST = 80  # of a frame's name
+_UNLINKED = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
+
+
+@dataclass(frozen=True, slots=True)
+class InputFacts:
+    """What is known of one input.
+
+    Attributes
+    ----------
+    received, used : messages, and what of them was handed on: of a message that holds several things, each
+    counts : since the start, of what was refused, repaired or noted, by reason
+    silent_s : since the last message, by the clock of the node; infinite before the first
+    publishers : names of the nodes that publish it
+    is_contested : whether several publish what is of one: an odometry
+    mismatch : what keeps publisher and subscription from connecting, in words; empty where nothing does
+    frames : those of its messages that nothing links to the robot, the last ones, each with the robot's
+    recent : what became of it in the last seconds
+    not_found : of odometry on /tf, the transform that has never come, and what mends that
+    """
+
+    name: str
+    topic: str
+    use: str
+    received: int = 0
+    used: int = 0
+    counts: Mapping[str, int] = field(default_factory=dict)
+    silent_s: float = math.inf
+    publishers: tuple[str, ...] = ()
+    is_contested: bool = False
+    mismatch: str = ""
+    frames: tuple[tuple[str, str], ...] = ()
+    recent: Recent = field(default_factory=Recent)
+    not_found: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What the verdict is made of.
+
+    Attributes
+    ----------
+    lifecycle : ``unconfigured``, ``inactive``, ``active`` or ``finalized``
+    loads : the run whose map is being loaded; empty where none is
+    faults : exceptions of callbacks in the last ten seconds
+    busy_s : for how long the solver has been at what it does
+    overflows, failures, restarts : messages refused for want of room, solves that failed, and threads of the solver
+        that died, since the last look
+    failing : why the last solve failed; empty where it did not
+    memory_is_short : the process has more than ``health.memory_mib``
+    authorities : other nodes that broadcast map -> odom, if somebody does
+    tf_behind_s : how much earlier than the last map -> odom would be dated now, so that it is not sent
+    preparing : what keeps the pipeline from beginning: kernels are compiled or loaded; empty when they are ready
+    cannot_prepare : why that failed
+    """
+
+    lifecycle: str
+    inputs: tuple[InputFacts, ...] = ()
+    estimate: Estimate | None = None
+    waits_for_clock: bool = False
+    is_paused: bool = False
+    loads: str = ""
+    is_stopped: bool = False
+    lag_s: float = 0.0
+    waiting: int = 0
+    busy_s: float = 0.0
+    worker_is_alive: bool = True
+    restarts: int = 0
+    failing: str = ""
+    memory_is_short: bool = False
+    faults: int = 0
+    overflows: int = 0
+    failures: int = 0
+    recording_fails: bool = False
+    path_version: int = 0
+    has_other_authority: bool = False
+    authorities: tuple[str, ...] = ()
+    twins: int = 0
+    tf_behind_s: float = 0.0
+    preparing: str = ""
+    cannot_prepare: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The state and its reasons, the first the most important."""
+
+    state: str
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def is_healthy(self) -> bool:
+        """Whether nobody need do anything."""
+        return self.state == "OK"
+
+    @property
+    def level(self) -> int:
+        """Of a DiagnosticStatus."""
+        return _LEVELS.get(self.state, OK)
+
+
+def judge(facts: Facts, config: Config) -> Verdict:
+    """The verdict."""
+    if facts.lifecycle != "active":
+        return Verdict(facts.lifecycle.upper(), tuple(filter(None, (facts.cannot_prepare or facts.preparing,))))
+    for state, found in (("ERROR", _errors(facts)), ("WAITING", _missing(facts)), ("DEGRADED", _faults(facts, config))):
+        if reasons := tuple(found):
+            return Verdict(state, reasons)
+    return Verdict("OK")
+
+
+def _errors(facts: Facts) -> Iterator[str]:
+    if facts.cannot_prepare:
+        yield facts.cannot_prepare
+    elif not facts.worker_is_alive:
+        yield "the solver's thread has ended"
+    if facts.faults >= 100:
+        yield f"{facts.faults} faults in callbacks in 10 s"
+    if facts.has_other_authority:
+        who = ", ".join(facts.authorities) or "a node that does not tell its name"
+        yield f"somebody else broadcasts map -> odom: {who}"
+    if facts.twins:
+        yield "another node has this node's name"
+    if facts.is_stopped:
+        yield "stopped when the clock jumped back (time.on_jump); ~/reset begins anew"
+    if facts.recording_fails:
+        yield "the run cannot be written"
+
+
+def _missing(facts: Facts) -> Iterator[str]:
+    """What keeps the first estimate from coming; of landmarks, only what is wrong."""
+    if facts.preparing:
+        yield facts.preparing
+    if facts.loads:
+        yield f"loads the map of {facts.loads}"
+        return
+    if facts.waits_for_clock:
+        yield "use_sim_time is set and nothing comes on /clock"
+    for one in facts.inputs:
+        if facts.estimate is None and one.use == "odometry":
+            yield from _silence(one)
+    if facts.estimate is None and not facts.inputs:
+        yield "no input"
+
+
+def _silence(one: InputFacts) -> Iterator[str]:
+    if one.mismatch:
+        yield f"{one.topic}: {one.mismatch}"
+    elif not one.publishers:
+        yield f"{one.topic}: nobody publishes this {one.use}"
+    elif not one.received:
+        yield f"{one.topic}: {', '.join(one.publishers)} publishes it, but nothing has come yet"
+    elif one.recent.times:
+        yield f"{one.topic}: {_refused(one)}"
+    elif one.not_found:
+        yield f"{one.topic}: {one.not_found}"
+    else:
+        yield f"{one.topic}: its first messages wait for their turn"
+
+
+def _refused(one: InputFacts) -> str:
+    """How much of an input was refused lately, for what reason most, and what mends that."""
+    recent = one.recent
+    meaning = explain(recent.worst).meaning
+    if recent.worst in _UNLINKED and one.frames:
+        meaning = "no transform links " + ", ".join(f"{frame[:_LONGEST]} to {robots}" for frame, robots in one.frames)
+    mend = remedy(one.name, recent.worst)
+    much = "all" if recent.is_nothing_used else f"{recent.times} of {recent.came}"
+    return f"{much} refused in {WINDOW_S:.0f} s ({recent.worst}): {meaning}{mend and ': '}{mend}"
+
+
+def _faults(facts: Facts, config: Config) -> Iterator[str]:
+    health, estimate = config.health, facts.estimate
+    for one in facts.inputs:
+        if one.is_contested:
+            yield (
+                f"{one.topic}: {' and '.join(one.publishers)} publish it, and one of them is used:"
+                " give each odometry a topic and an input of its own (inputs.names)"
+            )
+        most_s = health.odometry_silent_s if one.use == "odometry" else health.landmarks_silent_s
+        if one.mismatch:
+            yield f"{one.topic}: {one.mismatch}"
+        elif one.received and most_s and one.silent_s > most_s:
+            yield f"{one.topic}: {one.not_found or f'silent for {one.silent_s:.1f} s'}"
+        elif one.recent.is_bad and not (one.is_contested and one.recent.worst == "other_publisher"):
+            yield f"{one.topic}: {_refused(one)}"
+    if facts.is_paused:
+        yield "paused"
+    if facts.tf_behind_s > _TF_BEHIND_S:
+        yield (
+            f"map -> odom is not sent: the last was dated {facts.tf_behind_s:.0f} s later"
+            " (tf.stamp, tf.transform_tolerance); deactivate and activate the node, and listeners with it"
+        )
+    if facts.failing:
+        yield f"solves fail, the last good estimate stands: {facts.failing}"
+    elif facts.failures:
+        yield f"{facts.failures} solves failed: the last good estimate stands"
+    if facts.restarts:
+        yield "the solver's thread had died and was started again"
+    if facts.memory_is_short:
+        yield "the process has more memory than health.memory_mib: loop closures are refused"
+    if facts.busy_s > health.stuck_s and not facts.loads:
+        yield f"solver stuck: it has been at one thing for {facts.busy_s:.1f} s"
+    if facts.overflows:
+        yield f"{facts.overflows} messages refused: the queue is full (inputs.queue)"
+    if facts.lag_s > health.lag_s:
+        yield f"the solver is {facts.lag_s:.1f} s behind, {facts.waiting} messages wait"
+    if estimate and estimate.is_resumed:
+        yield (
+            "goes on by odometry alone since the restart, nothing recognised yet:"
+            " drive past known landmarks, or give initialpose"
+        )
+    elif estimate and not estimate.is_confirmed:
+        yield "where the robot is in the loaded map is not known yet"
+    if estimate and estimate.displaced:
+        yield estimate.displaced
+    if estimate and estimate.rivals:
+        yield f"ambiguous: {estimate.rivals} loop closures that are not believed agree with one another as well"
+    if estimate and health.chi2_per_dof and estimate.fit > health.chi2_per_dof:
+        yield f"the measurements contradict each other: chi2 per degree of freedom is {estimate.fit:.1f}"
+
+
+def statuses(facts: Facts, verdict: Verdict, node: str) -> Iterator[Status]:
+    """For /diagnostics: the verdict, each input, and the graph."""
+    message = "; ".join((verdict.state, *verdict.reasons))
+    healthy = {"healthy": str(verdict.is_healthy), "state": verdict.state}
+    reasons = {f"reason {k}": reason for k, reason in enumerate(verdict.reasons, 1)}
+    load = {"lag [s]": f"{facts.lag_s:.3f}", "messages waiting": str(facts.waiting)}
+    load |= {"faults in 10 s": str(facts.faults)}
+    yield Status(verdict.level, f"{node}: health", message, node, healthy | reasons | load)
+    for one in facts.inputs:
+        told = {"topic": one.topic, "use": one.use, "received": str(one.received), "used": str(one.used)}
+        told |= {"came in 10 s": str(one.recent.came), "refused in 10 s": str(one.recent.times)}
+        told |= {"silent [s]": f"{one.silent_s:.1f}", "publishers": ", ".join(one.publishers)}
+        told |= {f"counted: {reason}": str(times) for reason, times in sorted(one.counts.items())}
+        is_wrong = one.mismatch or one.is_contested or one.recent.is_bad
+        level = WARN if is_wrong or (one.use == "odometry" and not one.received) else OK
+        yield Status(level, f"{node}: input {one.name}", one.mismatch or f"{one.received} received", node, told)
+    if facts.estimate:
+        told = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}
+        yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes", node, told)
+
+
+def _graph(e: Estimate) -> dict[str, str]:
+    return {
+        "keyframes": str(e.keyframes),
+        "landmarks": str(e.landmarks),
+        "edges": str(e.edges),
+        "segments": str(e.segments),
+        "solves": str(e.solves),
+        "chi2 per degree of freedom": f"{e.fit:.4g}",
+        "last update [ms]": f"{1e3 * e.solve_s:.2f}",
+        "slowest update [ms]": f"{1e3 * e.slowest_solve_s:.2f}",
+        "last correction [m]": f"{e.correction.distance_m:.4f}",
+        "last correction [rad]": f"{e.correction.angle_rad:.4f}",
+        "newest keyframe [ns]": str(e.stamp_ns),
+    }

@@ -1,0 +1,96 @@
+"""What has happened, as the statuses of ``~/events``: one for each thing, its numbers as values."""
+
+from collections.abc import Iterator
+
+from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
+from graph_slam_ros.slam import GraphSlam, Update
+from graph_slam_ros.slam.kidnap_detector import Alarm
+from graph_slam_ros.slam.robust.ledger import Change, Verdict
+
+_EDGES = 1000  # of one update that are told one by one
+
+
+def happened(what: str, message: str, level: int = OK, **values: object) -> Status:
+    """An event that is not of an update: a reset, a jump of the clock, a second authority."""
+    return Status(level, f"graph_slam: {what}", message, "", {name: str(value) for name, value in values.items()})
+
+
+def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
+    """New vertices, edges and segments, verdicts that changed, and the correction, if there was one."""
+    graph = slam.graph
+    for k in update.keyframes:
+        keyframe = slam.keyframes[k]
+        values = {"vertex": keyframe.vertex, "stamp_ns": keyframe.stamp_ns}
+        yield happened("vertex", f"keyframe {k}", **values)
+        if k and k in slam.segments:
+            yield happened("segment", f"a new segment begins at keyframe {k}", WARN, **values)
+    for edge in list(update.edges)[:_EDGES]:
+        table, row = graph.row(edge)
+        vertices = table.vertices.values[row].tolist()
+        label = graph.label_of(edge)
+        what, verdict = "closure" if label == "closures" else "edge", slam.ledger.verdict_of(edge).name.lower()
+        yield happened(
+            what, f"edge {edge}: {label} of {vertices}", edge=edge, label=label, vertices=vertices, verdict=verdict
+        )
+    for change in update.changes[:_EDGES]:
+        yield _verdict(slam, change)
+    for alarm in update.alarms:
+        yield _alarm(alarm)
+    if update.solved and update.correction.distance_m + update.correction.angle_rad > 0.0:
+        yield correction(slam, update)
+
+
+def _verdict(slam: GraphSlam, change: Change) -> Status:
+    verdict, reason = change.verdict.name.lower(), change.reason.name.lower()
+    why = f": {reason.replace('_', ' ')}" if change.reason else ""
+    return happened(
+        "verdict",
+        f"edge {change.edge} ({name_of(slam, change.edge)}) {verdict.replace('_', ' ')}{why},"
+        f" chi2 {change.statistic:.3g} against {change.threshold:.3g}",
+        OK if change.verdict is Verdict.ACCEPTED else WARN,
+        edge=change.edge,
+        keyframe=change.keyframe,
+        verdict=verdict,
+        reason=reason,
+        statistic=f"{change.statistic:.6g}",
+        threshold=f"{change.threshold:.6g}",
+    )
+
+
+def _alarm(alarm: Alarm) -> Status:
+    """An alarm that began, was decided or ended."""
+    values: dict[str, object] = {"began_ns": alarm.began_ns, "evidence": alarm.evidence}
+    if alarm.segment is not None:
+        values |= {"segment": alarm.segment, "distance_m": f"{alarm.distance_m:.6f}"}
+        values |= {"angle_rad": f"{alarm.angle_rad:.6f}"}
+    if alarm.ended_ns is None:
+        return happened("displaced", str(alarm), WARN, **values)
+    agree = "the landmarks and odometry agree again"
+    return happened("displaced", f"{agree}: {alarm}", OK, **values, ended_ns=alarm.ended_ns)
+
+
+def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:
+    """How far a solve moved the robot in the map, and the edges it had to reconcile."""
+    told = update.correction
+    causes = [f"{e} ({name_of(slam, e)}, {fit:.1f})" for e, fit in zip(told.edges, told.chi2, strict=True) if fit > 1.0]
+    return happened(
+        "correction",
+        f"map -> odom moved the robot by {told.distance_m:.3f} m, {told.angle_rad:.3f} rad"
+        + (f"; caused by edges {', '.join(causes)}" if causes else ""),
+        level,
+        distance_m=f"{told.distance_m:.6f}",
+        angle_rad=f"{told.angle_rad:.6f}",
+        edges=" ".join(map(str, told.edges)),
+        chi2_per_dof=" ".join(f"{fit:.3g}" for fit in told.chi2),
+    )
+
+
+def name_of(slam: GraphSlam, edge: int) -> str:
+    """What an edge is of: its class, and the landmark it is about."""
+    table, row = slam.graph.row(edge)
+    vertices = set(table.vertices.values[row].tolist())
+    of = next((name for name, mark in slam.landmarks.items() if mark.vertex in vertices), "")
+    return f"{slam.graph.label_of(edge)} {of}".strip()
+
+
+__all__ = ["ERROR", "OK", "WARN", "correction", "happened", "name_of", "of_update"]

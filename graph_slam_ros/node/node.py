@@ -1,0 +1,389 @@
+"""The ROS node: its lifecycle, parameters, services and state. What it does with messages is in ``live/configured``."""
+
+import os
+import re
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy comes in: threads would reorder sums
+
+import rclpy
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import UInt64
+
+from graph_slam_ros.errors import ConfigError, GraphSlamError, said
+from graph_slam_ros.messages import to_msg
+from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.node import bond, diagnostics
+from graph_slam_ros.node.map_services import serve_maps
+from graph_slam_ros.node.parameters import changed, declare_parameters
+from graph_slam_ros.node.publishers import LATCHED
+from graph_slam_ros.node.runtime import Configured
+from graph_slam_ros.node.services import serve_later
+from graph_slam_ros.node.worker import URGENT_S
+
+_SUCCESS, _FAILURE, _ERROR = (getattr(TransitionCallbackReturn, name) for name in ("SUCCESS", "FAILURE", "ERROR"))
+_TICK_S = 0.1
+_AGAIN_S = 5.0
+_SWITCH_S = 5e-4  # a callback waits no longer than this for the worker's Python; the default is ten times that
+
+
+class GraphSlamNode(LifecycleNode):
+    """Online pose-graph SLAM of odometry, landmark sightings, fixes and closures; topics are in ``messages/topics.py``.
+
+    Configured, it has read its parameters, opened its run folder and has its publishers; its kernels are loaded or
+    compiled meanwhile. Active, it listens and broadcasts map -> odom.
+
+    Parameters
+    ----------
+    is_told_to_stop : asked while something takes long that may as well not be done
+    """
+
+    def __init__(self, is_told_to_stop: Callable[[], bool] = lambda: False, **options: Any) -> None:
+        super().__init__("graph_slam", **options)
+        self._is_told_to_stop = is_told_to_stop
+        self.config = declare_parameters(self)
+        self.add_on_set_parameters_callback(self._on_set)
+        self._run: Configured | None = None
+        self._bond: bond.Bond | None = None
+        self._faults: deque[float] = deque(maxlen=1000)
+        self._told: set[str] = set()
+        self._verdict = diagnostics.Verdict("UNCONFIGURED")
+        self._logged_s = 0.0
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # whatever becomes of /clock
+        self._acknowledge = self.create_publisher(UInt64, "~/received", LATCHED)
+        self._diagnostics = self.create_publisher(
+            message_class("diagnostic_msgs/msg/DiagnosticArray"), "/diagnostics", 10
+        )
+        self.create_timer(_TICK_S, self.guarded(self._tick), clock=steady)
+        self.create_timer(1.0, self.guarded(self._diagnose), clock=steady)
+        for name, start in (
+            ("save", lambda run: run.save()),
+            ("load", lambda run: run.load()),
+            ("reset", lambda run: run.reset()),
+            ("pause", lambda run: run.pause(True)),
+            ("resume", lambda run: run.pause(False)),
+            ("optimize", lambda run: run.control("optimize")),
+            ("clear_closures", lambda run: run.control("clear_closures")),
+        ):
+            serve_later(self, f"~/{name}", partial(self._serve, start))
+        serve_maps(self, serve_later)
+        if not self.config.node.autostart and not bond.is_installed():
+            self.get_logger().warn(bond.MISSING)
+        for service in self.services:
+            service.callback = self._answered(service)
+
+    # -- lifecycle ---------------------------------------------------------------------------------------------------
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Check the parameters and files, begin to load or compile the kernels, make the publishers."""
+        return self._transition(self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listen and broadcast."""
+        return self._transition(self._activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listen no more; what was taken stays."""
+        return self._transition(self._deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Save and forget the run."""
+        return self._transition(self.finish)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Save and end, even where it cannot be saved."""
+        return self._transition(self.finish, _FAILURE)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Whatever failed, nothing is left of it and the node can be configured again."""
+        return self._transition(self.finish)
+
+    @property
+    def _state(self) -> str:
+        """Of the lifecycle; rclpy has it."""
+        return str(self._state_machine.current_state[1])
+
+    def _transition(
+        self, action: Callable[[], object], failed: TransitionCallbackReturn = _ERROR
+    ) -> TransitionCallbackReturn:
+        try:
+            action()
+        except Exception as error:
+            self.get_logger().fatal(
+                said(error) if isinstance(error, GraphSlamError) else f"a fault of ours, {said(error)}"
+            )
+            return failed
+        return _SUCCESS
+
+    def _configure(self) -> None:
+        if self._run is None:
+            self._run = run = Configured(self)
+            run.prepare(self._is_told_to_stop)
+            if self.config.journal.resume and run.was_cut_off:
+                unused = "" if self.config.load_pose is None else "; output.load_pose is not used: it has driven since"
+                self.get_logger().warn(f"the last run was never ended: going on in its map{unused}")
+                run.in_passing(run.resume())
+            elif self.config.output.load_at_start:
+                run.in_passing(run.load())
+
+    def _activate(self) -> None:
+        self._configured().activate()
+        if self._bond is None and not self.config.node.autostart and bond.is_installed():
+            self._bond = bond.Bond(self)
+
+    def _deactivate(self) -> None:
+        self._end_bond()
+        self._configured().deactivate()
+
+    def _end_bond(self) -> None:
+        if self._bond is not None:
+            self._bond.end()
+            self._bond = None
+
+    def _configured(self) -> "Configured":
+        if self._run is None:
+            raise GraphSlamError("not configured")
+        return self._run
+
+    def finish(self, patience_s: float | None = None) -> None:
+        """Save what was not saved yet, and take everything away.
+
+        Parameters
+        ----------
+        patience_s : how long what waits may still take; None: as long as it takes, unless the node is told to stop
+        """
+        self._end_bond()
+        if self._run is not None:
+            run, self._run = self._run, None
+            run.finish(patience_s, self._is_told_to_stop)
+
+    def destroy_node(self) -> None:
+        """As rclpy's, and at once: its state machine would keep the node in the graph until it is collected."""
+        super().destroy_node()
+        self._state_machine = None
+
+    # -- parameters --------------------------------------------------------------------------------------------------
+
+    def set_parameters_atomically(self, parameter_list: Any) -> SetParametersResult:
+        """As rclpy's, but our refusals come first: they name the parameter, and of an unknown one the nearest known.
+
+        A whole number is a number, as it is at the start.
+        """
+        try:
+            _, values = changed(self.config, parameter_list, is_configured=self._run is not None)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return super().set_parameters_atomically(
+            [Parameter(one.name, value=values[one.name]) if one.name in values else one for one in parameter_list]
+        )
+
+    def change(self, values: dict[str, Any]) -> None:
+        """Set parameters, by name, as anybody may."""
+        self.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
+
+    def _on_set(self, given: Sequence[Any]) -> SetParametersResult:
+        """All of them or none, and what may change at work takes effect at its place among the measurements."""
+        try:
+            config, values = changed(self.config, given, is_configured=self._run is not None)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self.config = config
+        if self._run is not None and values:
+            self._run.set(values)
+        return SetParametersResult(successful=True)
+
+    # -- the run -----------------------------------------------------------------------------------------------------
+
+    def _answered(self, service: Any) -> Callable[[Any, Any], Any]:
+        """The callback of a service, which answers that nothing was done where it would raise.
+
+        rclpy's own raise where a transition is told by its number and it is not its turn, or where a parameter has a
+        type that there is not; the executor raises that again, and the node would end.
+        """
+        answer = service.callback
+
+        def answered(request: Any, response: Any) -> Any:
+            try:
+                return answer(request, response)
+            except Exception as error:
+                self.get_logger().warn(f"{service.srv_name}: {said(error)}")
+                return service.srv_type.Response()
+
+        return answered
+
+    def _serve(self, start: "Callable[[Configured], Future[str]]", _: Any) -> "Future[str]":
+        return start(self.configured())
+
+    def configured(self) -> Configured:
+        """What there is since configuration. Raises GraphSlamError before."""
+        if self._run is None:
+            raise GraphSlamError(f"not active: the node is {self._state}")
+        return self._run
+
+    def acknowledge(self, count: int) -> None:
+        """Tell a player how many messages were taken."""
+        self._acknowledge.publish(UInt64(data=count))
+
+    @property
+    def has_player(self) -> bool:
+        """Whether somebody waits for that."""
+        return self._acknowledge.get_subscription_count() > 0
+
+    @property
+    def now_ns(self) -> int:
+        """ROS time; 0 before the first /clock where that is used."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
+        """Nothing ends the node: what a callback raises is counted, and told with its origin once."""
+
+        def guarded(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except Exception as error:
+                self._faults.append(time.monotonic())
+                if self._run is not None:
+                    self._run.counters.count("node", type(error).__name__)
+                key = f"{type(error).__name__}: {error}"
+                if key not in self._told and len(self._told) < 1000:
+                    self._told.add(key)
+                    self.get_logger().error("".join(traceback.format_exception(error)))
+                self.get_logger().error(key, throttle_duration_sec=5.0)
+
+        return guarded
+
+    def _tick(self) -> None:
+        if self._run is not None:
+            self._run.tick()
+
+    def _diagnose(self) -> None:
+        facts = diagnostics.Facts(self._state) if self._run is None else self._run.facts(self._state)
+        since = time.monotonic() - 10.0
+        facts = replace(facts, faults=sum(at > since for at in self._faults))
+        verdict = diagnostics.judge(facts, self.config)
+        self._tell(verdict)
+        statuses = diagnostics.statuses(facts, verdict, self.get_fully_qualified_name().lstrip("/"))
+        self._diagnostics.publish(to_msg.diagnostics(self.now_ns, statuses))
+
+    def _tell(self, verdict: diagnostics.Verdict) -> None:
+        """In the log where it changes, numbers apart; what somebody must do something about, every few seconds.
+
+        A node that has just begun to wait is no reason to warn: publishers take a moment to be discovered.
+        """
+        before, self._verdict = self._verdict, verdict
+        has_lasted = before.state == verdict.state and time.monotonic() - self._logged_s > _AGAIN_S
+        urgent = verdict.state in ("WAITING", "ERROR") and has_lasted
+        if _without_numbers(before) == _without_numbers(verdict) and not urgent:
+            return
+        self._logged_s = time.monotonic()
+        said = "; ".join((verdict.state, *verdict.reasons))
+        if verdict.level == to_msg.OK or (verdict.state == "WAITING" and not urgent):
+            self.get_logger().info(said)
+        else:
+            self.get_logger().warn(said)
+
+
+def _without_numbers(verdict: diagnostics.Verdict) -> tuple[str, ...]:
+    return (verdict.state, *(re.sub(r"\d+(\.\d+)?", "#", reason) for reason in verdict.reasons))
+
+
+class _Told:
+    """Whether Ctrl-C or SIGTERM came: noted, never raised, so that no message is left half-way.
+
+    A launch file sends Ctrl-C on to a node that the terminal has told already: what comes twice at once is once.
+    """
+
+    def __init__(self) -> None:
+        self.at_s = 0.0
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._note)
+
+    @property
+    def to_stop(self) -> bool:
+        """Whether it did."""
+        return self.at_s > 0.0
+
+    def _note(self, number: int, frame: Any) -> None:
+        if self.to_stop and number == signal.SIGINT and time.monotonic() - self.at_s > 1.0:
+            os._exit(128 + number)  # asked for again: at once
+        self.at_s = self.at_s or time.monotonic()
+
+
+def main() -> int:
+    """Run the node until it is told to stop; returns the exit code: 0, 1 our fault, 2 refused to start or save."""
+    code = _run()
+    if any(thread.daemon and thread is not threading.current_thread() for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)  # one that still solves would be ended inside compiled code, and abort the process
+    return code
+
+
+def _run() -> int:
+    told = _Told()
+    sys.setswitchinterval(_SWITCH_S)
+    try:
+        _init()
+        node = GraphSlamNode(lambda: told.to_stop)
+        executor = _executor()
+        executor.add_node(node)
+        if node.config.node.autostart and not _started(node, told):
+            return 2
+        while not told.to_stop and rclpy.ok():
+            executor.spin_once(timeout_sec=0.1)
+        node.finish(URGENT_S)
+        executor.shutdown()
+        node.destroy_node()
+    except GraphSlamError as error:
+        rclpy.logging.get_logger("graph_slam").fatal(str(error))
+        return 2
+    except Exception as error:
+        rclpy.logging.get_logger("graph_slam").fatal(f"a fault of ours, {said(error)}")
+        return 1
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+def _started(node: GraphSlamNode, told: _Told) -> bool:
+    """Configure and activate."""
+    for trigger in (node.trigger_configure, node.trigger_activate):
+        if told.to_stop:
+            return True
+        if trigger() != _SUCCESS:
+            return told.to_stop
+    return True
+
+
+def _executor() -> Any:
+    """The quickest there is: rclpy's events executor takes a fifth of the time per message (docs/benchmarks.md)."""
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:  # Humble
+        from rclpy.executors import SingleThreadedExecutor as EventsExecutor
+    return EventsExecutor()
+
+
+def _init() -> None:
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy has several for arguments and files it cannot read
+        raise GraphSlamError(" ".join(str(error).split())) from None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

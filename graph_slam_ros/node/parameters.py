@@ -1,0 +1,72 @@
+"""ROS parameters from the one configuration tree: declared with description, unit and range, read back as it."""
+
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+
+from graph_slam_ros.config.config import Config, flatten, parameters
+from graph_slam_ros.config.parameter import Parameter
+from graph_slam_ros.errors import ConfigError
+
+_NODE = "{node}"  # in output.folder
+_OTHERS = {"use_sim_time", "start_type_description_service"}  # rclpy's own
+_AT_START = {"inputs.names", "output.folder", "node.autostart", "landmarks.surveyed_file"}
+"""Sections are declared by the first; what nobody may point elsewhere from outside is the second."""
+
+
+def declare_parameters(node: Any) -> Config:
+    """Declare every parameter on a node and return the configuration it was started with.
+
+    Raises
+    ------
+    ConfigError
+        An unknown name (the nearest known one is suggested), a wrong type or a value out of range.
+    """
+    config = Config.from_mapping(
+        {
+            name: override.value
+            for name, override in sorted(node._parameter_overrides.items())
+            if name not in _OTHERS and not name.startswith("qos_overrides")
+        }
+    )
+    folder = config.output.folder.replace(_NODE, node.get_fully_qualified_name().strip("/").replace("/", "_"))
+    config = config.changed({"output.folder": folder})
+    used = dict(flatten(config.as_mapping()))
+    for p in parameters(one.name for one in config.sources):
+        node.declare_parameter(p.name, used[p.name], _descriptor(p), ignore_override=True)
+    return config
+
+
+def changed(config: Config, given: Iterable[Any], *, is_configured: bool) -> tuple[Config, dict[str, Any]]:
+    """The configuration with ROS parameters that are to be set, and those of them that are ours, in their types.
+
+    Raises
+    ------
+    ConfigError
+        One of them may not be changed now, or not to that: none is.
+    """
+    values = {one.name: one.value for one in given if one.name not in _OTHERS}
+    wanted = config.changed(values)
+    live = {p.name for p in parameters(one.name for one in config.sources) if p.live}
+    if is_configured and (fixed := sorted(set(values) - live)):
+        raise ConfigError(f"{fixed[0]}: can be changed only before the node is configured (deactivate, clean up)")
+    used = dict(flatten(wanted.as_mapping()))
+    return wanted, {name: used[name] for name in values}
+
+
+def _descriptor(p: Parameter) -> ParameterDescriptor:
+    unit = f" [{p.unit}]" if p.unit else ""
+    choices = f" One of: {', '.join(p.choices)}." if p.choices else ""
+    when = " May change at any time." if p.live else ""
+    fixed = p.name in _AT_START
+    descriptor = ParameterDescriptor(description=f"{p.meaning}{unit}.{choices}{when}", read_only=fixed)
+    if p.type is float and (p.low is not None or p.high is not None):
+        largest = sys.float_info.max
+        low, high = (-largest if p.low is None else p.low), (largest if p.high is None else p.high)
+        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    if p.type is int and (p.low is not None or p.high is not None):
+        low, high = int(p.low or 0), int(2**31 - 1 if p.high is None else p.high)
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+    return descriptor

@@ -1,0 +1,289 @@
+"""Plays a recording into a live ROS graph: the recorded bytes, with /clock, as fast as the node keeps up.
+
+The node tells how many messages it has received; the player never runs further ahead than its queues hold, and never
+lets a message of one topic overtake those of another by more than the node's window of stamps. So nothing is lost, and
+what would be is counted.
+"""
+
+import os
+import random
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import UInt64
+from std_srvs.srv import Trigger
+
+from graph_slam_ros.config.config import parameters
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.parameters import parameters_text
+from graph_slam_ros.messages import to_msg
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC, is_correction
+from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.recordings.bag import Bag, BagMessage
+from graph_slam_ros.runs.replay import Inputs
+from graph_slam_ros.slam import Config
+
+_LISTS = {"tf2_msgs/msg/TFMessage", "visualization_msgs/msg/MarkerArray"}  # a header stands in each item
+_AHEAD = 256  # messages on their way
+_OVERTAKE_NS = 20_000_000  # at most, and well inside the node's ordering window
+_CLOCK_NS = 5_000_000
+_PATIENCE_S = 10.0
+_START_S = 300.0  # the first start of an installation compiles
+_OWN_LAG_S = 60.0  # the player waits for its own node: that it is behind is no fault
+_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class PlayError(GraphSlamError):
+    """The live graph does not do its part."""
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What was sent and what did not arrive, and the folder the node saved."""
+
+    sent: int
+    lost: int
+    saved: str
+
+
+class Player:
+    """A publisher of recorded messages that waits for a graph_slam node."""
+
+    def __init__(
+        self, bag: Bag, inputs: Inputs, node_name: str, config: Config, own: subprocess.Popen[bytes] | None
+    ) -> None:
+        self._bag, self._name, self._own = bag, node_name, own
+        self._static = inputs.topics.get(TF_STATIC)
+        self._moving = inputs.topics.get(TF)
+        self._topics = set(inputs.by_topic())
+        self._map_frame = config.frames.map
+        self._overtake_ns = min(_OVERTAKE_NS, round(0.5e9 * config.ordering.window_s))
+        self._node = Node("graph_slam_player")
+        self._sent = self._received = self._lost = 0
+        self._before: int | None = None
+        self._on_the_way: dict[str, tuple[int, int]] = {}  # oldest and newest stamp by topic
+        self._clock_ns = 0
+        self._clock = self._node.create_publisher(Clock, "/clock", 10)
+        self._publishers = {topic: self._publisher(topic) for topic in set(inputs.topics.values())}
+        self._node.create_subscription(UInt64, f"{node_name}/received", self._on_received, _LATCHED)
+
+    def play(self, rate: float | None, progress: Callable[[Iterable[Any], int], Iterable[Any]]) -> Played:
+        """Send everything, wait until it has arrived, have it saved.
+
+        Parameters
+        ----------
+        rate : times real time, or None for as fast as the node keeps up
+        """
+        patience_s = _START_S if self._own else _PATIENCE_S
+        self._wait(lambda: self._before is not None, f"no {self._name}/received: is the node running?", patience_s)
+        for topic, publisher in self._publishers.items():
+            self._wait(partial(_has_subscriber, publisher), f"nobody subscribes to {topic}")
+        for message in self._bag.messages({self._static} if self._static else ()):
+            self._send(message)
+        self._settle()
+        total = sum(self._bag.topics[topic].count for topic in self._topics)
+        start_wall, start_log = time.monotonic(), None
+        for message in progress(self._bag.messages(self._topics), total):
+            if message.topic == self._moving and is_correction(message.cdr, self._map_frame):
+                continue  # of the map, one node tells: now it is ours
+            start_log = message.log_ns if start_log is None else start_log
+            if rate:
+                self._pause(start_wall + (message.log_ns - start_log) * 1e-9 / rate)
+            self._keep_order(message)
+            self._send(message)
+        self._settle()
+        return Played(self._sent, self._lost, self._save())
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._node.destroy_node()
+
+    def _publisher(self, topic: str) -> Any:
+        kind = message_class(self._bag.topics[topic].type)
+        latched = topic == self._static
+        return self._node.create_publisher(
+            kind, topic, QoSProfile(depth=100, durability=_LATCHED.durability) if latched else 4 * _AHEAD
+        )
+
+    def _on_received(self, message: UInt64) -> None:
+        if self._before is None:
+            self._before = message.data
+        self._received = message.data - self._before
+        if self._received + self._lost >= self._sent:
+            self._on_the_way.clear()
+
+    def _send(self, message: BagMessage) -> None:
+        if message.log_ns - self._clock_ns >= _CLOCK_NS:
+            self._clock_ns = message.log_ns
+            self._clock.publish(to_msg.clock(message.log_ns))
+        self._publishers[message.topic].publish(message.cdr)
+        self._sent += 1
+        stamp_ns = self._stamp_ns(message)
+        oldest, newest = self._on_the_way.get(message.topic, (stamp_ns, stamp_ns))
+        self._on_the_way[message.topic] = min(oldest, stamp_ns), max(newest, stamp_ns)
+
+    def _keep_order(self, message: BagMessage) -> None:
+        """Wait where the queues are full, or where it would matter which of two topics' messages arrives first."""
+        stamp_ns = self._stamp_ns(message)
+        others = [stamps for topic, stamps in self._on_the_way.items() if topic != message.topic]
+        apart = self._overtake_ns
+        if any(stamp_ns - oldest >= apart or newest - stamp_ns >= apart for oldest, newest in others):
+            self._settle()
+        elif self._sent - self._received - self._lost >= _AHEAD:
+            self._until_received(self._sent - self._lost - _AHEAD // 2)
+
+    def _stamp_ns(self, message: BagMessage) -> int:
+        return _stamp_ns(message.cdr, 4 if self._bag.topics[message.topic].type not in _LISTS else 8)
+
+    def _settle(self) -> None:
+        self._until_received(self._sent - self._lost)
+
+    def _until_received(self, count: int) -> None:
+        """Wait for that many; what does not arrive while nothing moves is counted as lost."""
+        last, deadline = self._received, time.monotonic() + _PATIENCE_S
+        while self._received < count:
+            rclpy.spin_once(self._node, timeout_sec=0.1)
+            self._check_node()
+            if self._received != last:
+                last, deadline = self._received, time.monotonic() + _PATIENCE_S
+            elif time.monotonic() > deadline:
+                self._lost += count - self._received
+                self._on_the_way.clear()
+                return
+
+    def _pause(self, until: float) -> None:
+        while (left := until - time.monotonic()) > 0.0:
+            rclpy.spin_once(self._node, timeout_sec=left)
+
+    def _wait(self, condition: Callable[[], bool], complaint: str, patience_s: float = _PATIENCE_S) -> None:
+        deadline = time.monotonic() + patience_s
+        while not condition():
+            self._check_node()
+            if time.monotonic() > deadline:
+                raise PlayError(complaint)
+            rclpy.spin_once(self._node, timeout_sec=0.05)
+
+    def _check_node(self) -> None:
+        code = self._own.poll() if self._own else None
+        if code is not None:
+            raise PlayError(f"the node ended with exit code {code}")
+
+    def _save(self) -> str:
+        client = self._node.create_client(Trigger, f"{self._name}/save")
+        if not client.wait_for_service(timeout_sec=_PATIENCE_S):
+            raise PlayError(f"no service {self._name}/save")
+        future = client.call_async(Trigger.Request())
+        rclpy.spin_until_future_complete(self._node, future, timeout_sec=300.0)
+        answer = future.result()
+        if answer is None or not answer.success:
+            raise PlayError(f"{self._name}/save: {answer.message if answer else 'no answer'}")
+        return str(answer.message)
+
+
+def config_of(node_name: str) -> Config:
+    """The configuration of a running node, by its parameters: what it listens to.
+
+    Raises
+    ------
+    PlayError
+        There is no such node.
+    """
+    rclpy.init(args=[])
+    try:
+        node = Node("graph_slam_player")
+
+        def answer(kind: Any, service: str, **fields: Any) -> Any:
+            client = node.create_client(kind, f"{node_name}/{service}")
+            if not client.wait_for_service(timeout_sec=_PATIENCE_S):
+                raise PlayError(f"no parameters of {node_name}: is the node running?")
+            future = client.call_async(kind.Request(**fields))
+            rclpy.spin_until_future_complete(node, future, timeout_sec=_PATIENCE_S)
+            if future.result() is None:
+                raise PlayError(f"{node_name}/{service}: no answer")
+            return future.result()
+
+        there = set(answer(ListParameters, "list_parameters").result.names)
+        (inputs,) = answer(GetParameters, "get_parameters", names=["inputs.names"]).values
+        names = [p.name for p in parameters(inputs.string_value.split()) if p.name in there]
+        values = answer(GetParameters, "get_parameters", names=names).values
+        return Config.from_mapping(dict(zip(names, map(parameter_value_to_python, values), strict=True)))
+    finally:
+        rclpy.try_shutdown()
+
+
+def play(
+    bag: Bag,
+    inputs: Inputs,
+    *,
+    node_name: str = "/graph_slam",
+    config: Config | None = None,
+    own: subprocess.Popen[bytes] | None = None,
+    rate: float | None = None,
+    progress: Callable[[Iterable[Any], int], Iterable[Any]] = lambda items, total: items,
+) -> Played:
+    """Play a recording into the running node of that name, or into one of our own (``own_node``)."""
+    rclpy.init(args=[])
+    try:
+        player = Player(bag, inputs, node_name, config or Config(), own)
+        try:
+            return player.play(rate, progress)
+        finally:
+            player.close()
+    finally:
+        rclpy.try_shutdown()
+
+
+@contextmanager
+def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subprocess.Popen[bytes]]:
+    """A node of our own, on this machine and a ROS domain of its own, for as long as the context lasts."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_DOMAIN_ID"] = str(random.randint(1, 100))
+    config = replace(
+        config,
+        inputs=replace(config.inputs, reliable=True),
+        sources=tuple(replace(one, topic=inputs.topics.get(one.name, one.topic)) for one in config.sources),
+        output=replace(config.output, folder=str(folder), keep_earlier=0),
+        health=replace(config.health, lag_s=max(config.health.lag_s, _OWN_LAG_S)),
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        parameters = Path(scratch) / "parameters.yaml"
+        parameters.write_text(parameters_text(config.as_mapping()), encoding="utf-8")
+        command = [sys.executable, "-m", "graph_slam_ros.node.node", "--ros-args", "--params-file", str(parameters)]
+        command += ["-p", "use_sim_time:=true", "--log-level", "warn"]
+        process = subprocess.Popen(command)
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(timeout=60.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def _has_subscriber(publisher: Any) -> bool:
+    return bool(publisher.get_subscription_count())
+
+
+def _stamp_ns(cdr: bytes, at: int = 4) -> int:
+    """Stamp of the header at an offset, without decoding the rest; 0 where the message is too short for one."""
+    if len(cdr) < at + 8:
+        return 0
+    sec, nanosec = struct.unpack_from("<iI" if cdr[1] & 1 else ">iI", cdr, at)
+    return int(sec) * 1_000_000_000 + int(nanosec)

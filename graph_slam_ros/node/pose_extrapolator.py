@@ -1,0 +1,65 @@
+"""The robot in the map at each odometry message, from the last estimate on: it waits for no solve."""
+
+from collections import deque
+from itertools import takewhile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.graph.geometry import Numbers
+from graph_slam_ros.measurements.types import Odometry
+from graph_slam_ros.node.session import Estimate
+from graph_slam_ros.slam.frontend.odometry_integration import Motion, OdometryNoise, Rest
+from graph_slam_ros.slam.frontend.odometry_selector import Step
+
+_MOST = 2_000  # messages since the newest keyframe: of a robot that stands there are many
+
+
+class Reckoning:
+    """The last estimate composed with the odometry since; its covariance grows with that."""
+
+    def __init__(self, config: Config) -> None:
+        self._space, self._max_speed_m_s = config.space, config.odometry.max_speed_m_s
+        self._noise = OdometryNoise(config.odometry, config.space)
+        self._since: deque[Odometry] = deque(maxlen=_MOST)
+        self._estimate: Estimate | None = None
+        self._motion: Motion | None = None
+        self._last: Numbers = self._space.identity
+
+    @property
+    def newest(self) -> Odometry | None:
+        """The newest odometry of the source that is in use."""
+        return self._since[-1] if self._since else None
+
+    def hear(self, m: Odometry, estimate: Estimate | None) -> bool:
+        """Take an odometry message; whether it is of the source in use, and newer than the last."""
+        if estimate is not None and estimate.source != m.source:
+            return False
+        if self._since and m.source == self._since[-1].source and m.stamp_ns <= self._since[-1].stamp_ns:
+            return False
+        self._since.append(m)
+        return True
+
+    def forget(self) -> None:
+        """Stamps, or the map, begin anew."""
+        self._since.clear()
+        self._estimate = self._motion = None
+
+    def pose(self, estimate: Estimate) -> tuple[Numbers, NDArray[np.float64]]:
+        """``T_map_base`` at the newest odometry and its covariance in its tangent space."""
+        group = self._space.group
+        if estimate is not self._estimate or self._motion is None:
+            self._estimate, self._last = estimate, estimate.T_odom_keyframe
+            self._motion = Motion(self._noise, self._space, 0, estimate.stamp_ns, Rest(self._noise, self._space))
+            while len(self._since) > 1 and self._since[0].stamp_ns <= estimate.stamp_ns:
+                self._since.popleft()
+        at_ns = self._motion.now.stamp_ns
+        for m in reversed(list(takewhile(lambda m: m.stamp_ns > at_ns, reversed(self._since)))):
+            step = Step(m.stamp_ns, group.between(self._last, m.T_odom_base), m.T_odom_base, m.twist_covariance)
+            self._motion.step(step)
+            self._last = m.T_odom_base
+        moved = self._motion.now
+        T_map_keyframe = group.compose(estimate.T_map_odom, estimate.T_odom_keyframe)
+        covariance = group.propagate(estimate.covariance, moved.T_keyframe_base, moved.covariance)
+        return group.compose(T_map_keyframe, moved.T_keyframe_base), covariance

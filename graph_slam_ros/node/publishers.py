@@ -1,0 +1,164 @@
+"""What the node publishes of a run: at once what is small, the rest when it is due, changed, and somebody listens.
+
+A topic that is latched is sent once more to whom comes late, so that nobody waits for the robot to move.
+"""
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from graph_slam_ros.messages import results, to_msg, topics
+from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.messages.path_updates import PathUpdates
+from graph_slam_ros.messages.to_msg import Status
+from graph_slam_ros.node import events
+from graph_slam_ros.slam import Config, GraphSlam, Update
+
+_LANDMARKS = ("landmarks", "landmarks_estimate")
+_LATER = ("path", "path_updates", "graph", *_LANDMARKS)
+_SPARE = 50.0  # of the worker's time, one part for each topic
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@dataclass(slots=True)
+class _Topic:
+    """A publisher and what has become of it."""
+
+    publisher: Any
+    listeners: int = 0
+    is_stale: bool = False  # something has changed since it was sent
+    begins_anew: bool = True  # somebody has nothing of it
+    sent_s: float = -1e9
+    took_s: float = 0.0  # to make and send it
+
+
+class Outputs:
+    """Publishers of results, and what is due on them; made by the node, used by the worker's thread.
+
+    Parameters
+    ----------
+    node : the ROS node
+    """
+
+    def __init__(self, node: Any, config: Config) -> None:
+        self._node = node
+        self._topics = {
+            one.name.removeprefix("~/"): _Topic(
+                node.create_publisher(message_class(one.type), one.name, LATCHED if one.latched else 100)
+            )
+            for one in topics.PUBLICATIONS
+            if one.name.startswith("~/") and one.name not in ("~/received", "~/events")
+        }
+        self._events = node.create_publisher(message_class("diagnostic_msgs/msg/DiagnosticArray"), "~/events", 100)
+        self._landmarks_at = 0  # keyframes, or later
+        self._has_something = False
+        self.begin(config)
+
+    def begin(self, config: Config, *, has_map: bool = False) -> None:
+        """A new run, perhaps in a map: what was sent is of another."""
+        self._has_something |= has_map
+        output = config.output
+        self._updates = PathUpdates(output.path_moved_m, output.path_moved_rad)
+        self._landmarks_at = 0
+        for topic in self._topics.values():
+            topic.is_stale = topic.begins_anew = True
+
+    def forget_time(self) -> None:
+        """Stamps begin anew: who knows poses by their stamps needs all again."""
+        self._topics["path_updates"].begins_anew = True
+
+    @property
+    def path_version(self) -> int:
+        """Messages of ``~/path_updates`` since it began anew."""
+        return self._updates.version
+
+    def close(self) -> None:
+        """Take the publishers away."""
+        for topic in self._topics.values():
+            self._node.destroy_publisher(topic.publisher)
+        self._node.destroy_publisher(self._events)
+
+    # -- at once -----------------------------------------------------------------------------------------------------
+
+    def update(self, slam: GraphSlam, update: Update, *, is_located: bool) -> None:
+        """The pose, what has happened, and a note of what is to be sent."""
+        if is_located:
+            self._send("pose", results.pose(slam))
+        self._has_something = True
+        for name in ("path", "path_updates", "graph"):
+            self._topics[name].is_stale = True
+        if self._landmarks_due(slam, update):
+            self._landmarks_at = len(slam.keyframes) + slam.config.output.landmarks_every_keyframes
+            for name in _LANDMARKS:
+                self._topics[name].is_stale = True
+        if self._events.get_subscription_count():
+            self.tell(slam.keyframes[-1].stamp_ns, events.of_update(slam, update))
+
+    def tell(self, stamp_ns: int, happened: Iterable[Status]) -> None:
+        """Events, whoever listens."""
+        if statuses := list(happened):
+            self._events.publish(to_msg.diagnostics(stamp_ns, statuses))
+
+    def odometry(self, cdr: bytes) -> None:
+        """The robot in the map."""
+        self._send("odometry", cdr)
+
+    def has_listeners(self, name: str) -> bool:
+        """Whether somebody subscribes to a topic."""
+        return bool(self._topics[name].publisher.get_subscription_count())
+
+    def _send(self, name: str, cdr: bytes) -> None:
+        topic = self._topics[name]
+        topic.publisher.publish(cdr)
+        topic.is_stale, topic.sent_s = False, time.monotonic()
+
+    def _landmarks_due(self, slam: GraphSlam, update: Update) -> bool:
+        """From the first on regularly."""
+        regularly = bool(slam.landmarks) and len(slam.keyframes) >= self._landmarks_at
+        return update.report is not None or (update.solved and regularly)
+
+    def _send_updates(self, slam: GraphSlam) -> None:
+        """All again to whom comes late: what was sent before, nobody can send him."""
+        if self._topics["path_updates"].begins_anew:
+            self._topics["path_updates"].begins_anew = False
+            self._send("path_updates", self._updates.restart(slam))
+        if changed := self._updates.update(slam):
+            self._send("path_updates", changed)
+
+    # -- when due ----------------------------------------------------------------------------------------------------
+
+    def are_due(self, config: Config) -> bool:
+        """Whether there is something for ``publish_due``; asked often, from any thread."""
+        now_s = time.monotonic()
+        return any(self._is_due(config, name, now_s) for name in _LATER)
+
+    def _is_due(self, config: Config, name: str, now_s: float) -> bool:
+        topic, output = self._topics[name], config.output
+        listeners = topic.publisher.get_subscription_count()
+        if listeners > topic.listeners:
+            topic.begins_anew = True  # who came late has what was latched, and of what is not latched nothing
+            topic.is_stale = topic.is_stale or name == "path_updates"
+        topic.listeners = listeners
+        period_s = output.graph_period_s if name == "graph" else output.path_period_s
+        period_s = max(period_s, _SPARE * topic.took_s)  # what takes long comes seldom
+        return self._has_something and topic.is_stale and bool(listeners) and now_s - topic.sent_s >= period_s
+
+    def publish_due(self, slam: GraphSlam) -> None:
+        """What has changed and somebody waits for."""
+        now_s, output = time.monotonic(), slam.config.output
+        make: dict[str, Callable[[], bytes]] = {
+            "path": lambda: results.path(slam, output.path_max_poses),
+            "graph": lambda: results.graph(slam, output.graph_max_edges),
+            "landmarks": lambda: results.landmarks(slam),
+            "landmarks_estimate": lambda: results.landmarks_estimate(slam),
+        }
+        for name, encode in make.items():
+            if self._is_due(slam.config, name, now_s):
+                start = time.thread_time()
+                self._send(name, encode())
+                self._topics[name].took_s = time.thread_time() - start
+        if self._is_due(slam.config, "path_updates", now_s):
+            self._send_updates(slam)

@@ -1,0 +1,58 @@
+"""Whether a drive that was cut off goes on after a restart: its odometry tells."""
+
+import math
+
+from graph_slam_ros.graph.geometry import Numbers
+from graph_slam_ros.slam import GraphSlam
+
+_LONGEST_NS = 60_000_000_000  # without odometry: after more, the robot may have been carried
+_NEAR = 0.1  # m and rad: an odometry that begins anew so close to where it was does no harm
+
+
+class Resumption:
+    """Compares the odometry before a restart with the first after it.
+
+    Parameters
+    ----------
+    slam : the pipeline in the map of the run that was cut off, before the first odometry
+    used_ns, source : stamp and input of the last odometry before; None and empty where there was none
+    """
+
+    def __init__(self, slam: GraphSlam, used_ns: int | None, source: str) -> None:
+        self._first = len(slam.keyframes)  # of the new drive
+        self._used_ns, self._source = used_ns, source
+        self._goes_on: bool | None = None
+
+    def goes_on(self, slam: GraphSlam) -> bool:
+        """Whether the odometry of the new drive continues that of the drive before, and has not jumped since."""
+        if len(slam.keyframes) <= self._first or slam.segments[-1] != self._first:
+            return False
+        if self._goes_on is None:
+            self._goes_on = self._is_continuous(slam)
+        return self._goes_on
+
+    def _is_continuous(self, slam: GraphSlam) -> bool:
+        last, first = slam.keyframes[self._first - 1], slam.keyframes[self._first]
+        if self._used_ns is None or _name(slam.odometry_source) != _name(self._source):
+            return False
+        if not 0 < first.stamp_ns - self._used_ns <= _LONGEST_NS:
+            return False
+        moved = slam.space.group.between(last.T_odom_base, first.T_odom_base)
+        far_m = math.hypot(*moved[: slam.space.dimensions])
+        most_m = slam.config.odometry.max_speed_m_s * (first.stamp_ns - last.stamp_ns) * 1e-9
+        return far_m <= most_m and not _begins_anew(slam, moved, first.T_odom_base)
+
+
+def _begins_anew(slam: GraphSlam, moved: Numbers, T_odom_base: Numbers) -> bool:
+    """Whether odometry is nearer to where it begins than to where it was; a metre counts as much as a radian."""
+    far, from_begin = (_size(slam, pose) for pose in (moved, T_odom_base))
+    return far > _NEAR and from_begin < far
+
+
+def _size(slam: GraphSlam, pose: Numbers) -> float:
+    return math.hypot(*pose[: slam.space.dimensions]) + slam.space.angle(pose)
+
+
+def _name(source: str) -> str:
+    """Of the input; its publishers are numbered anew after a restart."""
+    return source.partition("#")[0]

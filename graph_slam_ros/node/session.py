@@ -1,0 +1,444 @@
+"""One run of the pipeline in a node, from configuration or reset to the next: its estimate, its recording, its files.
+
+The main thread accepts measurements (``accept``) in the order in which it hands them to the worker's thread. That does
+all the rest; others see ``estimate``, which is replaced whole.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph.geometry import Numbers
+from graph_slam_ros.measurements.types import InitialPose
+from graph_slam_ros.node.resumption import Resumption
+from graph_slam_ros.node.threads import in_a_thread
+from graph_slam_ros.runs import (
+    RunError,
+    RunRecorder,
+    account,
+    earlier_runs,
+    incomplete_runs,
+    is_cut_off,
+    is_name_of_earlier,
+    is_run,
+    keep_earlier,
+    map_of,
+    run_config,
+    save_copy,
+    summarize,
+)
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement, Update
+from graph_slam_ros.slam.graph_slam import Correction
+from graph_slam_ros.slam.snapshot import MapState
+
+OnUpdate = Callable[[GraphSlam, Update], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What is known after an update, for whoever must not wait for the next.
+
+    Attributes
+    ----------
+    T_map_odom : the correction; of identity before the first keyframe
+    T_odom_keyframe, covariance, stamp_ns : odometry's pose, tangent covariance and stamp of the newest keyframe
+    source : the odometry in use
+    is_confirmed : whether the robot knows where it is in a map that was loaded
+    fit : chi2 per degree of freedom; NaN before it was looked at
+    rivals : loop closures of other explanations that could not be ruled out
+    displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
+    is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
+    """
+
+    T_map_odom: Numbers
+    T_odom_keyframe: Numbers
+    covariance: Any
+    stamp_ns: int
+    source: str
+    is_confirmed: bool
+    keyframes: int
+    landmarks: int
+    edges: int
+    segments: int
+    solves: int
+    correction: Correction
+    solve_s: float
+    slowest_solve_s: float
+    fit: float
+    rivals: int
+    displaced: str = ""
+    is_resumed: bool = False
+
+    @property
+    def is_located(self) -> bool:
+        """Whether pose and ``map -> odom`` may be published."""
+        return self.is_confirmed or self.is_resumed
+
+
+class Session:
+    """The pipeline with its recording.
+
+    Parameters
+    ----------
+    border : counters of what was refused before it came here: they are saved with the run
+    on_update : called with what an update changed
+    """
+
+    def __init__(self, config: Config, border: Counters, on_update: OnUpdate, tell: Callable[[str, str], None]) -> None:
+        self.config = config
+        self._border, self._on_update, self._tell = border, on_update, tell
+        self._folder = Path(config.output.folder) if config.output.folder else None
+        self.estimate: Estimate | None = None
+        self._recorder: RunRecorder | None = None
+        self._accepting = threading.Lock()
+        self._held: deque[list[Measurement]] = deque()  # for each run that is still to begin, what was accepted for it
+        self._is_left = False
+        self._has_news = False  # since the last save was asked for
+        self.recording_fails = False
+        self.loads = ""  # the run whose map is being loaded
+        self.was_cut_off = self._folder is not None and is_cut_off(self._folder)
+        self._begin()
+
+    def _begin(self, start: MapState | None = None, loaded: Path | None = None) -> None:
+        slam = GraphSlam(self.config, None, in_a_thread, start)
+        recorder: RunRecorder | None = None
+        if self._folder is not None:
+            named = self._folder.with_name(load) if (load := self.config.output.load) else None
+            keep_earlier(self._folder, self.config.output.keep_earlier, loaded or named)
+            self._recorder = None
+            try:
+                recorder = RunRecorder(self._folder, self.config, self.config.journal.sync_s, start, force=True)
+            except Exception:
+                self.recording_fails = True
+                raise
+        self.slam, self._recorder, self.recording_fails = slam, recorder, False
+        self.slam.counters.on_first = self._tell
+        self._refused_before = Counters()
+        self._refused_before.update(self._border)
+        self.estimate = None
+        self._is_saved, self._is_ended = True, False
+        self._loaded = len(self.slam.keyframes)
+        self._is_confirmed = not self._loaded
+        self._resumption: Resumption | None = None
+        self._slowest_s = 0.0
+        self._fit, self._fitted_at, self._fit_due_s = float("nan"), 0, 0.0
+
+    @property
+    def incomplete(self) -> list[Path]:
+        """Earlier runs that were ended while measurements waited, and whose results are not made yet."""
+        return incomplete_runs(self._folder) if self._folder is not None else []
+
+    @property
+    def failures(self) -> int:
+        """Solves that failed."""
+        return sum(self.slam.counters.as_dict().get("solver", {}).values())
+
+    # -- measurements ------------------------------------------------------------------------------------------------
+
+    def accept(self, measurements: Sequence[Measurement]) -> None:
+        """Put measurements into the journal, before they wait for their turn in ``process``."""
+        self._has_news = True
+        with self._accepting:
+            if self._held:
+                self._held[-1] += measurements
+            elif (recorder := self._recorder) is not None:
+                for measurement in measurements:
+                    recorder.accept(measurement)
+
+    def hold(self) -> None:
+        """What is accepted from now on belongs to a run that is still to begin: it waits for ``release``."""
+        self._has_news = False
+        with self._accepting:
+            self._held.append([])
+
+    def release(self) -> None:
+        """The run has begun, or the one before goes on."""
+        with self._accepting:
+            held = self._held.popleft()
+            if (recorder := self._recorder) is not None:
+                for measurement in held:
+                    recorder.accept(measurement)
+
+    def flush_beside(self) -> None:
+        """Have what was accepted written, however busy the worker is."""
+        if (recorder := self._recorder) is not None:
+            recorder.flush_beside()
+
+    def process(self, measurements: Sequence[Measurement]) -> None:
+        """Hand measurements that were accepted to the pipeline, in order."""
+        for measurement in measurements:
+            if self._is_left:
+                return
+            self._is_saved = False
+            self._process(measurement)
+
+    def take(self, measurements: Sequence[Measurement]) -> None:
+        """Accept and process."""
+        self.accept(measurements)
+        self.process(measurements)
+
+    def restart(self) -> None:
+        """Go on after the thread has died, from the last good estimate; a replay needs no such step."""
+        self.slam.restart()
+
+    def _process(self, measurement: Measurement) -> None:
+        start = time.perf_counter()
+        update = self.slam.process(measurement)
+        took_s = time.perf_counter() - start
+        if not update or self._is_left:
+            return
+        self._slowest_s = max(self._slowest_s, took_s) if update.solved else self._slowest_s
+        recorded = self._recorded(lambda recorder: recorder.record(self.slam, update))
+        if self._recorded(RunRecorder.flush) and recorded:  # nobody is told of anything that a restart would not know
+            self.recording_fails = False
+        self._look(update, took_s)
+        self._on_update(self.slam, update)
+
+    def _recorded(self, write: Callable[[RunRecorder], None]) -> bool:
+        """Where the disk fails, the robot goes on; that nothing is recorded is told, and tried again and again."""
+        if self._recorder is None:
+            return False
+        try:
+            write(self._recorder)
+        except OSError as error:
+            if not self.recording_fails:
+                self._tell("output.folder", error.strerror or type(error).__name__)
+            self.recording_fails = True
+            if self._recorder.unwritten > _MOST_UNWRITTEN:
+                self._recorder.abandon()
+                self._recorder = None
+                self._tell("output.folder", "recording was given up: too much waits for room")
+            return False
+        return True
+
+    def _look(self, update: Update, took_s: float) -> None:
+        slam, newest = self.slam, self.slam.keyframes[-1]
+        covariance = slam.pose_covariance
+        if update.solved and not self._is_confirmed and len(slam.keyframes) > self._loaded:
+            self._is_confirmed = self._is_sure
+        self.estimate = Estimate(
+            slam.T_map_odom,
+            newest.T_odom_base,
+            covariance,
+            newest.stamp_ns,
+            slam.odometry_source,
+            self._is_confirmed,
+            len(slam.keyframes),
+            len(slam.landmarks),
+            slam.graph.edge_count,
+            len(slam.segments),
+            slam.solves,
+            update.correction,
+            took_s,
+            self._slowest_s,
+            self._fit,
+            sum(len(rival.only_here) for rival in slam.backend.rivals),
+            str(slam.displaced or ""),
+            not self._is_confirmed and self._resumption is not None and self._resumption.goes_on(slam),
+        )
+
+    @property
+    def _is_sure(self) -> bool:
+        """Whether the newest keyframe's place in the map is known better than over a jump of odometry."""
+        covariance = self.slam.pose_covariance
+        return float(covariance[0, 0] + covariance[1, 1]) ** 0.5 < _CONFIRMED * self.slam.config.odometry.jump_sigma_m
+
+    def evaluate(self) -> None:
+        """Look at how well everything fits, when there is nothing else to do, for a fiftieth of the time at most."""
+        if self.estimate is None or self._fitted_at == self.slam.solves or time.perf_counter() < self._fit_due_s:
+            return
+        start = time.perf_counter()
+        now, dof = self.slam.solver.evaluate(), self.slam.solver.degrees_of_freedom
+        self._fit = now.chi2_final / dof if dof > 0 else float("nan")
+        self._fitted_at = self.slam.solves
+        self._fit_due_s = start + 50.0 * (time.perf_counter() - start)
+        self.estimate = replace(self.estimate, fit=self._fit)
+
+    # -- services ----------------------------------------------------------------------------------------------------
+
+    def control(self, event: Control) -> str:
+        """Process an event that was accepted."""
+        self.process([event])
+        return f"{len(self.slam.keyframes)} keyframes"
+
+    def accept_save(self) -> list[Control]:
+        """The events that belong before a save, at their place in the journal; none where nothing is new."""
+        events = [Control("flush"), Control("optimize")] if self._has_news else []
+        self.accept(events)
+        self._has_news = False
+        return events
+
+    def save(self, events: Sequence[Control] | None = None, name: str = "") -> str:
+        """Release what waits, solve, and write the run folder; returns its name.
+
+        Parameters
+        ----------
+        events : that were accepted for it; None: they are accepted now
+        name : of a run beside the folder that the map is written as, too; empty: none
+        """
+        self._recorded(RunRecorder.wait_synced)  # what the disk refused before is told, and is no reason not to save
+        self.process(self.accept_save() if events is None else events)
+        folder = self._write(ended=False)
+        return f"{folder}, {self._save_as(Path(folder), name)}" if name else folder
+
+    def _save_as(self, folder: Path, name: str) -> Path:
+        """Write the map as a run beside the folder, which was saved already."""
+        if is_name_of_earlier(folder, name):
+            raise RunError(
+                f"{folder.name} is saved; {name}: earlier runs are called so, and are removed: choose another name"
+            )
+        out = folder.with_name(name)
+        try:
+            save_copy(self.slam, out)
+        except GraphSlamError as error:
+            raise RunError(f"{folder.name} is saved; {error}") from None
+        return out
+
+    def _write(self, *, ended: bool) -> str:
+        if self._recorder is None:
+            why = "recording was given up" if self._folder else "output.folder is empty"
+            raise GraphSlamError(f"{why}: nowhere to save")
+        summary = summarize(self.slam) | account(self.slam, self._counters()) | {"ended": ended}
+        folder = str(self._recorder.save(self.slam, summary))
+        self._is_saved, self._is_ended, self.recording_fails = True, ended, False
+        return folder
+
+    def reset(self) -> str:
+        """Save, keep that, and begin anew."""
+        said = self.finish() or ("recording was given up" if self.recording_fails else "nothing to save")
+        self.config = self.slam.config
+        self._begin()
+        return said
+
+    def load(self, name: str, T_map_base: Numbers | None = None) -> str:
+        """Save, keep that, and go on from an earlier run.
+
+        Parameters
+        ----------
+        T_map_base : where the robot is in its map; None: that is to be found out
+        """
+        return self._load(self.earlier(name), T_map_base)
+
+    def resume(self) -> str:
+        """Go on from the run that was cut off: in its map, and where the robot was if its odometry goes on."""
+        try:
+            return self._load(self.earlier(""), resumes=True)
+        except GraphSlamError:
+            if not self.config.output.load_at_start:
+                raise
+            return self.load(self.config.output.load)
+
+    def _load(self, run: Path, T_map_base: Numbers | None = None, *, resumes: bool = False) -> str:
+        self.loads = run.name
+        try:
+            return self._go_on_from(run, T_map_base, resumes=resumes)
+        finally:
+            self.loads = ""
+
+    def _go_on_from(self, run: Path, T_map_base: Numbers | None, *, resumes: bool) -> str:
+        loaded = run_config(run)
+        if loaded.world != self.config.world:
+            raise RunError(f"{run.name}: world.dimensions is {loaded.world.dimensions} there")
+        if run == self._folder:
+            self.finish()
+        losses: list[str] = []
+        start = map_of(run, losses)
+        self.finish()
+        self.config = self.slam.config
+        try:
+            self._begin(start, run)
+        except Exception:
+            self._begin(loaded=run)
+            raise
+        if resumes and (len(start.drives) <= 1 or self._is_sure):  # else nobody knew where it was
+            self._resumption = Resumption(self.slam, start.used_ns, start.source)
+        where = []
+        if T_map_base is not None:
+            self._place(T_map_base)
+            at = " ".join(f"{x:.6g}" for x in T_map_base[: self.config.space.dimensions])
+            where.append(f"the robot is taken to be at {at}")
+        self._recorded(RunRecorder.flush)
+        self._look(Update(), 0.0)
+        return ": ".join([run.name, f"{len(self.slam.keyframes)} keyframes", *where, *losses[:1]])
+
+    def _place(self, T_map_base: Numbers) -> None:
+        """Begin the sequence with where the robot is, as uncertain as a pose on ``initialpose`` without covariance."""
+        said, space = self.config.initialpose, self.config.space
+        sigmas = np.array(space.sigmas(said.sigma_m, said.sigma_rad))
+        pose = InitialPose(T_map_base, tuple(np.diag(sigmas**2).ravel().tolist()))
+        if (recorder := self._recorder) is not None:
+            recorder.accept(pose)  # before what waits for ``release``
+        self._process(pose)
+
+    def earlier(self, name: str) -> Path:
+        """The run of that name beside the folder; of an empty name, the newest earlier. Raises RunError: none."""
+        if self._folder is None:
+            raise GraphSlamError("output.folder is empty: nothing to load")
+        if not name:
+            earlier = earlier_runs(self._folder)
+            if not earlier:
+                raise RunError(f"no earlier run of {self._folder.name}")
+            return earlier[max(earlier)]
+        run = self._folder.parent / name
+        if run.is_symlink() or not is_run(run):  # a link may lead anywhere
+            raise RunError(f"{name}: not a run")
+        return run
+
+    def finish(self) -> str:
+        """Save what was not saved yet, and end the recording; returns the folder, or nothing."""
+        if self._recorder is None:
+            return ""
+        folder, recorder = "", self._recorder
+        if not self._is_saved or (self.slam.keyframes and not self._is_ended):
+            self._recorded(RunRecorder.wait_synced)
+            for event in (Control("end"), Control("optimize")) if not self._is_saved else ():
+                recorder.accept(event)
+                self._process(event)
+            folder = self._write(ended=True)
+        recorder.close()
+        return folder
+
+    def leave(self) -> tuple[int, int]:
+        """End the recording though measurements wait for the pipeline.
+
+        Returns how many: those in the journal, whose results the next start makes, or ``graph_slam recover``; and those
+        for a run that has not begun, which are lost. May be called while the worker is busy: of what that still does
+        nothing is recorded or published.
+        """
+        self._is_left = True
+        recorder = self._recorder
+        lost = sum(map(len, self._held))
+        if recorder is None:
+            return 0, lost
+        try:
+            return recorder.leave(self.slam.processed, len(self.slam.keyframes), self._counters()), lost
+        except OSError as error:
+            recorder.abandon()
+            raise RunError(f"{recorder.folder}: {error.strerror}") from None
+
+    def _counters(self) -> Counters:
+        """Of the run: those of the border since it began, and of the pipeline."""
+        counters = self._border.since(self._refused_before)
+        counters.update(self.slam.counters)
+        return counters
+
+    def abandon(self) -> None:
+        """End the recording as it is, where it was not finished."""
+        self._is_left = True
+        if self._recorder is None:
+            return
+        try:
+            self._recorder.close()
+        except OSError:  # told when it was to be saved
+            self._recorder.abandon()
+
+
+_MOST_UNWRITTEN = 256 * 2**20  # bytes of the journal: hours of a robot's measurements
+_CONFIRMED = 0.2  # of the noise of the motion over a jump: less, and something was recognised

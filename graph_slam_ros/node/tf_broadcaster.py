@@ -1,0 +1,88 @@
+"""Broadcasts map -> odom, and notices whether somebody else does."""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from tf2_msgs.msg import TFMessage
+
+from graph_slam_ros.messages import to_msg
+from graph_slam_ros.node.map_to_odom import MapToOdom
+from graph_slam_ros.node.session import Estimate
+from graph_slam_ros.node.subscriptions import full_name
+from graph_slam_ros.slam import Config, Odometry
+
+_REMEMBERED = 500  # messages of ours that may still come back to us
+_OTHERS_S = 5.0  # after its last message somebody else is gone
+
+
+class Broadcaster:
+    """The publisher of map -> odom while the node is active.
+
+    Parameters
+    ----------
+    guarded : makes a callback that raises nothing
+    look : gives the configuration, the last estimate and the newest odometry
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        config: Config,
+        guarded: Callable[[Callable[..., None]], Callable[..., None]],
+        look: Callable[[], tuple[Config, Estimate | None, Odometry | None]],
+    ) -> None:
+        self._node, self._look = node, look
+        self._policy = MapToOdom(config)
+        self._publisher = node.create_publisher(TFMessage, "/tf", 100)
+        self._is_closed = False
+        self._ours: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self._others_s = -1e9
+        self._timer = node.create_timer(config.tf.transform_publish_period, guarded(self._tick))
+
+    def close(self) -> None:
+        """Take timer and publisher away; a tick that is on its way already finds it so."""
+        self._is_closed = True
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_publisher(self._publisher)
+
+    def forget_time(self) -> None:
+        """Stamps begin anew."""
+        self._policy.forget_time()
+
+    def heard(self, cdr: bytes) -> None:
+        """A transform from map, ours or another's."""
+        if cdr[4:] not in self._ours:
+            self._others_s = time.monotonic()
+
+    @property
+    def behind_s(self) -> float:
+        """How much earlier than the last the transform would be dated now: until then it is not sent."""
+        return self._policy.behind_s
+
+    @property
+    def has_rival(self) -> bool:
+        """Whether somebody else has broadcast it lately."""
+        return time.monotonic() - self._others_s < _OTHERS_S
+
+    def candidates(self) -> tuple[str, ...]:
+        """Who else publishes on /tf: one of them it must be."""
+        own = self._node.get_fully_qualified_name()
+        names = set(map(full_name, self._node.get_publishers_info_by_topic("/tf")))
+        return tuple(sorted(names - {own}))
+
+    def _tick(self) -> None:
+        config, estimate, newest = self._look()
+        if self._is_closed or estimate is None or newest is None or not config.tf.publish_tf or not estimate.is_located:
+            return
+        if config.tf.second_authority == "yield" and self.has_rival:
+            return
+        now_ns = self._node.get_clock().now().nanoseconds
+        told = self._policy.next(config.tf, now_ns, newest.stamp_ns, newest.T_odom_base, estimate.T_map_odom)
+        if told is None:
+            return
+        stamp_ns, T_map_odom = told
+        cdr = to_msg.transform(stamp_ns, config.frames.map, config.frames.odom, T_map_odom)
+        self._ours.append(cdr[4:])
+        self._publisher.publish(cdr)

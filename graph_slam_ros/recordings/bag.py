@@ -1,0 +1,380 @@
+"""Bags: one iterator of CDR messages over mcap, sqlite3 and ROS 1 recordings, and a writer of mcap.
+
+Whole and damaged files are read the same way: what is whole is read, what is lost is told.
+"""
+
+import heapq
+import re
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol
+
+from mcap.records import Channel, Message, Schema
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import get_types_from_msg
+
+from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.formats.durable import AppendedFile
+from graph_slam_ros.formats.files import opened
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.recordings import mcap_records, ros1_records, sqlite_records
+from graph_slam_ros.recordings.decompression import ZSTD_MAGIC, zstd_message
+
+_SUFFIXES = (".mcap", ".db3", ".bag", ".bag.active", ".mcap.zstd", ".db3.zstd")
+_PACKED = {b"\x1f\x8b": "gzip", ZSTD_MAGIC: "zstd", b"BZh": "bzip2", b"\x04\x22\x4d\x18": "lz4"}
+_OF_ROS1 = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")  # words of its language
+MOST_TEXT = 2**16
+"""Of a recorded definition; rosbags' parser takes a minute for two megabytes of blank lines."""
+_WINDOW_BYTES, _OVERHEAD = 64 * 2**20, 256
+
+
+class BagError(GraphSlamError):
+    """A recording that cannot be read, or does not hold what was asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A recorded topic.
+
+    Attributes
+    ----------
+    definition : the message definition recorded with it (ROS .msg text), or empty
+    encoding : of its messages
+    """
+
+    name: str
+    type: str
+    count: int
+    definition: str = ""
+    encoding: str = "cdr"
+
+
+@dataclass(frozen=True, slots=True)
+class BagMessage:
+    """One recorded message: CDR bytes and the time it was received."""
+
+    topic: str
+    log_ns: int
+    cdr: bytes
+
+
+class Bag:
+    """A recording, opened: one file, or the parts of one.
+
+    Attributes
+    ----------
+    topics : by name
+    losses, warnings : what could not be read, and what to beware of, as far as it has been read
+    """
+
+    def __init__(self, parts: Sequence["_Part"]) -> None:
+        self._parts = sorted(parts, key=lambda part: part.first_ns)
+        self.topics: dict[str, Topic] = {}
+        self.losses: list[str] = []
+        self.warnings: list[str] = []
+        for part in parts:
+            for topic in part.topics:
+                self._add(part.file, topic)
+
+    def _add(self, file: Path, topic: Topic) -> None:
+        old = self.topics.get(topic.name)
+        if old is not None and old.type != topic.type:
+            raise BagError(f"{file.name}: topic {topic.name} is {topic.type} here, {old.type} elsewhere in the bag")
+        self.topics[topic.name] = replace(topic, count=topic.count + (old.count if old else 0))
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        """Messages of the named topics by the time they were received; those of one time in order of the file.
+
+        Messages are put in order within a window: one that was written later than 64 MiB of others is not.
+        """
+        return _in_order(self._merged(topics))
+
+    def _merged(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        """Of several parts, split by time or by topic; one is opened when its time has come, for there may be many."""
+        waiting = deque(enumerate(self._parts))
+        heads: list[tuple[int, int, BagMessage, Iterator[BagMessage]]] = []
+        while waiting or heads:
+            while waiting and (not heads or waiting[0][1].first_ns <= heads[0][0]):
+                number, part = waiting.popleft()
+                _push(heads, number, self._of(part, topics))
+            if heads:
+                _, number, message, rest = heapq.heappop(heads)
+                yield message
+                _push(heads, number, rest)
+
+    def _of(self, part: "_Part", topics: Collection[str]) -> Iterator[BagMessage]:
+        losses, warnings = list[str](), list[str]()
+        for message in part.messages(topics, losses, warnings):
+            try:
+                yield _plain(message)
+            except FormatError as error:
+                losses.append(f"{part.file.name}: a message of {message.topic} was passed over ({error})")
+        for told, new in ((self.losses, losses), (self.warnings, warnings)):
+            told += [line for line in dict.fromkeys(new) if line not in told]  # a file may be read more than once
+
+
+def open_bag(path: Path | str) -> Bag:
+    """Open a file (mcap, db3, ROS 1 bag) or a folder that holds them, split or not.
+
+    Raises
+    ------
+    BagError
+        No such file, not a recording, or nothing whole in it.
+    """
+    path = Path(path)
+    try:
+        return Bag([_part(file) for file in _files(path)])
+    except OSError as error:
+        raise BagError(f"{path}: {error.strerror}") from None
+    except FormatError as error:
+        raise BagError(str(error)) from None
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path]
+    if not path.exists():
+        raise BagError(f"{path}: no such file or folder")
+    if not path.is_dir():
+        raise BagError(f"{path}: neither a file nor a folder")
+    for suffix in _SUFFIXES:
+        found = sorted((file for file in path.glob(f"*{suffix}") if file.is_file()), key=_natural)
+        if found:
+            return found
+    raise BagError(f"{path}: no recording (.mcap, .db3, .bag) in this folder")
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """bag_2 before bag_10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def _part(file: Path) -> "_Part":
+    """By how the file begins: whatever its name says."""
+    with opened(file, follow=True) as stream:
+        begins = stream.read(16)
+    if not begins:
+        raise BagError(f"{file}: the file is empty")
+    for magic, kind in _KINDS.items():
+        if begins.startswith(magic):
+            return kind(file)
+    for magic, codec in _PACKED.items():
+        if begins.startswith(magic):
+            raise BagError(f"{file}: the whole file is compressed with {codec}: unpack it first")
+    raise BagError(f"{file}: not a readable recording: it begins as neither mcap, sqlite3 nor a ROS 1 bag")
+
+
+class _Part(Protocol):
+    """One file of a recording.
+
+    Attributes
+    ----------
+    first_ns : time of its first message, or 0 where that is not known
+    """
+
+    file: Path
+    topics: list[Topic]
+    first_ns: int
+
+    def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
+        """Messages in order of the file."""
+
+
+class _McapPart:
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self._contents = found = mcap_records.contents(file)
+        self.first_ns = found.first_ns
+        self.topics = [
+            self._topic(channel, found.schemas.get(channel.schema_id), found.counts.get(channel.id, 0))
+            for channel in found.channels.values()
+        ]
+        if not self.topics:
+            lost: list[str] = []
+            for _ in mcap_records.records(file, lost):
+                pass
+            raise BagError(f"{file}: no topic in it{' that is whole; ' + lost[0] if lost else ''}")
+
+    def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
+        # a channel's own record may sit in a damaged chunk: the summary knows it, too
+        names = {channel.id: channel.topic for channel in self._contents.channels.values()}
+        for record in mcap_records.records(self.file, losses, warnings):
+            if isinstance(record, Message):
+                name = names.get(record.channel_id, "")
+                if name in topics:
+                    yield BagMessage(name, record.log_time, record.data)
+            elif isinstance(record, Channel):
+                names[record.id] = record.topic
+
+    def _topic(self, channel: Channel, schema: Schema | None, count: int) -> Topic:
+        type_name = schema.name if schema else ""
+        if type_name.count("/") == 1:
+            type_name = type_name.replace("/", "/msg/")
+        definition = schema.data.decode(errors="replace") if schema and schema.encoding == "ros2msg" else ""
+        return Topic(channel.topic, type_name, count, definition, channel.message_encoding)
+
+
+class _SqlitePart:
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self._contents = found = sqlite_records.contents(file)
+        self._damage: str | None = None  # not looked for yet: it takes as long as reading
+        self.first_ns = found.first_ns
+        self.topics = [
+            Topic(name, type_name, found.counts.get(number, 0), found.definitions.get(type_name, ""), encoding)
+            for number, (name, type_name, encoding) in found.topics.items()
+        ]
+
+    def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
+        names = {number: name for number, (name, _, _) in self._contents.topics.items() if name in topics}
+        for number, log_ns, cdr in sqlite_records.messages(self.file, list(names), losses):
+            yield BagMessage(names[number], log_ns, cdr)
+        if self._damage is None:
+            self._damage = sqlite_records.damage(self.file)
+        if self._damage and not losses:
+            losses.append(f"{self.file.name}: damaged ({self._damage})")
+
+
+class _Ros1Part:
+    """A ROS 1 bag; messages are turned into CDR where their type is ours."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        found = ros1_records.contents(file)
+        if not found.connections:
+            raise BagError(f"{file}: no topic in it{' that is whole; ' + found.lost if found.lost else ''}")
+        self.first_ns = found.first_ns
+        self._is_ours: dict[str, bool] = {}
+        by_name: dict[str, Topic] = {}
+        for number, connection in found.connections.items():
+            count = found.counts.get(number, 0) + (
+                by_name[connection.topic].count if connection.topic in by_name else 0
+            )
+            type_name = connection.type.replace("/", "/msg/")
+            if type_name not in self._is_ours:
+                self._is_ours[type_name] = _is_ours(type_name, connection.definition)
+            encoding = "cdr" if self._is_ours[type_name] else "ros1"
+            by_name[connection.topic] = Topic(connection.topic, type_name, count, encoding=encoding)
+        self.topics = list(by_name.values())
+
+    def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
+        types = {topic.name: topic.type for topic in self.topics if topic.name in topics}
+        damaged = 0
+        for message in ros1_records.messages(self.file, losses):
+            type_name = types.get(message.topic)
+            if type_name is None:
+                continue
+            cdr = message.data
+            if self._is_ours[type_name]:
+                try:
+                    cdr = bytes(typestore().ros1_to_cdr(cdr, type_name))
+                except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors
+                    damaged += 1
+                    continue
+            yield BagMessage(message.topic, message.log_ns, cdr)
+        if damaged:
+            losses.append(f"{self.file.name}: {damaged} of its messages are not what their types say")
+
+
+def _is_ours(type_name: str, definition: str) -> bool:
+    """Whether a recorded ROS 1 type, and all it is made of, has our fields (a header's ``seq`` aside)."""
+    if len(definition) > MOST_TEXT:
+        return False
+    try:
+        recorded = get_types_from_msg(definition, type_name)
+    except Exception:  # rosbags' parser raises errors of its own grammar library
+        return False
+    ours = typestore().fielddefs
+
+    def same(name: str) -> bool:
+        if name in _OF_ROS1:
+            return True
+        if name not in recorded or name not in ours:
+            return False
+        theirs = [field for field in recorded[name][1] if field[0] != "seq"]
+        return theirs == list(ours[name][1]) and all(map(same, set(re.findall(r"\w+/msg/\w+", repr(theirs)))))
+
+    return same(type_name)
+
+
+# By how a file begins. rosbags reads whole files alone, and of a damaged one nothing.
+_KINDS: dict[bytes, Callable[[Path], _Part]] = {
+    mcap_records.MAGIC: _McapPart,
+    sqlite_records.MAGIC: _SqlitePart,
+    ros1_records.MAGIC: _Ros1Part,
+}
+
+
+def _push(heads: list[Any], number: int, messages: Iterator[BagMessage]) -> None:
+    message = next(messages, None)
+    if message is not None:
+        heapq.heappush(heads, (message.log_ns, number, message, messages))
+
+
+def _in_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
+    heap: list[tuple[int, int, BagMessage]] = []
+    held = 0
+    for number, message in enumerate(messages):
+        heapq.heappush(heap, (message.log_ns, number, message))
+        held += len(message.cdr) + _OVERHEAD
+        while held > _WINDOW_BYTES:
+            first = heapq.heappop(heap)[2]
+            held -= len(first.cdr) + _OVERHEAD
+            yield first
+    while heap:
+        yield heapq.heappop(heap)[2]
+
+
+def _plain(message: BagMessage) -> BagMessage:
+    """Without the compression of rosbag2's own; CDR never begins so."""
+    return replace(message, cdr=zstd_message(message.cdr)) if message.cdr.startswith(ZSTD_MAGIC) else message
+
+
+class BagWriter:
+    """Writes CDR messages into one mcap file that Foxglove and ``ros2 bag`` open; every chunk carries its CRC.
+
+    What could not be written, since the disk is full, waits: the next ``write`` tries again.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self._file = AppendedFile(Path(path))
+        self._writer = Writer(self._file, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._writer.start(profile="ros2", library=mcap_records.LIBRARY)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._sequence: dict[str, int] = {}
+
+    def write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
+        """Append one message, received at ``stamp_ns``. Raises OSError, and keeps it."""
+        if topic not in self._channels:
+            if type_name not in self._schemas:
+                text, _ = typestore().generate_msgdef(type_name, ros_version=2)
+                self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", text.encode())
+            self._channels[topic] = self._writer.register_channel(
+                topic, "cdr", self._schemas[type_name], {"offered_qos_profiles": ""}
+            )
+        sequence = self._sequence[topic] = self._sequence.get(topic, -1) + 1
+        self._writer.add_message(self._channels[topic], stamp_ns, cdr, stamp_ns, sequence)
+        self._file.flush()
+
+    def end(self) -> AppendedFile:
+        """Append the index; returns the file, which is to be closed."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        return self._file
+
+    def abandon(self) -> None:
+        """Close the file as it is on the disk, without an index: what waits is lost."""
+        self._file.abandon()
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        self.end().close()
+
+    def __enter__(self) -> "BagWriter":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()

@@ -1,0 +1,213 @@
+"""One look at a whole recording: of each topic its span, its frames, and what decides how it can be used."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any
+
+from graph_slam_ros.lie import so3
+from graph_slam_ros.messages.from_msg import TRANSFORMS
+from graph_slam_ros.messages.inputs import CONVERTERS
+from graph_slam_ros.recordings.bag import Bag, BagError, Topic
+from graph_slam_ros.recordings.definitions import recorded_decoder
+
+_LOOKED_AT = 2000  # messages of each topic but odometry
+_MOST_NAMES, _LAGS = 1000, 100
+_LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # as for what is counted as out of the plane
+
+
+@dataclass(slots=True)
+class Contents:
+    """What is known of one topic.
+
+    Attributes
+    ----------
+    trouble : why its messages cannot be read; empty where they can
+    first_ns, last_ns : of its messages, by the time they were received
+    lag_s : receive time less header stamp of the first messages
+    is_stamped : whether any header has a stamp
+    frame, child : of the first header that names them
+    items, without_id : what its messages hold (detections, points, transforms), and how many of these have no identity
+    ids, classes : identities and class ids that occur
+    is_repeated : whether one message has a class id twice
+    has_noise : whether the first message tells its covariance
+    usable : messages that can be used at all: with a fix, with an orientation
+    path_m, off_plane : of odometry: length of the path, and messages above, below or tilted against the first
+    """
+
+    topic: Topic
+    trouble: str = ""
+    first_ns: int = 0
+    last_ns: int = 0
+    read: int = 0
+    lag_s: list[float] = field(default_factory=list)
+    is_stamped: bool = False
+    frame: str = ""
+    child: str = ""
+    items: int = 0
+    without_id: int = 0
+    ids: set[str] = field(default_factory=set)
+    classes: set[str] = field(default_factory=set)
+    fields: set[str] = field(default_factory=set)
+    is_repeated: bool = False
+    has_noise: bool = False
+    usable: int = 0
+    path_m: float = 0.0
+    off_plane: int = 0
+    last_at: tuple[float, float, float] | None = None
+    height_m: float = 0.0
+
+
+@dataclass(slots=True)
+class Recording:
+    """What a recording holds.
+
+    Attributes
+    ----------
+    topics : by name
+    moving, fixed : frames that move in their parent, and that do not: child to parent
+    """
+
+    topics: dict[str, Contents]
+    moving: dict[str, str] = field(default_factory=dict)
+    fixed: dict[str, str] = field(default_factory=dict)
+
+    def is_linked(self, frame: str, base: str) -> bool:
+        """Whether TF tells where a frame is on the robot."""
+        links = self.fixed | {child: parent for child, parent in self.moving.items() if child != base}
+        return _root(links, frame) == _root(links, base)
+
+
+def _root(links: dict[str, str], frame: str) -> str:
+    seen = {frame}
+    while frame in links and links[frame] not in seen:
+        frame = links[frame]
+        seen.add(frame)
+    return frame
+
+
+def look(bag: Bag) -> Recording:
+    """Read a recording once."""
+    out = Recording({name: Contents(topic) for name, topic in bag.topics.items()})
+    decoders = dict(_decoders(out))
+    for message in bag.messages(set(bag.topics)):
+        one = out.topics[message.topic]
+        one.first_ns = one.first_ns or message.log_ns
+        one.last_ns = message.log_ns
+        is_odometry = one.topic.type == "nav_msgs/msg/Odometry"
+        if message.topic not in decoders or (one.read >= _LOOKED_AT and not is_odometry):
+            continue
+        one.read += 1
+        try:
+            _add(out, one, decoders[message.topic](message.cdr), message.log_ns)
+        except Exception:  # damaged bytes: replay counts them
+            one.trouble = one.trouble if one.frame or one.items else "its messages cannot be decoded"
+    return out
+
+
+def _decoders(recording: Recording) -> Iterator[tuple[str, Callable[[bytes], Any]]]:
+    for name, one in recording.topics.items():
+        if one.topic.type in CONVERTERS:
+            try:
+                yield name, recorded_decoder(one.topic)
+            except BagError as error:
+                one.trouble = str(error)
+
+
+def _add(recording: Recording, one: Contents, m: Any, log_ns: int) -> None:
+    if one.topic.type == TRANSFORMS:
+        links = recording.fixed if one.topic.name.endswith("tf_static") else recording.moving
+        links.update((_plain(t.child_frame_id), _plain(t.header.frame_id)) for t in m.transforms)
+        one.items += len(m.transforms)
+        return
+    header = getattr(m, "header", None)
+    if header is not None:
+        one.frame = one.frame or _plain(header.frame_id)
+        one.child = one.child or _plain(getattr(m, "child_frame_id", ""))
+        stamp_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
+        one.is_stamped |= stamp_ns != 0
+        if len(one.lag_s) < _LAGS:
+            one.lag_s.append((log_ns - stamp_ns) * 1e-9)
+    _OF_TYPE.get(one.topic.type, _any)(one, m)
+
+
+def _plain(frame: str) -> str:
+    return frame.removeprefix("/")
+
+
+# -- by type -----------------------------------------------------------------------------------------------------------
+
+
+def _any(one: Contents, m: Any) -> None:
+    """Of packages that need not be there: how many landmarks it holds."""
+    for name in ("landmarks", "markers", "sensed_data", "detections", "poses"):
+        if hasattr(m, name):
+            one.items += len(getattr(m, name))
+            return
+
+
+def _odometry(one: Contents, m: Any) -> None:
+    p, q = m.pose.pose.position, m.pose.pose.orientation
+    at = float(p.x), float(p.y), float(p.z)
+    if one.last_at is None:
+        one.height_m, one.has_noise = at[2], bool(m.twist.covariance.any())
+    else:
+        step = math.dist(at, one.last_at)
+        one.path_m += step if math.isfinite(step) else 0.0
+    one.last_at = at
+    up = so3.act((q.x, q.y, q.z, q.w), (0.0, 0.0, 1.0))[2]
+    one.off_plane += abs(at[2] - one.height_m) > _LEVEL_M or up < _UPRIGHT
+
+
+def _detections(one: Contents, m: Any) -> None:
+    classes = [d.results[0].hypothesis.class_id for d in m.detections if len(d.results)]
+    one.is_repeated |= len(set(classes)) < len(classes)
+    for d in m.detections:
+        one.items += 1
+        one.without_id += not d.id
+        one.frame = one.frame or _plain(d.header.frame_id)
+        if d.id and len(one.ids) < _MOST_NAMES:
+            one.ids.add(d.id)
+    one.classes.update(filter(None, islice(classes, _MOST_NAMES - len(one.classes))))
+
+
+def _cloud(one: Contents, m: Any) -> None:
+    one.fields = one.fields or {f.name for f in m.fields}
+    one.items += int(m.width * m.height)
+
+
+def _fix(one: Contents, m: Any) -> None:
+    has_fix = m.status.status >= 0 and math.isfinite(m.latitude) and (m.latitude, m.longitude) != (0.0, 0.0)
+    if has_fix and not one.usable:
+        one.has_noise = m.position_covariance_type != 0 and bool(m.position_covariance[:5:4].all())
+    one.usable += has_fix
+
+
+def _imu(one: Contents, m: Any) -> None:
+    q = m.orientation
+    is_known = m.orientation_covariance[0] != -1.0 and math.hypot(q.x, q.y, q.z, q.w) > 0.5
+    if is_known and not one.usable:
+        one.has_noise = bool(m.orientation_covariance[8] > 0.0)
+    one.usable += is_known
+
+
+def _pose(one: Contents, m: Any) -> None:
+    one.has_noise |= hasattr(m.pose, "covariance") and bool(m.pose.covariance[:8:7].all())
+
+
+def _apriltags(one: Contents, m: Any) -> None:
+    one.items += len(m.detections)
+    one.ids.update(f"{d.family}:{d.id}" for d in m.detections if len(one.ids) < _MOST_NAMES)
+
+
+_OF_TYPE: dict[str, Callable[[Contents, Any], None]] = {
+    "nav_msgs/msg/Odometry": _odometry,
+    "vision_msgs/msg/Detection3DArray": _detections,
+    "sensor_msgs/msg/PointCloud2": _cloud,
+    "sensor_msgs/msg/NavSatFix": _fix,
+    "sensor_msgs/msg/Imu": _imu,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose,
+    "geometry_msgs/msg/PoseStamped": _pose,
+    "apriltag_msgs/msg/AprilTagDetectionArray": _apriltags,
+}

@@ -1,0 +1,149 @@
+"""Recorded message definitions: a bag is decoded by what it says of itself, if that has what we need."""
+
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from graph_slam_ros.messages.from_msg import Decoder, decoder
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.recordings.bag import MOST_TEXT, BagError, Topic
+
+_MOST_VALUES = 10_000
+
+_NEEDED: dict[str, tuple[str, ...]] = {
+    "nav_msgs/msg/Odometry": ("header", "child_frame_id", "pose", "twist"),
+    "vision_msgs/msg/Detection3DArray": ("header", "detections"),
+    "vision_msgs/msg/Detection3D": ("header", "results", "bbox", "id"),
+    "vision_msgs/msg/ObjectHypothesisWithPose": ("hypothesis", "pose"),
+    "vision_msgs/msg/ObjectHypothesis": ("class_id",),
+    "vision_msgs/msg/BoundingBox3D": ("center",),
+    "tf2_msgs/msg/TFMessage": ("transforms",),
+    "std_msgs/msg/Header": ("stamp", "frame_id"),
+    "builtin_interfaces/msg/Time": ("sec", "nanosec"),
+    "geometry_msgs/msg/PoseWithCovariance": ("pose", "covariance"),
+    "geometry_msgs/msg/TwistWithCovariance": ("covariance",),
+    "geometry_msgs/msg/Pose": ("position", "orientation"),
+    "geometry_msgs/msg/Point": ("x", "y", "z"),
+    "geometry_msgs/msg/Quaternion": ("x", "y", "z", "w"),
+    "geometry_msgs/msg/TransformStamped": ("header", "child_frame_id", "transform"),
+    "geometry_msgs/msg/Transform": ("translation", "rotation"),
+    "geometry_msgs/msg/Vector3": ("x", "y", "z"),
+    "geometry_msgs/msg/PoseStamped": ("header", "pose"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("header", "pose"),
+    "sensor_msgs/msg/NavSatFix": (
+        "header",
+        "status",
+        "latitude",
+        "longitude",
+        "altitude",
+        "position_covariance",
+        "position_covariance_type",
+    ),
+    "sensor_msgs/msg/NavSatStatus": ("status",),
+    "sensor_msgs/msg/Imu": ("header", "orientation", "orientation_covariance"),
+    "sensor_msgs/msg/PointCloud2": (
+        "header",
+        "height",
+        "width",
+        "fields",
+        "is_bigendian",
+        "point_step",
+        "row_step",
+        "data",
+    ),
+    "sensor_msgs/msg/PointField": ("name", "offset", "datatype"),
+    "visualization_msgs/msg/MarkerArray": ("markers",),
+    "visualization_msgs/msg/Marker": ("header", "ns", "id", "action", "pose"),
+    "apriltag_msgs/msg/AprilTagDetectionArray": ("header", "detections"),
+    "apriltag_msgs/msg/AprilTagDetection": ("family", "id", "hamming", "decision_margin"),
+    "aruco_msgs/msg/MarkerArray": ("header", "markers"),
+    "aruco_msgs/msg/Marker": ("header", "id", "pose"),
+    "ros2_aruco_interfaces/msg/ArucoMarkers": ("header", "marker_ids", "poses"),
+    "aruco_opencv_msgs/msg/ArucoDetection": ("header", "markers", "boards"),
+    "aruco_opencv_msgs/msg/MarkerPose": ("marker_id", "pose"),
+    "aruco_opencv_msgs/msg/BoardPose": ("board_name", "pose"),
+    "rtabmap_msgs/msg/LandmarkDetections": ("header", "landmarks"),
+    "rtabmap_msgs/msg/LandmarkDetection": ("header", "id", "pose"),
+    "cartographer_ros_msgs/msg/LandmarkList": ("header", "landmarks"),
+    "cartographer_ros_msgs/msg/LandmarkEntry": (
+        "id",
+        "tracking_from_landmark_transform",
+        "translation_weight",
+        "rotation_weight",
+    ),
+    "mrpt_msgs/msg/ObservationRangeBearing": (
+        "header",
+        "sensor_pose_on_robot",
+        "sensor_std_range",
+        "sensor_std_yaw",
+        "sensor_std_pitch",
+        "sensed_data",
+    ),
+    "mrpt_msgs/msg/SingleRangeBearingObservation": ("range", "yaw", "pitch", "id"),
+    "mrpt_msgs/msg/ObservationRangeBeacon": ("header", "sensor_pose_on_robot", "sensor_std_range", "sensed_data"),
+    "mrpt_msgs/msg/SingleRangeBeaconObservation": ("range", "id"),
+}
+"""What the converters read of each type. Those of packages that we have no layout of are compared by name only."""
+
+
+def recorded_decoder(topic: Topic) -> Decoder:
+    """From CDR bytes of a topic to message objects, by the definition recorded with it.
+
+    Raises
+    ------
+    BagError
+        Another encoding than CDR, a definition that cannot be parsed, or one that lacks a field we read.
+    """
+    if topic.encoding != "cdr":
+        raise BagError(f"topic {topic.name}: messages are encoded as {topic.encoding!r}, not cdr")
+    if not topic.definition:
+        if topic.type not in typestore().types:
+            raise BagError(f"topic {topic.name}: no definition of {topic.type} in the recording")
+        return decoder(topic.type)
+    if len(topic.definition) > MOST_TEXT:
+        raise BagError(f"topic {topic.name}: the recorded definition of {topic.type} is longer than {MOST_TEXT} bytes")
+    try:
+        recorded = get_types_from_msg(topic.definition, topic.type)
+    except Exception as error:  # rosbags' parser raises errors of its own grammar library
+        raise BagError(f"topic {topic.name}: the recorded definition of {topic.type} is not valid") from error
+    ours = typestore().fielddefs
+    if all(ours.get(name) == definition for name, definition in recorded.items()):
+        return decoder(topic.type)
+    for name, (_, fields) in recorded.items():
+        there = dict(fields)
+        known = dict(ours[name][1]) if name in ours else there
+        for field in _NEEDED.get(name, ()):
+            if field not in there:
+                raise BagError(f"topic {topic.name}: {name} of this recording has no field {field!r}")
+            if there[field] != known[field]:
+                raise BagError(f"topic {topic.name}: field {field!r} of {name} has another type in this recording")
+    if not _length({**ours, **recorded}, topic.type, {}) <= _MOST_VALUES:
+        raise BagError(f"topic {topic.name}: the recorded {topic.type} has more than {_MOST_VALUES} values")
+    store = _store(recorded)
+    return lambda cdr: store.deserialize_cdr(cdr, topic.type)
+
+
+def _length(types: Any, name: str, known: dict[str, float]) -> float:
+    """How many values a message has at least, each sequence with one: rosbags' decoder is as long as that."""
+    known[name] = float("inf")  # of a type that holds itself, there is no end
+    total = 0.0
+    for _, (kind, of) in types[name][1]:
+        count = 1
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            (inner, of), count = of[0], of[1] if kind == Nodetype.ARRAY else 1
+            kind, count = inner, count if inner == Nodetype.NAME else 1
+        if kind == Nodetype.NAME and of in types:
+            total += count * (known[of] if of in known else _length(types, of, known))
+        else:
+            total += 1
+    known[name] = total
+    return total
+
+
+def _store(recorded: Any) -> Typestore:
+    store = get_typestore(Stores.EMPTY)
+    basic = {name: fields for name, fields in typestore().fielddefs.items() if name not in recorded}
+    store.register({**basic, **recorded})
+    return store

@@ -1,0 +1,287 @@
+"""The records of an mcap file in order: one way to read whole, damaged and truncated files.
+
+Records are parsed by the library. Walking from one to the next is ours: the library's readers end at the first damage,
+believe every length, and decompress whatever comes of it.
+"""
+
+import io
+import os
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema
+from mcap.stream_reader import MAGIC_SIZE
+from mcap.summary import Summary
+from mcap.writer import Writer
+
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.files import opened
+from graph_slam_ros.recordings.decompression import MOST_BYTES, decompressed
+
+MAGIC = b"\x89MCAP0\r\n"
+LIBRARY = "graph_slam_ros"
+"""What the head of our own files names as the program that wrote them."""
+_HEAD = struct.Struct("<BQ")  # opcode and length of a record
+_READ: dict[Opcode, Any] = {
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.MESSAGE: Message,
+    Opcode.CHUNK: Chunk,
+    Opcode.DATA_END: DataEnd,
+}
+_MOST_PADDING = 64  # a later version may add fields; after a damaged length there is more
+_BLOCK, _FIRST_BLOCK = 2**20, 2**12
+# A chunk's head: opcode, length, two times, size, checksum, codec; then the length of its data.
+_CHUNK = re.compile(rb"\x06(?=(.{8}).{28}(\0{4}|\x04\0{3}zstd|\x03\0{3}lz4)(.{8}))", re.DOTALL)
+_CHUNK_HEAD = 57
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What a file holds: schemas and channels by id, messages by channel id, and the time of the first message."""
+
+    schemas: dict[int, Schema]
+    channels: dict[int, Channel]
+    counts: dict[int, int]
+    first_ns: int = 0
+
+
+class _Stream(io.BufferedReader):
+    """A file that is never asked for more than there is, up to ``end``: a length in a damaged file may be 2^60."""
+
+    def __init__(self, path: Path, follow: bool = True) -> None:
+        super().__init__(opened(path, follow=follow))
+        self.size = self.end = os.fstat(self.fileno()).st_size
+
+    def go(self, at: int, end: int | None = None) -> None:
+        self.end = self.size if end is None else end
+        self.seek(at)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = self.end - self.tell()
+        if size is not None and size > left:
+            raise EndOfFile()
+        return super().read(left if size is None or size < 0 else size)
+
+
+def begin(profile: str = "", library: str = LIBRARY) -> bytes:
+    """How a file of ours begins."""
+    head = io.BytesIO()
+    Writer(head, use_chunking=False).start(profile, library)
+    return head.getvalue()
+
+
+def contents(path: Path) -> Contents:
+    """From the summary, or by reading everything where there is no whole one."""
+    try:
+        with _Stream(path) as stream:
+            summary = _summary(stream)
+    except Exception:  # of a damaged file the library raises almost anything
+        summary = None
+    if summary is not None and summary.statistics is not None and summary.channels:
+        told = summary.statistics
+        return Contents(summary.schemas, summary.channels, told.channel_message_counts, told.message_start_time)
+    schemas, channels, counts, first_ns = dict[int, Schema](), dict[int, Channel](), dict[int, int](), 2**64
+    for record in records(path, []):
+        if isinstance(record, Message):
+            counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
+            first_ns = min(first_ns, record.log_time)
+        elif isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+    return Contents(schemas, channels, counts, first_ns)
+
+
+def records(
+    path: Path, losses: list[str], warnings: list[str] | None = None, *, follow: bool = True
+) -> Iterator[McapRecord]:
+    """Schemas, channels and messages in order of the file.
+
+    What is damaged is passed over up to the next chunk; a cut tail ends it. Each adds a line to ``losses``; one in
+    ``warnings`` says where there is damage, and no checksum that would tell of more. ``follow``: the file may be a
+    symbolic link.
+    """
+    known = len(losses)
+    read, unchecked, loose = 0, False, False
+    with _Stream(path, follow) as stream:
+        at = MAGIC_SIZE
+        while True:
+            try:
+                record, after = _record(stream, at)
+            except Exception as error:  # see contents
+                next_chunk = _next_chunk(stream, at + 1)
+                losses.append(f"{path.name}: {_lost(error, read, at, next_chunk, stream.size)}")
+                if next_chunk is None:
+                    break
+                at = next_chunk
+                continue
+            if isinstance(record, Chunk):
+                unchecked |= not record.uncompressed_crc
+                try:
+                    for inner in _inside(record):
+                        read += isinstance(inner, Message)
+                        yield inner
+                except Exception as error:  # see contents
+                    losses.append(
+                        f"{path.name}: a damaged chunk of {after - at} bytes was passed over ({_what(error)})"
+                    )
+            elif isinstance(record, DataEnd):
+                if loose and record.data_section_crc not in (0, _checksum(stream, at)):
+                    losses.append(f"{path.name}: damaged: its data do not agree with their checksum")
+                unchecked |= loose and not record.data_section_crc
+                if not _ends_whole(stream):
+                    losses.append(f"{path.name}: cut off after {read} messages, in the summary behind them")
+                break
+            elif record is not None:
+                loose |= isinstance(record, Message)
+                read += isinstance(record, Message)
+                yield record
+            at = after
+        told = _told(stream)
+        if told is not None and told != read:  # a record whose kind is damaged is passed over in silence
+            what = f"{told - read} of its messages could not be read"
+            if read > told:
+                what = f"{read - told} messages too many"
+            losses.append(f"{path.name}: {what}")
+    if unchecked and len(losses) > known and warnings is not None:
+        warnings.append(f"{path.name}: carries no checksums: more of it may be damaged than was found")
+
+
+def _record(stream: _Stream, at: int) -> tuple[McapRecord | None, int]:
+    """The record that begins there, or nothing for one of no interest, and where the next begins.
+
+    Raises almost anything where it is damaged.
+    """
+    stream.go(at)
+    opcode, length = _HEAD.unpack(stream.read(_HEAD.size))
+    after = at + _HEAD.size + length
+    if after > stream.size:
+        raise EndOfFile()
+    if opcode not in _READ:
+        return None, after
+    if length > MOST_BYTES:
+        raise FormatError(f"a record of {length} bytes; {MOST_BYTES} is the limit")
+    stream.end = after
+    return _parsed(opcode, ReadDataStream(stream), length), after
+
+
+def _parsed(opcode: int, stream: ReadDataStream, length: int) -> McapRecord:
+    start = stream.count
+    kind = _READ[Opcode(opcode)]
+    record: McapRecord = Message.read(stream, length) if kind is Message else kind.read(stream)
+    padding = length - (stream.count - start)
+    if not 0 <= padding <= _MOST_PADDING:
+        raise FormatError(f"a record of {length} bytes with {length - padding} in it")
+    stream.read(padding)
+    return record
+
+
+def _inside(chunk: Chunk) -> Iterator[McapRecord]:
+    """One after another: a list of them all would take the chunk's memory a second time."""
+    plain = decompressed(chunk.data, chunk.compression, chunk.uncompressed_size)
+    if chunk.uncompressed_crc not in (0, zlib.crc32(plain)):
+        raise FormatError("its checksum is another")
+    stream = ReadDataStream(io.BytesIO(plain))
+    while stream.count < len(plain):
+        opcode, length = _HEAD.unpack(stream.read(_HEAD.size))
+        if length > len(plain) - stream.count:
+            raise EndOfFile()
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            yield _parsed(opcode, stream, length)
+        else:
+            stream.read(length)
+
+
+def _next_chunk(stream: _Stream, at: int) -> int | None:
+    """Where the next chunk begins that is whole: its head agrees with itself, and its end is in the file.
+
+    The blocks that are searched begin small and double: forged heads, one after another, cost little each.
+    """
+    size = _FIRST_BLOCK
+    while (at := _data_from(stream, at)) < stream.size:
+        stream.go(at)
+        block = stream.read(min(size + _CHUNK_HEAD, stream.size - at))
+        for found in _CHUNK.finditer(block):
+            if found.start() >= size:
+                break
+            length, within = int.from_bytes(found[1], "little"), int.from_bytes(found[3], "little")
+            begins = at + found.start()
+            is_whole = length == within + 36 + len(found[2]) and begins + _HEAD.size + length <= stream.size
+            if is_whole and length <= MOST_BYTES:
+                return begins
+        at += size
+        size = min(2 * size, _BLOCK)
+    return None
+
+
+def _data_from(stream: _Stream, at: int) -> int:
+    """The next byte that is on the disk: a file may say to be a terabyte and hold nothing."""
+    try:
+        return os.lseek(stream.fileno(), at, os.SEEK_DATA)
+    except OSError:  # nothing follows; or the file system does not know
+        return at if at < stream.size and not _knows_holes(stream) else stream.size
+
+
+def _knows_holes(stream: _Stream) -> bool:
+    try:
+        os.lseek(stream.fileno(), 0, os.SEEK_HOLE)
+    except OSError:
+        return False
+    return True
+
+
+def _lost(error: Exception, read: int, at: int, next_chunk: int | None, size: int) -> str:
+    if next_chunk is None:
+        return f"cut off after {read} messages, {max(0, size - at)} of {size} bytes are lost ({_what(error)})"
+    return f"damaged at {at}: {next_chunk - at} bytes were passed over ({_what(error)})"
+
+
+def _what(error: Exception) -> str:
+    return str(error) if isinstance(error, FormatError) else type(error).__name__
+
+
+def _summary(stream: _Stream) -> Summary | None:
+    return make_reader(stream).get_summary() if _has_whole_summary(stream) else None
+
+
+def _told(stream: _Stream) -> int | None:
+    """How many messages there are by the summary; None where it is damaged itself, or does not say."""
+    try:
+        summary = _summary(stream)
+    except Exception:  # see contents
+        return None
+    return summary.statistics.message_count if summary is not None and summary.statistics is not None else None
+
+
+def _has_whole_summary(stream: _Stream) -> bool:
+    """The footer: where the summary begins, and its checksum, 0 where there is none."""
+    end = stream.size - MAGIC_SIZE - 4
+    stream.go(end - 16)
+    summary, _, crc = struct.unpack("<QQI", stream.read(20))
+    is_whole = 0 < summary < end and crc in (0, _checksum(stream, end, summary))
+    stream.go(0)
+    return is_whole
+
+
+def _ends_whole(stream: _Stream) -> bool:
+    stream.go(stream.size - MAGIC_SIZE)
+    return stream.read(MAGIC_SIZE) == MAGIC
+
+
+def _checksum(stream: _Stream, end: int, start: int = 0) -> int:
+    stream.go(start, end)
+    crc = 0
+    while block := stream.read(min(_BLOCK, end - stream.tell())):
+        crc = zlib.crc32(block, crc)
+    stream.end = stream.size
+    return crc

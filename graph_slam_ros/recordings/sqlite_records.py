@@ -1,0 +1,118 @@
+"""Topics and messages of a rosbag2 sqlite3 file: read only, in order of writing, up to where it is damaged.
+
+rosbags opens a file of which all is whole, and sorts it by time: one bad page, and nothing is read.
+"""
+
+import sqlite3
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.recordings.decompression import MOST_BYTES
+
+MAGIC = b"SQLite format 3\x00"
+_DEFINITIONS = "SELECT topic_type, encoded_message_definition FROM message_definitions WHERE encoding = 'ros2msg'"
+_LEAST_LIMIT = 2**20  # bytes of a text or blob; none is longer than the file
+_ROWS = "SELECT topic_id, timestamp, data FROM messages"
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """Topics (name, type, encoding) by number, messages by topic, definitions by type, time of the first message."""
+
+    topics: dict[int, tuple[str, str, str]]
+    counts: dict[int, int]
+    definitions: dict[str, str]
+    first_ns: int
+
+
+def contents(path: Path) -> Contents:
+    """Raises FormatError: it is no rosbag2 file, or not even its topics can be read."""
+    try:
+        with closing(_connection(path)) as database:
+            kinds = dict(database.execute("SELECT name, type FROM sqlite_master WHERE name IN ('topics', 'messages')"))
+            if kinds != {"topics": "table", "messages": "table"}:
+                raise FormatError(f"{path}: not a readable recording: no tables of rosbag2 in it")
+            for table in ("topics", "messages", "message_definitions"):
+                _refuse_computed(database, path, table)
+            rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+            topics = {int(number): (str(name), str(kind), str(code)) for number, name, kind, code in rows}
+            counts: dict[int, int] = {}
+            definitions: dict[str, str] = {}
+            first_ns = 0
+            with suppress(sqlite3.Error, TypeError, ValueError):  # damaged farther on: reading tells
+                counts = dict(database.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
+                first_ns = int(database.execute("SELECT MIN(timestamp) FROM messages").fetchone()[0])
+            with suppress(sqlite3.Error):  # before Iron there are none
+                definitions = dict(database.execute(_DEFINITIONS))
+    except (sqlite3.Error, TypeError, ValueError) as error:
+        raise FormatError(f"{path}: not a readable recording ({error})") from None
+    return Contents(topics, counts, definitions, first_ns)
+
+
+def _refuse_computed(database: sqlite3.Connection, path: Path, table: str) -> None:
+    """Raise FormatError where reading a table would compute its columns: a few bytes may then give gigabytes."""
+    columns = database.execute(f"PRAGMA table_xinfo({table})").fetchall()
+    computed = [str(name) for _, name, *_, hidden in columns if hidden]
+    if computed:
+        raise FormatError(f"{path}: not a readable recording: the column {computed[0]} of {table} is computed")
+
+
+def messages(path: Path, topics: Sequence[int], losses: list[str]) -> Iterator[tuple[int, int, bytes]]:
+    """Topic, time and bytes of each message of some topics in order of writing; what is lost adds to ``losses``."""
+    if _beside(path, "-journal"):
+        losses.append(f"{path.name}: its recorder was stopped while it wrote; what it wrote last may be lost")
+    read = 0
+    with closing(_connection(path)) as database:
+        marks = ", ".join("?" * len(topics))
+        try:
+            for topic, stamp, data in database.execute(f"{_ROWS} WHERE topic_id IN ({marks}) ORDER BY id", topics):
+                if isinstance(topic, int) and isinstance(stamp, int) and isinstance(data, bytes):
+                    read += 1
+                    yield topic, stamp, data
+                else:
+                    losses.append(f"{path.name}: a message without time or content was passed over")
+        except sqlite3.Error as error:
+            losses.append(f"{path.name}: cut off after {read} messages ({error})")
+
+
+def damage(path: Path) -> str:
+    """What sqlite finds wrong with the file, or nothing: rows may be missing that nobody misses while reading."""
+    try:
+        with closing(_connection(path)) as database:
+            (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
+    except sqlite3.Error as error:
+        found = error
+    return "" if found == "ok" else " ".join(str(found).split())
+
+
+def _connection(path: Path) -> sqlite3.Connection:
+    """Nothing is written, nor are locks taken, unless there is a log of writes that must be read with it."""
+    how = "mode=ro" if _beside(path, "-wal") else "mode=ro&immutable=1"
+    database = sqlite3.connect(f"file:{quote(str(path.absolute()))}?{how}", uri=True)
+    database.text_factory = _text
+    if sys.version_info >= (3, 11):
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _most(path))
+    database.execute("PRAGMA trusted_schema = OFF")
+    database.execute("PRAGMA writable_schema = ON")  # else a file that is cut is not opened at all; it is read only
+    return database
+
+
+def _most(path: Path) -> int:
+    """Bytes of the longest text or blob that the file and its log of writes can hold."""
+    log = path.with_name(path.name + "-wal")
+    size = path.stat().st_size + (log.stat().st_size if log.is_file() else 0)
+    return min(MOST_BYTES, max(_LEAST_LIMIT, size))
+
+
+def _beside(path: Path, ending: str) -> bool:
+    file = path.with_name(path.name + ending)
+    return file.is_file() and file.stat().st_size > 0
+
+
+def _text(raw: bytes) -> str:
+    return raw.decode(errors="replace")

@@ -1,1 +1,0 @@
-"""The border to ROS: messages, bags, parameters and the node."""

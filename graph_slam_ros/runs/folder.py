@@ -1,0 +1,388 @@
+"""Which folder is a run, which of several is the newest, and what of a folder may be replaced.
+
+A folder is a run if its ``run.json`` says so (``format``); it does from the start of the run on. Only such a folder is
+ever cleared, and only of the files of a run: a recording in it is looked into before it is removed. Runs of earlier
+versions, whose ``run.json`` has no such mark or was never written, are known by their journal. They are read like any
+other, and never cleared.
+"""
+
+import contextlib
+import errno
+import itertools
+import json
+import os
+import re
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from mcap.records import Channel, Schema
+
+from graph_slam_ros import __version__
+from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
+from graph_slam_ros.formats.durable import NEW, claimed, sync_folder, write_whole
+from graph_slam_ros.formats.files import is_regular, opened, read_bytes, read_text
+from graph_slam_ros.runs.journal import INGEST, MAP, MEASUREMENT, parts_of, read_ingest
+from graph_slam_ros.recordings.mcap_records import begin, records
+from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER
+from graph_slam_ros.runs.map_journal import GROWTH, grew
+from graph_slam_ros.slam import Config
+
+SUMMARY, CONFIG = "run.json", "config.yaml"
+GRAPH, VERTICES, COVARIANCES = "graph.g2o", "graph_vertices.csv", "covariances.csv"
+PATH, PATH_ODOMETRY = "path.tum", "path_odometry.tum"  # at keyframes: estimate, and what odometry alone says
+SIGHTINGS, ODOMETRY = "sightings.tum", "odometry.tum"  # the same at the stamps of sightings
+LANDMARKS, PICTURE = "landmarks.csv", "path.png"
+_PATHS = {PATH, PATH_ODOMETRY, SIGHTINGS, ODOMETRY, COVARIANCES}
+_RESULTS = {SUMMARY, GRAPH, VERTICES, LEDGER, CHANGES, LANDMARKS, PICTURE, *_PATHS}
+MARK = "graph_slam_ros run"
+"""The ``format`` of the ``run.json`` of a run."""
+BEGUN = json.dumps({"format": MARK, "version": __version__, "ended": False}).encode()
+"""The ``run.json`` of a run until it is saved."""
+_RECORDED = re.compile(r"(ingest|map|run)(_\d+)?\.mcap")
+_UNFINISHED = re.compile(r"\.[0-9a-f]{8}" + re.escape(NEW))
+_SCHEMAS = {INGEST: MEASUREMENT, MAP: GROWTH}
+_OF_RECORDINGS = re.compile(r"(\.(mcap|db3|bag|active|zstd|gz))+$")
+_NO_FILE = (errno.ENOENT, errno.ENOTDIR)
+_ENDS = 2**16
+_TOPICS = {"/tf", "/pose", "/path", "/landmarks"}
+
+
+class RunError(GraphSlamError):
+    """A run folder that cannot be written or read."""
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder holds a run: its ``run.json`` says so, or it is of an earlier version and has our journal.
+
+    Raises
+    ------
+    RunError
+        The disk fails to tell: a run may be there, which nobody may take for another thing.
+    """
+    if not folder.is_dir():
+        return False
+    try:
+        return _is_marked(folder) or (is_regular(folder / CONFIG) and any(map(_is_recorded, parts_of(folder)[:1])))
+    except OSError:  # its journal cannot be read
+        return False
+
+
+def _is_marked(folder: Path) -> bool:
+    return summary_of(folder).get("format") == MARK
+
+
+def _is_recorded(file: Path) -> bool:
+    """Whether a file with the name of a run's recording is one: its head and its first record say so."""
+    name = _RECORDED.fullmatch(file.name)
+    if name is None or not is_regular(file):
+        return False
+    head = begin("ros2" if name[1] == "run" else "")
+    with opened(file) as stream:
+        there = stream.read(len(head))
+    if there != head:
+        return head.startswith(there)  # torn as it began
+    first = next((r for r in records(file, [], follow=False) if isinstance(r, Schema | Channel)), None)
+    if name[1] == "run":
+        channels = (r for r in records(file, [], follow=False) if isinstance(r, Channel))
+        return first is None or getattr(next(channels, None), "topic", "") in _TOPICS
+    return first is None or getattr(first, "name", "") == _SCHEMAS[name[1]]
+
+
+def is_cut_off(folder: Path) -> bool:
+    """Whether the newest run, there or moved out of its way, holds something and was never ended."""
+    earlier = earlier_runs(folder)
+    newest = folder if _holds_something(folder) else earlier[max(earlier)] if earlier else folder
+    if not _holds_something(newest):
+        return False
+    return not summary_of(newest).get("ended")
+
+
+def incomplete_runs(folder: Path) -> list[Path]:
+    """Earlier runs that were ended before all that they had accepted was processed, the newest first."""
+    earlier = earlier_runs(folder)
+    return [earlier[number] for number in sorted(earlier, reverse=True) if is_incomplete(earlier[number])]
+
+
+def is_incomplete(folder: Path) -> bool:
+    """Whether a run was ended before all that it had accepted was processed, and its results are still to be made."""
+    return summary_of(folder).get("is_incomplete") is True
+
+
+def was_saved_whole(folder: Path) -> bool:
+    """Whether the map of a run has all of its journal, by its summary."""
+    parts = list(_parts(folder))
+    return summary_of(folder).get("unprocessed") == 0 and bool(parts) and all(then == now for _, then, now in parts)
+
+
+def _holds_something(folder: Path) -> bool:
+    if not is_run(folder) or summary_of(folder).get("keyframes"):
+        return is_run(folder)
+    try:
+        return next(read_ingest(folder, []), None) is not None or grew(folder)
+    except (FormatError, OSError):  # who knows
+        return True
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    """The summary; empty where there is none, or no JSON in it.
+
+    Raises
+    ------
+    RunError
+        It is there and cannot be read: what it says must not be taken for missing.
+    """
+    try:
+        told = json.loads(read_text(folder / SUMMARY))
+    except OSError as error:
+        if error.errno not in _NO_FILE:
+            raise RunError(f"{folder / SUMMARY}: {error.strerror}") from None
+        return {}
+    except (ValueError, RecursionError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def recording_of(folder: Path) -> str:
+    """The name of the recording that a run was replayed from; empty where it was a live run, or is not known."""
+    name = summary_of(folder).get("recording", "")
+    return name if isinstance(name, str) else ""
+
+
+def run_config(folder: Path) -> Config:
+    """The configuration a run was made with. Raises ConfigError naming the file."""
+    if not os.path.lexists(folder / CONFIG):
+        raise ConfigError(f"{folder}: not a run: no {CONFIG} in it")
+    values = read_parameters(folder / CONFIG, follow=False)
+    try:
+        return Config.from_mapping(values)
+    except GraphSlamError as error:
+        raise ConfigError(f"{folder / CONFIG}: {error}") from None
+
+
+def changed_since(folder: Path) -> list[str]:
+    """Files that are not those that ``run.json`` was written with: of a save that was cut off, exchanged, or edited."""
+    out = list(_not_as_saved(folder, "files", lambda file: checksum(read_bytes(file))))
+    out += [change for change in _not_as_saved(folder, "recorded", ends_of) if change not in out]
+    if any(now > then for _, then, now in _parts(folder)) or is_incomplete(folder):
+        out.append("the run went on after its results were saved: graph_slam recover has those of its end")
+    return out
+
+
+def missing(folder: Path) -> list[str]:
+    """Of its recordings, those that have fewer parts than when the run was saved, or are not those of then."""
+    fewer = [f"{name}: {then} parts when it was saved, {now} now" for name, then, now in _parts(folder) if now < then]
+    return fewer + list(_not_as_saved(folder, "recorded", ends_of))
+
+
+def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> Iterator[str]:
+    """Of the files whose marks the summary has: those that are gone, cannot be read, or have another mark."""
+    summary = summary_of(folder)
+    if not summary and os.path.lexists(folder / SUMMARY):
+        yield f"{SUMMARY} is not the summary of a run: whether its files belong together is not known"
+    told = summary.get(kind)
+    for name, mark in sorted(told.items()) if isinstance(told, dict) else ():
+        if name in _RESULTS or name == CONFIG or _RECORDED.fullmatch(name):  # no path out of the folder
+            try:
+                if mark_of(folder / name) != mark:
+                    yield f"{name} is not the one that {SUMMARY} was saved with"
+            except FileNotFoundError:
+                yield f"{name} is missing, with which {SUMMARY} was saved"
+            except OSError as error:
+                yield f"{name} cannot be read: {error.strerror}"
+
+
+def recorded_files(folder: Path) -> dict[str, str]:
+    """What tells the recordings and the configuration of a run from those of another. Raises OSError."""
+    parts = [file for name in (INGEST, MAP) for file in parts_of(folder, name)]
+    config = [folder / CONFIG] if (folder / CONFIG).exists() else []  # somebody may have removed it: results are saved
+    return {file.name: ends_of(file) for file in (*parts, *config)}
+
+
+def ends_of(file: Path) -> str:
+    """Size and CRC-32 of the first and the last 64 KiB: it takes no longer for a long recording. Raises OSError."""
+    with opened(file) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        first = stream.read(_ENDS)
+        stream.seek(max(0, size - _ENDS))
+        return f"{size}-{checksum(first + stream.read(_ENDS))}"
+
+
+def _parts(folder: Path) -> Iterator[tuple[str, int, int]]:
+    """Of each recording of a run that was saved: how many parts it had then and has now."""
+    parts = summary_of(folder).get("parts")
+    told: dict[str, Any] = parts if isinstance(parts, dict) else {}
+    for name in (INGEST, MAP):
+        if isinstance(then := told.get(name), int):
+            yield name, then, len(parts_of(folder, name))
+
+
+def checksum(data: bytes) -> str:
+    """CRC-32."""
+    return f"{zlib.crc32(data):08x}"
+
+
+def suggested_out(source: Path) -> Path:
+    """A free name here for the run of a recording (``drive_run``), or for the replay of a run (``drive_run_again``)."""
+    name = _OF_RECORDINGS.sub("", source.resolve().name)
+    name = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._-") or "recording"
+    name += "_again" if is_run(source) else "_run"
+    free = (Path(f"{name}_{k}" if k > 1 else name) for k in itertools.count(1))
+    return next(path for path in free if not os.path.lexists(path))
+
+
+def check_room(folder: Path, source: Path | None = None, *, force: bool = False) -> None:
+    """Refuse a folder that holds anything but a run that may be replaced, or the source that is about to be read.
+
+    Parameters
+    ----------
+    force : a run that holds something may be replaced, too
+
+    Raises
+    ------
+    RunError
+        Nothing was touched.
+    """
+    try:
+        if source is not None and folder.resolve() in (source.resolve(), source.resolve().parent):
+            raise RunError(f"{folder}: cannot be read from and written to at once")
+        if not folder.exists():
+            return
+        with claimed(folder):
+            pass
+        if _is_marked(folder):
+            _, foreign = _contents(folder)
+            if foreign:
+                raise RunError(f"{foreign[0]}: not written by this run, and so never removed: choose another folder")
+            if not force and _holds_something(folder):
+                raise RunError(f"{folder}: holds a run already: choose another folder, or --force replaces it")
+        elif is_run(folder):
+            raise RunError(f"{folder}: a run of an earlier version, which is never replaced: choose another folder")
+        elif not all(map(_is_unfinished, folder.iterdir())):
+            raise RunError(f"{folder}: not empty and not an earlier run; nothing was written")
+    except OSError as error:
+        raise RunError(f"{folder}: {error.strerror}") from None
+
+
+def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> None:
+    """Move an earlier run out of the way: to ``folder-1``, or one more than the last; so many of them are kept.
+
+    One that holds nothing is not kept; one that was never ended, or that an earlier version wrote, is in any case. Of
+    older ones the files of the run are removed, and nothing else.
+
+    Parameters
+    ----------
+    loaded : the run whose map is gone on in, or is to be: it stays
+    """
+    is_of_earlier_version = is_run(folder) and not _is_marked(folder)
+    most = max(most, is_cut_off(folder) or is_incomplete(folder) or is_of_earlier_version)
+    if not _holds_something(folder) or not most:
+        return
+    earlier = earlier_runs(folder)
+    target = folder.with_name(f"{folder.name}-{max(_numbered(folder), default=0) + 1}")
+    try:
+        with claimed(folder):
+            folder.rename(target)
+        for number in sorted(earlier)[: max(0, len(earlier) + 1 - most)]:
+            if earlier[number] != loaded and _is_marked(earlier[number]):
+                remove(earlier[number])
+    except OSError as error:
+        raise RunError(f"{folder}: cannot be moved to {target.name}: {error.strerror}") from None
+
+
+def earlier_runs(folder: Path) -> dict[int, Path]:
+    """Earlier runs beside a run folder, by number."""
+    return {number: run for number, run in _numbered(folder).items() if _is_readable_run(run)}
+
+
+def _is_readable_run(folder: Path) -> bool:
+    with contextlib.suppress(RunError):  # it stays as it is
+        return is_run(folder)
+    return False
+
+
+def is_name_of_earlier(folder: Path, name: str) -> bool:
+    """Whether an earlier run of a folder could have that name, and so be removed with the oldest of these."""
+    return _earlier_name(folder).fullmatch(name) is not None
+
+
+def _earlier_name(folder: Path) -> re.Pattern[str]:
+    return re.compile(re.escape(folder.name) + r"-([1-9]\d*)")
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    """Whatever is called as an earlier run is."""
+    named = _earlier_name(folder)
+    there = folder.parent.iterdir() if folder.parent.is_dir() else ()
+    return {int(match[1]): run for run in there if (match := named.fullmatch(run.name))}
+
+
+@contextlib.contextmanager
+def room(folder: Path, *, force: bool = False) -> Iterator[None]:
+    """Make a folder for a run, and have it for oneself; a run in it is replaced, if that is allowed.
+
+    From here on its ``run.json`` says that it is a run.
+
+    Raises
+    ------
+    RunError
+        Something else is there, or somebody else records there.
+    """
+    check_room(folder, force=force)
+    with contextlib.ExitStack() as held:
+        try:
+            if not folder.exists():
+                folder.mkdir(parents=True, exist_ok=True)
+                sync_folder(folder.parent)
+            held.enter_context(claimed(folder))
+            write_whole(folder / SUMMARY, BEGUN)
+            _clear(folder)
+        except KeyboardInterrupt:
+            discard(folder)
+            raise
+        except OSError as error:
+            raise RunError(f"{folder}: {error.strerror}") from None
+        yield
+
+
+def discard(folder: Path) -> None:
+    """Remove a run that was begun and not saved yet; a saved one stays."""
+    with contextlib.suppress(OSError):
+        if read_bytes(folder / SUMMARY) == BEGUN:
+            remove(folder)
+        else:
+            folder.rmdir()  # if it was made and nothing more
+
+
+def remove(folder: Path) -> None:
+    """Remove the files of a run, and the folder if nothing else is in it. Raises OSError."""
+    _clear(folder)
+    (folder / SUMMARY).unlink()
+    with contextlib.suppress(OSError):  # somebody has put more into it
+        folder.rmdir()
+
+
+def _clear(folder: Path) -> None:
+    """Remove the files of a run but for its mark: who is stopped half-way leaves a folder that may be cleared again."""
+    for file in _contents(folder)[0]:
+        file.unlink()
+
+
+def _contents(folder: Path) -> tuple[list[Path], list[Path]]:
+    """The files that a run has made, without its mark, and what only has the name of one."""
+    ours, foreign = list[Path](), list[Path]()
+    for file in sorted(folder.iterdir(), reverse=True):
+        if _RECORDED.fullmatch(file.name):
+            (ours if _is_recorded(file) else foreign).append(file)
+        elif file.name in _RESULTS or file.name == CONFIG:
+            (ours if is_regular(file) else foreign).append(file)
+        elif _is_unfinished(file):
+            ours.append(file)
+    return [file for file in ours if file.name != SUMMARY], foreign
+
+
+def _is_unfinished(file: Path) -> bool:
+    """What a process that was killed while it wrote a file has left."""
+    return _UNFINISHED.fullmatch(file.name) is not None and is_regular(file)

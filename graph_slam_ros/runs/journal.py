@@ -1,0 +1,222 @@
+"""JSON records in mcap, on disk as they come: the journal of what the pipeline accepted, and the map as it grew.
+
+One channel per kind of record; the order of the file is that in which they came, and ``sequence`` counts it. Each flush
+writes one chunk, which carries its CRC. What is recorded may be split over several files, ``ingest.mcap``,
+``ingest_1.mcap``, ...
+"""
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mcap.records import Channel, Message
+from mcap.writer import CompressionType, Writer
+
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.durable import AppendedFile
+from graph_slam_ros.recordings.mcap_records import LIBRARY, records
+
+_ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
+INGEST, MAP = "ingest", "map"
+BEGINS_IN_A_MAP = {"type": "begins_in_a_map"}
+"""The first record of the journal of such a run; its start is in ``map.mcap``."""
+MEASUREMENT = "graph_slam_ros.Measurement"
+_SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}}, "required": ["type"]}).encode()
+
+
+class RecordWriter:
+    """Appends records to one new file: they wait in memory for the next ``flush`` of that."""
+
+    def __init__(self, path: Path, schema: str = MEASUREMENT) -> None:
+        self.file = AppendedFile(path)
+        self._chunk = _Chunk()
+        self._writer = Writer(self.file, chunk_size=self._chunk, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._writer.start(profile="", library=LIBRARY)
+        self._schema = self._writer.register_schema(schema, "jsonschema", _SCHEMA)
+        self._channels: dict[str, int] = {}
+        self._sequence = 0
+        self._stamp_ns = 0
+
+    def write(self, several: Iterable[Mapping[str, Any]]) -> None:
+        """Append records, as one chunk; one without a stamp is filed under the last."""
+        *others, last = several
+        for record in others:
+            self._add(record)
+        self._chunk.is_full = True
+        self._add(last)
+        self._chunk.is_full = False
+
+    def _add(self, record: Mapping[str, Any]) -> None:
+        kind = record["type"]
+        if kind not in self._channels:
+            self._channels[kind] = self._writer.register_channel(kind, "json", self._schema)
+        self._stamp_ns = record.get("stamp_ns", self._stamp_ns)
+        data = _ENCODE(record).encode()
+        self._writer.add_message(self._channels[kind], self._stamp_ns, data, self._stamp_ns, self._sequence)
+        self._sequence += 1
+
+    def end(self) -> AppendedFile:
+        """Append the index; returns the file, which is to be closed."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        return self.file
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        self.end().close()
+
+
+class Parts:
+    """What is recorded under one name in a folder, part after part, each a file of its own.
+
+    What the disk does not take waits, of parts that were ended as of the present one, and is written in that order.
+    """
+
+    def __init__(self, folder: Path, name: str, schema: str) -> None:
+        self._folder, self._name, self._schema = folder, name, schema
+        self._part = 0
+        self._present: RecordWriter | None = None
+        self._ended: list[AppendedFile] = []
+
+    def begin(self) -> RecordWriter:
+        """Have the present part, also where nothing is to be written yet."""
+        if self._present is None:
+            self._present = RecordWriter(self._folder / part_name(self._name, self._part), self._schema)
+        return self._present
+
+    def write(self, several: Sequence[Mapping[str, Any]]) -> None:
+        """Append records: they wait for ``flush``."""
+        if several:
+            self.begin().write(several)
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that are not in files yet."""
+        return sum(file.waiting for file in self._files())
+
+    def flush(self) -> None:
+        """Write what waits. Raises OSError: then some of it waits still."""
+        close_all(self._ended)
+        for file in self._files():
+            file.flush()
+
+    def sync(self) -> None:
+        """Have the disk take what was flushed. May be called from another thread; raises OSError."""
+        present = self._present
+        if present is not None:
+            present.file.sync()
+
+    def end(self) -> None:
+        """End the present part: what comes is of the next. Raises OSError as ``flush`` does."""
+        if self._present is not None:
+            self._ended.append(self._present.end())
+            self._present = None
+            self._part += 1
+        close_all(self._ended)
+
+    def abandon(self) -> None:
+        """Leave everything as it is on the disk."""
+        for file in self._files():
+            file.abandon()
+
+    def _files(self) -> list[AppendedFile]:
+        return self._ended + ([self._present.file] if self._present is not None else [])
+
+
+def close_all(files: list[AppendedFile]) -> None:
+    """Close files in order; those that were are out of the list. Raises OSError of the first that could not be."""
+    while files:
+        files[0].close()
+        del files[0]
+
+
+class _Chunk(int):
+    """The size beyond which the library ends a chunk: none, until the last record of a flush comes."""
+
+    is_full = False
+
+    def __lt__(self, size: int) -> bool:
+        return self.is_full
+
+
+def part_name(name: str, part: int) -> str:
+    """Of the files that a recording is split over."""
+    return f"{name}_{part}.mcap" if part else f"{name}.mcap"
+
+
+def parts_of(folder: Path, name: str = INGEST) -> list[Path]:
+    """The files of a recording in a run folder, in order."""
+    pattern = re.compile(rf"{name}(?:_(\d+))?\.mcap")
+    parts = {file: pattern.fullmatch(file.name) for file in folder.glob(f"{name}*.mcap")}
+    numbered = {file: int(part[1] or 0) for file, part in parts.items() if part}
+    return sorted(numbered, key=lambda file: numbered[file])
+
+
+def read_ingest(folder: Path, losses: list[str]) -> Iterator[dict[str, Any]]:
+    """The measurements of a run folder in order of acceptance, as ``read_records`` reads them."""
+    for record in read_records(folder, INGEST, losses):
+        if record != BEGINS_IN_A_MAP:
+            yield record
+        elif not parts_of(folder, MAP):
+            losses.append(f"{part_name(MAP, 0)}: not there, though the run began in a map: what follows is without it")
+
+
+def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) -> list[dict[str, Any]]:
+    """The measurements that a map lacks which came of the first so many records.
+
+    Those after them, and of those the ones that waited for their turn then: newer than the last odometry that was used.
+    """
+    waited: list[dict[str, Any]] = []
+    rest: list[dict[str, Any]] = []
+    count = 0
+    for file, channel, message in _messages(folder, INGEST, losses):
+        if channel == BEGINS_IN_A_MAP["type"]:
+            continue
+        if count >= processed:
+            rest.append(_decoded(file, message))
+        elif channel == "control":
+            if _decoded(file, message).get("event") == "time_jump":
+                waited.clear()
+        elif channel != "initial_pose" and used_ns is not None and message.log_time > used_ns:
+            waited.append(_decoded(file, message))
+        count += 1
+    return waited + rest
+
+
+def read_records(folder: Path, name: str, losses: list[str]) -> Iterator[dict[str, Any]]:
+    """In the order they were written, up to the first that cannot be read; what is lost adds to ``losses``."""
+    for file, _, message in _messages(folder, name, losses):
+        yield _decoded(file, message)
+
+
+def _decoded(file: str, message: Message) -> Any:
+    try:
+        return json.loads(message.data)
+    except ValueError:
+        raise FormatError(f"{file}: record {message.sequence} is not JSON") from None
+
+
+def _messages(folder: Path, name: str, losses: list[str]) -> Iterator[tuple[str, str, Message]]:
+    """The same before they are decoded, each with its file and its kind."""
+    lost = len(losses)
+    for part, file in enumerate(parts_of(folder, name)):
+        if file.name != (due := part_name(name, part)):
+            losses.append(f"{due}: not there; what came after was not read")
+        if len(losses) > lost:
+            if file.name == due:
+                losses.append(f"{due}: not read, with what came after it: it would be out of place")
+            return
+        known: dict[int, str] = {}
+        expected = 0
+        for record in records(file, losses, follow=False):
+            if isinstance(record, Channel):
+                if record.message_encoding != "json":
+                    raise FormatError(f"{file.name}: channel {record.topic} is {record.message_encoding}, not json")
+                known[record.id] = record.topic
+            elif isinstance(record, Message) and record.channel_id in known:
+                if record.sequence != expected:
+                    losses.append(f"{file.name}: record {expected} is missing; what came after was not read")
+                    return
+                expected += 1
+                yield file.name, known[record.channel_id], record

@@ -1,0 +1,243 @@
+"""The ledger of a saved run: ``ledger.csv``, a row for each edge, and ``ledger_changes.csv``, of each changed verdict.
+
+Rows are in order of the edges' ids. A list of numbers is one field, with spaces between them.
+"""
+
+import csv
+import io
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from pathlib import Path
+from reprlib import repr as shortened
+from typing import Any, NewType, TypeVar, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.formats.strict import integer, lines, numbers, stamp
+from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.robust.ledger import Change, Reason, Verdict
+
+LEDGER, CHANGES = "ledger.csv", "ledger_changes.csv"
+Numbers = tuple[float, ...]
+Ids = tuple[int, ...]
+Stamp = NewType("Stamp", int)
+Row = TypeVar("Row")
+_ROUNDING = 1e-6  # of a statistic, which is then below 0
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """An edge: what was measured, what was decided about it, and how it stands now.
+
+    Attributes
+    ----------
+    edge : id, the same in events
+    label : its class
+    tag : its type, as ``graph.g2o`` calls it
+    source : the input that told it; empty where nobody did
+    landmark : the name of the landmark it is about; empty where there is none
+    vertices : as ``graph.g2o`` numbers them
+    keyframe : at which it was judged first
+    stamp_ns : of the newest keyframe that it is attached to: when it was measured, not when it was judged
+    measured : with the sensor's place on the robot where the type has one
+    information : of the measurement, the upper triangle row by row
+    residual : how the measurement differed from what was expected when it was judged first, in its units
+    statistic, threshold : chi2 that was last judged, and what it was held against
+    dof : how many numbers were measured
+    chi2 : how it fits now, without loss
+    weight : what is left of its information now, by its loss; 0 where it is out
+    """
+
+    edge: int
+    label: str
+    tag: str
+    source: str
+    landmark: str
+    vertices: Ids
+    keyframe: int
+    stamp_ns: Stamp
+    measured: Numbers
+    information: Numbers
+    residual: Numbers
+    statistic: float
+    dof: int
+    threshold: float
+    chi2: float
+    weight: float
+    verdict: Verdict
+    reason: Reason
+
+    @property
+    def is_in(self) -> bool:
+        """Whether it is part of the problem."""
+        return self.verdict not in (Verdict.PENDING, Verdict.REJECTED)
+
+    @property
+    def about(self) -> str:
+        """Its class, and the landmark it is about."""
+        return f"{self.label} {self.landmark}".strip()
+
+    @property
+    def information_matrix(self) -> NDArray[np.float64]:
+        """The whole of it, (dof, dof)."""
+        upper = np.zeros((self.dof, self.dof))
+        upper[np.triu_indices(self.dof)] = self.information
+        return upper + np.triu(upper, 1).T
+
+
+def ledger_text(slam: GraphSlam, ids: list[int]) -> str:
+    """All edges that were judged or taken for granted; ``ids`` are the numbers of the vertices in the file."""
+    return _text(Entry, _entries(slam, ids))
+
+
+def changes_text(slam: GraphSlam) -> str:
+    """The history of all verdicts."""
+    return _text(Change, slam.ledger.history)
+
+
+def read_ledger(folder: Path) -> list[Entry]:
+    """The entries of a run, by edge. Raises FormatError naming the line."""
+    entries = list[Entry]()
+    for line, entry in _read(Entry, folder / LEDGER):
+        fault = f"edge {entry.edge} where {len(entries)} is due" if entry.edge != len(entries) else _fault(entry)
+        if fault:
+            raise FormatError(f"{folder / LEDGER}:{line}: {fault}")
+        entries.append(entry)
+    return entries
+
+
+def read_changes(folder: Path, edges: int) -> list[Change]:
+    """The history of a run of so many edges, in order. Raises FormatError naming the line."""
+    changes = list[Change]()
+    for line, change in _read(Change, folder / CHANGES):
+        if not 0 <= change.edge < edges:
+            raise FormatError(f"{folder / CHANGES}:{line}: edge {change.edge} is none of the {edges} of {LEDGER}")
+        changes.append(change)
+    return changes
+
+
+def _fault(entry: Entry) -> str:
+    """What of an edge does not go together."""
+    edge = EDGE_TAGS.get(entry.tag)
+    if edge is None:
+        return f"tag {shortened(entry.tag)} is none of a graph"
+    m = edge.residual_size
+    sizes = {
+        "vertices": (len(entry.vertices), len(edge.accepts)),
+        "measured": (len(entry.measured), edge.measured_size),
+        "information": (len(entry.information), m * (m + 1) // 2),
+        "residual": (len(entry.residual), m),
+    }
+    for name, (found, wanted) in sizes.items():
+        if found != wanted:
+            return f"{name}: {found} numbers, where {entry.tag} has {wanted}"
+    if entry.dof != m:
+        return f"dof: {entry.dof}, where {entry.tag} has {m}"
+    least = {"statistic": -_ROUNDING, "threshold": np.finfo(float).tiny, "chi2": 0.0, "weight": 0.0}
+    return next((f"{name}: {n} is too small" for name, low in least.items() if (n := getattr(entry, name)) < low), "")
+
+
+def _entries(slam: GraphSlam, ids: list[int]) -> Iterable[Entry]:
+    graph, ledger = slam.graph, slam.ledger
+    tags = {edge: tag for tag, edge in EDGE_TAGS.items()}
+    names = {mark.vertex: name for name, mark in slam.landmarks.items()}
+    chi2, _ = slam.solver.chi2_of(np.arange(len(ledger)))
+    losses = slam.solver.settings.stages()[-1]
+    keyframe_of = {vertex: k for k, vertex in enumerate(slam.keyframes.ids.tolist())}
+    stamps_ns = slam.keyframes.stamps_ns
+    judged = {change.edge: change.threshold for change in ledger.history}
+    for edge in range(len(ledger)):
+        table, row = graph.row(edge)
+        label, vertices = graph.label_of(edge), table.vertices.values[row].tolist()
+        root, loss, keyframe = table.sqrt_information.values[row], losses.get(label), int(ledger.keyframe.values[edge])
+        left = weight_and_cost(loss.kind, loss.scale, float(chi2[edge]))[0] if loss else 1.0
+        yield Entry(
+            edge,
+            label,
+            tags[table.type],
+            graph.source_of(edge),
+            next((names[v] for v in vertices if v in names), ""),
+            tuple(ids[v] for v in vertices),
+            keyframe,
+            Stamp(int(stamps_ns[max((keyframe_of[v] for v in vertices if v in keyframe_of), default=keyframe)])),
+            tuple(table.measured.values[row].tolist()),
+            tuple((root.T @ root)[np.triu_indices(len(root))].tolist()),
+            tuple(ledger.residual(edge).tolist()),
+            float(ledger.statistic.values[edge]),
+            int(ledger.numbers.values[edge]),
+            judged.get(edge, float(ledger.threshold.values[edge])),
+            float(chi2[edge]),
+            float(left * table.weight.values[row]),
+            Verdict(int(ledger.verdict.values[edge])),
+            Reason(int(ledger.reason.values[edge])),
+        )
+
+
+# -- rows of a dataclass -----------------------------------------------------------------------------------------------
+
+_PARSED: dict[Any, Callable[[str], Any]] = {
+    int: integer,
+    Stamp: stamp,
+    float: lambda text: np.inf if text == "inf" else numbers([text])[0],  # no bound on what a statistic is
+    str: str,
+    Ids: lambda text: tuple(map(integer, text.split())),
+    Numbers: lambda text: tuple(numbers(text.split())),
+    Verdict: lambda text: _member(Verdict, text),
+    Reason: lambda text: _member(Reason, text),
+}
+
+
+def _member(kind: type[IntEnum], word: str) -> IntEnum:
+    names = [member.name.lower() for member in kind]
+    if word not in names:
+        raise FormatError(f"{shortened(word)} is none of {', '.join(names)}")
+    return kind[word.upper()]
+
+
+def _text(kind: type, rows: Iterable[Any]) -> str:
+    names = [field.name for field in fields(kind)]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows([_word(getattr(row, name)) for name in names] for row in rows)
+    return out.getvalue()
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, Verdict | Reason):
+        return value.name.lower()
+    return " ".join(map(repr, value)) if isinstance(value, tuple) else str(value)
+
+
+def _read(kind: type[Row], file: Path) -> Iterator[tuple[int, Row]]:
+    """Each row with the line it ends on."""
+    hints = get_type_hints(kind)
+    if not os.path.lexists(file):
+        raise FormatError(f"{file}: no such file: is it a run, and saved by this version?")
+    rows = csv.reader((text for _, text in lines(file, follow=False)), strict=True)
+    try:
+        if next(rows, None) != list(hints):
+            raise FormatError(f"{file}: not a ledger: its first line is not {','.join(hints)}")
+        for row in rows:
+            if len(row) != len(hints):
+                raise FormatError(f"{file}:{rows.line_num}: {len(row)} columns, not {len(hints)}")
+            try:
+                yield rows.line_num, kind(*map(_parsed, hints.items(), row))
+            except FormatError as error:
+                raise FormatError(f"{file}:{rows.line_num}: {error}") from None
+    except csv.Error as error:
+        raise FormatError(f"{file}:{rows.line_num}: {error}") from None
+
+
+def _parsed(column: tuple[str, Any], word: str) -> Any:
+    name, kind = column
+    try:
+        return _PARSED[kind](word)
+    except FormatError as error:
+        raise FormatError(f"{name}: {error}") from None

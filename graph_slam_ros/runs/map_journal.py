@@ -1,0 +1,370 @@
+"""The map as it grew, in ``map.mcap``: from it a map is taken up again without the drive being repeated.
+
+JSON records in mcap, as in the journal. The first is ``map`` with the version of the format. Each update adds a
+``growth``: what there is since the one before,
+
+* ``vertices``: kind and initial values; ``edges``: tag (as in g2o), vertices, what was measured, square root of the
+  information by rows, class, input. Both are numbered in order from 0;
+* ``judged``: of each edge, in order, keyframe at which it was judged first, statistic, threshold, numbers measured,
+  residual then, verdict, reason; ``changes``: edge, keyframe, verdict, reason, statistic, threshold;
+* ``keyframes``: vertex, stamp, ``T_odom_base``; ``segments``: keyframes at which odometry began; ``drives``:
+  the first keyframe of each drive; ``sightings``: keyframe, stamp, ``T_keyframe_base``;
+* ``landmarks``: by name, vertex, whether without identity, whether tentative, number of sightings, first and last
+  stamp, or null where it was given up; ``seen``: of those without identity, each sighting and its edge; ``offsets``: by
+  input, the vertex of what its ranges have in common;
+* ``datum``: latitude, longitude and height that fixes are from; ``settings``: parameters that were changed on the way;
+* ``processed``: records of the ingest sequence that all of it came of; ``used``: stamp and input of the last odometry
+  that was used by then;
+* ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are; ``held``: the
+  same while ``map.localize`` is true, zeros when it ends.
+
+Now and then an ``estimate`` tells all values, end to end. A run that goes on in another's map has that first, as one
+``growth`` and one ``estimate``, up to a record ``start``.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.runs.journal import MAP, parts_of, read_records
+from graph_slam_ros.graph import Gaussian, Graph
+from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3
+from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.frontend.motion_compensation import Where
+from graph_slam_ros.slam.landmarks.landmark_map import Landmark, Seen
+from graph_slam_ros.slam.robust.ledger import Change, Ledger, Reason, Verdict
+from graph_slam_ros.slam.snapshot import MapState
+from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
+
+GROWTH = "graph_slam_ros.Map"
+VERSION = 1
+_TAGS = {edge_type: tag for tag, edge_type in EDGE_TAGS.items()}
+_KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}
+_MORE = 1.1  # an estimate is written when there are so many times the keyframes: in total it stays linear
+_JUMP_M = 0.5  # or when a solve moved the newest that far, and there are a hundredth more
+
+Record = dict[str, Any]
+
+
+class Growth:
+    """What of a map was told already.
+
+    Parameters
+    ----------
+    start : the map that the run goes on in
+    """
+
+    def __init__(self, start: MapState | None = None) -> None:
+        self._vertices = self._edges = self._judged = self._changes = 0
+        self._keyframes = self._segments = self._sightings = self._landmarks = self._offsets = 0
+        self._frozen = self._drives = 0
+        self._held = (0, 0)
+        self._datum: tuple[float, ...] = ()
+        self._settings: dict[str, Any] = {}
+        self._estimated = 0  # keyframes at the last estimate
+        self.first: list[Record] = [{"type": "map", "version": VERSION}]
+        if start is not None:
+            self.first += [self.since(start), _estimate(start.values), {"type": "start"}]
+
+    def of(self, slam: GraphSlam) -> Iterator[Record]:
+        """What there is since the last call, and now and then where all of it is thought to be."""
+        changed = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
+        self._settings = dict(slam.settings)
+        used = {"used": [slam.newest_odometry_ns, slam.odometry_source]} if slam.odometry_source else {}
+        yield self.since(slam) | changed | {"processed": slam.processed} | used
+        count = len(slam.keyframes)
+        has_jumped = slam.correction.distance_m > _JUMP_M and count > 1.01 * self._estimated
+        if has_jumped or count >= _MORE * self._estimated + 1:
+            self._estimated = count
+            yield _estimate(slam.solver.values)
+
+    def since(self, a: GraphSlam | MapState) -> Record:
+        """What there is since the last call."""
+        graph, first_edge = a.graph, self._edges
+        out: Record = {"type": "growth"}
+        out["vertices"] = [_vertex(graph, v) for v in range(self._vertices, graph.vertex_count)]
+        out["edges"] = [_edge(graph, edge) for edge in range(first_edge, graph.edge_count)]
+        out["judged"] = [_judgement(a.ledger, edge) for edge in range(self._judged, len(a.ledger))]
+        out["changes"] = [_change(change) for change in a.ledger.history[self._changes :]]
+        keyframes = [a.keyframes[k] for k in range(self._keyframes, len(a.keyframes))]
+        out["keyframes"] = [[k.vertex, k.stamp_ns, k.T_odom_base] for k in keyframes]
+        out["segments"] = a.segments[self._segments :]
+        out["drives"] = a.drives[self._drives :]
+        poses = [a.sighting_poses[k] for k in range(self._sightings, len(a.sighting_poses))]
+        out["sightings"] = [[p.keyframe, p.stamp_ns, p.T_keyframe_base] for p in poses]
+        landmarks = a.touched_landmarks(self._landmarks)
+        out["landmarks"] = {name: mark and _landmark(mark) for name, mark in landmarks.items()}
+        out["seen"] = [_seen(one) for mark in landmarks.values() if mark for one in _newer(mark.seen, first_edge)]
+        if len(a.range_offsets) > self._offsets:
+            out["offsets"] = a.range_offsets
+        if a.frozen > self._frozen:
+            out["frozen"] = [a.frozen, a.frozen_edges]
+        if a.held != self._held:
+            out["held"] = self._held = a.held
+        if a.datum != self._datum:
+            out["datum"] = self._datum = a.datum
+        if keyframes:
+            out["stamp_ns"] = keyframes[-1].stamp_ns
+        self._vertices, self._edges, self._judged = graph.vertex_count, graph.edge_count, len(a.ledger)
+        self._changes, self._keyframes, self._segments = len(a.ledger.history), len(a.keyframes), len(a.segments)
+        self._sightings, self._offsets = len(a.sighting_poses), len(a.range_offsets)
+        self._drives = len(a.drives)
+        self._landmarks, self._frozen = a.landmark_changes, a.frozen
+        return {name: part for name, part in out.items() if part}
+
+
+def has_map(folder: Path) -> bool:
+    """Whether a run folder has one."""
+    return bool(parts_of(folder, MAP))
+
+
+def grew(folder: Path) -> bool:
+    """Whether there is anything in it."""
+    return any(record.get("type") == "growth" for record in read_records(folder, MAP, []))
+
+
+def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> MapState | None:
+    """The map of a run folder, as far as it can be read; None where there is none.
+
+    Parameters
+    ----------
+    start_only : that which the run began with
+
+    Raises
+    ------
+    FormatError
+        It is of a later version, or no map.
+    """
+    state, has_start = MapState(), False
+    for count, record in enumerate(read_records(folder, MAP, losses)):
+        try:
+            match record["type"]:
+                case "map" if record["version"] > VERSION:
+                    raise FormatError(f"its version is {record['version']}; this program knows up to {VERSION}")
+                case "growth":
+                    _grow(state, record)
+                case "estimate":
+                    values = np.array(record["values"], dtype=float)
+                    state.values[: len(values)] = values
+                case "start":
+                    has_start = True
+                    state.processed = 0
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, GraphSlamError) as error:
+            raise FormatError(f"{folder.name}/{MAP}.mcap: record {count}: {error}") from None
+        if start_only and has_start:
+            break
+    if (start_only and not has_start) or not state.keyframes:
+        return None
+    if fault := _fault(state):
+        raise FormatError(f"{folder.name}/{MAP}.mcap: {fault}")
+    _take_effect(state)
+    return state
+
+
+def state_of(slam: GraphSlam) -> MapState:
+    """The map of a pipeline, apart from it."""
+    state = MapState()
+    extend(state, Growth().since(slam))
+    state.values, state.settings = slam.solver.values, dict(slam.settings)
+    state.used_ns, state.source = slam.newest_odometry_ns, slam.odometry_source
+    return state
+
+
+def extend(state: MapState, record: Mapping[str, Any]) -> None:
+    """Take a ``growth`` in, after what there is."""
+    _grow(state, record)
+    _take_effect(state)
+
+
+def _fault(state: MapState) -> str:
+    """Where the parts do not fit together; empty if they do."""
+    graph = state.graph
+    kinds = [graph.kinds[code] for code in graph.kind.values.tolist()]
+    pose = next((kind for kind in kinds if kind in GROUPS), None)
+
+    def are_numbers(several: tuple[Any, ...]) -> bool:
+        return all(isinstance(x, int | float) and math.isfinite(x) for x in several)
+
+    def is_instant(stamp_ns: Any, at: tuple[Any, ...]) -> bool:
+        return _is_index(stamp_ns, 2**63) and are_numbers(at) and pose is not None and len(at) == pose.size
+
+    for k, one in enumerate(state.keyframes):
+        fits = _is_index(one.vertex, len(kinds)) and kinds[one.vertex] is pose
+        if not (fits and is_instant(one.stamp_ns, one.T_odom_base)):
+            return f"keyframe {k} is none"
+    for k, seen in enumerate(state.sighting_poses):
+        if not (_is_index(seen.keyframe, len(state.keyframes)) and is_instant(seen.stamp_ns, seen.T_keyframe_base)):
+            return f"sighting {k} is none"
+    for name, mark in state.landmarks.items():
+        if not all(map(_is_index, (mark.vertex, mark.sightings), (len(kinds), 2**31))):
+            return f"landmark {name} is none"
+        if not all(_is_index(stamp_ns, 2**63) for stamp_ns in (mark.first_seen_ns, mark.last_seen_ns)):
+            return f"landmark {name} was never seen"
+    for name, vertex in state.range_offsets.items():
+        if not (_is_index(vertex, len(kinds)) and kinds[vertex] is R1):
+            return f"the offset of {name} is none"
+    if not all(_is_index(one, len(state.keyframes)) for one in (*state.segments, *state.drives)):
+        return "a segment or a drive begins where no keyframe is"
+    if not (state.used_ns is None or _is_index(state.used_ns, 2**63)) or not isinstance(state.source, str):
+        return "the odometry that was used last is none"
+    if state.datum and not (len(state.datum) == 3 and are_numbers(state.datum)):
+        return "its datum is none"
+    if len(state.ledger) > graph.edge_count:
+        return f"{len(state.ledger)} verdicts on {graph.edge_count} edges"
+    return "" if np.isfinite(state.values).all() else "an estimate is not finite"
+
+
+def _is_index(one: Any, count: int) -> bool:
+    return isinstance(one, int) and not isinstance(one, bool) and 0 <= one < count
+
+
+# -- what is written --------------------------------------------------------------------------------------------------
+
+
+def _estimate(values: Any) -> Record:
+    return {"type": "estimate", "values": values.tolist()}
+
+
+def _vertex(graph: Graph, vertex: int) -> list[Any]:
+    kind, at = graph.kind_of(vertex), int(graph.offset.values[vertex])
+    return [kind.name, graph.initial.values[at : at + kind.size].tolist()]
+
+
+def _edge(graph: Graph, edge: int) -> list[Any]:
+    table, row = graph.row(edge)
+    numbers = (table.vertices, table.measured, table.sqrt_information)
+    vertices, measured, root = (column.values[row].ravel().tolist() for column in numbers)
+    return [_TAGS[table.type], vertices, measured, root, graph.label_of(edge), graph.source_of(edge)]
+
+
+def _judgement(ledger: Ledger, edge: int) -> list[Any]:
+    first, numbers = int(ledger.keyframe.values[edge]), int(ledger.numbers.values[edge])
+    verdict, reason = Verdict(int(ledger.verdict.values[edge])), Reason(int(ledger.reason.values[edge]))
+    statistic, threshold = _told(float(ledger.statistic.values[edge])), _told(float(ledger.threshold.values[edge]))
+    return [first, statistic, threshold, numbers, ledger.residual(edge).tolist(), *_named(verdict, reason)]
+
+
+def _change(c: Change) -> list[Any]:
+    return [c.edge, c.keyframe, *_named(c.verdict, c.reason), _told(c.statistic), _told(c.threshold)]
+
+
+def _named(verdict: Verdict, reason: Reason) -> tuple[str, str]:
+    return verdict.name.lower(), reason.name.lower()
+
+
+def _told(number: float) -> float | str:
+    """JSON has no infinity."""
+    return number if math.isfinite(number) else repr(number)
+
+
+def _landmark(mark: Landmark) -> list[Any]:
+    stamps = mark.first_seen_ns, mark.last_seen_ns
+    return [mark.vertex, mark.is_unnamed, mark.is_tentative, mark.sightings, *stamps]
+
+
+def _newer(seen: Sequence[Seen], first_edge: int) -> Iterable[Seen]:
+    """Those of new edges: they are at the end."""
+    count = next((k for k, one in enumerate(reversed(seen)) if one.edge < first_edge), len(seen))
+    return seen[len(seen) - count :]
+
+
+def _seen(one: Seen) -> list[Any]:
+    where = one.where
+    at = [where.keyframe, where.vertex, where.stamp_ns, where.T_keyframe_base, where.covariance.tolist()]
+    return [one.edge, one.topic, asdict(one.sighting), *at]
+
+
+# -- what is read -----------------------------------------------------------------------------------------------------
+
+
+def _take_effect(state: MapState) -> None:
+    """What is not believed pulls no more; what was given to another landmark is withdrawn from the one before."""
+    out = np.flatnonzero(np.isin(state.ledger.verdict.values, (Verdict.PENDING, Verdict.REJECTED)))
+    state.graph.set_weights(out, 0.0)
+    for mark in state.landmarks.values():
+        mark.seen = [one for one in mark.seen if not state.ledger.is_withdrawn(one.edge)]
+        mark.stamps = {one.where.stamp_ns for one in mark.seen}
+
+
+def _grow(state: MapState, record: Mapping[str, Any]) -> None:
+    graph, ledger = state.graph, state.ledger
+    for name, several in groupby(record.get("vertices", ()), key=lambda vertex: vertex[0]):
+        graph.add_vertices(_KINDS[name], [values for _, values in several])
+    state.values = np.concatenate((state.values, graph.initial.values[len(state.values) :]))
+    for (tag, label, source), several in groupby(record.get("edges", ()), key=lambda edge: (edge[0], *edge[4:])):
+        _, vertices, measured, roots, *_ = zip(*several, strict=True)
+        size = EDGE_TAGS[tag].residual_size
+        noise = Gaussian(np.array(roots, dtype=float).reshape(-1, size, size))
+        graph.add_edges(EDGE_TAGS[tag], vertices, measured, noise, label, source)
+    _judge(ledger, record.get("judged", ()))
+    for edge, keyframe, verdict, reason, statistic, threshold in record.get("changes", ()):
+        ledger.note(edge, keyframe, *_verdict(verdict, reason), float(statistic), float(threshold))
+    state.keyframes += [Keyframe(vertex, stamp, tuple(pose)) for vertex, stamp, pose in record.get("keyframes", ())]
+    state.segments += record.get("segments", ())
+    state.drives += record.get("drives", ())
+    state.sighting_poses += [SightingPose(k, stamp, tuple(pose)) for k, stamp, pose in record.get("sightings", ())]
+    _know(state, record)
+    state.range_offsets.update(record.get("offsets", {}))
+    state.datum = tuple(record.get("datum", state.datum))
+    state.settings.update(record.get("settings", {}))
+    state.processed = _count(record.get("processed"))
+    state.used_ns, state.source = record.get("used", (None, ""))
+    for name in ("frozen", "held"):
+        vertices, edges = record.get(name, (0, 0))
+        if not (_is_index(vertices, graph.vertex_count + 1) and _is_index(edges, len(ledger) + 1)):
+            raise ValueError(f"{name} {record[name]}: more than there is")
+    if "frozen" in record:
+        state.frozen, edges = record["frozen"]
+        ledger.finish(edges)
+    state.held = tuple(record.get("held", state.held))
+
+
+def _count(told: Any) -> int | None:
+    if told is not None and not _is_index(told, 2**63):
+        raise ValueError(f"processed {told!r} is no count")
+    return told
+
+
+def _judge(ledger: Ledger, judged: Sequence[Any]) -> None:
+    if not judged:
+        return
+    keyframes, statistics, thresholds, numbers, residuals, *named = zip(*judged, strict=True)
+    told = [_verdict(*names) for names in zip(*named, strict=True)]
+    is_judged = np.array([verdict is not Verdict.NOT_EVALUATED for verdict, _ in told])
+    flat = np.array([number for residual in residuals for number in residual])
+    limits = np.array(list(map(float, thresholds)))
+    ids = ledger.enter(
+        np.array(keyframes), np.array(list(map(float, statistics))), np.array(numbers), limits, flat, is_judged
+    )
+    for edge, (verdict, reason) in zip(ids.tolist(), told, strict=True):
+        ledger.put(edge, verdict, reason)
+
+
+def _verdict(verdict: str, reason: str) -> tuple[Verdict, Reason]:
+    return Verdict[verdict.upper()], Reason[reason.upper()]
+
+
+def _know(state: MapState, record: Mapping[str, Any]) -> None:
+    for name, told in record.get("landmarks", {}).items():
+        before = state.landmarks.get(name)
+        if before is not None and (told is None or told[0] != before.vertex):  # it was given up: another comes last
+            del state.landmarks[name]
+            before = None
+        if told is not None:
+            now = state.landmarks[name] = Landmark(name, *told)
+            now.seen = before.seen if before is not None else []
+    by_vertex = {mark.vertex: mark for mark in state.landmarks.values()} if record.get("seen") else {}
+    for edge, topic, sighting, keyframe, vertex, stamp, pose, covariance in record.get("seen", ()):
+        lists = {name: tuple(value) for name, value in sighting.items() if isinstance(value, list)}
+        where = Where(keyframe, vertex, stamp, tuple(pose), np.array(covariance))
+        table, row = state.graph.row(edge)
+        mark = by_vertex[int(table.vertices.values[row, 1])]
+        mark.seen.append(Seen(edge, topic, Sighting(**sighting | lists), where))

@@ -1,0 +1,125 @@
+"""What came of each input of a run: a table for a person, and what makes the result less than what was asked for.
+
+Both are made from ``run.json``, so they are the same for a live run, a replay and a recovered run.
+"""
+
+import textwrap
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from graph_slam_ros.measurements.reasons import Effect, Reason, explain, remedy
+
+Summary = Mapping[str, Any]
+
+_WIDTH = 100
+_MOST_REASONS, _MOST_WAITING = 5, 10  # that are listed
+_COLUMNS = ("received", "used", "believed")
+_OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does not move in a plane
+_MOSTLY = 0.5
+_CONTRADICT = (
+    "graph_slam explain RUN says why; if its noise is larger than told, --set {0}.noise=sigmas {0}.sigma_m=..."
+)
+
+_EXTREME = "distances or noise that no robot means do that: --set INPUT.max_distance_m=... or INPUT.noise=sigmas"
+
+
+def text(summary: Summary) -> list[str]:
+    """Numbers of a run, what waits, and what came of each input."""
+    lines = [
+        f"keyframes  {summary['keyframes']:8d}   over {summary['span_s']:.1f} s",
+        f"landmarks  {summary['landmarks']:8d}   from {summary['sightings']} sightings",
+        f"edges      {summary['edges']:8d}",
+        f"chi2       {summary['chi2']:12.3f}   after {summary['solves']} solves",
+    ]
+    if "time_s" in summary:
+        cpu = f", {summary['cpu_s']:.1f} s of CPU time" if "cpu_s" in summary else ""
+        lines.append(f"took       {summary['time_s']:10.1f} s{cpu}")
+    waiting = [f"waiting    {name}: {reason}" for name, reason in summary["waiting"].items()]
+    if len(waiting) > _MOST_WAITING:
+        waiting[_MOST_WAITING:] = [f"waiting    and {len(waiting) - _MOST_WAITING} more, see run.json"]
+    inputs = summary.get("inputs", {})
+    others = [
+        line
+        for source, counts in summary["counters"].items()
+        for reason, times in counts.items()
+        if source not in inputs or explain(reason).effect is not Effect.REFUSED
+        for line in _wrapped(f"counted    {source}: {reason} {times} ({explain(reason).meaning})", 11)
+    ]
+    return [*lines, *waiting, *others, *table(summary)]
+
+
+def _wrapped(line: str, indent: int) -> list[str]:
+    """Of a line, as many as it takes; a name that came with a message cannot begin one."""
+    return textwrap.wrap(" ".join(line.splitlines()), _WIDTH, subsequent_indent=" " * indent)
+
+
+def table(summary: Summary) -> list[str]:
+    """A row for each input, with the reasons of what was refused and the lines that mend them.
+
+    ``received`` counts messages; the others count what is in them: odometry, sightings, fixes, closures. ``believed``
+    is what the estimate follows.
+    """
+    inputs: Mapping[str, Any] = summary.get("inputs", {})
+    if not inputs:
+        return []
+    wide = max(5, *map(len, inputs))
+    lines = [f"{'input':{wide}s}" + "".join(f"{name:>10s}" for name in (*_COLUMNS, "refused"))]
+    for name, counts in inputs.items():
+        refused = _counted(summary, name, Effect.REFUSED)
+        numbers = (*(counts[column] for column in _COLUMNS), sum(refused.values()))
+        lines.append(f"{name:{wide}s}" + "".join(f"{'-' if n is None else n:>10}" for n in numbers))
+        for reason, times in list(refused.items())[:_MOST_REASONS]:
+            lines += textwrap.wrap(f"{reason} {times}: {explain(reason).meaning}", _WIDTH - 2, initial_indent="  ")
+            if mend := remedy(name, reason):
+                lines += textwrap.wrap(f"-> {mend}", _WIDTH, initial_indent="    ", subsequent_indent="       ")
+    return lines
+
+
+def shortcomings(summary: Summary) -> Iterator[str]:
+    """Why the result is less than what was asked for, a sentence each; nothing where it is not."""
+    inputs: Mapping[str, Any] = summary.get("inputs", {})
+    if summary.get("failing"):
+        yield f"the last solve failed ({summary['failing']}), and the estimate is the one before it: {_EXTREME}"
+    for name, counts in inputs.items():
+        counted = _counted(summary, name, Effect.REFUSED)
+        refused = sum(counted.values())
+        is_odometry = counts["use"] == "odometry"
+        if not counts["used"] and not is_odometry:
+            yield _unused(summary, name, counts["received"])
+        elif refused > _MOSTLY * (refused + counts["used"]):
+            yield f"{name}: most of it was refused: {_because(name, counted)}"
+        elif not is_odometry and (counts["believed"] or 0) < _MOSTLY * counts["used"]:
+            yield f"{name}: only {counts['believed'] or 0} of {counts['used']} are believed: {_CONTRADICT.format(name)}"
+        out_of_plane = summary["counters"].get(name, {}).get("out_of_plane", 0)
+        if is_odometry and out_of_plane > _OUT_OF_PLANE * (counts["received"] or counts["used"]):
+            yield f"{name} leaves the plane: these are three dimensions: --set world.dimensions=3"
+    if not sum(counts["believed"] or 0 for counts in inputs.values()):
+        yield "this is odometry alone: no landmark, fix or closure is in the result"
+    elif summary["landmarks"] and summary["sightings"] == summary["landmarks"]:
+        yield "no landmark was seen twice, so they correct nothing: do ids change? --set landmarks.association=joint"
+
+
+def _unused(summary: Summary, name: str, received: int | None) -> str:
+    if not received and received is not None:
+        return f"{name}: no message came"
+    messages = "" if received is None else f" of {received} messages"
+    counted = _counted(summary, name, Effect.REFUSED) or _counted(summary, name, Effect.NOTED)
+    if not counted and summary["waiting"]:
+        return f"{name}: nothing{messages} was used: {len(summary['waiting'])} landmarks wait, see above"
+    return f"{name}: nothing{messages} was used: {_because(name, counted)}"
+
+
+def _because(name: str, counted: Mapping[str, int]) -> str:
+    """The most frequent reason, and what mends it."""
+    if not counted:
+        return "it holds nothing"
+    reason = next(iter(counted))
+    row: Reason = explain(reason)
+    mend = remedy(name, reason)
+    return f"{reason} {counted[reason]} ({row.meaning})" + (f"; {mend}" if mend else "")
+
+
+def _counted(summary: Summary, name: str, effect: Effect) -> dict[str, int]:
+    """Reasons of one effect for an input, the most frequent first."""
+    some = [(r, times) for r, times in summary["counters"].get(name, {}).items() if explain(r).effect is effect]
+    return dict(sorted(some, key=lambda one: (-one[1], one[0])))

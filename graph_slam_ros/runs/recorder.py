@@ -1,0 +1,342 @@
+"""Recording a run as it goes on, and saving its results."""
+
+import contextlib
+import json
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros.formats.durable import AppendedFile, write_whole
+from graph_slam_ros.runs.journal import BEGINS_IN_A_MAP, INGEST, MAP, MEASUREMENT, Parts, close_all, part_name, parts_of
+from graph_slam_ros.formats.parameters import parameters_text
+from graph_slam_ros.messages import results
+from graph_slam_ros.recordings.bag import BagWriter
+from graph_slam_ros.runs.folder import (
+    CONFIG,
+    MARK,
+    SUMMARY,
+    RunError,
+    checksum,
+    discard,
+    recorded_files,
+    room,
+    summary_of,
+)
+from graph_slam_ros.runs.map_journal import GROWTH, Growth
+from graph_slam_ros.runs.tables import counted, result_texts, summarize
+from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
+from graph_slam_ros.slam.snapshot import MapState
+from graph_slam_ros.measurements.types import to_record
+from graph_slam_ros.solver.leverage import leverage
+
+_PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
+_TOGETHER = 256  # measurements that are written at once: one by one, as they come, each takes several times as long
+
+
+class RunRecorder:
+    """Records a run while it goes on, and saves its results.
+
+    What was accepted is in the journal once ``flush`` has returned. A disk that is full loses nothing: what could not
+    be written is written when there is room. One thread accepts measurements (``accept``) while another processes them
+    and calls everything else; ``leave`` may be called by either.
+
+    Parameters
+    ----------
+    folder : made if it is not there; anything in it is refused but a run that holds nothing
+    force : a run that holds something is replaced, too
+    sync_s : so often at most the disk is asked to take the journal, in a thread of its own; 0: at the end
+    start : the map that the run goes on in
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        config: Config,
+        sync_s: float = 0.0,
+        start: MapState | None = None,
+        *,
+        force: bool = False,
+    ) -> None:
+        self.folder = Path(folder)
+        self._sync_s, self._due_s = sync_s, 0.0
+        self._disk: ThreadPoolExecutor | None = None
+        self._writing = threading.RLock()
+        self._is_ended = False
+        self._flushing: Future[None] | None = None
+        self.accepted = 0  # measurements, written or not
+        self._syncing: Future[None] | None = None
+        self._journal = Parts(self.folder, INGEST, MEASUREMENT)
+        self._map = Parts(self.folder, MAP, GROWTH)
+        self._accepted: deque[Measurement] = deque()  # and not written yet
+        self._growth = Growth(start)
+        self._grown = self._growth.first
+        self._bag: BagWriter | None = None
+        self._bags = 0
+        self._ended_bags: list[AppendedFile] = []
+        self._next_path_at = 1.0
+        self._room = ExitStack()
+        self._room.enter_context(room(self.folder, force=force))
+        try:
+            self._journal.begin()
+            self._journal.write([BEGINS_IN_A_MAP] if start is not None else [])
+            self._journal.flush()
+            _put(self.folder, CONFIG, parameters_text(config.as_mapping()))
+        except KeyboardInterrupt:
+            self.discard()
+            raise
+        except OSError as error:
+            self.abandon()
+            raise RunError(f"{self.folder}: {error.strerror}") from None
+
+    def accept(self, measurement: Measurement) -> None:
+        """Take a measurement for the journal; it waits for ``flush`` or ``flush_beside``."""
+        self._accepted.append(measurement)
+        self.accepted += 1
+
+    def flush_beside(self) -> None:
+        """Have a thread write what was accepted, if that waits: the one that processes may be busy for long."""
+        if self._accepted and not self._is_ended and (self._flushing is None or self._flushing.done()):
+            with contextlib.suppress(RuntimeError):  # the recording has just been ended
+                self._flushing = self._beside().submit(self._flush_journal)
+
+    def _flush_journal(self) -> None:
+        with contextlib.suppress(OSError), self._writing:  # it waits, and the next flush raises that again
+            if not self._is_ended:
+                self._fill_journal()
+                self._journal.flush()
+                if self._syncing is None or (self._syncing.done() and not self._syncing.exception()):
+                    self._syncing = self._sync_if_due()
+
+    def _beside(self) -> ThreadPoolExecutor:
+        with self._writing:
+            self._disk = self._disk or ThreadPoolExecutor(1, "journal")
+            return self._disk
+
+    def sink(self, measurement: Measurement) -> None:
+        """Append to the journal: the sink of ``GraphSlam``. Raises OSError as ``flush`` does."""
+        self.accept(measurement)
+        if len(self._accepted) >= _TOGETHER or (self._sync_s and time.monotonic() >= self._due_s):
+            self.flush()
+
+    def flush(self) -> None:
+        """Bring to the disk what was accepted and what came of it: before any of that is told to anybody.
+
+        Raises
+        ------
+        OSError
+            It is kept, and written by the next call that can; or the disk did not take what was flushed before.
+        """
+        with self._writing:
+            if self._is_ended:
+                return
+            self._fill()
+            self._journal.flush()
+            self._map.flush()  # last: it is never ahead of what it came of
+            if self._syncing is None or self._syncing.done():
+                synced, self._syncing = self._syncing, self._sync_if_due()
+                if synced is not None:
+                    synced.result()
+
+    def _fill_journal(self) -> None:
+        accepted = [self._accepted.popleft() for _ in range(len(self._accepted))]
+        self._journal.write([to_record(measurement) for measurement in accepted])
+
+    def _fill(self) -> None:
+        self._fill_journal()
+        grown, self._grown = self._grown, []
+        self._map.write(grown)
+
+    @property
+    def unwritten(self) -> int:
+        """Bytes of the journal that wait for room on the disk."""
+        return self._journal.waiting + self._map.waiting
+
+    def _sync_if_due(self) -> Future[None] | None:
+        """The disk may take long: nobody waits for it."""
+        now = time.monotonic()
+        if not self._sync_s or now < self._due_s:
+            return None
+        self._due_s = now + self._sync_s
+        return self._beside().submit(self._sync)
+
+    def wait_synced(self) -> None:
+        """Wait until the disk has taken what it was asked to take. Raises OSError: it did not, which is told once."""
+        asked, self._syncing = self._syncing, None
+        if asked is not None:
+            asked.result()
+
+    def _sync(self) -> None:
+        self._journal.sync()
+        self._map.sync()
+
+    def record(self, slam: GraphSlam, update: Update) -> None:
+        """Append what an update changed: the map, pose and TF, and the path and the landmarks when they have grown."""
+        if not update or not slam.keyframes:
+            return
+        with self._writing:
+            if not self._is_ended:
+                self._record(slam)
+
+    def _record(self, slam: GraphSlam) -> None:
+        self._grown += self._growth.of(slam)
+        stamp = slam.keyframes[-1].stamp_ns
+        self._write("/tf", results.TF, stamp, results.map_to_odom(slam, stamp))
+        self._write("/tf", results.TF, stamp, results.odom_to_base(slam))
+        self._write("/pose", results.POSE, stamp, results.pose(slam))
+        if len(slam.keyframes) >= self._next_path_at:
+            self._next_path_at = len(slam.keyframes) * _PATH_GROWTH
+            self._record_map(slam)
+
+    def save(self, slam: GraphSlam, summary: dict[str, Any] | None = None) -> Path:
+        """Write all results; recording may go on, in new parts of ``ingest`` and ``run``. Returns the folder.
+
+        Raises
+        ------
+        RunError
+            The folder cannot be written.
+        """
+        try:
+            with self._writing:
+                self._refuse_if_ended()
+                if slam.keyframes:
+                    self._record_map(slam)
+                self._end_parts()
+                parts = self._ended_parts()
+            waiting = max(0, self.accepted - slam.processed)
+            told = (summary or {}) | parts | {"unprocessed": waiting}
+            save_results(self.folder, slam, told, self._refuse_if_ended)
+        except OSError as error:
+            raise RunError(f"{self.folder}: {error.strerror}") from None
+        return self.folder
+
+    def _ended_parts(self) -> dict[str, Any]:
+        """For the summary: how many parts there are (with more of them it went on), and what tells them from others."""
+        parts = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}
+        return {"parts": parts, "recorded": recorded_files(self.folder)}
+
+    def _refuse_if_ended(self) -> None:
+        if self._is_ended:
+            raise RunError(f"{self.folder}: its recording has been ended")
+
+    def leave(self, processed: int, keyframes: int, counters: Counters) -> int:
+        """End the recording before all of it was processed, and note that in the summary; returns what waits.
+
+        What has been saved until now stays; ``complete`` makes the results of the whole.
+
+        Raises
+        ------
+        OSError
+            The disk refuses it.
+        """
+        waiting = max(0, self.accepted - processed)
+        with self._writing:
+            if self._is_ended:
+                return 0
+            self._end_parts()
+            now = {
+                "keyframes": keyframes,
+                "ended": True,
+                "is_incomplete": bool(waiting or keyframes),
+                "unprocessed": waiting,
+            }
+            told = summary_of(self.folder) | now | counted(counters) | self._ended_parts()
+            _put(self.folder, SUMMARY, json.dumps(told, indent=2) + "\n")
+            self._is_ended = True
+            self._room.close()
+        return waiting
+
+    def close(self) -> None:
+        """End the recording: somebody else may have the folder.
+
+        Raises
+        ------
+        OSError
+            What the disk did not take is kept: the next ``flush`` or ``close`` tries again.
+        """
+        with self._writing:
+            self._end_parts()
+            self._is_ended = True
+            self._room.close()
+
+    def abandon(self) -> None:
+        """End the recording as it is on the disk: what waits is lost."""
+        with self._writing:
+            self._is_ended = True
+            self._abandon()
+            self._room.close()
+
+    def _abandon(self) -> None:
+        if self._disk is not None:
+            self._disk.shutdown(wait=False)
+        self._journal.abandon()
+        self._map.abandon()
+        for bag in self._ended_bags:
+            bag.abandon()
+        if self._bag is not None:
+            self._bag.abandon()
+
+    def discard(self) -> None:
+        """End the recording and remove what was written of it, if it was not saved yet."""
+        with self._writing, self._room:
+            self._is_ended = True
+            self._abandon()
+            discard(self.folder)
+
+    def _end_parts(self) -> None:
+        """What comes is of the next."""
+        self._fill()
+        failed = self._syncing.exception() if self._syncing is not None else None
+        self._syncing = None
+        if self._disk is not None:  # its thread ends; another comes with the next sync
+            self._disk.shutdown(wait=False)
+            self._disk = None
+        if self._bag is not None:
+            self._ended_bags.append(self._bag.end())
+            self._bag, self._bags = None, self._bags + 1
+        self._journal.end()
+        self._map.end()
+        close_all(self._ended_bags)
+        if failed is not None:
+            raise failed
+
+    def _record_map(self, slam: GraphSlam) -> None:
+        stamp = slam.keyframes[-1].stamp_ns
+        self._write("/path", results.PATH, stamp, results.path(slam))
+        self._write("/landmarks", results.LANDMARKS, stamp, results.landmarks(slam))
+
+    def _write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
+        if self._bag is None:
+            self._bag = BagWriter(self.folder / part_name("run", self._bags))
+        self._bag.write(topic, type_name, stamp_ns, cdr)
+
+
+def save_results(
+    folder: Path, slam: GraphSlam, summary: dict[str, Any], check: Callable[[], None] = lambda: None
+) -> None:
+    """All that can be computed first, then file by file; the summary, the last, tells which belong together.
+
+    Parameters
+    ----------
+    check : called before each file; where it raises, no more is written
+    """
+
+    def put(name: str, text: str) -> str:
+        check()
+        return _put(folder, name, text)
+
+    files = {name: put(name, text) for name, text in result_texts(slam).items()}
+    told = {"format": MARK} | summarize(slam) | summary | {"format": MARK, "files": files}
+    told["leverage"] = leverage(slam.solver) if slam.is_solved else {}
+    put(SUMMARY, json.dumps(told, indent=2) + "\n")
+
+
+def _put(folder: Path, name: str, text: str) -> str:
+    """Write a file whole or not at all; returns its CRC-32."""
+    data = text.encode()
+    write_whole(folder / name, data)
+    return checksum(data)

@@ -1,0 +1,241 @@
+"""What becomes of a run after it: it is recorded again from its events, or its map is gone on in."""
+
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.formats.durable import claimed
+from graph_slam_ros.runs.journal import read_ingest, read_rest
+from graph_slam_ros.runs.folder import (
+    SUMMARY,
+    RunError,
+    check_room,
+    discard,
+    missing,
+    recording_of,
+    run_config,
+    summary_of,
+    was_saved_whole,
+)
+from graph_slam_ros.runs.map_journal import has_map, read_map, state_of
+from graph_slam_ros.runs.recorder import RunRecorder, save_results
+from graph_slam_ros.runs.tables import counters_of, summarize
+from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
+from graph_slam_ros.slam.snapshot import MapState
+from graph_slam_ros.measurements.types import from_record
+from graph_slam_ros.warmup import warmup
+
+Summary = dict[str, Any]
+Took = Callable[[], dict[str, float]]
+
+
+def map_of(folder: Path, losses: list[str], counters: Counters | None = None) -> MapState:
+    """The map of a run: as it was written down, with what its journal holds besides; or by repeating the drive.
+
+    Parameters
+    ----------
+    counters : added to them is what the run has counted, by its summary and by what is processed here
+
+    Raises
+    ------
+    RunError, FormatError
+        There is none, or it cannot be read.
+    """
+    warmup()
+    losses += missing(folder)
+    counters = Counters() if counters is None else counters
+    try:
+        counters.update(counters_of(summary_of(folder)))
+    except ValueError as error:
+        losses.append(f"{folder / SUMMARY}: what it had counted: {error}")
+    state = read_map(folder, losses) if has_map(folder) else None
+    state = _repeated(folder, losses, counters) if state is None else _with_rest(folder, state, losses, counters)
+    if not state.keyframes:
+        raise RunError(f"{folder}: no keyframe, so there is no map")
+    space = run_config(folder).space
+    if state.graph.kind_of(state.keyframes[0].vertex) is not space.pose:
+        raise RunError(f"{folder}: its map is not in {space.dimensions} dimensions, as its configuration says")
+    return state
+
+
+def config_of(folder: Path, state: MapState) -> Config:
+    """The configuration of a run when its map was as it is: with what was changed on the way."""
+    try:
+        return run_config(folder).changed(state.settings)
+    except ConfigError as error:
+        raise RunError(f"{folder}: changed on the way: {error}") from None
+
+
+def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapState:
+    slam = GraphSlam(run_config(folder), start=read_map(folder, [], start_only=True))  # its losses are known
+    for record in read_ingest(folder, losses):
+        slam.process(from_record(record))
+    slam.process(Control("end"))
+    counters.raise_to(slam.counters)
+    return state_of(slam)
+
+
+def _with_rest(folder: Path, state: MapState, losses: list[str], counters: Counters) -> MapState:
+    """The map after those measurements, too, that were accepted and not processed any more."""
+    if state.processed is None or was_saved_whole(folder):
+        return state
+    rest = [from_record(record) for record in read_rest(folder, state.processed, state.used_ns, losses)]
+    if not rest:
+        return state
+    state.continues_with = state.source if state.used_ns is not None else ""
+    settings = dict(state.settings)
+    slam = GraphSlam(config_of(folder, state), start=state)
+    for measurement in [*rest, Control("end")]:
+        slam.process(measurement)
+    counters.update(slam.counters)
+    out = state_of(slam)
+    out.settings = settings | out.settings
+    return out
+
+
+def taken_up(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
+    """The map of a run, solved; as ``map_of``."""
+    lost = len(losses)
+    state = map_of(folder, losses, counters)
+    losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
+    config = config_of(folder, state).changed({"map.localize": False})  # what is asked of a map is asked of all of it
+    return GraphSlam(config, start=state)
+
+
+def settled(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
+    """The same with all of it judged. Raises GraphSlamError, too, where it cannot be solved."""
+    slam = taken_up(folder, losses, counters)
+    slam.process(Control("optimize"))
+    if not slam.is_solved:
+        raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
+    return slam
+
+
+def record_run(
+    folder: Path,
+    config: Config,
+    measurements: Iterable[Measurement],
+    losses: Sequence[str],
+    start: MapState | None = None,
+    *,
+    border: Counters | None = None,
+    earlier: Counters | None = None,
+    took: Took | None = None,
+    recording: str = "",
+    force: bool = False,
+) -> tuple[GraphSlam, Summary]:
+    """Run the pipeline over measurements and save it all; returns the pipeline and the summary.
+
+    Parameters
+    ----------
+    losses : what could not be read, as known when the last measurement was
+    start : the map to go on in
+    border : counters of what was refused before it came here
+    earlier : counters of the run whose results these are, up to ``start``
+    took : the time since whatever is told as its beginning
+    recording : the name of the file or folder that the measurements are from
+    force : a run in the folder may be replaced
+
+    Raises
+    ------
+    KeyboardInterrupt
+        Nothing of it is left in the folder; so it is whatever is raised before the first measurement is accepted.
+    """
+    took = took or stopwatch()
+    recorder: RunRecorder | None = None
+    try:
+        recorder = RunRecorder(folder, config, start=start, force=force)
+        slam = GraphSlam(config, recorder.sink, start=start)
+        for measurement in measurements:
+            recorder.record(slam, slam.process(measurement))
+        slam.counters.update(border or Counters())
+        summary = summarize(slam, earlier) | took() | {"losses": list(dict.fromkeys(losses))}
+        summary |= {"recording": recording} if recording else {}
+        recorder.save(slam, summary)
+    except KeyboardInterrupt:
+        if recorder is not None:
+            recorder.discard()
+        raise
+    except BaseException:
+        if recorder is not None and recorder.accepted:
+            recorder.close()
+        elif recorder is not None:  # the first that was read was refused
+            recorder.discard()
+        raise
+    recorder.close()
+    return slam, summary
+
+
+def stopwatch() -> Took:
+    """Of what follows."""
+    start_s, cpu_s = time.perf_counter(), time.process_time()
+    return lambda: {"time_s": time.perf_counter() - start_s, "cpu_s": time.process_time() - cpu_s}
+
+
+def recover(folder: Path, out: Path, *, force: bool = False) -> Summary:
+    """Write the results of a run that was never ended, from its map: the drive is not repeated."""
+    took = stopwatch()
+    check_room(out, folder, force=force)
+    losses: list[str] = []
+    counters = Counters()
+    state = map_of(folder, losses, counters)
+    told: dict[str, Any] = {"earlier": counters, "took": took, "recording": recording_of(folder)}
+    return record_run(out, config_of(folder, state), (), losses, state, force=force, **told)[1]
+
+
+def complete(folder: Path) -> Summary:
+    """Write into a run the results of all that it holds; its recordings stay as they are.
+
+    Raises
+    ------
+    RunError
+        Somebody else has the folder, or its map cannot be solved.
+    """
+    took = stopwatch()
+    losses: list[str] = []
+    try:
+        with claimed(folder):
+            before, counters = summary_of(folder), Counters()
+            slam = settled(folder, losses, counters)
+            summary = (
+                before | summarize(slam, counters) | took() | {"losses": losses, "ended": True, "is_incomplete": False}
+            )
+            save_results(folder, slam, summary)
+    except OSError as error:
+        raise RunError(f"{error.filename or folder}: {error.strerror}") from None
+    return summary
+
+
+def save_copy(slam: GraphSlam, out: Path) -> None:
+    """Write the map of a pipeline as a run of its own, which others can load; the pipeline goes on as it was.
+
+    Raises
+    ------
+    RunError
+        Something of that name is there already, or there is no map that is solved. Nothing was written.
+    """
+    if os.path.lexists(out):
+        raise RunError(f"{out.name}: is there already, and nothing is replaced: choose another name")
+    if not slam.keyframes:
+        raise RunError(f"{out.name}: not written: there is no keyframe, so there is no map")
+    if not slam.is_solved:
+        raise RunError(f"{out.name}: not written: the map cannot be solved: {slam.failing}")
+    try:
+        record_run(out, slam.config, (), [], state_of(slam))
+    except Exception:
+        discard(out)
+        raise
+
+
+def freeze(folder: Path, out: Path, *, force: bool = False) -> Summary:
+    """Write a run that begins in the map of another, all of which then stays as it is."""
+    took = stopwatch()
+    check_room(out, folder, force=force)
+    losses: list[str] = []
+    slam = settled(folder, losses)
+    state = state_of(slam)
+    state.freeze()
+    return record_run(out, slam.config, [Control("optimize")], losses, state, took=took, force=force)[1]

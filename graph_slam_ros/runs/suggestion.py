@@ -1,0 +1,354 @@
+"""The replay command that fits a recording: which topics are inputs, and which look like it but are not."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from graph_slam_ros.recordings.contents import Contents, Recording
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.parameters import parse_setting
+from graph_slam_ros.runs.replay import TF_TOPIC, choose_inputs
+from graph_slam_ros.recordings.bag import Bag
+from graph_slam_ros.messages.from_msg import TRANSFORMS
+from graph_slam_ros.messages.inputs import CONVERTERS
+from graph_slam_ros.runs import suggested_out
+from graph_slam_ros.slam import Config
+
+ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
+CLOUD, GNSS, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
+POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+APRILTAGS = "apriltag_msgs/msg/AprilTagDetectionArray"
+_LANDMARKS = {
+    APRILTAGS: "tags",
+    "aruco_msgs/msg/MarkerArray": "tags",
+    "ros2_aruco_interfaces/msg/ArucoMarkers": "tags",
+    "aruco_opencv_msgs/msg/ArucoDetection": "tags",
+    "rtabmap_msgs/msg/LandmarkDetections": "tags",
+    "cartographer_ros_msgs/msg/LandmarkList": "reflectors",
+    "mrpt_msgs/msg/ObservationRangeBearing": "beacons",
+    "mrpt_msgs/msg/ObservationRangeBeacon": "beacons",
+}
+"""Types that are landmarks whenever they are there, and the names of their inputs."""
+
+_WORD = r"(^|[/_])({})([/_\d]|$)"
+_TRUTH = re.compile(
+    _WORD.format(r"ground_?truth|groundtruth|truth|true|gt|reference|vicon|vrpn\w*|mocap|optitrack|qualisys|p3d|leica"),
+    re.IGNORECASE,
+)
+_ESTIMATE = re.compile(
+    _WORD.format(
+        r"amcl\w*|\w*slam\w*|cartographer|rtabmap|locali[sz]\w*|mcl|tracked_pose|initialpose|goal\w*|pose_est\w*"
+    ),
+    re.IGNORECASE,
+)
+_FUSED = re.compile(r"filtered|fused|[eu]kf|combined", re.IGNORECASE)
+_NOT_MEASURED = re.compile(r"raw|cmd|desired|target|set_?point|plan", re.IGNORECASE)
+_TAG = re.compile(r"((?:.*[/_])?(?:tag|aruco|marker|fiducial).*?)[:_]?\d+", re.IGNORECASE)
+_CORNERS = re.compile(r"tag|aruco|fiducial", re.IGNORECASE)
+_MAPS = ("map", "earth", "utm")
+_OPTICAL = "0 0 0 -1.5707963 0 -1.5707963"  # z ahead, x to the right
+_OFF_PLANE = 0.05
+_CLOCKS_DIFFER_S, _MOST_OFFSET_S = 2.0, 3600.0
+
+
+class Suggestion:
+    """A command, and what a person should know of it.
+
+    Attributes
+    ----------
+    settings : parameters that differ from their defaults, by dotted name
+    notes : sentences: what was chosen and why, and what is assumed
+    unused : why a topic that could be an input is not offered, by its name
+    trouble : why there is no command; empty where there is one
+    """
+
+    def __init__(self, bag: Bag, recording: Recording, path: Path) -> None:
+        self._recording, self._path = recording, path
+        self.settings: dict[str, Any] = {}
+        self.notes: list[str] = []
+        self.unused: dict[str, str] = {}
+        self._topics: dict[str, str] = {}  # of odom and detections
+        self._names: list[str] = []
+        self._base, self._odom = "base_link", "odom"
+        self._lag_s: float | None = None
+        self.trouble = self._of_a_result() or self._choose_odometry()
+        if not self.trouble:
+            self._choose_landmarks()
+            self._choose_fixes()
+            self._finish()
+            self.trouble = self._refused(bag)
+
+    def command(self) -> str:
+        """As it is pasted into a shell."""
+        path = str(self._path)
+        words = ["graph_slam", "replay", f"./{path}" if path.startswith("-") else path]
+        for option, name in (("--odom", "odom"), ("--landmarks", "detections")):
+            words += [option, self._topics[name]] if name in self._topics else []
+        for key, value in self.settings.items():
+            words += ["--set", _assignment(key, value)]
+        return shlex.join([*words, "--out", str(suggested_out(self._path))])
+
+    def _refused(self, bag: Bag) -> str:
+        """Why the command would be; empty where it is not."""
+        try:
+            config = Config.from_mapping(self.settings)
+            choose_inputs(bag, config, self._topics.get("odom"), self._topics.get("detections"))
+        except GraphSlamError as error:
+            return str(error)
+        return ""
+
+    def _of_a_result(self) -> str:
+        types = {name: one.topic.type for name, one in self._recording.topics.items()}
+        if (
+            types.get("/path") == "nav_msgs/msg/Path"
+            and types.get("/landmarks") == "visualization_msgs/msg/MarkerArray"
+        ):
+            return (
+                "this is the result of a run (path, pose, landmarks), not what sensors said: give replay its run folder"
+            )
+        return ""
+
+    def _of_type(self, *types: str) -> Iterator[Contents]:
+        """Topics that can be read and are no truth."""
+        for name, one in self._recording.topics.items():
+            if one.topic.type in types and one.topic.count:
+                if _TRUTH.search(name):
+                    self.unused[name] = "ground truth by its name: graph_slam evaluate RUN --truth compares with it"
+                elif one.trouble:
+                    self.unused[name] = one.trouble
+                else:
+                    yield one
+
+    # -- odometry ------------------------------------------------------------------------------------------------
+
+    def _choose_odometry(self) -> str:
+        found = []
+        for one in self._of_type(ODOMETRY):
+            if one.frame in _MAPS:
+                self.unused[one.topic.name] = f"in frame {one.frame}: somebody's estimate, not odometry"
+            elif _is_zero(one):
+                self.unused[one.topic.name] = "its stamps are zero: have the driver fill in header.stamp"
+            else:
+                found.append(one)
+        if not found:
+            return self._odometry_of_tf()
+        best = max(found, key=self._merit)
+        for one in found:
+            if one is not best:
+                self.unused[one.topic.name] = "another odometry"
+        if len(found) > 1:
+            self.notes.append(f"{len(found)} odometries: {best.topic.name} is chosen; --odom takes another")
+        self._topics["odom"], self._lag_s = best.topic.name, _lag_s(best)
+        self._frames(best.frame, best.child)
+        if best.off_plane > _OFF_PLANE * best.read:
+            self.settings["world.dimensions"] = 3
+            self.notes.append(f"{best.topic.name} leaves the plane: these are three dimensions")
+        return ""
+
+    def _merit(self, one: Contents) -> tuple[Any, ...]:
+        """Whole and moving first, then fused, then in a frame of odometry, then the one with the most messages."""
+        longest = max(other.last_ns - other.first_ns for other in self._recording.topics.values())
+        is_whole = one.last_ns - one.first_ns >= 0.5 * longest
+        name = one.topic.name
+        is_odom = "odom" in one.frame.lower()
+        fused = bool(_FUSED.search(name)) - bool(_NOT_MEASURED.search(name))
+        return is_whole, one.path_m > 0.05, fused, is_odom, one.topic.count
+
+    def _odometry_of_tf(self) -> str:
+        links = [(p, c) for c, p in self._recording.moving.items() if p not in _MAPS]
+        links = [(p, c) for p, c in links if "odom" in p.lower() or c.startswith("base")]
+        if not links or TF_TOPIC not in self._recording.topics:
+            there = ", ".join(f"{name} ({one.topic.type or 'no type'})" for name, one in self._recording.topics.items())
+            why = "".join(f"; {name}: {reason}" for name, reason in self.unused.items())
+            return f"no odometry (nav_msgs/msg/Odometry, or odom -> base_link on /tf); there are {there}{why}"
+        parent, child = min(links, key=lambda link: ("odom" not in link[0].lower(), not link[1].startswith("base")))
+        self.settings |= {"odom.type": TRANSFORMS, "odom.topic": TF_TOPIC}
+        self.notes.append(f"odometry is {parent} -> {child} of /tf: there is no topic with it")
+        self._frames(parent, child)
+        return ""
+
+    def _frames(self, parent: str, child: str) -> None:
+        self._names.append("odom")
+        if not parent:
+            self.settings["odom.frame"] = self._odom
+        elif parent != self._odom:
+            self.settings["frames.odom"] = self._odom = parent
+        if not child:
+            self.settings["odom.mount"] = "0 0 0 0 0 0"
+            self.notes.append("odometry names no child frame: that of the robot's base is assumed")
+        elif child != self._base:
+            self.settings["frames.base"] = self._base = child
+
+    # -- landmarks -----------------------------------------------------------------------------------------------
+
+    def _choose_landmarks(self) -> None:
+        for one in self._of_type(DETECTIONS):
+            self._detections(one)
+        for one in self._of_type(CLOUD):
+            self._cloud(one)
+        for one in self._of_type(*_LANDMARKS):
+            if one.topic.type == APRILTAGS and not one.ids & self._recording.moving.keys():
+                self._corners(one)
+            else:
+                self._add(_LANDMARKS[one.topic.type], one, linked=one.topic.type == APRILTAGS)
+        prefixes = {found[1] for found in map(_TAG.fullmatch, self._recording.moving) if found}
+        if not any(name.startswith("tags") for name in self._names):
+            for prefix in sorted(prefixes):
+                chosen = {"type": TRANSFORMS, "topic": TF_TOPIC, "use": "landmarks", "frame_prefix": prefix}
+                frame = next(p for c, p in self._recording.moving.items() if c.startswith(prefix))
+                self._set(self._free("tags"), chosen | self._mount(TF_TOPIC, frame))
+        for name, one in self._recording.topics.items():
+            if _CORNERS.search(one.topic.type) and one.topic.type not in CONVERTERS:
+                self._corners(one)
+            elif one.topic.type == "visualization_msgs/msg/MarkerArray" and not _TRUTH.search(name):
+                self.unused[name] = f"markers are mostly pictures; --set marks.type={one.topic.type} takes them"
+
+    def _corners(self, one: Contents) -> None:
+        self.unused[one.topic.name] = (
+            "these are corners without poses: run a pose estimator first, e.g. apriltag_ros on the images"
+        )
+
+    def _detections(self, one: Contents) -> None:
+        if not one.items:
+            self.unused[one.topic.name] = "empty"
+        elif one.ids and not one.without_id and all(id_.isdecimal() and len(id_) >= 15 for id_ in one.ids):
+            self._add("closures", one, {"use": "closure"})
+        else:
+            if one.without_id == one.items and len(one.classes) > 1 and not one.is_repeated:
+                self.settings["landmarks.id_from"] = "class_id"
+                self.notes.append(f"{one.topic.name}: ids are empty, class ids are taken instead")
+            elif one.without_id > 0.5 * one.items:
+                self._join(one)
+            self._add("detections", one)
+
+    def _join(self, one: Contents) -> None:
+        self.settings["landmarks.association"] = "joint"
+        self.notes.append(f"{one.topic.name} has no ids: landmarks are told apart by where they are")
+
+    def _cloud(self, one: Contents) -> None:
+        is_position, is_bearing = {"x", "y"} <= one.fields, "bearing" in one.fields
+        if not (is_position or is_bearing or "range" in one.fields):
+            return
+        if "id" not in one.fields and not (is_bearing and "range" in one.fields):
+            self.unused[one.topic.name] = "points without ids: a scan is no list of landmarks"
+        elif is_bearing and "elevation" not in one.fields and self.settings.get("world.dimensions") == 3:
+            self.unused[one.topic.name] = "bearings without elevation, in three dimensions"
+        else:
+            has_sigma = one.fields & {"sigma_bearing"} or (one.fields & {"sigma"} and "range" not in one.fields)
+            chosen: dict[str, Any] = {"sigma_rad": 0.02} if is_bearing and not has_sigma else {}
+            if chosen:
+                self.notes.append(f"{one.topic.name} does not tell the noise of bearings: 0.02 rad is assumed")
+            if "range" in one.fields and "sigma" not in one.fields:
+                chosen["sigma_m"] = 0.5
+                self.notes.append(f"{one.topic.name} does not tell the noise of ranges: 0.5 m is assumed")
+            if "id" not in one.fields:
+                self._join(one)
+            self._add("ranges" if "range" in one.fields else "points", one, chosen)
+
+    # -- fixes ---------------------------------------------------------------------------------------------------
+
+    def _choose_fixes(self) -> None:
+        has_landmarks = len(self._names) > 1
+        receivers = sorted(self._of_type(GNSS), key=lambda one: -one.usable)
+        for one in receivers[1:]:
+            self.unused[one.topic.name] = "another receiver"
+        for one in receivers[:1]:
+            if not one.usable:
+                self.unused[one.topic.name] = "no message has a fix"
+                continue
+            self._add("gps", one, {} if one.has_noise else {"sigma_m": 2.0}, linked=True)
+            self._mount(one.topic.name, one.frame)  # says what is assumed; the input itself assumes and counts it
+            if not one.has_noise:
+                self.notes.append(f"{one.topic.name} does not tell its noise: 2 m is assumed")
+        self._choose_imu(self._of_type(IMU), is_needed=len(self._names) == 1)
+        for one in self._of_type(POSE, POSE_WITH_COVARIANCE):
+            name = one.topic.name
+            if _ESTIMATE.search(name):
+                self.unused[name] = "the output of a localiser, or a goal: no measurement"
+            elif one.frame == self._odom:
+                self.unused[name] = "in the frame of the odometry: it says the same"
+            elif one.topic.type == POSE or has_landmarks or len(self._names) > 1:
+                self.unused[name] = (
+                    "a pose may be an estimate or the truth; as a fix: type, topic, frame=map in a section"
+                )
+            else:
+                chosen: dict[str, Any] = {} if one.frame == "map" else {"frame": "map"}
+                self._add("pose", one, chosen | ({} if one.has_noise else {"sigma_m": 0.1}), linked=True)
+                self.notes.append(f"{name} is taken for a fix: if it is an estimate or the truth, leave it out")
+
+    def _choose_imu(self, found: Iterator[Contents], is_needed: bool) -> None:
+        for one in sorted(found, key=lambda one: -one.usable):
+            if one.usable < 0.5 * one.read:
+                self.unused[one.topic.name] = "it has no orientation (an IMU with a filter has)"
+            elif not is_needed:
+                self.unused[one.topic.name] = "its heading may drift, and there is better: --set imu.type=" + IMU
+            else:
+                self._add("imu", one, {} if one.has_noise else {"sigma_rad": 0.05})
+                is_needed = False
+
+    # -- what all inputs need --------------------------------------------------------------------------------------
+
+    def _add(self, name: str, one: Contents, chosen: dict[str, Any] | None = None, linked: bool = False) -> None:
+        topic = one.topic.name
+        if _is_zero(one):
+            self.unused[topic] = "its stamps are zero: have the driver fill in header.stamp"
+            return
+        offset_s = 0.0
+        if self._lag_s is not None and one.lag_s:
+            offset_s = _lag_s(one) - self._lag_s
+        if abs(offset_s) > _MOST_OFFSET_S:
+            self.unused[topic] = f"its stamps are {offset_s:.0f} s from those of odometry: another clock"
+            return
+        told = dict(chosen or {}) | ({} if linked else self._mount(topic, one.frame))
+        if abs(offset_s) > _CLOCKS_DIFFER_S:
+            told["offset_s"] = round(offset_s, 3)
+            self.notes.append(f"{topic} has another clock than odometry: {offset_s:.3f} s are added to its stamps")
+        name = self._free(name)
+        if name == "detections":
+            self._topics[name] = topic
+        else:
+            told = {"type": one.topic.type, "topic": topic} | told
+        self._set(name, told)
+
+    def _set(self, name: str, chosen: dict[str, Any]) -> None:
+        self._names.append(name)
+        self.settings |= {f"{name}.{key}": value for key, value in chosen.items()}
+
+    def _mount(self, topic: str, frame: str) -> dict[str, str]:
+        """Where a sensor is that TF does not tell of."""
+        if frame and self._recording.is_linked(frame, self._base):
+            return {}
+        mount = _OPTICAL if "optical" in frame else "0 0 0 0 0 0"
+        where = "at the base, looking ahead" if mount == _OPTICAL else "at the base"
+        self.notes.append(
+            f"{topic}: no transform tells where {frame or 'its sensor'} is on the robot: {where} is assumed"
+        )
+        return {"mount": mount}
+
+    def _free(self, name: str) -> str:
+        number = 1 + sum(re.fullmatch(rf"{name}(_\d+)?", other) is not None for other in self._names)
+        return name if number == 1 else f"{name}_{number}"
+
+    def _finish(self) -> None:
+        names = " ".join(self._names)
+        if names != Config().inputs.names:
+            self.settings = {"inputs.names": names} | self.settings
+        if self._names == ["odom"]:
+            self.notes.append("nothing corrects this odometry: the result will be odometry alone (exit code 3)")
+
+
+def _lag_s(one: Contents) -> float:
+    return median(one.lag_s) if one.lag_s else 0.0
+
+
+def _is_zero(one: Contents) -> bool:
+    """Whether all its stamps are."""
+    return bool(one.lag_s) and not one.is_stamped
+
+
+def _assignment(key: str, value: Any) -> str:
+    text = f"{key}={value}"
+    return text if parse_setting(text) == (key, value) else f"{key}='{value}'"

@@ -1,0 +1,201 @@
+"""The tables of a run, and what happened in it in numbers."""
+
+import itertools
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, TypeVar
+
+import numpy as np
+
+from graph_slam_ros import __version__
+from graph_slam_ros.formats.g2o_writer import g2o_text
+from graph_slam_ros.formats.graph_file import G2oFile
+from graph_slam_ros.formats.tum import tum_text
+from graph_slam_ros.messages import results
+from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.runs.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, PATH_ODOMETRY, SIGHTINGS, VERTICES
+from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
+from graph_slam_ros.slam import Counters, GraphSlam
+from graph_slam_ros.slam.robust.gating import CANDIDATES
+from graph_slam_ros.slam.robust.ledger import INSIDE, Verdict
+
+Name = TypeVar("Name")
+_TANGENT = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "rx", "ry", "rz")}
+_POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
+
+
+def result_texts(slam: GraphSlam) -> dict[str, str]:
+    """The results but for the summary, by the names of their files."""
+    stamps = slam.sighting_poses.stamps_ns.tolist()
+    ids, vertices = numbered(slam)
+    return {
+        GRAPH: g2o_text(graph_file(slam, ids), slam.solver.estimate),
+        VERTICES: vertices,
+        LEDGER: ledger_text(slam, ids),
+        CHANGES: changes_text(slam),
+        PATH: tum_text(slam.keyframes.stamps_ns.tolist(), slam.trajectory()),
+        PATH_ODOMETRY: tum_text(slam.keyframes.stamps_ns.tolist(), slam.keyframes.poses),
+        COVARIANCES: _covariance_table(slam),
+        SIGHTINGS: tum_text(stamps, slam.sighting_trajectory()),
+        ODOMETRY: tum_text(stamps, slam.sighting_odometry()),
+        LANDMARKS: _landmark_table(slam),
+    }
+
+
+def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any]:
+    """What happened, in numbers; ``earlier`` was counted of the same run before this pipeline went on in it."""
+    counters = Counters()
+    for some in (earlier or Counters(), slam.counters):
+        counters.update(some)
+    last = slam.report or (slam.solver.evaluate() if slam.is_solved else None)
+    return {
+        "version": __version__,
+        "keyframes": len(slam.keyframes),
+        "landmarks": len(slam.landmarks),
+        "waiting": slam.waiting,
+        "segments": len(slam.segments),
+        "drives": _drives(slam),
+        "sightings": sum(landmark.sightings for landmark in slam.landmarks.values()),
+        "edges": slam.graph.edge_count,
+        "solves": slam.solves,
+        "chi2": last.chi2_final if last else 0.0,
+        "cost": last.cost_final if last else 0.0,
+        "ended": True,
+        "converged": last.converged if last else True,
+        "stop": last.stop if last else "nothing_to_do",
+        "failing": slam.failing,
+        "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
+        "rivals": [asdict(rival) for rival in slam.backend.rivals],
+        "displacements": [asdict(alarm) for alarm in slam.alarms],
+        "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
+    } | account(slam, counters)
+
+
+def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
+    """What was counted, and what came of each input.
+
+    ``received`` counts messages, ``used`` what was measured by them, ``believed`` the edges of that (odometry aside)
+    that the estimate follows.
+
+    Parameters
+    ----------
+    counters : those of the pipeline, of what stands before it, and of an earlier part of the run
+    """
+    used_as = dict.fromkeys(slam.odometry_sources, "odometry") | uses(slam.config)  # a source need not be an input
+    is_of_map = not slam.counters.used  # nothing was measured since: a run that is written from its map
+    believed = _believed(slam, 0 if is_of_map else slam.first_edge)
+    inputs = {}
+    for name in dict.fromkeys([*slam.config.inputs.names.split(), *counters.used, *believed]):
+        if name in counters.received or counters.used[name] or name in believed:
+            used = max(counters.used[name], believed.get(name, 0) if is_of_map else 0)
+            of_input = {"received": counters.received.get(name), "used": used, "believed": believed.get(name)}
+            inputs[name] = {"use": used_as.get(name, "")} | of_input
+    return {"counters": counters.as_dict(), "inputs": inputs}
+
+
+def counted(counters: Counters) -> dict[str, Any]:
+    """The same of a pipeline that is still at work: its graph is not looked into."""
+    inputs = {
+        name: {"use": "", "received": counters.received.get(name), "used": counters.used[name], "believed": None}
+        for name in dict.fromkeys([*counters.received, *counters.used])
+    }
+    return {"counters": counters.as_dict(), "inputs": inputs}
+
+
+def counters_of(summary: Mapping[str, Any]) -> Counters:
+    """What ``account`` or ``counted`` was made of. Raises ValueError where a summary has anything else there."""
+    out = Counters()
+    try:
+        for source, counts in summary.get("counters", {}).items():
+            for reason, times in counts.items():
+                out.count(str(source), str(reason), _times(times))
+        for name, of in summary.get("inputs", {}).items():
+            out.used[name] += _times(of["used"])
+            if of["received"] is not None:
+                out.received[name] += _times(of["received"])
+    except (AttributeError, LookupError, TypeError) as error:
+        raise ValueError(str(error)) from None
+    return out
+
+
+def _times(told: Any) -> int:
+    if not isinstance(told, int) or isinstance(told, bool) or not 0 <= told < 2**63:
+        raise ValueError(f"{told!r:.20} is no count")
+    return told
+
+
+def _believed(slam: GraphSlam, first_edge: int) -> dict[str, int]:
+    """Edges of landmarks, fixes and closures that pull, by input."""
+    out = Counter[str]()
+    inside = [Verdict.NOT_EVALUATED, *INSIDE]
+    verdicts = slam.ledger.verdict.values
+    for table in slam.graph.tables.values():
+        labels = np.array([label in CANDIDATES for label in slam.graph.labels], dtype=bool)
+        ids = table.id.values
+        chosen = labels[table.label.values] & (ids >= first_edge)
+        judged = chosen & (ids < len(verdicts))
+        chosen[judged] = np.isin(verdicts[ids[judged]], inside)
+        for code, count in zip(*np.unique(table.source.values[chosen], return_counts=True), strict=True):
+            out[slam.graph.sources[code]] += int(count)
+    return dict(out)
+
+
+def _drives(slam: GraphSlam) -> list[dict[str, int]]:
+    """Where each drive begins in ``path.tum`` and in ``sightings.tum``: rows, from 0."""
+    of = slam.sighting_poses.ids
+    return [{"keyframe": first, "sighting": int(np.sum(of < first))} for first in slam.drives]
+
+
+def numbered(slam: GraphSlam) -> tuple[list[int], str]:
+    """The number of each vertex, and the table of them.
+
+    Poses are numbered from 0 in order of time, landmarks after them: other tools read odometry from that. What is
+    neither is an offset that the ranges of a sensor share.
+    """
+    names: list[tuple[int, str, int | str, str]] = []
+    for k, keyframe in enumerate(slam.keyframes):
+        names.append((keyframe.vertex, "keyframe", keyframe.stamp_ns, str(k)))
+    for name, landmark in slam.landmarks.items():
+        names.append((landmark.vertex, "landmark", "", name))
+    named = {vertex for vertex, *_ in names}
+    names += [(vertex, "offset", "", "") for vertex in range(slam.graph.vertex_count) if vertex not in named]
+    ids = [0] * slam.graph.vertex_count
+    rows = ["id,vertex,stamp_ns,name"]
+    for file_id, (vertex, what, stamp, name) in enumerate(names):
+        ids[vertex] = file_id
+        rows.append(f"{file_id},{what},{stamp},{_csv(name)}")
+    return ids, "\n".join(rows) + "\n"
+
+
+def graph_file(slam: GraphSlam, ids: list[int]) -> G2oFile:
+    """The graph, with the vertices of a frozen map fixed."""
+    return G2oFile(slam.graph, ids, slam.solver.held.tolist())
+
+
+def _covariance_table(slam: GraphSlam) -> str:
+    dof = slam.config.space.dof
+    rows = [f"stamp_ns,{','.join(f'tangent_{a}{b}' for a, b in _upper(_TANGENT[dof]))}"]
+    for stamp_ns, covariance in zip(slam.keyframes.stamps_ns, slam.keyframe_covariances(), strict=True):
+        rows.append(f"{stamp_ns},{','.join(map(repr, covariance[np.triu_indices(dof)].tolist()))}")
+    return "\n".join(rows) + "\n"
+
+
+def _landmark_table(slam: GraphSlam) -> str:
+    space = slam.config.space
+    rows = [f"id,kind,{_POSE[space.dof]},sightings,{','.join(f'cov_{a}{b}' for a, b in _upper(_TANGENT[space.dof]))}"]
+    for name, value, covariance in results.landmark_estimates(slam):
+        kind = "pose" if len(value) == space.pose.size else "point"
+        at = [*map(repr, value), *[""] * (space.pose.size - len(value))]
+        spread = [f"{covariance[i, j]:.9e}" if j < len(covariance) else "" for i, j in _upper(range(space.dof))]
+        rows.append(",".join([_csv(name), kind, *at, str(slam.landmarks[name].sightings), *spread]))
+    return "\n".join(rows) + "\n"
+
+
+def _upper(names: Sequence[Name]) -> Iterator[tuple[Name, Name]]:
+    """Pairs of the upper triangle of a matrix, row by row."""
+    return itertools.combinations_with_replacement(names, 2)
+
+
+def _csv(text: str) -> str:
+    return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\n\r') else text

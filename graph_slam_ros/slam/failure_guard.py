@@ -1,0 +1,195 @@
+"""What comes of a solve that fails: the last good estimate stays, and soon what has come since is doubted.
+
+All of it is told by the ingest sequence: a replay fails where the live run did, and recovers as it did.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.errors import DivergedError, said
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.robust.gating import CANDIDATES, landmark_of
+from graph_slam_ros.slam.robust.ledger import Reason
+
+Array = NDArray[np.float64]
+Result = TypeVar("Result")
+
+_FAR = 1.0  # m, rad: whoever moves no farther has not gone astray
+_RISE = 10.0  # times the cost before, or of residuals as large as their noise: more is no solution
+_TRIALS = 30  # solves in search of what is to blame
+
+
+@dataclass(frozen=True, slots=True)
+class _Suspect:
+    """Edges that are in or out together: one, or all of a landmark that is new."""
+
+    edges: tuple[int, ...]
+    landmark: int | None = None
+
+
+class Safeguard:
+    """Has a back-end solved, and sees to it that its estimate is always one that is good.
+
+    Attributes
+    ----------
+    failing : why the last solve failed; empty where it did not
+    on_gone : told of landmarks that are no part of the problem any more, by their vertices
+    """
+
+    def __init__(self, backend: Backend, counters: Counters, on_gone: Callable[[set[int]], None]) -> None:
+        self.failing = ""
+        self._backend, self._counters, self._on_gone = backend, counters, on_gone
+        self._graph, self._solver = backend.graph, backend.solver
+        self._good = np.empty(0)  # stored numbers of all vertices after the last solve that succeeded
+        self._good_vertices = self._good_edges = 0  # that it had
+        self._in_a_row = 0  # failures since
+
+    def solve(self, work: Callable[[], Result], keyframe: int) -> Result | None:
+        """What work returns that solves; None where it fails, or gives what cannot be."""
+        try:
+            return self._done(work)
+        except Exception as error:
+            self._fail(error)
+        if self._in_a_row == 1 or self._in_a_row.bit_count() > 1:  # then at 2, 4, 8, ...: it costs some solves
+            return None
+        try:
+            return self._done(work) if self._quarantine(keyframe) else None
+        except Exception:  # it is the same solve: counted already
+            self.go_back()
+            return None
+
+    def note_good(self) -> None:
+        """The present estimate is one to come back to."""
+        self._good, self._good_vertices = self._solver.values, self._graph.vertex_count
+        self._good_edges, self._in_a_row, self.failing = self._graph.edge_count, 0, ""
+
+    def note_moved(self) -> None:
+        """The map was moved rigidly: so is the estimate to come back to."""
+        self._good = self._solver.values[: len(self._good)]
+
+    def go_back(self) -> None:
+        """Have the last good estimate, in a solver that is made anew."""
+        self._solver.start_at(self._last_good())
+        with suppress(Exception):  # e.g. no memory for it: the estimate is good without
+            self._solver.rebuild()
+
+    def _done(self, work: Callable[[], Result]) -> Result:
+        done = work()
+        self._refuse_absurd()
+        self.note_good()
+        return done
+
+    def _fail(self, error: Exception) -> None:
+        self._counters.count("solver", type(error).__name__)
+        self.failing = said(error)
+        self._in_a_row += 1
+        self.go_back()
+        self._drop_unmeasured()
+
+    def _drop_unmeasured(self) -> None:
+        """Take out vertices that a fault parted from the edges they were added for: nothing tells where they are."""
+        vertices = self._solver.vertices
+        unmeasured = set(vertices[vertices >= self._good_vertices].tolist())
+        for edge in range(self._good_edges, self._graph.edge_count):
+            table, row = self._graph.row(edge)
+            unmeasured.difference_update(table.vertices.values[row].tolist())
+        for vertex in unmeasured:
+            self._solver.remove(vertex)
+        self._on_gone(unmeasured)
+
+    def _last_good(self) -> Array:
+        """What is newer than the last good estimate is where it was put by it."""
+        out: Array = self._graph.initial.values.copy()
+        out[: len(self._good)] = self._good
+        return out
+
+    def _refuse_absurd(self) -> None:
+        """Raise where the estimate is no number, or far from the last and explains the measurements far worse."""
+        values, before = self._solver.values, self._last_good()
+        if not np.isfinite(values).all():
+            raise DivergedError("the estimate is not finite")
+        if np.abs(values - before).max(initial=0.0) <= _FAR:
+            return
+        now = self._solver.evaluate()
+        if now.cost_final <= _RISE * sum(one.residuals for one in now.classes.values()):
+            return
+        then = self._solver.evaluate(at=before)
+        if not now.cost_final <= _RISE * then.cost_final:
+            raise DivergedError(f"the cost rose from {then.cost_final:.3g} to {now.cost_final:.3g}")
+
+    # -- quarantine --------------------------------------------------------------------------------------------------
+
+    def _quarantine(self, keyframe: int) -> bool:
+        """Take out for good without what it can be solved, of the candidates that are new; whether it can."""
+        suspects = self._suspects()
+        self._take_out(suspects)
+        if not self._is_solvable():
+            self._let_in(suspects)
+            return False
+        blamed = self._to_blame(suspects)
+        for one in blamed:
+            self._counters.count(self._graph.label_of(one.edges[0]), "quarantined", len(one.edges))
+            out = one.edges if one.landmark is None else self._solver.edges_on(one.landmark).tolist()
+            self._backend.withdraw(out, keyframe, Reason.QUARANTINED)  # also edges that were held back before
+        self._on_gone({one.landmark for one in blamed if one.landmark is not None})
+        return True
+
+    def _suspects(self) -> list[_Suspect]:
+        new = self._solver.edges
+        new = new[new >= self._good_edges]
+        found: dict[tuple[bool, int], _Suspect] = {}
+        for edge in new[self._graph.has_label(new, CANDIDATES)].tolist():
+            landmark = landmark_of(self._graph, edge)
+            if landmark is None or landmark < self._good_vertices:
+                found[False, edge] = _Suspect((edge,))
+            else:
+                before = found.get((True, landmark), _Suspect(()))
+                found[True, landmark] = _Suspect((*before.edges, edge), landmark)
+        return list(found.values())
+
+    def _to_blame(self, suspects: list[_Suspect]) -> list[_Suspect]:
+        """Of suspects that are out those that cannot come back, half by half; the others are in again."""
+        blamed, groups = list[_Suspect](), [suspects] if suspects else []
+        for _ in range(_TRIALS):
+            if not groups:
+                break
+            group = groups.pop()
+            self._let_in(group)
+            if self._is_solvable():
+                continue
+            self._take_out(group)
+            half = len(group) // 2
+            if half:
+                groups += [group[half:], group[:half]]
+            else:
+                blamed += group
+        return blamed + [one for group in groups for one in group]
+
+    def _is_solvable(self) -> bool:
+        try:
+            self._solver.optimize()
+            self._refuse_absurd()
+        except Exception:
+            self.go_back()
+            return False
+        return True
+
+    def _take_out(self, suspects: Sequence[_Suspect]) -> None:
+        for one in suspects:
+            for edge in one.edges:
+                self._solver.set_weight(edge, 0.0)
+            if one.landmark is not None:
+                self._solver.remove(one.landmark)
+
+    def _let_in(self, suspects: Sequence[_Suspect]) -> None:
+        for one in suspects:
+            if one.landmark is not None:
+                self._solver.add([one.landmark], [])
+            for edge in one.edges:
+                self._solver.set_weight(edge, 1.0)

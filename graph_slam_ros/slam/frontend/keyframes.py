@@ -1,0 +1,125 @@
+"""Where the robot was: its keyframes, and the odometry in between as far back as late measurements may reach."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.slam.frontend.motion_compensation import Where
+from graph_slam_ros.slam.frontend.odometry_integration import Motion, OdometryNoise, Rest
+from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.slam.frontend.stamped_poses import Track
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A selected instant: its vertex, its stamp, and where odometry put it. No estimate: the solver owns that."""
+
+    vertex: int
+    stamp_ns: int
+    T_odom_base: Numbers
+
+
+@dataclass(frozen=True, slots=True)
+class SightingPose:
+    """Where the robot was when it saw something: a keyframe, by its index, and the motion since."""
+
+    keyframe: int
+    stamp_ns: int
+    T_keyframe_base: Numbers
+
+
+class Trail:
+    """Keyframes in order of time, and the motion since each of the last.
+
+    Attributes
+    ----------
+    segments : keyframes at which odometry began, or began anew
+    drives : the first keyframe of each drive: more than one where the map was loaded
+    """
+
+    def __init__(self, noise: OdometryNoise, space: Space) -> None:
+        self.keyframes = Track(Keyframe, space.pose.size)
+        self.segments: list[int] = []
+        self.drives: list[int] = []
+        self._is_new_drive = True
+        self._noise, self._space = noise, space
+        self._motions: deque[Motion] = deque()
+        self._rest = Rest(noise, space)
+        self._epoch = 0  # the first keyframe since stamps began anew
+
+    @property
+    def motion(self) -> Motion | None:
+        """Since the newest keyframe; none where stamps have begun anew since."""
+        return self._motions[-1] if self._motions else None
+
+    @property
+    def rests(self) -> bool:
+        """Whether the robot has stood for a second or more."""
+        return self._rest.is_on
+
+    @property
+    def oldest_ns(self) -> int:
+        """Stamp of the first keyframe, of those whose stamps are of the present time."""
+        return int(self.keyframes.stamps_ns[self._epoch])
+
+    @property
+    def remembered_ns(self) -> int:
+        """From this stamp on odometry is remembered, message by message."""
+        return self._motions[0].start_ns
+
+    def append(self, vertex: int, step: Step, late_s: float) -> None:
+        """Add a keyframe where odometry is; motions are forgotten that ended more than ``late_s`` ago."""
+        if self._is_new_drive:
+            self.drives.append(len(self.keyframes))
+            self._is_new_drive = False
+        self.keyframes.append(vertex, step.stamp_ns, step.T_odom_base)
+        keyframe = len(self.keyframes) - 1
+        self._motions.append(Motion(self._noise, self._space, keyframe, step.stamp_ns, self._rest))
+        oldest_ns = step.stamp_ns - round(late_s * 1e9)
+        while len(self._motions) > 2 and self._motions[1].start_ns <= oldest_ns:
+            self._motions.popleft()
+
+    def take_up(self, keyframes: Sequence[Keyframe], segments: Sequence[int], drives: Sequence[int]) -> None:
+        """Go on after these; how the robot came from the last of them to where it is, nobody knows."""
+        for one in keyframes:
+            self.keyframes.append(one.vertex, one.stamp_ns, one.T_odom_base)
+        self.segments += segments
+        self.drives += drives or [0]  # a map of an earlier version does not say
+        self.forget_time()
+
+    def go_on(self) -> None:
+        """After ``take_up``: the same drive continues, so odometry tells the motion since the last keyframe."""
+        last = len(self.keyframes) - 1
+        backwards = np.flatnonzero(np.diff(self.keyframes.stamps_ns) < 0)
+        self._epoch = max(self.drives[-1], int(backwards[-1]) + 1 if len(backwards) else 0)
+        self._is_new_drive = False
+        self._motions.append(Motion(self._noise, self._space, last, self.keyframes[last].stamp_ns, self._rest))
+
+    def forget_time(self) -> None:
+        """Stamps begin anew: none before can be told from them."""
+        self._motions.clear()
+        self._rest = Rest(self._noise, self._space)
+        self._epoch = len(self.keyframes)
+
+    def where(self, stamp_ns: int) -> Where:
+        """Where the robot was, by the keyframe before and the odometry in between."""
+        motion = next((m for m in reversed(self._motions) if m.start_ns <= stamp_ns), None)
+        if motion is None:
+            return self._where_long_ago(stamp_ns)
+        moved = motion.at(stamp_ns)
+        vertex = int(self.keyframes.ids[motion.keyframe])
+        return Where(motion.keyframe, vertex, stamp_ns, moved.T_keyframe_base, moved.covariance)
+
+    def _where_long_ago(self, stamp_ns: int) -> Where:
+        """Between two keyframes whose odometry is forgotten: evenly from one to the next."""
+        present = self.keyframes.stamps_ns[self._epoch :]
+        k = self._epoch + int(np.searchsorted(present, stamp_ns, side="right")) - 1
+        group, (a, b) = self._space.group, (self.keyframes[k], self.keyframes[k + 1])
+        T_a_b = self._space.identity if k + 1 in self.segments else group.between(a.T_odom_base, b.T_odom_base)
+        fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+        moved = group.interpolate(self._space.identity, T_a_b, fraction)
+        noise = self._noise.of((stamp_ns - a.stamp_ns) * 1e-9, None)
+        return Where(k, a.vertex, stamp_ns, moved, group.noise_during(moved, noise))

@@ -1,0 +1,103 @@
+"""What no sensor can mean: distances beyond its reach are refused, directions straight up or down get regular axes."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graph_slam_ros.config.inputs import InputConfig
+from graph_slam_ros.graph.geometry import Space
+from graph_slam_ros.measurements.types import Closure, Fix, Sighting, Sightings
+from graph_slam_ros.slam.frontend import motion_compensation
+
+_LEARNED_AFTER = 30  # distances of an input
+_TIMES_FARTHEST = 10.0  # a sensor may see so many times farther than it has shown
+_ALWAYS_M = 1e3  # a learned limit is never less
+_MOST_M = 1e5  # nor more: farther than from any sensor to its horizon
+_FARTHEST = 3  # the third farthest counts: two wrong distances teach nothing
+_STEEP = 0.2  # cosine of an elevation: at 78.5 degrees and above the azimuth is turned away from the pole
+
+
+@dataclass(slots=True)
+class _Shown:
+    """What the sensor of one input has shown: how many distances, and the farthest of them, the least first."""
+
+    count: int = 0
+    farthest: list[float] = field(default_factory=lambda: [0.0] * _FARTHEST)
+
+
+class Reach:
+    """The farthest distance [m] that each input may measure: its ``max_distance_m``, or learned from its measurements.
+
+    A limit is learned from the accepted measurements alone, in their order, so a replay refuses what the live run
+    refused. A bearing has no distance; a fix has one from the map's origin, which may be anywhere.
+    """
+
+    def __init__(self, space: Space, inputs: Iterable[InputConfig]) -> None:
+        self._space = space
+        self._given = {one.name: one.max_distance_m for one in inputs if one.max_distance_m > 0.0}
+        self._shown: dict[str, _Shown] = {}
+
+    def limit_m(self, topic: str) -> float:
+        """The present limit of an input."""
+        if topic in self._given:
+            return self._given[topic]
+        shown = self._shown.get(topic)
+        if shown is None or shown.count < _LEARNED_AFTER:
+            return _MOST_M
+        return min(_MOST_M, max(_ALWAYS_M, _TIMES_FARTHEST * shown.farthest[0]))
+
+    def split(self, m: Sightings | Fix | Closure) -> tuple[Sightings | Fix | Closure | None, int]:
+        """What of a measurement is within reach, None where nothing is, and how many sightings or closures are not."""
+        match m:
+            case Sightings():
+                within = tuple(s for s in m.sightings if self._is_within(m.topic, self._distance(s)))
+                beyond = len(m.sightings) - len(within)
+                return (replace(m, sightings=within) if beyond else m) if within or not beyond else None, beyond
+            case Closure():
+                is_within = self._is_within(m.topic, math.hypot(*m.T_from_base[: self._space.dimensions]))
+                return (m, 0) if is_within else (None, 1)
+            case _:
+                return m, 0
+
+    def _distance(self, s: Sighting) -> float | None:
+        """From the sensor or, of a position or pose, from the base."""
+        if s.kind in ("position", "pose"):
+            return math.hypot(*s.measured[: self._space.dimensions])
+        return None if s.kind == "bearing" else abs(s.measured[0])
+
+    def _is_within(self, topic: str, distance_m: float | None) -> bool:
+        if distance_m is None:
+            return True
+        if distance_m > self.limit_m(topic):
+            return False
+        shown = self._shown.setdefault(topic, _Shown())
+        shown.count += 1
+        if distance_m > shown.farthest[0]:
+            shown.farthest = sorted([*shown.farthest[1:], distance_m])
+        return True
+
+
+def off_the_pole(space: Space, s: Sighting) -> Sighting:
+    """The same sighting; a steep direction in space is told in axes where it is straight ahead.
+
+    At the zenith and the nadir azimuth is undefined and its derivative infinite. There the sensor's frame is turned so
+    that its x axis points along what was measured: azimuth and elevation are both 0. Across, the direction is known as
+    well as its elevation, or worse: ``sigma_azimuth cos(elevation)``.
+    """
+    if space.dimensions == 2 or s.kind not in ("bearing", "range_bearing"):
+        return s
+    azimuth, elevation = s.measured[-2:]
+    if math.cos(elevation) >= _STEEP:
+        return s
+    half_a, half_e = 0.5 * azimuth, -0.5 * elevation
+    ca, sa, ce, se = math.cos(half_a), math.sin(half_a), math.cos(half_e), math.sin(half_e)
+    turn = (-sa * se, ca * se, sa * ce, ca * ce)  # about z by the azimuth, then about y by minus the elevation
+    sensor = space.group.compose(s.T_base_sensor or space.identity, (0.0, 0.0, 0.0, *turn))
+    scale = np.ones(len(s.measured))
+    scale[-2] = abs(math.cos(elevation))
+    covariance = scale[:, None] * motion_compensation.square(s.covariance) * scale
+    covariance[-2, -2] = max(covariance[-2, -2], covariance[-1, -1])
+    measured = (*s.measured[:-2], 0.0, 0.0)
+    return replace(s, measured=measured, covariance=tuple(covariance.ravel().tolist()), T_base_sensor=sensor)

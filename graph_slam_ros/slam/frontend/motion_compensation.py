@@ -1,0 +1,230 @@
+"""From where the robot was when it measured to the keyframe before: the motion in between, and its noise, are added.
+
+Throughout, ``T_a_b`` is the base b seen from its keyframe a, with covariance M in right tangent coordinates: the true
+motion is ``T_a_b Exp(m)``. A point p of b then moves by ``B m`` with ``B = [I, -hat(p)]``, in the axes of b.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.lie import so3
+from graph_slam_ros.measurements.types import Closure, Fix, Sighting, Sightings
+
+Array = NDArray[np.float64]
+
+ROUNDING = 100.0 * float(np.finfo(float).eps)  # of the largest variance that was added up to a covariance
+_NEAREST_M = 1e-9  # below this distance a direction is rounding
+_UNKNOWN_M2 = 1e6  # a variance of this or more says that an axis was not measured
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """Where the robot was at a stamp: a keyframe, and the motion since with its covariance (dof, dof)."""
+
+    keyframe: int
+    vertex: int
+    stamp_ns: int
+    T_keyframe_base: Numbers
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """A measurement as an edge takes it: what was measured from the keyframe, and its covariance."""
+
+    measured: Numbers
+    covariance: Array
+
+
+def by_motion(space: Space, point: Array) -> Array:
+    """``B`` (n, dof) of a point (n,) in the base frame."""
+    n = space.dimensions
+    if n == 2:
+        return np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]])
+    return np.hstack([np.eye(3), -so3.hat((point[0], point[1], point[2]))])
+
+
+def position(space: Space, s: Sighting, where: Where) -> Carried:
+    """A landmark's position, from the sighting of a position or of a pose: ``p_a = T_a_b p_b``."""
+    n = space.dimensions
+    point = np.array(s.measured[:n])
+    own = square(s.covariance)
+    if s.kind == "pose":  # from the tangent space of the measured pose to the axes of b
+        own = space.in_parent_axes(s.measured, own)[:n, :n]
+    b, turn = by_motion(space, point), space.turn(where.T_keyframe_base)
+    covariance = turn @ (own + b @ where.covariance @ b.T) @ turn.T
+    return Carried(_floats(space.group.act(where.T_keyframe_base, tuple(point.tolist()))), covariance)
+
+
+def pose(space: Space, s: Sighting, where: Where) -> Carried:
+    """A landmark's pose: ``T_a_c = T_a_b T_b_c``."""
+    measured = space.group.compose(where.T_keyframe_base, s.measured)
+    return Carried(_floats(measured), space.group.propagate(where.covariance, s.measured, square(s.covariance)))
+
+
+def seen_from_sensor(space: Space, s: Sighting, where: Where, p_keyframe: Array) -> Carried:
+    """Range, bearing or both, by a sensor whose place goes with it.
+
+    Parameters
+    ----------
+    p_keyframe : (n,) where the landmark is thought to be, from the keyframe; the motion's noise depends on it
+    """
+    T_base_sensor = s.T_base_sensor or space.identity
+    p_base = np.array(space.group.act(space.group.inverse(where.T_keyframe_base), tuple(p_keyframe.tolist())))
+    p_sensor = np.array(space.group.act(space.group.inverse(T_base_sensor), tuple(p_base.tolist())))
+    j = gradient(space, s.kind, p_sensor) @ space.turn(T_base_sensor).T @ by_motion(space, p_base)
+    covariance = square(s.covariance) + j @ where.covariance @ j.T
+    return Carried((*s.measured, *_floats(space.group.compose(where.T_keyframe_base, T_base_sensor))), covariance)
+
+
+def is_shared(space: Space, m: Sightings | Fix | Closure, where: Where, most: float, added_sigma_m: float) -> bool:
+    """Whether the motion adds more to the variance than a part of it: all that a message says has that in common.
+
+    Parameters
+    ----------
+    most : part of the variance
+    added_sigma_m : what is added to sightings besides
+    """
+    n, motion = space.dimensions, where.covariance
+    moved, turned = float(np.trace(motion[:n, :n])), float(np.trace(motion[n:, n:]))
+    if isinstance(m, Sightings):
+        return any(_adds(space, s, moved, turned, most, added_sigma_m**2) for s in m.sightings)
+    own = float(np.trace(square(m.covariance)))
+    if isinstance(m, Fix) and m.kind != "pose":
+        return (moved if m.kind == "position" else turned) > most * own
+    return moved + turned > most * own
+
+
+def _adds(space: Space, s: Sighting, moved: float, turned: float, most: float, added: float) -> bool:
+    own = np.diag(square(s.covariance)).tolist()
+    if s.kind == "bearing":
+        return turned > most * sum(own)
+    if s.kind == "range":
+        return moved > most * (own[0] + added)
+    if s.kind == "range_bearing":
+        far = s.measured[0]
+        return moved + far**2 * turned > most * (own[0] + far**2 * sum(own[1:]) + added)
+    n = space.dimensions
+    far = float(np.linalg.norm(s.measured[:n]))
+    return moved + far**2 * turned > most * (sum(own[:n]) + n * added)
+
+
+def square(flat: Numbers) -> Array:
+    """A covariance as a matrix."""
+    size = round(len(flat) ** 0.5)
+    return np.array(flat).reshape(size, size)
+
+
+def gradient(space: Space, kind: str, p: Array) -> Array:
+    """Derivative (..., m, n) of range, bearing or both with respect to points p (..., n) in the sensor's frame."""
+    flat = np.maximum(np.hypot(p[..., 0], p[..., 1]), _NEAREST_M)
+    far = np.maximum(np.linalg.norm(p, axis=-1), _NEAREST_M)
+    rows = []
+    if kind in ("range", "range_bearing"):
+        rows.append(p / far[..., None])
+    if kind in ("bearing", "range_bearing"):
+        across = np.zeros_like(p)
+        across[..., 0], across[..., 1] = -p[..., 1] / flat**2, p[..., 0] / flat**2
+        rows.append(across)
+        if space.dimensions == 3:
+            up = [-p[..., 0] * p[..., 2] / flat, -p[..., 1] * p[..., 2] / flat, flat]
+            rows.append(np.stack(up, axis=-1) / far[..., None] ** 2)
+    return np.stack(rows, axis=-2)
+
+
+def seen_as(space: Space, kind: str, p: Array) -> Array:
+    """What a sensor says (..., m) of points p (..., n) in its frame."""
+    said = []
+    if kind in ("range", "range_bearing"):
+        said.append(np.linalg.norm(p, axis=-1))
+    if kind in ("bearing", "range_bearing"):
+        said.append(np.arctan2(p[..., 1], p[..., 0]))
+        if space.dimensions == 3:
+            said.append(np.arctan2(p[..., 2], np.hypot(p[..., 0], p[..., 1])))
+    return np.stack(said, axis=-1)
+
+
+def point_of(space: Space, measured: Numbers) -> Array:
+    """The point (n,) in the sensor's frame that a range and bearing say."""
+    far, azimuth = measured[0], measured[1]
+    if space.dimensions == 2:
+        return far * np.array([np.cos(azimuth), np.sin(azimuth)])
+    flat = far * np.cos(measured[2])
+    return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), far * np.sin(measured[2])])
+
+
+def polar_derivative(space: Space, measured: Numbers) -> Array:
+    """Derivative (n, n) of that point with respect to range and angles."""
+    far, azimuth = measured[0], measured[1]
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    if space.dimensions == 2:
+        return np.array([[c, -far * s], [s, far * c]])
+    level, up = np.cos(measured[2]), np.sin(measured[2])
+    return np.array(
+        [
+            [level * c, -far * level * s, -far * up * c],
+            [level * s, far * level * c, -far * up * s],
+            [up, 0.0, far * level],
+        ]
+    )
+
+
+def fix(space: Space, m: Fix, where: Where, T_map_keyframe: Numbers) -> Carried:
+    """What is known of the robot, as known of its keyframe.
+
+    Parameters
+    ----------
+    T_map_keyframe : where the keyframe is thought to be: what of the motion a position or heading sees depends on it
+    """
+    group, T_a_b = space.group, where.T_keyframe_base
+    own = square(m.covariance)
+    if m.kind == "pose":
+        into = group.adjoint(T_a_b)
+        return Carried(
+            _floats(group.compose(m.measured, group.inverse(T_a_b))), into @ (own + where.covariance) @ into.T
+        )
+    if m.kind == "position":
+        point = np.array(m.point or (0.0,) * space.dimensions)
+        turn = space.turn(group.compose(T_map_keyframe, T_a_b))
+        j = turn @ by_motion(space, point)
+        antenna = _floats(group.act(T_a_b, tuple(point.tolist())))
+        return Carried((*m.measured, *antenna), own + j @ where.covariance @ j.T)
+    if m.kind == "attitude":
+        turn = space.turn(T_a_b)
+        back = so3.inverse((T_a_b[3], T_a_b[4], T_a_b[5], T_a_b[6]))
+        q = so3.compose((m.measured[0], m.measured[1], m.measured[2], m.measured[3]), back)
+        return Carried(_floats(q), turn @ (own + where.covariance[3:, 3:]) @ turn.T)
+    yaw = space.heading(T_map_keyframe) - space.heading(group.compose(T_map_keyframe, T_a_b))
+    return Carried((m.measured[0] + float(yaw),), own + where.covariance[-1:, -1:])
+
+
+def axes_unknown(covariance: Array) -> NDArray[np.bool_]:
+    """Which axes (n,) a position (n, n) says nothing of."""
+    unknown: NDArray[np.bool_] = np.diag(covariance) >= 0.5 * _UNKNOWN_M2
+    return unknown
+
+
+def axes_known(covariance: Array) -> list[tuple[Array, float]]:
+    """Directions (n,) in which a position was measured, and their variances, where some axis was not; else none."""
+    if np.diag(covariance).max() < _UNKNOWN_M2:
+        return []
+    values, vectors = np.linalg.eigh(covariance)
+    values = np.maximum(values, ROUNDING * values[-1])  # of what nearly nothing is known beside, the rest is rounding
+    return [(v, float(value)) for value, v in zip(values, vectors.T, strict=True) if value < 0.5 * _UNKNOWN_M2]
+
+
+def closure(space: Space, m: Closure, earlier: Where, later: Where) -> Carried:
+    """Between two keyframes: ``T_a_d = T_a_b T_b_c T_d_c^-1`` for the base b at the earlier stamp, c at the later."""
+    group = space.group
+    to_c = group.propagate(earlier.covariance, m.T_from_base, square(m.covariance))
+    into = group.adjoint(later.T_keyframe_base)
+    back = group.inverse(later.T_keyframe_base)
+    measured = group.compose(group.compose(earlier.T_keyframe_base, m.T_from_base), back)
+    return Carried(_floats(measured), into @ (to_c + later.covariance) @ into.T)
+
+
+def _floats(numbers: tuple[float, ...]) -> Numbers:
+    return tuple(map(float, numbers))

@@ -1,0 +1,196 @@
+"""Odometry since a keyframe: relative motion and its covariance."""
+
+from bisect import bisect_right
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.config.config import OdometryConfig
+from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.slam.frontend.odometry_selector import Step
+
+Array = NDArray[np.float64]
+
+_REST_NS = 10**9  # for so long a robot must have stood before what its odometry jitters is no motion
+_MOST = 10_000  # odometry messages that one motion remembers
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """``T_keyframe_base`` at a stamp, and its covariance (dof, dof) in right tangent coordinates."""
+
+    stamp_ns: int
+    T_keyframe_base: Numbers
+    covariance: Array
+    twist_covariance: Numbers | None = None
+    stands: bool = False  # since the odometry before
+
+
+class OdometryNoise:
+    """Noise of a motion from its duration.
+
+    A step of dt seconds adds density^2 dt. From a twist covariance C a step adds C dt max(dt, tau), since errors of
+    velocity last for about tau. A robot that stands gathers none.
+    """
+
+    __slots__ = ("_config", "_density", "_flat", "_space", "_square")
+
+    def __init__(self, config: OdometryConfig, space: Space) -> None:
+        self._config, self._space = config, space
+        c = config
+        sigmas = [c.translation_density, c.lateral_density, c.rotation_density]
+        if space.dimensions == 3:
+            sigmas[2:] = [c.vertical_density, c.tilt_density, c.tilt_density, c.rotation_density]
+        self._density = np.diag(np.square(sigmas))
+        self._flat: Numbers = ()
+        self._square: Array = self._density
+
+    def stands(self, step: Numbers, dt: float) -> bool:
+        """Whether a step in dt seconds is too slow to be one."""
+        c = self._config
+        slow_m, slow_rad = c.still_m_s * dt, c.still_rad_s * dt
+        if self._space.dimensions == 2:
+            return step[0] ** 2 + step[1] ** 2 < slow_m**2 and abs(step[2]) < slow_rad
+        turn = 2.0 * (step[3] ** 2 + step[4] ** 2 + step[5] ** 2) ** 0.5  # of a small rotation
+        return step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < slow_m**2 and turn < slow_rad
+
+    def is_jitter(self, moved: Numbers) -> bool:
+        """Whether a motion is so small that it may be odometry's jitter, however long it took."""
+        c, n = self._config, self._space.dimensions
+        return bool(sum(x * x for x in moved[:n]) < c.still_m**2 and self._space.angle(moved) < c.still_rad)
+
+    def of(self, dt: float, twist_covariance: Numbers | None) -> Array:
+        """Covariance (dof, dof) of the velocities' integral over dt seconds."""
+        if self._config.noise == "twist" and twist_covariance is not None:
+            return self._twist(twist_covariance) * (dt * max(dt, self._config.twist_correlation_s))
+        return self._density * dt
+
+    def _twist(self, flat: Numbers) -> Array:
+        if flat is not self._flat:  # drivers repeat the same covariance
+            self._flat, self._square = flat, np.array(flat).reshape(self._density.shape)
+        return self._square
+
+
+class Rest:
+    """Whether the robot stands: motion that is slow, or that leads nowhere."""
+
+    __slots__ = ("_T_odom_base", "_noise", "_since_ns", "_space", "is_on")
+
+    def __init__(self, noise: OdometryNoise, space: Space) -> None:
+        self._noise, self._space = noise, space
+        self._T_odom_base: Numbers | None = None  # where it has been since, but for jitter
+        self._since_ns = 0
+        self.is_on = False
+
+    def take(self, step: Step, dt: float) -> bool:
+        """Whether the robot stood during a step of dt seconds."""
+        stands = self._noise.stands(step.T_last_base, dt)
+        if self._T_odom_base is None or step.broken:
+            self._begin(step)
+            return stands and not step.broken
+        moved = self._space.group.between(self._T_odom_base, step.T_odom_base)
+        elapsed_ns, is_jitter = step.stamp_ns - self._since_ns, self._noise.is_jitter(moved)
+        if self.is_on:
+            stands = stands or is_jitter
+            if not stands:
+                self._begin(step)
+        elif elapsed_ns >= _REST_NS:
+            self.is_on = self._noise.stands(moved, elapsed_ns * 1e-9)
+            if not (self.is_on or is_jitter):  # else it may be either: time will tell
+                self._begin(step)
+        return stands
+
+    def _begin(self, step: Step) -> None:
+        self._T_odom_base, self._since_ns, self.is_on = step.T_odom_base, step.stamp_ns, False
+
+
+class Motion:
+    """The motion since a keyframe, remembered odometry by odometry.
+
+    Parameters
+    ----------
+    rest : of the robot, which outlasts keyframes
+    """
+
+    __slots__ = ("_moved", "_noise", "_rest", "_space", "keyframe", "moving_ns")
+
+    def __init__(self, noise: OdometryNoise, space: Space, keyframe: int, start_ns: int, rest: Rest) -> None:
+        self.keyframe = keyframe
+        self.moving_ns = 0  # whole numbers: a sum of seconds would round
+        self._noise, self._space, self._rest = noise, space, rest
+        self._moved = [Moved(start_ns, space.identity, np.zeros((space.dof, space.dof)))]
+
+    @property
+    def now(self) -> Moved:
+        """At the newest odometry."""
+        return self._moved[-1]
+
+    @property
+    def start_ns(self) -> int:
+        """Stamp of the keyframe."""
+        return self._moved[0].stamp_ns
+
+    def step(self, step: Step) -> None:
+        """Go on by one step of odometry."""
+        self._go_on(step, self._rest.take(step, (step.stamp_ns - self.now.stamp_ns) * 1e-9))
+
+    def go_on_after_cut(self, rest: Step, stood: bool) -> None:
+        """Go on by what ``cut`` has left over of the motion before, in which the robot stood or not."""
+        self._go_on(rest, stood)
+
+    def _go_on(self, step: Step, stands: bool) -> None:
+        before, moved = self.now, self._after(step, stands)
+        self.moving_ns += (moved.stamp_ns - before.stamp_ns) * (not moved.stands)
+        if before.stands and moved.stands:  # of a robot that stands for hours, only the last is remembered
+            self._moved[-1] = moved
+        else:
+            self._moved.append(moved)
+
+    def at(self, stamp_ns: int) -> Moved:
+        """At a stamp from the keyframe's to the newest odometry's, between two odometry messages by interpolation."""
+        k = bisect_right(self._moved, stamp_ns, key=_stamp) - 1
+        a = self._moved[k]
+        if a.stamp_ns == stamp_ns or k + 1 == len(self._moved):
+            return a
+        b, group = self._moved[k + 1], self._space.group
+        fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+        step = group.interpolate(self._space.identity, group.between(a.T_keyframe_base, b.T_keyframe_base), fraction)
+        return self._extended(a, stamp_ns, group.compose(a.T_keyframe_base, step), step, b.twist_covariance, b.stands)
+
+    def cut(self, stamp_ns: int) -> Step | None:
+        """End the motion at a stamp after the last odometry but one; returns the step that is left over, if any."""
+        last, group = self.now, self._space.group
+        if stamp_ns == last.stamp_ns:
+            return None
+        at = self.at(stamp_ns)
+        # the next cut is made of this rest: without a norm of 1 its error would double from cut to cut
+        rest = self._space.normalized(group.between(at.T_keyframe_base, last.T_keyframe_base))
+        self._moved[-1] = at
+        return Step(last.stamp_ns, rest, rest, last.twist_covariance)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether it is time to begin another, for what is remembered grows."""
+        return len(self._moved) >= _MOST
+
+    @property
+    def before_last_ns(self) -> int:
+        """Stamp of the last odometry but one, or of the keyframe."""
+        return self._moved[-2].stamp_ns if len(self._moved) > 1 else self.start_ns
+
+    def _after(self, step: Step, stands: bool) -> Moved:
+        to = self._space.group.compose(self.now.T_keyframe_base, step.T_last_base)
+        return self._extended(self.now, step.stamp_ns, to, step.T_last_base, step.twist_covariance, stands)
+
+    def _extended(
+        self, a: Moved, stamp_ns: int, to: Numbers, T_a_b: Numbers, twist_covariance: Numbers | None, stands: bool
+    ) -> Moved:
+        moving_ns = (stamp_ns - a.stamp_ns) * (not stands)
+        noise = self._noise.of(moving_ns * 1e-9, twist_covariance)
+        covariance = self._space.group.propagate_during(a.covariance, T_a_b, noise)
+        return Moved(stamp_ns, to, covariance, twist_covariance, stands)
+
+
+def _stamp(moved: Moved) -> int:
+    return moved.stamp_ns

@@ -1,0 +1,161 @@
+"""One odometry out of several: the first in priority that is alive, told as steps; and where it does not hold."""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from graph_slam_ros.config.config import OdometryConfig
+from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import Odometry
+
+_REMEMBERED = 1000  # messages of a source that is not in use, to take over from where the one in use fell silent
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """The motion since the step before.
+
+    Attributes
+    ----------
+    T_odom_base : the pose in the frame of the odometry in use
+    broken : whether odometry jumped here, so that ``T_last_base`` is no motion of the robot
+    """
+
+    stamp_ns: int
+    T_last_base: Numbers
+    T_odom_base: Numbers
+    twist_covariance: Numbers | None = None
+    broken: bool = False
+
+
+class OdometryChoice:
+    """Chooses by stamps alone: what is used follows from what was accepted, not from when it came.
+
+    Parameters
+    ----------
+    priority : names of sources, the best first; others follow in the order they come
+
+    Attributes
+    ----------
+    sources : those that have been used
+    """
+
+    def __init__(self, config: OdometryConfig, priority: Sequence[str], space: Space, counters: Counters) -> None:
+        self._config, self._space, self._counters = config, space, counters
+        self._silent_ns = round(config.timeout_s * 1e9)
+        self.sources: set[str] = set()
+        self._order = list(priority)
+        self._past: dict[str, deque[Odometry]] = {}
+        self._used: Odometry | None = None
+        self._last_step = space.identity
+
+    @property
+    def used(self) -> Odometry | None:
+        """The last odometry that was used."""
+        return self._used
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the last odometry that was used."""
+        return None if self._used is None else self._used.stamp_ns
+
+    def forget(self) -> None:
+        """Begin anew with stamps of another time."""
+        self._past.clear()
+        self._used = None
+        self._last_step = self._space.identity
+
+    def go_on(self, stamp_ns: int, T_odom_base: Numbers, source: str) -> None:
+        """Begin as if an odometry message of this source had been used last."""
+        self._used = Odometry(stamp_ns, T_odom_base, None, source)
+        if source not in self._order:
+            self._order.append(source)
+
+    def take(self, m: Odometry) -> list[Step]:
+        """The steps that a message leads to: none where it is not the odometry in use."""
+        if m.source not in self._order:
+            self._order.append(m.source)
+        self._past.setdefault(m.source, deque(maxlen=_REMEMBERED))
+        past, used = self._past[m.source], self._used
+        if past and past[-1].stamp_ns == m.stamp_ns:
+            self._counters.count(m.source, "duplicate" if past[-1] == m else "duplicate_stamp")
+            return []
+        past.append(m)
+        if used is None:
+            return [self._use(m, self._space.identity, broken="")]
+        if m.source == used.source:
+            return [self._follow(used, m)]
+        if self._takes_over(m, used):
+            return self._switched(past, used)
+        self._counters.count(m.source, "not_in_use")
+        return []
+
+    def _takes_over(self, m: Odometry, used: Odometry) -> bool:
+        if self._order.index(m.source) < self._order.index(used.source):
+            return m.stamp_ns >= used.stamp_ns
+        return m.stamp_ns - used.stamp_ns > self._silent_ns
+
+    def _switched(self, past: "deque[Odometry]", used: Odometry) -> list[Step]:
+        """From where the other was used last, by interpolation of this one; not before it reaches back so far."""
+        group = self._space.group
+        newer = [m for m in past if m.stamp_ns > used.stamp_ns]
+        older = [m for m in past if m.stamp_ns <= used.stamp_ns]
+        source = past[-1].source
+        if not older:
+            if newer[-1].stamp_ns - used.stamp_ns <= self._silent_ns:
+                self._counters.count(source, "not_in_use")
+                return []
+            self._counters.count(source, "switched_to_unlinked")
+            return [self._use(newer[-1], self._space.identity, broken="jump")]
+        self._counters.count(source, "switched_to")
+        if not newer:  # of the very stamp that was used last
+            self._used = older[-1]
+            return []
+        a, b = older[-1], newer[0]
+        fraction = (used.stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+        at = Odometry(used.stamp_ns, group.interpolate(a.T_odom_base, b.T_odom_base, fraction), None, b.source)
+        out = []
+        for m in newer:
+            out.append(self._follow(at, m))
+            at = m
+        return out
+
+    def _follow(self, a: Odometry, b: Odometry) -> Step:
+        step = self._space.group.between(a.T_odom_base, b.T_odom_base)
+        if self._is_reset(step, b):
+            return self._use(b, step, broken="reset_to_zero")
+        return self._use(b, step, broken="jump" if self._jumps(step, (b.stamp_ns - a.stamp_ns) * 1e-9) else "")
+
+    def _use(self, m: Odometry, step: Numbers, *, broken: str) -> Step:
+        if broken:
+            self._counters.count(m.source, broken)
+        self._counters.used[m.source] += 1
+        self.sources.add(m.source)
+        self._used, self._last_step = m, self._space.identity if broken else step
+        return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken))
+
+    def _is_reset(self, step: Numbers, to: Odometry) -> bool:
+        """Its driver began anew: exactly where odometry begins, and by more than robots move from message to message.
+
+        However long it took: while a driver starts, nothing comes.
+        """
+        if max(self._size(to.T_odom_base)) > _AT_ZERO:
+            return False
+        (far_m, far_rad), (usual_m, usual_rad) = self._size(step), self._size(self._last_step)
+        return far_m > max(_RESET_M, _UNUSUAL * usual_m) or far_rad > max(_RESET_RAD, _UNUSUAL * usual_rad)
+
+    def _size(self, pose: Numbers) -> tuple[float, float]:
+        """In metres and radians."""
+        return math.hypot(*pose[: self._space.dimensions]), self._space.angle(pose)
+
+    def _jumps(self, step: Numbers, dt: float) -> bool:
+        """No robot moves like this: odometry was set anew, or has slipped by a lap."""
+        n = self._space.dimensions
+        return sum(x * x for x in step[:n]) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
+
+
+_AT_ZERO = 1e-9  # [m, rad]
+_RESET_M, _RESET_RAD, _UNUSUAL = 0.1, 0.1, 3.0
+_LEAST_S = 0.02  # stamps of some drivers crowd together: a pair of them says nothing of speed

@@ -1,0 +1,65 @@
+"""What is measured of poses, as edges of the graph: odometry, fixes and loop closures."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph import Gaussian, Graph
+from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.edge_noise import edge_noise
+from graph_slam_ros.measurements.types import Closure, Fix, InitialPose
+from graph_slam_ros.slam.frontend import motion_compensation
+from graph_slam_ros.slam.frontend.motion_compensation import Where
+
+Array = NDArray[np.float64]
+
+
+class PoseEdges:
+    """Adds such edges to a graph; what had to be repaired of their noise is counted."""
+
+    def __init__(self, space: Space, graph: Graph, counters: Counters) -> None:
+        self._space, self._graph, self._counters = space, graph, counters
+
+    def odometry(self, vertices: list[int], T_last_now: Numbers, covariance: Array, source: str) -> None:
+        """The motion from one keyframe to the next."""
+        noise = self._noise("odometry", covariance)
+        self._graph.add_edge(self._space.relative_pose, vertices, T_last_now, noise, "odometry", source)
+
+    def initial_pose(self, vertex: int, said: InitialPose) -> None:
+        """Where somebody says that the robot is."""
+        noise = self._noise("initialpose", motion_compensation.square(said.covariance))
+        self._graph.add_edge(self._space.pose_prior, [vertex], said.T_map_base, noise, "initialpose")
+
+    def fix(self, m: Fix, where: Where, T_map_keyframe: Numbers) -> None:
+        """A prior on a keyframe; of a position that lacks some axes, one on each principal axis that is known."""
+        space, vertices, topic = self._space, [where.vertex], m.topic
+        if m.kind not in space.fixes:
+            self._counters.count(topic, "not_in_this_space")
+            return
+        carried = motion_compensation.fix(space, m, where, T_map_keyframe)
+        n = space.dimensions
+        axes = motion_compensation.axes_known(carried.covariance) if m.kind == "position" else []
+        for axis, variance in axes:
+            noise = edge_noise(self._counters, topic, np.array([[variance]]), 1)
+            along = float(axis @ carried.measured[:n])
+            measured = (*axis.tolist(), along, *carried.measured[n:])
+            self._graph.add_edge(space.coordinate_prior, vertices, measured, noise, "fixes", topic)
+        if not axes:
+            metres = n if m.kind in ("pose", "position") else 0
+            noise = edge_noise(self._counters, topic, carried.covariance, metres)
+            self._graph.add_edge(space.fixes[m.kind], vertices, carried.measured, noise, "fixes", topic)
+        self._counters.used[topic] += 1
+
+    def closure(self, m: Closure, earlier: Where, later: Where) -> None:
+        """Between two keyframes."""
+        if earlier.keyframe == later.keyframe:
+            self._counters.count(m.topic, "within_one_keyframe")
+            return
+        carried = motion_compensation.closure(self._space, m, earlier, later)
+        noise, vertices = self._noise(m.topic, carried.covariance), [earlier.vertex, later.vertex]
+        self._graph.add_edge(self._space.relative_pose, vertices, carried.measured, noise, "closures", m.topic)
+        self._counters.used[m.topic] += 1
+
+    def _noise(self, source: str, covariance: Array) -> Gaussian:
+        """Of a pose."""
+        return edge_noise(self._counters, source, covariance, self._space.dimensions)

@@ -1,0 +1,106 @@
+"""Measurements arrive nearly in order of stamp; they are used exactly in order of stamp.
+
+Odometry is the clock: what is ``window_s`` of stamp time older than the newest odometry is released. A landmark message
+may come early (it waits for the odometry around it) or late within the window. No wall clock is read.
+"""
+
+import heapq
+
+from graph_slam_ros.config.config import OrderingConfig
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import Observation, Odometry, Sightings
+
+NS = 1_000_000_000
+_REMEMBERED = 100  # messages of each topic, by which one that comes again is known
+
+
+def _things(m: Observation) -> int:
+    """Each sighting counts."""
+    return len(m.sightings) if isinstance(m, Sightings) else 1
+
+
+class StampOrder:
+    """A bounded queue that releases measurements by (stamp, odometry first, topic, arrival)."""
+
+    def __init__(self, config: OrderingConfig, counters: Counters) -> None:
+        self._window_ns = round(config.window_s * NS)
+        self._max_waiting = config.max_waiting
+        self._counters = counters
+        self._heap: list[tuple[int, int, str, int, Odometry | Observation]] = []
+        self._recent: dict[str, dict[Observation, None]] = {}  # in the order they came
+        self._arrivals = 0
+        self._newest_odometry_ns: int | None = None
+        self._released_ns: int | None = None
+
+    def accepts(self, m: Odometry | Observation) -> bool:
+        """Whether there is room for it, odometry is not older than what was released, and all else is new; or counted.
+
+        Odometry newer than all before always has room: it is what makes others leave.
+        """
+        if not isinstance(m, Odometry):
+            reason = "duplicate" if self._is_repeated(m) else "" if self._has_room(m.stamp_ns) else "overflow"
+            if reason:
+                self._counters.count(m.topic, reason, _things(m))
+            return not reason
+        if self._released_ns is not None and m.stamp_ns < self._released_ns:
+            self._counters.count(m.source, "late")
+            return False
+        is_newest = self._newest_odometry_ns is None or m.stamp_ns > self._newest_odometry_ns
+        if not is_newest and not self._has_room(m.stamp_ns):
+            self._counters.count(m.source, "overflow")
+            return False
+        return True
+
+    def _has_room(self, stamp_ns: int) -> bool:
+        """Whether so many wait only, or what is dated latest of all can make room: its turn may never come."""
+        if len(self._heap) < self._max_waiting:
+            return True
+        latest = max(range(len(self._heap)), key=self._heap.__getitem__)
+        at_ns, _, _, _, m = self._heap[latest]
+        if at_ns <= stamp_ns or isinstance(m, Odometry):
+            return False
+        self._heap[latest] = self._heap[-1]
+        self._heap.pop()
+        heapq.heapify(self._heap)
+        self._counters.count(m.topic, "overflow", _things(m))
+        return True
+
+    def _is_repeated(self, m: Observation) -> bool:
+        """Whether the very same has come before; what comes for the first time is remembered."""
+        recent = self._recent.setdefault(m.topic, {})
+        if m in recent:
+            return True
+        recent[m] = None
+        if len(recent) > _REMEMBERED:
+            del recent[next(iter(recent))]
+        return False
+
+    def push(self, m: Odometry | Observation) -> list[Odometry | Observation]:
+        """Take one measurement; returns those whose turn has come."""
+        rank, topic = (0, "") if isinstance(m, Odometry) else (1, m.topic)
+        heapq.heappush(self._heap, (m.stamp_ns, rank, topic, self._arrivals, m))
+        self._arrivals += 1
+        if isinstance(m, Odometry):
+            self._newest_odometry_ns = max(m.stamp_ns, self._newest_odometry_ns or m.stamp_ns)
+        if self._newest_odometry_ns is None:
+            return []
+        return self._release(self._newest_odometry_ns - self._window_ns)
+
+    def flush(self) -> list[Odometry | Observation]:
+        """Release everything that waits for its turn."""
+        return self._release(max((entry[0] for entry in self._heap), default=0))
+
+    def forget(self) -> None:
+        """Begin anew with stamps of another time."""
+        self._heap.clear()
+        self._recent.clear()
+        self._newest_odometry_ns = self._released_ns = None
+
+    def _release(self, until_ns: int) -> list[Odometry | Observation]:
+        out = []
+        while self._heap and self._heap[0][0] <= until_ns:
+            stamp_ns, _, _, _, m = heapq.heappop(self._heap)
+            if self._newest_odometry_ns is not None:  # a landmark message of the future is not what others are late for
+                self._released_ns = max(self._released_ns or 0, min(stamp_ns, self._newest_odometry_ns))
+            out.append(m)
+        return out

@@ -1,0 +1,58 @@
+"""Instants in order, in columns: what asks for all of them gets arrays, what asks for one gets a record."""
+
+from collections.abc import Callable, Iterator
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph.geometry import Numbers
+from graph_slam_ros.graph.graph import Column
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Instant = TypeVar("Instant")
+
+
+class Track(Generic[Instant]):
+    """Instants, each with the id of what it belongs to, a stamp and a pose; it grows at its end.
+
+    Parameters
+    ----------
+    record : makes the record of one instant of these three
+    size : numbers of a pose
+    """
+
+    __slots__ = ("_id", "_pose", "_record", "_stamp_ns")
+
+    def __init__(self, record: Callable[[int, int, Numbers], Instant], size: int) -> None:
+        self._record = record
+        self._id, self._stamp_ns, self._pose = Column(np.int64), Column(np.int64), Column(np.float64, size)
+
+    @property
+    def ids(self) -> Index:
+        """What each belongs to, a view: the vertex of a keyframe, the keyframe of a sighting."""
+        return self._id.values
+
+    @property
+    def stamps_ns(self) -> Index:
+        """Stamp of each, a view."""
+        return self._stamp_ns.values
+
+    @property
+    def poses(self) -> Array:
+        """Pose of each, (n, size), a view."""
+        return self._pose.values
+
+    def append(self, id_: int, stamp_ns: int, pose: Numbers) -> None:
+        """Add an instant."""
+        Column.extend((self._id, id_, 1), (self._stamp_ns, stamp_ns, 1), (self._pose, pose, 1))
+
+    def __len__(self) -> int:
+        return len(self._id)
+
+    def __getitem__(self, index: int) -> Instant:
+        return self._record(int(self.ids[index]), int(self.stamps_ns[index]), tuple(self.poses[index].tolist()))
+
+    def __iter__(self) -> Iterator[Instant]:
+        return (self[k] for k in range(len(self)))

@@ -1,0 +1,334 @@
+"""Landmarks: from sightings to vertices and edges, and what still waits to be determined, with the reason."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.config.survey import Surveyed
+from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian, Graph, VertexKind
+from graph_slam_ros.graph.geometry import Numbers
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.edge_noise import LEAST_RAD2, edge_noise
+from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.slam.frontend import motion_compensation
+from graph_slam_ros.slam.frontend.motion_compensation import Carried, Where
+from graph_slam_ros.slam.landmarks import triangulation
+from graph_slam_ros.slam.landmarks.triangulation import Glance, Place
+from graph_slam_ros.solver import Solver
+
+Array = NDArray[np.float64]
+
+LABEL = "landmarks"
+_SOMEWHERE_M = 3.0  # away, of what was seen by its bearing alone
+_MOST_WAITING = 60  # sightings of one landmark: every other is forgotten beyond
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One sighting of a landmark, and the edge that says so."""
+
+    edge: int
+    topic: str
+    sighting: Sighting
+    where: Where
+
+
+@dataclass(slots=True)
+class Landmark:
+    """A landmark of the graph.
+
+    Attributes
+    ----------
+    is_unnamed : whether no sighting of it tells which it is
+    is_tentative : whether it is too new to be believed: it may be given up
+    seen : its sightings that do not tell which it is: they may change hands
+    stamps : of these; a landmark is never seen twice at once
+    """
+
+    name: str
+    vertex: int
+    is_unnamed: bool = False
+    is_tentative: bool = False
+    sightings: int = 0
+    first_seen_ns: int = 0
+    last_seen_ns: int = 0
+    seen: list[Seen] = field(default_factory=list)
+    stamps: set[int] = field(default_factory=set)
+
+
+@dataclass(slots=True)
+class Waiting:
+    """A landmark that no vertex has yet: what was seen of it, where it may be, and why that is not enough."""
+
+    topic: str
+    seen: list[tuple[Where, Sighting]] = field(default_factory=list)
+    places: list[Place] = field(default_factory=list)
+    reason: str = ""
+
+
+class Landmarks:
+    """Landmarks with identity.
+
+    Attributes
+    ----------
+    known : those in the graph, by identity
+    waiting : those that are not determined yet
+    offsets : by input, the vertex of what all its ranges have in common
+    touched : the name of a landmark of the graph for each change of it, in order
+    begins_new : whether what is not known begins a landmark; not so while the map is held
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        graph: Graph,
+        solver: Solver,
+        counters: Counters,
+        withdraw: Callable[[Sequence[int]], None],
+    ) -> None:
+        self.known: dict[str, Landmark] = {}
+        self.begins_new = True
+        self.waiting: dict[str, Waiting] = {}
+        self._config, self._space = config, config.space
+        self._graph, self._solver, self._counters, self._withdraw = graph, solver, counters, withdraw
+        if config.landmarks.surveyed_file and not config.landmarks.surveyed:
+            raise ConfigError(f"landmarks.surveyed_file: {config.landmarks.surveyed_file} has not been read")
+        self._survey = config.survey
+        self.offsets: dict[str, int] = {}
+        self.touched: list[str] = []
+
+    def add(self, topic: str, name: str, s: Sighting, where: Where) -> None:
+        """Take a sighting of a landmark with this identity."""
+        landmark = self.known.get(name)
+        if landmark is not None:
+            self._add_edge(topic, landmark, s, where)
+        elif not self.begins_new:
+            self._counters.count(topic, "not_in_map")
+        elif s.kind == "pose":
+            self._begin(topic, name, s, where, motion_compensation.pose(self._space, s, where).measured)
+        elif s.kind == "position":
+            self._begin(
+                topic, name, s, where, self._in_map(where, motion_compensation.position(self._space, s, where).measured)
+            )
+        elif s.kind == "range_bearing":
+            point = motion_compensation.point_of(self._space, s.measured)
+            self._begin(topic, name, s, where, tuple(self._from_sensor(s, where, point).tolist()))
+        elif name in self._survey:  # there is nothing to wait for
+            self._begin(topic, name, s, where, self._survey[name].position)
+        else:
+            self._wait(topic, name, s, where)
+
+    def survey_of(self, name: str, s: Sighting, where: Where) -> tuple[Surveyed, Array] | None:
+        """The survey of a landmark that was not seen before, and where (n,) a sighting puts it, or may put it."""
+        if name not in self._survey or name in self.known:
+            return None
+        if s.kind in ("pose", "position"):
+            return self._survey[name], np.array(
+                self._in_map(where, motion_compensation.position(self._space, s, where).measured)
+            )
+        measured = s.measured
+        if s.kind == "bearing":
+            measured = (_SOMEWHERE_M, *measured)
+        elif s.kind == "range":
+            measured = (*measured, *[0.0] * (self._space.dimensions - 1))
+        return self._survey[name], self._from_sensor(s, where, motion_compensation.point_of(self._space, measured))
+
+    def take_up(self, known: dict[str, Landmark], offsets: dict[str, int]) -> None:
+        """Go on with these, whose vertices and edges are in the graph."""
+        self.known.update(known)
+        self.offsets.update(offsets)
+        self.touched += known
+
+    # -- in the graph --------------------------------------------------------------------------------------------
+
+    def _begin(self, topic: str, name: str, s: Sighting, where: Where, value: Numbers) -> None:
+        """Add a vertex; ``value`` is in map, but for a pose, which is still in the keyframe's frame."""
+        kind = self._space.pose if s.kind == "pose" else self._space.point
+        if s.kind == "pose":
+            value = self._space.group.compose(self._pose(where), value)
+        landmark = self.known[name] = Landmark(name, self._graph.add_vertex(kind, value), not s.id, not s.id)
+        if name in self._survey:
+            self._hold(landmark, self._survey[name])
+        self._add_edge(topic, landmark, s, where)
+
+    def _hold(self, landmark: Landmark, known: Surveyed) -> None:
+        """A prior on the position; without a loss, what contradicts it is the sightings' fault."""
+        space = self._space
+        is_pose = self._graph.kind_of(landmark.vertex) is space.pose
+        edge_type = space.fixes["position"] if is_pose else POINT_PRIOR[space.point]
+        noise = Gaussian.from_sigmas(*[known.sigma_m] * space.dimensions)
+        measured = edge_type.whole(known.position)
+        self._graph.add_edge(edge_type, [landmark.vertex], measured, noise, "surveyed")
+
+    def _add_edge(self, topic: str, landmark: Landmark, s: Sighting, where: Where) -> None:
+        space = self._space
+        is_pose = self._graph.kind_of(landmark.vertex) is space.pose
+        vertices, metres = [where.vertex, landmark.vertex], space.dimensions
+        if s.kind == "pose" and is_pose:
+            edge_type, carried = space.relative_pose, motion_compensation.pose(space, s, where)
+        elif s.kind in ("pose", "position"):
+            edge_type = space.tag_position if is_pose else space.sightings["position"]
+            carried = motion_compensation.position(space, s, where)
+        elif is_pose:
+            self._counters.count(topic, "not_for_a_pose")
+            return
+        else:
+            edge_type, metres = space.sightings[s.kind], 0 if s.kind == "bearing" else 1
+            carried = self._from_sensors(s, where, landmark)
+            if s.kind == "range" and self._config.landmarks.range_offset_sigma_m > 0.0:
+                edge_type = space.range_with_offset
+                vertices.append(self._offset(topic))
+        distance_m = float(np.linalg.norm(carried.measured[:metres]))
+        noise = edge_noise(self._counters, topic, self._blurred(s, carried), metres, distance_m)
+        edge = self._graph.add_edge(edge_type, vertices, carried.measured, noise, LABEL, topic)
+        if not s.id:
+            landmark.seen.append(Seen(edge, topic, s, where))
+            landmark.stamps.add(where.stamp_ns)
+        landmark.sightings += 1
+        self._counters.used[topic] += 1
+        self.touched.append(landmark.name)
+        landmark.first_seen_ns = min(landmark.first_seen_ns or where.stamp_ns, where.stamp_ns)
+        landmark.last_seen_ns = max(landmark.last_seen_ns, where.stamp_ns)
+
+    def _from_sensors(self, s: Sighting, where: Where, landmark: Landmark) -> Carried:
+        at = self._solver.estimate([landmark.vertex])[0]
+        group = self._space.group
+        seen = np.array(group.act(group.inverse(self._pose(where)), tuple(at.tolist())))
+        return motion_compensation.seen_from_sensor(self._space, s, where, seen)
+
+    def _blurred(self, s: Sighting, carried: Carried) -> Array:
+        """With what messages leave out: clocks, mounting, size."""
+        covariance, added = carried.covariance.copy(), self._config.landmarks.added_sigma_m**2
+        if s.kind in ("pose", "position"):
+            n = self._space.dimensions
+            covariance[:n, :n] += added * np.eye(n)
+        elif s.kind != "bearing":
+            covariance[0, 0] += added
+        return covariance
+
+    def _offset(self, topic: str) -> int:
+        """The vertex of what all ranges of a topic have in common."""
+        if topic not in self.offsets:
+            vertex = self._graph.add_vertex(R1, [0.0])
+            noise = Gaussian.from_sigmas(self._config.landmarks.range_offset_sigma_m)
+            self._graph.add_edge(POINT_PRIOR[R1], [vertex], [0.0], noise, "range_offset")
+            self.offsets[topic] = vertex
+        return self.offsets[topic]
+
+    # -- taken back ----------------------------------------------------------------------------------------------
+
+    def give_up(self, name: str) -> None:
+        """Take a landmark and its edges out of the problem."""
+        landmark = self.known.pop(name)
+        self.touched.append(name)
+        self._take_out(landmark.seen)
+        self._solver.remove(landmark.vertex)
+
+    def forget(self, vertices: set[int]) -> None:
+        """These are out of the problem already; whatever is seen of them begins others."""
+        for name in [name for name, landmark in self.known.items() if landmark.vertex in vertices]:
+            self.touched.append(name)
+            del self.known[name]
+
+    def merge(self, kept: str, merged: str) -> None:
+        """Give the sightings of one landmark to another."""
+        a, b = self.known[kept], self.known[merged]
+        self.give_up(merged)
+        for one in b.seen:
+            self._add_edge(one.topic, a, one.sighting, one.where)
+
+    def part(self, kept: str, merged: str, moved: Sequence[Seen]) -> None:
+        """Take a merger back: these sightings are of a landmark of their own."""
+        a = self.known[kept]
+        gone = {one.edge for one in moved}
+        a.seen = [one for one in a.seen if one.edge not in gone]
+        a.stamps = {one.where.stamp_ns for one in a.seen}
+        a.sightings -= len(moved)
+        self._take_out(moved)
+        for one in moved:
+            self.add(one.topic, merged, one.sighting, one.where)
+        self.touched.append(kept)
+        self.believe(merged)
+
+    def believe(self, name: str) -> None:
+        """It is tentative no more."""
+        self.known[name].is_tentative = False
+        self.touched.append(name)
+
+    def _take_out(self, seen: Sequence[Seen]) -> None:
+        for one in seen:
+            self._counters.used[one.topic] -= 1
+        self._withdraw([one.edge for one in seen])
+
+    def kind_of(self, vertex: int) -> VertexKind:
+        """Point or pose."""
+        return self._graph.kind_of(vertex)
+
+    def chi2_of(self, edges: Sequence[int]) -> tuple[float, int]:
+        """Sum of the squared whitened residuals of some edges, without loss, and how many numbers they are."""
+        chi2, numbers = self._solver.chi2_of(edges)
+        return float(chi2.sum()), int(numbers.sum())
+
+    def _wait(self, topic: str, name: str, s: Sighting, where: Where) -> None:
+        waiting = self.waiting.setdefault(name, Waiting(topic))
+        is_elsewhere = not waiting.seen or waiting.seen[-1][0].keyframe != where.keyframe
+        waiting.seen.append((where, s))
+        if is_elsewhere:  # another look from where the last was taken determines nothing
+            self._determine(name, waiting)
+        if len(waiting.seen) > _MOST_WAITING:
+            del waiting.seen[1::2]
+
+    def _determine(self, name: str, waiting: Waiting) -> None:
+        glances = []
+        for where, s in waiting.seen:
+            covariance = motion_compensation.square(s.covariance) + LEAST_RAD2 * np.eye(len(s.measured))
+            glances.append(Glance(self._sensor_pose(s, where), s.kind, s.measured, covariance))
+        waiting.places = triangulation.places(self._space, glances, self._config.landmarks.range_offset_sigma_m)
+        waiting.reason = self._why_not(waiting.places, glances)
+        if not waiting.reason:
+            del self.waiting[name]
+            at = tuple(waiting.places[0].position.tolist())
+            landmark = self.known[name] = Landmark(name, self._graph.add_vertex(self._space.point, at))
+            for where, s in waiting.seen:
+                self._add_edge(waiting.topic, landmark, s, where)
+
+    def _why_not(self, places: list[Place], glances: list[Glance]) -> str:
+        """Why a landmark is not determined; empty where it is."""
+        settings, count = self._config.landmarks, len(glances)
+        if count <= self._space.dimensions - (glances[0].kind != "range"):
+            return f"{count} {'sightings' if count > 1 else 'sighting'} by {glances[0].kind}: too few"
+        if not places:
+            return f"no place fits {count} sightings by {glances[0].kind}"
+        best = places[0]
+        others = [p for p in places[1:] if p.chi2 < best.chi2 + settings.mirror_chi2]
+        if others:
+            fits = " and ".join("(" + ", ".join(f"{x:.2f}" for x in p.position) + ")" for p in [best, *others[:2]])
+            return f"{1 + len(others)} places fit: {fits}"
+        n = self._space.dimensions
+        distance = min(float(np.linalg.norm(best.position - np.array(g.T_map_sensor[:n]))) for g in glances)
+        sigma = (
+            float(np.sqrt(np.linalg.eigvalsh(best.covariance)[-1])) if np.isfinite(best.covariance).all() else np.inf
+        )
+        if sigma > settings.determined_below * distance:
+            return f"sigma {sigma:.2f} m at {distance:.2f} m: more than {settings.determined_below:g} of the distance"
+        return ""
+
+    # -- where things are ----------------------------------------------------------------------------------------
+
+    def _pose(self, where: Where) -> Numbers:
+        return tuple(self._solver.estimate([where.vertex])[0].tolist())
+
+    def _in_map(self, where: Where, point: Numbers) -> Numbers:
+        return tuple(map(float, self._space.group.act(self._pose(where), point)))
+
+    def _sensor_pose(self, s: Sighting, where: Where) -> Numbers:
+        group = self._space.group
+        T_map_base = group.compose(self._pose(where), where.T_keyframe_base)
+        return tuple(map(float, group.compose(T_map_base, s.T_base_sensor or self._space.identity)))
+
+    def _from_sensor(self, s: Sighting, where: Where, point: Array) -> Array:
+        return np.array(self._space.group.act(self._sensor_pose(s, where), tuple(point.tolist())))

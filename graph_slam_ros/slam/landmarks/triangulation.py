@@ -1,0 +1,168 @@
+"""Where a landmark can be, from ranges and bearings taken at known places: all places that fit, and how well.
+
+A range from one place leaves a circle, from two places two points; bearings from one place leave a ray. So the search
+begins at many points of the circle, sphere or ray that the first sighting leaves, each followed to the least squares
+next to it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.lie import se2
+from graph_slam_ros.slam.frontend.motion_compensation import gradient, point_of, seen_as
+
+Array = NDArray[np.float64]
+
+_DISTANCES_M = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # along a ray
+_DIRECTIONS = {2: 16, 3: 64}
+_ITERATIONS = 30
+_ARRIVED_M = 1e-5
+_ONE_PLACE_M = 1e-2
+_LEAST_CURVATURE = 1e-12
+_NO_OFFSET_M = 1e-6
+
+
+Field = tuple[str, Array, Array, Array, Array]
+
+
+@dataclass(frozen=True, slots=True)
+class Glance:
+    """One sighting from a place that is taken for known.
+
+    Attributes
+    ----------
+    T_map_sensor : where the sensor was
+    kind, measured : as in ``Sighting``
+    covariance : (m, m)
+    """
+
+    T_map_sensor: Numbers
+    kind: str
+    measured: Numbers
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a landmark may be, its covariance (n, n), infinite where it is loose, and the chi2 of the sightings."""
+
+    position: Array
+    covariance: Array
+    chi2: float
+
+
+def places(space: Space, glances: Sequence[Glance], offset_sigma_m: float = 0.0) -> list[Place]:
+    """Every place that fits the sightings best among those next to it, the best first.
+
+    Parameters
+    ----------
+    offset_sigma_m : standard deviation of an unknown offset that all ranges have in common
+    """
+    fields = _fields(space, glances)
+    known = 1.0 / max(offset_sigma_m, _NO_OFFSET_M) ** 2
+    starts = np.array([[*start, 0.0] for start in _starts(space, glances[0])])
+    found: list[Place] = []
+    for place in _descend(space, fields, starts, known):
+        if all(np.linalg.norm(place.position - other.position) > _ONE_PLACE_M for other in found):
+            found.append(place)
+    return sorted(found, key=lambda place: place.chi2)
+
+
+def _fields(space: Space, glances: Sequence[Glance]) -> list[Field]:
+    """By kind: rotations (k, n, n) and positions (k, n) of the sensors, what they said (k, m), whitening (k, m, m)."""
+    out = []
+    n = space.dimensions
+    for kind in dict.fromkeys(glance.kind for glance in glances):
+        members = [glance for glance in glances if glance.kind == kind]
+        turns = np.array([space.turn(g.T_map_sensor) for g in members])
+        at = np.array([g.T_map_sensor[:n] for g in members])
+        whiten = np.linalg.inv(np.linalg.cholesky(np.array([g.covariance for g in members])))
+        out.append((kind, turns, at, np.array([g.measured for g in members]), whiten))
+    return out
+
+
+def _starts(space: Space, glance: Glance) -> list[Array]:
+    if glance.kind == "range":
+        points = glance.measured[0] * _directions(space.dimensions)
+    else:
+        far = (glance.measured[0],) if glance.kind == "range_bearing" else _DISTANCES_M
+        angles = glance.measured[-(space.dimensions - 1) :]
+        points = np.array([point_of(space, (distance, *angles)) for distance in far])
+    return [np.array(space.group.act(glance.T_map_sensor, tuple(p))) for p in points.tolist()]
+
+
+def _directions(n: int) -> Array:
+    """Unit vectors, evenly spread (in space along a spiral)."""
+    k = np.arange(_DIRECTIONS[n]) + 0.5
+    if n == 2:
+        angle = 2.0 * np.pi * k / len(k)
+        return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    z, angle = 1.0 - 2.0 * k / len(k), np.pi * (1.0 + 5.0**0.5) * k
+    flat = np.sqrt(1.0 - z * z)
+    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
+
+
+def _descend(space: Space, fields: list[Field], starts: Array, known: float) -> list[Place]:
+    """Levenberg-Marquardt from all starts at once, each to the nearest minimum; those that arrive, in their order.
+
+    Parameters
+    ----------
+    starts : (s, n + 1) points and the ranges' offset
+    known : information on the offset
+    """
+    n, at, damping = space.dimensions, starts.copy(), np.full(len(starts), 1e-3)
+    chi2, b, h = _normal(space, fields, at, known)
+    under_way, has_arrived = np.arange(len(starts)), np.zeros(len(starts), dtype=bool)
+    for _ in range(_ITERATIONS):
+        k = under_way
+        lift = damping[k, None] * np.einsum("kii->ki", h[k]) + _LEAST_CURVATURE
+        step = -np.linalg.solve(h[k] + lift[..., None] * np.eye(n + 1), b[k, :, None])[..., 0]
+        tried = at[k] + step
+        chi2_there, b_there, h_there = _normal(space, fields, tried, known)
+        goes = ~(chi2_there > chi2[k])
+        gone = k[goes]
+        at[gone], chi2[gone], b[gone], h[gone] = tried[goes], chi2_there[goes], b_there[goes], h_there[goes]
+        damping[k] *= np.where(goes, 0.1, 10.0)
+        is_short = np.linalg.norm(step, axis=1) < _ARRIVED_M * (1.0 + np.linalg.norm(tried, axis=1))
+        has_arrived[k] = goes & is_short
+        under_way = k[~has_arrived[k]]
+        if not len(under_way):
+            break
+    points = h[:, :n, :n] - h[:, :n, n:] * h[:, n:, :n] / h[:, n:, n:]  # the offset is eliminated
+    return [Place(at[k, :n], _covariance(points[k]), float(chi2[k])) for k in np.flatnonzero(has_arrived).tolist()]
+
+
+def _covariance(information: Array) -> Array:
+    values = np.linalg.eigvalsh(information)
+    if values[0] <= max(_LEAST_CURVATURE, 1e-9 * values[-1]):
+        return np.full_like(information, np.inf)
+    inverse: Array = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    return inverse
+
+
+def _normal(space: Space, fields: list[Field], at: Array, known: float) -> tuple[Array, Array, Array]:
+    """chi2 (s,), gradients (s, n + 1) and Gauss-Newton matrices (s, n + 1, n + 1) at points and offsets (s, n + 1)."""
+    n = space.dimensions
+    b, h = np.zeros(at.shape), np.zeros((*at.shape, n + 1))
+    chi2, b[:, n], h[:, n, n] = known * at[:, n] ** 2, known * at[:, n], known
+    for kind, turns, sensors, said, whiten in fields:
+        p = np.einsum("kij,ski->skj", turns, at[:, None, :n] - sensors)
+        r = seen_as(space, kind, p) - said
+        first_angle = 0 if kind == "bearing" else 1
+        r[..., first_angle:] = se2.wrap(r[..., first_angle:])
+        j = np.zeros((*r.shape, n + 1))
+        j[..., :n] = gradient(space, kind, p) @ np.swapaxes(turns, 1, 2)
+        if kind == "range":
+            r[..., 0] += at[:, None, n]
+            j[..., 0, n] = 1.0
+        j = (whiten @ j).reshape(len(at), -1, n + 1)
+        r = (whiten @ r[..., None]).reshape(len(at), -1, 1)
+        transposed = np.swapaxes(j, 1, 2)
+        chi2 += np.sum(r * r, axis=(1, 2))
+        b += (transposed @ r)[..., 0]
+        h += transposed @ j
+    return chi2, b, h

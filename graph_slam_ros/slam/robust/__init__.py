@@ -1,0 +1,1 @@
+"""What is believed: gating, pairwise consistency, alternative hypotheses, displacement, the ledger."""

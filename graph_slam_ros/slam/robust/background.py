@@ -1,0 +1,64 @@
+"""When a second look is taken while the robot drives on, and when what it found is taken over.
+
+Both are keyframes, told by the ingest sequence alone, so that a replay decides as the live run did: it begins on a
+frozen copy; at a fixed later keyframe its outcome is taken over, waited for if it must be. Where in between the work is
+done, in a thread or at the end, changes nothing.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from graph_slam_ros.config.robust import RobustConfig
+from graph_slam_ros.slam.robust.hypotheses import Frozen, Outcome, Wanted, second_look
+
+_MORE = 1.5  # times as many out as at the last look: looks become rarer as their cost grows
+
+Work = Callable[[], Outcome | None]
+Beside = Callable[[Work], Work]
+"""Begins work and returns what waits for its result."""
+
+
+def when_asked(work: Work) -> Work:
+    """Does it when its result is asked for."""
+    return work
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    apply_at: int
+    outcome: Work
+    wanted: Wanted
+
+
+class Background:
+    """At most one second look at a time, and its outcome at the keyframe it is for."""
+
+    def __init__(self, config: RobustConfig, beside: Beside) -> None:
+        self._config, self._beside = config, beside
+        self._out = 0  # candidates that were out at the last look
+        self._look: _Look | None = None
+
+    def is_due(self, out: int) -> bool:
+        """Whether so many candidates that are out deserve a look."""
+        after, self._out = self._config.second_look_after, min(self._out, out)
+        return self._look is None and after > 0 and out >= max(self._out + after, _MORE * self._out)
+
+    def start(self, frozen: Frozen, out: int) -> None:
+        """Begin with what there is now."""
+        self._out = out
+        wanted = Wanted()
+        outcome = self._beside(lambda: second_look(self._config, frozen, wanted))
+        self._look = _Look(frozen.keyframe + self._config.apply_after_keyframes, outcome, wanted)
+
+    def outcome(self, keyframe: int) -> Outcome | None:
+        """What was found, at the keyframe it is for; waits for it. None, too, where nothing could be."""
+        if self._look is None or keyframe < self._look.apply_at:
+            return None
+        look, self._look = self._look, None
+        return look.outcome()
+
+    def cancel(self, out: int) -> None:
+        """What is under way is for nobody: all was looked at, and so many are out."""
+        if self._look is not None:
+            self._look.wanted.still = False
+        self._look, self._out = None, out

@@ -1,0 +1,405 @@
+"""Whether the landmarks say that the robot is elsewhere than odometry does: after a slip, or after it was carried.
+
+Odometry that is wrong without a jump leaves traces in what is held back: those sightings agree with one another, at
+another pose of the robot, and not with odometry. Sightings with wrong identities do not agree with one another. The
+evidence is counted: sightings that are held back and fit the other pose, minus those that are believed and do not.
+"""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.lie import se2
+from graph_slam_ros.slam.frontend import motion_compensation
+from graph_slam_ros.slam.landmarks.association import quantile
+from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
+from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
+from graph_slam_ros.solver import Solver
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+WINDOW = 50  # sightings that are compared
+REACH_S = 20.0  # sightings that are older are not compared with the newest
+_SEEDS = 10  # newest held back sightings from which another pose is computed
+_FIT = 0.999  # probability with which a true sighting fits the other pose
+_MAP_SIGMA_M = 0.1  # error of a landmark of the map, beside its neighbours
+_LEAST_APART_M = 0.5  # two landmarks nearer to each other tell little of a heading
+_VAGUE_M, _VAGUE = 0.2, 0.3  # a sighting that fits within more than this, and this part of its distance, tells nothing
+_HEADING_SIGMA_RAD = 0.05  # error of a landmark's heading in the map
+SAME_M, SAME_RAD = 1.0, 0.3  # poses farther from each other are two
+
+
+@dataclass(frozen=True, slots=True)
+class DisplacementHypothesis:
+    """Another pose of the robot, and the evidence for it.
+
+    Attributes
+    ----------
+    first : the keyframe's vertex from which on the robot is there
+    T_map_chain : where the evidence's own frame of odometry lies then in map
+    evidence : sightings that are held back and fit it, minus those that are believed and do not
+    landmarks, keyframes : how many are in agreement
+    has_headings : whether the landmarks were seen with their headings, which agree, too
+    fitting, contradicting : edges of sightings from ``first`` on that fit and that do not
+    rival : the evidence for a pose that differs from it
+    """
+
+    first: int
+    T_map_chain: Numbers
+    evidence: int
+    landmarks: int
+    keyframes: int
+    has_headings: bool
+    fitting: tuple[int, ...]
+    contradicting: tuple[int, ...]
+    rival: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """One sighting of a landmark with a position: its edge, and where odometry's chain of motions puts it."""
+
+    edge: int
+    keyframe: int
+    landmark: int
+    stamp_ns: int
+    point: Array
+    base: Array
+    variance: float
+    drift: Array  # variances [m^2, rad^2] of odometry since the evidence's frame began
+    heading: float  # of a landmark that is a pose, in the evidence's frame; NaN where it was not seen
+    heading_variance: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """The sightings of the window as arrays, in order of time."""
+
+    edges: Index
+    keyframes: Index
+    landmarks: Index
+    seconds: Array  # since the newest, at most 0
+    points: Array
+    bases: Array
+    variances: Array
+    drifts: Array
+    headings: Array
+    heading_variances: Array
+    places: Array  # of the landmarks in map
+    place_headings: Array
+    supports: Index  # vertices of the keyframes from which each landmark was well known
+    is_in: Flags
+    fits_now: Flags  # the present estimate, but for what the map may be wrong by
+
+
+class DisplacementSearch:
+    """The newest sightings of landmarks, laid out along odometry alone.
+
+    Parameters
+    ----------
+    graph, solver, ledger : of the back-end
+    """
+
+    def __init__(self, space: Space, graph: Graph, solver: Solver, ledger: Ledger, history: LandmarkHistory) -> None:
+        self._space, self._history = space, history
+        self._graph, self._solver, self._ledger = graph, solver, ledger
+        self._seen: deque[_Seen] = deque(maxlen=WINDOW)
+        self._chain: dict[int, Numbers] = {}  # of each keyframe since the segment began
+        self._stamps_ns: dict[int, int] = {}
+        self._drift: dict[int, Array] = {}
+        self._links: dict[int, int] = {}  # odometry's edge to each of them
+        self._poses: dict[int, list[int]] = {}  # edges of initial poses, by their keyframe
+        self._first = 0  # vertex of the segment's first keyframe
+        self._is_supported = False  # whether a sighting of a landmark that was known is believed since then
+
+    # -- what came -----------------------------------------------------------------------------------------------
+
+    def begin(self, vertex: int) -> None:
+        """A segment begins at a keyframe: what was seen before tells nothing of where it is."""
+        self._first, self._is_supported = vertex, False
+        while self._seen and self._seen[0].keyframe < vertex:
+            self._seen.popleft()
+        self._forget_before(vertex)
+
+    def add_odometry(self, edge: int, vertices: Sequence[int], T_last_now: Numbers, stamp_ns: int) -> None:
+        """The motion from one keyframe to the next, whose stamp it is."""
+        self._links[vertices[1]] = edge
+        if vertices[1] not in self._chain:
+            before = self._chain.get(vertices[0], self._space.identity)
+            self._chain[vertices[1]] = tuple(map(float, self._space.group.compose(before, T_last_now)))
+            self._drift[vertices[1]] = self._drift.get(vertices[0], np.zeros(2)) + self._drift_of(edge)
+            self._stamps_ns[vertices[1]] = stamp_ns
+        if len(self._seen) == WINDOW:
+            self._forget_before(self._seen[0].keyframe)
+
+    def _forget_before(self, keyframe: int) -> None:
+        """Only what is compared is kept."""
+        while self._chain and (oldest := next(iter(self._chain))) < keyframe:
+            del self._chain[oldest], self._stamps_ns[oldest], self._drift[oldest], self._links[oldest]
+
+    def _drift_of(self, edge: int) -> Array:
+        """Variances [m^2, rad^2] of one step of odometry, the largest of any direction."""
+        table, row = self._graph.row(edge)
+        root, n = table.sqrt_information.values[row], self._space.dimensions
+        covariance = np.linalg.inv(root.T @ root)
+        return np.array([np.diag(covariance)[:n].max(), np.diag(covariance)[n:].max()])
+
+    def add_initial_pose(self, edge: int, keyframe: int) -> None:
+        """A pose that was given at a keyframe."""
+        self._poses.setdefault(keyframe, []).append(edge)
+
+    def add_sighting(self, edge: int, keyframe: int, landmark: int) -> None:
+        """A sighting of a landmark; of use is one that tells a position."""
+        base, point = self._chain.get(keyframe), self._point(edge)
+        if base is None or point is None or keyframe < self._first:
+            return
+        n = self._space.dimensions
+        in_chain = np.array(self._space.group.act(base, tuple(point.tolist())))
+        stamp_ns, variance, drift = self._stamps_ns[keyframe], self._variance(edge, point), self._drift[keyframe]
+        heading = self._heading(edge, base)
+        self._seen.append(
+            _Seen(edge, keyframe, landmark, stamp_ns, in_chain, np.array(base[:n]), variance, drift, *heading)
+        )
+
+    def _heading(self, edge: int, base: Numbers) -> tuple[float, float]:
+        """Of a landmark seen as a pose in the plane, and its variance."""
+        table, row = self._graph.row(edge)
+        if table.type is not self._space.relative_pose or self._space.dimensions != 2:
+            return np.nan, 0.0
+        root = table.sqrt_information.values[row]
+        variance = float(np.linalg.inv(root.T @ root)[2, 2])
+        return base[2] + float(table.measured.values[row][2]), variance
+
+    def _point(self, edge: int) -> Array | None:
+        """A landmark's position in the keyframe's frame, by one sighting; None where it does not tell one."""
+        table, row = self._graph.row(edge)
+        space, measured = self._space, table.measured.values[row]
+        if table.type in (space.relative_pose, space.tag_position, space.sightings["position"]):
+            return np.array(measured[: space.dimensions])
+        if table.type is space.sightings["range_bearing"]:
+            n = space.dimensions
+            point = motion_compensation.point_of(space, tuple(measured[:n].tolist()))
+            return np.array(space.group.act(tuple(measured[n:].tolist()), tuple(point.tolist())))
+        return None
+
+    def _variance(self, edge: int, point: Array) -> float:
+        """Of that position, the largest of any direction."""
+        table, row = self._graph.row(edge)
+        root, n = table.sqrt_information.values[row], self._space.dimensions
+        covariance = np.linalg.inv(root.T @ root)
+        if table.type is self._space.sightings["range_bearing"]:
+            return float(max(covariance[0, 0], point @ point * np.diag(covariance)[1:].max()))
+        return float(np.linalg.eigvalsh(covariance[:n, :n])[-1])
+
+    # -- what it tells -------------------------------------------------------------------------------------------
+
+    @property
+    def held_back_count(self) -> int:
+        """Of the newest sightings of landmarks that are well known, how many are held back."""
+        known = [one for one in self._standing() if self._known_from(one.landmark) < one.keyframe]
+        held_back = [not self._ledger.is_inside(one.edge) for one in known]
+        self._is_supported |= not all(held_back)
+        return sum(held_back)
+
+    def hypothesis(self) -> DisplacementHypothesis | None:
+        """The other pose for which the evidence is greatest; None where there is none."""
+        window = self._window()
+        if window is None:
+            return None
+        found = list[tuple[DisplacementHypothesis, Flags]]()
+        for motion, at in self._motions(window):
+            fits = self._fits(window, motion, at)
+            one = self._evidence(window, fits, motion)
+            found += [(one, fits & ~window.is_in)] if one else []
+        if not found:
+            return None
+        best, _ = max(found, key=lambda one: one[0].evidence)
+        same, newest = window.keyframes >= best.first, int(window.keyframes[-1])
+        rivals = [
+            np.count_nonzero(fits & same)
+            for one, fits in found
+            if self.are_apart(best.T_map_chain, one.T_map_chain, newest)
+        ]
+        return replace(best, rival=int(max(rivals, default=0)))
+
+    def _standing(self) -> list[_Seen]:
+        ledger = self._ledger
+        return [one for one in self._seen if one.edge < len(ledger) and ledger.reason.values[one.edge] not in FINAL]
+
+    def _window(self) -> _Window | None:
+        seen = self._standing()
+        if not seen:
+            return None
+        newest_ns, n = seen[-1].stamp_ns, self._space.dimensions
+        estimates = [self._solver.estimate([one.landmark])[0] for one in seen]
+        places = np.array([estimate[:n] for estimate in estimates])
+        return _Window(
+            np.array([one.edge for one in seen]),
+            np.array([one.keyframe for one in seen]),
+            np.array([one.landmark for one in seen]),
+            np.array([(one.stamp_ns - newest_ns) * 1e-9 for one in seen]),
+            np.array([one.point for one in seen]),
+            np.array([one.base for one in seen]),
+            np.array([one.variance for one in seen]),
+            np.array([one.drift for one in seen]),
+            np.array([one.heading for one in seen]),
+            np.array([one.heading_variance for one in seen]),
+            places,
+            np.array([estimate[2] if len(estimate) == 3 and n == 2 else np.nan for estimate in estimates]),
+            np.array([self._known_from(one.landmark) for one in seen]),
+            np.array([self._ledger.is_inside(one.edge) for one in seen]),
+            np.array([self._fits_now(one, place) for one, place in zip(seen, places, strict=True)]),
+        )
+
+    def _fits_now(self, one: _Seen, place: Array) -> bool:
+        group, chain = self._space.group, self._chain[one.keyframe]
+        now = tuple(self._solver.estimate([one.keyframe])[0].tolist())
+        point = group.act(group.compose(now, group.inverse(chain)), tuple(one.point.tolist()))
+        allowed = quantile(_FIT, self._space.dimensions) * (one.variance + _MAP_SIGMA_M**2)
+        return bool(np.sum((np.array(point) - place) ** 2) <= allowed)
+
+    def _motions(self, window: _Window) -> Iterator[tuple[tuple[Array, Array], int]]:
+        """Rigid motions that lay a few held back sightings on their landmarks, and the newest of these."""
+        out = np.flatnonzero(~window.is_in & (window.seconds > -REACH_S))[-_SEEDS:].tolist()[::-1]
+        for several in combinations(out, self._space.dimensions):
+            seeds = list(several)
+            p, m = window.points[seeds], window.places[seeds]
+            if len(set(window.landmarks[seeds].tolist())) < len(seeds) or not _are_apart(p) or not _are_apart(m):
+                continue
+            allowed = 3.0 * np.sqrt(self._variances(window, seeds[0])[seeds].sum())
+            if all(
+                abs(np.linalg.norm(p[i] - p[j]) - np.linalg.norm(m[i] - m[j])) < allowed
+                for i, j in combinations(range(len(seeds)), 2)
+            ):
+                yield self._refined(window, _aligned(p, m, np.ones(len(seeds))), seeds[0]), seeds[0]
+
+    def _refined(self, window: _Window, motion: tuple[Array, Array], at: int) -> tuple[Array, Array]:
+        """The motion by all sightings that are held back and fit it, the vaguer the less."""
+        for _ in range(2):
+            fits = self._fits(window, motion, at) & ~window.is_in
+            if np.count_nonzero(fits) < self._space.dimensions:
+                return motion
+            weights = 1.0 / self._variances(window, at)[fits]
+            motion = _aligned(window.points[fits], window.places[fits], weights)
+        return motion
+
+    def _variances(self, window: _Window, at: int) -> Array:
+        """Of each sighting, with what odometry may have drifted between it and one of them."""
+        drift, lever = np.abs(window.drifts - window.drifts[at]), self._levers(window)
+        return np.asarray(window.variances + _MAP_SIGMA_M**2 + drift[:, 0] + drift[:, 1] * lever**2)
+
+    @staticmethod
+    def _levers(window: _Window) -> Array:
+        return np.asarray(np.linalg.norm(window.points - window.bases, axis=1))
+
+    def _fits(self, window: _Window, motion: tuple[Array, Array], at: int) -> Flags:
+        """Sightings that fit a motion; one that would fit nearly anywhere does not count."""
+        turn, shift = motion
+        away = np.sum((window.points @ turn.T + shift - window.places) ** 2, axis=1)
+        allowed = quantile(_FIT, self._space.dimensions) * self._variances(window, at)
+        tells = allowed <= (_VAGUE_M + _VAGUE * self._levers(window)) ** 2
+        fits = (away <= allowed) & tells & (window.seconds > -REACH_S)
+        off = se2.wrap(window.headings + np.arctan2(turn[1, 0], turn[0, 0]) - window.place_headings)
+        drift = np.abs(window.drifts - window.drifts[at])[:, 1]
+        spread = window.heading_variances + drift + _HEADING_SIGMA_RAD**2
+        return np.asarray(fits & ~(off**2 > quantile(_FIT, 1) * spread))
+
+    def _known_from(self, landmark: int) -> int:
+        return self._history.known_from(landmark, self._seen[0].edge)
+
+    def _evidence(self, window: _Window, fits: Flags, motion: tuple[Array, Array]) -> DisplacementHypothesis | None:
+        """From which keyframe on there is most: landmarks that are newer than it tell nothing."""
+        for_it, against = fits & ~window.is_in & ~window.fits_now, ~fits & window.is_in
+        starts = np.flatnonzero(np.diff(window.keyframes, prepend=-1) != 0)
+        known = window.supports[None, :] < window.keyframes[starts][:, None]
+        since = window.keyframes[None, :] >= window.keyframes[starts][:, None]
+        counted = (known & since) @ (for_it.astype(int) - against.astype(int))
+        best = len(starts) - 1 - int(np.argmax(counted[::-1]))
+        if counted[best] <= 0:
+            return None
+        first = int(window.keyframes[starts[best]])
+        is_all = len(self._seen) < WINDOW
+        if not self._is_supported or (is_all and not window.is_in[window.keyframes < first].any()):
+            first = self._first  # nothing supports what came before in this segment
+        agreeing, both = since[best] & known[best] & for_it, since[best] & known[best]
+        return DisplacementHypothesis(
+            first,
+            self._pose(motion),
+            int(counted[best]),
+            len(set(window.landmarks[agreeing].tolist())),
+            len(set(window.keyframes[agreeing].tolist())),
+            bool(np.isfinite(window.headings[agreeing]).all()),
+            tuple(window.edges[both & fits].tolist()),
+            tuple(window.edges[both & ~fits].tolist()),
+        )
+
+    def _pose(self, motion: tuple[Array, Array]) -> Numbers:
+        turn, shift = motion
+        if self._space.dimensions == 2:
+            return *map(float, shift), float(np.arctan2(turn[1, 0], turn[0, 0]))
+        return *map(float, shift), *map(float, Rotation.from_matrix(turn).as_quat())
+
+    # -- for whoever acts on it ----------------------------------------------------------------------------------
+
+    def chain(self, keyframe: int) -> Numbers:
+        """Where the evidence's own frame of odometry has a keyframe, by its vertex."""
+        return self._chain[keyframe]
+
+    def apart(self, T_map_chain: Numbers, other: Numbers, keyframe: int) -> tuple[float, float]:
+        """Distance [m] and angle [rad] of a keyframe, by its vertex, by two places of the evidence's own frame."""
+        group, chain = self._space.group, self._chain[keyframe]
+        apart = group.between(group.compose(T_map_chain, chain), group.compose(other, chain))
+        return float(np.linalg.norm(apart[: self._space.dimensions])), float(self._space.angle(apart))
+
+    def are_apart(self, T_map_chain: Numbers, other: Numbers, keyframe: int) -> bool:
+        """Whether these are two different poses."""
+        far_m, turned_rad = self.apart(T_map_chain, other, keyframe)
+        return far_m > SAME_M or turned_rad > SAME_RAD
+
+    def drift_of(self, keyframe: int) -> Array:
+        """Variances [m^2, rad^2] of odometry since the evidence's own frame began."""
+        return self._drift[keyframe]
+
+    def drift(self, variances: Array, chain: Numbers, keyframe: int) -> tuple[float, float]:
+        """Sigmas [m, rad] of odometry up to a keyframe, since there were these variances and it was there."""
+        since, n = self._drift[keyframe] - variances, self._space.dimensions
+        lever = float(np.linalg.norm(np.subtract(self._chain[keyframe][:n], chain[:n])))
+        return float(np.sqrt(since[0] + since[1] * lever**2)), float(np.sqrt(since[1]))
+
+    def chained(self, first: int) -> list[int]:
+        """Vertices of the keyframes from one on, in order."""
+        return [vertex for vertex in self._chain if vertex >= first]
+
+    def link(self, keyframe: int) -> int:
+        """The edge of odometry to a keyframe."""
+        return self._links[keyframe]
+
+    def initial_poses(self, first: int) -> list[int]:
+        """Edges of initial poses from a keyframe on."""
+        return [edge for vertex, edges in self._poses.items() if vertex >= first for edge in edges]
+
+
+def _are_apart(points: Array) -> bool:
+    """Whether points are far enough from one another, and three not on a line, to tell a rigid motion."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[points.shape[1] - 2] >= 0.5 * _LEAST_APART_M)
+
+
+def _aligned(points: Array, places: Array, weights: Array) -> tuple[Array, Array]:
+    """Rotation and shift that lay points on places with the least weighted squares (Kabsch)."""
+    w = weights / weights.sum()
+    p, m = w @ points, w @ places
+    u, _, vt = np.linalg.svd((points - p).T @ ((places - m) * w[:, None]))
+    mirror = np.ones(points.shape[1])
+    mirror[-1] = np.sign(np.linalg.det(vt.T @ u.T))
+    turn = vt.T @ np.diag(mirror) @ u.T
+    return turn, m - turn @ p

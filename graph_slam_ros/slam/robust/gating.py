@@ -1,0 +1,377 @@
+"""Which measurements are believed: closures, sightings and fixes are candidates, odometry is not.
+
+A candidate that would be too unlikely given what was known just before is held back: its innovation is compared with
+the joint covariance of what it is between and its own (Neira and Tardos, "Data association in stochastic mapping using
+the joint compatibility test", 2001, eq. 2). One that does not fit after the solve pulls ever less, by its loss, and is
+taken out below a weight. Nothing is final: all are looked at again, and what fits then comes back.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.config.robust import RobustConfig
+from graph_slam_ros.graph import Graph, Loss
+from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.slam.landmarks.association import quantile
+from graph_slam_ros.slam.robust.innovation import innovation
+from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason, Verdict
+from graph_slam_ros.solver import Solver
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+CANDIDATES = ("landmarks", "fixes", "closures", "initialpose")
+_TYPICAL = 30  # residuals tell what all are like
+_SLACK = 10.0  # times the residuals that are typical of a class its gate may be, where they are small
+_TIGHTEST = 0.1  # part of a gate that is left
+_TOGETHER = 8  # sightings that tell but a part each determine a landmark, wherever they are from
+_COMPLETED = 50  # edges that are out and are tried again after everything was solved
+_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
+
+
+class Decisions:
+    """Judge of the candidates among the edges of a graph; what it decides is weights, and stands in its ledger."""
+
+    def __init__(self, config: RobustConfig, graph: Graph, solver: Solver, ledger: Ledger | None = None) -> None:
+        self._config, self._graph, self._solver = config, graph, solver
+        self.ledger = Ledger() if ledger is None else ledger
+        self._holds: dict[int, int] = {}  # of each landmark, edges that are in of which one alone determines it
+        self._helps: dict[int, int] = {}  # and those that do so only with others
+        for edge in self.ledger.inside.tolist():
+            self._count(edge, 1)
+        self._tightness: dict[str, float] = {}  # of each class, by what its gate is smaller
+        self.is_calibrated = False  # whether enough was measured twice to tell how good odometry is
+        self._looseness = config.noise_factor**2  # of the gate of what all else predicts
+        self._withdrawn: dict[int, Reason] = {}  # before they were taken
+        self._vertices = 0  # of the graph, at the last solve
+        self._next = 0  # of the accepted, where the next review goes on
+        self._next_out = 0  # and of those that are out
+
+    # -- what is new -------------------------------------------------------------------------------------------------
+
+    def take(self, count: int, keyframe: int, *, trusts_sightings: bool = True) -> list[int]:
+        """Look at the edges that are new, up to a count, by their own noise.
+
+        Those that fit are accepted; the others, which are told, wait outside, and all sightings where none is trusted.
+        """
+        ids = np.arange(len(self.ledger), count)
+        chi2, numbers = self._solver.chi2_of(ids)
+        limit, judged = self._limits(ids, numbers), self._graph.has_label(ids, CANDIDATES)
+        judged &= ~np.isin(ids, list(self._withdrawn))
+        self.ledger.enter(keyframe, chi2, numbers, limit, self._solver.residuals_of(ids), judged)
+        for edge in ids[judged].tolist():
+            self._count(edge, 1)
+        for edge, reason in self._withdrawn.items():
+            self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, self.ledger.statistic.values[edge])
+        self._withdrawn.clear()
+        waiting = []
+        held = [edge for edge in ids[judged & (chi2 > limit)].tolist() if not self._is_needed(edge)]
+        if not trusts_sightings:
+            held = sorted({*held, *(edge for edge in ids[judged].tolist() if self._is_of_known(edge))})
+        for edge in held if self._config.decide else ():
+            self._take_out(edge)
+            self.ledger.hold_back(edge)
+            waiting.append(edge)
+        self._vertices = self._graph.vertex_count
+        return waiting
+
+    def _is_of_known(self, edge: int) -> bool:
+        """Whether it is of a landmark that the last solve had: without it that is as determined as it was."""
+        landmark = landmark_of(self._graph, edge)
+        return landmark is not None and landmark < self._vertices
+
+    def admit(self, waiting: Sequence[int], keyframe: int) -> list[int]:
+        """Compare with all that is known: the likeliest first, then the others with that; who is let in."""
+        out, admitted = list(waiting), list[int]()
+        while out:
+            innovation = {edge: self._innovation(edge) for edge in out}
+            likely = [edge for edge in out if self._is_likely(edge, innovation[edge])]
+            if not likely:
+                break
+            best = min(likely, key=lambda edge: innovation[edge] / self.ledger.threshold.values[edge])
+            for edge in likely if admitted else [best]:
+                self._readmit(edge, keyframe, innovation[edge], self._widest(edge))
+                admitted.append(edge)
+            out = [edge for edge in out if not self.ledger.is_inside(edge)]
+            if out:
+                self._solver.update()
+        for edge in out:
+            self.ledger.note(edge, keyframe, Verdict.PENDING, Reason.UNLIKELY, innovation[edge], self._widest(edge))
+        return admitted
+
+    def fit(self, edges: Sequence[int]) -> bool:
+        """Whether all of some edges fit at the present estimate."""
+        chi2, _ = self._solver.chi2_of(edges)
+        return bool((chi2 <= self.ledger.threshold.values[edges]).all())
+
+    def refuse_unfit(self, edges: Sequence[int], keyframe: int) -> bool:
+        """Take those of some edges out that do not fit after all was done for it; whether there are any."""
+        chi2, _ = self._solver.chi2_of(edges)
+        unfit = np.flatnonzero(chi2 > self.ledger.threshold.values[edges])
+        for k in unfit.tolist():
+            self._reject(edges[k], keyframe, Reason.DOES_NOT_FIT, float(chi2[k]))
+        return len(unfit) > 0
+
+    # -- what was decided ---------------------------------------------------------------------------------------------
+
+    def review(self, keyframe: int) -> None:
+        """Look again at the newest verdicts and, in turn, at some of the others."""
+        self.tighten()
+        inside = self.ledger.inside
+        if len(inside) > 2 * _AT_ONCE:
+            self._next = (self._next + _AT_ONCE) % (len(inside) - _AT_ONCE)
+            older = np.arange(self._next, self._next + _AT_ONCE) % (len(inside) - _AT_ONCE)
+            inside = np.concatenate((np.unique(inside[older]), inside[-_AT_ONCE:]))
+        self._weigh(inside, keyframe)
+        outside = self.ledger.outside
+        chi2, _ = self._solver.chi2_of(outside)
+        fits = chi2 <= self.ledger.threshold.values[outside]
+        for edge, fit in zip(outside[fits].tolist(), chi2[fits].tolist(), strict=True):
+            self._readmit(edge, keyframe, fit)
+        others = outside[~fits & (self.ledger.verdict.values[outside] == Verdict.PENDING)].tolist()
+        turn = [others[(self._next_out + k) % len(others)] for k in range(min(self._config.retests, len(others)))]
+        self._next_out += len(turn)
+        likely = [(edge, fit) for edge in turn if self._is_likely(edge, fit := self._innovation(edge))]
+        for edge, fit in likely:
+            self._readmit(edge, keyframe, fit, self._widest(edge))
+
+    def settle(self, keyframe: int) -> bool:
+        """After a solve of everything: what fits is in, what does not is out; whether a verdict has changed."""
+        self.tighten()
+        ledger, changed = self.ledger, False
+        inside, outside = ledger.inside, ledger.outside
+        for edges, out in ((inside, True), (outside, False)):
+            chi2, _ = self._solver.chi2_of(edges)
+            other = (chi2 > ledger.threshold.values[edges]) == out
+            for edge, fit in zip(edges[other].tolist(), chi2[other].tolist(), strict=True):
+                if not out:
+                    self._readmit(edge, keyframe, fit)
+                elif self._is_needed(edge):
+                    continue
+                else:
+                    self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
+                changed = True
+        return changed
+
+    def complete(self, keyframe: int) -> bool:
+        """Let in what would fit if it were in, of that which fits least badly without; whether there was any."""
+        outside = self.ledger.outside
+        chi2, _ = self._solver.chi2_of(outside)
+        for edge in outside[np.argsort(chi2, kind="stable")[:_COMPLETED]].tolist():
+            innovation = self._innovation(edge)
+            if innovation <= self.ledger.threshold.values[edge] and self._is_likely(edge, innovation):
+                self._readmit(edge, keyframe, innovation)
+                return True
+        return False
+
+    def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
+        """Take edges out for good: who calls has other reasons than how they fit."""
+        for edge in edges:
+            if edge >= len(self.ledger):
+                self._solver.set_weight(edge, 0.0)
+                self._withdrawn[edge] = reason
+            elif self.ledger.reason.values[edge] not in FINAL:
+                if self.ledger.verdict.values[edge] == Verdict.NOT_EVALUATED:
+                    self._solver.set_weight(edge, 0.0)
+                self._reject(edge, keyframe, reason, float(self.ledger.statistic.values[edge]))
+
+    @property
+    def looseness(self) -> float:
+        """By what the gate of what all else predicts is wider than a quantile of chi2.
+
+        ``robust.noise_factor`` squared, times how good odometry has shown itself to be.
+        """
+        return self._looseness
+
+    def are_beyond_noise(self, edges: Sequence[int]) -> bool:
+        """Whether most of some edges that are out are farther off than odometry's noise explains.
+
+        However good odometry has shown itself to be: it may be ``robust.noise_factor`` times worse than it is said.
+        """
+        factor, numbers = self._config.noise_factor**2, self.ledger.numbers.values
+        far = [self._innovation(edge) > factor * quantile(self._config.gate, int(numbers[edge])) for edge in edges]
+        return 2 * sum(far) > len(far)
+
+    def innovations(self, edges: Sequence[int]) -> list[float]:
+        """What believing each of some edges that are out would cost, given all that is in."""
+        return [self._innovation(edge) for edge in edges]
+
+    def loosen(self, link: int, keyframe: int, evidence: float) -> None:
+        """Take an edge of odometry out: another with more noise is there in its place."""
+        self._solver.set_weight(link, 0.0)
+        self.ledger.note(link, keyframe, Verdict.REJECTED, Reason.DISPLACED, evidence)
+
+    def restore(self, link: int, keyframe: int, evidence: float) -> None:
+        """Undo ``loosen``."""
+        self._solver.set_weight(link, 1.0)
+        self.ledger.note(link, keyframe, Verdict.NOT_EVALUATED, Reason.NONE, evidence)
+
+    def exchange(self, let_in: Sequence[int], taken_out: Sequence[int], keyframe: int) -> None:
+        """Believe some edges and not others, which may come back; by how they fit it is judged afterwards."""
+        for edge in let_in:
+            if not self.ledger.is_inside(edge):
+                self._readmit(edge, keyframe, float(self.ledger.statistic.values[edge]))
+        for edge in taken_out:
+            if self.ledger.is_inside(edge) and not self._is_needed(edge):
+                self._reject(edge, keyframe, Reason.DOES_NOT_FIT, float(self.ledger.statistic.values[edge]))
+
+    def follow(self, other: Ledger, keyframe: int) -> bool:
+        """Take over verdicts on the same edges from who has had a second look; whether that changed one."""
+        mine, known = self.ledger, len(other)
+        judged = mine.final + np.flatnonzero(mine.verdict.values[mine.final : known] != Verdict.NOT_EVALUATED)
+        standing = judged[~np.isin(mine.reason.values[judged], FINAL)]
+        return self._have_in(standing, np.isin(standing, other.inside), keyframe, other)
+
+    def believe(self, edges: Index, keyframe: int) -> None:
+        """Have these candidates in and no others, to see what comes of it."""
+        candidates = np.sort(np.concatenate((self.ledger.inside, self.ledger.outside)))
+        self._have_in(candidates, np.isin(candidates, edges), keyframe, self.ledger)
+
+    def _have_in(self, edges: Index, wanted: NDArray[np.bool_], keyframe: int, judge: Ledger) -> bool:
+        """Those in that are wanted, then the others out, by who judged them; whether a verdict has changed."""
+        inside = np.isin(edges, self.ledger.inside)
+        changed = 0
+        for edge in edges[wanted & ~inside].tolist():
+            self._readmit(edge, keyframe, *_judged(judge, edge))
+            changed += 1
+        for edge in edges[~wanted & inside].tolist():
+            if not self._is_needed(edge):
+                statistic, threshold = _judged(judge, edge)
+                self._reject(edge, keyframe, Reason.OUTVOTED, statistic, threshold)
+                changed += 1
+        return changed > 0
+
+    def _weigh(self, edges: Index, keyframe: int) -> None:
+        """By what their losses leave of each one's weight."""
+        ledger = self.ledger
+        chi2, _ = self._solver.chi2_of(edges)
+        unfit = chi2 > ledger.threshold.values[edges]
+        again = ~unfit & (ledger.verdict.values[edges] == Verdict.DOWN_WEIGHTED)
+        for edge, fit in zip(edges[again].tolist(), chi2[again].tolist(), strict=True):
+            ledger.note(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, fit)
+        for edge, fit in zip(edges[unfit].tolist(), chi2[unfit].tolist(), strict=True):
+            loss = self._solver.settings.losses[self._graph.label_of(edge)][-1]
+            weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
+            if weight < self._config.out_below and not self._is_needed(edge):
+                self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
+            elif weight < 1.0 and ledger.verdict.values[edge] == Verdict.ACCEPTED:
+                ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)
+
+    def _innovation(self, edge: int) -> float:
+        """What believing an edge would cost; infinite where no number comes of it."""
+        try:
+            return innovation(self._graph, self._solver, edge)
+        except (np.linalg.LinAlgError, ValueError):
+            return np.inf
+
+    def _is_likely(self, edge: int, innovation: float) -> bool:
+        return innovation <= self._widest(edge)
+
+    def _widest(self, edge: int) -> float:
+        """What an innovation is held against."""
+        return self._looseness * quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
+
+    # -- one edge ----------------------------------------------------------------------------------------------------
+
+    def _readmit(self, edge: int, keyframe: int, statistic: float, threshold: float | None = None) -> None:
+        self._put_in(edge)
+        self.ledger.note(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, statistic, threshold)
+
+    def _reject(
+        self, edge: int, keyframe: int, reason: Reason, statistic: float, threshold: float | None = None
+    ) -> None:
+        if self.ledger.is_inside(edge):
+            self._take_out(edge)
+        self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, statistic, threshold)
+
+    def _put_in(self, edge: int) -> None:
+        self._solver.set_weight(edge, 1.0)
+        self._count(edge, 1)
+
+    def _take_out(self, edge: int) -> None:
+        self._solver.set_weight(edge, 0.0)
+        self._count(edge, -1)
+
+    def _landmark(self, edge: int) -> tuple[int, dict[int, int]] | None:
+        """The landmark that an edge is of, and among which of its edges it counts."""
+        landmark = landmark_of(self._graph, edge)
+        if landmark is None:
+            return None
+        table, _ = self._graph.row(edge)
+        alone = table.type.residual_size >= self._graph.kind_of(landmark).dof
+        return landmark, self._holds if alone else self._helps
+
+    def _count(self, edge: int, more: int) -> None:
+        found = self._landmark(edge)
+        if found is not None:
+            landmark, among = found
+            among[landmark] = among.get(landmark, 0) + more
+
+    def _is_needed(self, edge: int) -> bool:
+        """Whether a landmark may be undetermined without it: its last, or one of the few that do so together."""
+        found = self._landmark(edge)
+        if found is None:
+            return False
+        landmark, among = found
+        if self._solver.is_held(landmark):
+            return False
+        holds = self._holds.get(landmark, 0) - (among is self._holds)
+        helps = self._helps.get(landmark, 0) - (among is self._helps)
+        return holds < 1 and helps < _TOGETHER
+
+    # -- what is too much --------------------------------------------------------------------------------------------
+
+    def _limits(self, edges: Index, numbers: Index) -> Array:
+        """What chi2 is held against: the gate, or less where residuals of a class are far below their noise."""
+        limit = {int(n): quantile(self._config.gate, int(n)) for n in np.unique(numbers)}
+        out = np.array([limit[n] for n in numbers.tolist()], dtype=float)
+        for label, tightness in self._tightness.items():
+            out[self._graph.has_label(edges, (label,))] *= tightness
+        return out
+
+    def cautious_losses(self) -> dict[str, list[Loss]]:
+        """Losses by class under which what is false among candidates lets go by itself: Huber's, then DCS."""
+        stages = [Loss.named(name, self._config.loss_scale) for name in ("huber", "dcs")]
+        return dict.fromkeys(CANDIDATES, stages)
+
+    def tighten(self) -> None:
+        """Follow what residuals are like: whoever gives a noise ten times too large would let in all that is false.
+
+        The median of what is inside is compared with that of chi2; what is false does not move it.
+        """
+        inside, ledger, factor = self.ledger.inside, self.ledger, self._config.noise_factor**2
+        chi2, numbers = self._solver.chi2_of(inside)
+        typical = chi2 / np.array([_median(n) for n in numbers.tolist()])
+        for label in CANDIDATES:
+            of_label = self._graph.has_label(inside, (label,))
+            if np.count_nonzero(of_label) >= _TYPICAL:
+                ratio = float(np.median(typical[of_label]))
+                self._tightness[label] = min(1.0, max(_TIGHTEST, _SLACK * ratio))
+        freedom = self._solver.degrees_of_freedom
+        self.is_calibrated = freedom >= _TYPICAL
+        if self.is_calibrated:
+            as_noise_tells = self._solver.evaluate().chi2_final / freedom
+            self._looseness = min(factor, max(_TIGHTEST, factor * as_noise_tells))
+        edges = np.concatenate((inside, ledger.outside))
+        ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
+
+
+def landmark_of(graph: Graph, edge: int) -> int | None:
+    """The vertex of the landmark that an edge is of."""
+    if graph.label_of(edge) != "landmarks":
+        return None
+    table, row = graph.row(edge)
+    return int(table.vertices.values[row, 1])
+
+
+def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:
+    """The statistic and what it was held against."""
+    return float(ledger.statistic.values[edge]), float(ledger.threshold.values[edge])
+
+
+@cache
+def _median(numbers: int) -> float:
+    return quantile(0.5, numbers)

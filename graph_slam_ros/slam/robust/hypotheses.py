@@ -1,0 +1,214 @@
+"""A second look at everything: solve, judge, solve again, from more than one start; the best explanation wins.
+
+What an online run believed first may rest on a false closure that came before the true ones. So the whole is explained
+from the online estimate and what is believed there; from the candidates that agree with a neighbour, there and along
+odometry alone; and from the largest group that is out. In each, all is solved and every candidate judged by how it
+fits, in turn, until no verdict changes; what is out then costs as much as the gate would have let it cost (truncated
+least squares). The lowest cost wins.
+"""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.config.robust import RobustConfig
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph import GROUPS, SE2, Graph
+from graph_slam_ros.slam.robust.gating import Decisions
+from graph_slam_ros.slam.robust.ledger import Ledger
+from graph_slam_ros.slam.robust.pairwise_consistency import agreeing
+from graph_slam_ros.solver import Settings, Solver
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_ITERATIONS = 20  # of each stage of the losses, from another start
+_HOPELESS = 2.0  # times the least cost that was found: another explanation is none
+_STORY = 5  # closures that agree with one another and not with the map
+
+
+@dataclass(frozen=True, slots=True)
+class Frozen:
+    """What a second look begins with: copies, which nobody else changes.
+
+    Attributes
+    ----------
+    vertices : of the graph, that are part of the problem
+    held : those of them that stay where they are
+    values : the online estimate, the stored numbers of all vertices
+    ledger : what is believed online
+    """
+
+    keyframe: int
+    graph: Graph
+    vertices: Index
+    held: Index
+    values: Array
+    settings: Settings
+    ledger: Ledger
+
+
+@dataclass(frozen=True, slots=True)
+class Rival:
+    """Another explanation that holds together, too, and costs not much more: who sees both cannot tell by this graph.
+
+    Attributes
+    ----------
+    cost, best_cost : truncated cost of this one, and of the one that is believed
+    only_here, only_there : closures that this one believes and the other does not, and the other way round
+    """
+
+    cost: float
+    best_cost: float
+    only_here: tuple[int, ...]
+    only_there: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """An explanation: from which start, what is believed, the stored numbers of all vertices, its truncated cost."""
+
+    start: str
+    ledger: Ledger
+    values: Array
+    cost: float
+    frozen: Frozen
+    rivals: tuple[Rival, ...] = ()
+
+    def carried_to(self, graph: Graph, values: Array) -> Array:
+        """Stored numbers of a graph that has grown since: what is new moves with the newest pose that was there."""
+        out, known, old = values.copy(), len(self.values), self.frozen.graph
+        odometry = old.edges_of("odometry")
+        if known == len(values) or not len(odometry):
+            out[:known] = self.values
+            return out
+        table, row = old.row(int(odometry[-1]))
+        newest, kind = int(table.vertices.values[row, 1]), table.type.accepts[1][0]
+        at = int(graph.offset.values[newest])
+        group, here = GROUPS[kind], slice(at, at + kind.size)
+        moved = group.compose(tuple(self.values[here]), group.inverse(tuple(values[here])))
+        for vertex in range(old.vertex_count, graph.vertex_count):
+            at, of = int(graph.offset.values[vertex]), graph.kind_of(vertex)
+            numbers = tuple(values[at : at + of.size])
+            if of is kind:
+                out[at : at + of.size] = group.compose(moved, numbers)
+            elif of.size == (2 if kind is SE2 else 3):
+                out[at : at + of.size] = group.act(moved, numbers)
+        out[:known] = self.values
+        return out
+
+
+@dataclass(slots=True)
+class Wanted:
+    """Whether anybody still waits for an outcome."""
+
+    still: bool = True
+
+
+def second_look(config: RobustConfig, frozen: Frozen, wanted: Wanted | None = None) -> Outcome | None:
+    """Explain a graph anew, from each start; the least cost wins. None where nothing can be solved, or nobody waits."""
+    found: list[Outcome] = []
+    for name, start, believed in _starts(frozen):
+        if wanted is not None and not wanted.still:
+            return None
+        with suppress(GraphSlamError, np.linalg.LinAlgError):  # what is believed there does not hold together
+            hopeless = _HOPELESS * min((outcome.cost for outcome in found), default=np.inf)
+            found.append(_explained(name, config, frozen, start, believed, hopeless))
+        if name == "online" and found and not len(found[0].ledger.outside):
+            break
+    found = [outcome for outcome in found if np.isfinite(outcome.cost)]
+    if not found:
+        return None
+    best = min(found, key=lambda outcome: outcome.cost)
+    rivals = {rival.only_here: rival for rival in (_rival(one, best) for one in found) if rival is not None}
+    return replace(best, rivals=tuple(rivals.values()))
+
+
+def _rival(one: Outcome, best: Outcome) -> Rival | None:
+    """What another explanation believes against the best, where that is a whole story and not a few edges more."""
+    graph = best.frozen.graph
+    here, there = (outcome.ledger.inside for outcome in (one, best))
+    only_here, only_there = np.setdiff1d(here, there), np.setdiff1d(there, here)
+    is_story = np.count_nonzero(graph.has_label(only_here, ("closures",))) >= _STORY
+    if not is_story or one.cost > _HOPELESS * best.cost:
+        return None
+    return Rival(one.cost, best.cost, tuple(only_here.tolist()), tuple(only_there.tolist()))
+
+
+def _starts(frozen: Frozen) -> Iterator[tuple[str, Array, Index | None]]:
+    """The online estimate with what is believed; closures that agree with a neighbour, there and along odometry alone.
+
+    And the largest group that is out, as if it alone were true.
+    """
+    yield "online", frozen.values, None
+    ledger, graph = frozen.ledger, frozen.graph
+    candidates = np.sort(np.concatenate((ledger.inside, ledger.outside)))
+    is_closure = graph.has_label(candidates, ("closures",))
+    closures, others = candidates[is_closure], candidates[~is_closure]
+    if not len(closures):
+        yield "all", frozen.values, candidates
+        return
+    odometry = _along_odometry(graph, frozen.values, set(frozen.held.tolist()))
+    groups = agreeing(graph, odometry, closures, ledger.threshold.values[closures])
+    believed = np.concatenate((others, *groups))
+    yield "neighbours", frozen.values, believed
+    yield "odometry", odometry, believed
+    out = [group[~np.isin(group, ledger.inside)] for group in groups]
+    largest = max(out, key=len, default=closures[:0])
+    if len(largest) >= _STORY:
+        yield "rejected", odometry, np.concatenate((others, largest))
+
+
+def _explained(
+    name: str, config: RobustConfig, frozen: Frozen, start: Array, believed: Index | None, hopeless: float
+) -> Outcome:
+    """Solve and judge in turn, beginning with what is believed in the ledger, or with these candidates instead.
+
+    It ends when no verdict changes, or when the cost is hopeless.
+    """
+    graph, mine = frozen.graph.copy(), frozen.ledger.copy()
+    solver = Solver(graph, frozen.settings)
+    solver.add(frozen.vertices, range(len(mine)))
+    solver.start_at(start)
+    for vertex in frozen.held.tolist():
+        solver.hold(vertex)
+    decisions = Decisions(config, graph, solver, mine)
+    if believed is not None:
+        decisions.believe(believed, frozen.keyframe)
+        solver.optimize(replace(frozen.settings, losses=decisions.cautious_losses(), max_iterations=_ITERATIONS))
+        decisions.settle(frozen.keyframe)
+    rounds = config.rounds if _cost(solver, mine) <= 2.0 * hopeless else 0
+    for k in range(rounds):
+        solver.optimize()
+        is_last = k + 1 == rounds or _cost(solver, mine) > hopeless
+        if is_last or not (decisions.settle(frozen.keyframe) or decisions.complete(frozen.keyframe)):
+            break
+    judged = np.concatenate((mine.inside, mine.outside))
+    mine.statistic.values[judged], _ = solver.chi2_of(judged)
+    return Outcome(name, mine, solver.values, _cost(solver, mine), frozen)
+
+
+def _cost(solver: Solver, ledger: Ledger) -> float:
+    """Chi2 of all that is in, but of no candidate more than what it costs to be out."""
+    inside, limits = ledger.inside, ledger.threshold.values
+    chi2, _ = solver.chi2_of(inside)
+    doubted = float(np.minimum(chi2, limits[inside]).sum() + limits[ledger.outside].sum())
+    return solver.evaluate().chi2_final - float(chi2.sum()) + doubted
+
+
+def _along_odometry(graph: Graph, values: Array, held: set[int]) -> Array:
+    """Where odometry alone says that the robot was; landmarks, and what is held, stay where they are."""
+    out = values.copy()
+    for edge in graph.edges_of("odometry").tolist():
+        table, row = graph.row(edge)
+        last, new = table.vertices.values[row].tolist()
+        if new in held:
+            continue
+        a, b = graph.offset.values[[last, new]].tolist()
+        kind = graph.kind_of(new)
+        pose, step = tuple(out[a : a + kind.size]), tuple(table.measured.values[row])
+        out[b : b + kind.size] = GROUPS[kind].compose(pose, step)
+    return out

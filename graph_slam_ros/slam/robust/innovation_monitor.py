@@ -1,0 +1,142 @@
+"""Whether the newest sightings together contradict odometry: a test on the sum of their innovations.
+
+Each sighting has a normalised innovation squared: how far it is from what all else predicts, in sigmas, squared. Over a
+window of the newest, of which no landmark has more than a few (sightings of one landmark err together), the sum is
+compared with the quantile of chi2 of as many degrees of freedom. Some sightings carry wrong identities, however good
+the odometry is: as many of the worst as that explains, at the rate that the drive has shown, are left out of the sum.
+So ranges and bearings count as well, which do not tell a pose.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import beta, binom
+
+from graph_slam_ros.slam.landmarks.association import quantile
+from graph_slam_ros.slam.robust.gating import Decisions
+from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
+from graph_slam_ros.slam.robust.ledger import FINAL
+from graph_slam_ros.solver import Solver
+
+_SURE = 1.0 - 1e-6  # probability with which clean measurements raise no alarm
+_WINDOW, _LEAST = 20, 6  # sightings that are compared
+_PER_LANDMARK = 4  # of them, at most
+_REACH_S = 20.0
+_RATE_SURE = 0.999  # the rate of wrong ones is at most what it may be with this probability, by what was seen
+_CALM, _CALM_SURE = 12, 0.99  # newest sightings of which three quarters must agree for an alarm to end
+
+
+@dataclass(frozen=True, slots=True)
+class Contradiction:
+    """What the monitor has found in its window.
+
+    Attributes
+    ----------
+    held_back, count : sightings that are held back, and all
+    landmarks : how many are held back of
+    statistic, threshold : the sum of innovations but for the worst, and its quantile
+    """
+
+    held_back: int
+    count: int
+    landmarks: int
+    statistic: float
+    threshold: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether neither noise nor wrong identities explain it."""
+        return self.landmarks >= 2 and self.statistic > self.threshold
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    edge: int
+    keyframe: int
+    landmark: int
+    stamp_ns: int
+
+
+class InnovationMonitor:
+    """The newest sightings of well known landmarks, of any kind.
+
+    Parameters
+    ----------
+    solver, decisions : of the back-end
+    history : from when on each landmark is well known
+    """
+
+    def __init__(self, solver: Solver, decisions: Decisions, history: LandmarkHistory) -> None:
+        self._solver, self._decisions, self._history = solver, decisions, history
+        self._ledger = decisions.ledger
+        self._seen: deque[_Seen] = deque(maxlen=4 * _WINDOW)
+        self._held_back, self._count = 0, 0  # of those that the window has left behind
+
+    def begin(self, vertex: int) -> None:
+        """A segment begins at a keyframe: what was seen before tells nothing of where it is."""
+        self._seen = deque((one for one in self._seen if one.keyframe >= vertex), self._seen.maxlen)
+
+    def add(self, edge: int, keyframe: int, landmark: int, stamp_ns: int) -> None:
+        """A sighting of a landmark."""
+        if len(self._seen) == self._seen.maxlen:
+            self._leave_behind(self._seen[0])
+        self._seen.append(_Seen(edge, keyframe, landmark, stamp_ns))
+
+    def _leave_behind(self, one: _Seen) -> None:
+        if self._is_standing(one) and self._is_known(one):
+            self._count += 1
+            self._held_back += not self._ledger.is_inside(one.edge)
+
+    def _is_standing(self, one: _Seen) -> bool:
+        return one.edge < len(self._ledger) and self._ledger.reason.values[one.edge] not in FINAL
+
+    def _is_known(self, one: _Seen) -> bool:
+        return self._history.known_from(one.landmark, self._seen[0].edge) < one.keyframe
+
+    def _window(self) -> list[_Seen]:
+        """The newest, the newest first."""
+        out, times = list[_Seen](), dict[int, int]()
+        for one in reversed(self._seen):
+            if len(out) == _WINDOW or (self._seen[-1].stamp_ns - one.stamp_ns) * 1e-9 > _REACH_S:
+                break
+            if times.get(one.landmark, 0) < _PER_LANDMARK and self._is_standing(one) and self._is_known(one):
+                times[one.landmark] = times.get(one.landmark, 0) + 1
+                out.append(one)
+        return out
+
+    def contradiction(self) -> Contradiction | None:
+        """What the window tells; None where there is too little in it."""
+        window, ledger = self._window(), self._ledger
+        if len(window) < _LEAST:
+            return None
+        edges = np.array([one.edge for one in window])
+        fits, numbers = self._solver.chi2_of(edges)
+        is_out = np.array([not ledger.is_inside(edge) for edge in edges.tolist()])
+        innovations = np.where(is_out, ledger.statistic.values[edges], fits)
+        order = np.argsort(innovations / numbers, kind="stable")
+        kept = order[: max(0, len(order) - self._by_chance(len(order)))]
+        if not len(kept):  # all may be wrong by chance
+            return None
+        limit = self._decisions.looseness * quantile(_SURE, int(numbers[kept].sum()))
+        landmarks = {window[k].landmark for k in np.flatnonzero(is_out).tolist()}
+        count = int(np.count_nonzero(is_out))
+        return Contradiction(count, len(window), len(landmarks), float(innovations[kept].sum()), limit)
+
+    @property
+    def is_calm(self) -> bool:
+        """Whether most of the newest sightings agree with odometry."""
+        newest = np.array([one.edge for one in self._window()[:_CALM]], dtype=np.int64)
+        if not len(newest):
+            return False
+        innovations, numbers = self._solver.chi2_of(newest)
+        is_out = np.array([not self._ledger.is_inside(edge) for edge in newest.tolist()])
+        innovations[is_out] = self._decisions.innovations(newest[is_out].tolist())
+        kept = np.argsort(innovations / numbers, kind="stable")[: -(-3 * len(newest) // 4)]
+        limit = self._decisions.looseness * quantile(_CALM_SURE, int(numbers[kept].sum()))
+        return float(innovations[kept].sum()) <= limit
+
+    def _by_chance(self, count: int) -> int:
+        """How many of a count may be wrong though odometry is right."""
+        rate = beta.ppf(_RATE_SURE, 1 + self._held_back, 1 + self._count - self._held_back)
+        return int(binom.ppf(_SURE, count, rate))

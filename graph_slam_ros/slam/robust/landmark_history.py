@@ -1,0 +1,48 @@
+"""When each landmark was first seen: from which keyframe on it is known well enough to compare with."""
+
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.slam.robust.ledger import Ledger
+
+_SUPPORT, _FIRST = 4, 20  # believed sightings, of the first so many, that make a landmark one to compare with
+_DOUBTED = 0.3  # part of them that may be held back: else the landmark itself stands at the wrong place
+
+
+class LandmarkHistory:
+    """The first sightings of each landmark.
+
+    Parameters
+    ----------
+    graph, ledger : of the back-end
+    """
+
+    def __init__(self, graph: Graph, ledger: Ledger) -> None:
+        self._graph, self._ledger = graph, ledger
+        self._start = graph.vertex_count  # landmarks of a map that was loaded are known
+        self._surveyed: set[int] = set()
+        self._earliest: dict[int, list[tuple[int, int]]] = {}  # (edge, keyframe) of each landmark's first sightings
+
+    def add_survey(self, landmark: int) -> None:
+        """A landmark, by its vertex, whose position is known from a survey."""
+        self._surveyed.add(landmark)
+
+    def add(self, edge: int, keyframe: int, landmark: int) -> None:
+        """A sighting of a landmark."""
+        earliest = self._earliest.setdefault(landmark, [])
+        if len(earliest) < _FIRST:
+            earliest.append((edge, keyframe))
+
+    def known_from(self, landmark: int, newest: int) -> int:
+        """The keyframe, by its vertex, from which on a landmark was well known.
+
+        Parameters
+        ----------
+        newest : from this edge on a sighting that is held back tells nothing against the landmark
+        """
+        if landmark < self._start or landmark in self._surveyed:
+            return -1
+        ledger, earliest = self._ledger, self._earliest[landmark]
+        believed = [k for edge, k in earliest if edge < len(ledger) and ledger.is_inside(edge)]
+        doubted = sum(edge < newest and not ledger.is_inside(edge) for edge, _ in earliest)
+        if doubted > _DOUBTED * (doubted + len(believed)):
+            return self._graph.vertex_count
+        return believed[_SUPPORT - 1] if len(believed) >= _SUPPORT else self._graph.vertex_count

@@ -1,0 +1,88 @@
+"""A map that can be taken up again: all of a run but what was on its way."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
+from graph_slam_ros.slam.landmarks.landmark_map import Landmark
+from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict
+
+Array = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class MapState:
+    """What there is, what is believed of it, and where it is thought to be; named as in ``GraphSlam``.
+
+    Attributes
+    ----------
+    values : stored numbers of all vertices, as ``Graph.initial``: where solving begins
+    frozen : the first so many vertices stay there, and verdicts on what is between them as they are
+    held : so many vertices and edges were held when localization began (``map.localize``); zeros where the map grows
+    datum : of fixes on earth, as in ``Fix``
+    settings : parameters that were changed on the way, by name
+    processed : records of the ingest sequence that it came of; None where it does not tell
+    used_ns : stamp of the last odometry that was used by then; None before the first
+    source : the input of that odometry
+    continues_with : the odometry whose next message belongs to the same drive; empty where a new drive begins
+    """
+
+    graph: Graph = field(default_factory=Graph)
+    ledger: Ledger = field(default_factory=Ledger)
+    values: Array = field(default_factory=lambda: np.zeros(0))
+    keyframes: list[Keyframe] = field(default_factory=list)
+    segments: list[int] = field(default_factory=list)
+    drives: list[int] = field(default_factory=list)
+    sighting_poses: list[SightingPose] = field(default_factory=list)
+    landmarks: dict[str, Landmark] = field(default_factory=dict)
+    range_offsets: dict[str, int] = field(default_factory=dict)
+    frozen: int = 0
+    held: tuple[int, int] = (0, 0)
+    datum: tuple[float, ...] = ()
+    settings: dict[str, Any] = field(default_factory=dict)
+    processed: int | None = 0
+    used_ns: int | None = None
+    source: str = ""
+    continues_with: str = ""
+
+    @property
+    def frozen_edges(self) -> int:
+        """Verdicts of the first so many edges stay."""
+        return self.ledger.final
+
+    @property
+    def vertices(self) -> list[int]:
+        """Those of the problem; the others were of landmarks that were given up."""
+        poses = {one.vertex for one in self.keyframes}
+        points = {mark.vertex for mark in self.landmarks.values()}
+        return sorted(poses | points | {*self.range_offsets.values()})
+
+    def freeze(self) -> None:
+        """Have all of it stay as it is; what is too new to be believed is given up first.
+
+        All of its edges must have been judged.
+        """
+        for name in [name for name, mark in self.landmarks.items() if mark.is_tentative]:
+            self._give_up(name)
+        self.frozen = self.graph.vertex_count
+        self.ledger.finish(self.graph.edge_count)
+
+    def _give_up(self, name: str) -> None:
+        mark, last = self.landmarks.pop(name), len(self.keyframes) - 1
+        for edge in [one.edge for one in mark.seen]:
+            self.graph.set_weights(np.array([edge]), 0.0)
+            statistic = float(self.ledger.statistic.values[edge])
+            self.ledger.note(edge, last, Verdict.REJECTED, Reason.WITHDRAWN, statistic)
+
+    def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
+        """All of them, but for the first so many."""
+        return dict(list(self.landmarks.items())[first:])
+
+    @property
+    def landmark_changes(self) -> int:
+        """Each is one."""
+        return len(self.landmarks)

@@ -1,0 +1,335 @@
+"""Batch optimisation on the clique tree: Gauss-Newton, Levenberg-Marquardt, dogleg, with losses in stages."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.errors import GraphSlamError, SingularError
+from graph_slam_ros.graph import Graph, Loss
+from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.solver.clique_tree.numeric import back_substitute, curvature, eliminate, gradient, settle, step_by
+from graph_slam_ros.solver.clique_tree.storage import NOTHING, Tree
+from graph_slam_ros.solver.clique_tree.symbolic import mark
+from graph_slam_ros.solver.gauge import undetermined
+from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, store
+from graph_slam_ros.solver.report import Iteration, Report
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_TINY = 1e-12  # a cost of zero up to rounding has converged
+_STILL = 1e-8  # m and rad
+_ON_THE_WAY = 1e-4  # where another stage follows, what the cost still changes by is of no interest
+_DAMPING_FIRST, _DAMPING_LEAST, _DAMPING_MOST, _DAMPING_FACTOR = 1e-4, 1e-12, 1e12, 10.0
+_RADIUS_FIRST, _RADIUS_LEAST = 1.0, 1e-12
+_LEAST = {  # of the settings that are numbers
+    "max_iterations": 0,
+    "step_tolerance": 0.0,
+    "cost_tolerance": 0.0,
+    "relinearize_above": 0.0,
+    "relinearize_error": 0.0,
+    "relinearize_every": 1,
+    "relinearize_passes": 0,
+    "tolerance": 0.0,
+    "tolerance_sigmas": 0.0,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How to solve.
+
+    Attributes
+    ----------
+    method : of ``optimize``: ``gn`` (damped only after it fails to converge), ``lm`` or ``dogleg``
+    max_iterations : of each stage
+    step_tolerance : converged when no component of a step is larger [m, rad]
+    cost_tolerance : converged when the cost changes by a smaller fraction
+    losses : by label, the stages of its loss: each is minimised, the last until converged; a label with fewer stages
+        keeps its last. Online an edge has the first at its first update and the last from then on
+    relinearize_above : online, a vertex is linearised anew when a component of its step is larger [m, rad]
+    relinearize_error : or when its step squared is more than so many standard deviations of its strongest measurement
+    relinearize_every : that is looked for at every so many updates, or after two thirds of these at one that closes a
+        loop; steps ten times as large are at any
+    relinearize_passes : how often at most within one update; after the first time for steps as large as that
+    tolerance : online, changes of a step up to this are not followed [m, rad]
+    tolerance_sigmas : nor are those up to so many standard deviations of the vertex given its neighbours
+    """
+
+    method: str = "gn"
+    max_iterations: int = 50
+    step_tolerance: float = 1e-6
+    cost_tolerance: float = 1e-6
+    losses: Mapping[str, Sequence[Loss]] = field(default_factory=dict)
+    relinearize_above: float = 0.05
+    relinearize_error: float = 0.1
+    relinearize_every: int = 10
+    relinearize_passes: int = 5
+    tolerance: float = 1e-5
+    tolerance_sigmas: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise GraphSlamError(f"method {self.method!r}: choose {', '.join(METHODS[:-1])} or {METHODS[-1]}")
+        for name, least in _LEAST.items():
+            if not getattr(self, name) >= least:  # nor is NaN
+                raise GraphSlamError(f"{name} {getattr(self, name)}: must be a number >= {least}")
+        for label, stages in self.losses.items():
+            if not len(stages):
+                raise GraphSlamError(f"losses: {label!r} has no stage; leave it out, or give it a loss")
+
+    def stages(self) -> list[dict[str, Loss]]:
+        """One loss per label for each stage."""
+        count = max((len(stages) for stages in self.losses.values()), default=1)
+        return [{name: s[min(k, len(s) - 1)] for name, s in self.losses.items()} for k in range(count)]
+
+    def until_still(self) -> "Settings":
+        """For an estimate that is near: the last stage alone, until nothing moves."""
+        last = {label: stages[-1:] for label, stages in self.losses.items()}
+        return replace(self, losses=last, step_tolerance=_STILL, cost_tolerance=0.0)
+
+    def on_the_way(self) -> "Settings":
+        """For a stage that another follows."""
+        return replace(self, cost_tolerance=max(self.cost_tolerance, _ON_THE_WAY))
+
+
+@dataclass(frozen=True, slots=True)
+class _Saved:
+    """Where a problem was."""
+
+    value: Array
+    blocks: Array
+    diagonal: Array
+    chi2: float
+    cost: float
+
+
+class Problem:
+    """What is minimised: the edges of a clique tree over its unknowns, from where the estimate is.
+
+    Attributes
+    ----------
+    chi2, cost : of what was last linearised
+    """
+
+    def __init__(self, graph: Graph, tree: Tree, rows: Mapping[EdgeTable, Index], unknowns: Index) -> None:
+        self.graph, self.tree, self.rows, self.unknowns = graph, tree, rows, unknowns
+        self._cliques = mark(tree, unknowns)
+        self.edges = np.concatenate([t.id.values[r] for t, r in rows.items()] or [np.empty(0, dtype=np.int64)])
+        self._size = len(graph.initial)
+        self.chi2 = self.cost = 0.0
+        settle(tree, unknowns)
+
+    def linearize(self, losses: Losses, *, refuse: bool = False) -> None:
+        """Put the blocks of all edges at the linearisation points into the tree; costs not finite may be refused."""
+        self.chi2 = self.cost = 0.0
+        for b in linearize(self.graph, self.tree.value, self.rows, losses):
+            if refuse:
+                refuse_nonfinite(b)
+            store(self.tree, b.rows, b.table.id.values, b.residual, b.jacobian)
+            self.chi2 += float(b.chi2.sum())
+            self.cost += float(b.cost.sum())
+
+    def solve(self, damping: float = 0.0) -> float:
+        """Find the step of all unknowns; returns its largest component.
+
+        Raises
+        ------
+        SingularError
+            The edges do not determine a vertex.
+        """
+        vertex = eliminate(self.tree, self._cliques, damping)
+        if vertex != NOTHING:
+            raise undetermined(vertex)
+        back_substitute(self.tree, self._cliques, -1.0, -1.0)
+        return self.largest_step()
+
+    def largest_step(self) -> float:
+        """Largest component of the present step [m or rad]."""
+        return float(np.abs(self.tree.step).max(initial=0.0))
+
+    def move(self) -> None:
+        """Take the step: the estimate becomes the linearisation point."""
+        settle(self.tree, self.unknowns)
+
+    def here(self) -> Array:
+        """The linearisation points, to come back to."""
+        return self.tree.value[: self._size].copy()
+
+    def back_to(self, here: Array) -> None:
+        """Come back to linearisation points, without a step; what is linearised is left as it is."""
+        self.tree.value[: self._size] = self.tree.estimate[: self._size] = here
+        self.tree.step[:] = 0.0
+
+    def saved(self) -> _Saved:
+        """Linearisation points, and what is linearised there, to come back to."""
+        return _Saved(self.here(), self.tree.blocks.copy(), self.tree.diagonal.copy(), self.chi2, self.cost)
+
+    def restore(self, saved: _Saved) -> None:
+        """Come back to what was saved."""
+        self.back_to(saved.value)
+        self.tree.blocks[:], self.tree.diagonal[:] = saved.blocks, saved.diagonal
+        self.chi2, self.cost = saved.chi2, saved.cost
+
+
+@dataclass(frozen=True, slots=True)
+class _Descent:
+    """How one method went, from where it began."""
+
+    iterations: list[Iteration]
+    stop: str
+
+
+def minimise(problem: Problem, settings: Settings) -> Report:
+    """Minimise stage after stage of the losses, the last until converged; the tree is left at the last finite iterate.
+
+    Gauss-Newton may rise on its way. It has failed when it ends above where it began, or not finite, or without
+    converging, or met a singular system; then the stage is done again with damping. Damping hides what the edges
+    leave open, so after it the undamped system is factored once.
+
+    Raises
+    ------
+    SingularError
+        The edges do not determine a vertex.
+    GraphSlamError
+        The cost is not finite where it starts.
+    """
+    stages = [Losses(problem.graph, by_label) for by_label in settings.stages()]
+    problem.linearize(stages[0], refuse=True)
+    chi2_initial, cost_initial = problem.chi2, problem.cost
+    iterations: list[Iteration] = []
+    used, stop = settings.method, ""
+    for losses in stages:
+        begin = problem.here()
+        if losses is not stages[0]:
+            problem.linearize(losses)
+        until = settings if losses is stages[-1] else settings.on_the_way()
+        descent = _DESCENTS[settings.method](problem, losses, until)
+        if settings.method == "gn" and descent.stop not in ("step", "cost"):
+            problem.back_to(begin)
+            problem.linearize(losses)
+            descent = _levenberg_marquardt(problem, losses, until)
+            used = "lm"
+        stop = descent.stop
+        iterations += descent.iterations
+    if used != "gn":
+        problem.solve()
+        problem.back_to(problem.here())
+    end = costs(problem.graph, linearize(problem.graph, problem.tree.value, problem.rows, stages[-1]))
+    return Report(used, stop, chi2_initial, end.chi2, cost_initial, end.cost, tuple(iterations), end.classes)
+
+
+def _gauss_newton(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
+    start = problem.cost
+    iterations: list[Iteration] = []
+    for _ in range(settings.max_iterations):
+        try:
+            step = problem.solve()
+        except SingularError:
+            return _Descent(iterations, "singular")
+        previous = problem.cost
+        problem.move()
+        problem.linearize(losses)
+        iterations.append(Iteration(problem.chi2, problem.cost, step, 0.0))
+        if not np.isfinite(problem.cost):
+            return _Descent(iterations, "diverged")
+        stop = _converged(previous, iterations[-1], settings)
+        if stop:
+            risen = problem.cost > start * (1.0 + settings.cost_tolerance) + _TINY
+            return _Descent(iterations, "diverged" if risen else stop)
+    return _Descent(iterations, "max_iterations")
+
+
+def _levenberg_marquardt(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
+    """Marquardt 1963: the diagonal is enlarged until the cost falls."""
+    damping = _DAMPING_FIRST
+    iterations: list[Iteration] = []
+    while len(iterations) < settings.max_iterations:
+        previous, before = problem.cost, problem.saved()
+        while True:
+            step = problem.solve(damping)
+            problem.move()
+            problem.linearize(losses)
+            if problem.cost <= previous:
+                break
+            problem.restore(before)
+            if damping >= _DAMPING_MOST or step < settings.step_tolerance:
+                return _Descent(iterations, "step" if damping < _DAMPING_MOST else "no_decrease")
+            damping *= _DAMPING_FACTOR
+        iterations.append(Iteration(problem.chi2, problem.cost, step, damping))
+        stop = _converged(previous, iterations[-1], settings)
+        if stop:
+            return _Descent(iterations, stop)
+        damping = max(damping / _DAMPING_FACTOR, _DAMPING_LEAST)
+    return _Descent(iterations, "max_iterations")
+
+
+def _dogleg(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
+    """Powell 1970: within a radius, from steepest descent's minimum towards the Gauss-Newton step."""
+    radius = _RADIUS_FIRST
+    iterations: list[Iteration] = []
+    while len(iterations) < settings.max_iterations:
+        slope = gradient(problem.tree, problem.edges)
+        largest = max(float(np.abs(slope).max(initial=0.0)), _TINY)
+        along = slope / largest  # its square need not fit a double
+        steepest = -along * (largest * (along @ along) / max(curvature(problem.tree, problem.edges, along), _TINY))
+        try:
+            problem.solve()
+            newton = problem.tree.step.copy()
+        except SingularError:  # as where it starts: another point may tell more
+            newton = steepest
+        previous, before = problem.cost, problem.saved()
+        while True:
+            step = _within(radius, newton, steepest)
+            length = float(np.abs(step).max(initial=0.0))
+            promised = -2.0 * slope @ step - curvature(problem.tree, problem.edges, step)
+            step_by(problem.tree, problem.unknowns, step)
+            problem.move()
+            problem.linearize(losses)
+            kept = (previous - problem.cost) / promised if promised > 0.0 else 0.0
+            if problem.cost <= previous:
+                break
+            problem.restore(before)
+            if length < settings.step_tolerance or radius < _RADIUS_LEAST:
+                return _Descent(iterations, "step")
+            radius = 0.25 * min(radius, float(np.linalg.norm(step)))
+        if kept > 0.75:
+            radius = max(radius, 3.0 * float(np.linalg.norm(step)))
+        elif kept < 0.25:
+            radius *= 0.5
+        iterations.append(Iteration(problem.chi2, problem.cost, length, 0.0))
+        stop = _converged(previous, iterations[-1], settings)
+        if stop:
+            return _Descent(iterations, stop)
+    return _Descent(iterations, "max_iterations")
+
+
+def _within(radius: float, newton: Array, steepest: Array) -> Array:
+    """The point of the dogleg at a distance of at most the radius."""
+    if np.linalg.norm(newton) <= radius:
+        return newton
+    length = float(np.linalg.norm(steepest))
+    if length >= radius:
+        return steepest * (radius / length)
+    leg = newton - steepest
+    a, b, c = float(leg @ leg), float(steepest @ leg), length**2 - radius**2
+    return steepest + leg * ((-b + np.sqrt(b * b - a * c)) / a)
+
+
+def _converged(previous: float, last: Iteration, settings: Settings) -> str:
+    """Which of the two rules of the literature holds, or an empty string."""
+    if last.step <= settings.step_tolerance:
+        return "step"
+    if abs(previous - last.cost) <= settings.cost_tolerance * last.cost + _TINY:
+        return "cost"
+    return ""
+
+
+_DESCENTS: dict[str, Callable[[Problem, Losses, Settings], _Descent]] = {
+    "gn": _gauss_newton,
+    "lm": _levenberg_marquardt,
+    "dogleg": _dogleg,
+}
+METHODS = tuple(_DESCENTS)

@@ -1,0 +1,121 @@
+"""Dense kernels of the fronts: partial Cholesky and the triangular solution. Sums may be reordered, nothing more."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+from numba.core import types
+from numba.extending import overload
+from numba.np.linalg import _BLAS, ensure_blas
+
+from graph_slam_ros.solver.clique_tree.storage import NOTHING, Array
+
+LEAST_PIVOT = 1e-14  # of its diagonal entry: what elimination left of it is rounding
+WIDE = 12  # pivots that are applied to the rows below by matrix products
+FEWEST, SHORTEST = 3, 24  # pivots, and rows below them, for which that pays
+STRIP = 64  # rows of one product: half of what it makes on the diagonal is not needed
+
+dense = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+
+
+def _subtract_product(front: Array, low: int, high: int, first: int, last: int) -> None:
+    """Take the share of the pivot rows [low, high) out of the rows [first, last)."""
+    front[first:last, first:] -= front[low:high, first:last].T @ front[low:high, first:]
+
+
+# Compiled, it is one call of BLAS in place, by the way that Numba itself takes for np.dot: that would copy the rows and
+# their product.
+ensure_blas()  # type: ignore[no-untyped-call]
+_gemm = _BLAS().numba_xxgemm(types.float64)  # type: ignore[no-untyped-call]
+_DOUBLE, _PLAIN, _TRANSPOSED = (np.int8(ord(letter)) for letter in "dnt")
+
+
+@overload(_subtract_product, jit_options={"error_model": "numpy"})
+def _subtract_product_in_place(front: Any, low: Any, high: Any, first: Any, last: Any) -> Callable[..., None]:
+    def compiled(front: Any, low: Any, high: Any, first: Any, last: Any) -> None:
+        stride = front.shape[1]
+        panel, rows = front[low:, first:].ctypes, front[first:, first:].ctypes
+        minus, plus = np.full(1, -1.0).ctypes, np.full(1, 1.0).ctypes
+        _gemm(
+            _DOUBLE, _PLAIN, _TRANSPOSED, stride - first, last - first, high - low,
+            minus, panel, stride, panel, stride, plus, rows, stride,
+        )  # fmt: skip
+
+    return compiled
+
+
+@dense
+def partial_cholesky(front: Array, frontal: int, diagonal: Array) -> int:
+    """Eliminate the first ``frontal`` rows of a symmetric matrix with right sides; returns a row without a pivot.
+
+    ``front`` (n, n + m) holds an upper triangle and m right sides. It becomes [U11 U12 y; . C d]: the factor, its
+    diagonal inverted, and what is left for the other rows. NOTHING is returned where all pivots are safely above
+    rounding, which is judged by the ``diagonal`` of the whole problem. What is below the diagonal is not used.
+    """
+    n = front.shape[0]
+    done = 0
+    while done < frontal:
+        end = min(done + WIDE, frontal)
+        wide = end - done >= FEWEST and n - end >= SHORTEST
+        failed = _eliminate_panel(front, done, end, end if wide else n, diagonal)
+        if failed != NOTHING:
+            return failed
+        if wide:
+            for first in range(end, n, STRIP):
+                _subtract_product(front, done, end, first, min(first + STRIP, n))
+        done = end
+    return NOTHING
+
+
+@dense
+def _eliminate_panel(front: Array, low: int, high: int, below: int, diagonal: Array) -> int:
+    """Eliminate some rows, and take their share out of those before ``below``; returns a row without a pivot."""
+    for a in range(low, high, 4):
+        last = min(a + 4, high)
+        for p in range(a, last):
+            for q in range(a, p):
+                _subtract(front, p, p, q)
+            if not front[p, p] > LEAST_PIVOT * diagonal[p]:
+                return p
+            inverse = 1.0 / np.sqrt(front[p, p])
+            front[p, p] = inverse
+            for j in range(p + 1, front.shape[1]):
+                front[p, j] *= inverse
+        if last - a == 4:
+            _subtract_four(front, last, below, a)
+        else:
+            for i in range(last, below):
+                for q in range(a, last):
+                    _subtract(front, i, i, q)
+    return NOTHING
+
+
+@dense
+def _subtract(front: Array, row: int, column: int, pivot: int) -> None:
+    """Take a pivot row's share out of a row, from a column on."""
+    share = front[pivot, row]
+    for j in range(column, front.shape[1]):
+        front[row, j] -= share * front[pivot, j]
+
+
+@dense
+def _subtract_four(front: Array, low: int, high: int, pivot: int) -> None:
+    """Take four pivot rows' shares out of rows: each number is loaded and stored once for four."""
+    one, two, three, four = front[pivot], front[pivot + 1], front[pivot + 2], front[pivot + 3]
+    for i in range(low, high):
+        row = front[i]
+        a, b, c, d = one[i], two[i], three[i], four[i]
+        for j in range(i, front.shape[1]):
+            row[j] -= a * one[j] + b * two[j] + c * three[j] + d * four[j]
+
+
+@dense
+def solve_upper(front: Array, frontal: int, x: Array) -> None:
+    """``x_F = U11^-1 (y - U12 x_S)``: x holds x_S behind the first ``frontal`` numbers, and gets x_F there."""
+    n = front.shape[0]
+    for a in range(frontal - 1, -1, -1):
+        s = front[a, n]
+        for i in range(a + 1, n):
+            s -= front[a, i] * x[i]
+        x[a] = s * front[a, a]

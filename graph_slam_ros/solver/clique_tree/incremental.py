@@ -1,0 +1,383 @@
+"""One update of the clique tree: what changed goes in, the steps of what it moves come out."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph.edge_type import MOST_SLOTS
+from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.numeric import back_substitute, clear_block, eliminate, settle
+from graph_slam_ros.solver.clique_tree.ordering import key_of, move_tail, neighbourhood
+from graph_slam_ros.solver.clique_tree.storage import (
+    ACTIVE,
+    AFFECTED,
+    BLOCK,
+    BLOCKS_TOP,
+    CLIQUE,
+    CLIQUES,
+    CLIQUES_WANTED,
+    COUNT,
+    DOF,
+    END,
+    FLOPS,
+    FREE,
+    FREE_CLIQUE,
+    FREE_REGION,
+    FRONT_DOF,
+    FRONTS_TOP,
+    FRONTS_WANTED,
+    FULL_DOF,
+    KEY,
+    KIND,
+    LINK,
+    LINK_EDGE,
+    LINK_NEXT,
+    LINKS,
+    LIVE,
+    LIVE_MADE,
+    LOCAL,
+    MEMBERS_TOP,
+    MEMBERS_WANTED,
+    NEXT,
+    NOTHING,
+    OWNER,
+    R_COUNT,
+    R_DEPTH,
+    R_MADE,
+    REGION,
+    REGIONS,
+    STEP,
+    TAIL_END,
+    TAIL_FIRST,
+    TAKEN,
+    VALUE,
+    WIDTH,
+    Array,
+    Index,
+    Tree,
+    with_room,
+)
+from graph_slam_ros.solver.clique_tree.symbolic import (
+    build,
+    cliques_of,
+    collect,
+    compact,
+    mark,
+    release,
+    room_for,
+    structure,
+)
+
+SPARSE = 1.2  # of the memory of fronts, as a multiple of those in use: then it is compacted, not lengthened
+FEW = 64  # new vertices whose anchorage is looked for; more are said to be loose, which is then looked into
+
+
+@kernel
+def append_vertices(t: Tree, first: int, offset: Index, initial: Array, shapes: Index) -> None:
+    """Write the records of new vertices, not yet unknowns, with their initial values."""
+    vertex, t_step, value, estimate = t.vertex, t.step, t.value, t.estimate
+    step = 0 if first == 0 else vertex[first - 1, STEP] + vertex[first - 1, DOF]
+    for k in range(len(offset)):
+        v = first + k
+        vertex[v, :] = NOTHING
+        vertex[v, FREE] = 0
+        dof, size, kind = shapes[k]
+        vertex[v, DOF], vertex[v, KIND] = dof, kind
+        vertex[v, STEP], vertex[v, VALUE] = step, offset[k]
+        for i in range(dof):
+            t_step[step + i] = 0.0
+        for i in range(size):
+            x = initial[offset[k] + i]
+            value[offset[k] + i] = x
+            estimate[offset[k] + i] = x
+        step += dof
+
+
+@kernel
+def unfit(ids: Index, inside: NDArray[np.bool_], count: int) -> int:
+    """The place in ``ids`` of one that is not below ``count``, is inside or is there twice, or NOTHING."""
+    found, marked = NOTHING, 0
+    for k in range(len(ids)):
+        if ids[k] < 0 or ids[k] >= count or inside[ids[k]]:
+            found = k
+            break
+        inside[ids[k]] = True
+        marked += 1
+    for k in range(marked):
+        inside[ids[k]] = False
+    return found
+
+
+@kernel
+def outside(rows: Index, ends: Index, weight: Array, inside: NDArray[np.bool_], new: Index) -> int:
+    """A vertex that edges with a weight, rows of a table, need and that is neither inside nor new, or NOTHING."""
+    found = NOTHING
+    for v in new:
+        inside[v] = True
+    for row in rows:
+        for s in range(ends.shape[1]):
+            if found == NOTHING and weight[row] != 0.0 and not inside[ends[row, s]]:
+                found = ends[row, s]
+    for v in new:
+        inside[v] = False
+    return found
+
+
+@kernel
+def gather(estimate: Array, kind: Index, offset: Index, ids: Index, size: int) -> tuple[int, Array]:
+    """Stored numbers (n, size) of vertices of the first one's kind; a place in ``ids`` that is unfit, or NOTHING."""
+    out = np.empty((len(ids), size))
+    for k in range(len(ids)):
+        if ids[k] < 0 or ids[k] >= len(kind) or kind[ids[k]] != kind[ids[0]]:
+            return k, out
+        at = offset[ids[k]]
+        for i in range(size):
+            out[k, i] = estimate[at + i]
+    return NOTHING, out
+
+
+@kernel
+def append_edges(t: Tree, rows: Index, all_ids: Index, all_ends: Index) -> None:
+    """Write the records of edges, rows of a table, not yet in the structure, and link them to their vertices."""
+    vertex, edge, t_link, state, blocks = t.vertex, t.edge, t.link, t.state, t.blocks
+    for row in rows:
+        e = all_ids[row]
+        if edge[e, COUNT] > 0:  # by a call that was interrupted
+            continue
+        width = 0
+        edge[e, COUNT] = all_ends.shape[1]
+        for s in range(all_ends.shape[1]):
+            v = all_ends[row, s]
+            edge[e, END + s] = v
+            width += vertex[v, DOF]
+            link = state[LINKS]
+            state[LINKS] += 1
+            t_link[link, LINK_EDGE], t_link[link, LINK_NEXT] = e, vertex[v, LINK]
+            vertex[v, LINK] = link
+        edge[e, BLOCK] = state[BLOCKS_TOP]
+        state[BLOCKS_TOP] += width * (width + 1)
+        edge[e, WIDTH], edge[e, ACTIVE], edge[e, OWNER], edge[e, TAKEN] = width, 0, NOTHING, 0
+        blocks[edge[e, BLOCK] : state[BLOCKS_TOP]] = 0.0
+
+
+@kernel
+def enter(t: Tree, vertices: Index, edges: Index) -> None:
+    """Make vertices unknowns, the newest, and put edges, whose blocks are still to be made, into the structure."""
+    vertex, tail, state = t.vertex, t.tail, t.state
+    for v in vertices:
+        vertex[v, FREE] = 1
+        vertex[v, REGION] = vertex[v, NEXT] = vertex[v, CLIQUE] = NOTHING
+        vertex[v, KEY] = key_of(-1, 0, v)
+        if state[TAIL_END] == len(tail):  # what is before the first is not needed any more
+            keep = tail[state[TAIL_FIRST] :].copy()
+            tail[: len(keep)] = keep
+            state[TAIL_FIRST], state[TAIL_END] = 0, len(keep)
+        tail[state[TAIL_END]] = v
+        state[TAIL_END] += 1
+    for e in edges:
+        t.edge[e, ACTIVE] = 1
+
+
+@kernel
+def leave(t: Tree, vertices: Index, edges: Index) -> Index:
+    """Take vertices and edges out again; returns the vertices whose cliques must be made anew."""
+    deactivate(t, edges)
+    touched = neighbourhood(t, vertices)
+    for v in vertices:
+        t.vertex[v, FREE] = 0
+    return touched
+
+
+@kernel
+def deactivate(t: Tree, edges: Index) -> None:
+    """Take edges, and what they add to the diagonal of H, out of the structure."""
+    edge = t.edge
+    for e in edges:
+        edge[e, ACTIVE], edge[e, OWNER] = 0, NOTHING
+        clear_block(t, e)
+
+
+@kernel
+def reset(t: Tree, unknowns: Index) -> None:
+    """Forget order and cliques, and what a call that failed left in the scratch: all unknowns are new."""
+    vertex, region, state = t.vertex, t.region, t.state
+    vertex[:, LOCAL] = NOTHING
+    t.edge[:, TAKEN] = 0
+    state[CLIQUES] = state[MEMBERS_TOP] = state[FRONTS_TOP] = state[LIVE] = state[LIVE_MADE] = 0
+    state[FREE_CLIQUE] = NOTHING
+    state[REGIONS], state[FREE_REGION] = 1, NOTHING
+    region[0, :] = NOTHING
+    region[0, R_DEPTH] = region[0, R_COUNT] = region[0, R_MADE] = 0
+    t.vacant[:] = NOTHING
+    state[TAIL_FIRST] = state[TAIL_END] = 0
+    vertex[:, CLIQUE] = NOTHING
+    vertex[:, REGION] = NOTHING
+    enter(t, unknowns, unknowns[:0])
+
+
+@kernel
+def anchored(vertex: Index, edge: Index, link: Index, new: Index, edges: Index) -> bool:
+    """Whether some edges join each of new vertices, by a chain, to an older one or to an edge on one vertex alone."""
+    for v in new:
+        vertex[v, LOCAL] = 0
+    for e in edges:
+        edge[e, TAKEN] = 1
+    count, gained = 0, len(new) <= FEW
+    while gained and count < len(new):
+        gained = False
+        for v in new:
+            a = vertex[v, LINK]
+            while a != NOTHING and vertex[v, LOCAL] == 0:
+                e = link[a, LINK_EDGE]
+                a = link[a, LINK_NEXT]
+                if edge[e, TAKEN] == 0:
+                    continue
+                fixed = edge[e, COUNT] == 1
+                for s in range(edge[e, COUNT]):
+                    fixed = fixed or vertex[edge[e, END + s], LOCAL] != 0
+                if fixed:
+                    vertex[v, LOCAL] = 1
+                    count += 1
+                    gained = True
+    for v in new:
+        vertex[v, LOCAL] = NOTHING
+    for e in edges:
+        edge[e, TAKEN] = 0
+    return count == len(new)
+
+
+@kernel
+def edges_of(vertex: Index, link: Index, v: int) -> Index:
+    """All edges on a vertex, also those that are not in the structure, in order."""
+    out, count = np.empty(16, np.int64), 0
+    a = vertex[v, LINK]
+    while a != NOTHING:
+        if count == len(out):
+            out = np.concatenate((out, np.empty(count, np.int64)))
+        out[count] = link[a, LINK_EDGE]
+        count += 1
+        a = link[a, LINK_NEXT]
+    return np.sort(out[:count])
+
+
+@kernel
+def ends_of(t: Tree, edges: Index) -> Index:
+    """The vertices of edges; some more than once."""
+    edge = t.edge
+    out = np.empty(MOST_SLOTS * len(edges), np.int64)
+    count = 0
+    for e in edges:
+        for s in range(edge[e, COUNT]):
+            out[count] = edge[e, END + s]
+            count += 1
+    return out[:count]
+
+
+@kernel
+def _restructure(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
+    """Put changes of the structure into the tree: order again what they touch, and group it into cliques.
+
+    Parameters
+    ----------
+    touched : vertices whose surroundings changed; new : vertices that are not in it yet
+
+    Returns
+    -------
+    Whether there was room, and then the new cliques; otherwise the vertices to touch when it is tried again: nothing
+    was changed but the order, and ``state`` says how long the pools must be.
+    """
+    clique, state = t.clique, t.state
+    touched = move_tail(t, touched)
+    marked = mark(t, touched)
+    order, orphans = collect(t, marked, new)
+    start, later = structure(t, order, orphans)
+    group, last, size = cliques_of(t, order, start, later)
+    cliques, members, numbers = room_for(t, size, marked)
+    state[CLIQUES_WANTED] = state[CLIQUES] + cliques
+    state[MEMBERS_WANTED] = state[MEMBERS_TOP] + members
+    state[FRONTS_WANTED] = state[FRONTS_TOP] + numbers
+    if (
+        state[CLIQUES_WANTED] > len(clique)
+        or state[MEMBERS_WANTED] > len(t.members)
+        or state[FRONTS_WANTED] > len(t.fronts)
+    ):
+        return False, touched
+    release(t, marked)
+    state[AFFECTED] += len(order)
+    cliques = build(t, order, start, later, group, last, size, orphans)
+    state[LIVE_MADE] = state[LIVE_MADE] or state[LIVE]
+    return True, cliques
+
+
+def restructure(tree: Tree, touched: Index, new: Index) -> tuple[Tree, Index]:
+    """The tree with changes of the structure in it, and its new cliques, whose numbers are to be made.
+
+    Parameters
+    ----------
+    touched : vertices whose surroundings changed; new : vertices that are not in it yet
+    """
+    while True:
+        done, out = _restructure(tree, touched, new)
+        if done:
+            return tree, out
+        touched, state = out, tree.state
+        if state[FRONTS_TOP] > SPARSE * state[LIVE]:
+            compact(tree)
+            continue
+        tree = with_room(tree, clique=state[CLIQUES_WANTED], members=state[MEMBERS_WANTED], fronts=state[FRONTS_WANTED])
+
+
+@kernel
+def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float) -> tuple[int, Index]:
+    """Make the numbers of cliques, children before parents, and step.
+
+    Returns a vertex that has no pivot, or NOTHING, and the vertices that moved.
+    """
+    clique, state = t.clique, t.state
+    for c in cliques:
+        state[FLOPS] += clique[c, FULL_DOF] ** 2 * clique[c, FRONT_DOF]
+    failed = eliminate(t, cliques, 0.0)
+    if failed != NOTHING:
+        return failed, cliques[:0].copy()
+    return failed, back_substitute(t, cliques, tolerance, sigmas)
+
+
+@kernel
+def renumber(t: Tree, edges: Index, tolerance: float, sigmas: float) -> tuple[int, Index]:
+    """``solve`` where only the numbers of edges have changed."""
+    return solve(t, mark(t, ends_of(t, edges)), tolerance, sigmas)
+
+
+@kernel
+def relinearize(t: Tree, moved: Index, threshold: float, error: float) -> Index:
+    """Move the linearisation points of vertices whose step is too large; returns all edges on them.
+
+    It is above the threshold, or what a linearisation neglects (the square of the step) is above ``error`` standard
+    deviations of the strongest measurement.
+    """
+    vertex, edge, link, t_step, t_diagonal = t.vertex, t.edge, t.link, t.step, t.diagonal
+    edges, moving = np.empty(64, np.int64), np.empty(len(moved), np.int64)
+    count = many = 0
+    for v in moved:
+        step = t_step[vertex[v, STEP] : vertex[v, STEP] + vertex[v, DOF]]
+        largest = information = 0.0
+        for i in range(len(step)):
+            largest = max(largest, abs(step[i]))
+            information = max(information, t_diagonal[vertex[v, STEP] + i])
+        if largest <= threshold and largest * largest * np.sqrt(information) <= error:
+            continue
+        moving[many] = v
+        many += 1
+        a = vertex[v, LINK]
+        while a != NOTHING:
+            e = link[a, LINK_EDGE]
+            a = link[a, LINK_NEXT]
+            if edge[e, ACTIVE] == 1 and edge[e, TAKEN] == 0:
+                edge[e, TAKEN] = 1
+                if count == len(edges):
+                    edges = np.concatenate((edges, np.empty(count, np.int64)))
+                edges[count] = e
+                count += 1
+    for e in edges[:count]:
+        edge[e, TAKEN] = 0
+    settle(t, moving[:many])
+    return np.sort(edges[:count])

@@ -1,0 +1,433 @@
+"""The numbers of the clique tree: assembly and elimination, back-substitution, steps.
+
+Kernels take the arrays out of the tree once: each access through the tuple would count references.
+"""
+
+import numpy as np
+
+from graph_slam_ros.lie import se2, se3
+from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.dense import partial_cholesky, solve_upper
+from graph_slam_ros.solver.clique_tree.storage import (
+    BLOCK,
+    CHILD,
+    COUNT,
+    DOF,
+    END,
+    FREE,
+    FRONT,
+    FRONT_DOF,
+    FRONTALS,
+    FULL_DOF,
+    KIND,
+    LINK,
+    LINK_EDGE,
+    LINK_NEXT,
+    LOCAL,
+    MARK,
+    MEMBERS,
+    NOTHING,
+    OWNER,
+    PARENT,
+    SE2_KIND,
+    SE3_KIND,
+    SIBLING,
+    SIZE,
+    STEP,
+    VALUE,
+    WIDTH,
+    Array,
+    Index,
+    Tree,
+)
+
+MOVED = -2  # in LOCAL: its step has changed
+SUSPECT = 1e-9  # of its diagonal entry: a pivot below is looked into
+ROUNDING = 2.0**-52  # of the magnitudes that cancelled: a pivot below cannot be told from rounding
+CANCELLED = 1e-4  # of what is taken off a sum: less than that left has lost digits
+
+
+@kernel
+def eliminate(t: Tree, cliques: Index, damping: float) -> int:
+    """Factor the fronts of cliques, children before parents; returns a vertex whose pivot is rounding, or NOTHING.
+
+    ``damping`` enlarges the diagonal of H by the factor 1 + damping (Marquardt).
+    """
+    vertex, clique, members, fronts, diagonal = t.vertex, t.clique, t.members, t.fronts, t.diagonal
+    scale = np.empty(0)
+    failed = NOTHING
+    for c in cliques:
+        front, frontal = front_of(clique, fronts, c), clique[c, FRONT_DOF]
+        if len(scale) < frontal:
+            scale = np.empty(2 * frontal)
+        front[:] = 0.0
+        at = 0
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, SIZE]):
+            v = members[m]
+            vertex[v, LOCAL] = at
+            if at < frontal:
+                for i in range(vertex[v, DOF]):
+                    scale[at + i] = diagonal[vertex[v, STEP] + i]
+                    front[at + i, at + i] = damping * scale[at + i]
+            at += vertex[v, DOF]
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+            _add_edges(vertex, t.edge, t.link, t.blocks, members[m], front)
+        child = clique[c, CHILD]
+        while child != NOTHING:
+            _add_contribution(vertex, clique, members, fronts, child, front)
+            child = clique[child, SIBLING]
+        failed = partial_cholesky(front, frontal, scale)
+        if failed == NOTHING and damping == 0.0:
+            failed = _suspect(front, frontal, scale)
+            if failed != NOTHING and not _is_rounding(t, c, failed):
+                failed = NOTHING
+        if failed != NOTHING:
+            failed = _member_at(vertex, clique, members, c, failed)
+            break
+    for c in cliques:
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+            vertex[members[m], LOCAL] = NOTHING
+    return failed
+
+
+@kernel
+def _suspect(front: Array, frontal: int, diagonal: Array) -> int:
+    """The row of the least pivot, as a part of its diagonal entry, if it is suspiciously small, or NOTHING."""
+    found, least = NOTHING, 1.0 / SUSPECT
+    for a in range(frontal):
+        if front[a, a] * front[a, a] * diagonal[a] > least:  # inverted, and its root
+            found, least = a, front[a, a] * front[a, a] * diagonal[a]
+    return found
+
+
+@kernel
+def _is_rounding(t: Tree, c: int, row: int) -> bool:
+    """Whether a pivot cannot be told from rounding.
+
+    In the direction x of its unknown alone, where all that was eliminated before follows, the pivot is x'Hx. It is what
+    is left of a sum over the diagonal, whose rounding is in proportion to it.
+    """
+    vertex, clique, members, fronts = t.vertex, t.clique, t.members, t.fronts
+    step, stack, top = np.zeros(len(t.step)), np.empty(256, np.int64), 1
+    stack[0] = c
+    x, magnitude, front = np.empty(256), 0.0, front_of(clique, fronts, c)
+    pivot = 1.0 / front[row, row] ** 2
+    while top:
+        top -= 1
+        k = stack[top]
+        full, frontal, low = clique[k, FULL_DOF], clique[k, FRONT_DOF], clique[k, MEMBERS]
+        if len(x) < full:
+            x = np.empty(2 * full)
+        x[:full] = 0.0
+        at = frontal
+        if k == c:
+            x[row] = 1.0
+        else:
+            for m in range(low + clique[k, FRONTALS], low + clique[k, SIZE]):
+                for i in range(vertex[members[m], DOF]):
+                    x[at + i] = step[vertex[members[m], STEP] + i]
+                at += vertex[members[m], DOF]
+        front = front_of(clique, fronts, k)
+        for a in range((row if k == c else frontal) - 1, -1, -1):
+            s = 0.0
+            for i in range(a + 1, full):
+                s -= front[a, i] * x[i]
+            x[a] = s * front[a, a]
+        at = 0
+        for m in range(low, low + clique[k, FRONTALS]):
+            for i in range(vertex[members[m], DOF]):
+                d = vertex[members[m], STEP] + i
+                step[d] = x[at]
+                magnitude += t.diagonal[d] * x[at] * x[at]
+                at += 1
+        k = clique[k, CHILD]
+        while k != NOTHING:
+            if top == len(stack):
+                stack = np.concatenate((stack, np.empty(top, np.int64)))
+            stack[top] = k
+            top += 1
+            k = clique[k, SIBLING]
+    return pivot <= ROUNDING * magnitude
+
+
+@kernel
+def front_of(clique: Index, fronts: Array, c: int) -> Array:
+    """The front (full, full + 1): an upper triangle, and the right side as its last column."""
+    full, base = clique[c, FULL_DOF], clique[c, FRONT]
+    return fronts[base : base + full * (full + 1)].reshape(full, full + 1)
+
+
+@kernel
+def _member_at(vertex: Index, clique: Index, members: Index, c: int, row: int) -> int:
+    for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+        if row < vertex[members[m], LOCAL] + vertex[members[m], DOF]:
+            return members[m]
+    return NOTHING
+
+
+@kernel
+def _add_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, front: Array) -> None:
+    """Add the blocks of the edges of which v is eliminated first."""
+    right = front.shape[0]
+    a = vertex[v, LINK]
+    while a != NOTHING:
+        e = link[a, LINK_EDGE]
+        a = link[a, LINK_NEXT]
+        if edge[e, OWNER] != v:
+            continue
+        width = edge[e, WIDTH]
+        row = edge[e, BLOCK]  # of the block, where the rows of one end begin
+        for s in range(edge[e, COUNT]):
+            u = edge[e, END + s]
+            dof, at = vertex[u, DOF], vertex[u, LOCAL]
+            if vertex[u, FREE] == 1:
+                column = row
+                for z in range(edge[e, COUNT]):
+                    w = edge[e, END + z]
+                    to = vertex[w, LOCAL]
+                    if to >= at and vertex[w, FREE] == 1:
+                        for i in range(dof):
+                            for j in range(vertex[w, DOF]):
+                                front[at + i, to + j] += blocks[column + i * (width + 1) + j]
+                    column += vertex[w, DOF]
+                for i in range(dof):
+                    front[at + i, right] -= blocks[column + i * (width + 1)]
+            row += dof * (width + 1)
+
+
+@kernel
+def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Array, child: int, front: Array) -> None:
+    """Add what a child's subtree says of its separator."""
+    of_child = front_of(clique, fronts, child)
+    right, of_right = front.shape[0], of_child.shape[0]
+    low, high = clique[child, MEMBERS] + clique[child, FRONTALS], clique[child, MEMBERS] + clique[child, SIZE]
+    row = clique[child, FRONT_DOF]
+    for m in range(low, high):
+        at, dof = vertex[members[m], LOCAL], vertex[members[m], DOF]
+        for i in range(dof):
+            front[at + i, right] += of_child[row + i, of_right]
+            for j in range(i, dof):
+                front[at + i, at + j] += of_child[row + i, row + j]
+        column = row + dof
+        for k in range(m + 1, high):
+            to, width = vertex[members[k], LOCAL], vertex[members[k], DOF]
+            if at < to:
+                for i in range(dof):
+                    for j in range(width):
+                        front[at + i, to + j] += of_child[row + i, column + j]
+            else:
+                for i in range(dof):
+                    for j in range(width):
+                        front[to + j, at + i] += of_child[row + i, column + j]
+            column += width
+        row += dof
+
+
+@kernel
+def back_substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float) -> Index:
+    """Steps from the root down, through the given cliques (children before parents) and below where they matter.
+
+    A step that changes by no more than the tolerance [m, rad], or so many standard deviations of the vertex given its
+    neighbours, is left as it was, and so is what depends on it alone; so errors do not add up. Returns the vertices
+    whose step has changed; their estimates follow.
+    """
+    vertex, clique, members, fronts, step = t.vertex, t.clique, t.members, t.fronts, t.step
+    value, estimate, diagonal = t.value, t.estimate, t.diagonal
+    limit = sigmas * abs(sigmas)
+    moved, count = np.empty(256, np.int64), 0
+    stack, top = np.empty(256, np.int64), 0
+    x = np.empty(256)
+    for c in cliques:
+        clique[c, MARK] = 1
+        if clique[c, PARENT] == NOTHING:
+            if top == len(stack):
+                stack = np.concatenate((stack, np.empty(top, np.int64)))
+            stack[top] = c
+            top += 1
+    while top:
+        top -= 1
+        c = stack[top]
+        to_solve = clique[c, MARK] == 1
+        clique[c, MARK] = 0
+        full, frontal, low = clique[c, FULL_DOF], clique[c, FRONT_DOF], clique[c, MEMBERS]
+        if len(x) < full:
+            x = np.empty(2 * full)
+        at = frontal
+        for m in range(low + clique[c, FRONTALS], low + clique[c, SIZE]):
+            v = members[m]
+            to_solve = to_solve or vertex[v, LOCAL] == MOVED
+            for i in range(vertex[v, DOF]):
+                x[at + i] = step[vertex[v, STEP] + i]
+            at += vertex[v, DOF]
+        if not to_solve:
+            continue
+        solve_upper(front_of(clique, fronts, c), frontal, x)
+        if count + clique[c, FRONTALS] > len(moved):
+            moved = np.concatenate((moved, np.empty(count + clique[c, FRONTALS], np.int64)))
+        at = 0
+        for m in range(low, low + clique[c, FRONTALS]):
+            v = members[m]
+            first, dof = vertex[v, STEP], vertex[v, DOF]
+            change = error = 0.0
+            for i in range(dof):
+                d = abs(step[first + i] - x[at + i])
+                change, error = max(change, d), max(error, d * d * diagonal[first + i])
+            if not (change <= tolerance or error <= limit):
+                for i in range(dof):
+                    step[first + i] = x[at + i]
+                vertex[v, LOCAL] = MOVED
+                moved[count] = v
+                count += 1
+            at += dof
+        k = clique[c, CHILD]
+        while k != NOTHING:
+            if top == len(stack):
+                stack = np.concatenate((stack, np.empty(top, np.int64)))
+            stack[top] = k
+            top += 1
+            k = clique[k, SIBLING]
+    for c in cliques:
+        clique[c, MARK] = 0
+    for v in moved[:count]:
+        vertex[v, LOCAL] = NOTHING
+        _retract(vertex, value, step, estimate, v)
+    return moved[:count]
+
+
+@kernel
+def _retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -> None:
+    """The estimate of a vertex: its linearisation point [+] its step."""
+    kind, x, d = vertex[v, KIND], vertex[v, VALUE], vertex[v, STEP]
+    if kind == SE2_KIND:
+        pose = se2.retract((value[x], value[x + 1], value[x + 2]), (step[d], step[d + 1], step[d + 2]))
+        for i in range(3):
+            estimate[x + i] = pose[i]
+    elif kind == SE3_KIND:
+        p = (value[x], value[x + 1], value[x + 2], value[x + 3], value[x + 4], value[x + 5], value[x + 6])
+        q = se3.retract(p, (step[d], step[d + 1], step[d + 2], step[d + 3], step[d + 4], step[d + 5]))
+        for i in range(7):
+            estimate[x + i] = q[i]
+    else:
+        for i in range(vertex[v, DOF]):
+            estimate[x + i] = value[x + i] + step[d + i]
+
+
+@kernel
+def add_to_diagonal(vertex: Index, edge: Index, e: int, block: Array, diagonal: Array) -> None:
+    """Add the diagonal of an edge's block to that of the information matrix."""
+    p = 0
+    for s in range(edge[e, COUNT]):
+        v = edge[e, END + s]
+        for i in range(vertex[v, DOF]):
+            diagonal[vertex[v, STEP] + i] += block[p, p]
+            p += 1
+
+
+@kernel
+def clear_block(t: Tree, e: int) -> None:
+    """Forget an edge's block, and what it adds to the diagonal of H.
+
+    Where that was nearly all of it, what would be left is rounding: then it is added up anew.
+    """
+    vertex, edge, blocks, diagonal = t.vertex, t.edge, t.blocks, t.diagonal
+    width = edge[e, WIDTH]
+    block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
+    p = 0
+    cancelled = False
+    for s in range(edge[e, COUNT]):
+        v = edge[e, END + s]
+        for i in range(vertex[v, DOF]):
+            diagonal[vertex[v, STEP] + i] -= block[p, p]
+            cancelled = cancelled or diagonal[vertex[v, STEP] + i] < CANCELLED * block[p, p]
+            p += 1
+    block[:] = 0.0
+    if cancelled:
+        for s in range(edge[e, COUNT]):
+            _add_up_diagonal(t, edge[e, END + s])
+
+
+@kernel
+def _add_up_diagonal(t: Tree, v: int) -> None:
+    vertex, edge, link, blocks = t.vertex, t.edge, t.link, t.blocks
+    own = t.diagonal[vertex[v, STEP] : vertex[v, STEP] + vertex[v, DOF]]
+    own[:] = 0.0
+    a = vertex[v, LINK]
+    while a != NOTHING:
+        e = link[a, LINK_EDGE]
+        a = link[a, LINK_NEXT]
+        at, across = edge[e, BLOCK], edge[e, WIDTH] + 2  # from one number of a diagonal to the next
+        for s in range(edge[e, COUNT]):
+            u = edge[e, END + s]
+            if u == v:
+                for i in range(vertex[v, DOF]):
+                    own[i] += blocks[at + i * across]
+            at += vertex[u, DOF] * across
+
+
+@kernel
+def keep(vertex: Index, estimate: Array, kept: Array, vertices: Index) -> None:
+    """Copy the estimates of vertices."""
+    for v in vertices:
+        x = vertex[v, VALUE]
+        for i in range(7 if vertex[v, KIND] == SE3_KIND else vertex[v, DOF]):
+            kept[x + i] = estimate[x + i]
+
+
+@kernel
+def settle(t: Tree, vertices: Index) -> None:
+    """The estimate becomes the linearisation point."""
+    vertex, step, value, estimate = t.vertex, t.step, t.value, t.estimate
+    for v in vertices:
+        x, d, dof = vertex[v, VALUE], vertex[v, STEP], vertex[v, DOF]
+        for i in range(dof):
+            step[d + i] = 0.0
+        for i in range(7 if vertex[v, KIND] == SE3_KIND else dof):
+            value[x + i] = estimate[x + i]
+
+
+@kernel
+def step_by(t: Tree, vertices: Index, step: Array) -> None:
+    """Set the steps of vertices, and their estimates."""
+    for v in vertices:
+        for i in range(t.vertex[v, STEP], t.vertex[v, STEP] + t.vertex[v, DOF]):
+            t.step[i] = step[i]
+        _retract(t.vertex, t.value, t.step, t.estimate, v)
+
+
+@kernel
+def gradient(t: Tree, edges: Index) -> Array:
+    """J'r over the unknowns, numbered as ``step``."""
+    vertex, edge, blocks = t.vertex, t.edge, t.blocks
+    out = np.zeros(len(t.step))
+    for e in edges:
+        width = edge[e, WIDTH]
+        at = edge[e, BLOCK] + width
+        for s in range(edge[e, COUNT]):
+            v = edge[e, END + s]
+            for i in range(vertex[v, DOF]):
+                if vertex[v, FREE] == 1:
+                    out[vertex[v, STEP] + i] += blocks[at]
+                at += width + 1
+    return out
+
+
+@kernel
+def curvature(t: Tree, edges: Index, d: Array) -> float:
+    """``d' J'J d`` for a direction over the unknowns, numbered as ``step``."""
+    vertex, edge, blocks = t.vertex, t.edge, t.blocks
+    mine = np.empty(64)
+    out = 0.0
+    for e in edges:
+        width = edge[e, WIDTH]
+        if width > len(mine):
+            mine = np.empty(width)
+        k = 0
+        for s in range(edge[e, COUNT]):
+            v = edge[e, END + s]
+            for i in range(vertex[v, DOF]):
+                mine[k] = d[vertex[v, STEP] + i] if vertex[v, FREE] == 1 else 0.0
+                k += 1
+        for i in range(width):
+            for j in range(width):
+                out += mine[i] * blocks[edge[e, BLOCK] + i * (width + 1) + j] * mine[j]
+    return out

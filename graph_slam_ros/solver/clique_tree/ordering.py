@@ -1,0 +1,347 @@
+"""In which order vertices are eliminated: a nested dissection that follows the graph's growth.
+
+Regions form a binary tree. The vertices of an inner region separate those of its two subtrees, so they are eliminated
+after both: a path from any vertex to the root is short, and an update touches little. The newest vertices, the
+*tail*, come last of all in order of time, so that the next odometry edge meets the root. When the tail is long its
+older part moves down, each vertex into the deepest region that keeps the separation true. A region whose subtree has
+grown too much is dissected anew; that is paid for by what was added to it. So is all of it when the numbers of its
+fronts have grown as much: by lap after lap along the same places they grow faster than the vertices.
+"""
+
+import numpy as np
+
+from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.separator import separate
+from graph_slam_ros.solver.clique_tree.storage import (
+    ACTIVE,
+    COUNT,
+    DOF,
+    END,
+    FLOPS,
+    FLOPS_SEEN,
+    FLOPS_USUAL,
+    FREE,
+    FREE_REGION,
+    KEY,
+    LINK,
+    LINK_EDGE,
+    LINK_NEXT,
+    LIVE,
+    LIVE_MADE,
+    LOCAL,
+    NEXT,
+    NOTHING,
+    R_COUNT,
+    R_DEPTH,
+    R_FIRST,
+    R_LEFT,
+    R_MADE,
+    R_PARENT,
+    R_RIGHT,
+    RECENT,
+    REGION,
+    REGIONS,
+    RESTRUCTURED,
+    RESTRUCTURED_SEEN,
+    TAIL_END,
+    TAIL_FIRST,
+    TAIL_KEPT,
+    TAIL_LEAST,
+    Index,
+    Tree,
+)
+
+LEAF = 6  # vertices a region need not be dissected for
+GROWTH = 2.0  # a subtree is dissected anew when it has grown by this factor
+DEEPEST = 200
+TAIL_MOST = 128  # vertices that are kept in the tail at most
+SLACK = 8  # vertices beyond these that move down in one go, when a closure comes
+WAITING = 56  # as long as none comes
+INSIDE = 0.9  # share of the recent closures that a longer tail must hold
+
+
+@kernel
+def key_of(depth: int, region: int, vertex: int) -> int:
+    """Deeper regions are eliminated first, then as they came; the tail (depth -1) last."""
+    return ((DEEPEST - depth) << 54) | (region << 31) | vertex
+
+
+@kernel
+def move_tail(t: Tree, touched: Index) -> Index:
+    """Move the older vertices of a long tail down; returns all vertices this touches.
+
+    That waits for a change that goes further back, and so for a while if need be: what odometry alone adds is cheap.
+    """
+    vertex, region, tail, state = t.vertex, t.region, t.tail, t.state
+    first, end = state[TAIL_FIRST], state[TAIL_END]
+    state[RESTRUCTURED] += 1
+    if first == end:
+        return touched
+    back, beyond = 0, False
+    for v in touched:
+        back = max(back, tail[end - 1] - v)
+        beyond = beyond or vertex[v, REGION] != NOTHING
+    if back > TAIL_LEAST:
+        _decide_length(t, back)
+    keep = state[TAIL_KEPT]
+    beyond = beyond or (keep > TAIL_LEAST and back > TAIL_LEAST)
+    if end - first <= keep + (SLACK if beyond else WAITING):
+        return touched
+    last = end - keep
+    moving = tail[first:last]
+    state[TAIL_FIRST] = last
+    if last - first > max(region[0, R_COUNT], 4 * TAIL_LEAST):  # as many as there are: all in one go
+        for v in moving:
+            if vertex[v, FREE] == 1:
+                _enter(t, v, 0)
+        return np.concatenate((touched, dissect(t, 0)))
+    overgrown = NOTHING
+    for v in moving:
+        if vertex[v, FREE] == 0:
+            continue
+        _enter(t, v, _deepest_place(t, v))
+        r = vertex[v, REGION]
+        while r != NOTHING:
+            if region[r, R_COUNT] > GROWTH * region[r, R_MADE] + LEAF and (
+                overgrown == NOTHING or region[r, R_DEPTH] < region[overgrown, R_DEPTH]
+            ):
+                overgrown = r
+            r = region[r, R_PARENT]
+    if state[LIVE] > GROWTH * state[LIVE_MADE] > 0:
+        overgrown = 0
+    touched = np.concatenate((touched, neighbourhood(t, moving)))
+    if overgrown != NOTHING:
+        touched = np.concatenate((touched, dissect(t, overgrown)))
+    return touched
+
+
+@kernel
+def _decide_length(t: Tree, back: int) -> None:
+    """Decide how many vertices the tail keeps, now that a closure reaches back so far.
+
+    They are in the root, so a closure among them touches nothing else, but every update pays for them. So there are
+    more than a few only where most recent closures reach no further, and where a root of that size costs less than
+    updates cost while there were few. That is so where a robot sweeps row beside row.
+    """
+    state, reach = t.state, t.reach
+    reach[:-1] = reach[1:]
+    reach[-1] = back
+    updates = state[RESTRUCTURED] - state[RESTRUCTURED_SEEN]
+    spent = (state[FLOPS] - state[FLOPS_SEEN]) // updates
+    state[RESTRUCTURED_SEEN], state[FLOPS_SEEN] = state[RESTRUCTURED], state[FLOPS]
+    if state[TAIL_KEPT] == TAIL_LEAST:
+        state[FLOPS_USUAL] += (spent - state[FLOPS_USUAL]) // RECENT
+    enough = np.sort(reach)[int(INSIDE * RECENT)] + 1
+    state[TAIL_KEPT] = TAIL_LEAST
+    if enough <= TAIL_MOST:
+        size = (enough + SLACK) * t.vertex[t.tail[state[TAIL_END] - 1], DOF]
+        if 2 * size**3 <= state[FLOPS_USUAL]:
+            state[TAIL_KEPT] = enough
+
+
+@kernel
+def neighbourhood(t: Tree, vertices: Index) -> Index:
+    """The vertices and all that share an edge with one of them; some more than once."""
+    vertex, edge, link = t.vertex, t.edge, t.link
+    count = 0
+    for v in vertices:
+        count += 1
+        a = vertex[v, LINK]
+        while a != NOTHING:
+            count += edge[link[a, LINK_EDGE], COUNT]
+            a = link[a, LINK_NEXT]
+    out = np.empty(count, np.int64)
+    count = 0
+    for v in vertices:
+        out[count] = v
+        count += 1
+        a = vertex[v, LINK]
+        while a != NOTHING:
+            e = link[a, LINK_EDGE]
+            for s in range(edge[e, COUNT]):
+                out[count] = edge[e, END + s]
+                count += 1
+            a = link[a, LINK_NEXT]
+    return out
+
+
+@kernel
+def _enter(t: Tree, v: int, region: int) -> None:
+    """Put a vertex into a region."""
+    vertex, t_region = t.vertex, t.region
+    vertex[v, REGION] = region
+    vertex[v, KEY] = key_of(t_region[region, R_DEPTH], region, v)
+    vertex[v, NEXT] = t_region[region, R_FIRST]
+    t_region[region, R_FIRST] = v
+    while region != NOTHING:
+        t_region[region, R_COUNT] += 1
+        region = t_region[region, R_PARENT]
+
+
+@kernel
+def _deepest_place(t: Tree, v: int) -> int:
+    """The deepest region that has each region of v's neighbours above, at or below it, never beside it."""
+    vertex, region = t.vertex, t.region
+    deepest = NOTHING
+    for u in neighbourhood(t, np.array([v])):
+        r = vertex[u, REGION]
+        if r != NOTHING and (deepest == NOTHING or region[r, R_DEPTH] > region[deepest, R_DEPTH]):
+            deepest = r
+    place = max(deepest, 0)
+    beside = False
+    for u in neighbourhood(t, np.array([v])):
+        r = vertex[u, REGION]
+        if r == NOTHING:
+            continue
+        a = deepest
+        while region[a, R_DEPTH] > region[r, R_DEPTH]:
+            a = region[a, R_PARENT]
+        if a != r:
+            beside = True
+            while a != r:
+                a, r = region[a, R_PARENT], region[r, R_PARENT]
+            if region[a, R_DEPTH] < region[place, R_DEPTH]:
+                place = a
+    while not beside and region[place, R_LEFT] != NOTHING:  # beyond a separator: begin in the emptier part
+        left, right = region[place, R_LEFT], region[place, R_RIGHT]
+        place = left if region[left, R_COUNT] <= region[right, R_COUNT] else right
+    return place
+
+
+@kernel
+def _new_region(t: Tree, parent: int) -> int:
+    region, state = t.region, t.state
+    r = state[FREE_REGION]
+    if r != NOTHING:
+        state[FREE_REGION] = region[r, R_PARENT]
+    else:
+        r = state[REGIONS]
+        state[REGIONS] += 1
+    region[r, R_PARENT] = parent
+    region[r, R_DEPTH] = region[parent, R_DEPTH] + 1
+    region[r, R_LEFT] = region[r, R_RIGHT] = region[r, R_FIRST] = NOTHING
+    region[r, R_COUNT] = 0
+    return r
+
+
+@kernel
+def _clear(t: Tree, region: int) -> Index:
+    """Take all vertices out of a subtree of regions, and its inner regions away; returns the vertices by id."""
+    vertex, t_region, state = t.vertex, t.region, t.state
+    out = np.empty(t_region[region, R_COUNT], np.int64)
+    count = 0
+    stack = [region]
+    while len(stack):
+        r = stack.pop()
+        v = t_region[r, R_FIRST]
+        while v != NOTHING:
+            if vertex[v, FREE] == 1:
+                out[count] = v
+                count += 1
+            v = vertex[v, NEXT]
+        if t_region[r, R_LEFT] != NOTHING:
+            stack.append(t_region[r, R_LEFT])
+            stack.append(t_region[r, R_RIGHT])
+        if r != region:
+            t_region[r, R_PARENT] = state[FREE_REGION]
+            state[FREE_REGION] = r
+    t_region[region, R_FIRST] = t_region[region, R_LEFT] = t_region[region, R_RIGHT] = NOTHING
+    gone = t_region[region, R_COUNT]
+    r = region
+    while r != NOTHING:
+        t_region[r, R_COUNT] -= gone
+        r = t_region[r, R_PARENT]
+    return np.sort(out[:count])
+
+
+@kernel
+def dissect(t: Tree, region: int) -> Index:
+    """Divide a subtree anew, from its vertices and the edges among them; returns the vertices."""
+    t_region = t.region
+    vertices = _clear(t, region)
+    if region == 0:
+        t.state[LIVE_MADE] = 0  # it is told when there are cliques
+    start, neighbour, strength, weight = _graph_of(t, vertices)
+    n = len(vertices)
+    part = np.arange(n)
+    place = np.full(n, NOTHING, np.int64)
+    stack = [(0, n, region)]
+    while len(stack):
+        low, high, r = stack.pop()
+        mine = part[low:high].copy()
+        side = np.full(high - low, 2, np.int64)
+        if high - low > LEAF and t_region[r, R_DEPTH] < DEEPEST - 1:
+            side = separate(*_induced(mine, start, neighbour, strength, weight, place))
+        a, b = int(np.count_nonzero(side == 0)), int(np.count_nonzero(side == 1))
+        part[low : low + a] = mine[side == 0]
+        part[low + a : low + a + b] = mine[side == 1]
+        if a > 0 and b > 0:
+            left, right = _new_region(t, r), _new_region(t, r)
+            t_region[r, R_LEFT], t_region[r, R_RIGHT] = left, right
+            stack.append((low, low + a, left))
+            stack.append((low + a, low + a + b, right))
+        for k in mine[side == 2] if a > 0 and b > 0 else mine:
+            _enter(t, vertices[k], r)
+        t_region[r, R_MADE] = high - low
+    return vertices
+
+
+@kernel
+def _graph_of(t: Tree, vertices: Index) -> tuple[Index, Index, Index, Index]:
+    """The graph that active edges make of some vertices, numbered as they come (see ``separator``)."""
+    vertex, edge, link = t.vertex, t.edge, t.link
+    n = len(vertices)
+    most = 0
+    weight = np.empty(n, np.int64)
+    for k in range(n):
+        vertex[vertices[k], LOCAL] = k
+        weight[k] = vertex[vertices[k], DOF]
+        a = vertex[vertices[k], LINK]
+        while a != NOTHING:
+            most += edge[link[a, LINK_EDGE], COUNT] - 1
+            a = link[a, LINK_NEXT]
+    start, neighbour, strength = np.zeros(n + 1, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
+    place = np.full(n, NOTHING, np.int64)
+    top = 0
+    for k in range(n):
+        start[k] = top
+        a = vertex[vertices[k], LINK]
+        while a != NOTHING:
+            e = link[a, LINK_EDGE]
+            a = link[a, LINK_NEXT]
+            for s in range(edge[e, COUNT] if edge[e, ACTIVE] else 0):
+                u = vertex[edge[e, END + s], LOCAL]
+                if u in (NOTHING, k):
+                    continue
+                if place[u] < start[k]:
+                    place[u] = top
+                    neighbour[top], strength[top] = u, 0
+                    top += 1
+                strength[place[u]] += 1
+    start[n] = top
+    for v in vertices:
+        vertex[v, LOCAL] = NOTHING
+    return start, neighbour[:top], strength[:top], weight
+
+
+@kernel
+def _induced(
+    part: Index, start: Index, neighbour: Index, strength: Index, weight: Index, place: Index
+) -> tuple[Index, Index, Index, Index]:
+    """The graph of a part of its vertices; ``place`` is scratch, NOTHING everywhere before and after."""
+    n = len(part)
+    most = 0
+    for k in range(n):
+        place[part[k]] = k
+        most += start[part[k] + 1] - start[part[k]]
+    begin, joined, strong = np.zeros(n + 1, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
+    top = 0
+    for k in range(n):
+        for a in range(start[part[k]], start[part[k] + 1]):
+            if place[neighbour[a]] != NOTHING:
+                joined[top], strong[top] = place[neighbour[a]], strength[a]
+                top += 1
+        begin[k + 1] = top
+    for u in part:
+        place[u] = NOTHING
+    return begin, joined[:top], strong[:top], weight[part]

@@ -1,0 +1,405 @@
+"""Which cliques a change touches, and which cliques take their place."""
+
+import numpy as np
+
+from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.storage import (
+    ACTIVE,
+    CAPACITIES,
+    CHILD,
+    CLASS,
+    CLIQUE,
+    CLIQUES,
+    COUNT,
+    DOF,
+    END,
+    FREE,
+    FREE_CLIQUE,
+    FRONT,
+    FRONT_DOF,
+    FRONTALS,
+    FRONTS_TOP,
+    FULL_DOF,
+    KEY,
+    LINK,
+    LINK_EDGE,
+    LINK_NEXT,
+    LIVE,
+    LOCAL,
+    MARK,
+    MEMBERS,
+    MEMBERS_TOP,
+    NOTHING,
+    OWNER,
+    PARENT,
+    REGION,
+    SIBLING,
+    SIZE,
+    Index,
+    Tree,
+)
+
+RELAXED = 36  # zeros that a vertex may bring along when it joins a clique: fewer, larger fronts
+SHARE = 0.12  # or this share of a large one
+
+
+@kernel
+def mark(t: Tree, touched: Index) -> Index:
+    """The cliques of the touched vertices and all their ancestors, children before parents.
+
+    By the tree, not by the keys: where a region was ordered anew, what hangs below it may have later ones.
+    """
+    vertex, clique = t.vertex, t.clique
+    count = ways = 0
+    found, begin = np.empty(64, np.int64), np.empty(len(touched) + 1, np.int64)
+    for v in touched:
+        c = vertex[v, CLIQUE]
+        begin[ways] = count
+        while c != NOTHING and clique[c, MARK] == 0:
+            clique[c, MARK] = 1
+            if count == len(found):
+                found = np.concatenate((found, np.empty(count, np.int64)))
+            found[count] = c
+            count += 1
+            c = clique[c, PARENT]
+        ways += 1
+    begin[ways] = count
+    out = np.empty(count, np.int64)
+    at = 0
+    for w in range(ways - 1, -1, -1):  # each way ends below an earlier one
+        for k in range(begin[w], begin[w + 1]):
+            out[at] = found[k]
+            clique[found[k], MARK] = 0
+            at += 1
+    return out
+
+
+@kernel
+def collect(t: Tree, marked: Index, new: Index) -> tuple[Index, Index]:
+    """What is eliminated again (frontals of marked cliques, and new vertices) in order, and the orphans.
+
+    Orphans are unmarked children of marked cliques: their subtrees stay as they are.
+    """
+    vertex, clique, members = t.vertex, t.clique, t.members
+    count = len(new)
+    children = 0
+    for c in marked:
+        clique[c, MARK] = 1
+    for c in marked:
+        count += clique[c, FRONTALS]
+        k = clique[c, CHILD]
+        while k != NOTHING:
+            children += 1 - clique[k, MARK]
+            k = clique[k, SIBLING]
+    affected, orphans = np.empty(count, np.int64), np.empty(children, np.int64)
+    count = children = 0
+    for v in new:
+        if vertex[v, FREE] == 1:
+            affected[count] = v
+            count += 1
+    for c in marked:
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+            if vertex[members[m], FREE] == 1:
+                affected[count] = members[m]
+                count += 1
+        k = clique[c, CHILD]
+        while k != NOTHING:
+            if clique[k, MARK] == 0:
+                orphans[children] = k
+                children += 1
+            k = clique[k, SIBLING]
+    for c in marked:
+        clique[c, MARK] = 0
+    affected = affected[:count]
+    key = np.empty(count, np.int64)
+    for k in range(count):
+        key[k] = vertex[affected[k], KEY]
+    return affected[np.argsort(key)], orphans
+
+
+@kernel
+def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
+    """What each eliminated vertex leaves connected: of the k-th, numbers in ``order``, all later, the nearest first.
+
+    It is joined by edges, by the separators of orphans, and by what earlier vertices left (its children in the
+    elimination tree). Returns where each begins (n + 1) and the numbers.
+    """
+    vertex = t.vertex
+    n = len(order)
+    for k in range(n):
+        vertex[order[k], LOCAL] = k
+    orphan_of, orphan_next = _by_first(t, orphans, n)
+    child_of, child_next = np.full(n, NOTHING, np.int64), np.full(n, NOTHING, np.int64)
+    seen = np.full(n, NOTHING, np.int64)
+    start = np.zeros(n + 1, np.int64)
+    later = np.empty(8 * n + 64, np.int64)
+    top = 0
+    for k in range(n):
+        start[k] = top
+        if top + n - k > len(later):
+            later = np.concatenate((later, np.empty(len(later) + n, np.int64)))
+        top = _joined_by_edges(t, order[k], k, seen, later, top)
+        i = orphan_of[k]
+        while i != NOTHING:
+            top = _joined_by_orphan(t, orphans[i], k, seen, later, top)
+            i = orphan_next[i]
+        i = child_of[k]
+        while i != NOTHING:
+            for m in range(start[i], start[i + 1]):
+                top = _note(later[m], k, seen, later, top)
+            i = child_next[i]
+        if top > start[k]:
+            nearest = start[k] + np.argmin(later[start[k] : top])
+            later[start[k]], later[nearest] = later[nearest], later[start[k]]
+            parent = later[start[k]]
+            child_next[k] = child_of[parent]
+            child_of[parent] = k
+        start[k + 1] = top
+    for v in order:
+        vertex[v, LOCAL] = NOTHING
+    return start, later
+
+
+@kernel
+def _by_first(t: Tree, orphans: Index, n: int) -> tuple[Index, Index]:
+    """Linked lists of the orphans by the vertex of their separator that is eliminated first."""
+    vertex, clique, members = t.vertex, t.clique, t.members
+    orphan_of, orphan_next = np.full(n, NOTHING, np.int64), np.empty(len(orphans), np.int64)
+    for i in range(len(orphans)):
+        c = orphans[i]
+        first = n
+        for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
+            first = min(first, vertex[members[m], LOCAL])
+        orphan_next[i] = orphan_of[first]
+        orphan_of[first] = i
+    return orphan_of, orphan_next
+
+
+@kernel
+def _note(u: int, k: int, seen: Index, later: Index, top: int) -> int:
+    """Note u as connected to k, once, if it is later; returns how many are noted."""
+    if u > k and seen[u] != k:
+        seen[u] = k
+        later[top] = u
+        return top + 1
+    return top
+
+
+@kernel
+def _joined_by_edges(t: Tree, v: int, k: int, seen: Index, later: Index, top: int) -> int:
+    """Note what edges join to v; it owns those of which it is eliminated first."""
+    vertex, edge, link = t.vertex, t.edge, t.link
+    a = vertex[v, LINK]
+    while a != NOTHING:
+        e = link[a, LINK_EDGE]
+        a = link[a, LINK_NEXT]
+        if edge[e, ACTIVE] == 0:
+            continue
+        first = True
+        for s in range(edge[e, COUNT]):
+            w = edge[e, END + s]
+            u = vertex[w, LOCAL]
+            first = first and not (u < k and vertex[w, FREE] == 1)
+            top = _note(u, k, seen, later, top)
+        if first:
+            edge[e, OWNER] = v
+    return top
+
+
+@kernel
+def _joined_by_orphan(t: Tree, c: int, k: int, seen: Index, later: Index, top: int) -> int:
+    """Note what an orphan's separator joins."""
+    vertex, clique, members = t.vertex, t.clique, t.members
+    for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
+        top = _note(vertex[members[m], LOCAL], k, seen, later, top)
+    return top
+
+
+@kernel
+def cliques_of(t: Tree, order: Index, start: Index, later: Index) -> tuple[Index, Index, Index]:
+    """Group vertices into cliques, parents before children.
+
+    A vertex joins its parent's clique where that gains few zeros. Returns the clique of each vertex, and of each
+    clique its last vertex and its size in degrees of freedom.
+    """
+    vertex = t.vertex
+    n = len(order)
+    clique = np.empty(n, np.int64)
+    last, head, size = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    count = 0
+    for k in range(n - 1, -1, -1):
+        dof = vertex[order[k], DOF]
+        width = 0
+        for m in range(start[k], start[k + 1]):
+            width += vertex[order[later[m]], DOF]
+        if width > 0:
+            parent = later[start[k]]
+            c = clique[parent]
+            same = (vertex[order[k], REGION] == NOTHING) == (vertex[order[parent], REGION] == NOTHING)
+            zeros = size[c] - width
+            if head[c] == parent and (zeros * dof <= RELAXED or (same and zeros <= SHARE * size[c])):
+                clique[k], head[c] = c, k
+                size[c] += dof
+                continue
+        clique[k], last[count], head[count], size[count] = count, k, k, width + dof
+        count += 1
+    return clique, last[:count], size[:count]
+
+
+@kernel
+def capacity_class(size: int) -> int:
+    """The least size class that has room for so many degrees of freedom."""
+    return int(np.searchsorted(CAPACITIES, size))
+
+
+@kernel
+def room_for(t: Tree, size: Index, leaving: Index) -> tuple[int, int, int]:
+    """What new cliques of these sizes add to the pools: cliques, members, numbers of fronts.
+
+    They take the places of those that leave, and vacant ones, first.
+    """
+    clique, vacant = t.clique, t.vacant
+    wanted = np.zeros(len(CAPACITIES), np.int64)
+    for s in size:
+        wanted[capacity_class(s)] += 1
+    for c in leaving:
+        wanted[clique[c, CLASS]] -= 1
+    count = members = numbers = 0
+    for k in range(len(CAPACITIES)):
+        c = vacant[k]
+        while c != NOTHING and wanted[k] > 0:
+            wanted[k] -= 1
+            c = clique[c, SIBLING]
+        more = max(wanted[k], 0)
+        count += more
+        members += more * CAPACITIES[k]
+        numbers += more * numbers_of(k)
+    return count, members, numbers
+
+
+@kernel
+def release(t: Tree, cliques: Index) -> None:
+    """Give cliques back: their places are used again by the next ones of the same size class, while still in cache."""
+    vertex, clique, vacant, members = t.vertex, t.clique, t.vacant, t.members
+    for c in cliques:
+        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+            if vertex[members[m], CLIQUE] == c:  # it is no unknown any more
+                vertex[members[m], CLIQUE] = NOTHING
+        k = clique[c, CLASS]
+        clique[c, SIBLING] = vacant[k]
+        vacant[k] = c
+        t.state[LIVE] -= numbers_of(k)
+
+
+@kernel
+def _take(t: Tree, size: int) -> int:
+    clique, vacant, state = t.clique, t.vacant, t.state
+    k = capacity_class(size)
+    c = vacant[k]
+    state[LIVE] += numbers_of(k)
+    if c != NOTHING:
+        vacant[k] = clique[c, SIBLING]
+        return c
+    c = state[FREE_CLIQUE]
+    if c != NOTHING:
+        state[FREE_CLIQUE] = clique[c, SIBLING]
+    else:
+        c = state[CLIQUES]
+        state[CLIQUES] += 1
+    clique[c, CLASS] = k
+    clique[c, MARK] = 0
+    clique[c, MEMBERS] = state[MEMBERS_TOP]
+    clique[c, FRONT] = state[FRONTS_TOP]
+    state[MEMBERS_TOP] += CAPACITIES[k]
+    state[FRONTS_TOP] += numbers_of(k)
+    return c
+
+
+@kernel
+def numbers_of(size_class: int) -> int:
+    """The numbers of a front."""
+    return CAPACITIES[size_class] * (CAPACITIES[size_class] + 1)
+
+
+@kernel
+def compact(t: Tree) -> None:
+    """Move all cliques together in memory; those that are vacant keep none."""
+    clique, vacant, members, fronts, state = t.clique, t.vacant, t.members, t.fronts, t.state
+    live = np.ones(state[CLIQUES], np.bool_)
+    c = state[FREE_CLIQUE]
+    while c != NOTHING:
+        live[c] = False
+        c = clique[c, SIBLING]
+    for k in range(len(vacant)):
+        while vacant[k] != NOTHING:
+            c = vacant[k]
+            vacant[k] = clique[c, SIBLING]
+            live[c] = False
+            clique[c, SIBLING] = state[FREE_CLIQUE]
+            state[FREE_CLIQUE] = c
+    member = front = 0
+    for c in np.argsort(clique[: state[CLIQUES], FRONT]):  # each goes down, so none is written over before it has moved
+        if live[c]:
+            k = clique[c, CLASS]
+            for i in range(CAPACITIES[k]):
+                members[member + i] = members[clique[c, MEMBERS] + i]
+            for i in range(numbers_of(k)):
+                fronts[front + i] = fronts[clique[c, FRONT] + i]
+            clique[c, MEMBERS], clique[c, FRONT] = member, front
+            member += CAPACITIES[k]
+            front += numbers_of(k)
+    state[MEMBERS_TOP], state[FRONTS_TOP] = member, front
+
+
+@kernel
+def build(
+    t: Tree, order: Index, start: Index, later: Index, group: Index, last: Index, size: Index, orphans: Index
+) -> Index:
+    """Write the new cliques into the tree; returns them, children before parents."""
+    vertex, clique, members = t.vertex, t.clique, t.members
+    n, count = len(order), len(last)
+    new = np.empty(count, np.int64)
+    fill = np.empty(count, np.int64)
+    frontals = np.zeros(count, np.int64)
+    for k in range(n):
+        frontals[group[k]] += 1
+    for j in range(count):
+        c = new[j] = _take(t, size[j])
+        k = last[j]
+        clique[c, FRONTALS] = frontals[j]
+        clique[c, SIZE] = frontals[j] + start[k + 1] - start[k]
+        clique[c, FULL_DOF] = size[j]
+        clique[c, FRONT_DOF] = 0
+        clique[c, PARENT] = clique[c, CHILD] = clique[c, SIBLING] = NOTHING
+        fill[j] = clique[c, MEMBERS]
+        separator = fill[j] + frontals[j]
+        for m in range(start[k], start[k + 1]):
+            members[separator] = order[later[m]]
+            separator += 1
+    for k in range(n):
+        j, v = group[k], order[k]
+        members[fill[j]] = v
+        fill[j] += 1
+        vertex[v, CLIQUE] = new[j]
+        clique[new[j], FRONT_DOF] += vertex[v, DOF]
+    for j in range(count):
+        k = last[j]
+        if start[k + 1] > start[k]:
+            _hang(t, new[j], new[group[later[start[k]]]])
+    for c in orphans:
+        parent = NOTHING
+        key = np.iinfo(np.int64).max
+        for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
+            if vertex[members[m], KEY] < key:
+                key = vertex[members[m], KEY]
+                parent = vertex[members[m], CLIQUE]
+        _hang(t, c, parent)
+    return new[::-1].copy()
+
+
+@kernel
+def _hang(t: Tree, c: int, parent: int) -> None:
+    clique = t.clique
+    clique[c, PARENT] = parent
+    clique[c, SIBLING] = clique[parent, CHILD]
+    clique[parent, CHILD] = c

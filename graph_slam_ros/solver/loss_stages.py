@@ -1,0 +1,62 @@
+"""Losses in stages: an edge that has just arrived is held to the first of its loss, one update later to the last."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.solver.batch import Settings
+from graph_slam_ros.solver.linearization import Losses, chi2_of
+from graph_slam_ros.solver.pending import NONE
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class Stages:
+    """Which loss each edge has at present.
+
+    Attributes
+    ----------
+    young : edges that have had but one update
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        self.young = NONE
+        self._graph = graph
+        self._losses: list[Losses] = []
+        self._made_for: tuple[int, Settings | None] = 0, None  # so many labels, and their settings
+
+    def losses(self, settings: Settings) -> list[Losses]:
+        """Of each stage."""
+        count, made_for = self._made_for
+        if count != len(self._graph.labels) or made_for is not settings:
+            self._made_for = len(self._graph.labels), settings
+            self._losses = [Losses(self._graph, by_label) for by_label in settings.stages()]
+        return self._losses
+
+    def of(self, edges: Index, settings: Settings) -> list[tuple[Index, Losses]]:
+        """Edges by the loss that they have."""
+        stages = self.losses(settings)
+        if not len(self.young):
+            return [(edges, stages[-1])]
+        young = np.isin(edges, self.young)
+        return [(edges[young], stages[0]), (edges[~young], stages[-1])]
+
+    def begin(self, edges: Index, settings: Settings) -> None:
+        """These arrive; those that were young are so no more."""
+        self.young = edges if len(self.losses(settings)) > 1 else NONE
+
+    def mature(self, values: Array, settings: Settings) -> None:
+        """Only those stay young which the last stage of their loss weighs otherwise than the first."""
+        if not len(self.young):
+            return
+        first, *_, last = self.losses(settings)
+        chi2, _ = chi2_of(self._graph, values, self.young)
+        changes = []
+        for edge, fit in zip(self.young.tolist(), chi2.tolist(), strict=True):
+            table, row = self._graph.row(edge)
+            label, s = int(table.label.values[row]), fit * float(table.weight.values[row])
+            before, after = (weight_and_cost(one.kind[label], one.scale[label], s)[0] for one in (first, last))
+            changes.append(before != after)
+        self.young = self.young[changes]

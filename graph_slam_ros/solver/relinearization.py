@@ -1,0 +1,43 @@
+"""When large steps are looked for, which are linearised anew."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph_slam_ros.solver.clique_tree.storage import TAIL_LEAST
+from graph_slam_ros.solver.pending import NONE
+
+Index = NDArray[np.int64]
+
+BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
+
+
+class Schedule:
+    """Counts updates, and keeps what moved in them until large steps are looked for among all of it."""
+
+    def __init__(self) -> None:
+        self._moved: list[Index] = []
+        self._unseen = NONE
+        self._updates = 0
+
+    def note(self, moved: Index) -> None:
+        """Vertices that moved after the last look of an update: the next looks at them."""
+        self._moved.append(moved)
+        self._unseen = moved
+
+    def hasten(self, every: int) -> None:
+        """Have the present update look among all."""
+        self._updates = every
+
+    def after_update(self, moved: Index, every: int) -> tuple[Index, float]:
+        """Among which vertices to look for large steps now, and beyond how many times the threshold.
+
+        After so many updates among all that moved since, sooner if much moved anyway; else among what this one moved.
+        """
+        self._moved.append(moved)
+        self._updates += 1
+        if self._updates * (3 if len(moved) > TAIL_LEAST else 2) < 2 * every:
+            unseen, self._unseen = self._unseen, NONE
+            return np.union1d(moved, unseen) if len(unseen) else moved, BY_FAR
+        moved = np.unique(np.concatenate(self._moved))
+        self._moved, self._unseen, self._updates = [], NONE, 0
+        return moved, 1.0
