@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from benchmarks.problem import Array, Edges, Problem, joined
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph.geometry import PLANE
+from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.simulation import Fault
 from graph_slam_ros.simulation import false_closures as generator
@@ -116,7 +116,7 @@ def _with_wrong_ids(problem: Problem, fault: Fault, seed: int) -> Trial:
     seen, nowhere = problem.sightings, np.zeros((len(problem.poses), 3))
     named = [Sighting(str(landmark), "position", (0.0, 0.0), ()) for landmark in seen.ends[:, 1].tolist()]
     draft = Draft(
-        PLANE,
+        PLANAR,
         nowhere,
         nowhere,
         None,

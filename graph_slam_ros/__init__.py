@@ -9,13 +9,15 @@ __version__ = "0.1.0"
 TYPE_CHECKING = False  # type checkers take it for true; typing itself is slow to import
 if TYPE_CHECKING:
     from graph_slam_ros.certificate import Certificate, certify
+    from graph_slam_ros.config import Config
     from graph_slam_ros.formats.g2o import read_g2o
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.graph import Gaussian, Graph
+    from graph_slam_ros.measurements import Control, Odometry, Sighting, Sightings
     from graph_slam_ros.optimization import Solution, optimize
     from graph_slam_ros.runs.replay import replay
     from graph_slam_ros.runs.saved_run import SavedRun, load_run
-    from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+    from graph_slam_ros.slam import GraphSlam
     from graph_slam_ros.solver import Settings, Solver
 
 __all__ = [
@@ -43,12 +45,14 @@ __all__ = [
 _HOMES = {
     "optimization": ("Solution", "optimize"),
     "certificate": ("Certificate", "certify"),
+    "config": ("Config",),
     "formats.g2o": ("read_g2o",),
     "formats.g2o_writer": ("write_g2o",),
     "graph": ("Gaussian", "Graph"),
+    "measurements": ("Control", "Odometry", "Sighting", "Sightings"),
     "runs.replay": ("replay",),
     "runs.saved_run": ("SavedRun", "load_run"),
-    "slam": ("Config", "Control", "GraphSlam", "Odometry", "Sighting", "Sightings"),
+    "slam": ("GraphSlam",),
     "solver": ("Settings", "Solver"),
 }
 

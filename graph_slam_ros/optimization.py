@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 
 from graph_slam_ros.errors import GraphSlamError
@@ -12,9 +11,7 @@ from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.solver import Report, Settings, Solver, initial_values
-
-Array = NDArray[np.float64]
-
+from graph_slam_ros.typing import Array
 
 _FAR_ABOVE = 2.0  # times its degrees of freedom: chi2 of an optimum is about as large as these, or smaller
 _UNLIKELY = 1e-3  # that one edge of a graph has so large a residual by chance

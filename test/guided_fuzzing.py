@@ -38,7 +38,7 @@ def target(name, file):
     from graph_slam_ros.formats.g2o import read_g2o
     from graph_slam_ros.formats.parameters import read_parameters
     from graph_slam_ros.measurements.types import from_record
-    from graph_slam_ros.messages.from_msg import Border
+    from graph_slam_ros.messages.from_msg import MessageConverter
     from graph_slam_ros.runs.journal import INGEST, RecordWriter, read_ingest
     from graph_slam_ros.runs.map_journal import MAP, read_map
     from graph_slam_ros.slam import Config, Counters, GraphSlam
@@ -57,7 +57,7 @@ def target(name, file):
     def cdr(data):
         """The first byte is the input's; the message is told twice, since the second meets what the first left."""
         if data:
-            border = Border(config, Counters())
+            border = MessageConverter(config, Counters())
             for _ in range(2):
                 border.take(tuple(INPUTS)[data[0] % len(INPUTS)], data[1:])
 

@@ -6,7 +6,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from graph_slam_ros.lie import se2
-from graph_slam_ros.messages.from_msg import Border
+from graph_slam_ros.messages.from_msg import MessageConverter
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.to_msg import covariance6, encode, header, make, point, vector
 from graph_slam_ros.recordings.bag import BagWriter, Topic
@@ -109,7 +109,7 @@ def recorded(type_name, definition):
 def border(*links, decoders=None, **sections):
     """A border of this configuration that has been told of these fixed links, and waits for no others but if told."""
     sections["inputs"] = {"tf": False, **sections.get("inputs", {})}
-    out = Border(Config.from_mapping(sections), Counters(), decoders)
+    out = MessageConverter(Config.from_mapping(sections), Counters(), decoders)
     if links:
         out.take("tf_static", transforms(*links))
     return out

@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-NOT_COPIED = shutil.ignore_patterns(
-    ".*", "__pycache__", "*.egg-info", "benchmarks", "build", "install", "log", "runs", "soak"
-)
+NOT_COPIED = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info")
+NOT_COPIED_OF_ROOT = {"benchmarks", "build", "install", "log", "runs", "soak"}
 LIMIT_S, FIRST_LIMIT_S = 300, 1200  # the first compiles the kernels of the copy
 BROKEN = ("ImportError", "ModuleNotFoundError", "NameError", "SyntaxError")  # of a bug that was badly planted
 PASSED, FAILED = 0, 1  # exit codes of pytest
@@ -191,6 +190,10 @@ class Ended:
         return f"exit code {self.code}, {self.passed} passed, {len(self.failures)} failed, {self.errors} errors{first}"
 
 
+def _not_copied(folder, names):
+    return NOT_COPIED(folder, names) | (NOT_COPIED_OF_ROOT & set(names) if Path(folder) == ROOT else set())
+
+
 def ended(root, tests, limit_s):
     """Run tests of a copy in a process of its own."""
     report = root / "report.xml"
@@ -250,7 +253,7 @@ def main(*names):
     bugs = [bug for bug in BUGS if bug.name in (names or {bug.name for bug in BUGS})]
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "copy"
-        shutil.copytree(ROOT, root, ignore=NOT_COPIED)
+        shutil.copytree(ROOT, root, ignore=_not_copied)
         tests = dict.fromkeys(test for bug in bugs for test in bug.tests)
         how = ended(root, tests, FIRST_LIMIT_S)
         print(f"without any bug: {how}", flush=True)

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from graph_slam_ros.slam.frontend.motion_compensation import Carried
+from graph_slam_ros.slam.frontend.motion_compensation import KeyframeMeasurement
 from graph_slam_ros.slam.landmarks import association
 from graph_slam_ros.slam.landmarks.association import NEW, UNCLEAR, Candidates, Expected, Gates, likely_pairings
 
@@ -14,7 +14,7 @@ SIGMA = 0.1
 
 
 def seen(*points, sigma=SIGMA):
-    return [Carried(tuple(map(float, p)), sigma**2 * np.eye(2)) for p in points]
+    return [KeyframeMeasurement(tuple(map(float, p)), sigma**2 * np.eye(2)) for p in points]
 
 
 def landmarks(*points, sigma=SIGMA, shared=0.0, followed=None):

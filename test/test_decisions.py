@@ -7,7 +7,7 @@ import pytest
 
 from graph_slam_ros.graph import LANDMARK_POSITION, POSE_PRIOR, R2, RELATIVE_POSE, SE2, Gaussian
 from graph_slam_ros.lie import se2
-from graph_slam_ros.node.threads import in_a_thread
+from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.robust.background import when_asked
@@ -185,7 +185,7 @@ def test_G11_two_places_that_look_the_same_are_reported_as_ambiguous_with_what_s
 
 def test_a_second_look_decides_the_same_whether_it_is_taken_in_a_thread_or_when_it_is_asked_for():
     often = {"second_look_after": 3, "apply_after_keyframes": 5}
-    runs = [Drive(1, beside, **often).go(100, lies(every=1)) for beside in (when_asked, in_a_thread)]
+    runs = [Drive(1, beside, **often).go(100, lies(every=1)) for beside in (when_asked, run_in_thread)]
     histories = [run.backend.ledger.history for run in runs]
     assert histories[0] == histories[1]
     poses = [run.backend.solver.estimate(range(100)) for run in runs]

@@ -12,7 +12,7 @@ from graph_slam_ros.runs import map_of, record_run
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
-from graph_slam_ros.slam.snapshot import MapState
+from graph_slam_ros.slam.snapshot import MapSnapshot
 
 DISPLACED = ("odometry", "displaced")
 
@@ -180,7 +180,7 @@ def test_an_alarm_is_in_the_summary_and_a_map_with_a_segment_in_the_past_is_take
     (told,) = summary["displacements"]
     assert told["segment"] == slam.alarms[0].segment
     state = map_of(tmp_path / "run", [])
-    assert isinstance(state, MapState)
+    assert isinstance(state, MapSnapshot)
     assert state.segments == slam.segments
     again = GraphSlam(Config(), start=state)
     assert np.abs((again.trajectory() - slam.trajectory())[:, :2]).max() < 0.05  # solved anew, all of it

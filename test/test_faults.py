@@ -9,7 +9,7 @@ import pytest
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.messages.from_msg import Border
+from graph_slam_ros.messages.from_msg import MessageConverter
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.simulation import (
@@ -288,7 +288,7 @@ def test_closures_of_a_bag_decode_to_those_it_was_made_of_and_the_table_finds_it
         "loops.topic": "closures",
     }
     counters = Counters()
-    border = Border(Config.from_mapping(settings), counters)
+    border = MessageConverter(Config.from_mapping(settings), counters)
     bag, decoded, messages = open_bag(tmp_path / "bag.mcap"), [], {}
     for record in bag.messages(["/odom", "/landmarks", "/closures"]):
         messages[record.topic, record.log_ns] = typestore().deserialize_cdr(record.cdr, bag.topics[record.topic].type)

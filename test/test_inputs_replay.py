@@ -149,7 +149,7 @@ def test_a_type_that_only_the_recording_defines_is_read_by_its_definition(tmp_pa
 
 
 def test_the_readme_has_a_row_for_every_type_with_what_it_becomes_and_its_example_is_one(tmp_path):
-    readme = (Path(__file__).resolve().parents[1] / "README.md").read_text()
+    readme = (Path(__file__).resolve().parents[1] / "docs/inputs.md").read_text()
     section = readme[readme.index("### Inputs") : readme.index("### With ROS 2")]
     rows = [line.split("|") for line in section.splitlines() if line.startswith("| ")]
     for type_name, there in CONVERTERS.items():

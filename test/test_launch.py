@@ -1,4 +1,4 @@
-"""The launch file: its arguments are those of the README; where launch is installed, it starts the node and ends it."""
+"""The launch file: its arguments are those of docs/ros.md; where launch is installed, it starts and ends the node."""
 
 import ast
 import contextlib
@@ -51,7 +51,7 @@ def arguments():
 
 
 def test_the_readme_has_every_argument_with_its_default_and_meaning():
-    _, _, below = (ROOT / "README.md").read_text().partition("| argument | default | |\n|---|---|---|\n")
+    _, _, below = (ROOT / "docs/ros.md").read_text().partition("| argument | default | |\n|---|---|---|\n")
     rows = [f"| `{name}` | {f'`{default}`' if default else ''} | {text} |" for name, default, text in arguments()]
     assert below.split("\n\n")[0].splitlines() == rows
     assert len(rows) == 10
@@ -181,7 +181,7 @@ def test_the_node_comes_up_and_ctrl_c_ends_it_cleanly(prefix):
 def test_the_lines_of_the_readme_for_two_robots_start_both(prefix, monkeypatch):
     install(prefix, NODE, RUN_NODE)
     monkeypatch.chdir(prefix)
-    line = re.search(r"namespace:=robot1 frame_prefix:=robot1/", (ROOT / "README.md").read_text())[0]
+    line = re.search(r"namespace:=robot1 frame_prefix:=robot1/", (ROOT / "docs/ros.md").read_text())[0]
     with contextlib.ExitStack() as stack:
         both = [
             stack.enter_context(launched(prefix, *line.replace("robot1", name).split())) for name in ("robot1", "two")

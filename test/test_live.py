@@ -13,9 +13,9 @@ from messages import STAMP_NS
 from graph_slam_ros.lie import so3
 from graph_slam_ros.node import diagnostics
 from graph_slam_ros.node.diagnostics import Facts, InputFacts, judge, statuses
-from graph_slam_ros.node.future_stamps import Ahead
+from graph_slam_ros.node.future_stamps import FutureStamps
 from graph_slam_ros.node.map_to_odom import MapToOdom
-from graph_slam_ros.node.pose_extrapolator import Reckoning
+from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.recent import Recent, RecentInputs
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.throttle import Throttle
@@ -105,7 +105,7 @@ def drive(dimensions, k, source="odometry"):
 @pytest.mark.parametrize("heard_from", [0, 19])
 def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_keyframe_there(dimensions, heard_from):
     rare, often = round_a_curve(dimensions, 3.2), round_a_curve(dimensions, 0.4)
-    reckoning = Reckoning(rare.config)
+    reckoning = PoseExtrapolator(rare.config)
     for k in range(heard_from, 21):
         assert reckoning.hear(drive(dimensions, k), rare.estimate)
     at, covariance = reckoning.pose(rare.estimate)
@@ -123,7 +123,7 @@ def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_key
 
 def test_asking_at_each_message_or_at_the_last_alone_gives_the_same():
     session = round_a_curve(2, 3.2)
-    often, once = Reckoning(session.config), Reckoning(session.config)
+    often, once = PoseExtrapolator(session.config), PoseExtrapolator(session.config)
     for k in range(15, 40):
         for one in (often, once):
             one.hear(drive(2, k), session.estimate)
@@ -134,7 +134,7 @@ def test_asking_at_each_message_or_at_the_last_alone_gives_the_same():
 
 def test_another_odometry_or_an_older_message_says_nothing_of_the_robot_in_the_map():
     session = round_a_curve(2, 3.2)
-    reckoning = Reckoning(session.config)
+    reckoning = PoseExtrapolator(session.config)
     assert reckoning.hear(drive(2, 19), session.estimate)
     assert not reckoning.hear(drive(2, 20, "another"), session.estimate)
     assert not reckoning.hear(drive(2, 18), session.estimate)
@@ -151,7 +151,7 @@ def seen(stamp_ns):
 
 def test_B6_what_is_ahead_of_the_clock_waits_for_it_and_keeps_its_order(monkeypatch):
     clock, refused = [10 * NS], []
-    ahead = Ahead(1.0, lambda: clock[0], refused.append)
+    ahead = FutureStamps(1.0, lambda: clock[0], refused.append)
     now, soon, then = seen(11 * NS), seen(13 * NS), seen(5 * NS)
     assert list(ahead.pass_on(now)) == [now]
     assert list(ahead.pass_on(soon)) == []
@@ -167,7 +167,7 @@ def test_B6_what_is_ahead_of_the_clock_waits_for_it_and_keeps_its_order(monkeypa
 
 
 def test_where_no_clock_runs_or_nobody_asks_nothing_is_ahead():
-    for ahead in (Ahead(1.0, lambda: 0, pytest.fail), Ahead(0.0, lambda: NS, pytest.fail)):
+    for ahead in (FutureStamps(1.0, lambda: 0, pytest.fail), FutureStamps(0.0, lambda: NS, pytest.fail)):
         assert list(ahead.pass_on(seen(10**18))) == [seen(10**18)]
 
 
@@ -307,7 +307,7 @@ def test_what_is_wrong_before_the_first_estimate_is_named(facts, state, reason):
 def test_at_work_it_is_well_or_degraded_with_the_reason(values, inputs, reason):
     estimate = round_a_curve(2, 3.2).estimate
     verdict = judge(Facts("active", inputs or (odom(received=9, silent_s=0.0),), estimate, **values), Config())
-    assert verdict == diagnostics.Verdict("DEGRADED", (reason,)) if reason else verdict == diagnostics.Verdict("OK")
+    assert verdict == diagnostics.Health("DEGRADED", (reason,)) if reason else verdict == diagnostics.Health("OK")
     told = list(statuses(Facts("active", inputs, estimate, **values), verdict, "slam"))
     assert told[0].values["healthy"] == str(not reason)
     assert told[0].message == "; ".join(("DEGRADED", reason) if reason else ("OK",))

@@ -12,7 +12,7 @@ from graph_slam_ros import cli
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.runs import RunError, RunRecorder, is_cut_off, keep_earlier, map_of, run_config
 from graph_slam_ros.runs.journal import RecordWriter, read_records
-from graph_slam_ros.runs.map_journal import MAP, Growth, read_map, state_of
+from graph_slam_ros.runs.map_journal import MAP, MapGrowth, read_map, state_of
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
@@ -27,7 +27,7 @@ WORLDS = {
 
 def told(state):
     """All of a map, as JSON."""
-    return json.loads(json.dumps(Growth().since(state)))
+    return json.loads(json.dumps(MapGrowth().since(state)))
 
 
 @pytest.fixture(scope="module", params=[*WORLDS, "flight"])
@@ -84,7 +84,7 @@ def test_it_is_solved_to_where_it_was(run):
 
 def test_a_map_that_is_taken_up_is_written_down_as_it_was_read(run):
     folder, _ = run
-    first, second = (Growth(read_map(folder, [])).first for _ in range(2))
+    first, second = (MapGrowth(read_map(folder, [])).first for _ in range(2))
     assert json.dumps(first) == json.dumps(second)
     again = told(state_of(GraphSlam(run_config(folder), start=read_map(folder, []))))
     for part in ("vertices", "edges", "changes", "keyframes", "landmarks"):

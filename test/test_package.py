@@ -18,57 +18,61 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "graph_slam_ros"
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
 
-# From the lowest floor up: what a folder, or a module of the top, may import of the package besides itself. Each names
-# only what stands above its own line here, so that there is no circle.
+# From the lowest floor up: what a folder, or a module of the top, may import of the package besides itself, errors.py
+# and typing.py. Each names only what stands above its own line here, so that there is no circle.
 WITHIN = {
     "errors.py": set(),
     "progress.py": set(),
-    "lie": {"errors"},
-    "graph": {"errors", "lie"},
+    "typing.py": set(),
+    "lie": set(),
+    "graph": {"lie"},
     "solver/clique_tree": {"lie", "graph"},
-    "solver": {"errors", "lie", "graph", "solver/clique_tree"},
-    "warmup.py": {"errors", "progress", "lie", "graph", "solver"},
-    "formats": {"errors", "lie", "graph"},
-    "optimization.py": {"errors", "graph", "solver", "formats"},
-    "certificate": {"errors", "lie", "graph", "solver", "optimization"},
-    "measurements": {"errors", "graph"},
-    "config": {"errors", "lie", "graph", "solver"},
-    "slam/frontend": {"errors", "lie", "graph", "measurements", "config"},
-    "slam/landmarks": {"errors", "lie", "graph", "solver", "measurements", "config", "slam/frontend"},
-    "slam/robust": {"errors", "lie", "graph", "solver", "measurements", "config", "slam/frontend", "slam/landmarks"},
+    "solver": {"lie", "graph", "solver/clique_tree"},
+    "warmup.py": {"progress", "lie", "graph", "solver"},
+    "formats": {"lie", "graph"},
+    "optimization.py": {"graph", "solver", "formats"},
+    "certificate": {"lie", "graph", "solver", "optimization"},
+    "measurements": {"graph"},
+    "config": {"lie", "graph", "solver"},
+    "slam/frontend": {"lie", "graph", "measurements", "config"},
+    "slam/landmarks": {"lie", "graph", "solver", "measurements", "config", "slam/frontend"},
+    "slam/robust": {"lie", "graph", "solver", "measurements", "config", "slam/frontend", "slam/landmarks"},
     "slam": {
-        *("errors", "lie", "graph", "solver", "measurements", "config"),
+        *("lie", "graph", "solver", "measurements", "config"),
         *("slam/frontend", "slam/landmarks", "slam/robust"),
     },
-    "messages/inputs": {"errors", "lie", "graph", "measurements", "config"},
-    "messages": {"errors", "lie", "graph", "formats", "measurements", "config", "slam", "messages/inputs"},
-    "recordings": {"errors", "lie", "formats", "messages", "messages/inputs"},
+    "messages/inputs": {"lie", "graph", "measurements", "config"},
+    "messages": {"lie", "graph", "formats", "measurements", "config", "slam", "messages/inputs"},
+    "recordings": {"lie", "formats", "messages", "messages/inputs"},
     "runs": {
-        *("errors", "lie", "graph", "solver", "warmup", "formats", "measurements", "config"),
+        *("lie", "graph", "solver", "warmup", "formats", "measurements", "config"),
         *("slam", "slam/frontend", "slam/landmarks", "slam/robust", "messages", "messages/inputs", "recordings"),
     },
     "maps": {
-        *("errors", "lie", "graph", "formats", "slam", "slam/landmarks", "slam/robust"),
+        *("lie", "graph", "formats", "slam", "slam/landmarks", "slam/robust"),
         *("messages", "recordings", "runs"),
     },
     "analysis": {
-        *("errors", "lie", "graph", "solver", "formats", "slam", "slam/landmarks", "slam/robust"),
+        *("lie", "graph", "solver", "formats", "slam", "slam/landmarks", "slam/robust"),
         *("messages/inputs", "recordings", "runs", "maps"),
     },
-    "simulation": {"errors", "lie", "graph", "formats", "slam", "messages", "messages/inputs", "recordings"},
+    "simulation": {"lie", "graph", "formats", "slam", "messages", "messages/inputs", "recordings"},
     "node": {
-        *("errors", "graph", "warmup", "formats", "measurements", "config", "slam", "slam/frontend", "slam/robust"),
+        *("graph", "warmup", "formats", "measurements", "config", "slam", "slam/frontend", "slam/robust"),
         *("messages", "messages/inputs", "recordings", "runs"),
     },
     "cli": {
-        *("errors", "progress", "warmup", "graph", "solver", "optimization", "certificate", "formats", "config"),
+        *("progress", "warmup", "graph", "solver", "optimization", "certificate", "formats", "config"),
         *("slam", "recordings", "runs", "maps", "analysis", "simulation", "node"),
     },
-    "__init__.py": {"graph", "solver", "optimization", "certificate", "formats", "slam", "runs"},
+    "__init__.py": {
+        *("graph", "solver", "optimization", "certificate", "formats", "measurements", "config", "slam", "runs"),
+    },
 }
 # What is not the standard library's and not ours.
 THIRD_PARTY = {
     "errors.py": set(),
+    "typing.py": {"numpy"},
     "lie": {"numpy", "numba"},
     "graph": {"numpy", "numba"},
     "solver": {"numpy", "numba", "scipy"},
@@ -146,7 +150,7 @@ def test_imports_within_the_package_go_one_way(name):
     ours = [module for module in imported(name) if module.startswith("graph_slam_ros.")]
     folder = str(Path(name).parent)
     own = name if folder == "." else folder
-    assert {home(module) for module in ours} - {own, "__init__"} <= WITHIN[own]
+    assert {home(module) for module in ours} - {own, "__init__", "errors", "typing"} <= WITHIN[own]
     if rule(dict.fromkeys(OUTSIDE_THE_SOLVER, True), name):
         assert not [module for module in ours if module.startswith("graph_slam_ros.solver.")]
 

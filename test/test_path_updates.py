@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from graph_slam_ros.graph.geometry import PLANE, SPACE
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.messages import results
 from graph_slam_ros.messages.interfaces import typestore
@@ -50,23 +50,23 @@ def sent(updates, space, poses):
 def test_what_is_new_or_has_moved_too_far_is_sent_once():
     updates = PathUpdates(0.1, 0.2)
     path = [[0.0, 0.0, 0.0], [1.0, 0.0, 3.1]]
-    assert sent(updates, PLANE, path) == [0, 1]
-    assert sent(updates, PLANE, path) is None
+    assert sent(updates, PLANAR, path) == [0, 1]
+    assert sent(updates, PLANAR, path) is None
     path.append([2.0, 0.0, 0.0])
-    assert sent(updates, PLANE, path) == [2]
+    assert sent(updates, PLANAR, path) == [2]
     path[0] = [0.08, 0.08, 0.0]
-    assert sent(updates, PLANE, path) == [0]
+    assert sent(updates, PLANAR, path) == [0]
     path[1] = [1.0, 0.0, -3.1]  # by 0.08 rad, across pi
-    assert sent(updates, PLANE, path) is None
+    assert sent(updates, PLANAR, path) is None
     path[1] = [1.0, 0.0, -2.9]
-    assert sent(updates, PLANE, path) == [1]
+    assert sent(updates, PLANAR, path) == [1]
     assert updates.version == 4
 
 
 def test_small_movements_add_up_to_one_that_is_sent():
     updates = PathUpdates(0.1, 0.1)
-    sent(updates, PLANE, [[0.0, 0.0, 0.0]])
-    told = [sent(updates, PLANE, [[0.04 * k, 0.0, 0.0]]) for k in range(1, 7)]
+    sent(updates, PLANAR, [[0.0, 0.0, 0.0]])
+    told = [sent(updates, PLANAR, [[0.04 * k, 0.0, 0.0]]) for k in range(1, 7)]
     assert told == [None, None, [0], None, None, [0]]
 
 
@@ -79,12 +79,12 @@ def test_in_space_a_turn_about_any_axis_is_one_whatever_the_sign_of_the_quaterni
         for angle, too_far in ((most - 1e-6, False), (most + 1e-6, True), (np.pi, True)):
             turned = se3.compose(pose, se3.exp((0.0, 0.0, 0.0, *(angle * axis / np.linalg.norm(axis)))))
             updates = PathUpdates(0.1, most)
-            sent(updates, SPACE, [pose])
-            assert sent(updates, SPACE, [[*turned[:3], *(side * np.array(turned[3:]))]]) == ([0] if too_far else None)
+            sent(updates, SPATIAL, [pose])
+            assert sent(updates, SPATIAL, [[*turned[:3], *(side * np.array(turned[3:]))]]) == ([0] if too_far else None)
         raised = [*pose[:2], pose[2] + 0.11, *pose[3:]]
         updates = PathUpdates(0.1, most)
-        sent(updates, SPACE, [pose])
-        assert sent(updates, SPACE, [raised]) == [0]
+        sent(updates, SPATIAL, [pose])
+        assert sent(updates, SPATIAL, [raised]) == [0]
 
 
 def driven():

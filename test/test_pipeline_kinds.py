@@ -3,19 +3,19 @@
 import numpy as np
 import pytest
 
-from graph_slam_ros.graph.geometry import PLANE, SPACE
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.measurements.types import from_record, to_record
 from graph_slam_ros.slam import Closure, Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.frontend import motion_compensation
-from graph_slam_ros.slam.frontend.motion_compensation import seen_as
+from graph_slam_ros.slam.frontend.motion_compensation import predict
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
 HZ = 20
 END = (Control("end"), Control("optimize"))
-BOTH = pytest.mark.parametrize("space", [PLANE, SPACE], ids=["plane", "space"])
-SENSOR = {PLANE: (0.3, -0.2, 0.5), SPACE: (0.3, -0.2, 0.1, *so3.exp((0.2, -0.3, 0.5)))}
+BOTH = pytest.mark.parametrize("space", [PLANAR, SPATIAL], ids=["plane", "space"])
+SENSOR = {PLANAR: (0.3, -0.2, 0.5), SPATIAL: (0.3, -0.2, 0.1, *so3.exp((0.2, -0.3, 0.5)))}
 SOURCES = {
     "inputs__names": "wheels camera",
     "wheels__type": "nav_msgs/msg/Odometry",
@@ -32,7 +32,7 @@ def slam(space, **settings):
 
 def twist(space, t):
     """Velocities of a winding drive, banking and climbing in space."""
-    if space is PLANE:
+    if space is PLANAR:
         return (1.0, 0.0, 0.6 * np.sin(0.7 * t))
     return (1.0, 0.0, 0.2 * np.cos(t), 0.3 * np.sin(1.3 * t), 0.2 * np.cos(0.9 * t), 0.6 * np.sin(0.7 * t))
 
@@ -69,7 +69,7 @@ def sighting(space, kind, name, T_map_base, landmark, sigma=EXACT):
     if kind == "position":
         return Sighting(name, kind, floats(group.act(group.inverse(T_map_base), landmark[:n])), covariance(n, sigma))
     p = group.act(group.inverse(group.compose(T_map_base, T_base_sensor)), landmark[:n])
-    said = seen_as(space, kind, np.array(p))
+    said = predict(space, kind, np.array(p))
     return Sighting(name, kind, floats(said), covariance(len(said), sigma), T_base_sensor)
 
 
@@ -77,7 +77,7 @@ def landmarks(space):
     rng = np.random.default_rng(5)
     n = space.dimensions
     points = {f"m{k}": rng.uniform(-4, 8, n) for k in range(8)}
-    if space is PLANE:
+    if space is PLANAR:
         return {name: (*p, rng.uniform(-3, 3)) for name, p in points.items()}
     return {name: (*p, *so3.exp(tuple(rng.standard_normal(3)))) for name, p in points.items()}
 
@@ -143,16 +143,18 @@ def test_ranges_that_share_an_offset_say_how_large_it_is(space):
 
 
 def test_G3_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why():
-    pipeline = slam(PLANE)
+    pipeline = slam(PLANAR)
     for k in range(40):
         pipeline.process(Odometry(stamp(k), (0.0, 0.0, 0.0)))
-        pipeline.process(Sightings(stamp(k), "seen", (sighting(PLANE, "bearing", "a", PLANE.identity, (3.0, 1.0, 0)),)))
+        pipeline.process(
+            Sightings(stamp(k), "seen", (sighting(PLANAR, "bearing", "a", PLANAR.identity, (3.0, 1.0, 0)),))
+        )
     assert not pipeline.landmarks
     assert "too few" in pipeline.waiting["a"]
 
 
 def test_G5_both_mirror_places_of_a_landmark_are_kept_until_the_robot_turns():
-    pipeline, at = slam(PLANE, landmarks__mirror_chi2=20.0), PLANE.identity
+    pipeline, at = slam(PLANAR, landmarks__mirror_chi2=20.0), PLANAR.identity
     for k in range(160):
         pipeline.process(Odometry(stamp(k), at))
         if k == 60:  # straight ahead all the way: the beacon is on the left or on the right
@@ -232,8 +234,8 @@ def test_a_compass_holds_the_heading(space):
 
 
 def test_an_attitude_holds_roll_and_pitch_and_is_refused_in_the_plane():
-    true, odom = drive(SPACE, 20.0, drift=0.05)
-    pipeline = slam(SPACE)
+    true, odom = drive(SPATIAL, 20.0, drift=0.05)
+    pipeline = slam(SPATIAL)
     for k, at in enumerate(odom):
         pipeline.process(Odometry(stamp(k), at))
         if k % 7 == 1:
@@ -242,7 +244,7 @@ def test_an_attitude_holds_roll_and_pitch_and_is_refused_in_the_plane():
     at = round((pipeline.keyframes.stamps_ns[-1] - T0) / S * HZ)
     apart = se3.local(tuple(pipeline.trajectory()[-1]), true[at])
     assert np.linalg.norm(apart[3:]) < 0.01
-    planar = slam(PLANE)
+    planar = slam(PLANAR)
     planar.process(Odometry(stamp(0), (0.0, 0.0, 0.0)))
     planar.process(Fix(stamp(0), "imu", "attitude", (0.0, 0.0, 0.0, 1.0), covariance(3)))
     assert planar.counters.as_dict() == {"imu": {"not_in_this_space": 1}}
@@ -349,7 +351,7 @@ def test_where_the_anchor_is_loose_the_map_turns_into_the_frame_of_the_fixes(spa
 
 def test_a_path_that_is_cut_at_every_sighting_keeps_its_rotations():
     at_every_sighting = {"keyframes__shared_noise": 0.0, "keyframes__min_interval_s": 0.0}
-    pipeline, n = slam(SPACE, **at_every_sighting, keyframes__min_distance_m=1e3, keyframes__max_interval_s=1e3), 3
+    pipeline, n = slam(SPATIAL, **at_every_sighting, keyframes__min_distance_m=1e3, keyframes__max_interval_s=1e3), 3
     turned = floats(so3.exp((0.3, -0.2, 0.5)))
     off = tuple(x * (1.0 + 1e-9) for x in turned)  # as drivers round it
     for k in range(400):

@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from graph_slam_ros.graph.geometry import PLANE, SPACE
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.measurements import edge_noise
 from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.frontend.max_distance import Reach, off_the_pole
+from graph_slam_ros.slam.frontend.max_distance import MaxDistance, off_the_pole
 
 S, RATE = 10**9, 10
 SOURCE = "detections"
@@ -123,26 +123,26 @@ def refused(reach, *distances, **options):
 
 
 def test_the_first_of_a_long_range_sensor_are_used_and_so_is_what_is_a_little_farther():
-    reach = Reach(PLANE, Config().sources)
+    reach = MaxDistance(PLANAR, Config().sources)
     assert refused(reach, 60e3) == 0
     for far in np.geomspace(2e3, 90e3, 300):
         assert refused(reach, float(far)) == 0
-    short = Reach(PLANE, Config().sources)
+    short = MaxDistance(PLANAR, Config().sources)
     assert refused(short, *[0.5] * 1000) == 0
     assert refused(short, 900.0, kind="position") == 0
 
 
 def test_a_limit_is_learned_from_the_third_farthest_so_that_two_wrong_distances_teach_nothing():
-    reach = Reach(PLANE, Config().sources)
+    reach = MaxDistance(PLANAR, Config().sources)
     assert refused(reach, 99e3, 99e3, *[200.0] * 30) == 0
     assert reach.limit_m(SOURCE) == 2e3
     assert refused(reach, 2.1e3, 1.9e3, 1e8) == 2
     assert reach.limit_m("another") == 1e5
-    assert refused(Reach(PLANE, Config().sources), 1.1e5) == 1
+    assert refused(MaxDistance(PLANAR, Config().sources), 1.1e5) == 1
 
 
 def test_a_given_limit_is_kept_to_the_letter_and_a_bearing_has_none():
-    reach = Reach(PLANE, Config.from_mapping({f"{SOURCE}.max_distance_m": 5.0}).sources)
+    reach = MaxDistance(PLANAR, Config.from_mapping({f"{SOURCE}.max_distance_m": 5.0}).sources)
     assert refused(reach, 5.0, 5.1, 4.0, kind="position") == 1
     bearing = Sightings(S, SOURCE, (Sighting("a", "bearing", (1.0,), (0.01,)),))
     assert reach.split(bearing) == (bearing, 0)
@@ -188,16 +188,16 @@ def test_a_landmark_at_the_zenith_or_nadir_is_found_and_every_solve_succeeds(kin
 
 def test_a_steep_direction_is_the_same_direction_in_other_axes():
     for azimuth, elevation, sensor in itertools.product((-2.0, 0.0, 3.0), (1.4, -1.5, math.pi / 2), (None, True)):
-        T_base_sensor = SPACE.group.exp((0.1, 0.2, 0.3, 0.4, -0.5, 0.6)) if sensor else None
+        T_base_sensor = SPATIAL.group.exp((0.1, 0.2, 0.3, 0.4, -0.5, 0.6)) if sensor else None
         s = Sighting("a", "range_bearing", (2.0, azimuth, elevation), tuple(np.diag([1.0, 0.04, 0.01]).ravel()))
         s = Sighting(s.id, s.kind, s.measured, s.covariance, T_base_sensor)
-        turned = off_the_pole(SPACE, s)
+        turned = off_the_pole(SPATIAL, s)
         flat = 2.0 * math.cos(elevation)
         point = (flat * math.cos(azimuth), flat * math.sin(azimuth), 2.0 * math.sin(elevation))
-        at = SPACE.group.act(T_base_sensor or SPACE.identity, point)
+        at = SPATIAL.group.act(T_base_sensor or SPATIAL.identity, point)
         assert turned.measured == (2.0, 0.0, 0.0)
-        assert np.allclose(SPACE.group.act(turned.T_base_sensor, (2.0, 0.0, 0.0)), at)
+        assert np.allclose(SPATIAL.group.act(turned.T_base_sensor, (2.0, 0.0, 0.0)), at)
         expected = np.diag([1.0, max(0.04 * math.cos(elevation) ** 2, 0.01), 0.01])
         assert np.allclose(np.reshape(turned.covariance, (3, 3)), expected)
     level = Sighting("a", "bearing", (1.0, 1.3), (0.01, 0.0, 0.0, 0.01))
-    assert off_the_pole(SPACE, level) is level
+    assert off_the_pole(SPATIAL, level) is level

@@ -1,4 +1,4 @@
-"""The README's Python runs as it stands there and prints what it says; the names at top level are what they say."""
+"""The Python of docs/library.md prints what the page says; the names at top level are what they say."""
 
 import fnmatch
 import re
@@ -11,7 +11,7 @@ import pytest
 import graph_slam_ros
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs/library.md").read_text(), re.DOTALL)
 
 
 @pytest.fixture
@@ -23,14 +23,14 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.split("\n", 1)[0])
-def test_a_block_of_the_readme_prints_what_it_says(block, folder, capsys):
+def test_a_block_of_the_library_page_prints_what_it_says(block, folder, capsys):
     said = re.findall(r"^print\(.*\)  # (.*)$", block, re.MULTILINE)
     assert len(said) == block.count("print(") > 0
-    exec(compile(block, "README.md", "exec"), {"__name__": "readme"})
+    exec(compile(block, "docs/library.md", "exec"), {"__name__": "readme"})
     assert capsys.readouterr().out.splitlines() == said
 
 
-def test_the_readme_has_every_way():
+def test_the_library_page_has_every_way():
     assert len(BLOCKS) == 5
     assert all(re.search(rf"\b{name}\b", "".join(BLOCKS)) for name in ("optimize", "Solver", "GraphSlam"))
 

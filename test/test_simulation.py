@@ -9,7 +9,7 @@ from graph_slam_ros.analysis.trajectories import read_truth
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import RELATIVE_POSE
 from graph_slam_ros.lie import se2, se3, so3
-from graph_slam_ros.messages.from_msg import Border
+from graph_slam_ros.messages.from_msg import MessageConverter
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.trajectory import Trajectory
@@ -259,7 +259,7 @@ def test_a_bag_decodes_to_the_measurements_it_was_made_of(world, tmp_path):
     recording = simulate(world, 1, **SMALL[world])
     write_bag(recording, tmp_path / "bag.mcap")
     counters = Counters()
-    border = Border(Config.from_mapping({"world.dimensions": 3 if world == "flight" else 2}), counters)
+    border = MessageConverter(Config.from_mapping({"world.dimensions": 3 if world == "flight" else 2}), counters)
     decoded = []
     for record in open_bag(tmp_path / "bag.mcap").messages(["/odom", "/landmarks"]):
         decoded += border.take("odom" if record.topic == "/odom" else "detections", record.cdr)

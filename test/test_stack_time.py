@@ -16,7 +16,7 @@ from rosgraph_msgs.msg import Clock
 
 from graph_slam_ros.messages.cdr import LATEST_NS
 from graph_slam_ros.node.node import GraphSlamNode
-from graph_slam_ros.node.pose_extrapolator import Reckoning
+from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.slam import Odometry
 
 NS = 10**9
@@ -202,7 +202,7 @@ def test_B14_where_another_clock_is_used_a_segment_begins_and_the_map_stays(tmp_
 def test_B15_what_is_raised_after_a_jump_reaches_nobody_and_is_counted(monkeypatch):
     context = Context()
     context.init(args=[], domain_id=int(ENVIRONMENT["ROS_DOMAIN_ID"]))
-    monkeypatch.setattr(Reckoning, "forget", lambda self: 1 // 0)
+    monkeypatch.setattr(PoseExtrapolator, "forget", lambda self: 1 // 0)
     parameters = [Parameter("output.folder", value=""), Parameter("use_sim_time", value=True)]
     slam = GraphSlamNode(context=context, parameter_overrides=parameters)
     called = []

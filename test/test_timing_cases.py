@@ -27,7 +27,7 @@ from graph_slam_ros.graph import RELATIVE_POSE
 from graph_slam_ros.runs import RunRecorder, summarize
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.frontend.time_jump import StampJump
+from graph_slam_ros.slam.frontend.time_jump import TimeJumpDetector
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -200,7 +200,7 @@ def test_B7_after_a_jump_of_time_what_is_older_than_the_map_is_used_and_begins_a
 
 def begins_anew(*stamps_s, source="odom"):
     """Whether stamps of odometry begin anew, message by message."""
-    jump = StampJump(0.2)
+    jump = TimeJumpDetector(0.2)
     told = (s if isinstance(s, tuple) else (s, source) for s in stamps_s)
     return [jump.hear([Odometry(T0 + round(s * S), (0.0, 0.0, 0.0), None, name)]) for s, name in told]
 

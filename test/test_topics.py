@@ -9,8 +9,8 @@ import pytest
 from graph_slam_ros.messages.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS, Interface
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text()
-TABLES = {"out": PUBLICATIONS, "in, beside [other inputs](#inputs)": SUBSCRIPTIONS, "service": SERVICES}
+PAGE = (ROOT / "docs/ros.md").read_text()
+TABLES = {"out": PUBLICATIONS, "in, and [other inputs](inputs.md)": SUBSCRIPTIONS, "service": SERVICES}
 
 
 def row(one):
@@ -20,7 +20,7 @@ def row(one):
 
 @pytest.mark.parametrize("head", TABLES)
 def test_the_readme_has_every_row_and_no_other(head):
-    _, _, below = README.partition(f"| {head} | type | |\n|---|---|---|\n")
+    _, _, below = PAGE.partition(f"| {head} | type | |\n|---|---|---|\n")
     assert below.split("\n\n")[0].splitlines() == [row(one) for one in TABLES[head]]
 
 

@@ -10,12 +10,10 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2 as chi_square
 
 from graph_slam_ros.lie import se3, so3
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BAND = (0.025, 0.975)

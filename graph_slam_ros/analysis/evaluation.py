@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.analysis.consistency import ClassNoise, Consistency, Nees, class_noise, landmark_nees, pose_nees
 from graph_slam_ros.analysis.path_error import (
@@ -31,8 +30,7 @@ from graph_slam_ros.formats.files import is_empty, read_text
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs import COVARIANCES, SUMMARY, is_run, run_config, summary_of
 from graph_slam_ros.runs.trajectory import Point, Trajectory, read_covariances, read_landmarks, read_tum
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 _KEYFRAMES = ("path.tum", "path_odometry.tum")  # estimate and dead reckoning
 _SIGHTINGS = ("sightings.tum", "odometry.tum")

@@ -17,7 +17,7 @@ from graph_slam_ros.runs import SUMMARY, run_config
 from graph_slam_ros.runs.ledger_file import Entry, read_changes, read_ledger
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.landmarks.association import quantile
-from graph_slam_ros.slam.robust.ledger import FINAL, Change, Reason, Verdict
+from graph_slam_ros.slam.robust.ledger import FINAL, Reason, Verdict, VerdictChange
 
 _STATE = {
     Verdict.NOT_EVALUATED: "taken for granted",
@@ -97,7 +97,7 @@ def _row(e: Entry, numbers: str) -> str:
     return f"  edge {e.edge:<7d} {e.about:24s} keyframe {e.keyframe:<6d} {numbers}   {_state(e.verdict, e.reason)}"
 
 
-def _gates(entries: Sequence[Entry], changes: Sequence[Change], config: Config) -> Iterator[str]:
+def _gates(entries: Sequence[Entry], changes: Sequence[VerdictChange], config: Config) -> Iterator[str]:
     """Gates that decide nothing: all that was ever seen is far below them, more so than noise that is told right."""
     if not config.robust.decide:
         yield "warning: robust.decide is false: nothing was held back or taken out, whatever it said"
@@ -175,7 +175,7 @@ def _landmark(folder: Path, name: str) -> Iterator[str]:
         yield f"graph_slam explain {folder} {out[0].edge} tells more of the first"
 
 
-def _edge(run: SavedGraph, edge: int, changes: Iterable[Change], config: Config) -> Iterator[str]:
+def _edge(run: SavedGraph, edge: int, changes: Iterable[VerdictChange], config: Config) -> Iterator[str]:
     e = run.edge(edge)
     history = [change for change in changes if change.edge == edge]
     kind, of, by = _KIND.get(e.label, e.label), e.landmark and f" of {e.landmark}", e.source and f" by {e.source}"
@@ -201,7 +201,7 @@ def _edge(run: SavedGraph, edge: int, changes: Iterable[Change], config: Config)
         yield from _line("to change", _remedy(e))
 
 
-def _decided(e: Entry, history: Sequence[Change], config: Config) -> str:
+def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
     limit = quantile(config.robust.gate, e.dof)
     chance = f"noise alone exceeds {limit:.4g} once in {1.0 / (1.0 - config.robust.gate):.0f} times"
     if e.threshold < _SAME * limit:

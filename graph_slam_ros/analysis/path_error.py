@@ -8,15 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph.geometry import PLANE, SPACE
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.lie import se3
 from graph_slam_ros.maps.alignment import laid_on
 from graph_slam_ros.runs.trajectory import Trajectory
+from graph_slam_ros.typing import Array
 
-Array = NDArray[np.float64]
 Statistics = dict[str, float]
 
 MAX_STAMP_DIFFERENCE_S = 0.05
@@ -147,7 +146,7 @@ def alignment(points: Array, reference: Array) -> se3.Pose:
         All points are in one place, or in space on a line.
     """
     dimensions = points.shape[1]
-    moved = laid_on(PLANE if dimensions == 2 else SPACE, reference, points)
+    moved = laid_on(PLANAR if dimensions == 2 else SPATIAL, reference, points)
     if moved is None:
         where = "in one place" if dimensions == 2 else "on a line"
         raise GraphSlamError(f"cannot align: all positions are {where}")

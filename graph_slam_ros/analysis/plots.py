@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.analysis.evaluation import Drive, dimensions_of, input_topics, scored_drive
@@ -19,9 +18,7 @@ from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs import COVARIANCES, recording_of
 from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_tum
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 _TRUTH, _ODOMETRY, _ESTIMATE, _LANDMARK = "#1f6fd6", "#1a1a1a", "#d62728", "#e08a00"
 _CLOSURE, _SIGHTING, _QUIET = "#d62728", "#e08a00", "#9aa0a6"

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3
@@ -19,8 +18,6 @@ from graph_slam_ros.messages.inputs.fixes import east_north_up
 from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.runs.trajectory import Point, Trajectory, read_tum, trajectory
-
-Array = NDArray[np.float64]
 
 TRUTH_TOPIC = "/ground_truth"
 TRUE_LANDMARKS_TOPIC = "/landmarks_ground_truth"

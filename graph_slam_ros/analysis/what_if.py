@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.formats.g2o import read_g2o
@@ -20,14 +19,13 @@ from graph_slam_ros.runs import GRAPH, run_config
 from graph_slam_ros.runs.ledger_file import LEDGER, Entry, read_ledger
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.solver.linearization import linearized
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 _BELIEVED = "believed"  # the class of what is let in: it has no loss
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
+class MovedVertex:
     """What moves between two solutions of one run.
 
     Attributes
@@ -127,7 +125,7 @@ class SavedGraph:
         solver.optimize()
         return solver
 
-    def moved(self, solver: Solver) -> Moved:
+    def moved(self, solver: Solver) -> MovedVertex:
         """Compare a solution with that of the run."""
         a, b = self._was.estimate(self.keyframes), solver.estimate(self.keyframes)
         distance = np.linalg.norm(b[:, : self.space.dimensions] - a[:, : self.space.dimensions], axis=1)
@@ -135,7 +133,7 @@ class SavedGraph:
         inside = np.array([e.edge for e in self.entries if e.is_in], dtype=np.int64)
         before, after = self._was.chi2_of(inside)[0], solver.chi2_of(inside)[0]
         worse = [k for k in np.argsort(before - after, kind="stable").tolist() if after[k] > before[k]]
-        return Moved(
+        return MovedVertex(
             self._was.evaluate(),
             solver.evaluate(),
             (float(distance[-1]), float(turned)),

@@ -5,7 +5,6 @@ from math import isnan, nan
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
@@ -17,9 +16,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import POSE_PRIOR, POSE_PRIOR_3D, SE2, SE3, Graph
 from graph_slam_ros.optimization import Solution
 from graph_slam_ros.solver import Solver
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array
 
 CERTIFIED, NOT_CERTIFIED, DOES_NOT_APPLY = "certified", "not certified", "does not apply"
 

@@ -4,11 +4,10 @@ from collections.abc import Callable
 from math import nan
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, splu
 
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 _FACTOR = 10.0
 

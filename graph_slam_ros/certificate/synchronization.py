@@ -10,14 +10,11 @@ which is Problem 1 of Rosen et al. (2019), and with M its Problem 2. Arrays hold
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 
 from graph_slam_ros.graph import INVERSE_RELATIVE_POSE, RELATIVE_POSE, RELATIVE_POSE_3D, Graph
 from graph_slam_ros.lie import so3
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 RELATIVE = (RELATIVE_POSE, INVERSE_RELATIVE_POSE, RELATIVE_POSE_3D)
 

@@ -10,7 +10,7 @@ from graph_slam_ros.cli import console
 from graph_slam_ros.errors import GraphSlamError
 
 if TYPE_CHECKING:
-    from graph_slam_ros.analysis.what_if import Moved, SavedGraph
+    from graph_slam_ros.analysis.what_if import MovedVertex, SavedGraph
 
 _SHOWN = 10  # edges that fit worse
 
@@ -62,7 +62,7 @@ def influence(args: argparse.Namespace) -> int:
     return console.told([], changed_since(args.run_folder))
 
 
-def _moved_text(run: "SavedGraph", moved: "Moved") -> Iterable[str]:
+def _moved_text(run: "SavedGraph", moved: "MovedVertex") -> Iterable[str]:
     (final_m, final_rad), (most, most_m) = moved.final, moved.most
     yield f"chi2       {moved.before.chi2_final:14.4f}  ->  {moved.after.chi2_final:14.4f}"
     yield f"cost       {moved.before.cost_final:14.4f}  ->  {moved.after.cost_final:14.4f}"

@@ -4,7 +4,7 @@ import textwrap
 from pathlib import Path
 
 from graph_slam_ros.recordings.bag import Bag
-from graph_slam_ros.recordings.contents import Contents, look
+from graph_slam_ros.recordings.contents import TopicContents, look
 from graph_slam_ros.runs.suggestion import Suggestion
 
 
@@ -32,7 +32,7 @@ def describe(bag: Bag, path: Path) -> tuple[list[str], bool]:
     return [*lines, suggestion.command()], True
 
 
-def _line(one: Contents) -> str:
+def _line(one: TopicContents) -> str:
     topic, took_s = one.topic, (one.last_ns - one.first_ns) * 1e-9
     rate = f"{(topic.count - 1) / took_s:.1f} Hz" if took_s > 0 else "-"
     frames = " -> ".join(filter(None, (one.frame, one.child)))

@@ -32,9 +32,10 @@ from graph_slam_ros.config.robust import LOSSES, RobustConfig
 from graph_slam_ros.config.survey import Surveyed, surveyed
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import Loss
-from graph_slam_ros.graph.geometry import PLANE, SPACE, Numbers, Space
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se3
 from graph_slam_ros.solver import METHODS, Settings
+from graph_slam_ros.typing import Numbers
 
 _LEAST_SIGMA = 1e-6  # of an anchor: nothing is certain
 
@@ -411,9 +412,9 @@ class Config:
         return out
 
     @property
-    def space(self) -> Space:
+    def space(self) -> Geometry:
         """The plane or space."""
-        return PLANE if self.world.dimensions == 2 else SPACE
+        return PLANAR if self.world.dimensions == 2 else SPATIAL
 
     @property
     def start_pose(self) -> Numbers | None:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.graph.geometry import Numbers
+from graph_slam_ros.typing import Numbers
 
 _HEADERS = (["id", "x", "y", "sigma"], ["id", "x", "y", "z", "sigma"])
 

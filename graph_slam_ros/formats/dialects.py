@@ -15,13 +15,11 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.strict import expect, integer, numbers
 from graph_slam_ros.lie import se2, so3
 
-Array = NDArray[np.float64]
 Words: TypeAlias = list[str]
 
 LANDMARK_IDS_FROM = 1_000_000_000  # GTSAM's text numbers landmarks apart from poses

@@ -18,7 +18,7 @@ import numpy as np
 
 from graph_slam_ros.errors import FormatError, NoiseError
 from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, in_g2o_words, may_be_roots
-from graph_slam_ros.formats.graph_file import AT_OFFSET, EDGE_TAGS, HALVED, OFFSET, VERTEX_TAGS, Array, G2oFile, moved
+from graph_slam_ros.formats.graph_file import AT_OFFSET, EDGE_TAGS, HALVED, OFFSET, VERTEX_TAGS, G2oFile, moved
 from graph_slam_ros.formats.strict import expect, integer, lines, numbers
 from graph_slam_ros.graph import (
     ATTITUDE_PRIOR_3D,
@@ -34,6 +34,7 @@ from graph_slam_ros.graph import (
     Graph,
 )
 from graph_slam_ros.lie import se3
+from graph_slam_ros.typing import Array
 
 _RELATIVE = ("EDGE_SE2", "EDGE_SE3:QUAT")
 _CLASS = re.compile(r"#\s+(?:\d+\s+\d+\s+)?class\s+(\S+)\s*", re.ASCII)  # our comment, the label of what follows it

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.graph import (
     ATTITUDE_PRIOR_3D,
@@ -43,8 +42,8 @@ from graph_slam_ros.graph import (
     VertexKind,
 )
 from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.typing import Array
 
-Array = NDArray[np.float64]
 Values: TypeAlias = Callable[[Sequence[int]], Array]
 
 VERTEX_TAGS: dict[str, VertexKind] = {

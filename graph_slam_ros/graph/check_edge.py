@@ -3,13 +3,12 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.edge_type import EdgeType, numeric_jacobian
 from graph_slam_ros.graph.vertices import SE2, SE3, VertexKind
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 _SPREAD = 5.0  # of random positions and measurements
 _TRIALS = 50

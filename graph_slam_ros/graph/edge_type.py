@@ -14,13 +14,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.vertices import VertexKind
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 MOST_SLOTS = 3  # vertices of one edge: what the solver's records have room for
 

@@ -4,15 +4,12 @@ Derivatives used throughout, with J = [[0, -1], [1, 0]]:  R(theta) Exp([w]) = R(
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.vertices import R1, R2, R3, SE2
 from graph_slam_ros.lie import se2
 from graph_slam_ros.lie.jit import kernel
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 
 @kernel

@@ -4,16 +4,12 @@ Derivatives used throughout:  R Exp(w) = R (I + [w]x),  Log(R Exp(w)) = Log(R) +
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.vertices import R3, SE3
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.lie.jit import jitable, kernel
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
+from graph_slam_ros.typing import Array, Index
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 

@@ -5,18 +5,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros import graph
 from graph_slam_ros.graph import EdgeType, VertexKind
 from graph_slam_ros.lie import se2, se3, so3
-
-Array = NDArray[np.float64]
-Numbers = tuple[float, ...]
+from graph_slam_ros.typing import Array, Numbers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Space:
+class Geometry:
     """A group of rigid motions with its vertices and edges.
 
     Attributes
@@ -91,7 +88,7 @@ def _turn_3d(pose: Numbers) -> Array:
     return so3.matrix((pose[3], pose[4], pose[5], pose[6]))
 
 
-PLANE = Space(
+PLANAR = Geometry(
     graph.SE2,
     graph.R2,
     se2,
@@ -111,7 +108,7 @@ PLANE = Space(
     },
     {"pose": graph.POSE_PRIOR, "position": graph.POSITION_PRIOR, "heading": graph.HEADING_PRIOR},
 )
-SPACE = Space(
+SPATIAL = Geometry(
     graph.SE3,
     graph.R3,
     se3,

@@ -13,9 +13,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.noise import Gaussian
 from graph_slam_ros.graph.vertices import VertexKind
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 
 class Column:

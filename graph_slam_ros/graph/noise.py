@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from graph_slam_ros.errors import NoiseError
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 _ASYMMETRY = 1e-6  # of the largest entry; text files carry 6 digits
 _LEAST_EIGENVALUE = 16.0 * float(np.finfo(float).eps)  # of the correlations; that of a singular matrix is rounding

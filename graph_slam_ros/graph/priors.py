@@ -6,15 +6,12 @@ antenna: its coordinates in the pose's frame follow what was measured, or are le
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.vertices import SE2, SE3
 from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.lie.jit import kernel
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 
 @kernel

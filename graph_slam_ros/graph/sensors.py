@@ -9,15 +9,12 @@ Behind what was measured stands the sensor's pose in the pose's frame, which may
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, SE3
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.lie.jit import jitable, kernel
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 Frames = tuple[so3.Vector, so3.Quaternion, so3.Quaternion]
 

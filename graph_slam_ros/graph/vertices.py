@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import kernel
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 _UNIT = 1e-2  # a squared norm of a quaternion this near to 1 is that of few digits
 

@@ -8,12 +8,11 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from graph_slam_ros.lie import so3
 from graph_slam_ros.lie.jit import jitable, kernel
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 Pose: TypeAlias = tuple[Any, Any, Any, Any, Any, Any, Any]
 Tangent: TypeAlias = tuple[Any, Any, Any, Any, Any, Any]

@@ -6,16 +6,13 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import so3
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.landmarks.association import quantile
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from graph_slam_ros.typing import Array, Mask, Numbers
 
 _MOST_TRIALS = 2000  # minimal sets of points that are tried
 _ROUNDS = 20
@@ -67,7 +64,9 @@ def positions(slam: GraphSlam, names: Sequence[str]) -> tuple[Array, Array]:
     return np.array([value[:n] for value in values]), axes @ joint @ axes.T
 
 
-def align(space: Space, a: tuple[Array, Array], b: tuple[Array, Array], gate: float, factor: float) -> Alignment | None:
+def align(
+    space: Geometry, a: tuple[Array, Array], b: tuple[Array, Array], gate: float, factor: float
+) -> Alignment | None:
     """Lay points of b on the same of a; None where too few agree to tell how: two in the plane, three in space.
 
     Parameters
@@ -94,7 +93,7 @@ def align(space: Space, a: tuple[Array, Array], b: tuple[Array, Array], gate: fl
     return Alignment(_pose(space, turn, shift), apart, covariance, chi2, limit, fits)
 
 
-def as_they_are(space: Space, a: tuple[Array, Array], b: tuple[Array, Array], T_a_b: Numbers) -> Alignment:
+def as_they_are(space: Geometry, a: tuple[Array, Array], b: tuple[Array, Array], T_a_b: Numbers) -> Alignment:
     """Points that are not laid on one another, where b is in a by other means."""
     count, n = a[0].shape
     moved = np.stack(space.group.act(T_a_b, tuple(b[0].T)), axis=-1).reshape(count, n)
@@ -104,7 +103,7 @@ def as_they_are(space: Space, a: tuple[Array, Array], b: tuple[Array, Array], T_
     return Alignment(T_a_b, a[0] - moved, covariance, unknown, math.nan, none)
 
 
-def laid_on(space: Space, a: Array, b: Array) -> Numbers | None:
+def laid_on(space: Geometry, a: Array, b: Array) -> Numbers | None:
     """Where map b is in map a, by points of which none has moved; None where they are too few, or on a line."""
     spread = np.linalg.svd(b - b.mean(axis=0), compute_uv=False) if len(b) else np.empty(0)
     n = space.dimensions
@@ -122,7 +121,7 @@ def _motion(a: Array, b: Array) -> tuple[Array, Array]:
     return turn, (middle_a - middle_b @ np.swapaxes(turn, -1, -2))[..., 0, :]
 
 
-def _pose(space: Space, turn: Array, shift: Array) -> Numbers:
+def _pose(space: Geometry, turn: Array, shift: Array) -> Numbers:
     if space.dimensions == 2:
         return (*shift.tolist(), math.atan2(turn[1, 0], turn[0, 0]))
     return (*shift.tolist(), *Rotation.from_matrix(turn).as_quat().tolist())

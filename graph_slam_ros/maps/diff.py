@@ -8,16 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
-from graph_slam_ros.graph.geometry import Numbers
 from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on, positions
 from graph_slam_ros.runs import taken_up
 from graph_slam_ros.slam import GraphSlam
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array, Numbers
 
 _SAME_M = 1e-3  # nobody calls that moved
 _DIGITS = 6  # of what was measured
@@ -34,7 +31,7 @@ class Counts:
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
+class MovedLandmark:
     """A landmark that is elsewhere in B: by how many metres, and how many standard deviations of both."""
 
     landmark: str
@@ -75,7 +72,7 @@ class Difference:
     keyframes_m: tuple[float, float]
     only_in_a: list[str]
     only_in_b: list[str]
-    moved: list[Moved]
+    moved: list[MovedLandmark]
     verdicts: list[Judged]
 
     @property
@@ -144,7 +141,7 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
     apart = _keyframes_apart(one, two, T_a_b)
     known = [set(slam.landmarks) for slam in (one, two)]
     edges, verdicts = _edges(one, two)
-    moved = [Moved(name, *aligned.distance(k)) for k, name in enumerate(common)]
+    moved = [MovedLandmark(name, *aligned.distance(k)) for k, name in enumerate(common)]
     return Difference(
         Counts(len(one.keyframes), len(two.keyframes), len(apart)),
         Counts(len(known[0]), len(known[1]), len(known[0] & known[1])),

@@ -17,12 +17,12 @@ from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.maps.alignment import Alignment, align, positions
 from graph_slam_ros.maps.diff import refuse_other_space, shared_landmarks
 from graph_slam_ros.runs import check_room, record_run, settled, stopwatch
-from graph_slam_ros.runs.map_journal import Growth, Record, extend, state_of
+from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.landmarks.anonymous import NAME, last_number
 from graph_slam_ros.slam.robust.gating import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
-from graph_slam_ros.slam.snapshot import MapState
+from graph_slam_ros.slam.snapshot import MapSnapshot
 
 _ABSOLUTE = ("fixes", "surveyed")  # told in the axes of map, whoever tells them
 _ONCE = ("surveyed", "range_offset")  # what both sessions were told is told once
@@ -115,7 +115,7 @@ def _aligned(one: GraphSlam, two: GraphSlam, shared: list[str]) -> Alignment:
     return found
 
 
-def _leave_out(state: MapState, first_edge: int, chi2: Mapping[int, float], limit: float) -> None:
+def _leave_out(state: MapSnapshot, first_edge: int, chi2: Mapping[int, float], limit: float) -> None:
     """Take out what the second session saw of landmarks that are elsewhere in it; what fits after all comes back."""
     last, inside = len(state.keyframes) - 1, state.ledger.inside
     for edge in inside[inside >= first_edge].tolist():
@@ -140,8 +140,8 @@ class _Second:
 
     def record(self) -> Record:
         """With the numbers that vertices, edges and keyframes have after those of the first."""
-        told, first = Growth().since(self._two), self._keyframes
-        others = Growth().since(self._one)["edges"]
+        told, first = MapGrowth().since(self._two), self._keyframes
+        others = MapGrowth().since(self._one)["edges"]
         known = {(label, *vertices) for _, vertices, *_, label, _ in others if label in _ONCE}
         edges = [self._edge(edge) for edge in told["edges"]]
         kept = [k for k, (_, vertices, *_, label, _) in enumerate(edges) if (label, *vertices) not in known]

@@ -1,1 +1,25 @@
 """What sensors measured (metres, radians, stamps in nanoseconds), and what is counted by input and reason."""
+
+from graph_slam_ros.measurements.types import (
+    Closure,
+    Control,
+    Fix,
+    InitialPose,
+    Measured,
+    Measurement,
+    Odometry,
+    Sighting,
+    Sightings,
+)
+
+__all__ = [
+    "Closure",
+    "Control",
+    "Fix",
+    "InitialPose",
+    "Measured",
+    "Measurement",
+    "Odometry",
+    "Sighting",
+    "Sightings",
+]

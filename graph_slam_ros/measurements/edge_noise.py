@@ -1,13 +1,11 @@
 """The noise of an edge from a covariance that was added up: nothing is certain, and rounding is mended and counted."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import NoiseError
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.measurements.counters import Counters
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 LEAST_M2, LEAST_RAD2 = 1e-8, 1e-10  # 0.1 mm, 0.01 mrad
 _FINEST = 1e-6  # of a distance: a lever arm of a million standard deviations is as much as a solve resolves

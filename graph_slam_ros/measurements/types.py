@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
 from graph_slam_ros.errors import FormatError
-
-Numbers: TypeAlias = tuple[float, ...]
+from graph_slam_ros.typing import Numbers
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import InitialPose, Measured, Odometry
 from graph_slam_ros.messages.inputs import CONVERTERS, checks, fixes, odometry, uses
 from graph_slam_ros.messages.inputs.checks import MessageError
-from graph_slam_ros.messages.inputs.source import NotYet, Origin, Source
+from graph_slam_ros.messages.inputs.source import InputContext, NotYet, Origin
 from graph_slam_ros.messages.inputs.transforms import Transforms, pose
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.one_publisher import OnePublisher
@@ -66,7 +66,7 @@ def twist_of(cdr: bytes, base_frame: str) -> bytes | None:
     return struct.pack("<42d", *numbers) if child == base_frame.encode() else None
 
 
-class Border:
+class MessageConverter:
     """Turns messages into measurements.
 
     Parameters
@@ -85,17 +85,17 @@ class Border:
         self._config = config
         self._counters = counters
         self._transforms = Transforms(round(config.inputs.tf_buffer_s * 1e9), self._is_far_in_time)
-        self._sources: dict[str, Source] = {}
+        self._sources: dict[str, InputContext] = {}
         self._convert: dict[str, Callable[[Any], Any]] = {}
         self._publishers: dict[str, OnePublisher] = {}  # of each odometry
-        self._waiting: deque[tuple[Source, Any]] = deque()  # for /tf to tell where their sensors were
+        self._waiting: deque[tuple[InputContext, Any]] = deque()  # for /tf to tell where their sensors were
         self._types = {TF_STATIC: TRANSFORMS, TF: TRANSFORMS}
         by_name = {settings.name: settings for settings in config.sources}
         told = (settings.numbers("datum", 3) for settings in config.sources)
         self._origin = Origin(next(filter(None, told), ()))
         for name, use in uses(config).items():
             counters.received[name] += 0
-            source = self._sources[name] = Source(by_name[name], use, config, self._transforms, self._origin)
+            source = self._sources[name] = InputContext(by_name[name], use, config, self._transforms, self._origin)
             self._types[name] = by_name[name].type
             self._convert[name] = partial(CONVERTERS[by_name[name].type][use], source)
             if use == "odometry":
@@ -103,7 +103,7 @@ class Border:
                     config.odometry.timeout_s, partial(self._is_of_another, name), partial(self._is_ahead, name)
                 )
         for name, add in ((TF_STATIC, self._add_static), (TF, self._add_moving)):
-            source = self._sources[name] = Source(InputConfig(name), "none", config, self._transforms)
+            source = self._sources[name] = InputContext(InputConfig(name), "none", config, self._transforms)
             self._convert[name] = partial(self._transforms_of, source, add)
         self._add_initial_pose()
         known = typestore().types
@@ -172,13 +172,13 @@ class Border:
     def _is_far_in_time(self) -> None:
         self._counters.count(TF, "far_in_time")
 
-    def _hurried(self, source: Source, message: Any) -> list[Measured]:
+    def _hurried(self, source: InputContext, message: Any) -> list[Measured]:
         before, source.hurried = source.hurried, True
         out = self._converted(source, message)
         source.hurried = before
         return out
 
-    def _converted(self, source: Source, message: Any) -> list[Measured]:
+    def _converted(self, source: InputContext, message: Any) -> list[Measured]:
         out: list[Measured] = []
         try:
             with np.errstate(invalid="ignore"):  # a signalling NaN warns where it is compared; it is refused by name
@@ -197,13 +197,15 @@ class Border:
     def _add_initial_pose(self) -> None:
         said = self._config.initialpose
         settings = InputConfig(INITIAL_POSE, sigma_m=said.sigma_m, sigma_rad=said.sigma_rad)
-        source = self._sources[INITIAL_POSE] = Source(settings, "none", self._config, self._transforms)
+        source = self._sources[INITIAL_POSE] = InputContext(settings, "none", self._config, self._transforms)
         self._types[INITIAL_POSE] = "geometry_msgs/msg/PoseWithCovarianceStamped"
         self._convert[INITIAL_POSE] = partial(fixes.initial_pose, source)
 
     # -- transforms --------------------------------------------------------------------------------------------------
 
-    def _transforms_of(self, source: Source, add: Callable[[Any, str, str, Any], None], message: Any) -> list[Measured]:
+    def _transforms_of(
+        self, source: InputContext, add: Callable[[Any, str, str, Any], None], message: Any
+    ) -> list[Measured]:
         for t in message.transforms:
             try:
                 checks.point(t.transform.translation)

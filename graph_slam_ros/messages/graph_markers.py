@@ -4,17 +4,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.graph import POINT_PRIOR, R2, R3, SE2, SE3, EdgeType
-from graph_slam_ros.graph.geometry import Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.messages.markers import Lines
 from graph_slam_ros.messages.path_thinning import thinned, worst_and_some
 from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.typing import Array, Index
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 Ends = tuple[Array, Array]
 
 _COORDINATES = {SE2: 2, SE3: 3, R2: 2, R3: 3}
@@ -91,7 +89,7 @@ def _positions(slam: GraphSlam) -> Array:
 # -- the ends of the lines of some rows of a table ---------------------------------------------------------------------
 
 
-def _drawn(space: Space, kind: EdgeType) -> Callable[[GraphSlam, Array, EdgeTable, Index], Ends] | None:
+def _drawn(space: Geometry, kind: EdgeType) -> Callable[[GraphSlam, Array, EdgeTable, Index], Ends] | None:
     if len(kind.accepts) > 1:
         return _between if all(slot[0] in _COORDINATES for slot in kind.accepts[:2]) else None
     return {

@@ -12,9 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.cdr import CdrWriter
-
-Array = NDArray[np.float64]
-Numbers = tuple[float, ...]
+from graph_slam_ros.typing import Array, Numbers
 
 _ADD, _DELETE_ALL = 0, 3
 _ARROW, _SPHERE, _CYLINDER, _LINE_LIST, _POINTS, _TEXT = 0, 2, 3, 5, 8, 9

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any
 
-from graph_slam_ros.graph.geometry import Numbers
 from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.messages.inputs.stamp_leap import StampLeap
+from graph_slam_ros.typing import Numbers
 
 _ROOM_M, _ROOM_RAD = 0.08, 0.08  # between a pose and where its track leads
 _ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 10.0, 20.0  # of robots

@@ -1,11 +1,8 @@
 """What is shown of too much: the same as more comes, as long as that can be."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from graph_slam_ros.typing import Array, Index
 
 
 def thinned(count: int, most: int) -> Index:

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.slam import GraphSlam
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 
 class PathUpdates:

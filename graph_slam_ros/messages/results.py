@@ -3,16 +3,14 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages import markers, to_msg
 from graph_slam_ros.messages.graph_markers import graph_view
 from graph_slam_ros.messages.path_thinning import thinned
 from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.typing import Array, Numbers
 
-Array = NDArray[np.float64]
-Numbers = tuple[float, ...]
 Estimate = tuple[str, Numbers, Array]
 
 PATH, POSE, ODOMETRY, LANDMARKS, ESTIMATES, TF = (

@@ -13,13 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from graph_slam_ros.graph.geometry import PLANE, SPACE
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.cdr import HEADER, LATEST_NS, NS, CdrWriter, stamp
 from graph_slam_ros.messages.interfaces import typestore
-
-Array = NDArray[np.float64]
-Numbers = tuple[float, ...]
+from graph_slam_ros.typing import Array, Numbers
 
 UNKNOWN = 1e6  # variance [m^2, rad^2] of what is not known at all
 _IN_PLANE = np.array([0, 1, 5, 6, 7, 11, 30, 31, 35])  # of the 36 numbers: x, y and yaw
@@ -87,7 +85,7 @@ def pose_with_covariance(p: Numbers, covariance: Array, unused: float) -> Any:
 
     In the plane z, roll and pitch get the variance ``unused``.
     """
-    space = PLANE if len(p) == 3 else SPACE
+    space = PLANAR if len(p) == 3 else SPATIAL
     full = covariance6(space.in_parent_axes(p, covariance), unused)
     return make("geometry_msgs/msg/PoseWithCovariance", pose=pose(p), covariance=full)
 
@@ -120,7 +118,7 @@ def odometry(
     unused : variance of what a pose in the plane does not have
     twist : geometry_msgs/TwistWithCovariance as ``from_msg.twist_of`` gives it
     """
-    space = PLANE if len(p) == 3 else SPACE
+    space = PLANAR if len(p) == 3 else SPATIAL
     numbers = se3.in_space(p).tobytes(), covariance6(space.in_parent_axes(p, covariance), unused).tobytes()
     moving = _unknown_twist(UNKNOWN) if twist is None else twist
     return b"".join((HEADER, stamp(stamp_ns), _frames(8, frame, child), *numbers, moving))

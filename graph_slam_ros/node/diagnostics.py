@@ -100,7 +100,7 @@ class Facts:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Health:
     """The state and its reasons, the first the most important."""
 
     state: str
@@ -117,14 +117,14 @@ class Verdict:
         return _LEVELS.get(self.state, OK)
 
 
-def judge(facts: Facts, config: Config) -> Verdict:
+def judge(facts: Facts, config: Config) -> Health:
     """The verdict."""
     if facts.lifecycle != "active":
-        return Verdict(facts.lifecycle.upper(), tuple(filter(None, (facts.cannot_prepare or facts.preparing,))))
+        return Health(facts.lifecycle.upper(), tuple(filter(None, (facts.cannot_prepare or facts.preparing,))))
     for state, found in (("ERROR", _errors(facts)), ("WAITING", _missing(facts)), ("DEGRADED", _faults(facts, config))):
         if reasons := tuple(found):
-            return Verdict(state, reasons)
-    return Verdict("OK")
+            return Health(state, reasons)
+    return Health("OK")
 
 
 def _errors(facts: Facts) -> Iterator[str]:
@@ -238,7 +238,7 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield f"the measurements contradict each other: chi2 per degree of freedom is {estimate.fit:.1f}"
 
 
-def statuses(facts: Facts, verdict: Verdict, node: str) -> Iterator[Status]:
+def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
     """For /diagnostics: the verdict, each input, and the graph."""
     message = "; ".join((verdict.state, *verdict.reasons))
     healthy = {"healthy": str(verdict.is_healthy), "state": verdict.state}

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.slam import GraphSlam, Update
 from graph_slam_ros.slam.kidnap_detector import Alarm
-from graph_slam_ros.slam.robust.ledger import Change, Verdict
+from graph_slam_ros.slam.robust.ledger import Verdict, VerdictChange
 
 _EDGES = 1000  # of one update that are told one by one
 
@@ -40,7 +40,7 @@ def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
         yield correction(slam, update)
 
 
-def _verdict(slam: GraphSlam, change: Change) -> Status:
+def _verdict(slam: GraphSlam, change: VerdictChange) -> Status:
     verdict, reason = change.verdict.name.lower(), change.reason.name.lower()
     why = f": {reason.replace('_', ' ')}" if change.reason else ""
     return happened(

@@ -11,7 +11,7 @@ Stamped = Odometry | Sightings | Fix | Closure
 _PATIENCE_S = 1.0
 
 
-class Ahead:
+class FutureStamps:
     """Lets pass what is not ahead of the clock, in the order it came.
 
     Parameters

@@ -4,7 +4,8 @@ import math
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.node import TfConfig
-from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.typing import Numbers
 
 
 class MapToOdom:
@@ -16,7 +17,7 @@ class MapToOdom:
     """
 
     def __init__(self, config: Config) -> None:
-        self._space: Space = config.space
+        self._space: Geometry = config.space
         self._newest_ns: int | None = None  # odometry that has been told
         self._sent_ns: int | None = None
         self._told: Numbers | None = None

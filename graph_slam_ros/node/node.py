@@ -31,7 +31,7 @@ from graph_slam_ros.node import bond, diagnostics
 from graph_slam_ros.node.map_services import serve_maps
 from graph_slam_ros.node.parameters import changed, declare_parameters
 from graph_slam_ros.node.publishers import LATCHED
-from graph_slam_ros.node.runtime import Configured
+from graph_slam_ros.node.runtime import Runtime
 from graph_slam_ros.node.services import serve_later
 from graph_slam_ros.node.worker import URGENT_S
 
@@ -57,11 +57,11 @@ class GraphSlamNode(LifecycleNode):
         self._is_told_to_stop = is_told_to_stop
         self.config = declare_parameters(self)
         self.add_on_set_parameters_callback(self._on_set)
-        self._run: Configured | None = None
+        self._run: Runtime | None = None
         self._bond: bond.Bond | None = None
         self._faults: deque[float] = deque(maxlen=1000)
         self._told: set[str] = set()
-        self._verdict = diagnostics.Verdict("UNCONFIGURED")
+        self._verdict = diagnostics.Health("UNCONFIGURED")
         self._logged_s = 0.0
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # whatever becomes of /clock
         self._acknowledge = self.create_publisher(UInt64, "~/received", LATCHED)
@@ -131,7 +131,7 @@ class GraphSlamNode(LifecycleNode):
 
     def _configure(self) -> None:
         if self._run is None:
-            self._run = run = Configured(self)
+            self._run = run = Runtime(self)
             run.prepare(self._is_told_to_stop)
             if self.config.journal.resume and run.was_cut_off:
                 unused = "" if self.config.load_pose is None else "; output.load_pose is not used: it has driven since"
@@ -154,7 +154,7 @@ class GraphSlamNode(LifecycleNode):
             self._bond.end()
             self._bond = None
 
-    def _configured(self) -> "Configured":
+    def _configured(self) -> "Runtime":
         if self._run is None:
             raise GraphSlamError("not configured")
         return self._run
@@ -225,10 +225,10 @@ class GraphSlamNode(LifecycleNode):
 
         return answered
 
-    def _serve(self, start: "Callable[[Configured], Future[str]]", _: Any) -> "Future[str]":
+    def _serve(self, start: "Callable[[Runtime], Future[str]]", _: Any) -> "Future[str]":
         return start(self.configured())
 
-    def configured(self) -> Configured:
+    def configured(self) -> Runtime:
         """What there is since configuration. Raises GraphSlamError before."""
         if self._run is None:
             raise GraphSlamError(f"not active: the node is {self._state}")
@@ -279,7 +279,7 @@ class GraphSlamNode(LifecycleNode):
         statuses = diagnostics.statuses(facts, verdict, self.get_fully_qualified_name().lstrip("/"))
         self._diagnostics.publish(to_msg.diagnostics(self.now_ns, statuses))
 
-    def _tell(self, verdict: diagnostics.Verdict) -> None:
+    def _tell(self, verdict: diagnostics.Health) -> None:
         """In the log where it changes, numbers apart; what somebody must do something about, every few seconds.
 
         A node that has just begun to wait is no reason to warn: publishers take a moment to be discovered.
@@ -297,7 +297,7 @@ class GraphSlamNode(LifecycleNode):
             self.get_logger().warn(said)
 
 
-def _without_numbers(verdict: diagnostics.Verdict) -> tuple[str, ...]:
+def _without_numbers(verdict: diagnostics.Health) -> tuple[str, ...]:
     return (verdict.state, *(re.sub(r"\d+(\.\d+)?", "#", reason) for reason in verdict.reasons))
 
 

@@ -7,16 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.graph.geometry import Numbers
 from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.node.session import Estimate
-from graph_slam_ros.slam.frontend.odometry_integration import Motion, OdometryNoise, Rest
+from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise, StationaryDetector
 from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.typing import Numbers
 
 _MOST = 2_000  # messages since the newest keyframe: of a robot that stands there are many
 
 
-class Reckoning:
+class PoseExtrapolator:
     """The last estimate composed with the odometry since; its covariance grows with that."""
 
     def __init__(self, config: Config) -> None:
@@ -24,7 +24,7 @@ class Reckoning:
         self._noise = OdometryNoise(config.odometry, config.space)
         self._since: deque[Odometry] = deque(maxlen=_MOST)
         self._estimate: Estimate | None = None
-        self._motion: Motion | None = None
+        self._motion: IntegratedOdometry | None = None
         self._last: Numbers = self._space.identity
 
     @property
@@ -51,7 +51,9 @@ class Reckoning:
         group = self._space.group
         if estimate is not self._estimate or self._motion is None:
             self._estimate, self._last = estimate, estimate.T_odom_keyframe
-            self._motion = Motion(self._noise, self._space, 0, estimate.stamp_ns, Rest(self._noise, self._space))
+            self._motion = IntegratedOdometry(
+                self._noise, self._space, 0, estimate.stamp_ns, StationaryDetector(self._noise, self._space)
+            )
             while len(self._since) > 1 and self._since[0].stamp_ns <= estimate.stamp_ns:
                 self._since.popleft()
         at_ns = self._motion.now.stamp_ns

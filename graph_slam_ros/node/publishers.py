@@ -35,7 +35,7 @@ class _Topic:
     took_s: float = 0.0  # to make and send it
 
 
-class Outputs:
+class Publishers:
     """Publishers of results, and what is due on them; made by the node, used by the worker's thread.
 
     Parameters

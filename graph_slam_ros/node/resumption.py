@@ -2,8 +2,8 @@
 
 import math
 
-from graph_slam_ros.graph.geometry import Numbers
 from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.typing import Numbers
 
 _LONGEST_NS = 60_000_000_000  # without odometry: after more, the robot may have been carried
 _NEAR = 0.1  # m and rad: an odometry that begins anew so close to where it was does no harm

@@ -19,34 +19,34 @@ from rclpy.serialization import deserialize_message
 from graph_slam_ros.errors import GraphSlamError, said
 from graph_slam_ros.measurements.types import Closure, InitialPose, Measured, Sightings
 from graph_slam_ros.messages import results, to_msg
-from graph_slam_ros.messages.from_msg import Border, Decoder, twist_of
+from graph_slam_ros.messages.from_msg import Decoder, MessageConverter, twist_of
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.node import diagnostics, events
 from graph_slam_ros.node.completion import Completion
-from graph_slam_ros.node.future_stamps import Ahead
+from graph_slam_ros.node.future_stamps import FutureStamps
 from graph_slam_ros.node.memory import is_short
-from graph_slam_ros.node.pose_extrapolator import Reckoning
+from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.preparation import Preparation
-from graph_slam_ros.node.publishers import Outputs
+from graph_slam_ros.node.publishers import Publishers
 from graph_slam_ros.node.recent import RecentInputs
 from graph_slam_ros.node.session import Estimate, Session
-from graph_slam_ros.node.subscriptions import Listeners
-from graph_slam_ros.node.tf_broadcaster import Broadcaster
+from graph_slam_ros.node.subscriptions import Subscriptions
+from graph_slam_ros.node.tf_broadcaster import TfBroadcaster
 from graph_slam_ros.node.throttle import Throttle
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Update
 from graph_slam_ros.slam.edits import removal
-from graph_slam_ros.slam.frontend.time_jump import StampJump
+from graph_slam_ros.slam.frontend.time_jump import TimeJumpDetector
 
 _ACKNOWLEDGE = 32  # messages
 _MOST_UNPUBLISHED_S, _AGAIN_S = 4.0, 5.0
 _HINTS = {"future": ", ahead of the clock: is use_sim_time to be set, or does a clock differ?"}
 
 
-class Configured:
+class Runtime:
     """What there is from configuration to clean-up.
 
     Parameters
@@ -59,17 +59,17 @@ class Configured:
         self._node = node
         self.counters = Counters()  # of the border; those of the pipeline belong to the worker's thread
         self.counters.on_first = self._tell
-        self._border = Border(config, self.counters, _installed(config))
-        self._ahead = Ahead(config.time.future_s, self._clock_ns, partial(self._refuse, "future"))
-        self._stamp_jump = StampJump(config.time.jump_back_s)
-        self._reckoning = Reckoning(config)
+        self._border = MessageConverter(config, self.counters, _installed(config))
+        self._ahead = FutureStamps(config.time.future_s, self._clock_ns, partial(self._refuse, "future"))
+        self._stamp_jump = TimeJumpDetector(config.time.jump_back_s)
+        self._reckoning = PoseExtrapolator(config)
         self._session = Session(config, self.counters, self._on_update, self._tell)
-        self._outputs = Outputs(node, config)
+        self._outputs = Publishers(node, config)
         self._worker = Worker(config.inputs.queue)
         self._preparation = Preparation(node.get_logger())
         self._completion = Completion(self._session.incomplete, node.get_logger())
-        self._listeners: Listeners | None = None
-        self._broadcaster: Broadcaster | None = None
+        self._listeners: Subscriptions | None = None
+        self._broadcaster: TfBroadcaster | None = None
         self._jumps: Any = None
         self._is_paused = self._is_stopped = False
         self._before_ns = 0  # until the clock is there, what is dated later is of before it jumped back
@@ -109,9 +109,9 @@ class Configured:
         if self._listeners is not None:
             return
         node, config = self._node, self._node.config
-        self._broadcaster = Broadcaster(node, config, node.guarded, self._look)
+        self._broadcaster = TfBroadcaster(node, config, node.guarded, self._look)
         heard = self._broadcaster.heard
-        self._listeners = Listeners(node, config, self._border, self._take, node.guarded, heard, self.counters)
+        self._listeners = Subscriptions(node, config, self._border, self._take, node.guarded, heard, self.counters)
         back = Duration(nanoseconds=-round(config.time.jump_back_s * 1e9))
         threshold = JumpThreshold(min_forward=None, min_backward=back, on_clock_change=True)
         self._jumps = node.get_clock().create_jump_callback(threshold, post_callback=node.guarded(self._on_jump))

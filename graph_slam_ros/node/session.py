@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph.geometry import Numbers
 from graph_slam_ros.measurements.types import InitialPose
 from graph_slam_ros.node.resumption import Resumption
-from graph_slam_ros.node.threads import in_a_thread
+from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.runs import (
     RunError,
     RunRecorder,
@@ -36,7 +35,8 @@ from graph_slam_ros.runs import (
 )
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.graph_slam import Correction
-from graph_slam_ros.slam.snapshot import MapState
+from graph_slam_ros.slam.snapshot import MapSnapshot
+from graph_slam_ros.typing import Numbers
 
 OnUpdate = Callable[[GraphSlam, Update], None]
 
@@ -106,8 +106,8 @@ class Session:
         self.was_cut_off = self._folder is not None and is_cut_off(self._folder)
         self._begin()
 
-    def _begin(self, start: MapState | None = None, loaded: Path | None = None) -> None:
-        slam = GraphSlam(self.config, None, in_a_thread, start)
+    def _begin(self, start: MapSnapshot | None = None, loaded: Path | None = None) -> None:
+        slam = GraphSlam(self.config, None, run_in_thread, start)
         recorder: RunRecorder | None = None
         if self._folder is not None:
             named = self._folder.with_name(load) if (load := self.config.output.load) else None

@@ -14,7 +14,7 @@ except ImportError:  # Humble
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from graph_slam_ros.measurements.types import Measured
-from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, Border, is_correction
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageConverter, is_correction
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.node.diagnostics import InputFacts
@@ -43,7 +43,7 @@ class _Heard:
     at_ns: int | None = None  # the tick at which there was something new
 
 
-class Listeners:
+class Subscriptions:
     """Subscriptions of the inputs and of /tf.
 
     Parameters
@@ -58,7 +58,7 @@ class Listeners:
         self,
         node: Any,
         config: Config,
-        border: Border,
+        border: MessageConverter,
         take: Take,
         guarded: Guard,
         on_correction: Callable[[bytes], None],

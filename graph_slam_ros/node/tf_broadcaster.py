@@ -17,7 +17,7 @@ _REMEMBERED = 500  # messages of ours that may still come back to us
 _OTHERS_S = 5.0  # after its last message somebody else is gone
 
 
-class Broadcaster:
+class TfBroadcaster:
     """The publisher of map -> odom while the node is active.
 
     Parameters

@@ -8,7 +8,7 @@ from typing import TypeVar
 Result = TypeVar("Result")
 
 
-def in_a_thread(work: Callable[[], Result]) -> Callable[[], Result]:
+def run_in_thread(work: Callable[[], Result]) -> Callable[[], Result]:
     """Begin work in a thread that nobody waits for at the end; returns what waits for its result, or its exception."""
     future: Future[Result] = Future()
     Thread(target=_run, args=(work, future), name="second look", daemon=True).start()

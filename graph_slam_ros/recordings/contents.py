@@ -18,7 +18,7 @@ _LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # as for what is counted
 
 
 @dataclass(slots=True)
-class Contents:
+class TopicContents:
     """What is known of one topic.
 
     Attributes
@@ -69,7 +69,7 @@ class Recording:
     moving, fixed : frames that move in their parent, and that do not: child to parent
     """
 
-    topics: dict[str, Contents]
+    topics: dict[str, TopicContents]
     moving: dict[str, str] = field(default_factory=dict)
     fixed: dict[str, str] = field(default_factory=dict)
 
@@ -89,7 +89,7 @@ def _root(links: dict[str, str], frame: str) -> str:
 
 def look(bag: Bag) -> Recording:
     """Read a recording once."""
-    out = Recording({name: Contents(topic) for name, topic in bag.topics.items()})
+    out = Recording({name: TopicContents(topic) for name, topic in bag.topics.items()})
     decoders = dict(_decoders(out))
     for message in bag.messages(set(bag.topics)):
         one = out.topics[message.topic]
@@ -115,7 +115,7 @@ def _decoders(recording: Recording) -> Iterator[tuple[str, Callable[[bytes], Any
                 one.trouble = str(error)
 
 
-def _add(recording: Recording, one: Contents, m: Any, log_ns: int) -> None:
+def _add(recording: Recording, one: TopicContents, m: Any, log_ns: int) -> None:
     if one.topic.type == TRANSFORMS:
         links = recording.fixed if one.topic.name.endswith("tf_static") else recording.moving
         links.update((_plain(t.child_frame_id), _plain(t.header.frame_id)) for t in m.transforms)
@@ -139,7 +139,7 @@ def _plain(frame: str) -> str:
 # -- by type -----------------------------------------------------------------------------------------------------------
 
 
-def _any(one: Contents, m: Any) -> None:
+def _any(one: TopicContents, m: Any) -> None:
     """Of packages that need not be there: how many landmarks it holds."""
     for name in ("landmarks", "markers", "sensed_data", "detections", "poses"):
         if hasattr(m, name):
@@ -147,7 +147,7 @@ def _any(one: Contents, m: Any) -> None:
             return
 
 
-def _odometry(one: Contents, m: Any) -> None:
+def _odometry(one: TopicContents, m: Any) -> None:
     p, q = m.pose.pose.position, m.pose.pose.orientation
     at = float(p.x), float(p.y), float(p.z)
     if one.last_at is None:
@@ -160,7 +160,7 @@ def _odometry(one: Contents, m: Any) -> None:
     one.off_plane += abs(at[2] - one.height_m) > _LEVEL_M or up < _UPRIGHT
 
 
-def _detections(one: Contents, m: Any) -> None:
+def _detections(one: TopicContents, m: Any) -> None:
     classes = [d.results[0].hypothesis.class_id for d in m.detections if len(d.results)]
     one.is_repeated |= len(set(classes)) < len(classes)
     for d in m.detections:
@@ -172,19 +172,19 @@ def _detections(one: Contents, m: Any) -> None:
     one.classes.update(filter(None, islice(classes, _MOST_NAMES - len(one.classes))))
 
 
-def _cloud(one: Contents, m: Any) -> None:
+def _cloud(one: TopicContents, m: Any) -> None:
     one.fields = one.fields or {f.name for f in m.fields}
     one.items += int(m.width * m.height)
 
 
-def _fix(one: Contents, m: Any) -> None:
+def _fix(one: TopicContents, m: Any) -> None:
     has_fix = m.status.status >= 0 and math.isfinite(m.latitude) and (m.latitude, m.longitude) != (0.0, 0.0)
     if has_fix and not one.usable:
         one.has_noise = m.position_covariance_type != 0 and bool(m.position_covariance[:5:4].all())
     one.usable += has_fix
 
 
-def _imu(one: Contents, m: Any) -> None:
+def _imu(one: TopicContents, m: Any) -> None:
     q = m.orientation
     is_known = m.orientation_covariance[0] != -1.0 and math.hypot(q.x, q.y, q.z, q.w) > 0.5
     if is_known and not one.usable:
@@ -192,16 +192,16 @@ def _imu(one: Contents, m: Any) -> None:
     one.usable += is_known
 
 
-def _pose(one: Contents, m: Any) -> None:
+def _pose(one: TopicContents, m: Any) -> None:
     one.has_noise |= hasattr(m.pose, "covariance") and bool(m.pose.covariance[:8:7].all())
 
 
-def _apriltags(one: Contents, m: Any) -> None:
+def _apriltags(one: TopicContents, m: Any) -> None:
     one.items += len(m.detections)
     one.ids.update(f"{d.family}:{d.id}" for d in m.detections if len(one.ids) < _MOST_NAMES)
 
 
-_OF_TYPE: dict[str, Callable[[Contents, Any], None]] = {
+_OF_TYPE: dict[str, Callable[[TopicContents, Any], None]] = {
     "nav_msgs/msg/Odometry": _odometry,
     "vision_msgs/msg/Detection3DArray": _detections,
     "sensor_msgs/msg/PointCloud2": _cloud,

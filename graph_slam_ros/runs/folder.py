@@ -23,9 +23,9 @@ from graph_slam_ros import __version__
 from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
 from graph_slam_ros.formats.durable import NEW, claimed, sync_folder, write_whole
 from graph_slam_ros.formats.files import is_regular, opened, read_bytes, read_text
-from graph_slam_ros.runs.journal import INGEST, MAP, MEASUREMENT, parts_of, read_ingest
-from graph_slam_ros.recordings.mcap_records import begin, records
 from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.recordings.mcap_records import begin, records
+from graph_slam_ros.runs.journal import INGEST, MAP, MEASUREMENT, parts_of, read_ingest
 from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER
 from graph_slam_ros.runs.map_journal import GROWTH, grew
 from graph_slam_ros.slam import Config

@@ -21,10 +21,10 @@ from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.formats.strict import integer, lines, numbers, stamp
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.robust.ledger import Change, Reason, Verdict
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict, VerdictChange
+from graph_slam_ros.typing import Numbers
 
 LEDGER, CHANGES = "ledger.csv", "ledger_changes.csv"
-Numbers = tuple[float, ...]
 Ids = tuple[int, ...]
 Stamp = NewType("Stamp", int)
 Row = TypeVar("Row")
@@ -98,7 +98,7 @@ def ledger_text(slam: GraphSlam, ids: list[int]) -> str:
 
 def changes_text(slam: GraphSlam) -> str:
     """The history of all verdicts."""
-    return _text(Change, slam.ledger.history)
+    return _text(VerdictChange, slam.ledger.history)
 
 
 def read_ledger(folder: Path) -> list[Entry]:
@@ -112,10 +112,10 @@ def read_ledger(folder: Path) -> list[Entry]:
     return entries
 
 
-def read_changes(folder: Path, edges: int) -> list[Change]:
+def read_changes(folder: Path, edges: int) -> list[VerdictChange]:
     """The history of a run of so many edges, in order. Raises FormatError naming the line."""
-    changes = list[Change]()
-    for line, change in _read(Change, folder / CHANGES):
+    changes = list[VerdictChange]()
+    for line, change in _read(VerdictChange, folder / CHANGES):
         if not 0 <= change.edge < edges:
             raise FormatError(f"{folder / CHANGES}:{line}: edge {change.edge} is none of the {edges} of {LEDGER}")
         changes.append(change)

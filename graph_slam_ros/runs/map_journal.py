@@ -33,16 +33,16 @@ import numpy as np
 
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
-from graph_slam_ros.runs.journal import MAP, parts_of, read_records
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3
-from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.frontend.motion_compensation import Where
-from graph_slam_ros.slam.landmarks.landmark_map import Landmark, Seen
-from graph_slam_ros.slam.robust.ledger import Change, Ledger, Reason, Verdict
-from graph_slam_ros.slam.snapshot import MapState
 from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.runs.journal import MAP, parts_of, read_records
+from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.landmarks.landmark_map import Landmark, LandmarkEdge
+from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict, VerdictChange
+from graph_slam_ros.slam.snapshot import MapSnapshot
 
 GROWTH = "graph_slam_ros.Map"
 VERSION = 1
@@ -54,7 +54,7 @@ _JUMP_M = 0.5  # or when a solve moved the newest that far, and there are a hund
 Record = dict[str, Any]
 
 
-class Growth:
+class MapGrowth:
     """What of a map was told already.
 
     Parameters
@@ -62,7 +62,7 @@ class Growth:
     start : the map that the run goes on in
     """
 
-    def __init__(self, start: MapState | None = None) -> None:
+    def __init__(self, start: MapSnapshot | None = None) -> None:
         self._vertices = self._edges = self._judged = self._changes = 0
         self._keyframes = self._segments = self._sightings = self._landmarks = self._offsets = 0
         self._frozen = self._drives = 0
@@ -86,7 +86,7 @@ class Growth:
             self._estimated = count
             yield _estimate(slam.solver.values)
 
-    def since(self, a: GraphSlam | MapState) -> Record:
+    def since(self, a: GraphSlam | MapSnapshot) -> Record:
         """What there is since the last call."""
         graph, first_edge = a.graph, self._edges
         out: Record = {"type": "growth"}
@@ -131,7 +131,7 @@ def grew(folder: Path) -> bool:
     return any(record.get("type") == "growth" for record in read_records(folder, MAP, []))
 
 
-def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> MapState | None:
+def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> MapSnapshot | None:
     """The map of a run folder, as far as it can be read; None where there is none.
 
     Parameters
@@ -143,7 +143,7 @@ def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> Ma
     FormatError
         It is of a later version, or no map.
     """
-    state, has_start = MapState(), False
+    state, has_start = MapSnapshot(), False
     for count, record in enumerate(read_records(folder, MAP, losses)):
         try:
             match record["type"]:
@@ -169,22 +169,22 @@ def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> Ma
     return state
 
 
-def state_of(slam: GraphSlam) -> MapState:
+def state_of(slam: GraphSlam) -> MapSnapshot:
     """The map of a pipeline, apart from it."""
-    state = MapState()
-    extend(state, Growth().since(slam))
+    state = MapSnapshot()
+    extend(state, MapGrowth().since(slam))
     state.values, state.settings = slam.solver.values, dict(slam.settings)
     state.used_ns, state.source = slam.newest_odometry_ns, slam.odometry_source
     return state
 
 
-def extend(state: MapState, record: Mapping[str, Any]) -> None:
+def extend(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     """Take a ``growth`` in, after what there is."""
     _grow(state, record)
     _take_effect(state)
 
 
-def _fault(state: MapState) -> str:
+def _fault(state: MapSnapshot) -> str:
     """Where the parts do not fit together; empty if they do."""
     graph = state.graph
     kinds = [graph.kinds[code] for code in graph.kind.values.tolist()]
@@ -252,7 +252,7 @@ def _judgement(ledger: Ledger, edge: int) -> list[Any]:
     return [first, statistic, threshold, numbers, ledger.residual(edge).tolist(), *_named(verdict, reason)]
 
 
-def _change(c: Change) -> list[Any]:
+def _change(c: VerdictChange) -> list[Any]:
     return [c.edge, c.keyframe, *_named(c.verdict, c.reason), _told(c.statistic), _told(c.threshold)]
 
 
@@ -270,13 +270,13 @@ def _landmark(mark: Landmark) -> list[Any]:
     return [mark.vertex, mark.is_unnamed, mark.is_tentative, mark.sightings, *stamps]
 
 
-def _newer(seen: Sequence[Seen], first_edge: int) -> Iterable[Seen]:
+def _newer(seen: Sequence[LandmarkEdge], first_edge: int) -> Iterable[LandmarkEdge]:
     """Those of new edges: they are at the end."""
     count = next((k for k, one in enumerate(reversed(seen)) if one.edge < first_edge), len(seen))
     return seen[len(seen) - count :]
 
 
-def _seen(one: Seen) -> list[Any]:
+def _seen(one: LandmarkEdge) -> list[Any]:
     where = one.where
     at = [where.keyframe, where.vertex, where.stamp_ns, where.T_keyframe_base, where.covariance.tolist()]
     return [one.edge, one.topic, asdict(one.sighting), *at]
@@ -285,7 +285,7 @@ def _seen(one: Seen) -> list[Any]:
 # -- what is read -----------------------------------------------------------------------------------------------------
 
 
-def _take_effect(state: MapState) -> None:
+def _take_effect(state: MapSnapshot) -> None:
     """What is not believed pulls no more; what was given to another landmark is withdrawn from the one before."""
     out = np.flatnonzero(np.isin(state.ledger.verdict.values, (Verdict.PENDING, Verdict.REJECTED)))
     state.graph.set_weights(out, 0.0)
@@ -294,7 +294,7 @@ def _take_effect(state: MapState) -> None:
         mark.stamps = {one.where.stamp_ns for one in mark.seen}
 
 
-def _grow(state: MapState, record: Mapping[str, Any]) -> None:
+def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     graph, ledger = state.graph, state.ledger
     for name, several in groupby(record.get("vertices", ()), key=lambda vertex: vertex[0]):
         graph.add_vertices(_KINDS[name], [values for _, values in several])
@@ -352,7 +352,7 @@ def _verdict(verdict: str, reason: str) -> tuple[Verdict, Reason]:
     return Verdict[verdict.upper()], Reason[reason.upper()]
 
 
-def _know(state: MapState, record: Mapping[str, Any]) -> None:
+def _know(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     for name, told in record.get("landmarks", {}).items():
         before = state.landmarks.get(name)
         if before is not None and (told is None or told[0] != before.vertex):  # it was given up: another comes last
@@ -364,7 +364,7 @@ def _know(state: MapState, record: Mapping[str, Any]) -> None:
     by_vertex = {mark.vertex: mark for mark in state.landmarks.values()} if record.get("seen") else {}
     for edge, topic, sighting, keyframe, vertex, stamp, pose, covariance in record.get("seen", ()):
         lists = {name: tuple(value) for name, value in sighting.items() if isinstance(value, list)}
-        where = Where(keyframe, vertex, stamp, tuple(pose), np.array(covariance))
+        where = PoseAtStamp(keyframe, vertex, stamp, tuple(pose), np.array(covariance))
         table, row = state.graph.row(edge)
         mark = by_vertex[int(table.vertices.values[row, 1])]
-        mark.seen.append(Seen(edge, topic, Sighting(**sighting | lists), where))
+        mark.seen.append(LandmarkEdge(edge, topic, Sighting(**sighting | lists), where))

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.formats.durable import AppendedFile, write_whole
-from graph_slam_ros.runs.journal import BEGINS_IN_A_MAP, INGEST, MAP, MEASUREMENT, Parts, close_all, part_name, parts_of
 from graph_slam_ros.formats.parameters import parameters_text
+from graph_slam_ros.measurements.types import to_record
 from graph_slam_ros.messages import results
 from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.runs.folder import (
@@ -27,11 +27,11 @@ from graph_slam_ros.runs.folder import (
     room,
     summary_of,
 )
-from graph_slam_ros.runs.map_journal import GROWTH, Growth
+from graph_slam_ros.runs.journal import BEGINS_IN_A_MAP, INGEST, MAP, MEASUREMENT, Parts, close_all, part_name, parts_of
+from graph_slam_ros.runs.map_journal import GROWTH, MapGrowth
 from graph_slam_ros.runs.tables import counted, result_texts, summarize
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
-from graph_slam_ros.slam.snapshot import MapState
-from graph_slam_ros.measurements.types import to_record
+from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver.leverage import leverage
 
 _PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
@@ -58,7 +58,7 @@ class RunRecorder:
         folder: Path | str,
         config: Config,
         sync_s: float = 0.0,
-        start: MapState | None = None,
+        start: MapSnapshot | None = None,
         *,
         force: bool = False,
     ) -> None:
@@ -73,7 +73,7 @@ class RunRecorder:
         self._journal = Parts(self.folder, INGEST, MEASUREMENT)
         self._map = Parts(self.folder, MAP, GROWTH)
         self._accepted: deque[Measurement] = deque()  # and not written yet
-        self._growth = Growth(start)
+        self._growth = MapGrowth(start)
         self._grown = self._growth.first
         self._bag: BagWriter | None = None
         self._bags = 0

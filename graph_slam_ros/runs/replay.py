@@ -1,24 +1,19 @@
-"""Replay: a recording, or the ingest sequence of an earlier run, through ``GraphSlam`` as fast as the CPU allows.
+"""Replay: a recording, or the ingest sequence of an earlier run, through ``GraphSlam`` as fast as the CPU allows."""
 
-``graph_slam_ros.runs.replay`` is this module and the function of that name in one: it can be called.
-"""
-
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from graph_slam_ros.runs.journal import read_ingest
+from graph_slam_ros.config.inputs import InputConfig, default_input
+from graph_slam_ros.measurements.reasons import warnings as mendable
+from graph_slam_ros.measurements.types import Measured, from_record
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageConverter
+from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.recordings.bag import Bag, BagError, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
-from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, Border
-from graph_slam_ros.measurements.types import Measured
-from graph_slam_ros.messages.inputs import uses
-from graph_slam_ros.slam.frontend.time_jump import StampJump
-from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.runs import (
     RunError,
     check_room,
@@ -31,11 +26,10 @@ from graph_slam_ros.runs import (
     run_config,
     stopwatch,
 )
+from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
-from graph_slam_ros.config.inputs import InputConfig, default_input
-from graph_slam_ros.measurements.types import from_record
-from graph_slam_ros.measurements.reasons import warnings as mendable
+from graph_slam_ros.slam.frontend.time_jump import TimeJumpDetector
 from graph_slam_ros.warmup import warmup
 
 TF_STATIC_TOPIC, TF_TOPIC = "/tf_static", "/tf"
@@ -143,15 +137,17 @@ def measurements(
         At once, before anything is read: a recorded definition is not what we can use.
     """
     used = [bag.topics[topic] for topic in inputs.topics.values()]
-    border = Border(config, counters, {topic.type: recorded_decoder(topic) for topic in used})
+    border = MessageConverter(config, counters, {topic.type: recorded_decoder(topic) for topic in used})
     for name in counters.received.keys() - inputs.topics.keys():
         del counters.received[name]  # nobody asked for it
     if datum:
         border.begin_at(datum)
-    return _through(border, bag, inputs, StampJump(config.time.jump_back_s))
+    return _through(border, bag, inputs, TimeJumpDetector(config.time.jump_back_s))
 
 
-def _through(border: Border, bag: Bag, inputs: Inputs, jump: StampJump) -> Iterator[list[Measured | Control]]:
+def _through(
+    border: MessageConverter, bag: Bag, inputs: Inputs, jump: TimeJumpDetector
+) -> Iterator[list[Measured | Control]]:
     if TF_STATIC in inputs.topics:
         for message in bag.messages({inputs.topics[TF_STATIC]}):
             border.take(TF_STATIC, message.cdr)
@@ -233,14 +229,3 @@ def _with_end(items: Iterable[Sequence[Measurement]]) -> Iterator[Sequence[Measu
     yield from items
     yield [Control("end")]
     yield [Control("optimize")]
-
-
-class _CallableModule(ModuleType):
-    """Whoever has imported this module finds it where the function of its name is looked for."""
-
-    def __call__(self, *args: Any, **options: Any) -> Replayed:
-        """As ``replay``."""
-        return replay(*args, **options)
-
-
-sys.modules[__name__].__class__ = _CallableModule

@@ -8,7 +8,7 @@ from typing import Any
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.durable import claimed
-from graph_slam_ros.runs.journal import read_ingest, read_rest
+from graph_slam_ros.measurements.types import from_record
 from graph_slam_ros.runs.folder import (
     SUMMARY,
     RunError,
@@ -20,19 +20,19 @@ from graph_slam_ros.runs.folder import (
     summary_of,
     was_saved_whole,
 )
+from graph_slam_ros.runs.journal import read_ingest, read_rest
 from graph_slam_ros.runs.map_journal import has_map, read_map, state_of
 from graph_slam_ros.runs.recorder import RunRecorder, save_results
 from graph_slam_ros.runs.tables import counters_of, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
-from graph_slam_ros.slam.snapshot import MapState
-from graph_slam_ros.measurements.types import from_record
+from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.warmup import warmup
 
 Summary = dict[str, Any]
 Took = Callable[[], dict[str, float]]
 
 
-def map_of(folder: Path, losses: list[str], counters: Counters | None = None) -> MapState:
+def map_of(folder: Path, losses: list[str], counters: Counters | None = None) -> MapSnapshot:
     """The map of a run: as it was written down, with what its journal holds besides; or by repeating the drive.
 
     Parameters
@@ -61,7 +61,7 @@ def map_of(folder: Path, losses: list[str], counters: Counters | None = None) ->
     return state
 
 
-def config_of(folder: Path, state: MapState) -> Config:
+def config_of(folder: Path, state: MapSnapshot) -> Config:
     """The configuration of a run when its map was as it is: with what was changed on the way."""
     try:
         return run_config(folder).changed(state.settings)
@@ -69,7 +69,7 @@ def config_of(folder: Path, state: MapState) -> Config:
         raise RunError(f"{folder}: changed on the way: {error}") from None
 
 
-def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapState:
+def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapSnapshot:
     slam = GraphSlam(run_config(folder), start=read_map(folder, [], start_only=True))  # its losses are known
     for record in read_ingest(folder, losses):
         slam.process(from_record(record))
@@ -78,7 +78,7 @@ def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapState:
     return state_of(slam)
 
 
-def _with_rest(folder: Path, state: MapState, losses: list[str], counters: Counters) -> MapState:
+def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Counters) -> MapSnapshot:
     """The map after those measurements, too, that were accepted and not processed any more."""
     if state.processed is None or was_saved_whole(folder):
         return state
@@ -119,7 +119,7 @@ def record_run(
     config: Config,
     measurements: Iterable[Measurement],
     losses: Sequence[str],
-    start: MapState | None = None,
+    start: MapSnapshot | None = None,
     *,
     border: Counters | None = None,
     earlier: Counters | None = None,

@@ -7,16 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.runs import COVARIANCES, SUMMARY, RunError, changed_since, is_run, run_config
 from graph_slam_ros.runs.ledger_file import Entry, read_ledger
-from graph_slam_ros.slam import Config
 from graph_slam_ros.runs.trajectory import Trajectory, read_covariances, read_landmarks, read_tum
-
-Array = NDArray[np.float64]
+from graph_slam_ros.slam import Config
+from graph_slam_ros.typing import Array
 
 
 @dataclass(frozen=True, slots=True)

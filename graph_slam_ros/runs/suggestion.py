@@ -7,14 +7,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from graph_slam_ros.recordings.contents import Contents, Recording
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import parse_setting
-from graph_slam_ros.runs.replay import TF_TOPIC, choose_inputs
-from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs import CONVERTERS
+from graph_slam_ros.recordings.bag import Bag
+from graph_slam_ros.recordings.contents import Recording, TopicContents
 from graph_slam_ros.runs import suggested_out
+from graph_slam_ros.runs.replay import TF_TOPIC, choose_inputs
 from graph_slam_ros.slam import Config
 
 ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
@@ -111,7 +111,7 @@ class Suggestion:
             )
         return ""
 
-    def _of_type(self, *types: str) -> Iterator[Contents]:
+    def _of_type(self, *types: str) -> Iterator[TopicContents]:
         """Topics that can be read and are no truth."""
         for name, one in self._recording.topics.items():
             if one.topic.type in types and one.topic.count:
@@ -148,7 +148,7 @@ class Suggestion:
             self.notes.append(f"{best.topic.name} leaves the plane: these are three dimensions")
         return ""
 
-    def _merit(self, one: Contents) -> tuple[Any, ...]:
+    def _merit(self, one: TopicContents) -> tuple[Any, ...]:
         """Whole and moving first, then fused, then in a frame of odometry, then the one with the most messages."""
         longest = max(other.last_ns - other.first_ns for other in self._recording.topics.values())
         is_whole = one.last_ns - one.first_ns >= 0.5 * longest
@@ -206,12 +206,12 @@ class Suggestion:
             elif one.topic.type == "visualization_msgs/msg/MarkerArray" and not _TRUTH.search(name):
                 self.unused[name] = f"markers are mostly pictures; --set marks.type={one.topic.type} takes them"
 
-    def _corners(self, one: Contents) -> None:
+    def _corners(self, one: TopicContents) -> None:
         self.unused[one.topic.name] = (
             "these are corners without poses: run a pose estimator first, e.g. apriltag_ros on the images"
         )
 
-    def _detections(self, one: Contents) -> None:
+    def _detections(self, one: TopicContents) -> None:
         if not one.items:
             self.unused[one.topic.name] = "empty"
         elif one.ids and not one.without_id and all(id_.isdecimal() and len(id_) >= 15 for id_ in one.ids):
@@ -224,11 +224,11 @@ class Suggestion:
                 self._join(one)
             self._add("detections", one)
 
-    def _join(self, one: Contents) -> None:
+    def _join(self, one: TopicContents) -> None:
         self.settings["landmarks.association"] = "joint"
         self.notes.append(f"{one.topic.name} has no ids: landmarks are told apart by where they are")
 
-    def _cloud(self, one: Contents) -> None:
+    def _cloud(self, one: TopicContents) -> None:
         is_position, is_bearing = {"x", "y"} <= one.fields, "bearing" in one.fields
         if not (is_position or is_bearing or "range" in one.fields):
             return
@@ -279,7 +279,7 @@ class Suggestion:
                 self._add("pose", one, chosen | ({} if one.has_noise else {"sigma_m": 0.1}), linked=True)
                 self.notes.append(f"{name} is taken for a fix: if it is an estimate or the truth, leave it out")
 
-    def _choose_imu(self, found: Iterator[Contents], is_needed: bool) -> None:
+    def _choose_imu(self, found: Iterator[TopicContents], is_needed: bool) -> None:
         for one in sorted(found, key=lambda one: -one.usable):
             if one.usable < 0.5 * one.read:
                 self.unused[one.topic.name] = "it has no orientation (an IMU with a filter has)"
@@ -291,7 +291,7 @@ class Suggestion:
 
     # -- what all inputs need --------------------------------------------------------------------------------------
 
-    def _add(self, name: str, one: Contents, chosen: dict[str, Any] | None = None, linked: bool = False) -> None:
+    def _add(self, name: str, one: TopicContents, chosen: dict[str, Any] | None = None, linked: bool = False) -> None:
         topic = one.topic.name
         if _is_zero(one):
             self.unused[topic] = "its stamps are zero: have the driver fill in header.stamp"
@@ -340,11 +340,11 @@ class Suggestion:
             self.notes.append("nothing corrects this odometry: the result will be odometry alone (exit code 3)")
 
 
-def _lag_s(one: Contents) -> float:
+def _lag_s(one: TopicContents) -> float:
     return median(one.lag_s) if one.lag_s else 0.0
 
 
-def _is_zero(one: Contents) -> bool:
+def _is_zero(one: TopicContents) -> bool:
     """Whether all its stamps are."""
     return bool(one.lag_s) and not one.is_stamped
 

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.lie import se3
+from graph_slam_ros.typing import Array
 
-Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import replaced
-from graph_slam_ros.graph.geometry import Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.messages.to_msg import (
     covariance6,
     encode,
@@ -27,8 +26,7 @@ from graph_slam_ros.simulation.instrument_messages import Message, gnss_messages
 from graph_slam_ros.simulation.motion import space_of
 from graph_slam_ros.simulation.recording import CLOSURES_TOPIC, LANDMARKS_TOPIC, Recording
 from graph_slam_ros.slam import Closure, Sighting, Sightings
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 ODOMETRY_TOPIC = "/odom"
 TRUTH_TOPIC = "/ground_truth"
@@ -124,7 +122,7 @@ def _odometry(recording: Recording, k: int, twist_covariance: Array) -> bytes:
     return encode(message)
 
 
-def _true_landmarks(recording: Recording, space: Space) -> Sightings:
+def _true_landmarks(recording: Recording, space: Geometry) -> Sightings:
     """The true map, as sightings from the origin of world."""
     known = []
     for name, at in recording.landmarks.items():
@@ -133,12 +131,12 @@ def _true_landmarks(recording: Recording, space: Space) -> Sightings:
     return Sightings(int(recording.stamps_ns[0]), TRUE_LANDMARKS_TOPIC, tuple(known))
 
 
-def _detections(seen: Sightings, frame: str, space: Space) -> bytes:
+def _detections(seen: Sightings, frame: str, space: Geometry) -> bytes:
     head = header(seen.stamp_ns, frame)
     return encode(make(_DETECTIONS, header=head, detections=[_detection(head, s, space) for s in seen.sightings]))
 
 
-def _closures(several: list[Closure], space: Space) -> bytes:
+def _closures(several: list[Closure], space: Geometry) -> bytes:
     """Where the base was earlier, seen from where it is: moving a pose by ``d`` moves its inverse by ``-Ad d``."""
     head, detections = header(several[0].stamp_ns, "base_link"), []
     for one in several:
@@ -180,7 +178,7 @@ def _point_cloud(seen: Sightings, names: Mapping[str, str]) -> bytes:
     return encode(message)
 
 
-def _detection(head: Any, s: Sighting, space: Space) -> Any:
+def _detection(head: Any, s: Sighting, space: Geometry) -> Any:
     known = space.dof if s.kind == "pose" else space.dimensions
     covariance = _UNUSED * np.eye(space.dof)
     covariance[:known, :known] = np.reshape(s.covariance, (known, known))

@@ -4,15 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.random import PCG64, Generator, SeedSequence
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.simulation.motion import space_of
 from graph_slam_ros.simulation.recording import CLOSURES_TOPIC, Recording
 from graph_slam_ros.slam import Closure
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 PLACE_M = 0.5  # between the places that closures join, along the way
 REACH_M = 2.0  # from one end of a closure to the other at most

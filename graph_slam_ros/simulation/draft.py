@@ -8,16 +8,13 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graph_slam_ros.graph.geometry import Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.false_closures import Closures
 from graph_slam_ros.slam import Sighting
+from graph_slam_ros.typing import Array, Index, Numbers
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Numbers = tuple[float, ...]
 Measured = Literal["odometry", "sighting", "closure"]
 
 
@@ -51,7 +48,7 @@ class Draft:
     wrong : what faults have made wrong, by what was measured and its number; of odometry the later pose's
     """
 
-    space: Space
+    space: Geometry
     truth: Array
     odometry: Array
     twist: Array | None

@@ -4,14 +4,12 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from graph_slam_ros.simulation.motion import VelocityNoise, accumulated, integrate, space_of
 from graph_slam_ros.simulation.recording import LANDMARKS_TOPIC, START_NS, Recording
 from graph_slam_ros.slam import Sighting, Sightings
+from graph_slam_ros.typing import Array, Numbers
 
-Array = NDArray[np.float64]
-Numbers = tuple[float, ...]
 Look = Callable[[Numbers], list[Sighting]]
 """From the true pose, what is seen."""
 

@@ -11,16 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph.geometry import Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.simulation.motion import space_of
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Numbers = tuple[float, ...]
+from graph_slam_ros.typing import Array, Index
 
 POLICIES = ("random", "local", "group", "local-group", "aliased")
 SIGMA_M, SIGMA_RAD = 0.3, float(np.deg2rad(10.0))  # how far from the identity what is measured is
@@ -158,11 +154,11 @@ def _following(earlier: int, later: int, pairs: int) -> Index:
     return np.array([earlier, later]) + np.arange(pairs)[:, None]
 
 
-def _same(rng: Generator, space: Space, pairs: int) -> Array:
+def _same(rng: Generator, space: Geometry, pairs: int) -> Array:
     return np.tile(_near_identity(rng, space), (pairs, 1))
 
 
-def _near_identity(rng: Generator, space: Space) -> Array:
+def _near_identity(rng: Generator, space: Geometry) -> Array:
     n = space.dimensions
     sigmas = np.concatenate([np.full(n, SIGMA_M), np.full(space.dof - n, SIGMA_RAD)])
     turned = space.group.exp(tuple((sigmas * rng.standard_normal(space.dof)).tolist()))

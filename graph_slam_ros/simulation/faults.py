@@ -10,16 +10,13 @@ from typing import Any
 
 import numpy as np
 from numpy.random import PCG64, Generator, SeedSequence
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.simulation.draft import Draft
 from graph_slam_ros.simulation.false_closures import GROUP, POLICIES, Closures, count_for, false_closures
 from graph_slam_ros.simulation.options import fill, option
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array
 
 _OFTEN = 3  # times that a landmark must be seen, and seen again later, to be worth a fault
 _STREAMS = 1  # the world itself is drawn from the seed alone, true closures from stream 0

@@ -4,22 +4,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o_writer import graph_lines
 from graph_slam_ros.formats.graph_file import EDGE_TAGS, G2oFile
 from graph_slam_ros.graph import EdgeType, Gaussian, Graph
-from graph_slam_ros.graph.geometry import PLANE, SPACE, Space
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.simulation.draft import Draft
 from graph_slam_ros.simulation.false_closures import Closures
 from graph_slam_ros.simulation.fault_table import WrongLine
 from graph_slam_ros.simulation.faults import Fault, put_faults
 from graph_slam_ros.simulation.pose_graph import values_of
-from graph_slam_ros.simulation.recording import Numbers
 from graph_slam_ros.slam import Sighting
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array, Numbers
 
 
 def faulty_graph(file: G2oFile, truth: Array, faults: Sequence[Fault], seed: int) -> tuple[G2oFile, list[WrongLine]]:
@@ -64,7 +61,7 @@ class _Parts:
     def __init__(self, file: G2oFile, truth: Array) -> None:
         graph = file.graph
         self.file, self.truth = file, truth
-        self.space = space = SPACE if SPACE.pose in graph.kinds else PLANE
+        self.space = space = SPATIAL if SPATIAL.pose in graph.kinds else PLANAR
         self.tags = self._landmark_poses()
         ids = np.asarray(file.ids)
         is_pose = graph.kind.values == (graph.kinds.index(space.pose) if space.pose in graph.kinds else -1)
@@ -196,7 +193,7 @@ class _Parts:
         return measured if forward else tuple(float(x) for x in group.inverse(measured))
 
 
-def _fitting(edge: EdgeType, space: Space, graph: Graph, ends: list[int]) -> EdgeType:
+def _fitting(edge: EdgeType, space: Geometry, graph: Graph, ends: list[int]) -> EdgeType:
     """The edge's type, unless it leads to another landmark now, of which only points or only poses can be seen so."""
     if all(graph.kind_of(v) in kinds for v, kinds in zip(ends, edge.accepts, strict=True)):
         return edge

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.graph import Gaussian
-from graph_slam_ros.graph.geometry import Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.simulation.bag import ODOMETRY_TOPIC, recorded_names
 from graph_slam_ros.simulation.closures import places
 from graph_slam_ros.simulation.draft import Draft
@@ -72,7 +72,7 @@ def faulty_recording(recording: Recording, faults: Sequence[Fault], seed: int) -
     return faulty, sorted(rows, key=lambda row: (row.stamp_ns, row.topic, row.index or 0))
 
 
-def _closures_of(recording: Recording, space: Space, at: Mapping[int, int]) -> Closures:
+def _closures_of(recording: Recording, space: Geometry, at: Mapping[int, int]) -> Closures:
     n, d = len(recording.closures), space.dof
     ends = [(at[c.from_stamp_ns], at[c.stamp_ns]) for c in recording.closures]
     covariances = np.reshape([c.covariance for c in recording.closures], (n, d, d))

@@ -4,18 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import PCG64, Generator
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.lie import se3
 from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
-from graph_slam_ros.simulation.recording import Numbers, Recording
+from graph_slam_ros.simulation.recording import Recording
 from graph_slam_ros.simulation.sensing import KINDS, TagCamera
 from graph_slam_ros.slam import Sighting
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array, Numbers
 
 TICK_NS = 20_000_000  # odometry at 50 Hz
 LOOK_EVERY = 10  # camera at 5 Hz

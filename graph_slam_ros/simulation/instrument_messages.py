@@ -4,12 +4,11 @@ from collections.abc import Iterator
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.messages.to_msg import encode, header, make, quaternion, transform, vector
-from graph_slam_ros.simulation.recording import Gnss, Imu, Numbers
+from graph_slam_ros.simulation.recording import Gnss, Imu
+from graph_slam_ros.typing import Numbers
 
-Array = NDArray[np.float64]
 Message: TypeAlias = tuple[str, str, int, bytes]
 """Topic, type, stamp [ns] and CDR bytes."""
 

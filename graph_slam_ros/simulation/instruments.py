@@ -7,15 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import PCG64, Generator, SeedSequence
-from numpy.typing import NDArray
 
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.messages.inputs.fixes import east_north_up
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
-from graph_slam_ros.simulation.recording import Gnss, Imu, Numbers, Recording, Stamps
-
-Array = NDArray[np.float64]
+from graph_slam_ros.simulation.recording import Gnss, Imu, Recording, Stamps
+from graph_slam_ros.typing import Array, Numbers
 
 DATUM = (47.4, 8.55, 440.0)  # latitude [deg], longitude [deg], height above the ellipsoid [m] of the world's origin
 ANTENNA_M = (0.3, 0.1, 0.8)  # in base_link

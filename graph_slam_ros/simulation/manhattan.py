@@ -4,17 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import PCG64, Generator
-from numpy.typing import NDArray
 
 from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
-from graph_slam_ros.simulation.recording import Numbers, Recording
+from graph_slam_ros.simulation.recording import Recording
 from graph_slam_ros.simulation.sensing import KINDS, RangeBearing
 from graph_slam_ros.slam import Sighting
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index, Numbers
 
 STEP_M = 1.0
 STEPS_PER_BLOCK = 4

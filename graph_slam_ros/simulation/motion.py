@@ -5,13 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
-from graph_slam_ros.graph.geometry import PLANE, SPACE, Space
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se2, se3
-
-Array = NDArray[np.float64]
-Numbers = tuple[float, ...]
+from graph_slam_ros.typing import Array, Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +49,14 @@ class VelocityNoise:
         return self.covariance * (dt_s**2 * (1.0 + memory) / (1.0 - memory))
 
 
-def space_of(pose: Sequence[float] | Array) -> Space:
+def space_of(pose: Sequence[float] | Array) -> Geometry:
     """Where a pose is, by how many numbers it has."""
-    return PLANE if len(pose) == PLANE.pose.size else SPACE
+    return PLANAR if len(pose) == PLANAR.pose.size else SPATIAL
 
 
 def integrate(start: Numbers, steps: Array) -> Array:
     """Poses (n + 1, 3) or (n + 1, 7) from a start by n tangent steps: ``T[k + 1] = T[k] Exp(steps[k])``."""
-    if space_of(start) is PLANE:
+    if space_of(start) is PLANAR:
         return _integrate_planar(start, steps)
     poses = [start]
     for step in steps.tolist():

@@ -7,22 +7,19 @@ from pathlib import Path
 
 import numpy as np
 from numpy.random import PCG64, Generator
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile, Values
 from graph_slam_ros.graph import RELATIVE_POSE, SE2, Gaussian, Graph
-from graph_slam_ros.graph.geometry import Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.manhattan import STEP_M, stroll
 from graph_slam_ros.simulation.motion import space_of, step_covariance
 from graph_slam_ros.simulation.options import fill, option
-from graph_slam_ros.simulation.recording import Numbers, Recording
+from graph_slam_ros.simulation.recording import Recording
 from graph_slam_ros.slam import Sighting
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index, Numbers
 
 POSES_PER_CLOSURE = 3
 CLOSURE_RANGE_STEPS = 2  # to an earlier pose at most this far away in x and in y
@@ -161,7 +158,7 @@ def landmark_graph(recording: Recording) -> Graph:
     return graph
 
 
-def _first_seen(graph: Graph, space: Space, T_odom_base: Numbers, s: Sighting) -> int:
+def _first_seen(graph: Graph, space: Geometry, T_odom_base: Numbers, s: Sighting) -> int:
     """A vertex for a landmark, where a sighting has it."""
     group, seen = space.group, s.measured
     if s.kind == "pose":

@@ -9,9 +9,10 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
-from graph_slam_ros.simulation.recording import Numbers, Recording
+from graph_slam_ros.simulation.recording import Recording
 from graph_slam_ros.simulation.sensing import KINDS, RangeBearing
 from graph_slam_ros.slam import Sighting
+from graph_slam_ros.typing import Numbers
 
 LANDMARKS = ((10.0, -2.0), (15.0, 10.0), (3.0, 15.0), (-5.0, 20.0), (-5.0, 5.0))
 SPEED_M_S, TURN_RAD_S = 1.0, 0.1

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.slam import Closure, Odometry, Sightings
+from graph_slam_ros.typing import Array, Numbers
 
-Array = NDArray[np.float64]
-Numbers = tuple[float, ...]
 Stamps = NDArray[np.int64]
 
 START_NS = 1_700_000_000 * 10**9  # a plausible date: stamps near zero would hide faults of precision

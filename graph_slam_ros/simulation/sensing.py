@@ -7,12 +7,10 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from graph_slam_ros.graph.geometry import SPACE
+from graph_slam_ros.graph.geometry import SPATIAL
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.slam import Sighting
-
-Array = NDArray[np.float64]
-Numbers = tuple[float, ...]
+from graph_slam_ros.typing import Array, Numbers
 
 KINDS = ("position", "range_bearing", "bearing", "range")  # what a sensor may say, as in ``Sighting``
 
@@ -125,8 +123,8 @@ class TagCamera:
         position = np.add(se3.position(true), noise[:3])
         turned = so3.compose(so3.exp(tuple(noise[3:])), se3.rotation(true))
         measured = np.stack(se3.compose(self.T_base_sensor, (*position, *so3.normalize(turned))), axis=1)
-        in_base = SPACE.in_parent_axes(self.T_base_sensor, np.diag(np.square(self.sigmas)))
-        covariance = [SPACE.in_tangent(tuple(z), in_base) for z in measured.tolist()]
+        in_base = SPATIAL.in_parent_axes(self.T_base_sensor, np.diag(np.square(self.sigmas)))
+        covariance = [SPATIAL.in_tangent(tuple(z), in_base) for z in measured.tolist()]
         return measured, np.reshape(covariance, (-1, 6, 6))
 
     def _points(
@@ -135,7 +133,7 @@ class TagCamera:
         x, y, z = se3.act(se3.inverse(self._in_world(T_world_base)), tuple(points.T))
         noise = rng.standard_normal((len(points), 3))
         if kind == "position":
-            sigmas, turn = np.array(self.sigmas[:3]), SPACE.turn(self.T_base_sensor)
+            sigmas, turn = np.array(self.sigmas[:3]), SPATIAL.turn(self.T_base_sensor)
             covariance = turn @ np.diag(sigmas**2) @ turn.T
             in_sensor = np.stack([x, y, z]) + (sigmas * noise).T
             measured = np.stack(se3.act(self.T_base_sensor, tuple(in_sensor)), axis=1)

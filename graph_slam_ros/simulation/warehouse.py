@@ -7,16 +7,15 @@ import numpy as np
 from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
-from graph_slam_ros.graph.geometry import PLANE
+from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
-from graph_slam_ros.simulation.recording import Numbers, Recording
+from graph_slam_ros.simulation.recording import Recording
 from graph_slam_ros.simulation.sensing import KINDS, RangeBearing, sightings
 from graph_slam_ros.slam import Sighting
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array, Numbers
 
 SPEED_M_S = 1.0
 TICK_NS = 20_000_000  # odometry at 50 Hz
@@ -66,7 +65,7 @@ def simulate(seed: int, options: Warehouse) -> Recording:
         full[:, :2, :2] = covariance
         full[:, 2, 2] = SIGMA_YAW_RAD**2
         poses = np.column_stack([positions, yaw])
-        in_tangent = [PLANE.in_tangent(tuple(z), c) for z, c in zip(poses.tolist(), full, strict=True)]
+        in_tangent = [PLANAR.in_tangent(tuple(z), c) for z, c in zip(poses.tolist(), full, strict=True)]
         return sightings(seen, "pose", poses, np.array(in_tangent).reshape(-1, 3, 3))
 
     twists = follow(_route(options), CORNER_RADIUS_M, SPEED_M_S, TICK_NS * 1e-9)

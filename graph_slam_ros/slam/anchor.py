@@ -5,17 +5,15 @@ the prior is loose in every direction that such a measurement determines. Parame
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.survey import Surveyed
 from graph_slam_ros.graph import Gaussian
-from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.types import Fix
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.frontend.motion_compensation import axes_unknown, square
-
-Array = NDArray[np.float64]
+from graph_slam_ros.slam.frontend.motion_compensation import as_matrix, axes_unknown
+from graph_slam_ros.typing import Array, Numbers
 
 _TIGHT = 1e-3  # m, rad: the map begins where odometry begins, which is as good as any other place
 _LOOSE_M, _LOOSE_RAD = 1e3, 3.0
@@ -98,7 +96,7 @@ class Anchor:
             case "heading":
                 out[:-1] = 0.0
             case _:
-                unknown = axes_unknown(square(m.covariance))
+                unknown = axes_unknown(as_matrix(m.covariance))
                 out[:n][unknown] = 0.0
                 out[n:] *= not unknown[:2].any()
                 out[n:-1] *= not unknown.any()
@@ -114,7 +112,7 @@ class Anchor:
         if m.kind == "position":
             there = np.array(group.act(T_map_base, m.point or (0.0,) * n))
             shift = np.array(m.measured) - there
-            shift[axes_unknown(square(m.covariance))] = 0.0
+            shift[axes_unknown(as_matrix(m.covariance))] = 0.0
             return self._shifted(shift)
         if m.kind == "attitude":
             turn = group.compose(
@@ -153,7 +151,7 @@ class Anchor:
         self._edge = self._graph.add_edge(self._space.pose_prior, [vertex], T_map_base, noise, "anchor")
 
 
-def _about_z(space: Space, angle: float) -> Numbers:
+def _about_z(space: Geometry, angle: float) -> Numbers:
     if space.dimensions == 2:
         return 0.0, 0.0, angle
     return 0.0, 0.0, 0.0, 0.0, 0.0, float(np.sin(0.5 * angle)), float(np.cos(0.5 * angle))

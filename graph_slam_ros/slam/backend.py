@@ -4,21 +4,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.graph import Gaussian, Loss
-from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.robust.background import Background, Beside, Work, when_asked
 from graph_slam_ros.slam.robust.displacement import DisplacementHypothesis
-from graph_slam_ros.slam.robust.gating import Decisions
-from graph_slam_ros.slam.robust.hypotheses import Frozen, Outcome, Rival, second_look
+from graph_slam_ros.slam.robust.gating import OutlierGate
+from graph_slam_ros.slam.robust.hypotheses import Alternative, FrozenGraph, Outcome, second_look
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason
-from graph_slam_ros.slam.snapshot import MapState
+from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array, Numbers
 
 _WAITING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
 _UPDATES = 6  # until what was let in fits, before everything is solved for it
@@ -49,19 +47,19 @@ class Backend:
         config: RobustConfig,
         settings: Settings,
         beside: Beside = when_asked,
-        start: MapState | None = None,
+        start: MapSnapshot | None = None,
         counters: Counters | None = None,
     ) -> None:
         self._config, self._counters = config, counters or Counters()
-        start = start or MapState()
+        start = start or MapSnapshot()
         self.graph = start.graph
         self.solver = Solver(self.graph, settings)
-        self.decisions = Decisions(config, self.graph, self.solver, start.ledger)
+        self.decisions = OutlierGate(config, self.graph, self.solver, start.ledger)
         self.handed_over, self.frozen = (0, 0), start.frozen
         self.frozen_edges = start.ledger.final
         self.held = (0, 0)
         self._background = Background(config, beside)
-        self.rivals: tuple[Rival, ...] = ()
+        self.rivals: tuple[Alternative, ...] = ()
         self.spares_memory = self.holds_back = False
         self.trusts_sightings = True
         self._reviewed = 0  # the keyframe of the last review
@@ -163,7 +161,7 @@ class Backend:
         self._background.cancel(self.ledger.outside_count)
         return report
 
-    def move(self, T_new_old: Numbers, space: Space) -> None:
+    def move(self, T_new_old: Numbers, space: Geometry) -> None:
         """Move everything rigidly, what a second look works on besides: that is dropped."""
         values, graph = self.solver.values, self.graph
         for kind in (space.pose, space.point):
@@ -280,12 +278,12 @@ class Backend:
         self.solver.start_at(outcome.carried_to(self.graph, self.solver.values))
         return True
 
-    def _standing(self, rivals: Sequence[Rival]) -> tuple[Rival, ...]:
+    def _standing(self, rivals: Sequence[Alternative]) -> tuple[Alternative, ...]:
         """Explanations of which nothing was withdrawn."""
         reason = self.ledger.reason.values
         return tuple(one for one in rivals if not np.isin(reason[list(one.only_here)], FINAL).any())
 
-    def _frozen(self, keyframe: int, settings: Settings) -> Frozen:
+    def _frozen(self, keyframe: int, settings: Settings) -> FrozenGraph:
         solver = self.solver
         problem = self.graph.copy(), solver.vertices, solver.held, solver.values
-        return Frozen(keyframe, *problem, settings, self.ledger.copy())
+        return FrozenGraph(keyframe, *problem, settings, self.ledger.copy())

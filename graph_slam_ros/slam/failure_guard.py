@@ -9,15 +9,14 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import DivergedError, said
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.robust.gating import CANDIDATES, landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason
+from graph_slam_ros.typing import Array
 
-Array = NDArray[np.float64]
 Result = TypeVar("Result")
 
 _FAR = 1.0  # m, rad: whoever moves no farther has not gone astray
@@ -33,7 +32,7 @@ class _Suspect:
     landmark: int | None = None
 
 
-class Safeguard:
+class FailureGuard:
     """Has a back-end solved, and sees to it that its estimate is always one that is good.
 
     Attributes

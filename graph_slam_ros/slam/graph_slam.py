@@ -8,11 +8,9 @@ from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import DivergedError, GraphSlamError
-from graph_slam_ros.graph.geometry import Numbers
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import (
     Closure,
@@ -28,26 +26,25 @@ from graph_slam_ros.measurements.types import (
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.edits import Edits
-from graph_slam_ros.slam.failure_guard import Safeguard
+from graph_slam_ros.slam.failure_guard import FailureGuard
 from graph_slam_ros.slam.frontend import motion_compensation
-from graph_slam_ros.slam.frontend.keyframes import SightingPose, Trail
-from graph_slam_ros.slam.frontend.max_distance import Reach, off_the_pole
-from graph_slam_ros.slam.frontend.motion_compensation import Where
-from graph_slam_ros.slam.frontend.odometry_integration import Motion, OdometryNoise
-from graph_slam_ros.slam.frontend.odometry_selector import OdometryChoice, Step
+from graph_slam_ros.slam.frontend.keyframes import KeyframeList, SightingPose
+from graph_slam_ros.slam.frontend.max_distance import MaxDistance, off_the_pole
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise
+from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector, Step
 from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
 from graph_slam_ros.slam.frontend.stamp_order import StampOrder
-from graph_slam_ros.slam.frontend.stamped_poses import Track
-from graph_slam_ros.slam.frontend.thinning import Thinning
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.frontend.thinning import ObservationThinning
 from graph_slam_ros.slam.kidnap_detector import Alarm, KidnapDetector
-from graph_slam_ros.slam.landmarks.anonymous import Unnamed
+from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark, Landmarks
 from graph_slam_ros.slam.robust.background import Beside, when_asked
-from graph_slam_ros.slam.robust.ledger import Change
-from graph_slam_ros.slam.snapshot import MapState
+from graph_slam_ros.slam.robust.ledger import VerdictChange
+from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array, Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +84,7 @@ class Update:
     solved: bool = False
     report: Report | None = None
     correction: Correction = Correction()
-    changes: tuple[Change, ...] = ()
+    changes: tuple[VerdictChange, ...] = ()
     alarms: tuple[Alarm, ...] = ()
 
     def __bool__(self) -> bool:
@@ -130,14 +127,14 @@ class GraphSlam:
         config: Config | None = None,
         sink: Callable[[Measurement], None] | None = None,
         beside: Beside = when_asked,
-        start: MapState | None = None,
+        start: MapSnapshot | None = None,
     ) -> None:
         self.config = config or Config()
         self.space = self.config.space
         self.counters = Counters()
         self.backend = Backend(self.config.robust, self.config.solver_settings(), beside, start, self.counters)
         self.graph, self.solver, self.ledger = self.backend.graph, self.backend.solver, self.backend.ledger
-        self.sighting_poses = Track(SightingPose, self.space.pose.size)
+        self.sighting_poses = StampedPoses(SightingPose, self.space.pose.size)
         self.processed = 0  # measurements and control events that were handed over
         self.solves = 0
         self.report: Report | None = None  # of the last solve of everything
@@ -146,21 +143,23 @@ class GraphSlam:
         self.settings: dict[str, bool | int | float | str] = {}  # parameters that were changed on the way
         self._sink = sink
         self._order = StampOrder(self.config.ordering, self.counters)
-        self._odometry = OdometryChoice(
+        self._odometry = OdometrySelector(
             self.config.odometry, self.config.inputs.names.split(), self.space, self.counters
         )
         self._noise = OdometryNoise(self.config.odometry, self.space)
-        self._trail = Trail(self._noise, self.space)
+        self._trail = KeyframeList(self._noise, self.space)
         self.keyframes, self.segments = self._trail.keyframes, self._trail.segments
         self.drives = self._trail.drives  # the first keyframe of each; the last drive is the present one
-        self._reach = Reach(self.space, self.config.sources)
-        self._thinning = Thinning(self.config)
+        self._reach = MaxDistance(self.space, self.config.sources)
+        self._thinning = ObservationThinning(self.config)
         self._anchor = Anchor(self.config, self.backend)
         self._edges = PoseEdges(self.space, self.graph, self.counters)
         self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
-        self._unnamed = Unnamed(self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over)
+        self._unnamed = AnonymousLandmarks(
+            self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over
+        )
         self._kidnaps = KidnapDetector(self.space, self.config.odometry, self.backend, self.counters, self.segments)
-        self._safeguard = Safeguard(self.backend, self.counters, self._landmarks.forget)
+        self._safeguard = FailureGuard(self.backend, self.counters, self._landmarks.forget)
         self._edits = Edits(self.backend, self._landmarks, self.counters)
         self._held_covariance: Array | None = None  # of the newest pose when the map was held, for the next odometry
         self._waiting: list[Observation] = []
@@ -393,7 +392,7 @@ class GraphSlam:
             return False
         return True
 
-    def _take_up(self, start: MapState) -> None:
+    def _take_up(self, start: MapSnapshot) -> None:
         """Solve a map anew, and be nowhere in it yet."""
         if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
@@ -485,7 +484,7 @@ class GraphSlam:
                 self._add_keyframe(step, motion.now.T_keyframe_base, motion.now.covariance)
                 self._solve_if_due()
 
-    def _keyframe_due(self, motion: Motion) -> bool:
+    def _keyframe_due(self, motion: IntegratedOdometry) -> bool:
         due, n = self.config.keyframes, self.space.dimensions
         at = motion.now.T_keyframe_base
         far = sum(x * x for x in at[:n]) >= due.min_distance_m**2 or self.space.angle(at) >= due.min_angle_rad
@@ -640,13 +639,13 @@ class GraphSlam:
             self._count(m, "thinned")
         return used
 
-    def _lay_onto_fix(self, m: Fix, where: Where) -> None:
+    def _lay_onto_fix(self, m: Fix, where: PoseAtStamp) -> None:
         """The first fix of its kind tells where the map lies."""
         T_map_base = self.space.group.compose(self._pose(where.vertex), where.T_keyframe_base)
         if self._anchor.give_way_to_fix(m, T_map_base, len(self.keyframes) - 1):
             self._note_moved(m.topic)
 
-    def _lay_onto_survey(self, topic: str, name: str, s: Sighting, where: Where) -> None:
+    def _lay_onto_survey(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
         """The first sighting of a surveyed landmark does."""
         found = self._landmarks.survey_of(name, s, where)
         if found is not None and self._anchor.give_way_to_landmark(*found, len(self.keyframes) - 1):
@@ -656,7 +655,7 @@ class GraphSlam:
         self.counters.count(topic, "map_moved")
         self._safeguard.note_moved()
 
-    def _deserves_keyframe(self, m: Observation, where: Where, newest: Motion) -> bool:
+    def _deserves_keyframe(self, m: Observation, where: PoseAtStamp, newest: IntegratedOdometry) -> bool:
         """Where the motion since the keyframe would be too much of the noise of what was measured."""
         if where.keyframe != newest.keyframe or not newest.before_last_ns < where.stamp_ns:
             return False
@@ -666,9 +665,9 @@ class GraphSlam:
         most, added_sigma_m = self.config.keyframes.shared_noise, self.config.landmarks.added_sigma_m
         if is_soon:
             most = max(most, _SHARED_WHEN_SOON)
-        return motion_compensation.is_shared(self.space, m, where, most, added_sigma_m)
+        return motion_compensation.motion_noise_dominates(self.space, m, where, most, added_sigma_m)
 
-    def _keyframe_at(self, where: Where, motion: Motion) -> Where:
+    def _keyframe_at(self, where: PoseAtStamp, motion: IntegratedOdometry) -> PoseAtStamp:
         """A keyframe at a stamp within the last step of odometry, which is cut in two."""
         group, size = self.space.group, self.space.dof
         T_odom_base = group.compose(self.keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
@@ -680,9 +679,9 @@ class GraphSlam:
         if rest is not None and begun is not None:
             begun.go_on_after_cut(rest, stood)
         vertex = self.keyframes[-1].vertex
-        return Where(len(self.keyframes) - 1, vertex, where.stamp_ns, self.space.identity, np.zeros((size, size)))
+        return PoseAtStamp(len(self.keyframes) - 1, vertex, where.stamp_ns, self.space.identity, np.zeros((size, size)))
 
-    def _identified(self, m: Sightings, where: Where) -> list[tuple[str, Sighting]]:
+    def _identified(self, m: Sightings, where: PoseAtStamp) -> list[tuple[str, Sighting]]:
         """The sightings to be used, each with the landmark it is of."""
         how = self.config.landmarks.association
         if how == "none":
@@ -704,7 +703,7 @@ class GraphSlam:
             self.counters.count(topic, "new_while_elsewhere", len(found) - len(known))
         return known
 
-    def _add_closure(self, m: Closure, where: Where) -> None:
+    def _add_closure(self, m: Closure, where: PoseAtStamp) -> None:
         if not self._trail.oldest_ns <= m.from_stamp_ns <= (self.newest_odometry_ns or 0):
             self.counters.count(m.topic, "from_where_there_was_no_odometry")
             return

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.config.config import OdometryConfig
 from graph_slam_ros.graph import Gaussian
-from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, DisplacementHypothesis, DisplacementSearch
 from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array, Numbers
 
 _ALARM = 4  # sightings more for another pose than for odometry's
 _ALARM_LANDMARKS, _ALARM_KEYFRAMES = 2, 2
@@ -115,7 +114,7 @@ class KidnapDetector:
 
     def __init__(
         self,
-        space: Space,
+        space: Geometry,
         odometry: OdometryConfig,
         backend: Backend,
         counters: Counters,

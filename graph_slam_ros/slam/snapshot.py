@@ -4,18 +4,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 
 @dataclass(slots=True)
-class MapState:
+class MapSnapshot:
     """What there is, what is believed of it, and where it is thought to be; named as in ``GraphSlam``.
 
     Attributes

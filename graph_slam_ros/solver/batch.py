@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Graph, Loss
@@ -15,9 +14,7 @@ from graph_slam_ros.solver.clique_tree.symbolic import mark
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, store
 from graph_slam_ros.solver.report import Iteration, Report
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 _TINY = 1e-12  # a cost of zero up to rounding has converged
 _STILL = 1e-8  # m and rad

@@ -20,11 +20,10 @@ from graph_slam_ros.solver.clique_tree.storage import (
     NOTHING,
     PARENT,
     SIZE,
-    Array,
-    Index,
     Tree,
 )
 from graph_slam_ros.solver.clique_tree.symbolic import mark
+from graph_slam_ros.typing import Array, Index
 
 
 @kernel

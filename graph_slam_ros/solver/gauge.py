@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -12,9 +11,7 @@ from graph_slam_ros.graph import R2, R3, SE2, SE3, Graph, VertexKind
 from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.lie import so3
 from graph_slam_ros.solver.linearization import Losses, linearize
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 _AXES = {SE2: 2, R2: 2, SE3: 3, R3: 3}
 _LEAST_EIGENVALUE = 1e-9  # of correlations: less is no information

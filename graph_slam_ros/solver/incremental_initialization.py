@@ -7,15 +7,12 @@ closure arrives; so it often reaches the optimum where batch solvers, from any s
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import EdgeType, Graph, VertexKind
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.solver.solver import Solver
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 
 def replayed_values(

@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
@@ -34,9 +33,7 @@ from graph_slam_ros.graph import (
 from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.lie import so3
 from graph_slam_ros.solver.incremental_initialization import replayed_values
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 INITS = ("file", "tree", "chordal", "online")
 

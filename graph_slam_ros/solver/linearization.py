@@ -4,7 +4,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import EdgeType, Graph, Loss
@@ -14,9 +13,7 @@ from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.numeric import add_to_diagonal, clear_block
 from graph_slam_ros.solver.clique_tree.storage import BLOCK, Tree
 from graph_slam_ros.solver.report import ClassCost
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 CHUNK = 512  # edges
 

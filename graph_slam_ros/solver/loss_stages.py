@@ -1,19 +1,16 @@
 """Losses in stages: an edge that has just arrived is held to the first of its loss, one update later to the last."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.solver.batch import Settings
 from graph_slam_ros.solver.linearization import Losses, chi2_of
 from graph_slam_ros.solver.pending import NONE
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 
-class Stages:
+class LossStages:
     """Which loss each edge has at present.
 
     Attributes

@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Index
 
 NONE = np.empty(0, dtype=np.int64)
 
@@ -15,7 +14,7 @@ def _none() -> Index:
 
 
 @dataclass(slots=True)
-class Waiting:
+class PendingChanges:
     """What the next update has to take in.
 
     Attributes

@@ -1,17 +1,15 @@
 """When large steps are looked for, which are linearised anew."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.solver.clique_tree.storage import TAIL_LEAST
 from graph_slam_ros.solver.pending import NONE
-
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Index
 
 BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
 
 
-class Schedule:
+class RelinearizationSchedule:
     """Counts updates, and keeps what moved in them until large steps are looked for among all of it."""
 
     def __init__(self) -> None:

@@ -45,13 +45,11 @@ from graph_slam_ros.solver.linearization import (
     rows_of,
     store,
 )
-from graph_slam_ros.solver.loss_stages import Stages
-from graph_slam_ros.solver.pending import NONE, Waiting
-from graph_slam_ros.solver.relinearization import BY_FAR, Schedule
+from graph_slam_ros.solver.loss_stages import LossStages
+from graph_slam_ros.solver.pending import NONE, PendingChanges
+from graph_slam_ros.solver.relinearization import BY_FAR, RelinearizationSchedule
 from graph_slam_ros.solver.report import Change, Report
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 _KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
 
@@ -72,12 +70,12 @@ class Solver:
         self._inside = np.zeros(0, dtype=bool)  # vertices of the problem
         self._held = np.zeros(0, dtype=bool)
         self._taken = np.zeros(0, dtype=bool)  # edges of the problem
-        self._waiting = Waiting()
+        self._waiting = PendingChanges()
         self._kept = np.zeros(0)  # the estimate that the last call left
-        self._stages = Stages(graph)
+        self._stages = LossStages(graph)
         self._settled = True  # the tree's numbers are those at its linearisation points
         self._unfinished = False  # a batch stopped before the optimum
-        self._schedule = Schedule()
+        self._schedule = RelinearizationSchedule()
         self._solved_with: Settings | None = None
 
     # -- what the problem is -----------------------------------------------------------------------------------------
@@ -499,7 +497,7 @@ class Solver:
             self._set_estimate(self._kept)
             incremental.leave(self._tree, vertices, edges)  # the last: it needs memory
             raise
-        self._waiting = Waiting()
+        self._waiting = PendingChanges()
 
     @contextmanager
     def _looking(self) -> Iterator[None]:

@@ -1,6 +1,6 @@
 """Types of messages that can be inputs, what each can be used as, and how it is converted: one table.
 
-A converter is a function of an input (``Source``) and a decoded message; it raises ``MessageError`` where the whole
+A converter is a function of an input (``InputContext``) and a message; it raises ``MessageError`` where the whole
 message is refused, and ``NotYet`` where it is to be tried again when /tf has told more.
 """
 
@@ -12,13 +12,13 @@ from graph_slam_ros.config.inputs import InputConfig
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.inputs import detections, fixes, odometry, ranges
-from graph_slam_ros.messages.inputs.landmarks import Seen, sightings
-from graph_slam_ros.messages.inputs.source import Source
+from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark, sightings
+from graph_slam_ros.messages.inputs.source import InputContext
 
-Converter = Callable[[Source, Any], Iterable[Measured]]
+Converter = Callable[[InputContext, Any], Iterable[Measured]]
 
 
-def _landmarks(read: Callable[[Source, Any], Iterable[Seen]]) -> Converter:
+def _landmarks(read: Callable[[InputContext, Any], Iterable[ObservedLandmark]]) -> Converter:
     return lambda source, message: sightings(source, read(source, message))
 
 

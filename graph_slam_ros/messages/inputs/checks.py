@@ -4,12 +4,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.edge_noise import LEAST_M2, LEAST_RAD2
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 _NORM_REPAIRED = 0.1  # a quaternion this far from unit length is normalised, beyond it is refused
 _NORM_EXACT = 1e-6

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.messages.inputs.checks import MessageError
-from graph_slam_ros.messages.inputs.landmarks import Seen
-from graph_slam_ros.messages.inputs.source import Source
+from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark
+from graph_slam_ros.messages.inputs.source import InputContext
 
 _ADD, _DELETE, _DELETEALL = 0, 2, 3
 _NOTHING = np.zeros(36)  # all zero is unknown by custom
@@ -16,7 +16,7 @@ _ORIGIN = SimpleNamespace(x=0.0, y=0.0, z=0.0)
 _UNTURNED = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
-def detections(source: Source, m: Any) -> Iterator[Seen]:
+def detections(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """vision_msgs/Detection3DArray: the first result's pose, or the centre of the box."""
     by_class = source.config.landmarks.id_from == "class_id"
     for one in m.detections:
@@ -24,17 +24,17 @@ def detections(source: Source, m: Any) -> Iterator[Seen]:
         name = (first.hypothesis.class_id if first else "") if by_class else one.id
         at, covariance = (first.pose.pose, first.pose.covariance) if first else (one.bbox.center, _NOTHING)
         frame = one.header.frame_id or m.header.frame_id
-        yield Seen(m.header.stamp, frame, name, at.position, at.orientation, covariance)
+        yield ObservedLandmark(m.header.stamp, frame, name, at.position, at.orientation, covariance)
 
 
-def pose_stamped(source: Source, m: Any) -> Iterator[Seen]:
+def pose_stamped(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """geometry_msgs/PoseStamped and PoseWithCovarianceStamped: one landmark, of configured identity."""
     has_covariance = hasattr(m.pose, "covariance")
     at, covariance = (m.pose.pose, m.pose.covariance) if has_covariance else (m.pose, None)
-    yield Seen(m.header.stamp, m.header.frame_id, "", at.position, at.orientation, covariance)
+    yield ObservedLandmark(m.header.stamp, m.header.frame_id, "", at.position, at.orientation, covariance)
 
 
-def transforms(source: Source, m: Any) -> Iterator[Seen]:
+def transforms(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """tf2_msgs/TFMessage: frames whose names begin as configured; a stamp that is sent again is left out."""
     last = source.state.setdefault("stamps", {})
     for t in m.transforms:
@@ -47,10 +47,10 @@ def transforms(source: Source, m: Any) -> Iterator[Seen]:
             continue
         last[child] = t
         at = t.transform
-        yield Seen(t.header.stamp, t.header.frame_id, child, at.translation, at.rotation)
+        yield ObservedLandmark(t.header.stamp, t.header.frame_id, child, at.translation, at.rotation)
 
 
-def markers(source: Source, m: Any) -> Iterator[Seen]:
+def markers(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """visualization_msgs/MarkerArray: identity is namespace and id; only what is added (or modified) is seen."""
     for one in m.markers:
         if one.action in (_DELETE, _DELETEALL):
@@ -59,13 +59,13 @@ def markers(source: Source, m: Any) -> Iterator[Seen]:
             source.count("unknown_action")
             continue
         name = f"{one.ns}/{one.id}" if one.ns else str(one.id)
-        yield Seen(one.header.stamp, one.header.frame_id, name, one.pose.position, one.pose.orientation)
+        yield ObservedLandmark(one.header.stamp, one.header.frame_id, name, one.pose.position, one.pose.orientation)
 
 
 # -- of packages that need not be there -----------------------------------------------------------------------------
 
 
-def apriltags(source: Source, m: Any) -> Iterator[Seen]:
+def apriltags(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """apriltag_msgs/AprilTagDetectionArray: poses are on /tf, as frames that are named by family and id."""
     settings = source.settings
     for one in m.detections:
@@ -73,45 +73,47 @@ def apriltags(source: Source, m: Any) -> Iterator[Seen]:
             source.count("poor_tag")
             continue
         name = f"{one.family}:{one.id}"
-        yield Seen(m.header.stamp, name, name, _ORIGIN, _UNTURNED)
+        yield ObservedLandmark(m.header.stamp, name, name, _ORIGIN, _UNTURNED)
 
 
-def aruco_markers(source: Source, m: Any) -> Iterator[Seen]:
+def aruco_markers(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """aruco_msgs/MarkerArray: each with a header of its own, else that of the array."""
     for one in m.markers:
         has_own = one.header.stamp.sec or one.header.stamp.nanosec
         stamp = one.header.stamp if has_own else m.header.stamp
         frame = one.header.frame_id or m.header.frame_id
-        yield Seen(stamp, frame, str(one.id), one.pose.pose.position, one.pose.pose.orientation, one.pose.covariance)
+        yield ObservedLandmark(
+            stamp, frame, str(one.id), one.pose.pose.position, one.pose.pose.orientation, one.pose.covariance
+        )
 
 
-def ros2_aruco(source: Source, m: Any) -> Iterator[Seen]:
+def ros2_aruco(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """ros2_aruco_interfaces/ArucoMarkers: two parallel arrays."""
     if len(m.marker_ids) != len(m.poses):
         raise MessageError("lengths_differ")
     for name, at in zip(m.marker_ids, m.poses, strict=True):
-        yield Seen(m.header.stamp, m.header.frame_id, str(int(name)), at.position, at.orientation)
+        yield ObservedLandmark(m.header.stamp, m.header.frame_id, str(int(name)), at.position, at.orientation)
 
 
-def aruco_opencv(source: Source, m: Any) -> Iterator[Seen]:
+def aruco_opencv(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """aruco_opencv_msgs/ArucoDetection: single markers by number and boards by name."""
     named = [(str(one.marker_id), one.pose) for one in m.markers] + [(one.board_name, one.pose) for one in m.boards]
     for name, at in named:
-        yield Seen(m.header.stamp, m.header.frame_id, name, at.position, at.orientation)
+        yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, at.position, at.orientation)
 
 
-def rtabmap(source: Source, m: Any) -> Iterator[Seen]:
+def rtabmap(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """rtabmap_msgs/LandmarkDetections: an id of zero or less is none."""
     for one in m.landmarks:
         name = str(one.id) if one.id > 0 else ""
         frame, at = one.header.frame_id or m.header.frame_id, one.pose.pose
-        yield Seen(m.header.stamp, frame, name, at.position, at.orientation, one.pose.covariance)
+        yield ObservedLandmark(m.header.stamp, frame, name, at.position, at.orientation, one.pose.covariance)
 
 
-def cartographer(source: Source, m: Any) -> Iterator[Seen]:
+def cartographer(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """cartographer_ros_msgs/LandmarkList: a residual times its weight is one, so sigma is 1 / weight; 0: unknown."""
     for one in m.landmarks:
         at = one.tracking_from_landmark_transform
         sigmas = [1.0 / w if w else 0.0 for w in (one.translation_weight, one.rotation_weight)]
         covariance = np.diag([sigma * sigma for sigma in sigmas for _ in range(3)]).ravel()
-        yield Seen(m.header.stamp, m.header.frame_id, one.id, at.position, at.orientation, covariance)
+        yield ObservedLandmark(m.header.stamp, m.header.frame_id, one.id, at.position, at.orientation, covariance)

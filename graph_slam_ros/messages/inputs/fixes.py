@@ -5,18 +5,16 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.config.inputs import HIGHEST_M
-from graph_slam_ros.graph.geometry import SPACE
+from graph_slam_ros.graph.geometry import SPATIAL
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.measurements.types import Closure, Fix, InitialPose
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
-from graph_slam_ros.messages.inputs.source import Source
+from graph_slam_ros.messages.inputs.source import InputContext
 from graph_slam_ros.messages.inputs.transforms import pose
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array
 
 _NO_FIX = -1
 _UNKNOWN = 0  # position_covariance_type
@@ -26,7 +24,7 @@ _SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563  # WGS 84
 _ECCENTRICITY2 = _FLATTENING * (2.0 - _FLATTENING)
 
 
-def pose_fix(source: Source, m: Any) -> Iterator[Fix]:
+def pose_fix(source: InputContext, m: Any) -> Iterator[Fix]:
     """nav_msgs/Odometry, geometry_msgs/PoseWithCovarianceStamped and PoseStamped: a pose of the robot in the map.
 
     It is that of the base, or of the configured mount; where its orientation is not known, a position.
@@ -36,7 +34,7 @@ def pose_fix(source: Source, m: Any) -> Iterator[Fix]:
     T_map_frame = source.T_fixed(source.config.frames.map, source.frame(m.header.frame_id))
     T_base_sensor = source.T_base_child(getattr(m, "child_frame_id", "").lstrip("/"))
     at, n = checks.point(p.position), source.space.dimensions
-    covariance = SPACE.in_parent_axes(T_map_frame, source.pose_covariance(flat, 0.0))
+    covariance = SPATIAL.in_parent_axes(T_map_frame, source.pose_covariance(flat, 0.0))
     if not source.orientation_known(covariance):
         measured = tuple(map(float, se3.act(T_map_frame, at)))[:n]
         arm = tuple(map(float, se3.position(T_base_sensor)))[:n]
@@ -51,11 +49,11 @@ def pose_fix(source: Source, m: Any) -> Iterator[Fix]:
         covariance[:3, :3] = np.eye(3) * source.sigma_m() ** 2
         source.count("covariance_unknown")
     into_base = se3.adjoint(T_base_sensor)
-    tangent = into_base @ SPACE.in_parent_axes(se3.inverse(T_map_sensor), covariance) @ into_base.T
+    tangent = into_base @ SPATIAL.in_parent_axes(se3.inverse(T_map_sensor), covariance) @ into_base.T
     yield Fix(stamp_ns, source.name, "pose", source.of_robot(T_map_base), source.checked(source.block(tangent), n))
 
 
-def initial_pose(source: Source, m: Any) -> Iterator[InitialPose]:
+def initial_pose(source: InputContext, m: Any) -> Iterator[InitialPose]:
     """geometry_msgs/PoseWithCovarianceStamped in the map frame: where somebody says that the base is, now."""
     frame = source.frame(m.header.frame_id)
     T_map_frame = source.T_fixed(source.config.frames.map, frame)
@@ -63,17 +61,17 @@ def initial_pose(source: Source, m: Any) -> Iterator[InitialPose]:
     T_map_base = se3.compose(T_map_frame, pose(m.pose.pose.position, source.unit(m.pose.pose.orientation)))
     if not source.has_heading(T_map_base):
         raise MessageError("no_heading")
-    covariance = SPACE.in_parent_axes(T_map_frame, source.pose_covariance(m.pose.covariance, 0.0))
+    covariance = SPATIAL.in_parent_axes(T_map_frame, source.pose_covariance(m.pose.covariance, 0.0))
     unknown = np.diag(np.repeat(np.square([source.settings.sigma_m, source.settings.sigma_rad]), 3))
     for part in (slice(0, 3), slice(3, 6)):
         if not covariance[part, part].any():
             covariance[part] = unknown[part]
             covariance[:, part] = unknown[:, part]
-    block = source.block(SPACE.in_parent_axes(se3.inverse(T_map_base), covariance))
+    block = source.block(SPATIAL.in_parent_axes(se3.inverse(T_map_base), covariance))
     yield InitialPose(source.projected(T_map_base), source.checked(block, source.space.dimensions))
 
 
-def gnss(source: Source, m: Any) -> Iterator[Fix]:
+def gnss(source: InputContext, m: Any) -> Iterator[Fix]:
     """sensor_msgs/NavSatFix: the antenna's position, east, north and up of the datum."""
     stamp_ns = source.stamp_ns(m.header.stamp)
     if m.status.status <= _NO_FIX:
@@ -126,7 +124,7 @@ def _earth_centred(latitude_deg: float, longitude_deg: float, height_m: float) -
     return np.array([out * math.cos(longitude), out * math.sin(longitude), up])
 
 
-def imu(source: Source, m: Any) -> Iterator[Fix]:
+def imu(source: InputContext, m: Any) -> Iterator[Fix]:
     """sensor_msgs/Imu: the attitude in space, the heading in the plane; an orientation in ENU is assumed."""
     stamp_ns = source.stamp_ns(m.header.stamp)
     covariance = np.array(m.orientation_covariance, dtype=float).reshape(3, 3)
@@ -153,7 +151,7 @@ def imu(source: Source, m: Any) -> Iterator[Fix]:
     yield Fix(stamp_ns, source.name, "attitude", T_map_base[3:], block)
 
 
-def closures(source: Source, m: Any) -> Iterator[Closure]:
+def closures(source: InputContext, m: Any) -> Iterator[Closure]:
     """vision_msgs/Detection3DArray as loop closures: where the robot's base was earlier is what is detected.
 
     Its pose in the header's frame at the header's stamp, with its covariance; ``id`` is the earlier stamp in
@@ -167,7 +165,7 @@ def closures(source: Source, m: Any) -> Iterator[Closure]:
             source.count(str(reason))
 
 
-def _closure(source: Source, stamp_ns: int, frame: str, one: Any) -> Closure:
+def _closure(source: InputContext, stamp_ns: int, frame: str, one: Any) -> Closure:
     if not one.id.isdecimal() or len(one.id) > 19 or int(one.id) == 0:
         raise MessageError("id_not_a_stamp")
     if int(one.id) == stamp_ns:
@@ -184,7 +182,7 @@ def _closure(source: Source, stamp_ns: int, frame: str, one: Any) -> Closure:
     T_base_earlier = se3.compose(T_base_frame, T_frame_earlier)
     # T exp(d) inverted is T^-1 exp(-Ad(T) d)
     into_base = se3.adjoint(T_base_earlier)
-    tangent = into_base @ SPACE.in_parent_axes(se3.inverse(T_frame_earlier), covariance) @ into_base.T
+    tangent = into_base @ SPATIAL.in_parent_axes(se3.inverse(T_frame_earlier), covariance) @ into_base.T
     T_earlier_base = source.projected(se3.inverse(T_base_earlier))
     block = source.checked(source.block(tangent), source.space.dimensions)
     return Closure(stamp_ns, int(one.id), source.name, T_earlier_base, block)

@@ -1,6 +1,6 @@
 """What a message says of landmarks becomes sightings: one rule for all types.
 
-A converter of a type only reads: it yields one ``Seen`` for each landmark of a message.
+A converter of a type only reads: it yields one ``ObservedLandmark`` for each landmark of a message.
 """
 
 import math
@@ -9,16 +9,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graph_slam_ros.graph.geometry import SPACE
+from graph_slam_ros.graph.geometry import SPATIAL
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.measurements.types import Sighting, Sightings
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
-from graph_slam_ros.messages.inputs.source import Numbers, Source
-
-Array = NDArray[np.float64]
+from graph_slam_ros.messages.inputs.source import InputContext
+from graph_slam_ros.typing import Numbers
 
 _AGREE_SIGMA = 3.0
 _LONGEST_ID = 128  # bytes
@@ -26,7 +24,7 @@ _UPRIGHT = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ObservedLandmark:
     """One landmark, as a message says it.
 
     Attributes
@@ -52,9 +50,9 @@ class Seen:
     T_frame_sensor: se3.Pose = se3.IDENTITY
 
 
-def sightings(source: Source, found: Iterable[Seen]) -> Iterator[Sightings]:
+def sightings(source: InputContext, found: Iterable[ObservedLandmark]) -> Iterator[Sightings]:
     """One measurement for each stamp of a message; what cannot be used of it is counted."""
-    by_stamp: dict[tuple[int, int], list[Seen]] = {}
+    by_stamp: dict[tuple[int, int], list[ObservedLandmark]] = {}
     for one in _nearest(source, list(found)):
         by_stamp.setdefault((one.stamp.sec, one.stamp.nanosec), []).append(one)
     for same in by_stamp.values():
@@ -74,7 +72,7 @@ def sightings(source: Source, found: Iterable[Seen]) -> Iterator[Sightings]:
             yield Sightings(stamp_ns, source.name, tuple(usable))
 
 
-def _nearest(source: Source, found: list[Seen]) -> list[Seen]:
+def _nearest(source: InputContext, found: list[ObservedLandmark]) -> list[ObservedLandmark]:
     """Of a message's landmarks, as many as are taken."""
     if len(found) <= (most := source.config.landmarks.max_per_message):
         return found
@@ -83,7 +81,7 @@ def _nearest(source: Source, found: list[Seen]) -> list[Seen]:
     return [found[k] for k in sorted(nearest.tolist())]
 
 
-def _reach(seen: Seen) -> float:
+def _reach(seen: ObservedLandmark) -> float:
     """From the frame it is told in; a bearing alone is as good as near."""
     if seen.polar is None:
         return math.hypot(seen.position.x, seen.position.y, seen.position.z)
@@ -91,7 +89,7 @@ def _reach(seen: Seen) -> float:
     return 0.0 if kind == "bearing" else abs(measured[0])
 
 
-def _sighting(source: Source, stamp_ns: int, seen: Seen) -> Sighting:
+def _sighting(source: InputContext, stamp_ns: int, seen: ObservedLandmark) -> Sighting:
     name = _identity(source, seen.id)
     T_base_frame = source.T_base(source.frame(seen.frame), stamp_ns)
     if seen.polar is not None:
@@ -100,7 +98,7 @@ def _sighting(source: Source, stamp_ns: int, seen: Seen) -> Sighting:
     p = checks.point(seen.position)
     x, y, z = map(float, se3.act(T_base_frame, p))
     distance_m = math.hypot(x, y, z)
-    covariance = SPACE.in_parent_axes(T_base_frame, source.pose_covariance(seen.covariance, distance_m))
+    covariance = SPATIAL.in_parent_axes(T_base_frame, source.pose_covariance(seen.covariance, distance_m))
     n = source.space.dimensions
     if seen.orientation is not None and source.orientation_known(covariance):
         q = so3.compose(se3.rotation(T_base_frame), source.unit(seen.orientation))
@@ -112,7 +110,7 @@ def _sighting(source: Source, stamp_ns: int, seen: Seen) -> Sighting:
     return Sighting(name, "position", (x, y, z)[:n], source.checked(covariance[:n, :n], n, distance_m))
 
 
-def _identity(source: Source, name: str) -> str:
+def _identity(source: InputContext, name: str) -> str:
     name = name or source.settings.id
     if not name:  # what becomes of it is the pipeline's to say
         return ""
@@ -126,7 +124,12 @@ def _identity(source: Source, name: str) -> str:
 
 
 def _polar(
-    source: Source, name: str, kind: str, measured: Numbers, sigmas: Sequence[float] | None, T_base_sensor: se3.Pose
+    source: InputContext,
+    name: str,
+    kind: str,
+    measured: Numbers,
+    sigmas: Sequence[float] | None,
+    T_base_sensor: se3.Pose,
 ) -> Sighting:
     if not all(map(math.isfinite, measured)):
         raise MessageError("nonfinite")
@@ -182,7 +185,7 @@ def _levelled(
 # -- the same landmark twice -----------------------------------------------------------------------------------------
 
 
-def _agreed(source: Source, seen: list[Sighting]) -> list[Sighting]:
+def _agreed(source: InputContext, seen: list[Sighting]) -> list[Sighting]:
     """One sighting per id: repeats that agree within 3 sigma are merged, others are all dropped."""
     by_id: dict[str, list[Sighting]] = {}
     for k, one in enumerate(seen):
@@ -203,7 +206,7 @@ def _agreed(source: Source, seen: list[Sighting]) -> list[Sighting]:
     return out
 
 
-def _merge(source: Source, a: Sighting, b: Sighting) -> Sighting | None:
+def _merge(source: InputContext, a: Sighting, b: Sighting) -> Sighting | None:
     """Information-weighted mean of two sightings that agree, else None."""
     if a.kind != b.kind:
         return None

@@ -9,14 +9,15 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
-from graph_slam_ros.messages.inputs.source import Numbers, Source
+from graph_slam_ros.messages.inputs.source import InputContext
 from graph_slam_ros.messages.inputs.transforms import pose
+from graph_slam_ros.typing import Numbers
 
 _MOST_SIMILAR, _LONGEST = 3, 80  # transforms that are named, and letters of a frame's name
 _UNUSED = 1e6  # [m^2/s^2, rad^2/s^2]: what drivers of wheels write for what these do not measure
 
 
-def odometry(source: Source, m: Any) -> Iterator[Odometry]:
+def odometry(source: InputContext, m: Any) -> Iterator[Odometry]:
     """nav_msgs/Odometry."""
     stamp_ns = source.stamp_ns(m.header.stamp)
     p, parent = m.pose.pose, source.frame(m.header.frame_id)
@@ -27,7 +28,7 @@ def odometry(source: Source, m: Any) -> Iterator[Odometry]:
     yield Odometry(stamp_ns, at, twist, source.name)
 
 
-def pose_stamped(source: Source, m: Any) -> Iterator[Odometry]:
+def pose_stamped(source: InputContext, m: Any) -> Iterator[Odometry]:
     """geometry_msgs/PoseStamped and PoseWithCovarianceStamped: of the base, or of the configured mount."""
     stamp_ns = source.stamp_ns(m.header.stamp)
     p = m.pose.pose if hasattr(m.pose, "pose") else m.pose
@@ -35,7 +36,7 @@ def pose_stamped(source: Source, m: Any) -> Iterator[Odometry]:
     yield Odometry(stamp_ns, _in_odom(source, parent, "", p.position, p.orientation), None, source.name)
 
 
-def transforms(source: Source, m: Any) -> Iterator[Odometry]:
+def transforms(source: InputContext, m: Any) -> Iterator[Odometry]:
     """tf2_msgs/TFMessage: the transform from odometry's frame, or the one configured in its place, to the base."""
     frames = source.config.frames
     parent = source.settings.frame or frames.odom
@@ -54,14 +55,14 @@ def transforms(source: Source, m: Any) -> Iterator[Odometry]:
             source.count(str(reason))
 
 
-def _note_similar(source: Source, parent: str, child: str, *, is_similar: bool) -> None:
+def _note_similar(source: InputContext, parent: str, child: str, *, is_similar: bool) -> None:
     """Remember a transform that may be the odometry by other names."""
     similar: dict[tuple[str, str], None] = source.state.setdefault("similar", {})
     if is_similar and len(similar) < _MOST_SIMILAR and not source.state.get("found"):
         similar[parent, child] = None
 
 
-def not_found(source: Source) -> str:
+def not_found(source: InputContext) -> str:
     """Of odometry on /tf: what it waits for, as long as that has never come, and what may be meant; else empty."""
     if source.settings.type != "tf2_msgs/msg/TFMessage" or source.state.get("found"):
         return ""
@@ -74,7 +75,7 @@ def not_found(source: Source) -> str:
     )
 
 
-def _in_odom(source: Source, parent: str, child: str, position: Any, orientation: Any) -> Numbers:
+def _in_odom(source: InputContext, parent: str, child: str, position: Any, orientation: Any) -> Numbers:
     """T_odom_base from the pose of a child frame in its parent."""
     if parent == child:
         raise MessageError("frame_in_itself")
@@ -88,7 +89,7 @@ def _in_odom(source: Source, parent: str, child: str, position: Any, orientation
     return source.of_robot(se3.compose(se3.compose(T_odom_parent, pose(position, q)), T_child_base))
 
 
-def _named(source: Source, child: str) -> str:
+def _named(source: InputContext, child: str) -> str:
     if child.startswith("/"):
         source.count("frame_slash_stripped")
         child = child[1:]
@@ -97,7 +98,7 @@ def _named(source: Source, child: str) -> str:
     return child
 
 
-def _twist_covariance(source: Source, flat: Any) -> Numbers | None:
+def _twist_covariance(source: InputContext, flat: Any) -> Numbers | None:
     """Of a twist in the base frame; None where it is unknown, in part or altogether."""
     raw = flat.tobytes()
     if raw != source.state.get("raw"):  # drivers repeat the same one
@@ -110,7 +111,7 @@ def _twist_covariance(source: Source, flat: Any) -> Numbers | None:
     return covariance
 
 
-def _judged(source: Source, full: Any) -> tuple[Numbers | MessageError | None, list[str]]:
+def _judged(source: InputContext, full: Any) -> tuple[Numbers | MessageError | None, list[str]]:
     block, variances = source.block(full), np.diag(full)
     if not block.any():
         return None, ["covariance_unknown"]

@@ -10,8 +10,8 @@ import numpy as np
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
-from graph_slam_ros.messages.inputs.landmarks import Seen
-from graph_slam_ros.messages.inputs.source import Source
+from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark
+from graph_slam_ros.messages.inputs.source import InputContext
 from graph_slam_ros.messages.inputs.transforms import pose
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
@@ -20,7 +20,7 @@ _MOST_POINTS = 100_000  # landmarks in one message: a scan is no list of landmar
 _UNKNOWN_ID = -1
 
 
-def point_cloud(source: Source, m: Any) -> Iterator[Seen]:
+def point_cloud(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """sensor_msgs/PointCloud2 by the names of its fields.
 
     ``x``, ``y`` and perhaps ``z``; or ``range``, ``bearing`` (and ``elevation``), or some of these, in the sensor's
@@ -42,14 +42,14 @@ def point_cloud(source: Source, m: Any) -> Iterator[Seen]:
         if kind == "position":
             at = SimpleNamespace(x=row["x"], y=row["y"], z=row.get("z", 0.0))
             covariance = np.diag([sigma * sigma] * 3 + [0.0] * 3).ravel() if "sigma" in there else None
-            yield Seen(m.header.stamp, m.header.frame_id, name, at, covariance=covariance)
+            yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, at, covariance=covariance)
             continue
         sigma_rad = row.get("sigma_bearing", sigma if kind == "bearing" else 0.0)
         measured = [
             row[name] for name in (["range"] if "range" in kind else []) + (angles if "bearing" in kind else [])
         ]
         sigmas = [sigma, *[sigma_rad] * 2][: len(measured)] if "range" in kind else [sigma_rad] * len(measured)
-        yield Seen(
+        yield ObservedLandmark(
             m.header.stamp,
             m.header.frame_id,
             name,
@@ -94,26 +94,30 @@ def _identity(value: float | int | None) -> str:
     return str(int(value)) if value == int(value) else str(value)
 
 
-def range_bearing(source: Source, m: Any) -> Iterator[Seen]:
+def range_bearing(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """mrpt_msgs/ObservationRangeBearing: MRPT's pitch is positive downwards, an id of -1 is none."""
     T_frame_sensor = _sensor(source, m)
     sigmas = m.sensor_std_range, m.sensor_std_yaw, m.sensor_std_pitch
     for one in m.sensed_data:
         polar = "range_bearing", (one.range, one.yaw, -one.pitch)
         name = _identity(one.id)
-        yield Seen(m.header.stamp, m.header.frame_id, name, polar=polar, sigmas=sigmas, T_frame_sensor=T_frame_sensor)
+        yield ObservedLandmark(
+            m.header.stamp, m.header.frame_id, name, polar=polar, sigmas=sigmas, T_frame_sensor=T_frame_sensor
+        )
 
 
-def range_beacon(source: Source, m: Any) -> Iterator[Seen]:
+def range_beacon(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """mrpt_msgs/ObservationRangeBeacon: ranges alone."""
     T_frame_sensor = _sensor(source, m)
     for one in m.sensed_data:
         polar = "range", (one.range,)
         name, sigmas = _identity(one.id), [m.sensor_std_range]
-        yield Seen(m.header.stamp, m.header.frame_id, name, polar=polar, sigmas=sigmas, T_frame_sensor=T_frame_sensor)
+        yield ObservedLandmark(
+            m.header.stamp, m.header.frame_id, name, polar=polar, sigmas=sigmas, T_frame_sensor=T_frame_sensor
+        )
 
 
-def _sensor(source: Source, m: Any) -> se3.Pose:
+def _sensor(source: InputContext, m: Any) -> se3.Pose:
     at = m.sensor_pose_on_robot
     checks.point(at.position)
     return pose(at.position, source.unit(at.orientation))

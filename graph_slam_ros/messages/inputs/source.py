@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import InputConfig
@@ -15,9 +14,7 @@ from graph_slam_ros.messages.cdr import LATEST_NS
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.transforms import Transforms
-
-Array = NDArray[np.float64]
-Numbers = tuple[float, ...]
+from graph_slam_ros.typing import Array, Numbers
 
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BEYOND_MEANING = 1e12  # [m^2, rad^2]: larger numbers could not be turned into other axes
@@ -36,7 +33,7 @@ class NotYet(Exception):
     """/tf may still tell where the sensor was: the message is to be tried again."""
 
 
-class Source:
+class InputContext:
     """What a converter knows besides the message.
 
     Parameters

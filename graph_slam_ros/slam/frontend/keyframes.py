@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graph_slam_ros.graph.geometry import Numbers, Space
-from graph_slam_ros.slam.frontend.motion_compensation import Where
-from graph_slam_ros.slam.frontend.odometry_integration import Motion, OdometryNoise, Rest
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise, StationaryDetector
 from graph_slam_ros.slam.frontend.odometry_selector import Step
-from graph_slam_ros.slam.frontend.stamped_poses import Track
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.typing import Numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +32,7 @@ class SightingPose:
     T_keyframe_base: Numbers
 
 
-class Trail:
+class KeyframeList:
     """Keyframes in order of time, and the motion since each of the last.
 
     Attributes
@@ -40,18 +41,18 @@ class Trail:
     drives : the first keyframe of each drive: more than one where the map was loaded
     """
 
-    def __init__(self, noise: OdometryNoise, space: Space) -> None:
-        self.keyframes = Track(Keyframe, space.pose.size)
+    def __init__(self, noise: OdometryNoise, space: Geometry) -> None:
+        self.keyframes = StampedPoses(Keyframe, space.pose.size)
         self.segments: list[int] = []
         self.drives: list[int] = []
         self._is_new_drive = True
         self._noise, self._space = noise, space
-        self._motions: deque[Motion] = deque()
-        self._rest = Rest(noise, space)
+        self._motions: deque[IntegratedOdometry] = deque()
+        self._rest = StationaryDetector(noise, space)
         self._epoch = 0  # the first keyframe since stamps began anew
 
     @property
-    def motion(self) -> Motion | None:
+    def motion(self) -> IntegratedOdometry | None:
         """Since the newest keyframe; none where stamps have begun anew since."""
         return self._motions[-1] if self._motions else None
 
@@ -77,7 +78,7 @@ class Trail:
             self._is_new_drive = False
         self.keyframes.append(vertex, step.stamp_ns, step.T_odom_base)
         keyframe = len(self.keyframes) - 1
-        self._motions.append(Motion(self._noise, self._space, keyframe, step.stamp_ns, self._rest))
+        self._motions.append(IntegratedOdometry(self._noise, self._space, keyframe, step.stamp_ns, self._rest))
         oldest_ns = step.stamp_ns - round(late_s * 1e9)
         while len(self._motions) > 2 and self._motions[1].start_ns <= oldest_ns:
             self._motions.popleft()
@@ -96,24 +97,26 @@ class Trail:
         backwards = np.flatnonzero(np.diff(self.keyframes.stamps_ns) < 0)
         self._epoch = max(self.drives[-1], int(backwards[-1]) + 1 if len(backwards) else 0)
         self._is_new_drive = False
-        self._motions.append(Motion(self._noise, self._space, last, self.keyframes[last].stamp_ns, self._rest))
+        self._motions.append(
+            IntegratedOdometry(self._noise, self._space, last, self.keyframes[last].stamp_ns, self._rest)
+        )
 
     def forget_time(self) -> None:
         """Stamps begin anew: none before can be told from them."""
         self._motions.clear()
-        self._rest = Rest(self._noise, self._space)
+        self._rest = StationaryDetector(self._noise, self._space)
         self._epoch = len(self.keyframes)
 
-    def where(self, stamp_ns: int) -> Where:
+    def where(self, stamp_ns: int) -> PoseAtStamp:
         """Where the robot was, by the keyframe before and the odometry in between."""
         motion = next((m for m in reversed(self._motions) if m.start_ns <= stamp_ns), None)
         if motion is None:
             return self._where_long_ago(stamp_ns)
         moved = motion.at(stamp_ns)
         vertex = int(self.keyframes.ids[motion.keyframe])
-        return Where(motion.keyframe, vertex, stamp_ns, moved.T_keyframe_base, moved.covariance)
+        return PoseAtStamp(motion.keyframe, vertex, stamp_ns, moved.T_keyframe_base, moved.covariance)
 
-    def _where_long_ago(self, stamp_ns: int) -> Where:
+    def _where_long_ago(self, stamp_ns: int) -> PoseAtStamp:
         """Between two keyframes whose odometry is forgotten: evenly from one to the next."""
         present = self.keyframes.stamps_ns[self._epoch :]
         k = self._epoch + int(np.searchsorted(present, stamp_ns, side="right")) - 1
@@ -122,4 +125,4 @@ class Trail:
         fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
         moved = group.interpolate(self._space.identity, T_a_b, fraction)
         noise = self._noise.of((stamp_ns - a.stamp_ns) * 1e-9, None)
-        return Where(k, a.vertex, stamp_ns, moved, group.noise_during(moved, noise))
+        return PoseAtStamp(k, a.vertex, stamp_ns, moved, group.noise_during(moved, noise))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from graph_slam_ros.config.inputs import InputConfig
-from graph_slam_ros.graph.geometry import Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.types import Closure, Fix, Sighting, Sightings
 from graph_slam_ros.slam.frontend import motion_compensation
 
@@ -27,14 +27,14 @@ class _Shown:
     farthest: list[float] = field(default_factory=lambda: [0.0] * _FARTHEST)
 
 
-class Reach:
+class MaxDistance:
     """The farthest distance [m] that each input may measure: its ``max_distance_m``, or learned from its measurements.
 
     A limit is learned from the accepted measurements alone, in their order, so a replay refuses what the live run
     refused. A bearing has no distance; a fix has one from the map's origin, which may be anywhere.
     """
 
-    def __init__(self, space: Space, inputs: Iterable[InputConfig]) -> None:
+    def __init__(self, space: Geometry, inputs: Iterable[InputConfig]) -> None:
         self._space = space
         self._given = {one.name: one.max_distance_m for one in inputs if one.max_distance_m > 0.0}
         self._shown: dict[str, _Shown] = {}
@@ -79,7 +79,7 @@ class Reach:
         return True
 
 
-def off_the_pole(space: Space, s: Sighting) -> Sighting:
+def off_the_pole(space: Geometry, s: Sighting) -> Sighting:
     """The same sighting; a steep direction in space is told in axes where it is straight ahead.
 
     At the zenith and the nadir azimuth is undefined and its derivative infinite. There the sensor's frame is turned so
@@ -97,7 +97,7 @@ def off_the_pole(space: Space, s: Sighting) -> Sighting:
     sensor = space.group.compose(s.T_base_sensor or space.identity, (0.0, 0.0, 0.0, *turn))
     scale = np.ones(len(s.measured))
     scale[-2] = abs(math.cos(elevation))
-    covariance = scale[:, None] * motion_compensation.square(s.covariance) * scale
+    covariance = scale[:, None] * motion_compensation.as_matrix(s.covariance) * scale
     covariance[-2, -2] = max(covariance[-2, -2], covariance[-1, -1])
     measured = (*s.measured[:-2], 0.0, 0.0)
     return replace(s, measured=measured, covariance=tuple(covariance.ravel().tolist()), T_base_sensor=sensor)

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import so3
 from graph_slam_ros.measurements.types import Closure, Fix, Sighting, Sightings
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array, Numbers
 
 ROUNDING = 100.0 * float(np.finfo(float).eps)  # of the largest variance that was added up to a covariance
 _NEAREST_M = 1e-9  # below this distance a direction is rounding
@@ -21,7 +20,7 @@ _UNKNOWN_M2 = 1e6  # a variance of this or more says that an axis was not measur
 
 
 @dataclass(frozen=True, slots=True)
-class Where:
+class PoseAtStamp:
     """Where the robot was at a stamp: a keyframe, and the motion since with its covariance (dof, dof)."""
 
     keyframe: int
@@ -32,14 +31,14 @@ class Where:
 
 
 @dataclass(frozen=True, slots=True)
-class Carried:
+class KeyframeMeasurement:
     """A measurement as an edge takes it: what was measured from the keyframe, and its covariance."""
 
     measured: Numbers
     covariance: Array
 
 
-def by_motion(space: Space, point: Array) -> Array:
+def point_jacobian(space: Geometry, point: Array) -> Array:
     """``B`` (n, dof) of a point (n,) in the base frame."""
     n = space.dimensions
     if n == 2:
@@ -47,25 +46,27 @@ def by_motion(space: Space, point: Array) -> Array:
     return np.hstack([np.eye(3), -so3.hat((point[0], point[1], point[2]))])
 
 
-def position(space: Space, s: Sighting, where: Where) -> Carried:
+def position(space: Geometry, s: Sighting, where: PoseAtStamp) -> KeyframeMeasurement:
     """A landmark's position, from the sighting of a position or of a pose: ``p_a = T_a_b p_b``."""
     n = space.dimensions
     point = np.array(s.measured[:n])
-    own = square(s.covariance)
+    own = as_matrix(s.covariance)
     if s.kind == "pose":  # from the tangent space of the measured pose to the axes of b
         own = space.in_parent_axes(s.measured, own)[:n, :n]
-    b, turn = by_motion(space, point), space.turn(where.T_keyframe_base)
+    b, turn = point_jacobian(space, point), space.turn(where.T_keyframe_base)
     covariance = turn @ (own + b @ where.covariance @ b.T) @ turn.T
-    return Carried(_floats(space.group.act(where.T_keyframe_base, tuple(point.tolist()))), covariance)
+    return KeyframeMeasurement(_floats(space.group.act(where.T_keyframe_base, tuple(point.tolist()))), covariance)
 
 
-def pose(space: Space, s: Sighting, where: Where) -> Carried:
+def pose(space: Geometry, s: Sighting, where: PoseAtStamp) -> KeyframeMeasurement:
     """A landmark's pose: ``T_a_c = T_a_b T_b_c``."""
     measured = space.group.compose(where.T_keyframe_base, s.measured)
-    return Carried(_floats(measured), space.group.propagate(where.covariance, s.measured, square(s.covariance)))
+    return KeyframeMeasurement(
+        _floats(measured), space.group.propagate(where.covariance, s.measured, as_matrix(s.covariance))
+    )
 
 
-def seen_from_sensor(space: Space, s: Sighting, where: Where, p_keyframe: Array) -> Carried:
+def seen_from_sensor(space: Geometry, s: Sighting, where: PoseAtStamp, p_keyframe: Array) -> KeyframeMeasurement:
     """Range, bearing or both, by a sensor whose place goes with it.
 
     Parameters
@@ -75,12 +76,16 @@ def seen_from_sensor(space: Space, s: Sighting, where: Where, p_keyframe: Array)
     T_base_sensor = s.T_base_sensor or space.identity
     p_base = np.array(space.group.act(space.group.inverse(where.T_keyframe_base), tuple(p_keyframe.tolist())))
     p_sensor = np.array(space.group.act(space.group.inverse(T_base_sensor), tuple(p_base.tolist())))
-    j = gradient(space, s.kind, p_sensor) @ space.turn(T_base_sensor).T @ by_motion(space, p_base)
-    covariance = square(s.covariance) + j @ where.covariance @ j.T
-    return Carried((*s.measured, *_floats(space.group.compose(where.T_keyframe_base, T_base_sensor))), covariance)
+    j = gradient(space, s.kind, p_sensor) @ space.turn(T_base_sensor).T @ point_jacobian(space, p_base)
+    covariance = as_matrix(s.covariance) + j @ where.covariance @ j.T
+    return KeyframeMeasurement(
+        (*s.measured, *_floats(space.group.compose(where.T_keyframe_base, T_base_sensor))), covariance
+    )
 
 
-def is_shared(space: Space, m: Sightings | Fix | Closure, where: Where, most: float, added_sigma_m: float) -> bool:
+def motion_noise_dominates(
+    space: Geometry, m: Sightings | Fix | Closure, where: PoseAtStamp, most: float, added_sigma_m: float
+) -> bool:
     """Whether the motion adds more to the variance than a part of it: all that a message says has that in common.
 
     Parameters
@@ -92,14 +97,14 @@ def is_shared(space: Space, m: Sightings | Fix | Closure, where: Where, most: fl
     moved, turned = float(np.trace(motion[:n, :n])), float(np.trace(motion[n:, n:]))
     if isinstance(m, Sightings):
         return any(_adds(space, s, moved, turned, most, added_sigma_m**2) for s in m.sightings)
-    own = float(np.trace(square(m.covariance)))
+    own = float(np.trace(as_matrix(m.covariance)))
     if isinstance(m, Fix) and m.kind != "pose":
         return (moved if m.kind == "position" else turned) > most * own
     return moved + turned > most * own
 
 
-def _adds(space: Space, s: Sighting, moved: float, turned: float, most: float, added: float) -> bool:
-    own = np.diag(square(s.covariance)).tolist()
+def _adds(space: Geometry, s: Sighting, moved: float, turned: float, most: float, added: float) -> bool:
+    own = np.diag(as_matrix(s.covariance)).tolist()
     if s.kind == "bearing":
         return turned > most * sum(own)
     if s.kind == "range":
@@ -112,13 +117,13 @@ def _adds(space: Space, s: Sighting, moved: float, turned: float, most: float, a
     return moved + far**2 * turned > most * (sum(own[:n]) + n * added)
 
 
-def square(flat: Numbers) -> Array:
+def as_matrix(flat: Numbers) -> Array:
     """A covariance as a matrix."""
     size = round(len(flat) ** 0.5)
     return np.array(flat).reshape(size, size)
 
 
-def gradient(space: Space, kind: str, p: Array) -> Array:
+def gradient(space: Geometry, kind: str, p: Array) -> Array:
     """Derivative (..., m, n) of range, bearing or both with respect to points p (..., n) in the sensor's frame."""
     flat = np.maximum(np.hypot(p[..., 0], p[..., 1]), _NEAREST_M)
     far = np.maximum(np.linalg.norm(p, axis=-1), _NEAREST_M)
@@ -135,7 +140,7 @@ def gradient(space: Space, kind: str, p: Array) -> Array:
     return np.stack(rows, axis=-2)
 
 
-def seen_as(space: Space, kind: str, p: Array) -> Array:
+def predict(space: Geometry, kind: str, p: Array) -> Array:
     """What a sensor says (..., m) of points p (..., n) in its frame."""
     said = []
     if kind in ("range", "range_bearing"):
@@ -147,7 +152,7 @@ def seen_as(space: Space, kind: str, p: Array) -> Array:
     return np.stack(said, axis=-1)
 
 
-def point_of(space: Space, measured: Numbers) -> Array:
+def point_of(space: Geometry, measured: Numbers) -> Array:
     """The point (n,) in the sensor's frame that a range and bearing say."""
     far, azimuth = measured[0], measured[1]
     if space.dimensions == 2:
@@ -156,7 +161,7 @@ def point_of(space: Space, measured: Numbers) -> Array:
     return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), far * np.sin(measured[2])])
 
 
-def polar_derivative(space: Space, measured: Numbers) -> Array:
+def polar_derivative(space: Geometry, measured: Numbers) -> Array:
     """Derivative (n, n) of that point with respect to range and angles."""
     far, azimuth = measured[0], measured[1]
     c, s = np.cos(azimuth), np.sin(azimuth)
@@ -172,7 +177,7 @@ def polar_derivative(space: Space, measured: Numbers) -> Array:
     )
 
 
-def fix(space: Space, m: Fix, where: Where, T_map_keyframe: Numbers) -> Carried:
+def fix(space: Geometry, m: Fix, where: PoseAtStamp, T_map_keyframe: Numbers) -> KeyframeMeasurement:
     """What is known of the robot, as known of its keyframe.
 
     Parameters
@@ -180,25 +185,25 @@ def fix(space: Space, m: Fix, where: Where, T_map_keyframe: Numbers) -> Carried:
     T_map_keyframe : where the keyframe is thought to be: what of the motion a position or heading sees depends on it
     """
     group, T_a_b = space.group, where.T_keyframe_base
-    own = square(m.covariance)
+    own = as_matrix(m.covariance)
     if m.kind == "pose":
         into = group.adjoint(T_a_b)
-        return Carried(
+        return KeyframeMeasurement(
             _floats(group.compose(m.measured, group.inverse(T_a_b))), into @ (own + where.covariance) @ into.T
         )
     if m.kind == "position":
         point = np.array(m.point or (0.0,) * space.dimensions)
         turn = space.turn(group.compose(T_map_keyframe, T_a_b))
-        j = turn @ by_motion(space, point)
+        j = turn @ point_jacobian(space, point)
         antenna = _floats(group.act(T_a_b, tuple(point.tolist())))
-        return Carried((*m.measured, *antenna), own + j @ where.covariance @ j.T)
+        return KeyframeMeasurement((*m.measured, *antenna), own + j @ where.covariance @ j.T)
     if m.kind == "attitude":
         turn = space.turn(T_a_b)
         back = so3.inverse((T_a_b[3], T_a_b[4], T_a_b[5], T_a_b[6]))
         q = so3.compose((m.measured[0], m.measured[1], m.measured[2], m.measured[3]), back)
-        return Carried(_floats(q), turn @ (own + where.covariance[3:, 3:]) @ turn.T)
+        return KeyframeMeasurement(_floats(q), turn @ (own + where.covariance[3:, 3:]) @ turn.T)
     yaw = space.heading(T_map_keyframe) - space.heading(group.compose(T_map_keyframe, T_a_b))
-    return Carried((m.measured[0] + float(yaw),), own + where.covariance[-1:, -1:])
+    return KeyframeMeasurement((m.measured[0] + float(yaw),), own + where.covariance[-1:, -1:])
 
 
 def axes_unknown(covariance: Array) -> NDArray[np.bool_]:
@@ -216,14 +221,14 @@ def axes_known(covariance: Array) -> list[tuple[Array, float]]:
     return [(v, float(value)) for value, v in zip(values, vectors.T, strict=True) if value < 0.5 * _UNKNOWN_M2]
 
 
-def closure(space: Space, m: Closure, earlier: Where, later: Where) -> Carried:
+def closure(space: Geometry, m: Closure, earlier: PoseAtStamp, later: PoseAtStamp) -> KeyframeMeasurement:
     """Between two keyframes: ``T_a_d = T_a_b T_b_c T_d_c^-1`` for the base b at the earlier stamp, c at the later."""
     group = space.group
-    to_c = group.propagate(earlier.covariance, m.T_from_base, square(m.covariance))
+    to_c = group.propagate(earlier.covariance, m.T_from_base, as_matrix(m.covariance))
     into = group.adjoint(later.T_keyframe_base)
     back = group.inverse(later.T_keyframe_base)
     measured = group.compose(group.compose(earlier.T_keyframe_base, m.T_from_base), back)
-    return Carried(_floats(measured), into @ (to_c + later.covariance) @ into.T)
+    return KeyframeMeasurement(_floats(measured), into @ (to_c + later.covariance) @ into.T)
 
 
 def _floats(numbers: tuple[float, ...]) -> Numbers:

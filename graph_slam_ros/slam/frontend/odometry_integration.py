@@ -4,20 +4,18 @@ from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.config.config import OdometryConfig
-from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.frontend.odometry_selector import Step
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array, Numbers
 
 _REST_NS = 10**9  # for so long a robot must have stood before what its odometry jitters is no motion
 _MOST = 10_000  # odometry messages that one motion remembers
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
+class OdometrySample:
     """``T_keyframe_base`` at a stamp, and its covariance (dof, dof) in right tangent coordinates."""
 
     stamp_ns: int
@@ -36,7 +34,7 @@ class OdometryNoise:
 
     __slots__ = ("_config", "_density", "_flat", "_space", "_square")
 
-    def __init__(self, config: OdometryConfig, space: Space) -> None:
+    def __init__(self, config: OdometryConfig, space: Geometry) -> None:
         self._config, self._space = config, space
         c = config
         sigmas = [c.translation_density, c.lateral_density, c.rotation_density]
@@ -72,12 +70,12 @@ class OdometryNoise:
         return self._square
 
 
-class Rest:
+class StationaryDetector:
     """Whether the robot stands: motion that is slow, or that leads nowhere."""
 
     __slots__ = ("_T_odom_base", "_noise", "_since_ns", "_space", "is_on")
 
-    def __init__(self, noise: OdometryNoise, space: Space) -> None:
+    def __init__(self, noise: OdometryNoise, space: Geometry) -> None:
         self._noise, self._space = noise, space
         self._T_odom_base: Numbers | None = None  # where it has been since, but for jitter
         self._since_ns = 0
@@ -105,7 +103,7 @@ class Rest:
         self._T_odom_base, self._since_ns, self.is_on = step.T_odom_base, step.stamp_ns, False
 
 
-class Motion:
+class IntegratedOdometry:
     """The motion since a keyframe, remembered odometry by odometry.
 
     Parameters
@@ -115,14 +113,16 @@ class Motion:
 
     __slots__ = ("_moved", "_noise", "_rest", "_space", "keyframe", "moving_ns")
 
-    def __init__(self, noise: OdometryNoise, space: Space, keyframe: int, start_ns: int, rest: Rest) -> None:
+    def __init__(
+        self, noise: OdometryNoise, space: Geometry, keyframe: int, start_ns: int, rest: StationaryDetector
+    ) -> None:
         self.keyframe = keyframe
         self.moving_ns = 0  # whole numbers: a sum of seconds would round
         self._noise, self._space, self._rest = noise, space, rest
-        self._moved = [Moved(start_ns, space.identity, np.zeros((space.dof, space.dof)))]
+        self._moved = [OdometrySample(start_ns, space.identity, np.zeros((space.dof, space.dof)))]
 
     @property
-    def now(self) -> Moved:
+    def now(self) -> OdometrySample:
         """At the newest odometry."""
         return self._moved[-1]
 
@@ -147,7 +147,7 @@ class Motion:
         else:
             self._moved.append(moved)
 
-    def at(self, stamp_ns: int) -> Moved:
+    def at(self, stamp_ns: int) -> OdometrySample:
         """At a stamp from the keyframe's to the newest odometry's, between two odometry messages by interpolation."""
         k = bisect_right(self._moved, stamp_ns, key=_stamp) - 1
         a = self._moved[k]
@@ -179,18 +179,24 @@ class Motion:
         """Stamp of the last odometry but one, or of the keyframe."""
         return self._moved[-2].stamp_ns if len(self._moved) > 1 else self.start_ns
 
-    def _after(self, step: Step, stands: bool) -> Moved:
+    def _after(self, step: Step, stands: bool) -> OdometrySample:
         to = self._space.group.compose(self.now.T_keyframe_base, step.T_last_base)
         return self._extended(self.now, step.stamp_ns, to, step.T_last_base, step.twist_covariance, stands)
 
     def _extended(
-        self, a: Moved, stamp_ns: int, to: Numbers, T_a_b: Numbers, twist_covariance: Numbers | None, stands: bool
-    ) -> Moved:
+        self,
+        a: OdometrySample,
+        stamp_ns: int,
+        to: Numbers,
+        T_a_b: Numbers,
+        twist_covariance: Numbers | None,
+        stands: bool,
+    ) -> OdometrySample:
         moving_ns = (stamp_ns - a.stamp_ns) * (not stands)
         noise = self._noise.of(moving_ns * 1e-9, twist_covariance)
         covariance = self._space.group.propagate_during(a.covariance, T_a_b, noise)
-        return Moved(stamp_ns, to, covariance, twist_covariance, stands)
+        return OdometrySample(stamp_ns, to, covariance, twist_covariance, stands)
 
 
-def _stamp(moved: Moved) -> int:
+def _stamp(moved: OdometrySample) -> int:
     return moved.stamp_ns

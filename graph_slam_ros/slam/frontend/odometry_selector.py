@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from graph_slam_ros.config.config import OdometryConfig
-from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Odometry
+from graph_slam_ros.typing import Numbers
 
 _REMEMBERED = 1000  # messages of a source that is not in use, to take over from where the one in use fell silent
 
@@ -30,7 +31,7 @@ class Step:
     broken: bool = False
 
 
-class OdometryChoice:
+class OdometrySelector:
     """Chooses by stamps alone: what is used follows from what was accepted, not from when it came.
 
     Parameters
@@ -42,7 +43,7 @@ class OdometryChoice:
     sources : those that have been used
     """
 
-    def __init__(self, config: OdometryConfig, priority: Sequence[str], space: Space, counters: Counters) -> None:
+    def __init__(self, config: OdometryConfig, priority: Sequence[str], space: Geometry, counters: Counters) -> None:
         self._config, self._space, self._counters = config, space, counters
         self._silent_ns = round(config.timeout_s * 1e9)
         self.sources: set[str] = set()

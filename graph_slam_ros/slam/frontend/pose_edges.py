@@ -1,23 +1,21 @@
 """What is measured of poses, as edges of the graph: odometry, fixes and loop closures."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.graph import Gaussian, Graph
-from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import edge_noise
 from graph_slam_ros.measurements.types import Closure, Fix, InitialPose
 from graph_slam_ros.slam.frontend import motion_compensation
-from graph_slam_ros.slam.frontend.motion_compensation import Where
-
-Array = NDArray[np.float64]
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.typing import Array, Numbers
 
 
 class PoseEdges:
     """Adds such edges to a graph; what had to be repaired of their noise is counted."""
 
-    def __init__(self, space: Space, graph: Graph, counters: Counters) -> None:
+    def __init__(self, space: Geometry, graph: Graph, counters: Counters) -> None:
         self._space, self._graph, self._counters = space, graph, counters
 
     def odometry(self, vertices: list[int], T_last_now: Numbers, covariance: Array, source: str) -> None:
@@ -27,10 +25,10 @@ class PoseEdges:
 
     def initial_pose(self, vertex: int, said: InitialPose) -> None:
         """Where somebody says that the robot is."""
-        noise = self._noise("initialpose", motion_compensation.square(said.covariance))
+        noise = self._noise("initialpose", motion_compensation.as_matrix(said.covariance))
         self._graph.add_edge(self._space.pose_prior, [vertex], said.T_map_base, noise, "initialpose")
 
-    def fix(self, m: Fix, where: Where, T_map_keyframe: Numbers) -> None:
+    def fix(self, m: Fix, where: PoseAtStamp, T_map_keyframe: Numbers) -> None:
         """A prior on a keyframe; of a position that lacks some axes, one on each principal axis that is known."""
         space, vertices, topic = self._space, [where.vertex], m.topic
         if m.kind not in space.fixes:
@@ -50,7 +48,7 @@ class PoseEdges:
             self._graph.add_edge(space.fixes[m.kind], vertices, carried.measured, noise, "fixes", topic)
         self._counters.used[topic] += 1
 
-    def closure(self, m: Closure, earlier: Where, later: Where) -> None:
+    def closure(self, m: Closure, earlier: PoseAtStamp, later: PoseAtStamp) -> None:
         """Between two keyframes."""
         if earlier.keyframe == later.keyframe:
             self._counters.count(m.topic, "within_one_keyframe")

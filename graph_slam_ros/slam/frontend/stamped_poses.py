@@ -4,17 +4,14 @@ from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graph_slam_ros.graph.geometry import Numbers
 from graph_slam_ros.graph.graph import Column
+from graph_slam_ros.typing import Array, Index, Numbers
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 Instant = TypeVar("Instant")
 
 
-class Track(Generic[Instant]):
+class StampedPoses(Generic[Instant]):
     """Instants, each with the id of what it belongs to, a stamp and a pose; it grows at its end.
 
     Parameters

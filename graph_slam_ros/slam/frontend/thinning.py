@@ -6,7 +6,7 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.types import Fix, Sightings
 
 
-class Thinning:
+class ObservationThinning:
     """Chooses fixes, and what a robot sees while it rests, by their stamps, input by input.
 
     An error that lasts tau (exponentially correlated) leaves of n fixes over a long time T the information of

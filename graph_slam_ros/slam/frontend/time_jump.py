@@ -9,7 +9,7 @@ _SURE_NS, _SURE = 1_000_000_000, 3  # of stamps, and messages: a burst that was 
 _AGAIN_NS = 10_000_000_000  # what has been told not longer ago is told again where nothing new comes
 
 
-class StampJump:
+class TimeJumpDetector:
     """Looks whether odometry goes on from an earlier stamp, and nothing of any odometry from where it was.
 
     Parameters

@@ -15,18 +15,16 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.graph.geometry import Numbers
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import LEAST_M2
 from graph_slam_ros.measurements.types import Sighting, Sightings
 from graph_slam_ros.slam.frontend import motion_compensation
-from graph_slam_ros.slam.frontend.motion_compensation import Carried, Where
+from graph_slam_ros.slam.frontend.motion_compensation import KeyframeMeasurement, PoseAtStamp
 from graph_slam_ros.slam.landmarks import association
 from graph_slam_ros.slam.landmarks.association import NEW, UNCLEAR, Candidates, Gates
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark, Landmarks
 from graph_slam_ros.solver import Solver
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array, Numbers
 
 _MOST_CANDIDATES = 24  # landmarks that one message is compared with: the nearest
 _MOST_AT_ONCE = 8  # new landmarks whose pairings are weighed together: the latest
@@ -39,7 +37,7 @@ _POSITIONED = ("position", "pose", "range_bearing")
 
 
 @dataclass(frozen=True, slots=True)
-class Merger:
+class LandmarkMerge:
     """Two landmarks that became one, and the sightings that changed hands, each by its stamp and itself."""
 
     kept: str
@@ -48,18 +46,18 @@ class Merger:
 
 
 @dataclass(frozen=True, slots=True)
-class Weighed:
+class MergeCandidate:
     """Pairs of a landmark and an older one: the differences of their positions (P n,), and their covariance."""
 
     pairs: list[tuple[str, str]]
     residual: Array
     covariance: Array
 
-    def of(self, some: list[int]) -> "Weighed":
+    def of(self, some: list[int]) -> "MergeCandidate":
         """Some of them."""
         n = len(self.residual) // max(len(self.pairs), 1)
         rows = (np.array(some, dtype=np.int64)[:, None] * n + np.arange(n)).ravel()
-        return Weighed([self.pairs[p] for p in some], self.residual[rows], self.covariance[rows[:, None], rows])
+        return MergeCandidate([self.pairs[p] for p in some], self.residual[rows], self.covariance[rows[:, None], rows])
 
 
 def last_number(names: Iterable[str]) -> int:
@@ -68,7 +66,7 @@ def last_number(names: Iterable[str]) -> int:
     return max((int(number) for number in numbers if number.isdecimal()), default=0)
 
 
-class Unnamed:
+class AnonymousLandmarks:
     """Association of a message's sightings with the landmarks, and what follows from it later.
 
     Parameters
@@ -87,14 +85,14 @@ class Unnamed:
             c.gate_same, c.gate_other, c.density_per_m**self._space.dimensions, c.ambiguity_chi2, c.close_m
         )
         self._begun = 0
-        self._mergers: deque[Merger] = deque(maxlen=100)
+        self._mergers: deque[LandmarkMerge] = deque(maxlen=100)
         self._parted: set[tuple[str, str]] = set()
 
     def take_up(self) -> None:
         """New names are other than those that there are."""
         self._begun = last_number(name for name, mark in self._landmarks.known.items() if mark.is_unnamed)
 
-    def identified(self, m: Sightings, where: Where) -> list[tuple[str, Sighting]]:
+    def identified(self, m: Sightings, where: PoseAtStamp) -> list[tuple[str, Sighting]]:
         """The sightings of a message that can be used, each with an identity; the others are counted."""
         known = self._landmarks.known
         named = [(s.id, s) for s in m.sightings if s.id]
@@ -112,7 +110,7 @@ class Unnamed:
             self._counters.count(m.topic, "not_in_map", len(found) - len(in_map))
         return out + in_map
 
-    def _associated(self, sightings: list[Sighting], where: Where) -> list[tuple[str, Sighting]]:
+    def _associated(self, sightings: list[Sighting], where: PoseAtStamp) -> list[tuple[str, Sighting]]:
         seen = [self._position(s, where) for s in sightings]
         try:
             names, what = self._expected(where, seen)
@@ -128,12 +126,12 @@ class Unnamed:
                 out.append((names[match.landmark], self._widened(s, where, match.spread)))
         return out
 
-    def _widened(self, s: Sighting, where: Where, spread: Array | None) -> Sighting:
+    def _widened(self, s: Sighting, where: PoseAtStamp, spread: Array | None) -> Sighting:
         """With a covariance (n, n) in the keyframe's axes added."""
         added = self._config.unnamed_sigma_m**2 * np.eye(self._space.dimensions)
         spread = added if spread is None else spread + added
         space = self._space
-        n, covariance = space.dimensions, motion_compensation.square(s.covariance)
+        n, covariance = space.dimensions, motion_compensation.as_matrix(s.covariance)
         axes: Array = space.turn(where.T_keyframe_base).T
         if s.kind == "pose":
             axes = space.turn(s.measured).T @ axes
@@ -154,25 +152,25 @@ class Unnamed:
         name = f"{NAME}{self._begun}"
         return name if name not in self._landmarks.known else self._new_name()
 
-    def _position(self, s: Sighting, where: Where) -> Carried:
+    def _position(self, s: Sighting, where: PoseAtStamp) -> KeyframeMeasurement:
         """Where it was seen, from the keyframe."""
         if s.kind != "range_bearing":
             at = motion_compensation.position(self._space, s, where)
         else:
             at = self._by_range_and_bearing(s, where)
         rounding = motion_compensation.ROUNDING * float(np.trace(at.covariance)) * np.eye(self._space.dimensions)
-        return Carried(at.measured, at.covariance + self._extent() + rounding)
+        return KeyframeMeasurement(at.measured, at.covariance + self._extent() + rounding)
 
-    def _by_range_and_bearing(self, s: Sighting, where: Where) -> Carried:
+    def _by_range_and_bearing(self, s: Sighting, where: PoseAtStamp) -> KeyframeMeasurement:
         space, T_base_sensor = self._space, s.T_base_sensor or self._space.identity
         point = motion_compensation.point_of(space, s.measured)
         to_base = space.turn(T_base_sensor) @ motion_compensation.polar_derivative(space, s.measured)
-        own = to_base @ motion_compensation.square(s.covariance) @ to_base.T
+        own = to_base @ motion_compensation.as_matrix(s.covariance) @ to_base.T
         at_base = tuple(map(float, space.group.act(T_base_sensor, tuple(point.tolist()))))
         seen = Sighting("", "position", at_base, tuple(own.ravel().tolist()))
         return motion_compensation.position(space, seen, where)
 
-    def _expected(self, where: Where, seen: list[Carried]) -> tuple[list[str], association.Expected]:
+    def _expected(self, where: PoseAtStamp, seen: list[KeyframeMeasurement]) -> tuple[list[str], association.Expected]:
         """Landmarks that may be seen here, and what they look like."""
         space, n = self._space, self._space.dimensions
         self._hand_over()
@@ -232,7 +230,7 @@ class Unnamed:
         for name in [name for name, mark in known.items() if mark.is_tentative]:
             self._believe_or_give_up(name, weighed, now_ns)
 
-    def _merge(self, names: list[str], weighed: Weighed) -> None:
+    def _merge(self, names: list[str], weighed: MergeCandidate) -> None:
         """Merge those of a group of which it is clear which others they are."""
         pairs, candidates = self._candidates(names, weighed)
         if not pairs:
@@ -250,15 +248,15 @@ class Unnamed:
         self._counters.count("landmarks", "merged")
         seen = frozenset((one.where.stamp_ns, one.sighting) for one in self._landmarks.known[merged].seen)
         followed = (replace(m, kept=kept) if m.kept == merged else m for m in self._mergers)
-        self._mergers = deque([*followed, Merger(kept, merged, seen)], self._mergers.maxlen)
+        self._mergers = deque([*followed, LandmarkMerge(kept, merged, seen)], self._mergers.maxlen)
         self._landmarks.merge(kept, merged)
         self._hand_over()
 
-    def _weighed(self, pairs: list[tuple[str, str]]) -> Weighed:
+    def _weighed(self, pairs: list[tuple[str, str]]) -> MergeCandidate:
         """Those of the pairs that fit, the likeliest first."""
         known, n = self._landmarks.known, self._space.dimensions
         if not pairs:
-            return Weighed([], np.empty(0), np.empty((0, 0)))
+            return MergeCandidate([], np.empty(0), np.empty((0, 0)))
         r, covariance = self._apart([(known[a], known[b]) for a, b in pairs])
         fits = []
         for p in range(len(pairs)):
@@ -266,9 +264,9 @@ class Unnamed:
             statistic, cost = association.pair_cost(r[own], covariance[own, own])
             if statistic < self._gates.other_chi2(n):
                 fits.append((cost, p))
-        return Weighed(pairs, r, covariance).of([p for _, p in sorted(fits)])
+        return MergeCandidate(pairs, r, covariance).of([p for _, p in sorted(fits)])
 
-    def _candidates(self, names: list[str], weighed: Weighed) -> tuple[list[tuple[str, str]], Candidates]:
+    def _candidates(self, names: list[str], weighed: MergeCandidate) -> tuple[list[tuple[str, str]], Candidates]:
         """Pairs of these with believed landmarks, as they are now."""
         known, wanted = self._landmarks.known, set(names)
         kept = []
@@ -348,7 +346,7 @@ class Unnamed:
         for_long = landmark.last_seen_ns - landmark.first_seen_ns >= round(c.confirm_s * 1e9)
         return landmark.sightings >= c.confirm_sightings and for_long
 
-    def _believe_or_give_up(self, name: str, weighed: Weighed, now_ns: int) -> None:
+    def _believe_or_give_up(self, name: str, weighed: MergeCandidate, now_ns: int) -> None:
         """Believe a tentative landmark that is none of the others; give up what was not seen for long."""
         landmark = self._landmarks.known[name]
         if self._is_sure(landmark) and not self._candidates([name], weighed)[0]:

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
-from graph_slam_ros.graph.geometry import Numbers, Space
-from graph_slam_ros.slam.frontend.motion_compensation import ROUNDING, Carried, by_motion
-
-Array = NDArray[np.float64]
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.frontend.motion_compensation import ROUNDING, KeyframeMeasurement, point_jacobian
+from graph_slam_ros.typing import Array, Numbers
 
 NEW, UNCLEAR = -1, -2
 _SURE = 0.95
@@ -88,7 +87,7 @@ class Expected:
 
 
 def expected(
-    space: Space, T_map_keyframe: Numbers, landmarks: Sequence[Numbers], joint: Array, is_followed: NDArray[np.bool_]
+    space: Geometry, T_map_keyframe: Numbers, landmarks: Sequence[Numbers], joint: Array, is_followed: NDArray[np.bool_]
 ) -> Expected:
     """Positions of landmarks in a keyframe's frame.
 
@@ -105,7 +104,7 @@ def expected(
     for j, landmark in enumerate(landmarks):
         points[j] = space.group.act(back, landmark[:n])
         rows = slice(j * n, (j + 1) * n)
-        jacobian[rows, :dof] = -by_motion(space, points[j])
+        jacobian[rows, :dof] = -point_jacobian(space, points[j])
         is_pose = len(landmark) == space.pose.size
         jacobian[rows, at : at + n] = turn.T @ space.turn(landmark) if is_pose else turn.T
         at += dof if is_pose else n
@@ -133,7 +132,7 @@ class Match:
     spread: Array | None = None
 
 
-def associate(gates: Gates, seen: Sequence[Carried], what: Expected, *, jointly: bool) -> list[Match]:
+def associate(gates: Gates, seen: Sequence[KeyframeMeasurement], what: Expected, *, jointly: bool) -> list[Match]:
     """Of each sighting its landmark, by index."""
     statistic, cost = _costs(seen, what)
     n, followed = what.points.shape[1], what.is_followed
@@ -170,7 +169,7 @@ def pair_cost(residual: Array, covariance: Array) -> tuple[float, float]:
     return statistic, statistic + float(np.linalg.slogdet(2.0 * np.pi * covariance)[1])
 
 
-def _costs(seen: Sequence[Carried], what: Expected) -> tuple[Array, Array]:
+def _costs(seen: Sequence[KeyframeMeasurement], what: Expected) -> tuple[Array, Array]:
     """chi2 and cost of each sighting (a row) with each landmark."""
     count, n = what.points.shape
     k = np.arange(count)
@@ -191,7 +190,7 @@ def _one_by_one(cost: Array, new: float) -> dict[int, int]:
     return {int(i): int(j) for i, j in found if j < columns and np.isfinite(cost[i, j])}
 
 
-def _jointly(gates: Gates, seen: Sequence[Carried], what: Expected, cost: Array) -> dict[int, int]:
+def _jointly(gates: Gates, seen: Sequence[KeyframeMeasurement], what: Expected, cost: Array) -> dict[int, int]:
     """The pairs that fit together and cost the least: branch and bound."""
     n = what.points.shape[1]
     options = [[int(j) for j in np.argsort(row) if np.isfinite(row[j])] for row in cost]
@@ -220,7 +219,7 @@ def _jointly(gates: Gates, seen: Sequence[Carried], what: Expected, cost: Array)
     return best
 
 
-def _joint_statistic(seen: Sequence[Carried], what: Expected, pairs: dict[int, int]) -> float:
+def _joint_statistic(seen: Sequence[KeyframeMeasurement], what: Expected, pairs: dict[int, int]) -> float:
     n = what.points.shape[1]
     rows = np.concatenate([np.arange(j * n, (j + 1) * n) for j in pairs.values()])
     covariance = what.covariance[np.ix_(rows, rows)]

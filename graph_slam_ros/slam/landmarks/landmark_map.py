@@ -4,23 +4,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.survey import Surveyed
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian, Graph, VertexKind
-from graph_slam_ros.graph.geometry import Numbers
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import LEAST_RAD2, edge_noise
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend import motion_compensation
-from graph_slam_ros.slam.frontend.motion_compensation import Carried, Where
+from graph_slam_ros.slam.frontend.motion_compensation import KeyframeMeasurement, PoseAtStamp
 from graph_slam_ros.slam.landmarks import triangulation
-from graph_slam_ros.slam.landmarks.triangulation import Glance, Place
+from graph_slam_ros.slam.landmarks.triangulation import PartialObservation, PositionHypothesis
 from graph_slam_ros.solver import Solver
-
-Array = NDArray[np.float64]
+from graph_slam_ros.typing import Array, Numbers
 
 LABEL = "landmarks"
 _SOMEWHERE_M = 3.0  # away, of what was seen by its bearing alone
@@ -28,13 +25,13 @@ _MOST_WAITING = 60  # sightings of one landmark: every other is forgotten beyond
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class LandmarkEdge:
     """One sighting of a landmark, and the edge that says so."""
 
     edge: int
     topic: str
     sighting: Sighting
-    where: Where
+    where: PoseAtStamp
 
 
 @dataclass(slots=True)
@@ -56,17 +53,17 @@ class Landmark:
     sightings: int = 0
     first_seen_ns: int = 0
     last_seen_ns: int = 0
-    seen: list[Seen] = field(default_factory=list)
+    seen: list[LandmarkEdge] = field(default_factory=list)
     stamps: set[int] = field(default_factory=set)
 
 
 @dataclass(slots=True)
-class Waiting:
+class UndeterminedLandmark:
     """A landmark that no vertex has yet: what was seen of it, where it may be, and why that is not enough."""
 
     topic: str
-    seen: list[tuple[Where, Sighting]] = field(default_factory=list)
-    places: list[Place] = field(default_factory=list)
+    seen: list[tuple[PoseAtStamp, Sighting]] = field(default_factory=list)
+    places: list[PositionHypothesis] = field(default_factory=list)
     reason: str = ""
 
 
@@ -92,7 +89,7 @@ class Landmarks:
     ) -> None:
         self.known: dict[str, Landmark] = {}
         self.begins_new = True
-        self.waiting: dict[str, Waiting] = {}
+        self.waiting: dict[str, UndeterminedLandmark] = {}
         self._config, self._space = config, config.space
         self._graph, self._solver, self._counters, self._withdraw = graph, solver, counters, withdraw
         if config.landmarks.surveyed_file and not config.landmarks.surveyed:
@@ -101,7 +98,7 @@ class Landmarks:
         self.offsets: dict[str, int] = {}
         self.touched: list[str] = []
 
-    def add(self, topic: str, name: str, s: Sighting, where: Where) -> None:
+    def add(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
         """Take a sighting of a landmark with this identity."""
         landmark = self.known.get(name)
         if landmark is not None:
@@ -122,7 +119,7 @@ class Landmarks:
         else:
             self._wait(topic, name, s, where)
 
-    def survey_of(self, name: str, s: Sighting, where: Where) -> tuple[Surveyed, Array] | None:
+    def survey_of(self, name: str, s: Sighting, where: PoseAtStamp) -> tuple[Surveyed, Array] | None:
         """The survey of a landmark that was not seen before, and where (n,) a sighting puts it, or may put it."""
         if name not in self._survey or name in self.known:
             return None
@@ -145,7 +142,7 @@ class Landmarks:
 
     # -- in the graph --------------------------------------------------------------------------------------------
 
-    def _begin(self, topic: str, name: str, s: Sighting, where: Where, value: Numbers) -> None:
+    def _begin(self, topic: str, name: str, s: Sighting, where: PoseAtStamp, value: Numbers) -> None:
         """Add a vertex; ``value`` is in map, but for a pose, which is still in the keyframe's frame."""
         kind = self._space.pose if s.kind == "pose" else self._space.point
         if s.kind == "pose":
@@ -164,7 +161,7 @@ class Landmarks:
         measured = edge_type.whole(known.position)
         self._graph.add_edge(edge_type, [landmark.vertex], measured, noise, "surveyed")
 
-    def _add_edge(self, topic: str, landmark: Landmark, s: Sighting, where: Where) -> None:
+    def _add_edge(self, topic: str, landmark: Landmark, s: Sighting, where: PoseAtStamp) -> None:
         space = self._space
         is_pose = self._graph.kind_of(landmark.vertex) is space.pose
         vertices, metres = [where.vertex, landmark.vertex], space.dimensions
@@ -186,7 +183,7 @@ class Landmarks:
         noise = edge_noise(self._counters, topic, self._blurred(s, carried), metres, distance_m)
         edge = self._graph.add_edge(edge_type, vertices, carried.measured, noise, LABEL, topic)
         if not s.id:
-            landmark.seen.append(Seen(edge, topic, s, where))
+            landmark.seen.append(LandmarkEdge(edge, topic, s, where))
             landmark.stamps.add(where.stamp_ns)
         landmark.sightings += 1
         self._counters.used[topic] += 1
@@ -194,13 +191,13 @@ class Landmarks:
         landmark.first_seen_ns = min(landmark.first_seen_ns or where.stamp_ns, where.stamp_ns)
         landmark.last_seen_ns = max(landmark.last_seen_ns, where.stamp_ns)
 
-    def _from_sensors(self, s: Sighting, where: Where, landmark: Landmark) -> Carried:
+    def _from_sensors(self, s: Sighting, where: PoseAtStamp, landmark: Landmark) -> KeyframeMeasurement:
         at = self._solver.estimate([landmark.vertex])[0]
         group = self._space.group
         seen = np.array(group.act(group.inverse(self._pose(where)), tuple(at.tolist())))
         return motion_compensation.seen_from_sensor(self._space, s, where, seen)
 
-    def _blurred(self, s: Sighting, carried: Carried) -> Array:
+    def _blurred(self, s: Sighting, carried: KeyframeMeasurement) -> Array:
         """With what messages leave out: clocks, mounting, size."""
         covariance, added = carried.covariance.copy(), self._config.landmarks.added_sigma_m**2
         if s.kind in ("pose", "position"):
@@ -241,7 +238,7 @@ class Landmarks:
         for one in b.seen:
             self._add_edge(one.topic, a, one.sighting, one.where)
 
-    def part(self, kept: str, merged: str, moved: Sequence[Seen]) -> None:
+    def part(self, kept: str, merged: str, moved: Sequence[LandmarkEdge]) -> None:
         """Take a merger back: these sightings are of a landmark of their own."""
         a = self.known[kept]
         gone = {one.edge for one in moved}
@@ -259,7 +256,7 @@ class Landmarks:
         self.known[name].is_tentative = False
         self.touched.append(name)
 
-    def _take_out(self, seen: Sequence[Seen]) -> None:
+    def _take_out(self, seen: Sequence[LandmarkEdge]) -> None:
         for one in seen:
             self._counters.used[one.topic] -= 1
         self._withdraw([one.edge for one in seen])
@@ -273,8 +270,8 @@ class Landmarks:
         chi2, numbers = self._solver.chi2_of(edges)
         return float(chi2.sum()), int(numbers.sum())
 
-    def _wait(self, topic: str, name: str, s: Sighting, where: Where) -> None:
-        waiting = self.waiting.setdefault(name, Waiting(topic))
+    def _wait(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
+        waiting = self.waiting.setdefault(name, UndeterminedLandmark(topic))
         is_elsewhere = not waiting.seen or waiting.seen[-1][0].keyframe != where.keyframe
         waiting.seen.append((where, s))
         if is_elsewhere:  # another look from where the last was taken determines nothing
@@ -282,11 +279,11 @@ class Landmarks:
         if len(waiting.seen) > _MOST_WAITING:
             del waiting.seen[1::2]
 
-    def _determine(self, name: str, waiting: Waiting) -> None:
+    def _determine(self, name: str, waiting: UndeterminedLandmark) -> None:
         glances = []
         for where, s in waiting.seen:
-            covariance = motion_compensation.square(s.covariance) + LEAST_RAD2 * np.eye(len(s.measured))
-            glances.append(Glance(self._sensor_pose(s, where), s.kind, s.measured, covariance))
+            covariance = motion_compensation.as_matrix(s.covariance) + LEAST_RAD2 * np.eye(len(s.measured))
+            glances.append(PartialObservation(self._sensor_pose(s, where), s.kind, s.measured, covariance))
         waiting.places = triangulation.places(self._space, glances, self._config.landmarks.range_offset_sigma_m)
         waiting.reason = self._why_not(waiting.places, glances)
         if not waiting.reason:
@@ -296,7 +293,7 @@ class Landmarks:
             for where, s in waiting.seen:
                 self._add_edge(waiting.topic, landmark, s, where)
 
-    def _why_not(self, places: list[Place], glances: list[Glance]) -> str:
+    def _why_not(self, places: list[PositionHypothesis], glances: list[PartialObservation]) -> str:
         """Why a landmark is not determined; empty where it is."""
         settings, count = self._config.landmarks, len(glances)
         if count <= self._space.dimensions - (glances[0].kind != "range"):
@@ -319,16 +316,16 @@ class Landmarks:
 
     # -- where things are ----------------------------------------------------------------------------------------
 
-    def _pose(self, where: Where) -> Numbers:
+    def _pose(self, where: PoseAtStamp) -> Numbers:
         return tuple(self._solver.estimate([where.vertex])[0].tolist())
 
-    def _in_map(self, where: Where, point: Numbers) -> Numbers:
+    def _in_map(self, where: PoseAtStamp, point: Numbers) -> Numbers:
         return tuple(map(float, self._space.group.act(self._pose(where), point)))
 
-    def _sensor_pose(self, s: Sighting, where: Where) -> Numbers:
+    def _sensor_pose(self, s: Sighting, where: PoseAtStamp) -> Numbers:
         group = self._space.group
         T_map_base = group.compose(self._pose(where), where.T_keyframe_base)
         return tuple(map(float, group.compose(T_map_base, s.T_base_sensor or self._space.identity)))
 
-    def _from_sensor(self, s: Sighting, where: Where, point: Array) -> Array:
+    def _from_sensor(self, s: Sighting, where: PoseAtStamp, point: Array) -> Array:
         return np.array(self._space.group.act(self._sensor_pose(s, where), tuple(point.tolist())))

@@ -9,13 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
-from graph_slam_ros.slam.frontend.motion_compensation import gradient, point_of, seen_as
-
-Array = NDArray[np.float64]
+from graph_slam_ros.slam.frontend.motion_compensation import gradient, point_of, predict
+from graph_slam_ros.typing import Array, Numbers
 
 _DISTANCES_M = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0)  # along a ray
 _DIRECTIONS = {2: 16, 3: 64}
@@ -30,7 +28,7 @@ Field = tuple[str, Array, Array, Array, Array]
 
 
 @dataclass(frozen=True, slots=True)
-class Glance:
+class PartialObservation:
     """One sighting from a place that is taken for known.
 
     Attributes
@@ -47,7 +45,7 @@ class Glance:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class PositionHypothesis:
     """Where a landmark may be, its covariance (n, n), infinite where it is loose, and the chi2 of the sightings."""
 
     position: Array
@@ -55,7 +53,9 @@ class Place:
     chi2: float
 
 
-def places(space: Space, glances: Sequence[Glance], offset_sigma_m: float = 0.0) -> list[Place]:
+def places(
+    space: Geometry, glances: Sequence[PartialObservation], offset_sigma_m: float = 0.0
+) -> list[PositionHypothesis]:
     """Every place that fits the sightings best among those next to it, the best first.
 
     Parameters
@@ -65,14 +65,14 @@ def places(space: Space, glances: Sequence[Glance], offset_sigma_m: float = 0.0)
     fields = _fields(space, glances)
     known = 1.0 / max(offset_sigma_m, _NO_OFFSET_M) ** 2
     starts = np.array([[*start, 0.0] for start in _starts(space, glances[0])])
-    found: list[Place] = []
+    found: list[PositionHypothesis] = []
     for place in _descend(space, fields, starts, known):
         if all(np.linalg.norm(place.position - other.position) > _ONE_PLACE_M for other in found):
             found.append(place)
     return sorted(found, key=lambda place: place.chi2)
 
 
-def _fields(space: Space, glances: Sequence[Glance]) -> list[Field]:
+def _fields(space: Geometry, glances: Sequence[PartialObservation]) -> list[Field]:
     """By kind: rotations (k, n, n) and positions (k, n) of the sensors, what they said (k, m), whitening (k, m, m)."""
     out = []
     n = space.dimensions
@@ -85,7 +85,7 @@ def _fields(space: Space, glances: Sequence[Glance]) -> list[Field]:
     return out
 
 
-def _starts(space: Space, glance: Glance) -> list[Array]:
+def _starts(space: Geometry, glance: PartialObservation) -> list[Array]:
     if glance.kind == "range":
         points = glance.measured[0] * _directions(space.dimensions)
     else:
@@ -106,7 +106,7 @@ def _directions(n: int) -> Array:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
-def _descend(space: Space, fields: list[Field], starts: Array, known: float) -> list[Place]:
+def _descend(space: Geometry, fields: list[Field], starts: Array, known: float) -> list[PositionHypothesis]:
     """Levenberg-Marquardt from all starts at once, each to the nearest minimum; those that arrive, in their order.
 
     Parameters
@@ -133,7 +133,10 @@ def _descend(space: Space, fields: list[Field], starts: Array, known: float) -> 
         if not len(under_way):
             break
     points = h[:, :n, :n] - h[:, :n, n:] * h[:, n:, :n] / h[:, n:, n:]  # the offset is eliminated
-    return [Place(at[k, :n], _covariance(points[k]), float(chi2[k])) for k in np.flatnonzero(has_arrived).tolist()]
+    return [
+        PositionHypothesis(at[k, :n], _covariance(points[k]), float(chi2[k]))
+        for k in np.flatnonzero(has_arrived).tolist()
+    ]
 
 
 def _covariance(information: Array) -> Array:
@@ -144,14 +147,14 @@ def _covariance(information: Array) -> Array:
     return inverse
 
 
-def _normal(space: Space, fields: list[Field], at: Array, known: float) -> tuple[Array, Array, Array]:
+def _normal(space: Geometry, fields: list[Field], at: Array, known: float) -> tuple[Array, Array, Array]:
     """chi2 (s,), gradients (s, n + 1) and Gauss-Newton matrices (s, n + 1, n + 1) at points and offsets (s, n + 1)."""
     n = space.dimensions
     b, h = np.zeros(at.shape), np.zeros((*at.shape, n + 1))
     chi2, b[:, n], h[:, n, n] = known * at[:, n] ** 2, known * at[:, n], known
     for kind, turns, sensors, said, whiten in fields:
         p = np.einsum("kij,ski->skj", turns, at[:, None, :n] - sensors)
-        r = seen_as(space, kind, p) - said
+        r = predict(space, kind, p) - said
         first_angle = 0 if kind == "bearing" else 1
         r[..., first_angle:] = se2.wrap(r[..., first_angle:])
         j = np.zeros((*r.shape, n + 1))

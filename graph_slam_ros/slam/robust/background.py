@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from graph_slam_ros.config.robust import RobustConfig
-from graph_slam_ros.slam.robust.hypotheses import Frozen, Outcome, Wanted, second_look
+from graph_slam_ros.slam.robust.hypotheses import CancelToken, FrozenGraph, Outcome, second_look
 
 _MORE = 1.5  # times as many out as at the last look: looks become rarer as their cost grows
 
@@ -27,7 +27,7 @@ def when_asked(work: Work) -> Work:
 class _Look:
     apply_at: int
     outcome: Work
-    wanted: Wanted
+    wanted: CancelToken
 
 
 class Background:
@@ -43,10 +43,10 @@ class Background:
         after, self._out = self._config.second_look_after, min(self._out, out)
         return self._look is None and after > 0 and out >= max(self._out + after, _MORE * self._out)
 
-    def start(self, frozen: Frozen, out: int) -> None:
+    def start(self, frozen: FrozenGraph, out: int) -> None:
         """Begin with what there is now."""
         self._out = out
-        wanted = Wanted()
+        wanted = CancelToken()
         outcome = self._beside(lambda: second_look(self._config, frozen, wanted))
         self._look = _Look(frozen.keyframe + self._config.apply_after_keyframes, outcome, wanted)
 

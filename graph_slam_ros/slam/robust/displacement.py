@@ -15,16 +15,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.graph import Graph
-from graph_slam_ros.graph.geometry import Numbers, Space
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
 from graph_slam_ros.solver import Solver
+from graph_slam_ros.typing import Array, Index, Numbers
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 WINDOW = 50  # sightings that are compared
@@ -109,7 +108,7 @@ class DisplacementSearch:
     graph, solver, ledger : of the back-end
     """
 
-    def __init__(self, space: Space, graph: Graph, solver: Solver, ledger: Ledger, history: LandmarkHistory) -> None:
+    def __init__(self, space: Geometry, graph: Graph, solver: Solver, ledger: Ledger, history: LandmarkHistory) -> None:
         self._space, self._history = space, history
         self._graph, self._solver, self._ledger = graph, solver, ledger
         self._seen: deque[_Seen] = deque(maxlen=WINDOW)

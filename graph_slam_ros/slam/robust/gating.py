@@ -19,9 +19,7 @@ from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.innovation import innovation
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason, Verdict
 from graph_slam_ros.solver import Solver
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 CANDIDATES = ("landmarks", "fixes", "closures", "initialpose")
 _TYPICAL = 30  # residuals tell what all are like
@@ -32,7 +30,7 @@ _COMPLETED = 50  # edges that are out and are tried again after everything was s
 _AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
 
 
-class Decisions:
+class OutlierGate:
     """Judge of the candidates among the edges of a graph; what it decides is weights, and stands in its ledger."""
 
     def __init__(self, config: RobustConfig, graph: Graph, solver: Solver, ledger: Ledger | None = None) -> None:

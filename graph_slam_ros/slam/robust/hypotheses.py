@@ -12,18 +12,15 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import GROUPS, SE2, Graph
-from graph_slam_ros.slam.robust.gating import Decisions
+from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.ledger import Ledger
-from graph_slam_ros.slam.robust.pairwise_consistency import agreeing
+from graph_slam_ros.slam.robust.pairwise_consistency import consistent_groups
 from graph_slam_ros.solver import Settings, Solver
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 _ITERATIONS = 20  # of each stage of the losses, from another start
 _HOPELESS = 2.0  # times the least cost that was found: another explanation is none
@@ -31,7 +28,7 @@ _STORY = 5  # closures that agree with one another and not with the map
 
 
 @dataclass(frozen=True, slots=True)
-class Frozen:
+class FrozenGraph:
     """What a second look begins with: copies, which nobody else changes.
 
     Attributes
@@ -52,7 +49,7 @@ class Frozen:
 
 
 @dataclass(frozen=True, slots=True)
-class Rival:
+class Alternative:
     """Another explanation that holds together, too, and costs not much more: who sees both cannot tell by this graph.
 
     Attributes
@@ -75,8 +72,8 @@ class Outcome:
     ledger: Ledger
     values: Array
     cost: float
-    frozen: Frozen
-    rivals: tuple[Rival, ...] = ()
+    frozen: FrozenGraph
+    rivals: tuple[Alternative, ...] = ()
 
     def carried_to(self, graph: Graph, values: Array) -> Array:
         """Stored numbers of a graph that has grown since: what is new moves with the newest pose that was there."""
@@ -102,13 +99,13 @@ class Outcome:
 
 
 @dataclass(slots=True)
-class Wanted:
+class CancelToken:
     """Whether anybody still waits for an outcome."""
 
     still: bool = True
 
 
-def second_look(config: RobustConfig, frozen: Frozen, wanted: Wanted | None = None) -> Outcome | None:
+def second_look(config: RobustConfig, frozen: FrozenGraph, wanted: CancelToken | None = None) -> Outcome | None:
     """Explain a graph anew, from each start; the least cost wins. None where nothing can be solved, or nobody waits."""
     found: list[Outcome] = []
     for name, start, believed in _starts(frozen):
@@ -127,7 +124,7 @@ def second_look(config: RobustConfig, frozen: Frozen, wanted: Wanted | None = No
     return replace(best, rivals=tuple(rivals.values()))
 
 
-def _rival(one: Outcome, best: Outcome) -> Rival | None:
+def _rival(one: Outcome, best: Outcome) -> Alternative | None:
     """What another explanation believes against the best, where that is a whole story and not a few edges more."""
     graph = best.frozen.graph
     here, there = (outcome.ledger.inside for outcome in (one, best))
@@ -135,10 +132,10 @@ def _rival(one: Outcome, best: Outcome) -> Rival | None:
     is_story = np.count_nonzero(graph.has_label(only_here, ("closures",))) >= _STORY
     if not is_story or one.cost > _HOPELESS * best.cost:
         return None
-    return Rival(one.cost, best.cost, tuple(only_here.tolist()), tuple(only_there.tolist()))
+    return Alternative(one.cost, best.cost, tuple(only_here.tolist()), tuple(only_there.tolist()))
 
 
-def _starts(frozen: Frozen) -> Iterator[tuple[str, Array, Index | None]]:
+def _starts(frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
     """The online estimate with what is believed; closures that agree with a neighbour, there and along odometry alone.
 
     And the largest group that is out, as if it alone were true.
@@ -152,7 +149,7 @@ def _starts(frozen: Frozen) -> Iterator[tuple[str, Array, Index | None]]:
         yield "all", frozen.values, candidates
         return
     odometry = _along_odometry(graph, frozen.values, set(frozen.held.tolist()))
-    groups = agreeing(graph, odometry, closures, ledger.threshold.values[closures])
+    groups = consistent_groups(graph, odometry, closures, ledger.threshold.values[closures])
     believed = np.concatenate((others, *groups))
     yield "neighbours", frozen.values, believed
     yield "odometry", odometry, believed
@@ -163,7 +160,7 @@ def _starts(frozen: Frozen) -> Iterator[tuple[str, Array, Index | None]]:
 
 
 def _explained(
-    name: str, config: RobustConfig, frozen: Frozen, start: Array, believed: Index | None, hopeless: float
+    name: str, config: RobustConfig, frozen: FrozenGraph, start: Array, believed: Index | None, hopeless: float
 ) -> Outcome:
     """Solve and judge in turn, beginning with what is believed in the ledger, or with these candidates instead.
 
@@ -175,7 +172,7 @@ def _explained(
     solver.start_at(start)
     for vertex in frozen.held.tolist():
         solver.hold(vertex)
-    decisions = Decisions(config, graph, solver, mine)
+    decisions = OutlierGate(config, graph, solver, mine)
     if believed is not None:
         decisions.believe(believed, frozen.keyframe)
         solver.optimize(replace(frozen.settings, losses=decisions.cautious_losses(), max_iterations=_ITERATIONS))

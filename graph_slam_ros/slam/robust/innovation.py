@@ -1,15 +1,12 @@
 """How far a measurement is from what all else predicts of it, in units of both their uncertainties."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from graph_slam_ros.graph import POINT_SEEN_FROM, SE2, SE3, EdgeType, Graph
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import linearized
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 _ANGLES = {SE2: 1, SE3: 3}  # of a pose, its last coordinates
 _MOST_STEPS = 60  # of a search: with extreme numbers it would creep for seconds; the least it has found is taken

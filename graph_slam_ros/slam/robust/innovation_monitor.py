@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import beta, binom
 
 from graph_slam_ros.slam.landmarks.association import quantile
-from graph_slam_ros.slam.robust.gating import Decisions
+from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.ledger import FINAL
 from graph_slam_ros.solver import Solver
@@ -67,7 +67,7 @@ class InnovationMonitor:
     history : from when on each landmark is well known
     """
 
-    def __init__(self, solver: Solver, decisions: Decisions, history: LandmarkHistory) -> None:
+    def __init__(self, solver: Solver, decisions: OutlierGate, history: LandmarkHistory) -> None:
         self._solver, self._decisions, self._history = solver, decisions, history
         self._ledger = decisions.ledger
         self._seen: deque[_Seen] = deque(maxlen=4 * _WINDOW)

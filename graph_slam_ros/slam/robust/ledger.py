@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.graph.graph import Column
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 
 class Verdict(IntEnum):
@@ -43,7 +41,7 @@ _ACCEPTED, _DOWN_WEIGHTED = _INSIDE = tuple(map(int, INSIDE))  # comparing with 
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class VerdictChange:
     """A verdict that changed: at which keyframe, to what and why, and the statistic with its threshold."""
 
     edge: int
@@ -72,7 +70,7 @@ class Ledger:
         self.statistic, self.threshold = Column(np.float64), Column(np.float64)
         self.numbers, self.keyframe = Column(np.int64), Column(np.int64)
         self._residual, self._residual_at = Column(np.float64), Column(np.int64)
-        self.history: list[Change] = []
+        self.history: list[VerdictChange] = []
         self.final = 0
         self._out: set[int] = set()
 
@@ -149,7 +147,7 @@ class Ledger:
         self.put(edge, verdict, reason)
         self.statistic.values[edge] = statistic
         limit = float(self.threshold.values[edge]) if threshold is None else threshold
-        self.history.append(Change(edge, keyframe, verdict, reason, float(statistic), limit))
+        self.history.append(VerdictChange(edge, keyframe, verdict, reason, float(statistic), limit))
 
     def residual(self, edge: int) -> Array:
         """How the measurement differed from what was expected when it came, in its units."""

@@ -9,21 +9,18 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from graph_slam_ros.graph import GROUPS, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Graph
 from graph_slam_ros.graph.graph import EdgeTable
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 _NEAR = 5.0  # poses between the ends of neighbours
 
 
-def agreeing(graph: Graph, values: Array, closures: Index, limits: Array) -> list[Index]:
+def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Array) -> list[Index]:
     """Groups of closures each of which agrees with a neighbour of its group; without those that agree with none.
 
     Parameters

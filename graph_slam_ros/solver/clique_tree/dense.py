@@ -9,7 +9,8 @@ from numba.core import types
 from numba.extending import overload
 from numba.np.linalg import _BLAS, ensure_blas
 
-from graph_slam_ros.solver.clique_tree.storage import NOTHING, Array
+from graph_slam_ros.solver.clique_tree.storage import NOTHING
+from graph_slam_ros.typing import Array
 
 LEAST_PIVOT = 1e-14  # of its diagonal entry: what elimination left of it is rounding
 WIDE = 12  # pivots that are applied to the rows below by matrix products

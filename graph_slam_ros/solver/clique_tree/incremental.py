@@ -51,8 +51,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     TAKEN,
     VALUE,
     WIDTH,
-    Array,
-    Index,
     Tree,
     with_room,
 )
@@ -66,6 +64,7 @@ from graph_slam_ros.solver.clique_tree.symbolic import (
     room_for,
     structure,
 )
+from graph_slam_ros.typing import Array, Index
 
 SPARSE = 1.2  # of the memory of fronts, as a multiple of those in use: then it is compacted, not lengthened
 FEW = 64  # new vertices whose anchorage is looked for; more are said to be loose, which is then looked into

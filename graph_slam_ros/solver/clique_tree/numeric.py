@@ -36,10 +36,9 @@ from graph_slam_ros.solver.clique_tree.storage import (
     STEP,
     VALUE,
     WIDTH,
-    Array,
-    Index,
     Tree,
 )
+from graph_slam_ros.typing import Array, Index
 
 MOVED = -2  # in LOCAL: its step has changed
 SUSPECT = 1e-9  # of its diagonal entry: a pivot below is looked into

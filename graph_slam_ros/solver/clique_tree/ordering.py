@@ -47,9 +47,9 @@ from graph_slam_ros.solver.clique_tree.storage import (
     TAIL_FIRST,
     TAIL_KEPT,
     TAIL_LEAST,
-    Index,
     Tree,
 )
+from graph_slam_ros.typing import Index
 
 LEAF = 6  # vertices a region need not be dissected for
 GROWTH = 2.0  # a subtree is dissected anew when it has grown by this factor

@@ -11,7 +11,8 @@ joined by so many edges of the original graph; weight is a vertex's degrees of f
 import numpy as np
 
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.clique_tree.storage import NOTHING, Array, Index
+from graph_slam_ros.solver.clique_tree.storage import NOTHING
+from graph_slam_ros.typing import Array, Index
 
 COARSE = 40  # vertices of the graph that is separated first
 ATTEMPTS = 6  # from different ends

@@ -19,9 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.graph.edge_type import MOST_SLOTS
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from graph_slam_ros.typing import Array, Index
 
 NOTHING = -1
 

@@ -35,9 +35,9 @@ from graph_slam_ros.solver.clique_tree.storage import (
     REGION,
     SIBLING,
     SIZE,
-    Index,
     Tree,
 )
+from graph_slam_ros.typing import Index
 
 RELAXED = 36  # zeros that a vertex may bring along when it joins a clique: fewer, larger fronts
 SHARE = 0.12  # or this share of a large one

@@ -1,0 +1,12 @@
+"""Types of arrays, by one name each in the whole package."""
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array: TypeAlias = NDArray[np.float64]
+Index: TypeAlias = NDArray[np.int64]
+Mask: TypeAlias = NDArray[np.bool_]
+Numbers: TypeAlias = tuple[float, ...]
+"""A point, a pose or a covariance, row by row: what messages and measurements carry."""
