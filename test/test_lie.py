@@ -5,8 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm, logm
+from scipy.spatial.transform import Rotation
 
-from graph_slam_ros.lie import se2
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.lie import se2, se3
 
 NEAR_PI = np.pi - 1e-7
 
@@ -234,3 +236,34 @@ def test_the_noise_of_a_step_is_that_of_its_parts_fully_correlated():
     for _ in range(count):  # one error of velocity all through: what it did so far is carried on, and it adds the same
         j = se2.adjoint(se2.inverse(se2.exp(part))) @ j + se2.right_jacobian(part) / count
     assert se2.noise_during(se2.exp(whole), of_twist) == pytest.approx(j @ of_twist @ j.T, rel=1e-10)
+
+
+def test_matrices_of_poses_are_those_of_scipy_and_lead_back():
+    rng = np.random.default_rng(3)
+    turns = Rotation.random(200, random_state=4)
+    half = Rotation.from_rotvec(np.pi * np.vstack([np.eye(3), [[0.6, 0.8, 0.0]]]))  # where w is zero
+    quaternions = np.vstack([turns.as_quat(), half.as_quat()])
+    path = np.hstack([rng.uniform(-5, 5, (204, 3)), quaternions])
+    matrices = se3.to_matrix(tuple(path.T))
+    assert matrices.shape == (204, 4, 4)
+    assert matrices[:, :3, :3] == pytest.approx(Rotation.from_quat(quaternions).as_matrix(), abs=1e-14)
+    back = np.stack(se3.from_matrix(matrices), axis=-1)
+    assert back[:, :3] == pytest.approx(path[:, :3])
+    assert np.abs((back[:, 3:] * quaternions).sum(axis=1)) == pytest.approx(1.0, abs=1e-14)
+    assert (back[:, 6] >= 0.0).all()
+    one = se3.from_matrix(se3.to_matrix(tuple(path[7])))
+    assert se3.to_matrix(one) == pytest.approx(matrices[7], abs=1e-14)
+
+    planar = samples("uniform")
+    assert se2.to_matrix(tuple(planar.T))[5] == pytest.approx(matrix(planar[5]), abs=1e-15)
+    assert np.stack(se2.from_matrix(se2.to_matrix(tuple(planar.T))), axis=-1) == pytest.approx(planar, abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [np.eye(3) * 2.0, np.diag([1.0, -1.0, 1.0]), np.eye(4), [[1, 0, 0], [0, 1, 0], [0, 1, 1]], np.full((3, 3), np.nan)],
+    ids=["scaled", "mirrored", "of space", "projective", "nan"],
+)
+def test_what_is_no_rigid_motion_is_refused(wrong):
+    with pytest.raises(GraphSlamError, match=r"not a rigid motion|has the shape \(3, 3\)"):
+        se2.from_matrix(wrong)

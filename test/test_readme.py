@@ -1,4 +1,4 @@
-"""The Python of docs/library.md prints what the page says; the names at top level are what they say."""
+"""The Python of docs/library.md and theory.md prints what the page says; the names at top level are what they say."""
 
 import fnmatch
 import re
@@ -11,7 +11,12 @@ import pytest
 import graph_slam_ros
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs/library.md").read_text(), re.DOTALL)
+PAGES = ("library", "theory")
+BLOCKS = [
+    block
+    for page in PAGES
+    for block in re.findall(r"```python\n(.*?)```", (ROOT / f"docs/{page}.md").read_text(), re.DOTALL)
+]
 
 
 @pytest.fixture
@@ -23,15 +28,15 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.split("\n", 1)[0])
-def test_a_block_of_the_library_page_prints_what_it_says(block, folder, capsys):
+def test_a_block_of_the_docs_prints_what_it_says(block, folder, capsys):
     said = re.findall(r"^print\(.*\)  # (.*)$", block, re.MULTILINE)
     assert len(said) == block.count("print(") > 0
-    exec(compile(block, "docs/library.md", "exec"), {"__name__": "readme"})
+    exec(compile(block, "docs", "exec"), {"__name__": "readme"})
     assert capsys.readouterr().out.splitlines() == said
 
 
-def test_the_library_page_has_every_way():
-    assert len(BLOCKS) == 5
+def test_the_docs_have_every_way():
+    assert len(BLOCKS) == 8
     assert all(re.search(rf"\b{name}\b", "".join(BLOCKS)) for name in ("optimize", "Solver", "GraphSlam"))
 
 

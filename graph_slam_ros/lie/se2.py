@@ -10,9 +10,11 @@ on SE(2); equation numbers below are theirs.
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie.jit import jitable, kernel
+from graph_slam_ros.typing import Array
 
 Pose: TypeAlias = tuple[Any, Any, Any]
 
@@ -83,6 +85,47 @@ def retract(a: Pose, d: Pose) -> Pose:
 def local(a: Pose, b: Pose) -> Pose:
     """``a [-] b = Log(b^-1 a)``."""
     return log(between(b, a))
+
+
+def to_matrix(a: Pose) -> Array:
+    """Homogeneous matrix (..., 3, 3) of a pose, or of a path of them."""
+    x, y, theta = np.broadcast_arrays(*a)
+    out = np.zeros((*x.shape, 3, 3))
+    out[..., 0, 0] = out[..., 1, 1] = np.cos(theta)
+    out[..., 1, 0] = np.sin(theta)
+    out[..., 0, 1] = -out[..., 1, 0]
+    out[..., 0, 2], out[..., 1, 2], out[..., 2, 2] = x, y, 1.0
+    return out
+
+
+def from_matrix(matrix: ArrayLike) -> Pose:
+    """Pose of a homogeneous matrix (..., 3, 3), the inverse of ``to_matrix``.
+
+    Raises
+    ------
+    GraphSlamError
+        It is not a rigid motion of the plane.
+    """
+    m = rigid(matrix, 3)
+    return m[..., 0, 2], m[..., 1, 2], np.arctan2(m[..., 1, 0], m[..., 0, 0])
+
+
+def rigid(matrix: ArrayLike, size: int) -> Array:
+    """The matrices (..., size, size), checked to be rigid motions.
+
+    Raises
+    ------
+    GraphSlamError
+        The shape is another, the rotation is none (to 1e-6), or the last row is not 0 .. 0 1.
+    """
+    m = np.asarray(matrix, dtype=np.float64)
+    if m.shape[-2:] != (size, size):
+        raise GraphSlamError(f"a homogeneous matrix has the shape ({size}, {size}), not {m.shape}")
+    rotation, last = m[..., :-1, :-1], np.eye(size)[-1]
+    is_rotation = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(size - 1)).max(initial=0.0) < 1e-6
+    if not (is_rotation and (np.linalg.det(rotation) > 0.0).all() and (m[..., -1, :] == last).all()):
+        raise GraphSlamError(f"not a rigid motion: {m.tolist() if m.ndim == 2 else f'one of {len(m)} matrices'}")
+    return m
 
 
 def interpolate(a: Pose, b: Pose, fraction: float) -> Pose:

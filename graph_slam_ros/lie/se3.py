@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from graph_slam_ros.lie import so3
+from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.lie.jit import jitable, kernel
 from graph_slam_ros.typing import Array
 
@@ -44,6 +44,46 @@ def from_xyz_rpy(numbers: Sequence[float]) -> Pose:
     for axis in (2, 1, 0):  # roll is applied first
         q = so3.compose(q, so3.exp((*(angles[k] if k == axis else 0.0 for k in range(3)),)))
     return x, y, z, float(q[0]), float(q[1]), float(q[2]), float(q[3])
+
+
+def to_matrix(a: Pose) -> Array:
+    """Homogeneous matrix (..., 4, 4) of a pose, or of a path of them."""
+    numbers = np.stack(np.broadcast_arrays(*a), axis=-1)
+    out = np.zeros((*numbers.shape[:-1], 4, 4))
+    turns = np.asarray(so3.matrix(tuple(np.moveaxis(numbers[..., 3:], -1, 0))))  # (3, 3, ...)
+    out[..., :3, :3] = np.moveaxis(turns, (0, 1), (-2, -1))
+    out[..., :3, 3], out[..., 3, 3] = numbers[..., :3], 1.0
+    return out
+
+
+def from_matrix(matrix: ArrayLike) -> Pose:
+    """Pose of a homogeneous matrix (..., 4, 4), the inverse of ``to_matrix``; qw is not negative.
+
+    The quaternion comes from its largest component (Shepperd, Quaternion from rotation matrix, 1978).
+
+    Raises
+    ------
+    GraphSlamError
+        It is not a rigid motion.
+    """
+    m = se2.rigid(matrix, 4)
+    r = np.moveaxis(m[..., :3, :3], (-2, -1), (0, 1))
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    xy, xz, yz = r[1, 0] + r[0, 1], r[2, 0] + r[0, 2], r[2, 1] + r[1, 2]
+    squares = 1.0 + np.stack([r[0, 0] - r[1, 1] - r[2, 2], r[1, 1] - r[0, 0] - r[2, 2], r[2, 2] - r[0, 0] - r[1, 1]])
+    w = 1.0 + r[0, 0] + r[1, 1] + r[2, 2]
+    rows = np.stack(  # each is the quaternion times four times one of its components
+        [
+            np.stack([squares[0], xy, xz, x]),
+            np.stack([xy, squares[1], yz, y]),
+            np.stack([xz, yz, squares[2], z]),
+            np.stack([x, y, z, w]),
+        ]
+    )
+    largest = np.concatenate([squares, w[None]]).argmax(axis=0)
+    q = np.take_along_axis(rows, largest[None, None], axis=0)[0]
+    q = q / np.linalg.norm(q, axis=0) * np.where(q[3] < 0.0, -1.0, 1.0)
+    return m[..., 0, 3], m[..., 1, 3], m[..., 2, 3], q[0], q[1], q[2], q[3]
 
 
 @jitable

@@ -77,7 +77,7 @@ def log(a: Quaternion) -> Vector:
 
 @jitable
 def matrix(a: Quaternion) -> NDArray[np.float64]:
-    """(3, 3) of one rotation."""
+    """(3, 3) of one rotation; of many (3, 3, n)."""
     x, y, z, w = a
     return np.array(
         [
