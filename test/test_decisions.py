@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from graph_slam_ros.graph import LANDMARK_POSITION, POSE_PRIOR, R2, RELATIVE_POSE, SE2, Gaussian
+from graph_slam_ros.graph import LANDMARK_POSITION, POSE_PRIOR, R2, RANGE, RELATIVE_POSE, SE2, Gaussian
 from graph_slam_ros.lie import se2
 from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.slam import Config
@@ -148,6 +148,16 @@ def test_the_last_sighting_of_a_landmark_stays_whatever_it_says():
     drive.solve()
     inside = [edge for edge in (first, *others) if drive.backend.ledger.is_inside(edge)]
     assert inside
+
+
+def test_a_landmark_that_begins_with_ranges_of_which_none_fits_stays_determined():
+    drive = Drive().go(40)
+    graph = drive.backend.graph
+    landmark = graph.add_vertex(R2, (5.0, 5.0))
+    noise = Gaussian.from_sigmas(0.1)
+    ranges = [graph.add_edge(RANGE, [k, landmark], (50.0 + k,), noise, "landmarks") for k in range(12)]
+    drive.backend.update(40)  # nothing would fix its gauge if all were held back
+    assert sum(drive.backend.ledger.is_inside(edge) for edge in ranges) >= 8
 
 
 def test_the_innovation_is_what_the_cost_would_grow_by():

@@ -65,14 +65,13 @@ class OutlierGate:
         for edge, reason in self._withdrawn.items():
             self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, self.ledger.statistic.values[edge])
         self._withdrawn.clear()
-        waiting = []
-        held = [edge for edge in ids[judged & (chi2 > limit)].tolist() if not self._is_needed(edge)]
-        if not trusts_sightings:
-            held = sorted({*held, *(edge for edge in ids[judged].tolist() if self._is_of_known(edge))})
-        for edge in held if self._config.decide else ():
-            self._take_out(edge)
-            self.ledger.hold_back(edge)
-            waiting.append(edge)
+        waiting, unfit = list[int](), set(ids[chi2 > limit].tolist())
+        for edge in ids[judged & self._config.decide].tolist():
+            is_unfit = edge in unfit and not self._is_needed(edge)  # by what is left of those before it
+            if is_unfit or (not trusts_sightings and self._is_of_known(edge)):
+                self._take_out(edge)
+                self.ledger.hold_back(edge)
+                waiting.append(edge)
         self._vertices = self._graph.vertex_count
         return waiting
 
