@@ -6,7 +6,9 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from PIL import Image
 
+from graph_slam_ros.analysis import animation
 from graph_slam_ros.analysis.path_error import path_error
 from graph_slam_ros.analysis.plots import draw_graph, draw_run
 from graph_slam_ros.cli import main
@@ -242,6 +244,29 @@ def test_plot_draws_with_and_without_truth_and_replay_always(tmp_path, recording
     assert main(["evaluate", str(tmp_path / "bare"), "--truth", bag]) == 0
     assert main(["plot", out]) == 2
     assert "pip install matplotlib" in capsys.readouterr().err
+
+
+def test_the_animation_repeats_the_drive_and_ends_with_the_solved_path(tmp_path, recording, monkeypatch, capsys):
+    write_bag(recording, tmp_path / "world.mcap")
+    run, gif = tmp_path / "run", tmp_path / "drive.gif"
+    assert main(["replay", str(tmp_path / "world.mcap"), "--out", str(run)]) == 0
+    seen = []
+    drawn = animation._drawn
+    monkeypatch.setattr(animation, "_drawn", lambda moments, title: drawn(seen.append(moments) or moments, title))
+    assert main(["plot", str(run), "--animate", str(gif)]) == 0
+    (moments,) = seen
+    lengths = [len(moment.path) for moment in moments]
+    assert lengths == sorted(lengths) and lengths[0] < 0.1 * lengths[-1]
+    assert moments[-1].path[:, :2] == pytest.approx(read_tum(run / "path.tum").poses[:, :2], abs=1e-6)
+    with Image.open(gif) as image:
+        assert image.n_frames == len(moments)
+        assert image.size == (480, 480)
+    capsys.readouterr()
+    assert main(["plot", str(run), "--animate", str(gif)]) == 2, "it is there"
+    assert main(["plot", str(run), "--animate", str(tmp_path / "drive.png")]) == 2
+    (run / "ingest.mcap").unlink()
+    assert main(["plot", str(run), "--animate", str(gif), "--force"]) == 2
+    assert "ingest.mcap" in capsys.readouterr().err
 
 
 def test_a_graph_is_drawn_before_and_after_with_closures_unlike_odometry(tmp_path, figures):

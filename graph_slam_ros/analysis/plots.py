@@ -225,16 +225,16 @@ def _run_figure(found: _Placed, points: Array, dimensions: int) -> tuple[Any, li
     tall = [_INCHES * float(np.clip(height / sides[0], 0.35, 1.2)) for height in heights]
     has_errors = found.errors is not None
     size = (_INCHES + 1.0, sum(tall) + (2.2 if has_errors else 0.0) + 1.0)
-    figure = _canvas(size)
+    figure = canvas(size)
     grid = figure.add_gridspec(len(tall) + has_errors, 1, height_ratios=[*tall, *([2.0] * has_errors)])
     panels = [figure.add_subplot(grid[k]) for k in range(len(tall))]
     for axes in panels:
-        _dress(axes)
+        dress(axes)
         axes.set_aspect("equal", adjustable="box")
         axes.set_xlabel("x [m]")
     below = figure.add_subplot(grid[-1]) if has_errors else None
     if below is not None:
-        _dress(below)
+        dress(below)
     return figure, panels, below
 
 
@@ -300,22 +300,22 @@ def _draw_edges(axes: Any, points: Array, ends: Index, label: str, order: int) -
     axes.update_datalim(points[ends].reshape(-1, 2))
 
 
-def _canvas(size: tuple[float, float]) -> Any:
-    """A figure without pyplot, which would keep state and look for a display."""
+def canvas(size: tuple[float, float], dpi: int = _DPI) -> Any:
+    """A figure of a size in inches, without pyplot, which would keep state and look for a display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=size, dpi=dpi, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def _figure(count: int) -> Any:
     """A figure and its axes side by side, equal scales, metres."""
-    figure = _canvas((_INCHES * (1.0 + 0.6 * (count - 1)), _INCHES))
+    figure = canvas((_INCHES * (1.0 + 0.6 * (count - 1)), _INCHES))
     axes = figure.subplots(1, count, squeeze=False)[0]
     for one in axes:
-        _dress(one)
+        dress(one)
         one.set_aspect("equal", adjustable="datalim")
         one.set_xlabel("x [m]")
         one.set_ylabel("y [m]")
@@ -323,7 +323,8 @@ def _figure(count: int) -> Any:
     return figure, axes
 
 
-def _dress(axes: Any) -> None:
+def dress(axes: Any) -> None:
+    """Give axes a faint grid and no frame."""
     axes.grid(color="#e6e8eb", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.tick_params(colors="#555555", labelsize=9)

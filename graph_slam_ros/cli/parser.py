@@ -89,6 +89,7 @@ def _commands() -> "dict[str, tuple[Run, Options, str, *tuple[str, ...]]]":
             "a picture of a run: path, landmarks, and the truth where there is one",
             "drive_run",
             "drive_run --truth drive.mcap:/ground_truth --out drive.png",
+            "drive_run --animate drive.gif",
         ),
         "explain": (
             audit.explain,
@@ -332,6 +333,7 @@ def _evaluate(sub: "CommandParser") -> None:
 def _plot(sub: "CommandParser") -> None:
     _of_run(sub)
     sub.add_argument("--out", type=Path, metavar="PNG", help="default: path.png in the run folder")
+    sub.add_argument("--animate", type=Path, metavar="GIF", help="instead: the drive and its correction, as it went on")
     _add_truth(sub, required=False)
     _add_force(sub)
 

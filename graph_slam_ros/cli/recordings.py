@@ -121,10 +121,26 @@ def plot(args: argparse.Namespace) -> int:
         raise GraphSlamError("plot: no use for --topic or --no-align without --truth")
     if not _has_matplotlib():
         raise GraphSlamError(_NO_MATPLOTLIB)
+    if args.animate:
+        return _animate(args)
     console.check_file(args.out, force=args.force)
     picture = args.out or args.run_folder / PICTURE
     draw_run(args.run_folder, args.truth, picture, args.topic, align=not args.no_align)
     console.say(f"picture in {picture}")
+    _then_look(args.run_folder)
+    return console.told([], changed_since(args.run_folder))
+
+
+def _animate(args: argparse.Namespace) -> int:
+    """Draw the drive as it went on."""
+    from graph_slam_ros.analysis.animation import animate_run
+    from graph_slam_ros.runs import changed_since
+
+    if args.truth or args.out:
+        raise GraphSlamError("plot: --animate has no use for --truth or --out")
+    console.check_file(args.animate, force=args.force)
+    animate_run(args.run_folder, args.animate)
+    console.say(f"animation in {args.animate}")
     _then_look(args.run_folder)
     return console.told([], changed_since(args.run_folder))
 

@@ -1,0 +1,124 @@
+"""A drive and its correction as an animation: how the path looked at each moment, next to dead reckoning."""
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.analysis.plots import canvas, dress
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.durable import write_whole
+from graph_slam_ros.lie import se3
+from graph_slam_ros.measurements.types import from_record
+from graph_slam_ros.runs import recording_of, run_config
+from graph_slam_ros.runs.journal import read_ingest
+from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.trajectory import read_tum
+from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.typing import Array
+
+_FRAME_MS, _LAST_MS = 80, 2000
+_INCHES, _DPI = 6.0, 80
+_COLOURS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class _Moment:
+    """Positions (n, 3) in the map, as they were estimated at one moment: keyframes, dead reckoning, landmarks."""
+
+    path: Array
+    odometry: Array
+    landmarks: Array
+
+
+def animate_run(run: Path, out_gif: Path, frames: int = 80) -> None:
+    """Repeat a run's drive and draw the estimate of each moment into a GIF, from above.
+
+    Dead reckoning is black and begins where the estimate does; the estimate is red. A loop closure is seen as the
+    moment at which the red path moves. The last frame is the solved graph.
+
+    Parameters
+    ----------
+    run : folder of a run, with its ``ingest.mcap``
+    frames : at equal steps of time
+
+    Raises
+    ------
+    GraphSlamError
+        A file that is missing or unreadable, or that cannot be written.
+    """
+    if out_gif.suffix != ".gif":
+        raise GraphSlamError(f"{out_gif}: an animation is a .gif file")
+    moments = list(_moments(run, frames))
+    if not moments:
+        raise GraphSlamError(f"{run}: nothing of the drive can be repeated: it has no ingest.mcap, or an empty one")
+    drawn = io.BytesIO()
+    images = list(_drawn(moments, recording_of(run)))
+    durations = [_FRAME_MS] * (len(images) - 1) + [_LAST_MS]
+    images[0].save(
+        drawn, format="GIF", save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True
+    )
+    try:
+        write_whole(out_gif, drawn.getvalue())
+    except OSError as error:
+        raise GraphSlamError(f"{out_gif}: {error.strerror or error}") from None
+
+
+def _moments(run: Path, frames: int) -> Iterator[_Moment]:
+    """The estimate at so many stamps, and at the end."""
+    stamps_s = read_tum(run / "path.tum").stamps_s
+    if not len(stamps_s):
+        return
+    due_s = list(np.linspace(stamps_s[0], stamps_s[-1], frames)[1:])
+    slam = GraphSlam(run_config(run), start=read_map(run, [], start_only=True))
+    for record in read_ingest(run, []):
+        slam.process(from_record(record))
+        if due_s and len(slam.keyframes) > 1 and 1e-9 * slam.keyframes[-1].stamp_ns >= due_s[0]:
+            due_s = [t for t in due_s if t > 1e-9 * slam.keyframes[-1].stamp_ns]
+            yield _now(slam)
+    if len(slam.keyframes) > 1:
+        yield _now(slam)
+
+
+def _now(slam: GraphSlam) -> _Moment:
+    poses = se3.in_space(slam.trajectory())
+    odometry = se3.in_space(np.array([keyframe.T_odom_base for keyframe in slam.keyframes]))
+    T_map_odom = se3.compose(tuple(poses[0]), se3.inverse(tuple(odometry[0])))
+    moved = np.stack(se3.compose(T_map_odom, tuple(odometry.T))[:3], axis=-1)
+    points = [slam.solver.estimate([mark.vertex])[0] for mark in slam.landmarks.values()]
+    in_space = [[*point[:2], point[2] if slam.space.dimensions == 3 else 0.0] for point in points]
+    return _Moment(poses[:, :3], moved, np.array(in_space).reshape(-1, 3))
+
+
+def _drawn(moments: list[_Moment], title: str) -> Iterator[Any]:
+    """Pillow images, one for each moment, all with the same limits."""
+    from PIL import Image
+
+    figure = canvas((_INCHES, _INCHES), _DPI)
+    axes = figure.subplots()
+    dress(axes)
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title=title)
+    last = moments[-1]
+    everything = np.vstack([last.path, last.odometry, last.landmarks])
+    low, high = everything[:, :2].min(axis=0), everything[:, :2].max(axis=0)
+    room = 0.05 * float((high - low).max()) + 0.1
+    axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
+    (odometry,) = axes.plot([], [], "--", color="#1a1a1a", linewidth=1.0, label="dead reckoning")
+    (path,) = axes.plot([], [], color="#d62728", linewidth=1.6, label="estimate")
+    (landmarks,) = axes.plot([], [], "*", color="#e08a00", label="landmarks")
+    (robot,) = axes.plot([], [], "o", color="#d62728")
+    axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
+    for moment in moments:
+        for line, points in (
+            (odometry, moment.odometry),
+            (path, moment.path),
+            (landmarks, moment.landmarks),
+            (robot, moment.path[-1:]),
+        ):
+            line.set_data(points[:, 0], points[:, 1])
+        figure.canvas.draw()
+        image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
+        yield image.quantize(_COLOURS, dither=Image.Dither.NONE)
