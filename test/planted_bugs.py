@@ -56,7 +56,7 @@ BUGS = (
     Bug(
         "undetermined_landmark",
         "one landmark by bearing alone makes the whole problem singular",
-        (("slam/landmarks/landmark_map.py", "        if not waiting.reason:\n", "        if waiting.places:\n"),),
+        (("slam/landmarks/landmark_map.py", "        if not candidate.reason:\n", "        if candidate.places:\n"),),
         ("test_pipeline_kinds.py::test_G3_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why",),
     ),
     Bug(  # all of the check: a cost that is not finite fails its second half, too

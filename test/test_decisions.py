@@ -10,7 +10,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.robust.background import when_asked
+from graph_slam_ros.slam.robust.background import run_when_asked
 from graph_slam_ros.slam.robust.innovation import innovation
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 
@@ -31,7 +31,7 @@ def laps(count=120, around=30):
 class Drive:
     """A back-end that is driven around, with a true closure to the lap before at every pose, and others on demand."""
 
-    def __init__(self, seed=0, beside=when_asked, **robust):
+    def __init__(self, seed=0, beside=run_when_asked, **robust):
         self.rng = np.random.default_rng(seed)
         self.true = laps()
         config = Config.from_mapping({f"robust.{name}": value for name, value in robust.items()})
@@ -195,7 +195,7 @@ def test_G11_two_places_that_look_the_same_are_reported_as_ambiguous_with_what_s
 
 def test_a_second_look_decides_the_same_whether_it_is_taken_in_a_thread_or_when_it_is_asked_for():
     often = {"second_look_after": 3, "apply_after_keyframes": 5}
-    runs = [Drive(1, beside, **often).go(100, lies(every=1)) for beside in (when_asked, run_in_thread)]
+    runs = [Drive(1, beside, **often).go(100, lies(every=1)) for beside in (run_when_asked, run_in_thread)]
     histories = [run.backend.ledger.history for run in runs]
     assert histories[0] == histories[1]
     poses = [run.backend.solver.estimate(range(100)) for run in runs]

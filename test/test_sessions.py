@@ -225,7 +225,7 @@ def test_a_map_that_cannot_be_gone_on_in_stays_however_few_are_kept(tmp_path, mo
         raise GraphSlamError("no solution")
 
     with monkeypatch.context() as patch, pytest.raises(GraphSlamError, match="no solution"):
-        patch.setattr(Backend, "take_up", refused)
+        patch.setattr(Backend, "restore", refused)
         one.load("run-1")
     assert is_run(tmp_path / "run-1")
     one.take(WORLD[90:120])

@@ -299,7 +299,7 @@ def fails():
 
 
 def test_a_second_look_that_fails_changes_nothing_and_is_counted(clean):
-    p = run(pipeline(beside=lambda work: fails), drive(0))
+    p = run(pipeline(executor=lambda work: fails), drive(0))
     assert p.counters["second_look", "MemoryError"] > 0
     assert not p.failing
     run(p, END)

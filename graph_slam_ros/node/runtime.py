@@ -188,7 +188,7 @@ class Runtime:
 
     def _hand_over(self, measured: Sequence[Measured]) -> None:
         """To the worker; refused before it is accepted where there is no room, or nobody wants it now."""
-        if self._stamp_jump.hear(measured):
+        if self._stamp_jump.is_jump(measured):
             self._begin_anew("stamps", "odometry has gone back in time and stays there")
         reason = "stopped" if self._is_stopped else "paused" if self._is_paused else ""
         if measured and not reason:

@@ -154,7 +154,7 @@ def _through(
     by_topic = inputs.by_topic()
     for message in bag.messages(set(by_topic)):
         measured = [m for name in by_topic[message.topic] for m in border.take(name, message.cdr)]
-        if jump.hear(measured):
+        if jump.is_jump(measured):
             border.forget_time()
             jump.forget()
             yield [Control("time_jump"), *measured]

@@ -16,7 +16,7 @@ from graph_slam_ros.slam.frontend.motion_compensation import as_matrix, axes_unk
 from graph_slam_ros.typing import Array, Numbers
 
 _TIGHT = 1e-3  # m, rad: the map begins where odometry begins, which is as good as any other place
-_LOOSE_M, _LOOSE_RAD = 1e3, 3.0
+_UNCERTAIN_M, _UNCERTAIN_RAD = 1e3, 3.0
 _TILT_RAD = 0.3  # of odometry in space, whose z axis points up; positions do not tell it before the robot has moved
 
 
@@ -36,12 +36,12 @@ class Anchor:
 
     def begin(self, vertex: int, T_map_base: Numbers) -> Array:
         """Hold the first keyframe; returns its covariance (dof, dof)."""
-        given = self._config.anchor
-        self._sigmas = np.array(self._space.sigmas(given.sigma_m or _TIGHT, given.sigma_rad or _TIGHT))
+        settings = self._config.anchor
+        self._sigmas = np.array(self._space.sigmas(settings.sigma_m or _TIGHT, settings.sigma_rad or _TIGHT))
         self._add(vertex, T_map_base, Gaussian.from_sigmas(*self._sigmas))
         return np.diag(np.square(self._sigmas))
 
-    def take_up(self) -> None:
+    def restore(self) -> None:
         """Go on with the prior of a map that was loaded, if it can still be loosened."""
         for edge in self._graph.edges_of("anchor").tolist():
             table, row = self._graph.row(edge)
@@ -52,7 +52,7 @@ class Anchor:
                 covariance = self._space.in_parent_axes(at, np.linalg.inv(root.T @ root))
                 self._edge, self._vertex, self._sigmas = edge, vertex, np.sqrt(np.diag(covariance))
 
-    def give_way_to_fix(self, m: Fix, T_map_base: Numbers, keyframe: int) -> bool:
+    def align_to_fix(self, m: Fix, T_map_base: Numbers, keyframe: int) -> bool:
         """Loosen the prior for a fix, if that says more than was known; returns whether the map has moved.
 
         Parameters
@@ -60,10 +60,10 @@ class Anchor:
         T_map_base : where the robot is thought to be at the fix's stamp
         keyframe : the newest
         """
-        looser = self._looser(self._told_by(m))
+        looser = self._looser(self._determined_by(m))
         return looser is not None and self._move(self._onto_fix(m, T_map_base), looser, keyframe)
 
-    def give_way_to_landmark(self, known: Surveyed, at: Array, keyframe: int) -> bool:
+    def align_to_landmark(self, known: Surveyed, at: Array, keyframe: int) -> bool:
         """As for a fix. ``at`` (n,) is where the landmark is thought to be."""
         looser = self._looser(self._position())
         return looser is not None and self._move(self._shifted(np.array(known.position) - at), looser, keyframe)
@@ -72,27 +72,27 @@ class Anchor:
 
     def _looser(self, wanted: Array) -> Array | None:
         """Sigmas (dof,) with all that is wanted; None where nothing changes."""
-        given, n = self._config.anchor, self._space.dimensions
+        settings, n = self._config.anchor, self._space.dimensions
         if self._config.start_pose is not None:  # somebody has said roughly where the robot starts
             roughly = self._config.initialpose
             wanted = np.minimum(wanted, self._space.sigmas(roughly.sigma_m, roughly.sigma_rad))
-        wanted = np.where([bool(given.sigma_m)] * n + [bool(given.sigma_rad)] * (len(wanted) - n), 0.0, wanted)
+        wanted = np.where([bool(settings.sigma_m)] * n + [bool(settings.sigma_rad)] * (len(wanted) - n), 0.0, wanted)
         return np.maximum(self._sigmas, wanted) if (wanted > self._sigmas).any() else None
 
     def _position(self) -> Array:
         """What positions determine."""
         n, angles = self._space.dimensions, self._space.dof - self._space.dimensions
-        return np.array([_LOOSE_M] * n + [_TILT_RAD] * (angles - 1) + [_LOOSE_RAD])
+        return np.array([_UNCERTAIN_M] * n + [_TILT_RAD] * (angles - 1) + [_UNCERTAIN_RAD])
 
-    def _told_by(self, m: Fix) -> Array:
+    def _determined_by(self, m: Fix) -> Array:
         """What a fix determines, by its kind: sigmas (dof,), zero where it says nothing."""
         space, n = self._space, self._space.dimensions
         out = self._position()
         match m.kind:
             case "pose":
-                out[n:] = _LOOSE_RAD
+                out[n:] = _UNCERTAIN_RAD
             case "attitude":
-                out[:n], out[n:] = 0.0, _LOOSE_RAD
+                out[:n], out[n:] = 0.0, _UNCERTAIN_RAD
             case "heading":
                 out[:-1] = 0.0
             case _:

@@ -9,16 +9,16 @@ from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.graph import Gaussian, Loss
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.slam.robust.background import Background, Beside, Work, when_asked
+from graph_slam_ros.slam.robust.background import Background, Executor, Work, run_when_asked
 from graph_slam_ros.slam.robust.displacement import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
-from graph_slam_ros.slam.robust.hypotheses import Alternative, FrozenGraph, Outcome, second_look
+from graph_slam_ros.slam.robust.hypotheses import Alternative, FrozenGraph, Outcome, search_alternatives
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
 from graph_slam_ros.typing import Array, Numbers
 
-_WAITING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
+_MAX_PENDING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
 _UPDATES = 6  # until what was let in fits, before everything is solved for it
 
 
@@ -46,7 +46,7 @@ class Backend:
         self,
         config: RobustConfig,
         settings: Settings,
-        beside: Beside = when_asked,
+        executor: Executor = run_when_asked,
         start: MapSnapshot | None = None,
         counters: Counters | None = None,
     ) -> None:
@@ -58,12 +58,12 @@ class Backend:
         self.handed_over, self.frozen = (0, 0), start.frozen
         self.frozen_edges = start.ledger.final
         self.held = (0, 0)
-        self._background = Background(config, beside)
+        self._background = Background(config, executor)
         self.rivals: tuple[Alternative, ...] = ()
         self.spares_memory = self.holds_back = False
         self.trusts_sightings = True
         self._reviewed = 0  # the keyframe of the last review
-        self._doubtful: list[int] = []  # edges that have come and do not fit by themselves
+        self._pending: list[int] = []  # edges that have come and do not fit by themselves
 
     @property
     def decides(self) -> bool:
@@ -75,7 +75,7 @@ class Backend:
         """What was decided of each edge."""
         return self.decisions.ledger
 
-    def take_up(self, vertices: Sequence[int], values: Array, held: tuple[int, int] = (0, 0)) -> Report:
+    def restore(self, vertices: Sequence[int], values: Array, held: tuple[int, int] = (0, 0)) -> Report:
         """Solve all that is believed in a graph that was taken over: some of its vertices, from some values.
 
         Parameters
@@ -91,7 +91,7 @@ class Backend:
             self._hold(*held)
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         report = self.solver.optimize(self.solver.settings.until_still())  # what is believed was decided before
-        self.decisions.tighten()
+        self.decisions.recalibrate()
         self._background.cancel(self.ledger.outside_count)
         return report
 
@@ -126,16 +126,16 @@ class Backend:
     def update(self, keyframe: int) -> None:
         """Take in what is new and believed, then what is believed of the rest."""
         self.hand_over()
-        new = self.decisions.take(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
-        self._doubtful = [*self._doubtful, *new][-_WAITING:]
+        new = self.decisions.gate_new(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
+        self._pending = [*self._pending, *new][-_MAX_PENDING:]
         if self.holds_back:
             self.solver.update()
             return
         if self._config.decide and keyframe - self._reviewed >= self._config.review_every_keyframes:
             self._reviewed = keyframe
             self.decisions.review(keyframe)
-        outcome = self._looked(lambda: self._background.outcome(keyframe))
-        if outcome is not None and self._follow(outcome, keyframe):
+        outcome = self._guarded(lambda: self._background.outcome(keyframe))
+        if outcome is not None and self._adopt(outcome, keyframe):
             self.solver.optimize()
         self.solver.update()
         self._admit(keyframe)
@@ -146,16 +146,16 @@ class Backend:
     def optimize(self, keyframe: int, settings: Settings) -> Report:
         """Solve everything, and have a second look at all that was decided."""
         self.hand_over()
-        new = self.decisions.take(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
-        self._doubtful = [*self._doubtful, *new][-_WAITING:]
+        new = self.decisions.gate_new(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
+        self._pending = [*self._pending, *new][-_MAX_PENDING:]
         report = self.solver.optimize(settings)
         if not self._config.decide or self.holds_back:
             return report
         self._admit(keyframe)
-        outcome = self._looked(lambda: second_look(self._config, self._frozen(keyframe, settings)))
+        outcome = self._guarded(lambda: search_alternatives(self._config, self._frozen(keyframe, settings)))
         if outcome is not None:
             self.rivals = self._standing(outcome.rivals)
-            self.decisions.follow(outcome.ledger, keyframe)
+            self.decisions.adopt_verdicts(outcome.ledger, keyframe)
             self.solver.start_at(outcome.values)
             report = self.solver.optimize(settings)
         self._background.cancel(self.ledger.outside_count)
@@ -177,12 +177,12 @@ class Backend:
     def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
         """Take edges out for good."""
         self.decisions.withdraw(edges, keyframe, reason)
-        self._doubtful = [edge for edge in self._doubtful if edge not in edges]
+        self._pending = [edge for edge in self._pending if edge not in edges]
         self.rivals = self._standing(self.rivals)
 
     def split(
         self,
-        loose: tuple[int, Sequence[float], Gaussian],
+        replacement: tuple[int, Sequence[float], Gaussian],
         initial_poses: Sequence[int],
         values: Array,
         found: DisplacementHypothesis,
@@ -194,33 +194,33 @@ class Backend:
 
         Parameters
         ----------
-        loose : the edge of odometry that leads there, and the motion and noise that it is to have instead
+        replacement : the edge of odometry that leads there, and the motion and noise that it is to have instead
         initial_poses : edges that are out from now on, until they fit
         values : stored numbers of all vertices to go on from
         """
-        link, motion, noise = loose
+        link, motion, noise = replacement
         table, row = self.graph.row(link)
         vertices, source = table.vertices.values[row].tolist(), self.graph.source_of(link)
         edge = self.graph.add_edge(table.type, vertices, motion, noise, "odometry", source)
         self.hand_over()
-        self.decisions.take(self.handed_over[1], keyframe)
-        self.decisions.loosen(link, keyframe, found.evidence)
+        self.decisions.gate_new(self.handed_over[1], keyframe)
+        self.decisions.supersede(link, keyframe, found.evidence)
         self.decisions.exchange(found.fitting, (*found.contradicting, *initial_poses), keyframe)
         self.solver.start_at(values)
         self._go_on(found, keyframe)
         return edge
 
-    def rejoin(self, link: int, loose: int, values: Array, found: DisplacementHypothesis, keyframe: int) -> None:
+    def rejoin(self, link: int, replacement: int, values: Array, found: DisplacementHypothesis, keyframe: int) -> None:
         """Undo ``split``: odometry's edge is in again, that in its place is out, all else is judged by how it fits.
 
         Parameters
         ----------
         values : stored numbers of all vertices to go on from
         """
-        self.decisions.withdraw([loose], keyframe, Reason.REVOKED)
-        self.decisions.restore(link, keyframe, found.evidence)
+        self.decisions.withdraw([replacement], keyframe, Reason.REVOKED)
+        self.decisions.reinstate(link, keyframe, found.evidence)
         self.solver.start_at(values)
-        self.decisions.settle(keyframe)
+        self.decisions.reclassify(keyframe)
         self.decisions.exchange(found.fitting, found.contradicting, keyframe)
         self._go_on(found, keyframe)
 
@@ -231,9 +231,9 @@ class Backend:
 
     def _admit(self, keyframe: int) -> None:
         """Compare with all that is known what has come and does not fit by itself."""
-        waiting = [edge for edge in self._doubtful if not self.ledger.is_inside(edge)]
-        admitted = self.decisions.admit(waiting, keyframe)
-        self._doubtful = []
+        pending = [edge for edge in self._pending if not self.ledger.is_inside(edge)]
+        admitted = self.decisions.admit_compatible(pending, keyframe)
+        self._pending = []
         if admitted:
             self._make_fit(admitted, keyframe)
 
@@ -262,18 +262,18 @@ class Backend:
     def _rose_since(self, before: Array) -> bool:
         return self.solver.evaluate().cost_final > self.solver.evaluate(at=before).cost_final
 
-    def _looked(self, look: Work) -> Outcome | None:
+    def _guarded(self, search: Work) -> Outcome | None:
         """What a second look has found; nothing where it failed, which changes nothing."""
         try:
-            return look()
+            return search()
         except Exception as error:
             self._counters.count("second_look", type(error).__name__)
             return None
 
-    def _follow(self, outcome: Outcome, keyframe: int) -> bool:
+    def _adopt(self, outcome: Outcome, keyframe: int) -> bool:
         """Take over what a second look has found; whether that is other than what was known."""
         self.rivals = self._standing(outcome.rivals)
-        if not self.decisions.follow(outcome.ledger, keyframe):
+        if not self.decisions.adopt_verdicts(outcome.ledger, keyframe):
             return False
         self.solver.start_at(outcome.carried_to(self.graph, self.solver.values))
         return True

@@ -127,9 +127,9 @@ class FailureGuard:
     def _quarantine(self, keyframe: int) -> bool:
         """Take out for good without what it can be solved, of the candidates that are new; whether it can."""
         suspects = self._suspects()
-        self._take_out(suspects)
+        self._exclude(suspects)
         if not self._is_solvable():
-            self._let_in(suspects)
+            self._include(suspects)
             return False
         blamed = self._to_blame(suspects)
         for one in blamed:
@@ -159,10 +159,10 @@ class FailureGuard:
             if not groups:
                 break
             group = groups.pop()
-            self._let_in(group)
+            self._include(group)
             if self._is_solvable():
                 continue
-            self._take_out(group)
+            self._exclude(group)
             half = len(group) // 2
             if half:
                 groups += [group[half:], group[:half]]
@@ -179,14 +179,14 @@ class FailureGuard:
             return False
         return True
 
-    def _take_out(self, suspects: Sequence[_Suspect]) -> None:
+    def _exclude(self, suspects: Sequence[_Suspect]) -> None:
         for one in suspects:
             for edge in one.edges:
                 self._solver.set_weight(edge, 0.0)
             if one.landmark is not None:
                 self._solver.remove(one.landmark)
 
-    def _let_in(self, suspects: Sequence[_Suspect]) -> None:
+    def _include(self, suspects: Sequence[_Suspect]) -> None:
         for one in suspects:
             if one.landmark is not None:
                 self._solver.add([one.landmark], [])

@@ -40,7 +40,7 @@ from graph_slam_ros.slam.frontend.thinning import ObservationThinning
 from graph_slam_ros.slam.kidnap_detector import Alarm, KidnapDetector
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark, Landmarks
-from graph_slam_ros.slam.robust.background import Beside, when_asked
+from graph_slam_ros.slam.robust.background import Executor, run_when_asked
 from graph_slam_ros.slam.robust.ledger import VerdictChange
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
@@ -105,7 +105,7 @@ def _counted(count: int, what: str) -> str:
 
 
 _NOTHING = Update()
-_LOOSE, _LOOSEST_M = 10.0, 1e5  # times as far as a given pose is away: so little odometry is trusted there
+_UNCERTAIN, _MAX_UNCERTAIN_M = 10.0, 1e5  # times as far as a given pose is away: so little odometry is trusted there
 _BLAMED = 5  # edges that are named as the cause of a correction
 _SHARED_WHEN_SOON = 1.0  # of a variance: with more, what comes fast would seem better than it is
 
@@ -117,7 +117,7 @@ class GraphSlam:
     ----------
     config : the parameters
     sink : called with every measurement that is handed over, in that order, before it takes effect or is refused
-    beside : begins work that may go on beside ``process``; what it returns waits for the result
+    executor : starts a background job; the function that it returns waits for the result
     start : the map to go on in, which is then this object's; the next odometry begins a segment, unless the map tells
         that the same drive continues
     """
@@ -126,13 +126,13 @@ class GraphSlam:
         self,
         config: Config | None = None,
         sink: Callable[[Measurement], None] | None = None,
-        beside: Beside = when_asked,
+        executor: Executor = run_when_asked,
         start: MapSnapshot | None = None,
     ) -> None:
         self.config = config or Config()
         self.space = self.config.space
         self.counters = Counters()
-        self.backend = Backend(self.config.robust, self.config.solver_settings(), beside, start, self.counters)
+        self.backend = Backend(self.config.robust, self.config.solver_settings(), executor, start, self.counters)
         self.graph, self.solver, self.ledger = self.backend.graph, self.backend.solver, self.backend.ledger
         self.sighting_poses = StampedPoses(SightingPose, self.space.pose.size)
         self.processed = 0  # measurements and control events that were handed over
@@ -147,32 +147,32 @@ class GraphSlam:
             self.config.odometry, self.config.inputs.names.split(), self.space, self.counters
         )
         self._noise = OdometryNoise(self.config.odometry, self.space)
-        self._trail = KeyframeList(self._noise, self.space)
-        self.keyframes, self.segments = self._trail.keyframes, self._trail.segments
-        self.drives = self._trail.drives  # the first keyframe of each; the last drive is the present one
+        self._keyframe_list = KeyframeList(self._noise, self.space)
+        self.keyframes, self.segments = self._keyframe_list.keyframes, self._keyframe_list.segments
+        self.drives = self._keyframe_list.drives  # the first keyframe of each; the last drive is the present one
         self._reach = MaxDistance(self.space, self.config.sources)
         self._thinning = ObservationThinning(self.config)
         self._anchor = Anchor(self.config, self.backend)
         self._edges = PoseEdges(self.space, self.graph, self.counters)
         self._landmarks = Landmarks(self.config, self.graph, self.solver, self.counters, self._withdraw)
-        self._unnamed = AnonymousLandmarks(
+        self._anonymous = AnonymousLandmarks(
             self.config, self._landmarks, self.solver, self.counters, self.backend.hand_over
         )
         self._kidnaps = KidnapDetector(self.space, self.config.odometry, self.backend, self.counters, self.segments)
-        self._safeguard = FailureGuard(self.backend, self.counters, self._landmarks.forget)
+        self._failure_guard = FailureGuard(self.backend, self.counters, self._landmarks.forget)
         self._edits = Edits(self.backend, self._landmarks, self.counters)
         self._held_covariance: Array | None = None  # of the newest pose when the map was held, for the next odometry
-        self._waiting: list[Observation] = []
+        self._pending: list[Observation] = []
         self._initial_pose: InitialPose | None = None  # for the next odometry
         self._covariance = np.zeros((self.space.dof, self.space.dof))
-        self._taken_in = 0  # edges, by the last solve that succeeded
-        self._told = 0  # changes of verdicts that updates have told
-        self._told_alarms: tuple[Alarm, ...] = ()
+        self._solved_edges = 0  # edges, by the last solve that succeeded
+        self._reported_changes = 0  # changes of verdicts that updates have told
+        self._reported_alarms: tuple[Alarm, ...] = ()
         self._solved_T_map_odom = self.space.identity  # to see how far a solve moves it
         self._solved_vertices = 0  # that the last solve took in: none where it failed
-        self._unsolved_keyframes = self._unsolved_looks = 0
+        self._unsolved_keyframes = self._unsolved_sightings = 0
         if start is not None and start.keyframes:
-            self._take_up(start)
+            self._restore(start)
         self.first_edge = self.graph.edge_count  # of this run: those before are of the map it began in
 
     def __repr__(self) -> str:
@@ -228,20 +228,20 @@ class GraphSlam:
         solved = self.solves > solves
         correction = self.correction if solved else Correction()
         edges = range(first_edge, self.backend.handed_over[1])
-        changes, self._told = tuple(self.ledger.history[self._told :]), len(self.ledger.history)
+        changes, self._reported_changes = tuple(self.ledger.history[self._reported_changes :]), len(self.ledger.history)
         keyframes, alarms = tuple(range(first_new, len(self.keyframes))), self._changed_alarms()
         return Update(keyframes, edges, solved, new, correction, changes, alarms)
 
     def _changed_alarms(self) -> tuple[Alarm, ...]:
         """Alarms that began, were decided or ended since they were told."""
-        before, self._told_alarms = self._told_alarms, self.alarms
+        before, self._reported_alarms = self._reported_alarms, self.alarms
         known = {(one.began_ns, one.segment, one.ended_ns, one.outcome) for one in before}
         now = [((one.began_ns, one.segment, one.ended_ns, one.outcome), one) for one in self.alarms]
         return tuple(one for key, one in now if key not in known)
 
     def restart(self) -> None:
         """Go back to the last good estimate, after a fault outside."""
-        self._safeguard.go_back()
+        self._failure_guard.go_back()
         self._solved_vertices = 0
 
     # -- what is known now ---------------------------------------------------------------------------------------
@@ -259,7 +259,7 @@ class GraphSlam:
             for name, mark in self._landmarks.known.items()
             if mark.is_tentative
         }
-        return {name: waiting.reason for name, waiting in self._landmarks.waiting.items()} | tentative
+        return {name: mark.reason for name, mark in self._landmarks.undetermined.items()} | tentative
 
     def trajectory(self) -> Array:
         """Estimated poses ``T_map_base`` of all keyframes, (n, 3) or (n, 7)."""
@@ -323,7 +323,7 @@ class GraphSlam:
     @property
     def failing(self) -> str:
         """Why the last solve failed; empty where it did not."""
-        return self._safeguard.failing
+        return self._failure_guard.failing
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
@@ -392,28 +392,30 @@ class GraphSlam:
             return False
         return True
 
-    def _take_up(self, start: MapSnapshot) -> None:
+    def _restore(self, start: MapSnapshot) -> None:
         """Solve a map anew, and be nowhere in it yet."""
         if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
-        self._trail.take_up(start.keyframes, start.segments, start.drives)
+        self._keyframe_list.restore(start.keyframes, start.segments, start.drives)
         if start.continues_with:
-            self._trail.go_on()
-            self._odometry.go_on(self.keyframes[-1].stamp_ns, self.keyframes[-1].T_odom_base, start.continues_with)
+            self._keyframe_list.continue_drive()
+            self._odometry.continue_drive(
+                self.keyframes[-1].stamp_ns, self.keyframes[-1].T_odom_base, start.continues_with
+            )
         for pose in start.sighting_poses:
             self.sighting_poses.append(pose.keyframe, pose.stamp_ns, pose.T_keyframe_base)
-        self._anchor.take_up()
-        self._landmarks.take_up(start.landmarks, start.range_offsets)
-        self._unnamed.take_up()
+        self._anchor.restore()
+        self._landmarks.restore(start.landmarks, start.range_offsets)
+        self._anonymous.restore()
         localizes = self.config.map.localize
-        self.report = self.backend.take_up(start.vertices, start.values, start.held if localizes else (0, 0))
-        self._safeguard.note_good()
+        self.report = self.backend.restore(start.vertices, start.values, start.held if localizes else (0, 0))
+        self._failure_guard.note_good()
         (self._covariance,) = self.solver.marginal([self.keyframes[-1].vertex])
-        self._solved_vertices, self._taken_in = self.backend.handed_over
+        self._solved_vertices, self._solved_edges = self.backend.handed_over
         if localizes:
             self.backend.hold_map()
             self._landmarks.begins_new = False
-        self._told = len(self.ledger.history)
+        self._reported_changes = len(self.ledger.history)
         self._solved_T_map_odom = self.T_map_odom
 
     # -- the map is held, or edited by hand ------------------------------------------------------------------------
@@ -431,7 +433,7 @@ class GraphSlam:
             self._held_covariance = None
             self.backend.release_map()
         self._landmarks.begins_new = not is_held
-        self._safeguard.note_good()
+        self._failure_guard.note_good()
 
     def _begin_in_held_map(self, step: Step) -> None:
         """The first keyframe that is free: as uncertain as the pose was when the map began to be held."""
@@ -441,7 +443,7 @@ class GraphSlam:
             covariance = self.space.group.propagate(held, T_last_now, covariance)
         self._add_keyframe(step, T_last_now, covariance)
         self._solve_if_due()
-        self._use_waiting(step.stamp_ns)
+        self._use_pending(step.stamp_ns)
 
     def _remove(self, what: dict[str, bool | int | float | str]) -> None:
         keyframe, is_removed = len(self.keyframes) - 1, False
@@ -460,7 +462,7 @@ class GraphSlam:
         for m in released:
             try:
                 if isinstance(m, Odometry):
-                    for step in self._odometry.take(m):
+                    for step in self._odometry.steps(m):
                         self._on_step(step)
                 else:
                     self._on_observation(m)
@@ -472,14 +474,14 @@ class GraphSlam:
     def _on_step(self, step: Step) -> None:
         if not self.keyframes:
             self._first_keyframe(step)
-        elif (motion := self._trail.motion) is None or step.broken or self._initial_pose:
+        elif (motion := self._keyframe_list.motion) is None or step.broken or self._initial_pose:
             self._begin_segment(step)
         elif self._held_covariance is not None:
             self._begin_in_held_map(step)
         else:
             motion.step(step)
-            self._use_waiting(step.stamp_ns)
-            motion = self._trail.motion or motion  # since another keyframe, where something seen deserved one
+            self._use_pending(step.stamp_ns)
+            motion = self._keyframe_list.motion or motion  # since another keyframe, where something seen deserved one
             if self._keyframe_due(motion):
                 self._add_keyframe(step, motion.now.T_keyframe_base, motion.now.covariance)
                 self._solve_if_due()
@@ -496,7 +498,7 @@ class GraphSlam:
         vertex = self.graph.add_vertex(self.space.pose, T_map_base)
         self._covariance = self._anchor.begin(vertex, T_map_base)
         self.segments.append(0)
-        self._trail.append(vertex, step, self.config.ordering.late_s)
+        self._keyframe_list.append(vertex, step, self.config.ordering.late_s)
         self._solved_T_map_odom = self.T_map_odom
 
     def _add_keyframe(self, step: Step, T_last_now: Numbers, covariance: Array, at: Numbers | None = None) -> None:
@@ -505,7 +507,7 @@ class GraphSlam:
         vertex = self.graph.add_vertex(self.space.pose, at or group.compose(self._pose(last), T_last_now))
         self._edges.odometry([last, vertex], T_last_now, covariance, self.odometry_source)
         self._covariance = group.propagate(self._covariance, T_last_now, covariance)
-        self._trail.append(vertex, step, self.config.ordering.late_s)
+        self._keyframe_list.append(vertex, step, self.config.ordering.late_s)
         self._unsolved_keyframes += 1
 
     def _begin_segment(self, step: Step) -> None:
@@ -513,48 +515,50 @@ class GraphSlam:
 
         Or somebody tells: an initial pose.
         """
-        said, self._initial_pose, self._held_covariance = self._initial_pose, None, None
-        has_motion = self._trail.motion is not None  # none of a loaded map: its odometry was that of another drive
-        is_prior = said is not None and has_motion and self.config.initialpose.use == "prior"
+        given, self._initial_pose, self._held_covariance = self._initial_pose, None, None
+        has_motion = (
+            self._keyframe_list.motion is not None
+        )  # none of a loaded map: its odometry was that of another drive
+        is_prior = given is not None and has_motion and self.config.initialpose.use == "prior"
         T_last_now, covariance = self._motion_into(step)
         if not is_prior:
             self.segments.append(len(self.keyframes))
         self._kidnaps.begin_segment(self.graph.vertex_count, step.stamp_ns)
-        loose = self._loose(said, T_last_now, is_prior=is_prior)
-        covariance = covariance + np.diag(np.square(self.space.sigmas(*loose)))
-        self._add_keyframe(step, T_last_now, covariance, said.T_map_base if said else None)
-        if said:
-            self._edges.initial_pose(self.keyframes[-1].vertex, said)
+        added_sigmas = self._added_sigmas(given, T_last_now, is_prior=is_prior)
+        covariance = covariance + np.diag(np.square(self.space.sigmas(*added_sigmas)))
+        self._add_keyframe(step, T_last_now, covariance, given.T_map_base if given else None)
+        if given:
+            self._edges.initial_pose(self.keyframes[-1].vertex, given)
             self._solve()
         self._solve_if_due()
-        self._use_waiting(step.stamp_ns)
+        self._use_pending(step.stamp_ns)
 
     def _motion_into(self, step: Step) -> tuple[Numbers, Array]:
         """From the last keyframe, as far as odometry tells: after a jump of time what it says is all there is."""
-        motion = self._trail.motion
+        motion = self._keyframe_list.motion
         if motion is None:
             T_last_now = self.space.group.between(self.keyframes[-1].T_odom_base, step.T_odom_base)
             return T_last_now, np.zeros((self.space.dof, self.space.dof))
         if not step.broken:
             motion.step(step)
-        self._use_waiting(motion.now.stamp_ns)
-        now = (self._trail.motion or motion).now  # of another keyframe, where one of these deserved it
+        self._use_pending(motion.now.stamp_ns)
+        now = (self._keyframe_list.motion or motion).now  # of another keyframe, where one of these deserved it
         return now.T_keyframe_base, now.covariance
 
-    def _loose(self, said: InitialPose | None, T_last_now: Numbers, *, is_prior: bool) -> tuple[float, float]:
+    def _added_sigmas(self, given: InitialPose | None, T_last_now: Numbers, *, is_prior: bool) -> tuple[float, float]:
         """What is added to the noise of that motion, in metres and in radians.
 
         A pose that is given far away must not pull on the path before: it may be wrong.
         """
         jump_m, jump_rad = self.config.odometry.jump_sigma_m, self.config.odometry.jump_sigma_rad
-        if said is None:
+        if given is None:
             return jump_m, jump_rad
         if is_prior:
             return self.config.initialpose.loosen_m, self.config.initialpose.loosen_rad
         group, last = self.space.group, self._pose(self.keyframes[-1].vertex)
-        away = group.between(group.compose(last, T_last_now), said.T_map_base)
+        away = group.between(group.compose(last, T_last_now), given.T_map_base)
         far_m = math.hypot(*away[: self.space.dimensions])
-        return max(jump_m, min(_LOOSE * far_m, _LOOSEST_M)), max(jump_rad, _LOOSE * math.pi)
+        return max(jump_m, min(_UNCERTAIN * far_m, _MAX_UNCERTAIN_M)), max(jump_rad, _UNCERTAIN * math.pi)
 
     def _forget_time(self) -> None:
         """Stamps begin anew, the map stays: the next odometry begins a segment."""
@@ -562,7 +566,7 @@ class GraphSlam:
         self._drop_unreached()
         self._order.forget()
         self._odometry.forget()
-        self._trail.forget_time()
+        self._keyframe_list.forget_time()
         self._thinning.forget_time()
 
     # -- observations --------------------------------------------------------------------------------------------
@@ -570,29 +574,29 @@ class GraphSlam:
     def _on_observation(self, m: Observation) -> None:
         """Use what is not too late; what is newer than all odometry waits for the next."""
         newest_ns = self.newest_odometry_ns
-        if newest_ns is None or m.stamp_ns < self._trail.oldest_ns:
+        if newest_ns is None or m.stamp_ns < self._keyframe_list.oldest_ns:
             self._count(m, "before_odometry")
-        elif m.stamp_ns < self._trail.remembered_ns:
+        elif m.stamp_ns < self._keyframe_list.remembered_ns:
             self._count(m, "late")
         elif m.stamp_ns <= newest_ns:
             self._observe(m)
-        elif len(self._waiting) >= self.config.ordering.max_waiting:
+        elif len(self._pending) >= self.config.ordering.max_waiting:
             self._count(m, "overflow")
         else:
-            self._waiting.append(m)
+            self._pending.append(m)
 
-    def _use_waiting(self, until_ns: int) -> None:
+    def _use_pending(self, until_ns: int) -> None:
         """Use what waited for the odometry that has come."""
-        if self._waiting:
-            ready = [m for m in self._waiting if m.stamp_ns <= until_ns]
-            self._waiting = [m for m in self._waiting if m.stamp_ns > until_ns]
+        if self._pending:
+            ready = [m for m in self._pending if m.stamp_ns <= until_ns]
+            self._pending = [m for m in self._pending if m.stamp_ns > until_ns]
             for m in ready:
                 self._on_observation(m)
 
     def _drop_unreached(self) -> None:
-        for m in self._waiting:
+        for m in self._pending:
             self._count(m, "after_odometry")
-        self._waiting.clear()
+        self._pending.clear()
 
     def _count(self, m: Observation, reason: str) -> None:
         self.counters.count(m.topic, reason, len(m.sightings) if isinstance(m, Sightings) else 1)
@@ -602,20 +606,20 @@ class GraphSlam:
         m = self._thinned(within) if within else None
         if m is None:
             return
-        where = self._trail.where(m.stamp_ns)
-        motion = self._trail.motion
+        where = self._keyframe_list.where(m.stamp_ns)
+        motion = self._keyframe_list.motion
         if motion is not None and self._deserves_keyframe(m, where, motion):
             where = self._keyframe_at(where, motion)
         match m:
             case Sightings():
-                self._unsolved_looks += self._trail.rests
+                self._unsolved_sightings += self._keyframe_list.rests
                 self.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
                 m = replace(m, sightings=tuple(off_the_pole(self.space, s) for s in m.sightings))
                 for name, sighting in self._of_known_while_lost(m.topic, self._identified(m, where)):
-                    self._lay_onto_survey(m.topic, name, sighting, where)
+                    self._align_to_survey(m.topic, name, sighting, where)
                     self._landmarks.add(m.topic, name, sighting, where)
             case Fix():
-                self._lay_onto_fix(m, where)
+                self._align_to_fix(m, where)
                 self._edges.fix(m, where, self._pose(where.vertex))
             case Closure():
                 self._add_closure(m, where)
@@ -631,7 +635,7 @@ class GraphSlam:
     def _thinned(self, m: Observation) -> Observation | None:
         """As it is to be used; None where that before it says the same."""
         used: Observation | None = m
-        if isinstance(m, Sightings) and self._thinning.is_same_look(m, self._trail.rests):
+        if isinstance(m, Sightings) and self._thinning.is_repeated(m, self._keyframe_list.rests):
             used = None
         elif isinstance(m, Fix):
             used = self._thinning.thinned(m)
@@ -639,21 +643,21 @@ class GraphSlam:
             self._count(m, "thinned")
         return used
 
-    def _lay_onto_fix(self, m: Fix, where: PoseAtStamp) -> None:
+    def _align_to_fix(self, m: Fix, where: PoseAtStamp) -> None:
         """The first fix of its kind tells where the map lies."""
         T_map_base = self.space.group.compose(self._pose(where.vertex), where.T_keyframe_base)
-        if self._anchor.give_way_to_fix(m, T_map_base, len(self.keyframes) - 1):
+        if self._anchor.align_to_fix(m, T_map_base, len(self.keyframes) - 1):
             self._note_moved(m.topic)
 
-    def _lay_onto_survey(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
+    def _align_to_survey(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
         """The first sighting of a surveyed landmark does."""
         found = self._landmarks.survey_of(name, s, where)
-        if found is not None and self._anchor.give_way_to_landmark(*found, len(self.keyframes) - 1):
+        if found is not None and self._anchor.align_to_landmark(*found, len(self.keyframes) - 1):
             self._note_moved(topic)
 
     def _note_moved(self, topic: str) -> None:
         self.counters.count(topic, "map_moved")
-        self._safeguard.note_moved()
+        self._failure_guard.note_moved()
 
     def _deserves_keyframe(self, m: Observation, where: PoseAtStamp, newest: IntegratedOdometry) -> bool:
         """Where the motion since the keyframe would be too much of the noise of what was measured."""
@@ -675,9 +679,9 @@ class GraphSlam:
         rest = motion.cut(where.stamp_ns)
         step = Step(where.stamp_ns, self.space.identity, T_odom_base)
         self._add_keyframe(step, motion.now.T_keyframe_base, where.covariance)
-        begun = self._trail.motion
+        begun = self._keyframe_list.motion
         if rest is not None and begun is not None:
-            begun.go_on_after_cut(rest, stood)
+            begun.resume_after_cut(rest, stood)
         vertex = self.keyframes[-1].vertex
         return PoseAtStamp(len(self.keyframes) - 1, vertex, where.stamp_ns, self.space.identity, np.zeros((size, size)))
 
@@ -692,7 +696,7 @@ class GraphSlam:
             if len(named) < len(m.sightings):
                 self.counters.count(m.topic, "no_id", len(m.sightings) - len(named))
             return named
-        return self._unnamed.identified(m, where)
+        return self._anonymous.identified(m, where)
 
     def _of_known_while_lost(self, topic: str, found: list[tuple[str, Sighting]]) -> list[tuple[str, Sighting]]:
         """All; but while an alarm cannot be decided, those of landmarks that are in the map."""
@@ -704,30 +708,30 @@ class GraphSlam:
         return known
 
     def _add_closure(self, m: Closure, where: PoseAtStamp) -> None:
-        if not self._trail.oldest_ns <= m.from_stamp_ns <= (self.newest_odometry_ns or 0):
+        if not self._keyframe_list.oldest_ns <= m.from_stamp_ns <= (self.newest_odometry_ns or 0):
             self.counters.count(m.topic, "from_where_there_was_no_odometry")
             return
-        self._edges.closure(m, self._trail.where(m.from_stamp_ns), where)
+        self._edges.closure(m, self._keyframe_list.where(m.from_stamp_ns), where)
 
     # -- solving -------------------------------------------------------------------------------------------------
 
     def _solve_if_due(self) -> None:
-        if self._unsolved_keyframes + self._unsolved_looks >= self.config.solve.every_keyframes:
+        if self._unsolved_keyframes + self._unsolved_sightings >= self.config.solve.every_keyframes:
             self._solve()
 
     def _solve(self, everything: Settings | None = None) -> None:
         """Take in what is new, or solve everything; where that fails the last estimate stays, and it is counted."""
-        self._unsolved_keyframes = self._unsolved_looks = self._solved_vertices = 0
+        self._unsolved_keyframes = self._unsolved_sightings = self._solved_vertices = 0
         if not self.keyframes:
             return
         keyframe = len(self.keyframes) - 1
-        solved = self._safeguard.solve(lambda: self._solved(keyframe, everything), keyframe)
+        solved = self._failure_guard.solve(lambda: self._solved(keyframe, everything), keyframe)
         if solved is None:
             return
         fits, report, self._covariance = solved
         self.report = report or self.report
         self.solves += 1
-        self._solved_vertices, self._taken_in = self.backend.handed_over
+        self._solved_vertices, self._solved_edges = self.backend.handed_over
         self._note_correction(fits)
 
     def _solved(
@@ -736,7 +740,7 @@ class GraphSlam:
         """How new edges fitted before, the report of a solve of everything, and the newest pose's covariance."""
         self.backend.hand_over()
         self._kidnaps.add(self.backend.handed_over[1], self._now_ns)
-        fits, report = self._fit_of(range(self._taken_in, self.backend.handed_over[1])), None
+        fits, report = self._fit_of(range(self._solved_edges, self.backend.handed_over[1])), None
         if everything is None:
             self._review_if_due()
             self.backend.update(keyframe)
@@ -783,7 +787,7 @@ class GraphSlam:
             and self.config.landmarks.association in ("nearest", "joint")
             and len(self.keyframes) % due == 0
         ):
-            self._unnamed.review(self.keyframes[-1].stamp_ns)
+            self._anonymous.review(self.keyframes[-1].stamp_ns)
 
     def _pose(self, vertex: int) -> Numbers:
         return tuple(self.solver.estimate([vertex])[0].tolist())

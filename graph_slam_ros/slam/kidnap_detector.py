@@ -40,8 +40,8 @@ class Alarm:
     evidence : sightings more for another pose than for odometry's, at most; 0 where none was found
     segment : the keyframe, by its index, at which a segment begins since it was decided so; None where it was not
     distance_m, angle_rad : how far the robot was moved there, against odometry
-    held_back, looked_at : when it began, of the newest sightings how many were held back, and all
-    tells_pose : whether what is held back can tell a pose; ranges and bearings alone do not
+    held_back, tested : when it began, of the newest sightings how many were held back, and all
+    determines_pose : whether what is held back can tell a pose; ranges and bearings alone do not
     outcome : what came of it otherwise: it ended undecided since a segment began, or what was decided was taken back
     """
 
@@ -52,8 +52,8 @@ class Alarm:
     distance_m: float = 0.0
     angle_rad: float = 0.0
     held_back: int = 0
-    looked_at: int = 0
-    tells_pose: bool = True
+    tested: int = 0
+    determines_pose: bool = True
     outcome: str = ""
 
     def __str__(self) -> str:
@@ -66,9 +66,9 @@ class Alarm:
             )
         why = f"{self.evidence} sightings more than not"
         if not self.evidence:
-            why = f"{self.held_back} of the last {self.looked_at} sightings contradict odometry"
+            why = f"{self.held_back} of the last {self.tested} sightings contradict odometry"
         if self.ended_ns is None:
-            remedy = "" if self.tells_pose else "; ranges or bearings alone do not tell where: give initialpose"
+            remedy = "" if self.determines_pose else "; ranges or bearings alone do not tell where: give initialpose"
             return f"the landmarks say since {at} that the robot is elsewhere ({why}){remedy}"
         until = f"{self.ended_ns * 1e-9:.1f} s"
         outcome = self.outcome or "it was not so"
@@ -92,7 +92,7 @@ class _Split:
     first: int
     index: int | None
     link: int
-    loose: int
+    replacement: int
     T_map_chain_before: Numbers
     T_map_chain: Numbers
     chain: Numbers
@@ -179,7 +179,7 @@ class KidnapDetector:
         if found is not None and self._is_decided(found):
             last = self._splits[-1] if self._splits else None
             if last and self._is_refuted(last, found, int(vertices[-1])):
-                self._take_back(last, found, vertices, stamp_ns)
+                self._revoke(last, found, vertices, stamp_ns)
             else:
                 self._decide(found, vertices, stamp_ns)
             found = None
@@ -188,8 +188,8 @@ class KidnapDetector:
 
     def _is_refuted(self, split: _Split, found: DisplacementHypothesis, newest: int) -> bool:
         """Whether the robot is where it would be without a segment, but for odometry's drift since it began."""
-        before_m, before_rad = self._search.apart(split.T_map_chain_before, found.T_map_chain, newest)
-        after_m, _ = self._search.apart(split.T_map_chain, found.T_map_chain, newest)
+        before_m, before_rad = self._search.difference(split.T_map_chain_before, found.T_map_chain, newest)
+        after_m, _ = self._search.difference(split.T_map_chain, found.T_map_chain, newest)
         drift_m, drift_rad = self._search.drift(split.drift, split.chain, newest)
         return before_m < min(after_m, SAME_M + _DRIFT * drift_m) and before_rad < SAME_RAD + _DRIFT * drift_rad
 
@@ -197,7 +197,7 @@ class KidnapDetector:
         """Keep the map as it is while it is not decided; ranges or bearings fit a wrong pose by chance, too."""
         undecided = self.now if self.now and self.now.segment is None else None
         self._backend.holds_back = undecided is not None
-        self._backend.trusts_sightings = undecided is None or undecided.tells_pose
+        self._backend.trusts_sightings = undecided is None or undecided.determines_pose
 
     def _significant(self, newest: int) -> DisplacementHypothesis | None:
         """Another pose for which more sightings are than chance and noise explain."""
@@ -215,8 +215,8 @@ class KidnapDetector:
         evidence = found.evidence if found else 0
         if now is None and (found or is_contradicted):
             counts = (sum_of.held_back, sum_of.count) if sum_of else (0, 0)
-            tells_pose = found is not None or self._search.held_back_count > 0
-            self.alarms.append(Alarm(stamp_ns, evidence, None, None, 0.0, 0.0, *counts, tells_pose))
+            determines_pose = found is not None or self._search.held_back_count > 0
+            self.alarms.append(Alarm(stamp_ns, evidence, None, None, 0.0, 0.0, *counts, determines_pose))
         elif now is not None and evidence > now.evidence:
             self.alarms[-1] = replace(now, evidence=evidence)
         elif now is not None and not found and not is_contradicted and self._is_calm(now, stamp_ns):
@@ -255,8 +255,8 @@ class KidnapDetector:
         distance_m = float(np.linalg.norm(moved[: self._space.dimensions]))
         angle_rad = float(self._space.angle(moved))
         T_map_chain_before = group.compose(before, group.inverse(self._search.chain(found.first)))
-        link, motion, noise = self._loose(found.first, there)
-        loose = self._backend.split(
+        link, motion, noise = self._replacement(found.first, there)
+        replacement = self._backend.split(
             (link, motion, noise),
             self._search.initial_poses(found.first),
             self._moved(self._motions(found)),
@@ -281,7 +281,7 @@ class KidnapDetector:
                 found.first,
                 index if is_new else None,
                 link,
-                loose,
+                replacement,
                 T_map_chain_before,
                 found.T_map_chain,
                 self._search.chain(found.first),
@@ -290,14 +290,12 @@ class KidnapDetector:
             )
         )
 
-    def _take_back(
-        self, split: _Split, found: DisplacementHypothesis, vertices: NDArray[np.int64], stamp_ns: int
-    ) -> None:
+    def _revoke(self, split: _Split, found: DisplacementHypothesis, vertices: NDArray[np.int64], stamp_ns: int) -> None:
         """Believe odometry again where the last segment begins: the landmarks show that it was right."""
         group = self._space.group
         back = group.compose(split.T_map_chain_before, group.inverse(split.T_map_chain))
         values = self._moved({split.first: back})
-        self._backend.rejoin(split.link, split.loose, values, found, len(vertices) - 1)
+        self._backend.rejoin(split.link, split.replacement, values, found, len(vertices) - 1)
         self._counters.count("odometry", "displacement_taken_back")
         if split.index is not None:
             self._segments.remove(split.index)
@@ -314,7 +312,7 @@ class KidnapDetector:
     def _estimate(self, vertex: int) -> Numbers:
         return tuple(self._backend.solver.estimate([vertex])[0].tolist())
 
-    def _loose(self, first: int, there: Numbers) -> tuple[int, Numbers, Gaussian]:
+    def _replacement(self, first: int, there: Numbers) -> tuple[int, Numbers, Gaussian]:
         """Odometry's edge to a keyframe, the motion that the landmarks show instead, and next to no trust in it."""
         link, c = self._search.link(first), self._odometry
         table, row = self._backend.graph.row(link)

@@ -65,11 +65,11 @@ class MapSnapshot:
         All of its edges must have been judged.
         """
         for name in [name for name, mark in self.landmarks.items() if mark.is_tentative]:
-            self._give_up(name)
+            self._prune(name)
         self.frozen = self.graph.vertex_count
         self.ledger.finish(self.graph.edge_count)
 
-    def _give_up(self, name: str) -> None:
+    def _prune(self, name: str) -> None:
         mark, last = self.landmarks.pop(name), len(self.keyframes) - 1
         for edge in [one.edge for one in mark.seen]:
             self.graph.set_weights(np.array([edge]), 0.0)

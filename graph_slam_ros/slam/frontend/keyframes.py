@@ -83,7 +83,7 @@ class KeyframeList:
         while len(self._motions) > 2 and self._motions[1].start_ns <= oldest_ns:
             self._motions.popleft()
 
-    def take_up(self, keyframes: Sequence[Keyframe], segments: Sequence[int], drives: Sequence[int]) -> None:
+    def restore(self, keyframes: Sequence[Keyframe], segments: Sequence[int], drives: Sequence[int]) -> None:
         """Go on after these; how the robot came from the last of them to where it is, nobody knows."""
         for one in keyframes:
             self.keyframes.append(one.vertex, one.stamp_ns, one.T_odom_base)
@@ -91,8 +91,8 @@ class KeyframeList:
         self.drives += drives or [0]  # a map of an earlier version does not say
         self.forget_time()
 
-    def go_on(self) -> None:
-        """After ``take_up``: the same drive continues, so odometry tells the motion since the last keyframe."""
+    def continue_drive(self) -> None:
+        """After ``restore``: the same drive continues, so odometry tells the motion since the last keyframe."""
         last = len(self.keyframes) - 1
         backwards = np.flatnonzero(np.diff(self.keyframes.stamps_ns) < 0)
         self._epoch = max(self.drives[-1], int(backwards[-1]) + 1 if len(backwards) else 0)

@@ -36,13 +36,13 @@ class MaxDistance:
 
     def __init__(self, space: Geometry, inputs: Iterable[InputConfig]) -> None:
         self._space = space
-        self._given = {one.name: one.max_distance_m for one in inputs if one.max_distance_m > 0.0}
+        self._configured = {one.name: one.max_distance_m for one in inputs if one.max_distance_m > 0.0}
         self._shown: dict[str, _Shown] = {}
 
     def limit_m(self, topic: str) -> float:
         """The present limit of an input."""
-        if topic in self._given:
-            return self._given[topic]
+        if topic in self._configured:
+            return self._configured[topic]
         shown = self._shown.get(topic)
         if shown is None or shown.count < _LEARNED_AFTER:
             return _MOST_M

@@ -142,14 +142,14 @@ def gradient(space: Geometry, kind: str, p: Array) -> Array:
 
 def predict(space: Geometry, kind: str, p: Array) -> Array:
     """What a sensor says (..., m) of points p (..., n) in its frame."""
-    said = []
+    predicted = []
     if kind in ("range", "range_bearing"):
-        said.append(np.linalg.norm(p, axis=-1))
+        predicted.append(np.linalg.norm(p, axis=-1))
     if kind in ("bearing", "range_bearing"):
-        said.append(np.arctan2(p[..., 1], p[..., 0]))
+        predicted.append(np.arctan2(p[..., 1], p[..., 0]))
         if space.dimensions == 3:
-            said.append(np.arctan2(p[..., 2], np.hypot(p[..., 0], p[..., 1])))
-    return np.stack(said, axis=-1)
+            predicted.append(np.arctan2(p[..., 2], np.hypot(p[..., 0], p[..., 1])))
+    return np.stack(predicted, axis=-1)
 
 
 def point_of(space: Geometry, measured: Numbers) -> Array:

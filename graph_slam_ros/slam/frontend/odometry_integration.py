@@ -81,7 +81,7 @@ class StationaryDetector:
         self._since_ns = 0
         self.is_on = False
 
-    def take(self, step: Step, dt: float) -> bool:
+    def update(self, step: Step, dt: float) -> bool:
         """Whether the robot stood during a step of dt seconds."""
         stands = self._noise.stands(step.T_last_base, dt)
         if self._T_odom_base is None or step.broken:
@@ -133,13 +133,13 @@ class IntegratedOdometry:
 
     def step(self, step: Step) -> None:
         """Go on by one step of odometry."""
-        self._go_on(step, self._rest.take(step, (step.stamp_ns - self.now.stamp_ns) * 1e-9))
+        self._extend(step, self._rest.update(step, (step.stamp_ns - self.now.stamp_ns) * 1e-9))
 
-    def go_on_after_cut(self, rest: Step, stood: bool) -> None:
+    def resume_after_cut(self, rest: Step, stood: bool) -> None:
         """Go on by what ``cut`` has left over of the motion before, in which the robot stood or not."""
-        self._go_on(rest, stood)
+        self._extend(rest, stood)
 
-    def _go_on(self, step: Step, stands: bool) -> None:
+    def _extend(self, step: Step, stands: bool) -> None:
         before, moved = self.now, self._after(step, stands)
         self.moving_ns += (moved.stamp_ns - before.stamp_ns) * (not moved.stands)
         if before.stands and moved.stands:  # of a robot that stands for hours, only the last is remembered

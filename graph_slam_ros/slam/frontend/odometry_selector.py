@@ -68,13 +68,13 @@ class OdometrySelector:
         self._used = None
         self._last_step = self._space.identity
 
-    def go_on(self, stamp_ns: int, T_odom_base: Numbers, source: str) -> None:
+    def continue_drive(self, stamp_ns: int, T_odom_base: Numbers, source: str) -> None:
         """Begin as if an odometry message of this source had been used last."""
         self._used = Odometry(stamp_ns, T_odom_base, None, source)
         if source not in self._order:
             self._order.append(source)
 
-    def take(self, m: Odometry) -> list[Step]:
+    def steps(self, m: Odometry) -> list[Step]:
         """The steps that a message leads to: none where it is not the odometry in use."""
         if m.source not in self._order:
             self._order.append(m.source)
@@ -88,12 +88,12 @@ class OdometrySelector:
             return [self._use(m, self._space.identity, broken="")]
         if m.source == used.source:
             return [self._follow(used, m)]
-        if self._takes_over(m, used):
+        if self._has_failed_over(m, used):
             return self._switched(past, used)
         self._counters.count(m.source, "not_in_use")
         return []
 
-    def _takes_over(self, m: Odometry, used: Odometry) -> bool:
+    def _has_failed_over(self, m: Odometry, used: Odometry) -> bool:
         if self._order.index(m.source) < self._order.index(used.source):
             return m.stamp_ns >= used.stamp_ns
         return m.stamp_ns - used.stamp_ns > self._silent_ns

@@ -23,10 +23,10 @@ class PoseEdges:
         noise = self._noise("odometry", covariance)
         self._graph.add_edge(self._space.relative_pose, vertices, T_last_now, noise, "odometry", source)
 
-    def initial_pose(self, vertex: int, said: InitialPose) -> None:
+    def initial_pose(self, vertex: int, pose: InitialPose) -> None:
         """Where somebody says that the robot is."""
-        noise = self._noise("initialpose", motion_compensation.as_matrix(said.covariance))
-        self._graph.add_edge(self._space.pose_prior, [vertex], said.T_map_base, noise, "initialpose")
+        noise = self._noise("initialpose", motion_compensation.as_matrix(pose.covariance))
+        self._graph.add_edge(self._space.pose_prior, [vertex], pose.T_map_base, noise, "initialpose")
 
     def fix(self, m: Fix, where: PoseAtStamp, T_map_keyframe: Numbers) -> None:
         """A prior on a keyframe; of a position that lacks some axes, one on each principal axis that is known."""
@@ -34,18 +34,18 @@ class PoseEdges:
         if m.kind not in space.fixes:
             self._counters.count(topic, "not_in_this_space")
             return
-        carried = motion_compensation.fix(space, m, where, T_map_keyframe)
+        compensated = motion_compensation.fix(space, m, where, T_map_keyframe)
         n = space.dimensions
-        axes = motion_compensation.axes_known(carried.covariance) if m.kind == "position" else []
+        axes = motion_compensation.axes_known(compensated.covariance) if m.kind == "position" else []
         for axis, variance in axes:
             noise = edge_noise(self._counters, topic, np.array([[variance]]), 1)
-            along = float(axis @ carried.measured[:n])
-            measured = (*axis.tolist(), along, *carried.measured[n:])
+            along = float(axis @ compensated.measured[:n])
+            measured = (*axis.tolist(), along, *compensated.measured[n:])
             self._graph.add_edge(space.coordinate_prior, vertices, measured, noise, "fixes", topic)
         if not axes:
             metres = n if m.kind in ("pose", "position") else 0
-            noise = edge_noise(self._counters, topic, carried.covariance, metres)
-            self._graph.add_edge(space.fixes[m.kind], vertices, carried.measured, noise, "fixes", topic)
+            noise = edge_noise(self._counters, topic, compensated.covariance, metres)
+            self._graph.add_edge(space.fixes[m.kind], vertices, compensated.measured, noise, "fixes", topic)
         self._counters.used[topic] += 1
 
     def closure(self, m: Closure, earlier: PoseAtStamp, later: PoseAtStamp) -> None:
@@ -53,9 +53,9 @@ class PoseEdges:
         if earlier.keyframe == later.keyframe:
             self._counters.count(m.topic, "within_one_keyframe")
             return
-        carried = motion_compensation.closure(self._space, m, earlier, later)
-        noise, vertices = self._noise(m.topic, carried.covariance), [earlier.vertex, later.vertex]
-        self._graph.add_edge(self._space.relative_pose, vertices, carried.measured, noise, "closures", m.topic)
+        compensated = motion_compensation.closure(self._space, m, earlier, later)
+        noise, vertices = self._noise(m.topic, compensated.covariance), [earlier.vertex, later.vertex]
+        self._graph.add_edge(self._space.relative_pose, vertices, compensated.measured, noise, "closures", m.topic)
         self._counters.used[m.topic] += 1
 
     def _noise(self, source: str, covariance: Array) -> Gaussian:

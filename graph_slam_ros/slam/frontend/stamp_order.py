@@ -24,7 +24,7 @@ class StampOrder:
 
     def __init__(self, config: OrderingConfig, counters: Counters) -> None:
         self._window_ns = round(config.window_s * NS)
-        self._max_waiting = config.max_waiting
+        self._max_pending = config.max_waiting
         self._counters = counters
         self._heap: list[tuple[int, int, str, int, Odometry | Observation]] = []
         self._recent: dict[str, dict[Observation, None]] = {}  # in the order they came
@@ -53,7 +53,7 @@ class StampOrder:
 
     def _has_room(self, stamp_ns: int) -> bool:
         """Whether so many wait only, or what is dated latest of all can make room: its turn may never come."""
-        if len(self._heap) < self._max_waiting:
+        if len(self._heap) < self._max_pending:
             return True
         latest = max(range(len(self._heap)), key=self._heap.__getitem__)
         at_ns, _, _, _, m = self._heap[latest]

@@ -18,28 +18,28 @@ class ObservationThinning:
         self._lasting_ns = {one.name: round(2e9 * one.correlation_s) for one in config.sources}
         self._most_ns = round(1e9 * config.keyframes.max_interval_s)
         self._used_ns: dict[str, int] = {}
-        self._looked_ns: dict[str, int] = {}
+        self._observed_ns: dict[str, int] = {}
 
     def forget_time(self) -> None:
         """Stamps begin anew."""
         self._used_ns.clear()
-        self._looked_ns.clear()
+        self._observed_ns.clear()
 
-    def is_same_look(self, m: Sightings, rests: bool) -> bool:
+    def is_repeated(self, m: Sightings, rests: bool) -> bool:
         """Whether the robot rests and has looked just now: from one place it sees the same with the same errors."""
-        before_ns = self._looked_ns.get(m.topic)
+        before_ns = self._observed_ns.get(m.topic)
         if rests and before_ns is not None and 0 <= m.stamp_ns - before_ns < self._most_ns:
             return True
-        self._looked_ns[m.topic] = m.stamp_ns
+        self._observed_ns[m.topic] = m.stamp_ns
         return False
 
     def thinned(self, m: Fix) -> Fix | None:
         """The fix as it is to be used; None where the one before says all that it does."""
         lasting_ns, before_ns = self._lasting_ns.get(m.topic, 0), self._used_ns.get(m.topic)
-        apart_ns = lasting_ns if before_ns is None else abs(m.stamp_ns - before_ns)
-        if apart_ns < min(lasting_ns, self._most_ns):
+        interval_ns = lasting_ns if before_ns is None else abs(m.stamp_ns - before_ns)
+        if interval_ns < min(lasting_ns, self._most_ns):
             return None
         self._used_ns[m.topic] = max(m.stamp_ns, before_ns or 0)
-        if apart_ns >= lasting_ns:
+        if interval_ns >= lasting_ns:
             return m
-        return replace(m, covariance=tuple(variance * (lasting_ns / apart_ns) for variance in m.covariance))
+        return replace(m, covariance=tuple(variance * (lasting_ns / interval_ns) for variance in m.covariance))

@@ -23,10 +23,12 @@ class TimeJumpDetector:
         self._recent_ns: dict[str, deque[int]] = {}
         self._anew: dict[str, list[int]] = {}  # ascending stamps from which it may go on: the first, the last, how many
 
-    def hear(self, measured: Iterable[Measured]) -> bool:
+    def is_jump(self, measured: Iterable[Measured]) -> bool:
         """Whether it has begun anew with one of these, in the order they came."""
-        heard = [self._hear(m) for m in measured if isinstance(m, Odometry)]  # all of them, whatever the first tells
-        return any(heard)
+        jumped = [
+            self._has_jumped(m) for m in measured if isinstance(m, Odometry)
+        ]  # all of them, whatever the first tells
+        return any(jumped)
 
     def forget(self) -> None:
         """What comes next is of another time."""
@@ -34,7 +36,7 @@ class TimeJumpDetector:
         self._recent_ns.clear()
         self._anew.clear()
 
-    def _hear(self, m: Odometry) -> bool:
+    def _has_jumped(self, m: Odometry) -> bool:
         newest_ns = self._newest_ns.get(m.source, 0)
         if m.stamp_ns >= newest_ns - self._back_ns:
             self._newest_ns[m.source] = max(newest_ns, m.stamp_ns)

@@ -85,10 +85,10 @@ class AnonymousLandmarks:
             c.gate_same, c.gate_other, c.density_per_m**self._space.dimensions, c.ambiguity_chi2, c.close_m
         )
         self._begun = 0
-        self._mergers: deque[LandmarkMerge] = deque(maxlen=100)
-        self._parted: set[tuple[str, str]] = set()
+        self._merges: deque[LandmarkMerge] = deque(maxlen=100)
+        self._separated: set[tuple[str, str]] = set()
 
-    def take_up(self) -> None:
+    def restore(self) -> None:
         """New names are other than those that there are."""
         self._begun = last_number(name for name, mark in self._landmarks.known.items() if mark.is_unnamed)
 
@@ -102,7 +102,7 @@ class AnonymousLandmarks:
         unnamed = [s for s in m.sightings if not s.id and s.kind in _POSITIONED]
         if len(named) + len(unnamed) < len(m.sightings):
             self._counters.count(m.topic, "no_id", len(m.sightings) - len(named) - len(unnamed))
-        found = self._associated(unnamed, where) if unnamed else []
+        found = self._associate(unnamed, where) if unnamed else []
         if len(found) < len(unnamed):
             self._counters.count(m.topic, "unclear_which", len(unnamed) - len(found))
         in_map = [one for one in found if one[0] != NOT_IN_MAP]
@@ -110,7 +110,7 @@ class AnonymousLandmarks:
             self._counters.count(m.topic, "not_in_map", len(found) - len(in_map))
         return out + in_map
 
-    def _associated(self, sightings: list[Sighting], where: PoseAtStamp) -> list[tuple[str, Sighting]]:
+    def _associate(self, sightings: list[Sighting], where: PoseAtStamp) -> list[tuple[str, Sighting]]:
         seen = [self._position(s, where) for s in sightings]
         try:
             names, what = self._expected(where, seen)
@@ -180,13 +180,13 @@ class AnonymousLandmarks:
         if len(names):
             pose_covariance = self._solver.joint_marginal([where.vertex])
             at = np.array([space.group.act(T_map_keyframe, z.measured[:n]) for z in seen])
-            apart = np.linalg.norm(self._positions(vertices)[None] - at[:, None], axis=2).min(axis=0)
+            distances = np.linalg.norm(self._positions(vertices)[None] - at[:, None], axis=2).min(axis=0)
             lever = max(float(np.linalg.norm(z.measured[:n])) for z in seen)
             spread = [float(np.linalg.eigvalsh(z.covariance)[-1]) for z in seen]
             turned = lever**2 * float(np.linalg.eigvalsh(pose_covariance[n:, n:])[-1])
             moved = float(np.linalg.eigvalsh(pose_covariance[:n, :n])[-1])
             reach = _REACH_SIGMA * np.sqrt(max(spread) + turned + moved)
-            near = [k for k in np.argsort(apart, kind="stable").tolist() if apart[k] < reach][:_MOST_CANDIDATES]
+            near = [k for k in np.argsort(distances, kind="stable").tolist() if distances[k] < reach][:_MOST_CANDIDATES]
         else:
             near = []
         chosen = [int(vertices[k]) for k in near]
@@ -211,28 +211,28 @@ class AnonymousLandmarks:
 
     def review(self, now_ns: int) -> None:
         """Look at landmarks again: part, merge, believe, give up."""
-        self._part()
+        self._split_wrong_merge()
         known = self._landmarks.known
         unnamed = [name for name, mark in known.items() if mark.is_unnamed]
-        young = [name for name in unnamed if known[name].is_tentative and known[name].sightings > 1]
+        tentative = [name for name in unnamed if known[name].is_tentative and known[name].sightings > 1]
         if self._config.association == "joint":
-            young = young[-_MOST_AT_ONCE:]
-            self._merge(young, self._weighed(self._near(young)))
+            tentative = tentative[-_MOST_AT_ONCE:]
+            self._merge(tentative, self._plausible(self._near(tentative)))
         else:
-            for name in young:
-                self._merge([name], self._weighed(self._near([name])))
+            for name in tentative:
+                self._merge([name], self._plausible(self._near([name])))
         # of the others each by itself
         unnamed = [name for name in unnamed if name in known]
-        weighed = self._weighed(self._near(unnamed))
+        plausible = self._plausible(self._near(unnamed))
         for name in unnamed:
             if name in known and not known[name].is_tentative:
-                self._merge([name], weighed)
+                self._merge([name], plausible)
         for name in [name for name, mark in known.items() if mark.is_tentative]:
-            self._believe_or_give_up(name, weighed, now_ns)
+            self._confirm_or_prune(name, plausible, now_ns)
 
-    def _merge(self, names: list[str], weighed: MergeCandidate) -> None:
+    def _merge(self, names: list[str], plausible: MergeCandidate) -> None:
         """Merge those of a group of which it is clear which others they are."""
-        pairs, candidates = self._candidates(names, weighed)
+        pairs, candidates = self._candidates(names, plausible)
         if not pairs:
             return
         likely = association.likely_pairings(self._gates, candidates)
@@ -247,17 +247,17 @@ class AnonymousLandmarks:
     def _merge_into(self, kept: str, merged: str) -> None:
         self._counters.count("landmarks", "merged")
         seen = frozenset((one.where.stamp_ns, one.sighting) for one in self._landmarks.known[merged].seen)
-        followed = (replace(m, kept=kept) if m.kept == merged else m for m in self._mergers)
-        self._mergers = deque([*followed, LandmarkMerge(kept, merged, seen)], self._mergers.maxlen)
+        followed = (replace(m, kept=kept) if m.kept == merged else m for m in self._merges)
+        self._merges = deque([*followed, LandmarkMerge(kept, merged, seen)], self._merges.maxlen)
         self._landmarks.merge(kept, merged)
         self._hand_over()
 
-    def _weighed(self, pairs: list[tuple[str, str]]) -> MergeCandidate:
+    def _plausible(self, pairs: list[tuple[str, str]]) -> MergeCandidate:
         """Those of the pairs that fit, the likeliest first."""
         known, n = self._landmarks.known, self._space.dimensions
         if not pairs:
             return MergeCandidate([], np.empty(0), np.empty((0, 0)))
-        r, covariance = self._apart([(known[a], known[b]) for a, b in pairs])
+        r, covariance = self._position_differences([(known[a], known[b]) for a, b in pairs])
         fits = []
         for p in range(len(pairs)):
             own = slice(p * n, (p + 1) * n)
@@ -266,15 +266,15 @@ class AnonymousLandmarks:
                 fits.append((cost, p))
         return MergeCandidate(pairs, r, covariance).of([p for _, p in sorted(fits)])
 
-    def _candidates(self, names: list[str], weighed: MergeCandidate) -> tuple[list[tuple[str, str]], Candidates]:
+    def _candidates(self, names: list[str], plausible: MergeCandidate) -> tuple[list[tuple[str, str]], Candidates]:
         """Pairs of these with believed landmarks, as they are now."""
         known, wanted = self._landmarks.known, set(names)
         kept = []
-        for p, (name, other) in enumerate(weighed.pairs):
+        for p, (name, other) in enumerate(plausible.pairs):
             is_there = name in wanted and {name, other} <= known.keys()
-            if is_there and not known[other].is_tentative and self._may_be(name, other):
+            if is_there and not known[other].is_tentative and self._may_match(name, other):
                 kept.append(p)
-        some = weighed.of(kept)
+        some = plausible.of(kept)
         options = [[k for k, (name, _) in enumerate(some.pairs) if name == one] for one in names]
         excluded = np.array([[self._exclude_each_other(a, b) for b in some.pairs] for a in some.pairs], dtype=bool)
         return some.pairs, Candidates(options, some.residual, some.covariance, excluded)
@@ -301,24 +301,24 @@ class AnonymousLandmarks:
         out: list[tuple[str, str]] = []
         for name in names:
             k = everyone[name]
-            apart = np.sum((at[is_older] - at[k]) ** 2, axis=1)
+            distances = np.sum((at[is_older] - at[k]) ** 2, axis=1)
             reach = self._gates.other_chi2(n) * ((sigma[is_older] + sigma[k]) ** 2 + extent)
-            nearest = [older[j] for j in np.argsort(apart, kind="stable").tolist() if apart[j] < reach[j]]
-            out += [(name, other) for other in nearest if self._may_be(name, other)][:_MOST_OPTIONS]
+            nearest = [older[j] for j in np.argsort(distances, kind="stable").tolist() if distances[j] < reach[j]]
+            out += [(name, other) for other in nearest if self._may_match(name, other)][:_MOST_OPTIONS]
         return out
 
-    def _may_be(self, name: str, other: str) -> bool:
+    def _may_match(self, name: str, other: str) -> bool:
         a, b = self._landmarks.known[name], self._landmarks.known[other]
         if self._solver.is_held(a.vertex):
             return False
         is_later = a.is_tentative or (b.first_seen_ns, other) < (a.first_seen_ns, name)
-        return name != other and is_later and (other, name) not in self._parted and a.stamps.isdisjoint(b.stamps)
+        return name != other and is_later and (other, name) not in self._separated and a.stamps.isdisjoint(b.stamps)
 
     def _are_close(self, a: str, b: str) -> bool:
         at = self._positions(np.array([self._landmarks.known[name].vertex for name in (a, b)]))
         return float(np.linalg.norm(at[1] - at[0])) <= self._gates.close_m
 
-    def _apart(self, pairs: Sequence[tuple[Landmark, Landmark]]) -> tuple[Array, Array]:
+    def _position_differences(self, pairs: Sequence[tuple[Landmark, Landmark]]) -> tuple[Array, Array]:
         """Differences (k n,) of the positions of pairs in map, and their covariance together."""
         n = self._space.dimensions
         marks = list({id(mark): mark for pair in pairs for mark in pair}.values())
@@ -346,30 +346,30 @@ class AnonymousLandmarks:
         for_long = landmark.last_seen_ns - landmark.first_seen_ns >= round(c.confirm_s * 1e9)
         return landmark.sightings >= c.confirm_sightings and for_long
 
-    def _believe_or_give_up(self, name: str, weighed: MergeCandidate, now_ns: int) -> None:
+    def _confirm_or_prune(self, name: str, plausible: MergeCandidate, now_ns: int) -> None:
         """Believe a tentative landmark that is none of the others; give up what was not seen for long."""
         landmark = self._landmarks.known[name]
-        if self._is_sure(landmark) and not self._candidates([name], weighed)[0]:
-            self._landmarks.believe(name)
+        if self._is_sure(landmark) and not self._candidates([name], plausible)[0]:
+            self._landmarks.confirm(name)
         elif now_ns - landmark.last_seen_ns > round(self._config.give_up_s * 1e9):
-            self._landmarks.give_up(name)
+            self._landmarks.prune(name)
             self._counters.count("landmarks", "given_up")
 
-    def _part(self) -> None:
-        """Take back a merger whose sightings do not fit."""
-        for merger in list(self._mergers):
-            landmark = self._landmarks.known.get(merger.kept)
+    def _split_wrong_merge(self) -> None:
+        """Take back a merge whose sightings do not fit."""
+        for merge in list(self._merges):
+            landmark = self._landmarks.known.get(merge.kept)
             moved = (
-                [one for one in landmark.seen if (one.where.stamp_ns, one.sighting) in merger.seen] if landmark else []
+                [one for one in landmark.seen if (one.where.stamp_ns, one.sighting) in merge.seen] if landmark else []
             )
             if not moved:
-                self._mergers.remove(merger)
+                self._merges.remove(merge)
                 continue
             fits, dof = self._landmarks.chi2_of([one.edge for one in moved])
             if fits > association.quantile(1.0 - 1e-6, dof) and fits > 4.0 * dof:
                 self._counters.count("landmarks", "parted")
-                self._landmarks.part(merger.kept, merger.merged, moved)
+                self._landmarks.split(merge.kept, merge.merged, moved)
                 self._hand_over()
-                self._parted.add((merger.kept, merger.merged))
-                self._mergers.remove(merger)
+                self._separated.add((merge.kept, merge.merged))
+                self._merges.remove(merge)
                 return

@@ -148,9 +148,9 @@ def associate(gates: Gates, seen: Sequence[KeyframeMeasurement], what: Expected,
         elif statistic[i, j] > gates.sure_chi2(n) and (possible[i, ~followed] < cost[i, j]).any():
             out.append(Match(NEW))
         else:
-            taken = [k for k in pairs.values() if k != j]
+            used = [k for k in pairs.values() if k != j]
             rivals = np.flatnonzero(mine[i] < cost[i, j] + gates.margin)
-            out.append(_among_rivals(gates, what.points, cost[i], j, [k for k in rivals.tolist() if k not in taken]))
+            out.append(_among_rivals(gates, what.points, cost[i], j, [k for k in rivals.tolist() if k not in used]))
     return out
 
 

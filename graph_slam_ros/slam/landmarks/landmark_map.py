@@ -21,7 +21,7 @@ from graph_slam_ros.typing import Array, Numbers
 
 LABEL = "landmarks"
 _SOMEWHERE_M = 3.0  # away, of what was seen by its bearing alone
-_MOST_WAITING = 60  # sightings of one landmark: every other is forgotten beyond
+_MAX_SIGHTINGS = 60  # sightings of one landmark: every other is forgotten beyond
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Landmarks:
     Attributes
     ----------
     known : those in the graph, by identity
-    waiting : those that are not determined yet
+    undetermined : those that are not determined yet
     offsets : by input, the vertex of what all its ranges have in common
     touched : the name of a landmark of the graph for each change of it, in order
     begins_new : whether what is not known begins a landmark; not so while the map is held
@@ -89,7 +89,7 @@ class Landmarks:
     ) -> None:
         self.known: dict[str, Landmark] = {}
         self.begins_new = True
-        self.waiting: dict[str, UndeterminedLandmark] = {}
+        self.undetermined: dict[str, UndeterminedLandmark] = {}
         self._config, self._space = config, config.space
         self._graph, self._solver, self._counters, self._withdraw = graph, solver, counters, withdraw
         if config.landmarks.surveyed_file and not config.landmarks.surveyed:
@@ -117,7 +117,7 @@ class Landmarks:
         elif name in self._survey:  # there is nothing to wait for
             self._begin(topic, name, s, where, self._survey[name].position)
         else:
-            self._wait(topic, name, s, where)
+            self._note_undetermined(topic, name, s, where)
 
     def survey_of(self, name: str, s: Sighting, where: PoseAtStamp) -> tuple[Surveyed, Array] | None:
         """The survey of a landmark that was not seen before, and where (n,) a sighting puts it, or may put it."""
@@ -134,7 +134,7 @@ class Landmarks:
             measured = (*measured, *[0.0] * (self._space.dimensions - 1))
         return self._survey[name], self._from_sensor(s, where, motion_compensation.point_of(self._space, measured))
 
-    def take_up(self, known: dict[str, Landmark], offsets: dict[str, int]) -> None:
+    def restore(self, known: dict[str, Landmark], offsets: dict[str, int]) -> None:
         """Go on with these, whose vertices and edges are in the graph."""
         self.known.update(known)
         self.offsets.update(offsets)
@@ -166,22 +166,22 @@ class Landmarks:
         is_pose = self._graph.kind_of(landmark.vertex) is space.pose
         vertices, metres = [where.vertex, landmark.vertex], space.dimensions
         if s.kind == "pose" and is_pose:
-            edge_type, carried = space.relative_pose, motion_compensation.pose(space, s, where)
+            edge_type, compensated = space.relative_pose, motion_compensation.pose(space, s, where)
         elif s.kind in ("pose", "position"):
             edge_type = space.tag_position if is_pose else space.sightings["position"]
-            carried = motion_compensation.position(space, s, where)
+            compensated = motion_compensation.position(space, s, where)
         elif is_pose:
             self._counters.count(topic, "not_for_a_pose")
             return
         else:
             edge_type, metres = space.sightings[s.kind], 0 if s.kind == "bearing" else 1
-            carried = self._from_sensors(s, where, landmark)
+            compensated = self._from_sensors(s, where, landmark)
             if s.kind == "range" and self._config.landmarks.range_offset_sigma_m > 0.0:
                 edge_type = space.range_with_offset
                 vertices.append(self._offset(topic))
-        distance_m = float(np.linalg.norm(carried.measured[:metres]))
-        noise = edge_noise(self._counters, topic, self._blurred(s, carried), metres, distance_m)
-        edge = self._graph.add_edge(edge_type, vertices, carried.measured, noise, LABEL, topic)
+        distance_m = float(np.linalg.norm(compensated.measured[:metres]))
+        noise = edge_noise(self._counters, topic, self._blurred(s, compensated), metres, distance_m)
+        edge = self._graph.add_edge(edge_type, vertices, compensated.measured, noise, LABEL, topic)
         if not s.id:
             landmark.seen.append(LandmarkEdge(edge, topic, s, where))
             landmark.stamps.add(where.stamp_ns)
@@ -197,9 +197,9 @@ class Landmarks:
         seen = np.array(group.act(group.inverse(self._pose(where)), tuple(at.tolist())))
         return motion_compensation.seen_from_sensor(self._space, s, where, seen)
 
-    def _blurred(self, s: Sighting, carried: KeyframeMeasurement) -> Array:
+    def _blurred(self, s: Sighting, compensated: KeyframeMeasurement) -> Array:
         """With what messages leave out: clocks, mounting, size."""
-        covariance, added = carried.covariance.copy(), self._config.landmarks.added_sigma_m**2
+        covariance, added = compensated.covariance.copy(), self._config.landmarks.added_sigma_m**2
         if s.kind in ("pose", "position"):
             n = self._space.dimensions
             covariance[:n, :n] += added * np.eye(n)
@@ -218,11 +218,11 @@ class Landmarks:
 
     # -- taken back ----------------------------------------------------------------------------------------------
 
-    def give_up(self, name: str) -> None:
+    def prune(self, name: str) -> None:
         """Take a landmark and its edges out of the problem."""
         landmark = self.known.pop(name)
         self.touched.append(name)
-        self._take_out(landmark.seen)
+        self._withdraw_sightings(landmark.seen)
         self._solver.remove(landmark.vertex)
 
     def forget(self, vertices: set[int]) -> None:
@@ -234,29 +234,29 @@ class Landmarks:
     def merge(self, kept: str, merged: str) -> None:
         """Give the sightings of one landmark to another."""
         a, b = self.known[kept], self.known[merged]
-        self.give_up(merged)
+        self.prune(merged)
         for one in b.seen:
             self._add_edge(one.topic, a, one.sighting, one.where)
 
-    def part(self, kept: str, merged: str, moved: Sequence[LandmarkEdge]) -> None:
+    def split(self, kept: str, merged: str, moved: Sequence[LandmarkEdge]) -> None:
         """Take a merger back: these sightings are of a landmark of their own."""
         a = self.known[kept]
         gone = {one.edge for one in moved}
         a.seen = [one for one in a.seen if one.edge not in gone]
         a.stamps = {one.where.stamp_ns for one in a.seen}
         a.sightings -= len(moved)
-        self._take_out(moved)
+        self._withdraw_sightings(moved)
         for one in moved:
             self.add(one.topic, merged, one.sighting, one.where)
         self.touched.append(kept)
-        self.believe(merged)
+        self.confirm(merged)
 
-    def believe(self, name: str) -> None:
+    def confirm(self, name: str) -> None:
         """It is tentative no more."""
         self.known[name].is_tentative = False
         self.touched.append(name)
 
-    def _take_out(self, seen: Sequence[LandmarkEdge]) -> None:
+    def _withdraw_sightings(self, seen: Sequence[LandmarkEdge]) -> None:
         for one in seen:
             self._counters.used[one.topic] -= 1
         self._withdraw([one.edge for one in seen])
@@ -270,28 +270,28 @@ class Landmarks:
         chi2, numbers = self._solver.chi2_of(edges)
         return float(chi2.sum()), int(numbers.sum())
 
-    def _wait(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
-        waiting = self.waiting.setdefault(name, UndeterminedLandmark(topic))
-        is_elsewhere = not waiting.seen or waiting.seen[-1][0].keyframe != where.keyframe
-        waiting.seen.append((where, s))
+    def _note_undetermined(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
+        candidate = self.undetermined.setdefault(name, UndeterminedLandmark(topic))
+        is_elsewhere = not candidate.seen or candidate.seen[-1][0].keyframe != where.keyframe
+        candidate.seen.append((where, s))
         if is_elsewhere:  # another look from where the last was taken determines nothing
-            self._determine(name, waiting)
-        if len(waiting.seen) > _MOST_WAITING:
-            del waiting.seen[1::2]
+            self._determine(name, candidate)
+        if len(candidate.seen) > _MAX_SIGHTINGS:
+            del candidate.seen[1::2]
 
-    def _determine(self, name: str, waiting: UndeterminedLandmark) -> None:
+    def _determine(self, name: str, candidate: UndeterminedLandmark) -> None:
         glances = []
-        for where, s in waiting.seen:
+        for where, s in candidate.seen:
             covariance = motion_compensation.as_matrix(s.covariance) + LEAST_RAD2 * np.eye(len(s.measured))
             glances.append(PartialObservation(self._sensor_pose(s, where), s.kind, s.measured, covariance))
-        waiting.places = triangulation.places(self._space, glances, self._config.landmarks.range_offset_sigma_m)
-        waiting.reason = self._why_not(waiting.places, glances)
-        if not waiting.reason:
-            del self.waiting[name]
-            at = tuple(waiting.places[0].position.tolist())
+        candidate.places = triangulation.places(self._space, glances, self._config.landmarks.range_offset_sigma_m)
+        candidate.reason = self._why_not(candidate.places, glances)
+        if not candidate.reason:
+            del self.undetermined[name]
+            at = tuple(candidate.places[0].position.tolist())
             landmark = self.known[name] = Landmark(name, self._graph.add_vertex(self._space.point, at))
-            for where, s in waiting.seen:
-                self._add_edge(waiting.topic, landmark, s, where)
+            for where, s in candidate.seen:
+                self._add_edge(candidate.topic, landmark, s, where)
 
     def _why_not(self, places: list[PositionHypothesis], glances: list[PartialObservation]) -> str:
         """Why a landmark is not determined; empty where it is."""

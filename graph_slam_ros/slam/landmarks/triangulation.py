@@ -152,9 +152,9 @@ def _normal(space: Geometry, fields: list[Field], at: Array, known: float) -> tu
     n = space.dimensions
     b, h = np.zeros(at.shape), np.zeros((*at.shape, n + 1))
     chi2, b[:, n], h[:, n, n] = known * at[:, n] ** 2, known * at[:, n], known
-    for kind, turns, sensors, said, whiten in fields:
+    for kind, turns, sensors, measured, whiten in fields:
         p = np.einsum("kij,ski->skj", turns, at[:, None, :n] - sensors)
-        r = predict(space, kind, p) - said
+        r = predict(space, kind, p) - measured
         first_angle = 0 if kind == "bearing" else 1
         r[..., first_angle:] = se2.wrap(r[..., first_angle:])
         j = np.zeros((*r.shape, n + 1))

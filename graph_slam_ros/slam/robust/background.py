@@ -9,22 +9,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from graph_slam_ros.config.robust import RobustConfig
-from graph_slam_ros.slam.robust.hypotheses import CancelToken, FrozenGraph, Outcome, second_look
+from graph_slam_ros.slam.robust.hypotheses import CancelToken, FrozenGraph, Outcome, search_alternatives
 
 _MORE = 1.5  # times as many out as at the last look: looks become rarer as their cost grows
 
 Work = Callable[[], Outcome | None]
-Beside = Callable[[Work], Work]
+Executor = Callable[[Work], Work]
 """Begins work and returns what waits for its result."""
 
 
-def when_asked(work: Work) -> Work:
+def run_when_asked(work: Work) -> Work:
     """Does it when its result is asked for."""
     return work
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
+class _Job:
     apply_at: int
     outcome: Work
     wanted: CancelToken
@@ -33,32 +33,32 @@ class _Look:
 class Background:
     """At most one second look at a time, and its outcome at the keyframe it is for."""
 
-    def __init__(self, config: RobustConfig, beside: Beside) -> None:
-        self._config, self._beside = config, beside
+    def __init__(self, config: RobustConfig, executor: Executor) -> None:
+        self._config, self._executor = config, executor
         self._out = 0  # candidates that were out at the last look
-        self._look: _Look | None = None
+        self._job: _Job | None = None
 
     def is_due(self, out: int) -> bool:
         """Whether so many candidates that are out deserve a look."""
         after, self._out = self._config.second_look_after, min(self._out, out)
-        return self._look is None and after > 0 and out >= max(self._out + after, _MORE * self._out)
+        return self._job is None and after > 0 and out >= max(self._out + after, _MORE * self._out)
 
     def start(self, frozen: FrozenGraph, out: int) -> None:
         """Begin with what there is now."""
         self._out = out
         wanted = CancelToken()
-        outcome = self._beside(lambda: second_look(self._config, frozen, wanted))
-        self._look = _Look(frozen.keyframe + self._config.apply_after_keyframes, outcome, wanted)
+        outcome = self._executor(lambda: search_alternatives(self._config, frozen, wanted))
+        self._job = _Job(frozen.keyframe + self._config.apply_after_keyframes, outcome, wanted)
 
     def outcome(self, keyframe: int) -> Outcome | None:
         """What was found, at the keyframe it is for; waits for it. None, too, where nothing could be."""
-        if self._look is None or keyframe < self._look.apply_at:
+        if self._job is None or keyframe < self._job.apply_at:
             return None
-        look, self._look = self._look, None
-        return look.outcome()
+        job, self._job = self._job, None
+        return job.outcome()
 
     def cancel(self, out: int) -> None:
         """What is under way is for nobody: all was looked at, and so many are out."""
-        if self._look is not None:
-            self._look.wanted.still = False
-        self._look, self._out = None, out
+        if self._job is not None:
+            self._job.wanted.still = False
+        self._job, self._out = None, out

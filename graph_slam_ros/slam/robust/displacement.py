@@ -305,8 +305,8 @@ class DisplacementSearch:
         turn, shift = motion
         away = np.sum((window.points @ turn.T + shift - window.places) ** 2, axis=1)
         allowed = quantile(_FIT, self._space.dimensions) * self._variances(window, at)
-        tells = allowed <= (_VAGUE_M + _VAGUE * self._levers(window)) ** 2
-        fits = (away <= allowed) & tells & (window.seconds > -REACH_S)
+        is_informative = allowed <= (_VAGUE_M + _VAGUE * self._levers(window)) ** 2
+        fits = (away <= allowed) & is_informative & (window.seconds > -REACH_S)
         off = se2.wrap(window.headings + np.arctan2(turn[1, 0], turn[0, 0]) - window.place_headings)
         drift = np.abs(window.drifts - window.drifts[at])[:, 1]
         spread = window.heading_variances + drift + _HEADING_SIGMA_RAD**2
@@ -353,15 +353,15 @@ class DisplacementSearch:
         """Where the evidence's own frame of odometry has a keyframe, by its vertex."""
         return self._chain[keyframe]
 
-    def apart(self, T_map_chain: Numbers, other: Numbers, keyframe: int) -> tuple[float, float]:
+    def difference(self, T_map_chain: Numbers, other: Numbers, keyframe: int) -> tuple[float, float]:
         """Distance [m] and angle [rad] of a keyframe, by its vertex, by two places of the evidence's own frame."""
         group, chain = self._space.group, self._chain[keyframe]
-        apart = group.between(group.compose(T_map_chain, chain), group.compose(other, chain))
-        return float(np.linalg.norm(apart[: self._space.dimensions])), float(self._space.angle(apart))
+        difference = group.between(group.compose(T_map_chain, chain), group.compose(other, chain))
+        return float(np.linalg.norm(difference[: self._space.dimensions])), float(self._space.angle(difference))
 
     def are_apart(self, T_map_chain: Numbers, other: Numbers, keyframe: int) -> bool:
         """Whether these are two different poses."""
-        far_m, turned_rad = self.apart(T_map_chain, other, keyframe)
+        far_m, turned_rad = self.difference(T_map_chain, other, keyframe)
         return far_m > SAME_M or turned_rad > SAME_RAD
 
     def drift_of(self, keyframe: int) -> Array:

@@ -26,8 +26,8 @@ _TYPICAL = 30  # residuals tell what all are like
 _SLACK = 10.0  # times the residuals that are typical of a class its gate may be, where they are small
 _TIGHTEST = 0.1  # part of a gate that is left
 _TOGETHER = 8  # sightings that tell but a part each determine a landmark, wherever they are from
-_COMPLETED = 50  # edges that are out and are tried again after everything was solved
-_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
+_READMISSIONS = 50  # edges that are out and are tried again after everything was solved
+_REVIEWED_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
 
 
 class OutlierGate:
@@ -42,7 +42,7 @@ class OutlierGate:
             self._count(edge, 1)
         self._tightness: dict[str, float] = {}  # of each class, by what its gate is smaller
         self.is_calibrated = False  # whether enough was measured twice to tell how good odometry is
-        self._looseness = config.noise_factor**2  # of the gate of what all else predicts
+        self._gate_scale = config.noise_factor**2  # of the gate of what all else predicts
         self._withdrawn: dict[int, Reason] = {}  # before they were taken
         self._vertices = 0  # of the graph, at the last solve
         self._next = 0  # of the accepted, where the next review goes on
@@ -50,7 +50,7 @@ class OutlierGate:
 
     # -- what is new -------------------------------------------------------------------------------------------------
 
-    def take(self, count: int, keyframe: int, *, trusts_sightings: bool = True) -> list[int]:
+    def gate_new(self, count: int, keyframe: int, *, trusts_sightings: bool = True) -> list[int]:
         """Look at the edges that are new, up to a count, by their own noise.
 
         Those that fit are accepted; the others, which are told, wait outside, and all sightings where none is trusted.
@@ -65,24 +65,24 @@ class OutlierGate:
         for edge, reason in self._withdrawn.items():
             self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, self.ledger.statistic.values[edge])
         self._withdrawn.clear()
-        waiting, unfit = list[int](), set(ids[chi2 > limit].tolist())
+        pending, unfit = list[int](), set(ids[chi2 > limit].tolist())
         for edge in ids[judged & self._config.decide].tolist():
             is_unfit = edge in unfit and not self._is_needed(edge)  # by what is left of those before it
             if is_unfit or (not trusts_sightings and self._is_of_known(edge)):
-                self._take_out(edge)
+                self._exclude(edge)
                 self.ledger.hold_back(edge)
-                waiting.append(edge)
+                pending.append(edge)
         self._vertices = self._graph.vertex_count
-        return waiting
+        return pending
 
     def _is_of_known(self, edge: int) -> bool:
         """Whether it is of a landmark that the last solve had: without it that is as determined as it was."""
         landmark = landmark_of(self._graph, edge)
         return landmark is not None and landmark < self._vertices
 
-    def admit(self, waiting: Sequence[int], keyframe: int) -> list[int]:
+    def admit_compatible(self, pending: Sequence[int], keyframe: int) -> list[int]:
         """Compare with all that is known: the likeliest first, then the others with that; who is let in."""
-        out, admitted = list(waiting), list[int]()
+        out, admitted = list(pending), list[int]()
         while out:
             innovation = {edge: self._innovation(edge) for edge in out}
             likely = [edge for edge in out if self._is_likely(edge, innovation[edge])]
@@ -90,13 +90,15 @@ class OutlierGate:
                 break
             best = min(likely, key=lambda edge: innovation[edge] / self.ledger.threshold.values[edge])
             for edge in likely if admitted else [best]:
-                self._readmit(edge, keyframe, innovation[edge], self._widest(edge))
+                self._readmit(edge, keyframe, innovation[edge], self._innovation_gate(edge))
                 admitted.append(edge)
             out = [edge for edge in out if not self.ledger.is_inside(edge)]
             if out:
                 self._solver.update()
         for edge in out:
-            self.ledger.note(edge, keyframe, Verdict.PENDING, Reason.UNLIKELY, innovation[edge], self._widest(edge))
+            self.ledger.note(
+                edge, keyframe, Verdict.PENDING, Reason.UNLIKELY, innovation[edge], self._innovation_gate(edge)
+            )
         return admitted
 
     def fit(self, edges: Sequence[int]) -> bool:
@@ -116,13 +118,13 @@ class OutlierGate:
 
     def review(self, keyframe: int) -> None:
         """Look again at the newest verdicts and, in turn, at some of the others."""
-        self.tighten()
+        self.recalibrate()
         inside = self.ledger.inside
-        if len(inside) > 2 * _AT_ONCE:
-            self._next = (self._next + _AT_ONCE) % (len(inside) - _AT_ONCE)
-            older = np.arange(self._next, self._next + _AT_ONCE) % (len(inside) - _AT_ONCE)
-            inside = np.concatenate((np.unique(inside[older]), inside[-_AT_ONCE:]))
-        self._weigh(inside, keyframe)
+        if len(inside) > 2 * _REVIEWED_AT_ONCE:
+            self._next = (self._next + _REVIEWED_AT_ONCE) % (len(inside) - _REVIEWED_AT_ONCE)
+            older = np.arange(self._next, self._next + _REVIEWED_AT_ONCE) % (len(inside) - _REVIEWED_AT_ONCE)
+            inside = np.concatenate((np.unique(inside[older]), inside[-_REVIEWED_AT_ONCE:]))
+        self._reweight(inside, keyframe)
         outside = self.ledger.outside
         chi2, _ = self._solver.chi2_of(outside)
         fits = chi2 <= self.ledger.threshold.values[outside]
@@ -133,11 +135,11 @@ class OutlierGate:
         self._next_out += len(turn)
         likely = [(edge, fit) for edge in turn if self._is_likely(edge, fit := self._innovation(edge))]
         for edge, fit in likely:
-            self._readmit(edge, keyframe, fit, self._widest(edge))
+            self._readmit(edge, keyframe, fit, self._innovation_gate(edge))
 
-    def settle(self, keyframe: int) -> bool:
+    def reclassify(self, keyframe: int) -> bool:
         """After a solve of everything: what fits is in, what does not is out; whether a verdict has changed."""
-        self.tighten()
+        self.recalibrate()
         ledger, changed = self.ledger, False
         inside, outside = ledger.inside, ledger.outside
         for edges, out in ((inside, True), (outside, False)):
@@ -153,11 +155,11 @@ class OutlierGate:
                 changed = True
         return changed
 
-    def complete(self, keyframe: int) -> bool:
+    def readmit_next(self, keyframe: int) -> bool:
         """Let in what would fit if it were in, of that which fits least badly without; whether there was any."""
         outside = self.ledger.outside
         chi2, _ = self._solver.chi2_of(outside)
-        for edge in outside[np.argsort(chi2, kind="stable")[:_COMPLETED]].tolist():
+        for edge in outside[np.argsort(chi2, kind="stable")[:_READMISSIONS]].tolist():
             innovation = self._innovation(edge)
             if innovation <= self.ledger.threshold.values[edge] and self._is_likely(edge, innovation):
                 self._readmit(edge, keyframe, innovation)
@@ -176,12 +178,12 @@ class OutlierGate:
                 self._reject(edge, keyframe, reason, float(self.ledger.statistic.values[edge]))
 
     @property
-    def looseness(self) -> float:
+    def gate_scale(self) -> float:
         """By what the gate of what all else predicts is wider than a quantile of chi2.
 
         ``robust.noise_factor`` squared, times how good odometry has shown itself to be.
         """
-        return self._looseness
+        return self._gate_scale
 
     def are_beyond_noise(self, edges: Sequence[int]) -> bool:
         """Whether most of some edges that are out are farther off than odometry's noise explains.
@@ -196,38 +198,38 @@ class OutlierGate:
         """What believing each of some edges that are out would cost, given all that is in."""
         return [self._innovation(edge) for edge in edges]
 
-    def loosen(self, link: int, keyframe: int, evidence: float) -> None:
+    def supersede(self, link: int, keyframe: int, evidence: float) -> None:
         """Take an edge of odometry out: another with more noise is there in its place."""
         self._solver.set_weight(link, 0.0)
         self.ledger.note(link, keyframe, Verdict.REJECTED, Reason.DISPLACED, evidence)
 
-    def restore(self, link: int, keyframe: int, evidence: float) -> None:
-        """Undo ``loosen``."""
+    def reinstate(self, link: int, keyframe: int, evidence: float) -> None:
+        """Undo ``supersede``."""
         self._solver.set_weight(link, 1.0)
         self.ledger.note(link, keyframe, Verdict.NOT_EVALUATED, Reason.NONE, evidence)
 
-    def exchange(self, let_in: Sequence[int], taken_out: Sequence[int], keyframe: int) -> None:
+    def exchange(self, included: Sequence[int], excluded: Sequence[int], keyframe: int) -> None:
         """Believe some edges and not others, which may come back; by how they fit it is judged afterwards."""
-        for edge in let_in:
+        for edge in included:
             if not self.ledger.is_inside(edge):
                 self._readmit(edge, keyframe, float(self.ledger.statistic.values[edge]))
-        for edge in taken_out:
+        for edge in excluded:
             if self.ledger.is_inside(edge) and not self._is_needed(edge):
                 self._reject(edge, keyframe, Reason.DOES_NOT_FIT, float(self.ledger.statistic.values[edge]))
 
-    def follow(self, other: Ledger, keyframe: int) -> bool:
+    def adopt_verdicts(self, other: Ledger, keyframe: int) -> bool:
         """Take over verdicts on the same edges from who has had a second look; whether that changed one."""
         mine, known = self.ledger, len(other)
         judged = mine.final + np.flatnonzero(mine.verdict.values[mine.final : known] != Verdict.NOT_EVALUATED)
         standing = judged[~np.isin(mine.reason.values[judged], FINAL)]
-        return self._have_in(standing, np.isin(standing, other.inside), keyframe, other)
+        return self._set_verdicts(standing, np.isin(standing, other.inside), keyframe, other)
 
-    def believe(self, edges: Index, keyframe: int) -> None:
+    def force_inliers(self, edges: Index, keyframe: int) -> None:
         """Have these candidates in and no others, to see what comes of it."""
         candidates = np.sort(np.concatenate((self.ledger.inside, self.ledger.outside)))
-        self._have_in(candidates, np.isin(candidates, edges), keyframe, self.ledger)
+        self._set_verdicts(candidates, np.isin(candidates, edges), keyframe, self.ledger)
 
-    def _have_in(self, edges: Index, wanted: NDArray[np.bool_], keyframe: int, judge: Ledger) -> bool:
+    def _set_verdicts(self, edges: Index, wanted: NDArray[np.bool_], keyframe: int, judge: Ledger) -> bool:
         """Those in that are wanted, then the others out, by who judged them; whether a verdict has changed."""
         inside = np.isin(edges, self.ledger.inside)
         changed = 0
@@ -241,7 +243,7 @@ class OutlierGate:
                 changed += 1
         return changed > 0
 
-    def _weigh(self, edges: Index, keyframe: int) -> None:
+    def _reweight(self, edges: Index, keyframe: int) -> None:
         """By what their losses leave of each one's weight."""
         ledger = self.ledger
         chi2, _ = self._solver.chi2_of(edges)
@@ -265,30 +267,30 @@ class OutlierGate:
             return np.inf
 
     def _is_likely(self, edge: int, innovation: float) -> bool:
-        return innovation <= self._widest(edge)
+        return innovation <= self._innovation_gate(edge)
 
-    def _widest(self, edge: int) -> float:
+    def _innovation_gate(self, edge: int) -> float:
         """What an innovation is held against."""
-        return self._looseness * quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
+        return self._gate_scale * quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
 
     # -- one edge ----------------------------------------------------------------------------------------------------
 
     def _readmit(self, edge: int, keyframe: int, statistic: float, threshold: float | None = None) -> None:
-        self._put_in(edge)
+        self._include(edge)
         self.ledger.note(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, statistic, threshold)
 
     def _reject(
         self, edge: int, keyframe: int, reason: Reason, statistic: float, threshold: float | None = None
     ) -> None:
         if self.ledger.is_inside(edge):
-            self._take_out(edge)
+            self._exclude(edge)
         self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, statistic, threshold)
 
-    def _put_in(self, edge: int) -> None:
+    def _include(self, edge: int) -> None:
         self._solver.set_weight(edge, 1.0)
         self._count(edge, 1)
 
-    def _take_out(self, edge: int) -> None:
+    def _exclude(self, edge: int) -> None:
         self._solver.set_weight(edge, 0.0)
         self._count(edge, -1)
 
@@ -334,7 +336,7 @@ class OutlierGate:
         stages = [Loss.named(name, self._config.loss_scale) for name in ("huber", "dcs")]
         return dict.fromkeys(CANDIDATES, stages)
 
-    def tighten(self) -> None:
+    def recalibrate(self) -> None:
         """Follow what residuals are like: whoever gives a noise ten times too large would let in all that is false.
 
         The median of what is inside is compared with that of chi2; what is false does not move it.
@@ -350,8 +352,8 @@ class OutlierGate:
         freedom = self._solver.degrees_of_freedom
         self.is_calibrated = freedom >= _TYPICAL
         if self.is_calibrated:
-            as_noise_tells = self._solver.evaluate().chi2_final / freedom
-            self._looseness = min(factor, max(_TIGHTEST, factor * as_noise_tells))
+            noise_ratio = self._solver.evaluate().chi2_final / freedom
+            self._gate_scale = min(factor, max(_TIGHTEST, factor * noise_ratio))
         edges = np.concatenate((inside, ledger.outside))
         ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
 

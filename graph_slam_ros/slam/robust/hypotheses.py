@@ -1,6 +1,6 @@
 """A second look at everything: solve, judge, solve again, from more than one start; the best explanation wins.
 
-What an online run believed first may rest on a false closure that came before the true ones. So the whole is explained
+What an online run believes first may rest on a false closure that came before the true ones. So the whole is explained
 from the online estimate and what is believed there; from the candidates that agree with a neighbour, there and along
 odometry alone; and from the largest group that is out. In each, all is solved and every candidate judged by how it
 fits, in turn, until no verdict changes; what is out then costs as much as the gate would have let it cost (truncated
@@ -105,15 +105,15 @@ class CancelToken:
     still: bool = True
 
 
-def second_look(config: RobustConfig, frozen: FrozenGraph, wanted: CancelToken | None = None) -> Outcome | None:
+def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: CancelToken | None = None) -> Outcome | None:
     """Explain a graph anew, from each start; the least cost wins. None where nothing can be solved, or nobody waits."""
     found: list[Outcome] = []
-    for name, start, believed in _starts(frozen):
+    for name, start, inliers in _starts(frozen):
         if wanted is not None and not wanted.still:
             return None
         with suppress(GraphSlamError, np.linalg.LinAlgError):  # what is believed there does not hold together
             hopeless = _HOPELESS * min((outcome.cost for outcome in found), default=np.inf)
-            found.append(_explained(name, config, frozen, start, believed, hopeless))
+            found.append(_explained(name, config, frozen, start, inliers, hopeless))
         if name == "online" and found and not len(found[0].ledger.outside):
             break
     found = [outcome for outcome in found if np.isfinite(outcome.cost)]
@@ -150,9 +150,9 @@ def _starts(frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
         return
     odometry = _along_odometry(graph, frozen.values, set(frozen.held.tolist()))
     groups = consistent_groups(graph, odometry, closures, ledger.threshold.values[closures])
-    believed = np.concatenate((others, *groups))
-    yield "neighbours", frozen.values, believed
-    yield "odometry", odometry, believed
+    inliers = np.concatenate((others, *groups))
+    yield "neighbours", frozen.values, inliers
+    yield "odometry", odometry, inliers
     out = [group[~np.isin(group, ledger.inside)] for group in groups]
     largest = max(out, key=len, default=closures[:0])
     if len(largest) >= _STORY:
@@ -160,7 +160,7 @@ def _starts(frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
 
 
 def _explained(
-    name: str, config: RobustConfig, frozen: FrozenGraph, start: Array, believed: Index | None, hopeless: float
+    name: str, config: RobustConfig, frozen: FrozenGraph, start: Array, inliers: Index | None, hopeless: float
 ) -> Outcome:
     """Solve and judge in turn, beginning with what is believed in the ledger, or with these candidates instead.
 
@@ -173,15 +173,15 @@ def _explained(
     for vertex in frozen.held.tolist():
         solver.hold(vertex)
     decisions = OutlierGate(config, graph, solver, mine)
-    if believed is not None:
-        decisions.believe(believed, frozen.keyframe)
+    if inliers is not None:
+        decisions.force_inliers(inliers, frozen.keyframe)
         solver.optimize(replace(frozen.settings, losses=decisions.cautious_losses(), max_iterations=_ITERATIONS))
-        decisions.settle(frozen.keyframe)
+        decisions.reclassify(frozen.keyframe)
     rounds = config.rounds if _cost(solver, mine) <= 2.0 * hopeless else 0
     for k in range(rounds):
         solver.optimize()
         is_last = k + 1 == rounds or _cost(solver, mine) > hopeless
-        if is_last or not (decisions.settle(frozen.keyframe) or decisions.complete(frozen.keyframe)):
+        if is_last or not (decisions.reclassify(frozen.keyframe) or decisions.readmit_next(frozen.keyframe)):
             break
     judged = np.concatenate((mine.inside, mine.outside))
     mine.statistic.values[judged], _ = solver.chi2_of(judged)

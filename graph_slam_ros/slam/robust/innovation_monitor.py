@@ -115,13 +115,13 @@ class InnovationMonitor:
         is_out = np.array([not ledger.is_inside(edge) for edge in edges.tolist()])
         innovations = np.where(is_out, ledger.statistic.values[edges], fits)
         order = np.argsort(innovations / numbers, kind="stable")
-        kept = order[: max(0, len(order) - self._by_chance(len(order)))]
-        if not len(kept):  # all may be wrong by chance
+        counted = order[: max(0, len(order) - self._by_chance(len(order)))]
+        if not len(counted):  # all may be wrong by chance
             return None
-        limit = self._decisions.looseness * quantile(_SURE, int(numbers[kept].sum()))
+        limit = self._decisions.gate_scale * quantile(_SURE, int(numbers[counted].sum()))
         landmarks = {window[k].landmark for k in np.flatnonzero(is_out).tolist()}
         count = int(np.count_nonzero(is_out))
-        return Contradiction(count, len(window), len(landmarks), float(innovations[kept].sum()), limit)
+        return Contradiction(count, len(window), len(landmarks), float(innovations[counted].sum()), limit)
 
     @property
     def is_calm(self) -> bool:
@@ -132,9 +132,9 @@ class InnovationMonitor:
         innovations, numbers = self._solver.chi2_of(newest)
         is_out = np.array([not self._ledger.is_inside(edge) for edge in newest.tolist()])
         innovations[is_out] = self._decisions.innovations(newest[is_out].tolist())
-        kept = np.argsort(innovations / numbers, kind="stable")[: -(-3 * len(newest) // 4)]
-        limit = self._decisions.looseness * quantile(_CALM_SURE, int(numbers[kept].sum()))
-        return float(innovations[kept].sum()) <= limit
+        counted = np.argsort(innovations / numbers, kind="stable")[: -(-3 * len(newest) // 4)]
+        limit = self._decisions.gate_scale * quantile(_CALM_SURE, int(numbers[counted].sum()))
+        return float(innovations[counted].sum()) <= limit
 
     def _by_chance(self, count: int) -> int:
         """How many of a count may be wrong though odometry is right."""

@@ -3,7 +3,7 @@
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.slam.robust.ledger import Ledger
 
-_SUPPORT, _FIRST = 4, 20  # believed sightings, of the first so many, that make a landmark one to compare with
+_SUPPORT, _FIRST = 4, 20  # accepted sightings, of the first so many, that make a landmark one to compare with
 _DOUBTED = 0.3  # part of them that may be held back: else the landmark itself stands at the wrong place
 
 
@@ -41,8 +41,8 @@ class LandmarkHistory:
         if landmark < self._start or landmark in self._surveyed:
             return -1
         ledger, earliest = self._ledger, self._earliest[landmark]
-        believed = [k for edge, k in earliest if edge < len(ledger) and ledger.is_inside(edge)]
+        accepted = [k for edge, k in earliest if edge < len(ledger) and ledger.is_inside(edge)]
         doubted = sum(edge < newest and not ledger.is_inside(edge) for edge, _ in earliest)
-        if doubted > _DOUBTED * (doubted + len(believed)):
+        if doubted > _DOUBTED * (doubted + len(accepted)):
             return self._graph.vertex_count
-        return believed[_SUPPORT - 1] if len(believed) >= _SUPPORT else self._graph.vertex_count
+        return accepted[_SUPPORT - 1] if len(accepted) >= _SUPPORT else self._graph.vertex_count

@@ -54,8 +54,8 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
     noise = np.linalg.inv(table.sqrt_information.values[rows])
     noise = noise @ noise.transpose(0, 2, 1)
     steps = np.abs(walked[order[ends[a]]] - walked[order[ends[b]]])
-    covariance = noise[b] + _carried(group, after, noise[a])
-    covariance += _carried(group, onwards, _walked(group, before, steps[:, 0]))
+    covariance = noise[b] + _propagated(group, after, noise[a])
+    covariance += _propagated(group, onwards, _walked(group, before, steps[:, 0]))
     covariance += _walked(group, after, steps[:, 1])
     distance = np.einsum("ki,ki->k", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
     agree = distance <= np.minimum(limits[a], limits[b])
@@ -81,10 +81,10 @@ def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
 def _walked(group: Any, motion: Array, noise: Array) -> Array:
     """Covariance of the steps of a motion, as if all had erred half way, where turns weigh as they do on average."""
     half = _columns(group.exp, 0.5 * _columns(group.log, motion))
-    return _carried(group, half, noise)
+    return _propagated(group, half, noise)
 
 
-def _carried(group: Any, motion: Array, covariance: Array) -> Array:
+def _propagated(group: Any, motion: Array, covariance: Array) -> Array:
     """The covariance, in right tangent coordinates, of what is followed by a motion."""
     adjoint = np.array([group.adjoint(tuple(one)) for one in _columns(group.inverse, motion).tolist()])
     return adjoint @ covariance @ adjoint.transpose(0, 2, 1)
