@@ -24,6 +24,7 @@ from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.parameters import _StrictLoader
 from graph_slam_ros.messages.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS, Interface
 from graph_slam_ros.node.session import Session
+from graph_slam_ros.runs import changed_since
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config, Counters, Odometry
@@ -233,6 +234,11 @@ def test_F27_a_link_in_the_run_folder_is_not_written_through(folders):
     running.save()
     assert victim.read_text() == "mine"
     assert not (folders / "now" / "path.tum").is_symlink()
+    config = folders / "now" / "config.yaml"
+    assert changed_since(config.parent) == ["config.yaml cannot be read: a symbolic link, which is not followed here"]
+    config.unlink()
+    config.write_text("")
+    assert changed_since(config.parent) == ["config.yaml is not the one that run.json was saved with"]
     (folders / "now" / "run_9.mcap").symlink_to(victim)
     file = AppendedFile(folders / "now" / "run_9.mcap")
     file.write(b"theirs")

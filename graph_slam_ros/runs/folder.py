@@ -47,6 +47,7 @@ _SCHEMAS = {INGEST: MEASUREMENT, MAP: GROWTH}
 _OF_RECORDINGS = re.compile(r"(\.(mcap|db3|bag|active|zstd|gz))+$")
 _NO_FILE = (errno.ENOENT, errno.ENOTDIR)
 _ENDS = 2**16
+_NOT_A_FILE = "not a regular file"  # in place of a mark
 _TOPICS = {"/tf", "/pose", "/path", "/landmarks"}
 
 
@@ -195,10 +196,13 @@ def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> It
 
 
 def recorded_files(folder: Path) -> dict[str, str]:
-    """What tells the recordings and the configuration of a run from those of another. Raises OSError."""
+    """What tells the recordings and the configuration of a run from those of another. Raises OSError.
+
+    Somebody may have removed the configuration meanwhile, or put a link there: results are saved all the same.
+    """
     parts = [file for name in (INGEST, MAP) for file in parts_of(folder, name)]
-    config = [folder / CONFIG] if (folder / CONFIG).exists() else []  # somebody may have removed it: results are saved
-    return {file.name: ends_of(file) for file in (*parts, *config)}
+    config = [folder / CONFIG] if os.path.lexists(folder / CONFIG) else []
+    return {file.name: ends_of(file) if is_regular(file) else _NOT_A_FILE for file in (*parts, *config)}
 
 
 def ends_of(file: Path) -> str:
