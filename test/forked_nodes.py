@@ -146,7 +146,7 @@ def serve(asked):
 def main():
     """What a node imports, but for ROS; then, in each child, the node or the command."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the node does
-    for name in ("cli", "replay", "ros.live.session"):
+    for name in ("cli", "runs.replay", "node.session"):
         importlib.import_module(f"graph_slam_ros.{name}")
     from graph_slam_ros.warmup import warmup
 

@@ -24,13 +24,18 @@ STATUS = (
 
 
 @pytest.fixture
-def with_bond(request, monkeypatch):
-    """The environment of processes that have the messages: an installed ROS, else they are built once and kept."""
+def with_bond(request, tmp_path_factory, monkeypatch):
+    """The environment of processes that have the messages: an installed ROS, else they are built once and kept.
+
+    Without the cache of pytest they are built each time.
+    """
     if is_installed():
         return
     if reason := generate_interfaces.obstacle(["bond"]):
         pytest.skip(reason)
-    built = Path(request.config.cache.mkdir(f"bond_{sysconfig.get_python_version()}"))
+    cache = getattr(request.config, "cache", None)
+    name = f"bond_{sysconfig.get_python_version()}"
+    built = Path(cache.mkdir(name)) if cache else tmp_path_factory.mktemp(name)
     if not (done := built / "built").exists():
         monkeypatch.setitem(generate_interfaces.INTERFACES, "bond", {"Status": STATUS})
         generate_interfaces.generate(["bond"], Path(sys.prefix), built)

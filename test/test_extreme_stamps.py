@@ -19,8 +19,8 @@ from messages import (
 )
 from reliability import tell
 
+from graph_slam_ros.formats.cdr import LATEST_NS
 from graph_slam_ros.messages import to_msg
-from graph_slam_ros.messages.cdr import LATEST_NS
 from graph_slam_ros.messages.inputs.transforms import Transforms
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import choose_inputs, measurements

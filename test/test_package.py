@@ -41,7 +41,7 @@ WITHIN = {
         *("lie", "graph", "solver", "measurements", "config"),
         *("slam/frontend", "slam/landmarks", "slam/robust"),
     },
-    "messages/inputs": {"lie", "graph", "measurements", "config"},
+    "messages/inputs": {"lie", "graph", "formats", "measurements", "config"},
     "messages": {"lie", "graph", "formats", "measurements", "config", "slam", "messages/inputs"},
     "recordings": {"lie", "formats", "messages", "messages/inputs"},
     "runs": {
@@ -100,7 +100,9 @@ NEVER = {
     "node/node.py": {"numpy", "scipy"},
     "analysis/evaluation.py": {"matplotlib"},
 }
-SPEAK_RCLPY = {f"node/{name}.py" for name in ("node", "player", "runtime", "subscriptions", "publishers", "parameters")}
+SPEAK_RCLPY = {
+    f"node/{name}.py" for name in ("bond", "node", "player", "runtime", "subscriptions", "publishers", "parameters")
+}
 SPEAK_MESSAGES = SPEAK_RCLPY | {"messages/to_msg.py", "node/tf_broadcaster.py", "node/services.py"}
 OUTSIDE_THE_SOLVER = {"cli", "analysis/plots.py"}
 

@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
-from graph_slam_ros.messages.cdr import LATEST_NS
+from graph_slam_ros.formats.cdr import LATEST_NS
 from graph_slam_ros.node.node import GraphSlamNode
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.slam import Odometry

@@ -1,1 +1,1 @@
-"""File syntax: g2o, TUM, the ingest sequence. The only place that knows it."""
+"""File syntax: g2o, TUM, the bytes of a message. The only place that knows it."""

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from graph_slam_ros.formats.cdr import CdrWriter
 from graph_slam_ros.lie import se3
-from graph_slam_ros.messages.cdr import CdrWriter
 from graph_slam_ros.typing import Array, Numbers
 
 _ADD, _DELETE_ALL = 0, 3

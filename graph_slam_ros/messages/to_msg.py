@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from graph_slam_ros.formats.cdr import HEADER, LATEST_NS, NS, CdrWriter, stamp
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.lie import se3
-from graph_slam_ros.messages.cdr import HEADER, LATEST_NS, NS, CdrWriter, stamp
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.typing import Array, Numbers
 

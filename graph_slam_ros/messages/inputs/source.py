@@ -9,8 +9,8 @@ import numpy as np
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import InputConfig
+from graph_slam_ros.formats.cdr import LATEST_NS
 from graph_slam_ros.lie import se3, so3
-from graph_slam_ros.messages.cdr import LATEST_NS
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.transforms import Transforms
