@@ -53,7 +53,7 @@ WITHIN = {
         *("messages", "recordings", "runs"),
     },
     "analysis": {
-        *("lie", "graph", "solver", "formats", "slam", "slam/landmarks", "slam/robust"),
+        *("lie", "graph", "solver", "formats", "measurements", "slam", "slam/landmarks", "slam/robust"),
         *("messages/inputs", "recordings", "runs", "maps"),
     },
     "simulation": {"lie", "graph", "formats", "slam", "messages", "messages/inputs", "recordings"},
