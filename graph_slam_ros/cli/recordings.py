@@ -30,7 +30,8 @@ def replay(args: argparse.Namespace) -> int:
     own = config if args.config or args.set or not is_run(args.bag) else None
     topics = {"odometry": args.odom, "landmarks": args.landmarks, "map_folder": args.map}
     done = replayed(args.bag, args.out, own, **topics, force=args.force, progress=console.progress("replay"))
-    code = _say_run(args.bag, done.summary)
+    code = max([_say_earlier(run.folder, run.summary) for run in done.earlier], default=console.DONE)
+    code = max(code, _say_run(args.bag, done.summary))
     console.say(f"results in {args.out}")
     _draw(args.out)
     _then_look(args.out)
@@ -230,6 +231,23 @@ def _say_run(source: Path, summary: dict[str, Any]) -> int:
     if not summary["keyframes"]:
         why = f": {summary['losses'][0]}" if summary.get("losses") else ", see what was counted and graph_slam info"
         raise GraphSlamError(f"{source}: no odometry of it could be used{why}")
+    return _say_shortcomings(summary)
+
+
+def _say_earlier(folder: Path, summary: dict[str, Any]) -> int:
+    """Say what came of a run that ended where time jumped back; returns as ``_say_run``."""
+    from graph_slam_ros.runs import outcome
+
+    console.say(*outcome.text(summary))
+    code = _say_shortcomings(summary)
+    console.say(f"odometry went back in time, and time.on_jump is reset: the run until then is in {folder}")
+    _draw(folder)
+    return code
+
+
+def _say_shortcomings(summary: dict[str, Any]) -> int:
+    from graph_slam_ros.runs import outcome
+
     shortcomings = list(outcome.shortcomings(summary))
     for sentence in shortcomings:
         console.tell(sentence, most=_SENTENCE)

@@ -264,7 +264,7 @@ REASONS: dict[str, Reason] = {
     # -- the node and its solver
     "memory": Reason(_REFUSED, "a closure, while memory is short", "health.memory_mib"),
     "paused": Reason(_NOTED, "it came while the node was paused", "~/resume"),
-    "stopped": Reason(_REFUSED, "the clock jumped back and time.on_jump is stop", "~/reset"),
+    "stopped": Reason(_REFUSED, "time jumped back and time.on_jump is stop", "~/reset, or --set time.on_jump=segment"),
     "worker_restarted": Reason(_NOTED, "the solver's thread died and was started again", "report it"),
     "unknown_event": Reason(_NOTED, "a recorded event of another version"),
     "fault": Reason(

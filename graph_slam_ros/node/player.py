@@ -254,11 +254,12 @@ def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subproces
     """A node of our own, on this machine and a ROS domain of its own, for as long as the context lasts."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(random.randint(1, 100))
+    kept = config.output.keep_earlier if config.time.on_jump == "reset" else 0  # runs of this recording, too
     config = replace(
         config,
         inputs=replace(config.inputs, reliable=True),
         sources=tuple(replace(one, topic=inputs.topics.get(one.name, one.topic)) for one in config.sources),
-        output=replace(config.output, folder=str(folder), keep_earlier=0),
+        output=replace(config.output, folder=str(folder), keep_earlier=kept),
         health=replace(config.health, lag_s=max(config.health.lag_s, _OWN_LAG_S)),
     )
     with tempfile.TemporaryDirectory() as scratch:

@@ -17,7 +17,7 @@ from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
 from graph_slam_ros.errors import GraphSlamError, said
-from graph_slam_ros.measurements.types import Closure, InitialPose, Measured, Sightings
+from graph_slam_ros.measurements.types import Closure, InitialPose, Measured
 from graph_slam_ros.messages import results, to_msg
 from graph_slam_ros.messages.from_msg import Decoder, MessageConverter, twist_of
 from graph_slam_ros.messages.inputs import uses
@@ -39,7 +39,7 @@ from graph_slam_ros.node.throttle import Throttle
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Odometry, Update
 from graph_slam_ros.slam.edits import removal
-from graph_slam_ros.slam.frontend.time_jump import TimeJumpDetector
+from graph_slam_ros.slam.frontend.ingest_gate import IngestGate, Passage, input_of, size_of
 
 _ACKNOWLEDGE = 32  # messages
 _MOST_UNPUBLISHED_S, _AGAIN_S = 4.0, 5.0
@@ -61,7 +61,7 @@ class Runtime:
         self.counters.on_first = self._tell
         self._border = MessageConverter(config, self.counters, _installed(config))
         self._ahead = FutureStamps(config.time.future_s, self._clock_ns, partial(self._refuse, "future"))
-        self._stamp_jump = TimeJumpDetector(config.time.jump_back_s)
+        self._gate = IngestGate(config.time.jump_back_s, self.counters, lambda: int(node.now_ns))
         self._reckoning = PoseExtrapolator(config)
         self._session = Session(config, self.counters, self._on_update, self._tell)
         self._outputs = Publishers(node, config)
@@ -71,8 +71,6 @@ class Runtime:
         self._listeners: Subscriptions | None = None
         self._broadcaster: TfBroadcaster | None = None
         self._jumps: Any = None
-        self._is_paused = self._is_stopped = False
-        self._before_ns = 0  # until the clock is there, what is dated later is of before it jumped back
         self._sends_odometry = False
         self._with_twist = {one.name for one in config.sources if one.type == results.ODOMETRY}
         self._passed = self._done = 0  # messages, by this thread and by the worker's
@@ -169,7 +167,7 @@ class Runtime:
 
     def _take(self, measured: Sequence[Measured], cdr: bytes) -> None:
         """Pass on what one message has given, or was waiting for it."""
-        if self._before_ns and self._is_of_before(measured):
+        if self._gate.is_from_before(measured):
             self._refuse("before_jump", measured)
             return
         newest = [m for m in measured if isinstance(m, Odometry) and self._is_newest(m)]
@@ -187,33 +185,25 @@ class Runtime:
         return [m for m in measured if not isinstance(m, Closure)]
 
     def _hand_over(self, measured: Sequence[Measured]) -> None:
-        """To the worker; refused before it is accepted where there is no room, or nobody wants it now."""
-        if self._stamp_jump.is_jump(measured):
-            self._begin_anew("stamps", "odometry has gone back in time and stays there")
-        reason = "stopped" if self._is_stopped else "paused" if self._is_paused else ""
-        if measured and not reason:
-            if self._worker.has_room:
-                self._session.accept(measured)
-                self._worker.offer(self._node.guarded(partial(self._use, measured)))
-                return
-            reason = "overflow"
-        self._refuse(reason, measured)
+        """Hand a message to the worker, unless the gate refuses it; then it was not accepted."""
+        has_room = self._worker.has_room
+        passage = self._gate.admit(measured, self._node.config.time.on_jump, has_room=has_room)
+        if passage.jump:
+            self._begin_anew(passage, "stamps", "odometry has gone back in time and stays there")
+        if passage.measured:
+            self._session.accept(passage.measured)
+            self._worker.offer(self._node.guarded(partial(self._use, passage.measured)))
+        else:
+            self._passed += 1
 
     def _refuse(self, reason: str, measured: Sequence[Measured]) -> None:
         """A message that goes no further: the reason counts for each thing it said."""
-        for m in measured:
-            self.counters.count(_input(m), reason, _things(m))
+        self._gate.refuse(reason, measured)
         self._passed += 1
 
     def _is_newest(self, m: Odometry) -> bool:
         """Whether odometry tells where the robot is now; what is ahead of the clock would be the newest for long."""
         return not self._ahead.is_ahead([m]) and self._reckoning.hear(m, self._session.estimate)
-
-    def _is_of_before(self, measured: Sequence[Measured]) -> bool:
-        """Whether it was on its way when the clock jumped back: it is dated nearer to the time before."""
-        if self._node.now_ns >= self._before_ns:
-            self._before_ns = 0
-        return 0 < self._before_ns < max((m.stamp_ns for m in measured), default=0)
 
     def _clock_ns(self) -> int:
         """The clock that stamps are judged by: of a recording that is played it is no better than they are."""
@@ -249,27 +239,24 @@ class Runtime:
         """The clock jumped back, or another one is used."""
         estimate = self._session.estimate
         self._ahead.forget_time()
-        self._before_ns = self._node.now_ns - jump.delta.nanoseconds // 2
+        self._gate.clock_jumped(jump.delta.nanoseconds)
         if estimate is None and not self._worker.waiting:
             return
-        self._begin_anew("clock", f"jumped by {jump.delta.nanoseconds * 1e-9:.3f} s")
+        passage = self._gate.begin_anew(self._node.config.time.on_jump)
+        self._begin_anew(passage, "clock", f"jumped by {jump.delta.nanoseconds * 1e-9:.3f} s")
 
-    def _begin_anew(self, who: str, why: str) -> None:
+    def _begin_anew(self, passage: Passage, who: str, why: str) -> None:
         """What comes now is of another time."""
-        what = self._node.config.time.on_jump
-        self._tell(who, f"{why}: {what}")
-        self._stamp_jump.forget()
+        self._tell(who, f"{why}: {passage.jump}")
         self._border.forget_time()
         self._reckoning.forget()
         self._outputs.forget_time()
         if self._broadcaster is not None:
             self._broadcaster.forget_time()
-        if what == "stop":
-            self._is_stopped = True
-        elif what == "reset":
+        if passage.jump == "reset":
             self.in_passing(self.reset())
-        else:
-            self.in_passing(self.control("time_jump"))
+        elif passage.events:
+            self.in_passing(self._in_sequence(passage.events))
 
     def _look(self) -> tuple[Config, Estimate | None, Odometry | None]:
         return self._node.config, self._session.estimate, self._reckoning.newest
@@ -342,7 +329,7 @@ class Runtime:
         return self._anew(self._session.reset)
 
     def _anew(self, job: Callable[[], str]) -> "Future[str]":
-        self._is_stopped = False
+        self._gate.begin_run()
         self._reckoning.forget()
         self._session.hold()
 
@@ -362,7 +349,7 @@ class Runtime:
 
     def pause(self, is_paused: bool) -> "Future[str]":
         """Take nothing more, or again."""
-        self._is_paused = is_paused
+        self._gate.is_paused = is_paused
         return self._worker.call(lambda: "paused" if is_paused else "takes measurements")
 
     def control(self, event: str) -> "Future[str]":
@@ -392,7 +379,7 @@ class Runtime:
         finally:
             self._done += 1
             for m in measured:
-                self._taken[_input(m)] += _things(m)
+                self._taken[input_of(m)] += size_of(m)
             if self._is_overdue:
                 self._publish_due()
             if self._has_player and (not self._worker.waiting or self._done % _ACKNOWLEDGE == 0):
@@ -436,9 +423,9 @@ class Runtime:
             inputs,
             session.estimate,
             waits_for_clock=node.get_parameter("use_sim_time").value and not node.now_ns,
-            is_paused=self._is_paused,
+            is_paused=self._gate.is_paused,
             loads=session.loads,
-            is_stopped=self._is_stopped,
+            is_stopped=self._gate.is_stopped,
             lag_s=self._worker.lag_s,
             waiting=self._worker.waiting,
             busy_s=self._worker.busy_s,
@@ -457,16 +444,6 @@ class Runtime:
             preparing=self._preparation.said,
             cannot_prepare=self._preparation.fault,
         )
-
-
-def _input(m: Measured) -> str:
-    """The input that a measurement is of."""
-    return m.source.partition("#")[0] if isinstance(m, Odometry) else m.topic
-
-
-def _things(m: Measured) -> int:
-    """Each sighting counts."""
-    return len(m.sightings) if isinstance(m, Sightings) else 1
 
 
 def _installed(config: Config) -> dict[str, Decoder]:

@@ -270,8 +270,10 @@ def check_room(folder: Path, source: Path | None = None, *, force: bool = False)
         raise RunError(f"{folder}: {error.strerror}") from None
 
 
-def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> None:
+def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> Path | None:
     """Move an earlier run out of the way: to ``folder-1``, or one more than the last; so many of them are kept.
+
+    Returns where it is now; None where there is none to keep.
 
     One that holds nothing is not kept; one that was never ended, or that an earlier version wrote, is in any case. Of
     older ones the files of the run are removed, and nothing else.
@@ -283,7 +285,7 @@ def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> None:
     is_of_earlier_version = is_run(folder) and not _is_marked(folder)
     most = max(most, is_cut_off(folder) or is_incomplete(folder) or is_of_earlier_version)
     if not _holds_something(folder) or not most:
-        return
+        return None
     earlier = earlier_runs(folder)
     target = folder.with_name(f"{folder.name}-{max(_numbered(folder), default=0) + 1}")
     try:
@@ -294,6 +296,7 @@ def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> None:
                 remove(earlier[number])
     except OSError as error:
         raise RunError(f"{folder}: cannot be moved to {target.name}: {error.strerror}") from None
+    return target
 
 
 def earlier_runs(folder: Path) -> dict[int, Path]:

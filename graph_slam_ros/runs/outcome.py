@@ -19,7 +19,7 @@ _MOSTLY = 0.5
 _CONTRADICT = (
     "graph_slam explain RUN says why; if its noise is larger than told, --set {0}.noise=sigmas {0}.sigma_m=..."
 )
-
+_ON_JUMP = "--set time.on_jump=segment goes on in the same map, reset in another run"
 _EXTREME = "distances or noise that no robot means do that: --set INPUT.max_distance_m=... or INPUT.noise=sigmas"
 
 
@@ -80,6 +80,8 @@ def shortcomings(summary: Summary) -> Iterator[str]:
     inputs: Mapping[str, Any] = summary.get("inputs", {})
     if summary.get("failing"):
         yield f"the last solve failed ({summary['failing']}), and the estimate is the one before it: {_EXTREME}"
+    if stopped := sum(reasons.get("stopped", 0) for reasons in summary["counters"].values()):
+        yield f"time jumped back, and time.on_jump is stop: {stopped} measurements after it were refused: {_ON_JUMP}"
     for name, counts in inputs.items():
         counted = _counted(summary, name, Effect.REFUSED)
         refused = sum(counted.values())

@@ -1,8 +1,10 @@
 """Replay: a recording, or the ingest sequence of an earlier run, through ``GraphSlam`` as fast as the CPU allows."""
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from graph_slam_ros.runs import (
     check_room,
     config_of,
     is_run,
+    keep_earlier,
     map_of,
     missing,
     record_run,
@@ -28,13 +31,17 @@ from graph_slam_ros.runs import (
 )
 from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.restore import Took
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
-from graph_slam_ros.slam.frontend.time_jump import TimeJumpDetector
+from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
 from graph_slam_ros.warmup import warmup
 
 TF_STATIC_TOPIC, TF_TOPIC = "/tf_static", "/tf"
 _OPTIONS = {"odometry": "--odom", "landmarks": "--landmarks"}
 _OPTIONAL = default_input("detections")  # a recording need not have what nobody asked for
+
+END = Control("end"), Control("optimize")
+"""A recording ends: what waits is released, and the whole is solved."""
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
@@ -55,13 +62,27 @@ class Inputs:
 
 
 @dataclass(frozen=True, slots=True)
+class EarlierRun:
+    """A run that ended where time jumped back (``time.on_jump`` is reset), and its numbers."""
+
+    folder: Path
+    summary: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
 class Replayed:
-    """What came of a replay: the pipeline at its end, numbers, what could not be read, and what to beware of."""
+    """The outcome of a replay: the pipeline at its end, numbers, what could not be read, and what to beware of.
+
+    Attributes
+    ----------
+    earlier : the runs before the last, which ``time.on_jump: reset`` has ended
+    """
 
     slam: GraphSlam
     summary: dict[str, Any]
     losses: list[str]
     warnings: list[str]
+    earlier: tuple[EarlierRun, ...] = ()
 
 
 def choose_inputs(bag: Bag, config: Config, odometry: str | None = None, landmarks: str | None = None) -> Inputs:
@@ -124,8 +145,8 @@ def measurements(
 ) -> Iterator[list[Measured | Control]]:
     """What the border makes of each recorded message, in order, and at the end of what has waited.
 
-    Where the stamps of odometry begin anew, a segment does. Static transforms are read first: they hold for the whole
-    recording.
+    Where the stamps of odometry begin anew, ``time.on_jump`` says what becomes of the run. Static transforms are read
+    first: they hold for the whole recording.
 
     Parameters
     ----------
@@ -136,31 +157,72 @@ def measurements(
     BagError
         At once, before anything is read: a recorded definition is not what we can use.
     """
-    used = [bag.topics[topic] for topic in inputs.topics.values()]
-    border = MessageConverter(config, counters, {topic.type: recorded_decoder(topic) for topic in used})
-    for name in counters.received.keys() - inputs.topics.keys():
-        del counters.received[name]  # nobody asked for it
-    if datum:
-        border.begin_at(datum)
-    return _through(border, bag, inputs, TimeJumpDetector(config.time.jump_back_s))
+    return (measured for _, measured in RecordedRuns(bag, inputs, config, counters, datum))
 
 
-def _through(
-    border: MessageConverter, bag: Bag, inputs: Inputs, jump: TimeJumpDetector
-) -> Iterator[list[Measured | Control]]:
-    if TF_STATIC in inputs.topics:
-        for message in bag.messages({inputs.topics[TF_STATIC]}):
-            border.take(TF_STATIC, message.cdr)
-    by_topic = inputs.by_topic()
-    for message in bag.messages(set(by_topic)):
-        measured = [m for name in by_topic[message.topic] for m in border.take(name, message.cdr)]
-        if jump.is_jump(measured):
-            border.forget_time()
-            jump.forget()
-            yield [Control("time_jump"), *measured]
-        else:
-            yield [*measured]
-    yield [*border.finish()]
+class RecordedRuns:
+    """The measurements of a recording as the gate lets them pass: one run, or several where ``time.on_jump`` is reset.
+
+    Parameters
+    ----------
+    datum : as of ``measurements``
+
+    Attributes
+    ----------
+    counted : what was counted when each run but the last ended
+
+    Raises
+    ------
+    BagError
+        A recorded definition is not what we can use.
+    """
+
+    def __init__(
+        self, bag: Bag, inputs: Inputs, config: Config, counters: Counters, datum: tuple[float, ...] = ()
+    ) -> None:
+        self._bag, self._inputs, self._counters = bag, inputs, counters
+        self._on_jump = config.time.on_jump
+        self._gate = IngestGate(config.time.jump_back_s, counters)
+        self.counted: list[Counters] = []
+        used = [bag.topics[topic] for topic in inputs.topics.values()]
+        self._converter = MessageConverter(config, counters, {topic.type: recorded_decoder(topic) for topic in used})
+        for name in counters.received.keys() - inputs.topics.keys():
+            del counters.received[name]  # nobody asked for it
+        if datum:
+            self._converter.begin_at(datum)
+
+    def __iter__(self) -> Iterator[tuple[int, list[Measured | Control]]]:
+        """Yield the number of the run, from 0, and what comes of each message; the end of a run is among it."""
+        bag, by_topic = self._bag, self._inputs.by_topic()
+        if TF_STATIC in self._inputs.topics:
+            for message in bag.messages({self._inputs.topics[TF_STATIC]}):
+                self._converter.take(TF_STATIC, message.cdr)
+        for message in bag.messages(set(by_topic)):
+            names = by_topic[message.topic]
+            yield from self._passed([m for name in names for m in self._converter.take(name, message.cdr)], names)
+        yield from self._passed(self._converter.finish(), ())
+
+    def _passed(self, measured: list[Measured], names: Sequence[str]) -> Iterator[tuple[int, list[Measured | Control]]]:
+        passage = self._gate.admit(measured, self._on_jump)
+        if passage.jump:
+            self._converter.forget_time()
+        if passage.jump == "reset":
+            for event in END:
+                yield len(self.counted), [event]
+            self.counted.append(self._counted_before(names))
+        yield len(self.counted), [*passage.events, *passage.measured]
+
+    def counted_in(self, number: int) -> Counters:
+        """What was counted while a run lasted, by its number; of the last, until now."""
+        end = self.counted[number] if number < len(self.counted) else self._counters
+        return end.since(self.counted[number - 1] if number else Counters())
+
+    def _counted_before(self, names: Sequence[str]) -> Counters:
+        """What was counted before a message of these inputs, which is of the next run."""
+        before = Counters()
+        before.update(self._counters)
+        before.received.subtract(names)
+        return before
 
 
 def replay(
@@ -190,42 +252,85 @@ def replay(
     """
     took = stopwatch()
     source, out = Path(source), Path(out)
-    border = Counters()
     check_room(out, source, force=force)
-    state = None
-    if is_run(source):
-        if map_folder is not None:
-            raise RunError(f"{source}: a run is repeated in the map that it began in; a map is for a recording")
-        config, own = with_survey(config or run_config(source)), run_config(source)
-        if config.world != own.world:
-            raise RunError(f"{source}: world.dimensions is {own.world.dimensions} there")
-        losses, warnings, total = missing(source), list[str](), 0
-        state = read_map(source, losses, start_only=True)
-        items: Iterable[Sequence[Measurement]] = ([from_record(record)] for record in read_ingest(source, losses))
-    else:
-        of_map: list[str] = []
-        if map_folder is not None:
-            state = map_of(Path(map_folder), of_map)
-            config = config or config_of(Path(map_folder), state)
-        config = with_survey(config or Config())
-        bag = open_bag(source)
-        inputs = choose_inputs(bag, config, odometry, landmarks)
-        items = _with_end(measurements(bag, inputs, config, border, state.datum if state is not None else ()))
-        total = sum(bag.topics[topic].count for topic in inputs.by_topic()) + 3
-        bag.losses += of_map
-        losses, warnings = bag.losses, bag.warnings
+    if not is_run(source):
+        map_folder = None if map_folder is None else Path(map_folder)
+        return _recorded(source, out, config, (odometry, landmarks), map_folder, took, progress, force=force)
+    if map_folder is not None:
+        raise RunError(f"{source}: a run is repeated in the map that it began in; a map is for a recording")
+    config, own = with_survey(config or run_config(source)), run_config(source)
+    if config.world != own.world:
+        raise RunError(f"{source}: world.dimensions is {own.world.dimensions} there")
+    losses = missing(source)
+    state = read_map(source, losses, start_only=True)
     warmup()
-    one_by_one = chain.from_iterable(progress(items, total))
-    name = recording_of(source) if is_run(source) else source.resolve().name
+    measured = progress((from_record(record) for record in read_ingest(source, losses)), 0)
     slam, summary = record_run(
-        out, config, one_by_one, losses, state, border=border, took=took, recording=name, force=force
+        out, config, measured, losses, state, took=took, recording=recording_of(source), force=force
     )
-    told = [*map(str, slam.alarms), *mendable(summary["counters"])]
-    return Replayed(slam, summary, summary["losses"], [*warnings, *told])
+    return Replayed(slam, summary, summary["losses"], _warnings(slam, summary))
 
 
-def _with_end(items: Iterable[Sequence[Measurement]]) -> Iterator[Sequence[Measurement]]:
-    """A recording ends: what waits is released, and the whole is solved."""
-    yield from items
-    yield [Control("end")]
-    yield [Control("optimize")]
+def _recorded(
+    source: Path,
+    out: Path,
+    config: Config | None,
+    topics: tuple[str | None, str | None],
+    map_folder: Path | None,
+    took: Took,
+    progress: Progress,
+    *,
+    force: bool,
+) -> Replayed:
+    """The runs of a recording: the last is in ``out``, those before it beside it."""
+    losses: list[str] = []
+    state = None if map_folder is None else map_of(map_folder, losses)
+    if map_folder is not None and state is not None:
+        config = config or config_of(map_folder, state)
+    config = with_survey(config or Config())
+    bag = open_bag(source)
+    inputs = choose_inputs(bag, config, *topics)
+    runs = RecordedRuns(bag, inputs, config, Counters(), state.datum if state is not None else ())
+    total = sum(bag.topics[topic].count for topic in inputs.by_topic()) + 3
+    bag.losses += losses
+    warmup()
+    earlier: list[EarlierRun] = []
+    warnings: list[str] = []
+    summary: dict[str, Any] = {}
+    for number, run in groupby(progress(_with_end(runs), total), key=itemgetter(0)):
+        if number:
+            earlier.append(EarlierRun(_kept(out), summary))
+            state, took = None, stopwatch()
+        refused = Counters()
+        measured, name = _measured(run, runs, number, refused), source.resolve().name
+        slam, summary = record_run(
+            out, config, measured, bag.losses, state, border=refused, took=took, recording=name, force=force
+        )
+        warnings += _warnings(slam, summary)
+    return Replayed(slam, summary, summary["losses"], [*bag.warnings, *warnings], tuple(earlier))
+
+
+def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
+    return [*map(str, slam.alarms), *mendable(summary["counters"])]
+
+
+def _kept(out: Path) -> Path:
+    """Move a run out of the way of the next, as the node does; none is removed for it."""
+    if (kept := keep_earlier(out, sys.maxsize)) is None:
+        raise RunError(f"{out}: the run until time jumped back holds nothing")
+    return kept
+
+
+def _measured(
+    run: Iterable[tuple[int, Sequence[Measurement]]], runs: RecordedRuns, number: int, refused: Counters
+) -> Iterator[Measurement]:
+    """The measurements of a run one by one, and at its end in ``refused`` what was counted meanwhile."""
+    for _, some in run:
+        yield from some
+    refused.update(runs.counted_in(number))
+
+
+def _with_end(runs: RecordedRuns) -> Iterator[tuple[int, Sequence[Measurement]]]:
+    """All runs of a recording, the last with its end."""
+    yield from runs
+    yield from ((len(runs.counted), [event]) for event in END)

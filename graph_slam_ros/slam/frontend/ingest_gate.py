@@ -1,0 +1,99 @@
+"""The gate in front of the pipeline: what a jump of time, a pause, a stop and a full queue mean for what arrives.
+
+The node and a replay ask the same gate, so that both make the same run of the same messages.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import Control, Measured, Odometry, Sightings
+from graph_slam_ros.slam.frontend.time_jump import TimeJumpDetector
+
+
+@dataclass(frozen=True, slots=True)
+class Passage:
+    """What the gate has decided on one message.
+
+    Attributes
+    ----------
+    jump : ``time.on_jump`` where time jumped back with this message: segment, reset or stop; empty: it did not
+    events : what the pipeline processes before the measurements
+    measured : the measurements that go on to the pipeline; empty where they were refused
+    """
+
+    jump: str = ""
+    events: tuple[Control, ...] = ()
+    measured: Sequence[Measured] = ()
+
+
+class IngestGate:
+    """Decides which measurements go on to the pipeline, and counts what it refuses.
+
+    Parameters
+    ----------
+    jump_back_s : ``time.jump_back_s``
+    counters : where each refused measurement counts, by its input and the reason
+    now_ns : the clock, for what was on its way when the clock jumped back; 0 where there is none
+
+    Attributes
+    ----------
+    is_paused : whether everything is refused for now
+    is_stopped : whether everything is refused until another run begins: time jumped, and ``time.on_jump`` is stop
+    """
+
+    def __init__(self, jump_back_s: float, counters: Counters, now_ns: Callable[[], int] = lambda: 0) -> None:
+        self._detector = TimeJumpDetector(jump_back_s)
+        self._counters, self._now_ns = counters, now_ns
+        self._jumped_ns = 0  # halfway between the clock before its jump and after; 0: it did not jump lately
+        self.is_paused = self.is_stopped = False
+
+    def admit(self, measured: Sequence[Measured], on_jump: str, *, has_room: bool = True) -> Passage:
+        """Decide on the measurements of one message.
+
+        Parameters
+        ----------
+        on_jump : ``time.on_jump``, as it is now
+        has_room : whether the queue of the pipeline takes another message
+        """
+        jump = self.begin_anew(on_jump) if self._detector.is_jump(measured) else Passage()
+        reason = "stopped" if self.is_stopped else "paused" if self.is_paused else "" if has_room else "overflow"
+        if reason:
+            self.refuse(reason, measured)
+            return jump
+        return Passage(jump.jump, jump.events, measured)
+
+    def begin_anew(self, on_jump: str) -> Passage:
+        """Decide on a jump of time: what comes from now on is of another time."""
+        self._detector.forget()
+        self.is_stopped = on_jump == "stop" or (self.is_stopped and on_jump != "reset")
+        return Passage(on_jump, (Control("time_jump"),) if on_jump == "segment" else ())
+
+    def begin_run(self) -> None:
+        """Another run begins: it takes measurements, whatever stopped the one before."""
+        self.is_stopped = False
+
+    def clock_jumped(self, by_ns: int) -> None:
+        """Refuse from now on what was on its way when the clock jumped (``is_from_before``)."""
+        self._jumped_ns = self._now_ns() - by_ns // 2
+
+    def is_from_before(self, measured: Sequence[Measured]) -> bool:
+        """Whether measurements were on their way when the clock jumped back: they are dated nearer to that time."""
+        if self._jumped_ns and self._now_ns() >= self._jumped_ns:
+            self._jumped_ns = 0
+        return 0 < self._jumped_ns < max((m.stamp_ns for m in measured), default=0)
+
+    def refuse(self, reason: str, measured: Sequence[Measured]) -> None:
+        """Count measurements that go no further; each sighting counts."""
+        for m in measured:
+            self._counters.count(input_of(m), reason, size_of(m))
+
+
+def input_of(m: Measured) -> str:
+    """The input or topic that a measurement is of."""
+    return m.source.partition("#")[0] if isinstance(m, Odometry) else m.topic
+
+
+def size_of(m: Measured) -> int:
+    """The number of things in a measurement: its sightings, or one."""
+    return len(m.sightings) if isinstance(m, Sightings) else 1
