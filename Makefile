@@ -38,7 +38,7 @@ demo: install
 	@$(BIN)/graph_slam demo --force
 
 # Four on two cores, too: tests of nodes wait for half of their time.
-PYTEST := $(BIN)/python -m pytest -q -n 4 --dist worksteal
+PYTEST := $(BIN)/python -m pytest -q -n 4 --dist worksteal --durations=25 --durations-min=2
 
 check: lint $(VENV)/kernels.stamp
 	$(PYTEST) -m unit
