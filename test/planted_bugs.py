@@ -1,9 +1,11 @@
 """Ten ways in which such systems are known to fail, put into a copy of this one, one at a time: tests must see each.
 
 ``python test/planted_bugs.py [NAME ...]`` copies the sources to a temporary folder, where the tests must pass as they
-are and fail with each bug. Its exit code is 0 where all were caught.
+are and fail with each bug. Its exit code is 0 where all were caught. A bug is planted by a symbol's name, so that other
+changes of the source leave it.
 """
 
+import ast
 import contextlib
 import os
 import shutil
@@ -11,6 +13,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
@@ -25,30 +28,82 @@ PASSED, FAILED = 0, 1  # exit codes of pytest
 
 
 @dataclass(frozen=True)
+class Change:
+    """What one name of the package is instead.
+
+    Attributes
+    ----------
+    file : of the package
+    symbol : name in the module, or class and name: of a function or method, or of what a value is assigned to
+    instead : body of the function, in which ``original`` is the function as it was; or the value
+    """
+
+    file: str
+    symbol: str
+    instead: str
+
+    def made(self, text):
+        """The source with the change. Raises LookupError where the symbol is not in it, once."""
+        nodes = [ast.parse(text)]
+        for name in self.symbol.split("."):
+            nodes = [one for node in nodes for one in node.body if name in _names(one)]
+        if len(nodes) != 1:
+            raise LookupError(f"{self.file} has {self.symbol} {len(nodes)} times, not once: was it renamed or moved?")
+        (node,) = nodes
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            lines = text.encode().splitlines(keepends=True)
+            value, first, last = node.value, node.value.lineno - 1, node.value.end_lineno - 1
+            start, end = lines[first][: value.col_offset], lines[last][value.end_col_offset :]
+            lines[first : last + 1] = [start + self.instead.encode() + end]
+            return b"".join(lines).decode()
+        if node.decorator_list:
+            raise LookupError(f"{self.file}: {self.symbol} has a decorator, which would be lost")
+        for argument in ast.walk(node.args):
+            if isinstance(argument, ast.arg):
+                argument.annotation = None
+        planted = f"def planted({ast.unparse(node.args)}):\n{textwrap.indent(self.instead, '    ')}\nreturn planted"
+        return (
+            f"{text}\n\ndef _plant(original):\n{textwrap.indent(planted, '    ')}\n\n\n"
+            f"{self.symbol} = _plant({self.symbol})\n"
+        )
+
+
+def _names(node):
+    """What a statement defines."""
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        return {node.name}
+    if isinstance(node, ast.AnnAssign) and node.value is not None:
+        return {ast.unparse(node.target)}
+    return {ast.unparse(target).strip("()") for target in node.targets} if isinstance(node, ast.Assign) else set()
+
+
+@dataclass(frozen=True)
 class Bug:
     """A fault, and what must see it.
 
     Attributes
     ----------
     finding : what happens elsewhere
-    changes : files of the package, what is there exactly once, and what is put there instead
     tests : each of which must fail
     """
 
     name: str
     finding: str
-    changes: tuple[tuple[str, str, str], ...]
+    changes: tuple[Change, ...]
     tests: tuple[str, ...]
 
     def planted(self, root):
         """The files that change, by what is in them, and what is to be."""
         before, after = {}, {}
-        for name, there, instead in self.changes:
-            file = root / "graph_slam_ros" / name
+        for change in self.changes:
+            file = root / "graph_slam_ros" / change.file
+            if not file.is_file():
+                raise LookupError(f"{self.name}: there is no {change.file}: was it renamed or moved?")
             before.setdefault(file, file.read_text(encoding="utf-8"))
-            text = after.get(file, before[file])
-            assert text.count(there) == 1, f"{self.name}: {name} has {text.count(there)} times, not once:\n{there}"
-            after[file] = text.replace(there, instead)
+            try:
+                after[file] = change.made(after.get(file, before[file]))
+            except LookupError as error:
+                raise LookupError(f"{self.name}: {error}") from None
         return before, after
 
 
@@ -56,19 +111,19 @@ BUGS = (
     Bug(
         "undetermined_landmark",
         "one landmark by bearing alone makes the whole problem singular",
-        (("slam/landmarks/landmark_map.py", "        if not candidate.reason:\n", "        if candidate.places:\n"),),
+        (
+            Change(
+                "slam/landmarks/landmark_map.py",
+                "Landmarks._why_not",
+                "return '' if places else original(self, places, glances)",
+            ),
+        ),
         ("test_pipeline_kinds.py::test_G3_a_landmark_seen_by_bearing_from_one_place_waits_and_says_why",),
     ),
     Bug(  # all of the check: a cost that is not finite fails its second half, too
         "unchecked_solution",
         "a solve that returns what is not finite counts as done",
-        (
-            (
-                "slam/failure_guard.py",
-                "        values, before = self._solver.values, self._last_good()\n",
-                "        return\n",
-            ),
-        ),
+        (Change("slam/failure_guard.py", "FailureGuard._refuse_absurd", "return"),),
         (
             "test_solver_faults.py::"
             "test_T14_whatever_fails_at_any_solve_the_last_good_estimate_stays_and_soon_one_succeeds[6]",
@@ -78,13 +133,8 @@ BUGS = (
         "any_covariance",
         "a covariance that is zero or not positive definite is taken as it is",
         (
-            (
-                "messages/inputs/source.py",
-                "        if lengths and not block[:lengths, :lengths].any():\n",
-                "        if False:\n",
-            ),
-            ("messages/inputs/checks.py", "    repairs = []\n", "    return block, []\n"),
-            ("messages/inputs/checks.py", "    if not block.any():\n", "    if False:\n"),
+            Change("messages/inputs/source.py", "InputContext.checked", "return tuple(block.ravel().tolist())"),
+            Change("messages/inputs/checks.py", "covariance", "return block, []"),
         ),
         (
             "test_message_cases.py::test_A7_zero_covariance_means_unknown",
@@ -94,7 +144,10 @@ BUGS = (
     Bug(  # of two: what is singular in the eyes of the graph is mended after this
         "no_condition_limit",
         "odometry that is too sure of itself breaks the factorisation",
-        (("measurements/edge_noise.py", "    least = covariance + ", "    least = covariance + 0.0 * "),),
+        (
+            Change("measurements/edge_noise.py", "LEAST_M2, LEAST_RAD2", "0.0, 0.0"),
+            Change("measurements/edge_noise.py", "_FINEST", "0.0"),
+        ),
         (
             "test_graph_cases.py::"
             "test_A12_however_certain_odometry_says_it_is_its_edges_are_not_and_what_they_are_part_of_is_solved",
@@ -103,7 +156,7 @@ BUGS = (
     Bug(  # below the node, whose worker would count and go on without a solution
         "fatal_solve",
         "a solve that raises ends the node",
-        (("slam/failure_guard.py", "            self._fail(error)\n", "            raise error\n"),),
+        (Change("slam/failure_guard.py", "FailureGuard._fail", "raise error"),),
         (
             "test_graph_cases.py::"
             "test_G7_where_nothing_that_has_come_is_to_blame_the_last_good_estimate_is_held_until_it_heals",
@@ -112,17 +165,17 @@ BUGS = (
     Bug(  # below the node, where clock and stamps both tell of a jump
         "ignored_time_jump",
         "after time has jumped back all that comes is refused as late",
-        (("slam/graph_slam.py", "                self._forget_time()\n", "                pass\n"),),
+        (Change("slam/graph_slam.py", "GraphSlam._forget_time", "pass"),),
         ("test_timing_cases.py::test_B7_after_a_jump_of_time_what_is_older_than_the_map_is_used_and_begins_a_segment",),
     ),
     Bug(
         "written_over",
         "results are written straight over those of before",
         (
-            (
+            Change(
                 "runs/recorder.py",
-                "    write_whole(folder / name, data)\n",
-                "    (folder / name).write_bytes(data)\n",
+                "_put",
+                "(folder / name).write_bytes(text.encode())\nreturn checksum(text.encode())",
             ),
         ),
         ("test_journal.py::test_T11_a_crash_at_any_call_that_reaches_the_disk_loses_nothing_that_was_told",),
@@ -130,23 +183,17 @@ BUGS = (
     Bug(
         "journal_at_the_end",
         "what was told is not on the disk when the node is killed",
-        (
-            (
-                "runs/recorder.py",
-                "            self._fill()\n            self._journal.flush()\n",
-                "            return\n",
-            ),
-        ),
+        (Change("runs/recorder.py", "RunRecorder.flush", "return"),),
         ("test_journal.py::test_T11_a_crash_at_any_call_that_reaches_the_disk_loses_nothing_that_was_told",),
     ),
     Bug(
         "unchecked_chunks",
         "a damaged recording reads well, with other messages",
         (
-            (
+            Change(
                 "recordings/mcap_records.py",
-                "    if chunk.uncompressed_crc not in (0, zlib.crc32(plain)):\n",
-                "    if False:\n",
+                "_inside",
+                "from dataclasses import replace\nreturn original(replace(chunk, uncompressed_crc=0))",
             ),
         ),
         (
@@ -158,12 +205,8 @@ BUGS = (
         "every_closure_believed",
         "false closures destroy the map",
         (
-            ("config/robust.py", "    decide: bool = setting(True, ", "    decide: bool = setting(False, "),
-            (
-                "config/robust.py",
-                '        "dcs", "of closures and fixes; ',
-                '        "none", "of closures and fixes; ',
-            ),
+            Change("config/robust.py", "RobustConfig.decide", "setting(False, 'planted')"),
+            Change("config/robust.py", "RobustConfig.loss", "setting('none', 'planted', choices=LOSSES)"),
         ),
         ("test_decisions.py::test_G10_false_closures_pull_nothing_and_all_true_ones_stay",),
     ),
