@@ -29,6 +29,6 @@ class ConfigError(GraphSlamError):
     """A configuration key, value or combination that is not valid."""
 
 
-def said(error: BaseException) -> str:
+def message_of(error: BaseException) -> str:
     """An exception in one line: one of ours says enough by itself."""
     return str(error) if isinstance(error, GraphSlamError) else f"{type(error).__name__}: {error}"

@@ -105,7 +105,7 @@ def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = N
 
 def _solved(file: G2oFile, settings: Settings | None, init: str) -> Solution:
     solver, start = started(file, init)
-    take_whole(solver, file)
+    add_graph(solver, file)
     report = solver.optimize(settings)
     return Solution(file, solver, report, start, attempts=(Attempt(start, report.chi2_final, report.cost_final),))
 
@@ -163,7 +163,7 @@ def started(file: G2oFile, init: str) -> tuple[Solver, str]:
     return solver, start
 
 
-def take_whole(solver: Solver, file: G2oFile) -> None:
+def add_graph(solver: Solver, file: G2oFile) -> None:
     """Give a solver all of a graph, and hold what FIX lines name; the first pose where nothing else fixes it."""
     graph = file.graph
     solver.add(range(graph.vertex_count), range(graph.edge_count))

@@ -59,7 +59,7 @@ def target(name, file):
         if data:
             border = MessageConverter(config, Counters())
             for _ in range(2):
-                border.take(tuple(INPUTS)[data[0] % len(INPUTS)], data[1:])
+                border.convert(tuple(INPUTS)[data[0] % len(INPUTS)], data[1:])
 
     def journal(data):
         """The lines as records of both files; beginning with mcap's magic, as the files themselves."""

@@ -111,7 +111,7 @@ def border(*links, decoders=None, **sections):
     sections["inputs"] = {"tf": False, **sections.get("inputs", {})}
     out = MessageConverter(Config.from_mapping(sections), Counters(), decoders)
     if links:
-        out.take("tf_static", transforms(*links))
+        out.convert("tf_static", transforms(*links))
     return out
 
 
@@ -140,7 +140,7 @@ def listening(name, type_name, *links, dimensions=2, decoders=None, settings=Non
 
 def heard(b, name, cdr):
     """The one measurement of a message, or None."""
-    out = b.take(name, cdr)
+    out = b.convert(name, cdr)
     assert len(out) <= 1
     return out[0] if out else None
 

@@ -215,10 +215,10 @@ def play(seed, type_name, use, dimensions, count, sigma=0.1):
         cdr = bytes(STORE.serialize_cdr(sender.message(type_name), type_name))
         if sender.rng.random() < 0.2:
             cdr = sender.damaged(cdr)
-        out += b.take("any", cdr)
+        out += b.convert("any", cdr)
         became["rejected"] += counted(b).get("any", {}).get("undecodable", 0) - told
         turret = ("base_link", "turret", (1.0, 0.0, 0.0), quaternion(yaw=0.1 * k))
-        out += b.take("tf", transforms(turret, stamp_ns=STAMP_NS + (k % 20 - 10) * S // 10))
+        out += b.convert("tf", transforms(turret, stamp_ns=STAMP_NS + (k % 20 - 10) * S // 10))
     out += b.finish()
     assert not b._waiting
     for m in out:

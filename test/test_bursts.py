@@ -138,7 +138,7 @@ class Burst:
             kind.Request(parameters=given),
         )
 
-    def look(self):
+    def observe(self):
         names = [self.rng.choice(["", "nobody", "solve.method", "a" * 5000, *LIVE]) for _ in range(3)]
         depth = self.rng.choice([0, 1, 2**64 - 1])
         change = ChangeState.Request()

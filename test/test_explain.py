@@ -129,7 +129,7 @@ def test_every_type_of_edge_can_be_told(tag):
     entry = dataclasses.replace(_ENTRY, tag=tag, measured=tuple(measured), information=tuple(information), dof=m)
     entry = dataclasses.replace(entry, residual=tuple(np.full(m, 0.25)))
     assert measurement_text.expected(entry) == pytest.approx([0.25] * m)
-    assert len(measurement_text.told(entry, measurement_text.sigmas(entry)).split(", ")) == m
+    assert len(measurement_text.with_units(entry, measurement_text.sigmas(entry)).split(", ")) == m
 
 
 _ENTRY = Entry(0, "", "", "", "", (0,), 0, 0, (), (), (), 0.0, 0, 1.0, 0.0, 1.0, Verdict.ACCEPTED, Reason.NONE)

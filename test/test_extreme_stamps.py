@@ -135,7 +135,7 @@ def test_B25_a_drive_that_begins_or_ends_where_time_does_is_the_same_drive(tmp_p
 def test_B25_an_offset_does_not_lead_beyond_the_end_of_time_and_results_are_not_dated_there():
     for offset_s, reason in ((2.0, "bad_stamp"), (-2.0, "")):
         b = border(odom={"offset_s": offset_s})
-        assert len(b.take("odom", odometry(stamp_ns=LATEST_NS - S))) == (not reason)
+        assert len(b.convert("odom", odometry(stamp_ns=LATEST_NS - S))) == (not reason)
         assert counted(b) == ({"odom": {reason: 1}} if reason else {})
     assert to_msg.time(LATEST_NS + 1) == to_msg.time(LATEST_NS)
     assert to_msg.transform(LATEST_NS + 1, "map", "odom", (0.0,) * 3) == to_msg.transform(

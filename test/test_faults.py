@@ -293,7 +293,7 @@ def test_closures_of_a_bag_decode_to_those_it_was_made_of_and_the_table_finds_it
     for record in bag.messages(["/odom", "/landmarks", "/closures"]):
         messages[record.topic, record.log_ns] = typestore().deserialize_cdr(record.cdr, bag.topics[record.topic].type)
         if record.topic == "/closures":
-            decoded += border.take("loops", record.cdr)
+            decoded += border.convert("loops", record.cdr)
     assert counters.as_dict() == {}
     expected = [m for m in measurements(faulty) if isinstance(m, Closure)]
     assert len(decoded) == len(expected) == 30 + round(30 * 0.3 / 0.7)

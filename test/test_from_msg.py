@@ -125,7 +125,7 @@ def test_a_landmark_in_an_optical_frame_arrives_in_the_base_frame_with_its_covar
 
 def test_links_are_followed_over_several_frames_and_in_both_directions():
     b = border(("body", "base_link", (1.0, 0.0, 0.0), quaternion()), ("body", "mast", (3.0, 0.0, 0.0), quaternion()))
-    b.take("tf_static", transforms(("mast", "eye", (0.0, 0.5, 0.0), quaternion(yaw=math.pi / 2))))
+    b.convert("tf_static", transforms(("mast", "eye", (0.0, 0.5, 0.0), quaternion(yaw=math.pi / 2))))
     m = heard(b, "detections", detections(detection(pose(2.0, 0.0)), frame="eye"))
     assert only(m).measured == pytest.approx((2.0, 2.5))
 
@@ -143,7 +143,7 @@ def test_a_bad_static_transform_is_counted_and_the_others_are_kept():
         ("base_link", "", (0, 0, 0), quaternion()),
         ("base_link", "good", (1, 0, 0), quaternion()),
     )
-    b.take("tf_static", b"\x00\x01\x00\x00\xff\xff\xff")
+    b.convert("tf_static", b"\x00\x01\x00\x00\xff\xff\xff")
     assert counted(b) == {"tf_static": {"nonfinite": 1, "zero_quaternion": 1, "frame_empty": 1, "undecodable": 1}}
     assert only(heard(b, "detections", detections(detection(pose(2.0, 1.0)), frame="good"))).measured == (3.0, 1.0)
 

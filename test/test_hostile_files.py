@@ -162,10 +162,10 @@ def test_X11_what_a_name_says_to_a_terminal_is_shown_and_not_done(tmp_path, caps
 def test_X11_every_line_of_a_command_is_one_line(capsys):
     from graph_slam_ros.cli import console
 
-    console.say(f"landmark {HOSTILE}")
-    console.tell(HOSTILE)
-    console.told([HOSTILE], [HOSTILE])
-    console.told([f"{k}" for k in range(100)])
+    console.show(f"landmark {HOSTILE}")
+    console.warn(HOSTILE)
+    console.report_losses([HOSTILE], [HOSTILE])
+    console.report_losses([f"{k}" for k in range(100)])
     said = capsys.readouterr()
     assert len(said.out.splitlines()) == 1
     assert len(said.err.splitlines()) == 3 + 21

@@ -300,7 +300,7 @@ def test_the_covariance_of_a_fix_and_where_its_antenna_sits_are_kept():
 def test_an_antenna_of_which_nothing_is_told_is_at_the_base_and_counted():
     for frame in ("gps", ""):
         b = listening("gps", "sensor_msgs/msg/NavSatFix")
-        (fix,) = [*b.take("gps", gnss(frame=frame)), *b.finish()]
+        (fix,) = [*b.convert("gps", gnss(frame=frame)), *b.finish()]
         assert (fix.kind, fix.point) == ("position", ())
         assert counted(b) == {"gps": {"mount_unknown": 1}}
     said = warnings({"gps": {"mount_unknown": 7, "no_altitude": 2}})
@@ -424,8 +424,8 @@ def seen_by_turret(at_s=0.0):
 
 def test_a_sensor_on_a_joint_is_where_it_was_at_the_stamp_of_what_it_saw():
     b = border(**MOVING)
-    b.take("tf", turret(-0.1, 0.0))
-    b.take("tf", turret(0.1, 1.0))
+    b.convert("tf", turret(-0.1, 0.0))
+    b.convert("tf", turret(0.1, 1.0))
     for at_s, yaw in ((0.0, 0.5), (0.05, 0.75), (0.1, 1.0)):
         seen = only(heard(b, "detections", seen_by_turret(at_s))).measured
         assert seen == pytest.approx((1.0 + 2.0 * math.cos(yaw), 2.0 * math.sin(yaw)))
@@ -433,7 +433,7 @@ def test_a_sensor_on_a_joint_is_where_it_was_at_the_stamp_of_what_it_saw():
 
 def test_what_is_seen_before_tf_has_told_where_the_sensor_was_waits_for_it():
     b = border(**MOVING)
-    b.take("tf", turret(-0.1, 0.0))
+    b.convert("tf", turret(-0.1, 0.0))
     assert heard(b, "detections", seen_by_turret()) is None
     m = heard(b, "tf", turret(0.1, 1.0))
     assert m.stamp_ns == STAMP_NS
@@ -443,7 +443,7 @@ def test_what_is_seen_before_tf_has_told_where_the_sensor_was_waits_for_it():
 
 def test_a_tag_on_tf_that_waits_for_its_sensors_joint_is_not_taken_for_one_that_is_sent_again():
     b = listening("tags", TF, settings={"use": "landmarks", "frame_prefix": "tag"}, **MOVING)
-    b.take("tf", turret(-0.1, 0.0))
+    b.convert("tf", turret(-0.1, 0.0))
     assert heard(b, "tags", transforms(("turret", "tag1", (2.0, 0.0, 0.0), quaternion()))) is None
     assert only(heard(b, "tf", turret(0.1, 0.0))).measured == pytest.approx((3.0, 0.0))
     assert counted(b) == {}
@@ -452,14 +452,14 @@ def test_a_tag_on_tf_that_waits_for_its_sensors_joint_is_not_taken_for_one_that_
 def test_a_configured_mount_does_not_stand_in_for_a_joint_that_tf_is_late_to_tell_of():
     b = border(**MOVING, detections={"mount": "9 0 0 0 0 0"})
     assert only(heard(b, "detections", seen_by_turret())).measured == pytest.approx((11.0, 0.0))
-    b.take("tf", turret(-0.1, 0.0))
+    b.convert("tf", turret(-0.1, 0.0))
     assert heard(b, "detections", seen_by_turret()) is None
     assert only(heard(b, "tf", turret(0.1, 0.0))).measured == pytest.approx((3.0, 0.0))
 
 
 def test_what_tf_never_tells_of_is_refused_when_odometry_has_moved_on_or_ends():
     b = border(**MOVING)
-    b.take("tf", turret(-0.1, 0.0))
+    b.convert("tf", turret(-0.1, 0.0))
     assert heard(b, "detections", seen_by_turret()) is None
     for at_s, refused in ((0.2, {}), (0.21, {"detections": {"frame_unknown": 1}})):
         assert isinstance(heard(b, "odom", odometry(stamp_ns=STAMP_NS + round(at_s * 1e9))), Odometry)
@@ -474,9 +474,9 @@ def test_what_tf_never_tells_of_is_refused_when_odometry_has_moved_on_or_ends():
 def test_of_what_waits_for_tf_only_so_much_is_kept():
     b = border(**MOVING, ordering={"max_waiting": 3})
     for k in range(5):
-        b.take("detections", seen_by_turret(0.01 * k))
+        b.convert("detections", seen_by_turret(0.01 * k))
     assert counted(b) == {"detections": {"frame_unknown": 2}}
-    assert [m.stamp_ns - STAMP_NS for m in b.take("tf", turret(0.02, 0.0)) + b.take("tf", turret(0.1, 0.0))] == [
+    assert [m.stamp_ns - STAMP_NS for m in b.convert("tf", turret(0.02, 0.0)) + b.convert("tf", turret(0.1, 0.0))] == [
         20_000_000,
         30_000_000,
         40_000_000,
@@ -485,7 +485,7 @@ def test_of_what_waits_for_tf_only_so_much_is_kept():
 
 def test_what_we_estimate_ourselves_is_no_transform_to_measure_by():
     b = border(**MOVING)
-    b.take("tf", transforms(("map", "base_link", (5.0, 0.0, 0.0), quaternion())))
+    b.convert("tf", transforms(("map", "base_link", (5.0, 0.0, 0.0), quaternion())))
     assert heard(b, "detections", detections(detection(), frame="map")) is None
     assert b.finish() == []
     assert counted(b) == {"detections": {"frame_unknown": 1}}
@@ -514,7 +514,7 @@ def test_whatever_bytes_come_nothing_nonfinite_leaves_and_nothing_is_raised(type
         for at, value in edits:
             struct.pack_into("<d", cdr, 4 + 4 * (at % ((len(cdr) - 12) // 4)), value)
         b = listening("any", type_name, dimensions=dimensions, settings={"use": use, "frame_prefix": "tag"})
-        for m in b.take("any", bytes(cdr)):
+        for m in b.convert("any", bytes(cdr)):
             record = to_record(m)
             for part in record.pop("sightings", [record]):
                 values = [value for value in part.values() if isinstance(value, tuple)]

@@ -187,7 +187,7 @@ def test_A21_markers_that_are_added_are_landmarks_by_namespace_and_number_and_de
 
 def test_markers_of_several_stamps_are_several_measurements():
     b = listening("cones", MARKERS)
-    out = b.take("cones", markers(marker(1), marker(2, stamp_ns=STAMP_NS + 5), marker(3), marker(4, stamp_ns=0)))
+    out = b.convert("cones", markers(marker(1), marker(2, stamp_ns=STAMP_NS + 5), marker(3), marker(4, stamp_ns=0)))
     assert [(m.stamp_ns, [s.id for s in m.sightings]) for m in out] == [
         (STAMP_NS, ["cones/1", "cones/3"]),
         (STAMP_NS + 5, ["cones/2"]),
@@ -252,7 +252,7 @@ def test_aruco_markers_have_headers_of_their_own():
         message("aruco_msgs/msg/Marker", header=head, id=k, pose=at, confidence=1.0)
         for k, head in ((12, header(0, "")), (13, header(STAMP_NS + 7, "base_link")))
     ]
-    first, second = b.take("seen", encoded(header=HEAD, markers=parts))
+    first, second = b.convert("seen", encoded(header=HEAD, markers=parts))
     assert (first.stamp_ns, only(first).id, only(first).covariance) == (
         STAMP_NS,
         "12",
@@ -415,7 +415,7 @@ def test_whatever_bytes_come_nothing_nonfinite_leaves_and_nothing_is_raised(type
             size = struct.calcsize(kind)
             struct.pack_into(kind, cdr, 4 + size * (at % ((len(cdr) - 4) // size)), value)
         b = listening("any", type_name, dimensions=dimensions, settings={"sigma_rad": 0.1})
-        for m in b.take("any", bytes(cdr)):
+        for m in b.convert("any", bytes(cdr)):
             for s in m.sightings:
                 assert np.isfinite(s.measured).all()
                 size = math.isqrt(len(s.covariance))

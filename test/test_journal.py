@@ -312,7 +312,7 @@ def test_P4_that_the_disk_did_not_take_it_in_time_is_told_and_does_not_keep_it_f
     monkeypatch.setattr(os, "fsync", failing)
     session = session_in(tmp_path / "run", told)
     session.take(recorded()[:1])
-    session.flush_beside()
+    session.flush_in_background()
     assert failed.wait(10.0)
     assert not told
     session.save()
@@ -368,7 +368,7 @@ def test_P4_what_a_full_device_does_not_take_waits(monkeypatch):
     for _ in range(2):
         with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)):
             file.flush()
-        assert (file.waiting, file.tell()) == (6, 6)
+        assert (file.unwritten, file.tell()) == (6, 6)
     file.abandon()
 
 

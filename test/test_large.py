@@ -24,7 +24,7 @@ def test_G25_a_drive_past_very_many_identities_has_each_where_it_is():
     slam = GraphSlam(Config.from_mapping({"odometry.noise": "density"}))
     rng, count, start_s = np.random.default_rng(25), times(1_000, 100_000), time.process_time()
 
-    def look(first, x):
+    def observe(first, x):
         noise = 0.02 * rng.standard_normal((EACH, 2))
         there = [(0.3 * (first // EACH) + 1.0 + 0.2 * j - x + noise[j, 0], 2.0 + noise[j, 1]) for j in range(EACH)]
         return [Sighting(f"{first + j}", "position", at, (0.0004, 0.0, 0.0, 0.0004)) for j, at in enumerate(there)]
@@ -32,7 +32,7 @@ def test_G25_a_drive_past_very_many_identities_has_each_where_it_is():
     for first in range(0, count, EACH):
         k, x = first // EACH, 0.3 * (first // EACH)
         slam.process(Odometry(10**18 + k * S // 2, (x, 0.0, 0.0)))
-        seen = look(first, x) + (look(first - EACH, x) if k else [])
+        seen = observe(first, x) + (observe(first - EACH, x) if k else [])
         slam.process(Sightings(10**18 + k * S // 2, "tags", tuple(seen)))
     for event in ("end", "optimize"):
         slam.process(Control(event))

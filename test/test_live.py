@@ -109,7 +109,7 @@ def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_key
     for k in range(heard_from, 21):
         assert reckoning.hear(drive(dimensions, k), rare.estimate)
     at, covariance = reckoning.pose(rare.estimate)
-    often.take([drive(dimensions, 20)])
+    often.convert([drive(dimensions, 20)])
     slam = often.slam
     assert (slam.keyframes[-1].stamp_ns, len(slam.keyframes)) == (drive(dimensions, 20).stamp_ns, 21)
     assert rare.estimate.keyframes < 10
@@ -325,7 +325,7 @@ def test_A35_what_is_refused_is_judged_by_the_last_seconds_wherever_it_was_refus
             (after, "no_id", unnamed),
         ):
             counts["tags"][reason] = counts["tags"].get(reason, 0) + times
-        return recent.look(100.0 + now_s, accepted, before, after)["tags"]
+        return recent.observe(100.0 + now_s, accepted, before, after)["tags"]
 
     for k in range(20):
         now = second(k, unlinked=5)

@@ -98,11 +98,11 @@ def test_holding_is_part_of_the_sequence_and_of_the_map_that_is_taken_up(world):
     assert again.trajectory().tobytes() == live.trajectory().tobytes()
     there = places(live)
     state = state_of(live)
-    taken_up = GraphSlam(Config().changed(state.settings), start=state)
-    assert taken_up.config.map.localize
-    assert len(taken_up.solver.held) == len(taken_up.solver.vertices)
-    assert places(taken_up).keys() == there.keys()
-    assert np.array(list(places(taken_up).values())) == pytest.approx(np.array(list(there.values())), abs=1e-6)
+    restored = GraphSlam(Config().changed(state.settings), start=state)
+    assert restored.config.map.localize
+    assert len(restored.solver.held) == len(restored.solver.vertices)
+    assert places(restored).keys() == there.keys()
+    assert np.array(list(places(restored).values())) == pytest.approx(np.array(list(there.values())), abs=1e-6)
 
 
 def test_a_landmark_that_is_removed_is_gone_and_begins_anew_when_it_is_seen(world):

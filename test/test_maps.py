@@ -13,7 +13,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.maps.alignment import laid_on
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs import RunRecorder, map_of, run_config, taken_up
+from graph_slam_ros.runs import RunRecorder, map_of, restored, run_config
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.simulation import measurements, simulate, with_closures
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
@@ -170,7 +170,7 @@ def test_diff_of_a_run_and_what_it_repeats_to_is_nothing(first, tmp_path, capsys
 
 
 def test_diff_finds_the_landmark_that_was_moved_and_what_is_only_in_one(first, world, tmp_path, capsys):
-    slam = taken_up(first, [])
+    slam = restored(first, [])
     names = sorted(slam.landmarks, key=lambda name: -slam.landmarks[name].sightings)
     other, gone = names[0], names[1]
     without = [
@@ -262,7 +262,7 @@ def merged(first, elsewhere, tmp_path_factory):
 
 
 def test_merge_lays_the_second_session_on_the_first(first, elsewhere, merged):
-    one, two, both = (taken_up(folder, []) for folder in (first, elsewhere, merged))
+    one, two, both = (restored(folder, []) for folder in (first, elsewhere, merged))
     count = len(one.keyframes)
     assert len(both.keyframes) == count + len(two.keyframes)
     assert both.segments == [*one.segments, *(count + k for k in two.segments)]
@@ -292,14 +292,14 @@ def test_a_merged_run_repeats_recovers_and_is_gone_on_in(merged, world, tmp_path
 
 
 def test_merge_leaves_out_what_has_moved_and_tells(first, tmp_path, capsys):
-    seen = taken_up(first, []).landmarks
+    seen = restored(first, []).landmarks
     name = max(seen, key=lambda name: seen[name].sightings)
     other = moved(measurements(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=6.0)), name, 1.5)
     assert run("merge", first, ended(tmp_path / "other", other, ELSEWHERE), "--out", tmp_path / "out") == 0
     warning = capsys.readouterr().err
     assert f"landmark {name} is 1." in warning
     assert len(warning.splitlines()) == 1
-    one, both = taken_up(first, []), taken_up(tmp_path / "out", [])
+    one, both = restored(first, []), restored(tmp_path / "out", [])
     _, found = told(capsys, "diff", first, tmp_path / "out", "--json")
     (same,) = (one for one in found["moved"] if one["landmark"] == name)
     assert same["distance_m"] < 0.1, "it is where the first session saw it"
@@ -327,7 +327,7 @@ def test_merge_of_unnamed_landmarks_keeps_them_apart(first, elsewhere, tmp_path)
     a, b = ended(tmp_path / "a", half_named(0), config), ended(tmp_path / "b", half_named(5), config)
     assert run("merge", a, b, "--out", tmp_path / "out") == 0
     start = read_map(tmp_path / "out", [], start_only=True)
-    one, two = (taken_up(folder, []) for folder in (a, b))
+    one, two = (restored(folder, []) for folder in (a, b))
     unnamed = [sum(mark.is_unnamed for mark in slam.touched_landmarks(0).values()) for slam in (one, two)]
     assert min(unnamed) > 3
     assert sum(mark.is_unnamed for mark in start.landmarks.values()) == sum(unnamed)
@@ -348,7 +348,7 @@ def test_merge_in_space_and_of_what_shares_an_offset(kind, tmp_path):
     recordings = [simulate(name, seed, **options) for seed in (0, 3)]
     runs = [ended(tmp_path / str(k), measurements(r), Config.from_mapping(settings)) for k, r in enumerate(recordings)]
     assert run("merge", *runs, "--out", tmp_path / "out") == 0
-    one, two, both = (taken_up(folder, []) for folder in (*runs, tmp_path / "out"))
+    one, two, both = (restored(folder, []) for folder in (*runs, tmp_path / "out"))
     assert list(both.range_offsets) == list(one.range_offsets)
     assert both.graph.vertex_count < one.graph.vertex_count + two.graph.vertex_count
     assert len(both.graph.edges_of("range_offset")) == len(one.graph.edges_of("range_offset"))
@@ -356,7 +356,7 @@ def test_merge_in_space_and_of_what_shares_an_offset(kind, tmp_path):
 
 
 def test_merge_refuses_in_one_line(first, elsewhere, world, tmp_path, capsys):
-    few = taken_up(first, []).landmarks
+    few = restored(first, []).landmarks
     keep = next(iter(few))
     one_only = [
         replace(m, sightings=tuple(s for s in m.sightings if s.id == keep)) if isinstance(m, Sightings) else m
@@ -445,7 +445,7 @@ def test_in_a_frozen_map_the_robot_is_located_as_well_as_in_one_that_goes_on(fir
     assert run("replay", tmp_path / "run", "--out", tmp_path / "again") == 0
     for name in RECORDED:
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
-    assert_untouched(taken_up(tmp_path / "run", []), frozen)
+    assert_untouched(restored(tmp_path / "run", []), frozen)
 
 
 def test_what_is_asked_of_a_run_in_a_frozen_map_leaves_that_where_it_is(frozen, world, tmp_path):
@@ -503,7 +503,7 @@ def test_a_run_in_a_frozen_map_that_was_cut_off_is_taken_up_with_it_frozen(froze
     assert_untouched(slam, frozen)
     other = ended(tmp_path / "other", world)
     assert run("merge", frozen, other, "--out", tmp_path / "merged") == 0
-    assert_untouched(taken_up(tmp_path / "merged", []), frozen)
+    assert_untouched(restored(tmp_path / "merged", []), frozen)
 
 
 def test_without_names_and_with_closures_a_frozen_map_stays(tmp_path):

@@ -285,7 +285,7 @@ def test_A18_a_child_frame_that_changes_is_taken_for_what_it_is_or_refused_and_n
 def test_A19_a_frame_in_itself():
     refused("frame_in_itself", odometry(frame="base_link"), odometry(child="odom"))
     b = border(("base_link", "mast", (1.0, 0.0, 0.0), quaternion()))
-    b.take("tf_static", transforms(("mast", "mast", (9.0, 0.0, 0.0), quaternion())))
+    b.convert("tf_static", transforms(("mast", "mast", (9.0, 0.0, 0.0), quaternion())))
     assert counted(b) == {"tf_static": {"frame_in_itself": 1}}
     assert only(heard(b, "detections", detections(detection(pose(2.0, 1.0)), frame="mast"))).measured == (3.0, 1.0)
 

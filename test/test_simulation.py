@@ -262,7 +262,7 @@ def test_a_bag_decodes_to_the_measurements_it_was_made_of(world, tmp_path):
     border = MessageConverter(Config.from_mapping({"world.dimensions": 3 if world == "flight" else 2}), counters)
     decoded = []
     for record in open_bag(tmp_path / "bag.mcap").messages(["/odom", "/landmarks"]):
-        decoded += border.take("odom" if record.topic == "/odom" else "detections", record.cdr)
+        decoded += border.convert("odom" if record.topic == "/odom" else "detections", record.cdr)
     for a, b in itertools.zip_longest(decoded, measurements(recording)):
         assert (type(a), a.stamp_ns) == (type(b), b.stamp_ns)
         if isinstance(a, Odometry):

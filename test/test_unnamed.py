@@ -37,14 +37,16 @@ def park(seed, laps=2, clutter=None):
     rng, points = np.random.default_rng(seed), trees(seed)
     names, ticks = [str(k) for k in range(len(points))], iter(range(10**6))
 
-    def look(T_world_base):
+    def observe(T_world_base):
         t_s = next(ticks) * 0.5
         moving = points[:0] if clutter is None else np.array([clutter(t_s)])
-        return SENSOR.look(rng, T_world_base, [*names, "clutter"], np.vstack([points, moving]), "range_bearing")
+        return SENSOR.observe(rng, T_world_base, [*names, "clutter"], np.vstack([points, moving]), "range_bearing")
 
     rate = 2.0 * np.pi / (LAP_TICKS * 0.1)
     twists = np.tile([2.0, 0.0, rate], (laps * LAP_TICKS + 100, 1))
-    return drive(rng, (0.0, 0.0, 0.0), twists, TICK_NS, NOISE, look, 5, dict(zip(names, points.tolist(), strict=True)))
+    return drive(
+        rng, (0.0, 0.0, 0.0), twists, TICK_NS, NOISE, observe, 5, dict(zip(names, points.tolist(), strict=True))
+    )
 
 
 def pipeline(association, **settings):

@@ -208,14 +208,14 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
     if is_empty(run / odometry):
         odometry = _SIGHTINGS[1]
     whole = read_tum(run / name)
-    beside = None if is_empty(run / odometry) else read_tum(run / odometry)
+    odometry_path = None if is_empty(run / odometry) else read_tum(run / odometry)
     drives = _drives(run) if name in (*_SIGHTINGS, *_KEYFRAMES) else _ONE_DRIVE
     chosen = None
     for k in reversed(range(len(drives))):
         follows = drives[k + 1] if k + 1 < len(drives) else {}
         rows = {key: slice(drives[k][key], follows.get(key)) for key in ("keyframe", "sighting")}
         estimated = whole.at(rows["sighting" if name in _SIGHTINGS else "keyframe"])
-        reckoned = beside and beside.at(rows["sighting" if odometry in _SIGHTINGS else "keyframe"])
+        reckoned = odometry_path and odometry_path.at(rows["sighting" if odometry in _SIGHTINGS else "keyframe"])
         if not len(estimated.stamps_s):
             continue
         part = Drive(
@@ -224,14 +224,14 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
         chosen = chosen or part
         if truth is None or _overlap(estimated, truth):
             return part
-    return chosen or Drive(whole, beside, (name, odometry))
+    return chosen or Drive(whole, odometry_path, (name, odometry))
 
 
 def _drives(run: Path) -> list[dict[str, int]]:
     """Where each drive begins; one where the summary does not say."""
     try:
-        told = summary_of(run)["drives"]
-        drives = [{key: int(one[key]) for key in ("keyframe", "sighting")} for one in told]
+        drives = summary_of(run)["drives"]
+        drives = [{key: int(one[key]) for key in ("keyframe", "sighting")} for one in drives]
     except (ValueError, KeyError, TypeError):
         return _ONE_DRIVE
     return drives or _ONE_DRIVE

@@ -122,13 +122,13 @@ def _rivals(folder: Path) -> Iterator[str]:
     """What the last second look could not rule out."""
     file = folder / SUMMARY
     try:
-        told = [
+        rows = [
             _rival(folder, rival)
             for rival in json.loads("".join(text for _, text in lines(file, follow=False)))["rivals"]
         ]
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise FormatError(f"{file}: not the summary of a run: {error!r}") from None
-    yield from told
+    yield from rows
 
 
 def _rival(folder: Path, rival: Mapping[str, Any]) -> str:
@@ -183,9 +183,11 @@ def _edge(run: SavedGraph, edge: int, changes: Iterable[VerdictChange], config: 
     yield from _line("stamp", f"{e.stamp_ns / 1e9:.3f} s, of the newest keyframe that it is attached to")
     yield from _line("judged", f"first at keyframe {e.keyframe}")
     yield from _line("between", " and ".join(_vertex(run, e, v) for v in e.vertices))
-    yield from _line("measured", measurement_text.told(e, measurement_text.measured(e)))
-    yield from _line("sigmas", measurement_text.told(e, measurement_text.sigmas(e)))
-    yield from _line("expected", f"{measurement_text.told(e, measurement_text.expected(e))}, when it was judged first")
+    yield from _line("measured", measurement_text.with_units(e, measurement_text.measured(e)))
+    yield from _line("sigmas", measurement_text.with_units(e, measurement_text.sigmas(e)))
+    yield from _line(
+        "expected", f"{measurement_text.with_units(e, measurement_text.expected(e))}, when it was judged first"
+    )
     yield from _line("decided", _decided(e, history, config))
     if not e.verdict:
         return

@@ -31,7 +31,7 @@ _NAMES = {
 }
 
 
-def told(entry: Entry, numbers: Sequence[float]) -> str:
+def with_units(entry: Entry, numbers: Sequence[float]) -> str:
     """One number for each that the edge measures, with their names; angles in degrees."""
     names = _NAMES.get(entry.tag) or (_XY if len(numbers) == 2 else _XYZ)
     words = []

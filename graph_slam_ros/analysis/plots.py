@@ -22,9 +22,9 @@ from graph_slam_ros.typing import Array, Index
 
 _TRUTH, _ODOMETRY, _ESTIMATE, _LANDMARK = "#1f6fd6", "#1a1a1a", "#d62728", "#e08a00"
 _CLOSURE, _SIGHTING, _QUIET = "#d62728", "#e08a00", "#9aa0a6"
-_TRUTH_LOOK = {"label": "truth", "color": _TRUTH, "linewidth": 2.4, "zorder": 2}
-_ODOMETRY_LOOK = {"label": "dead reckoning", "color": _ODOMETRY, "linewidth": 1.0, "linestyle": "--", "zorder": 3}
-_ESTIMATE_LOOK = {"label": "estimate", "color": _ESTIMATE, "linewidth": 1.3, "zorder": 4}
+_TRUTH_STYLE = {"label": "truth", "color": _TRUTH, "linewidth": 2.4, "zorder": 2}
+_ODOMETRY_STYLE = {"label": "dead reckoning", "color": _ODOMETRY, "linewidth": 1.0, "linestyle": "--", "zorder": 3}
+_ESTIMATE_STYLE = {"label": "estimate", "color": _ESTIMATE, "linewidth": 1.3, "zorder": 4}
 _INCHES, _DPI = 8.0, 150
 _SIGMAS, _ELLIPSES = 2.0, 30  # how large ellipses are drawn, and about how many of the poses
 _GAP_S, _LONG_STEPS = 1.0, 5.0  # truth was not recorded where stamps are farther apart and this many times the usual
@@ -73,8 +73,8 @@ def draw_run(
                 circles = {"s": 90, "facecolors": "none", "edgecolors": _TRUTH, "linewidths": 1.0, "zorder": 5}
                 axes.scatter(*true_points[:, shown].T, label="true landmarks", **circles)
         for at, (label, mark) in ((0, ("start", "o")), (-1, ("end", "s"))):
-            look = {"color": "white", "markeredgecolor": _ESTIMATE, "markeredgewidth": 2.0, "markersize": 8}
-            axes.plot(*found.path.poses[at, shown], mark, label=label, zorder=8, **look)
+            style = {"color": "white", "markeredgecolor": _ESTIMATE, "markeredgewidth": 2.0, "markersize": 8}
+            axes.plot(*found.path.poses[at, shown], mark, label=label, zorder=8, **style)
         _limit(axes, found, points, shown)
     if below is not None:
         _draw_errors(below, found)
@@ -124,10 +124,10 @@ def _title(run: Path, drive: Drive, found: _Placed, landmarks: int) -> str:
     if drive.count > 1:
         parts.insert(1, f"drive {drive.number} of {drive.count}")
     if found.errors is not None:
-        told = f"position error {np.sqrt(np.mean(found.errors[1] ** 2)):.3f} m rmse"
+        score = f"position error {np.sqrt(np.mean(found.errors[1] ** 2)):.3f} m rmse"
         if found.odometry_errors is not None:
-            told += f", dead reckoning {np.sqrt(np.mean(found.odometry_errors[1] ** 2)):.3f} m"
-        parts.append(told)
+            score += f", dead reckoning {np.sqrt(np.mean(found.odometry_errors[1] ** 2)):.3f} m"
+        parts.append(score)
     return "  ·  ".join(parts)
 
 
@@ -136,10 +136,10 @@ def _draw_paths(axes: Any, found: _Placed, whole: Trajectory, drive: Drive, show
         others = whole.moved(found.T_world_map).poses
         others[drive.keyframes] = np.nan
         axes.plot(*others[:, shown].T, color=_QUIET, linewidth=0.8, zorder=1, label="drives before")
-    paths = ((found.truth, _TRUTH_LOOK), (found.odometry, _ODOMETRY_LOOK), (found.path, _ESTIMATE_LOOK))
-    for drawn, look in paths:
+    paths = ((found.truth, _TRUTH_STYLE), (found.odometry, _ODOMETRY_STYLE), (found.path, _ESTIMATE_STYLE))
+    for drawn, style in paths:
         if drawn is not None:
-            axes.plot(*drawn.poses[:, shown].T, solid_joinstyle="round", **look)
+            axes.plot(*drawn.poses[:, shown].T, solid_joinstyle="round", **style)
 
 
 def _pose_spread(run: Path, drive: Drive, found: _Placed) -> list[tuple[Array, Array]]:
@@ -174,10 +174,10 @@ def _draw_ellipses(axes: Any, spreads: list[tuple[Array, Array]], shown: list[in
     values, vectors = np.linalg.eigh(np.array([c for _, c in known]))
     lengths = 2.0 * _SIGMAS * np.sqrt(np.maximum(values, 0.0))
     angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-    look: dict[str, Any] = {"facecolors": _ESTIMATE, "edgecolors": _ESTIMATE, "linewidths": 0.6, "alpha": 0.25}
-    look |= {"zorder": 4.5, "units": "xy"}
+    style: dict[str, Any] = {"facecolors": _ESTIMATE, "edgecolors": _ESTIMATE, "linewidths": 0.6, "alpha": 0.25}
+    style |= {"zorder": 4.5, "units": "xy"}
     where = {"offsets": np.array([at for at, _ in known]), "offset_transform": axes.transData}
-    drawn = EllipseCollection(lengths[:, 1], lengths[:, 0], angles, **where, **look)
+    drawn = EllipseCollection(lengths[:, 1], lengths[:, 0], angles, **where, **style)
     axes.add_collection(drawn, autolim=False)
     axes.scatter([], [], s=90, color=_ESTIMATE, alpha=0.25, label=f"{_SIGMAS:g} sigma")  # for the legend
 
@@ -186,9 +186,9 @@ def _draw_errors(axes: Any, found: _Placed) -> None:
     """Position errors over time; on a logarithmic scale where dead reckoning's are of another size."""
     start_s = found.path.stamps_s[0]
     of_odometry = None if found.odometry_errors is None else found.odometry_errors[1]
-    for errors, look in ((found.odometry_errors, _ODOMETRY_LOOK), (found.errors, _ESTIMATE_LOOK)):
+    for errors, style in ((found.odometry_errors, _ODOMETRY_STYLE), (found.errors, _ESTIMATE_STYLE)):
         if errors is not None:
-            axes.plot(errors[0] - start_s, errors[1], **look)
+            axes.plot(errors[0] - start_s, errors[1], **style)
     if found.errors is not None and of_odometry is not None and of_odometry.max() > 5.0 * found.errors[1].max() > 0.0:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
@@ -277,8 +277,8 @@ def _within(truth: Trajectory, path: Trajectory) -> Trajectory:
 
 
 def _draw_stars(axes: Any, points: Array) -> None:
-    look = {"marker": "*", "color": _LANDMARK, "edgecolors": "white", "linewidths": 0.4, "zorder": 6}
-    axes.scatter(*points.T, s=70, label="landmarks", **look)
+    style = {"marker": "*", "color": _LANDMARK, "edgecolors": "white", "linewidths": 0.4, "zorder": 6}
+    axes.scatter(*points.T, s=70, label="landmarks", **style)
 
 
 def _with_gaps(truth: Trajectory) -> Trajectory:
@@ -292,8 +292,8 @@ def _with_gaps(truth: Trajectory) -> Trajectory:
 def _draw_edges(axes: Any, points: Array, ends: Index, label: str, order: int) -> None:
     from matplotlib.collections import LineCollection
 
-    looks = {"odometry": (_ODOMETRY, 1.0, 0.9, 4), "landmarks": (_SIGHTING, 0.4, 0.25, 2)}
-    color, width, alpha, layer = looks.get(label, (_CLOSURE, 0.6, 0.45, 3))
+    style = {"odometry": (_ODOMETRY, 1.0, 0.9, 4), "landmarks": (_SIGHTING, 0.4, 0.25, 2)}
+    color, width, alpha, layer = style.get(label, (_CLOSURE, 0.6, 0.45, 3))
     name = "sightings" if label == "landmarks" else label
     lines = LineCollection(list(points[ends]), colors=color, linewidths=width, alpha=alpha, zorder=layer, label=name)
     axes.add_collection(lines)
@@ -339,9 +339,9 @@ def _legend(axes: Any, *, at: float, side: str) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if not handles:
         return
-    look = {"frameon": False, "fontsize": 9.5, "columnspacing": 1.6, "handlelength": 1.6, "borderaxespad": 0.0}
+    style = {"frameon": False, "fontsize": 9.5, "columnspacing": 1.6, "handlelength": 1.6, "borderaxespad": 0.0}
     legend = axes.legend(
-        handles, labels, loc=f"lower {side}", bbox_to_anchor=(at, 1.01), ncols=min(len(handles), 4), **look
+        handles, labels, loc=f"lower {side}", bbox_to_anchor=(at, 1.01), ncols=min(len(handles), 4), **style
     )
     for line in legend.get_lines():
         line.set_alpha(1.0)

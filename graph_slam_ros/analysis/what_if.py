@@ -21,7 +21,7 @@ from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.solver.linearization import linearized
 from graph_slam_ros.typing import Array
 
-_BELIEVED = "believed"  # the class of what is let in: it has no loss
+_ACCEPTED = "believed"  # the class of what is let in: it has no loss
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class SavedGraph:
         graph, settings = self.graph, self._settings
         if let_in:
             graph = graph.copy()
-            edges += [_add(graph, self.edge(e), _BELIEVED) for e in let_in]
+            edges += [_add(graph, self.edge(e), _ACCEPTED) for e in let_in]
             edges = [e for e in edges if e not in set(let_in)]
         if loss is not None:
             settings = replace(settings, losses={label: [loss] for label in settings.losses})
@@ -193,8 +193,8 @@ def _graph(folder: Path, entries: Sequence[Entry]) -> tuple[Graph, list[int]]:
         try:
             _add(out, entry, entry.label)
         except GraphSlamError as error:
-            told = f"edge {entry.edge}: {error} (or {GRAPH} is not of the same run)"
-            raise FormatError(f"{folder / LEDGER}: {told}") from None
+            message = f"edge {entry.edge}: {error} (or {GRAPH} is not of the same run)"
+            raise FormatError(f"{folder / LEDGER}: {message}") from None
     _check_same_run(folder, file, entries)
     return out, [file.ids[vertex] for vertex in file.fixed]
 

@@ -41,22 +41,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
             compile_all()
         return int(args.run(args))
     except GraphSlamError as error:
-        console.tell(str(error))
+        console.warn(str(error))
         return console.REFUSED
     except KeyboardInterrupt:
-        console.tell("interrupted: nothing is left half-written")
+        console.warn("interrupted: nothing is left half-written")
         return console.INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()
         return console.DONE
     except OSError as error:
-        console.tell(f"{error.filename or 'writing'}: {error.strerror}")
+        console.warn(f"{error.filename or 'writing'}: {error.strerror}")
         return console.REFUSED
     except Exception as error:
         if os.environ.get("GRAPH_SLAM_TRACEBACK"):
             traceback.print_exc()
         what = " ".join(str(error).split())
-        console.tell(f"a fault of ours, {type(error).__name__}: {what} (GRAPH_SLAM_TRACEBACK=1 shows where)")
+        console.warn(f"a fault of ours, {type(error).__name__}: {what} (GRAPH_SLAM_TRACEBACK=1 shows where)")
         return console.FAULT
 
 
@@ -64,7 +64,7 @@ def node_main() -> int:
     """Run the ROS node; without ROS, say so."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing to tell or save while modules are imported
     if not console.has_ros():
-        console.tell("ROS 2 is not installed here (no rclpy); replay works without it", "graph_slam_node")
+        console.warn("ROS 2 is not installed here (no rclpy); replay works without it", "graph_slam_node")
         return console.REFUSED
     from graph_slam_ros.node.node import main as run
 

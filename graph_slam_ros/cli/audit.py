@@ -20,12 +20,12 @@ def explain(args: argparse.Namespace) -> int:
     from graph_slam_ros.analysis.explain import explain_edge, explain_run
     from graph_slam_ros.runs import changed_since
 
-    console.say(*(explain_edge(args.run_folder, args.edge) if args.edge else explain_run(args.run_folder)))
+    console.show(*(explain_edge(args.run_folder, args.edge) if args.edge else explain_run(args.run_folder)))
     if args.edge:
         console.then(f"{console.command('solve', args.run_folder, '--without', 'EDGE')} (the drive without an edge)")
     else:
         console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (all about one edge or landmark)")
-    return console.told([], changed_since(args.run_folder))
+    return console.report_losses([], changed_since(args.run_folder))
 
 
 def solve(args: argparse.Namespace) -> int:
@@ -38,10 +38,10 @@ def solve(args: argparse.Namespace) -> int:
     run = SavedGraph(args.run_folder)
     start = time.process_time()
     solver = run.solve(args.without, args.let_in, args.loss)
-    took_s = time.process_time() - start
-    console.say(*_moved_text(run, run.moved(solver)), f"solved in {1e3 * took_s:.0f} ms of CPU time")
+    elapsed_s = time.process_time() - start
+    console.show(*_moved_text(run, run.moved(solver)), f"solved in {1e3 * elapsed_s:.0f} ms of CPU time")
     console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (why the run judged an edge as it did)")
-    return console.told([], changed_since(args.run_folder))
+    return console.report_losses([], changed_since(args.run_folder))
 
 
 def influence(args: argparse.Namespace) -> int:
@@ -50,16 +50,16 @@ def influence(args: argparse.Namespace) -> int:
     from graph_slam_ros.runs import changed_since
 
     run = SavedGraph(args.run_folder)
-    console.say(
+    console.show(
         f"the last pose without each edge, the {args.count} of most influence to first order",
         f"  {'edge':<8s} {'':24s} {'first order':>12s} {'solved again':>12s}",
     )
     for one in run.influences(args.count):
         exact = f"{one.exact_m:10.4f} m" if math.isfinite(one.exact_m) else "undetermined"
-        told = f"{one.first_order_m:10.4f} m {exact}"
-        console.say(f"  {one.edge:<8d} {run.edge(one.edge).about:24s} {told}")
+        text = f"{one.first_order_m:10.4f} m {exact}"
+        console.show(f"  {one.edge:<8d} {run.edge(one.edge).about:24s} {text}")
     console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (all about one of them)")
-    return console.told([], changed_since(args.run_folder))
+    return console.report_losses([], changed_since(args.run_folder))
 
 
 def _moved_text(run: "SavedGraph", moved: "MovedVertex") -> Iterable[str]:

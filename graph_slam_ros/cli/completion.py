@@ -33,7 +33,7 @@ _ZSH = "autoload -U +X compinit && compinit -u\nautoload -U +X bashcompinit && b
 
 def completion(args: argparse.Namespace) -> int:
     """Print the script."""
-    console.say(*((_ZSH if args.shell == "zsh" else "") + script(args.parser())).splitlines())
+    console.show(*((_ZSH if args.shell == "zsh" else "") + script(args.parser())).splitlines())
     return console.DONE
 
 

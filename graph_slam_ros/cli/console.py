@@ -15,7 +15,7 @@ from graph_slam_ros.formats.files import is_regular
 
 # Control characters, and those that change the direction of a text or are not seen.
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
-_MOST_TOLD, _LINES_TOLD = 200, 20  # characters of a line on standard error; lines of losses
+_MAX_CHARACTERS, _MAX_LINES = 200, 20  # characters of a line on standard error; lines of losses
 _LEAST_WORD = 40  # characters that a word keeps when it is shortened: the name of a file, and a part of its folder
 _GAP = "..."
 DONE, FAULT, REFUSED, LOSSES, INTERRUPTED = 0, 1, 2, 3, 130
@@ -28,7 +28,7 @@ def escaped(text: str) -> str:
     return _CONTROL.sub(lambda found: repr(found[0])[1:-1], text)
 
 
-def say(*lines: str) -> None:
+def show(*lines: str) -> None:
     """Print the answer of a command to standard output.
 
     Each argument is one line: control characters in it, line ends included, are escaped, since names in it may come
@@ -40,7 +40,7 @@ def say(*lines: str) -> None:
 
 def then(what: str) -> None:
     """The last line of an answer: what to do next."""
-    say(f"next: {what}")
+    show(f"next: {what}")
 
 
 def command(*words: object) -> str:
@@ -67,7 +67,7 @@ def check_file(*paths: Path | None, force: bool, source: Path | None = None) -> 
                 raise GraphSlamError(f"{path}: exists already: choose another name, or --force replaces it")
 
 
-def tell(what: str, programme: str = "graph_slam", most: int = _MOST_TOLD) -> None:
+def warn(what: str, programme: str = "graph_slam", most: int = _MAX_CHARACTERS) -> None:
     """What stands beside the answer, on standard error: a line, whatever is in the names that it tells.
 
     Parameters
@@ -99,22 +99,22 @@ class Throttled:
     def __init__(self, period_s: float = 5.0) -> None:
         self._period_s, self._due_s = period_s, 0.0
 
-    def __call__(self, said: str) -> None:
+    def __call__(self, message: str) -> None:
         """Tell it, if it is time."""
         if time.monotonic() >= self._due_s:
             self._due_s = time.monotonic() + self._period_s
-            tell(said)
+            warn(message)
 
 
-def told(losses: Sequence[str], warnings: Sequence[str] = ()) -> int:
+def report_losses(losses: Sequence[str], warnings: Sequence[str] = ()) -> int:
     """Tell what was lost, and what to beware of; returns the exit code."""
     for warning in warnings:
-        tell(f"beware: {warning}")
+        warn(f"beware: {warning}")
     distinct = list(dict.fromkeys(losses))
-    for loss in distinct[:_LINES_TOLD]:
-        tell(f"lost: {loss}")
-    if len(distinct) > _LINES_TOLD:
-        tell(f"lost: and {len(distinct) - _LINES_TOLD} more of this kind")
+    for loss in distinct[:_MAX_LINES]:
+        warn(f"lost: {loss}")
+    if len(distinct) > _MAX_LINES:
+        warn(f"lost: and {len(distinct) - _MAX_LINES} more of this kind")
     return LOSSES if losses else DONE
 
 

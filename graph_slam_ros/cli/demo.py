@@ -19,7 +19,7 @@ from graph_slam_ros.slam import Config
 _BAG = Path(__file__).resolve().parents[2] / "data" / "demo.mcap"
 
 
-def demo(out: Path, *, live: bool, force: bool, progress: Callable[[str], Any], say: Callable[[str], None]) -> int:
+def demo(out: Path, *, live: bool, force: bool, progress: Callable[[str], Any], show: Callable[[str], None]) -> int:
     """Run it and say what happened; returns the exit code (3 if messages were lost)."""
     check_room(out, force=force)
     with tempfile.TemporaryDirectory() as scratch:
@@ -29,21 +29,21 @@ def demo(out: Path, *, live: bool, force: bool, progress: Callable[[str], Any], 
             write_bag(simulate("warehouse", 8, aisle_m=9.0), recording)
         start = time.perf_counter()
         lost = (_live if live else _offline)(recording, out, progress)
-        took_s = time.perf_counter() - start
+        elapsed_s = time.perf_counter() - start
         scores = evaluate(out, str(recording))
         draw_run(out, str(recording), out / "path.png")
     summary = json.loads(read_text(out / SUMMARY))
     through = "a live ROS graph (rclpy)" if live else "the pipeline directly: no ROS 2 here"
-    say(f"replayed {recording.name} through {through} in {took_s:.1f} s of wall time")
-    say(f"  keyframes        {summary['keyframes']}")
-    say(f"  landmarks        {summary['landmarks']}, from {summary['sightings']} sightings")
-    say(f"  edges            {summary['edges']}")
-    say(f"  chi2             {summary['chi2']:.1f}")
+    show(f"replayed {recording.name} through {through} in {elapsed_s:.1f} s of wall time")
+    show(f"  keyframes        {summary['keyframes']}")
+    show(f"  landmarks        {summary['landmarks']}, from {summary['sightings']} sightings")
+    show(f"  edges            {summary['edges']}")
+    show(f"  chi2             {summary['chi2']:.1f}")
     if scores.odometry is not None:
-        say(f"  position error   {scores.odometry.position_m['rmse']:.3f} m before (odometry)")
-    say(f"                   {scores.estimate.position_m['rmse']:.3f} m after")
-    say(f"  messages lost    {lost}")
-    say(f"path, graph and picture: {out}/path.tum, graph.g2o, path.png (run.mcap opens in Foxglove)")
+        show(f"  position error   {scores.odometry.position_m['rmse']:.3f} m before (odometry)")
+    show(f"                   {scores.estimate.position_m['rmse']:.3f} m after")
+    show(f"  messages lost    {lost}")
+    show(f"path, graph and picture: {out}/path.tum, graph.g2o, path.png (run.mcap opens in Foxglove)")
     return 3 if lost else 0
 
 

@@ -49,21 +49,21 @@ def optimize(args: argparse.Namespace) -> int:
     proof = _certify(solution, settings) if args.certify else None
     if args.json:
         answer = _answer(report, start, args) | _starts(solution)
-        console.say(json.dumps(answer if proof is None else answer | {"certificate": proof.as_dict()}))
+        console.show(json.dumps(answer if proof is None else answer | {"certificate": proof.as_dict()}))
     else:
-        told_start = _START[start] + ("" if file.has_values else f": {_NO_VALUES}")
-        console.say(*_optimize_text(report, told_start, args.loss), *_starts_text(solution))
-        console.say(*(proof.text(report.chi2_final) if proof else ()))
+        start_text = _START[start] + ("" if file.has_values else f": {_NO_VALUES}")
+        console.show(*_optimize_text(report, start_text, args.loss), *_starts_text(solution))
+        console.show(*(proof.text(report.chi2_final) if proof else ()))
     if args.out:
         write_g2o(args.out, file, solver.estimate)
     if args.plot:
         _plot_graph(args.plot, graph, _positions(graph, started(file, start)[0]), _positions(graph, solver))
-    _tell_unknown(file)
+    _warn_unknown(file)
     for note in file.notes:
-        console.tell(note)
+        console.warn(note)
     if not args.json:
         console.then(_after(args, report.converged))
-    return console.told(file.skipped) or (proof.code if proof else console.DONE)
+    return console.report_losses(file.skipped) or (proof.code if proof else console.DONE)
 
 
 def _after(args: argparse.Namespace, converged: bool) -> str:
@@ -106,16 +106,16 @@ def convert(args: argparse.Namespace) -> int:
         solver, start = started(file, "file")
         written = write_graph(args.out, file, solver.estimate, target)
         if not file.has_values:
-            console.say(f"{_NO_VALUES}: those of {_START[start]} are written")
+            console.show(f"{_NO_VALUES}: those of {_START[start]} are written")
     else:
         written = write_graph(args.out, file, None, target)
     vertices = f"{written.vertices} of {file.graph.vertex_count} vertices"
-    console.say(f"wrote {args.out} as {NAMES[target]}: {vertices}, {written.edges} of {file.graph.edge_count} edges")
+    console.show(f"wrote {args.out} as {NAMES[target]}: {vertices}, {written.edges} of {file.graph.edge_count} edges")
     reader = "evo_traj tum" if target == "tum" else "graph_slam optimize"
     console.then(shlex.join([*reader.split(), str(args.out)]))
     if target == "g2o":
-        _tell_unknown(file)
-    return console.told(file.skipped + written.lost)
+        _warn_unknown(file)
+    return console.report_losses(file.skipped + written.lost)
 
 
 def _read_graph(args: argparse.Namespace, **options: Any) -> "G2oFile":
@@ -125,10 +125,10 @@ def _read_graph(args: argparse.Namespace, **options: Any) -> "G2oFile":
     return read_g2o(args.graph, lenient=args.lenient, raw=raw, dialect=args.source, **options)
 
 
-def _tell_unknown(file: "G2oFile") -> None:
+def _warn_unknown(file: "G2oFile") -> None:
     tags = sorted({line.split()[0] for line in file.unknown})
     if tags:
-        console.tell(f"{len(file.unknown)} lines with unknown tags kept as they are: {', '.join(tags)}")
+        console.warn(f"{len(file.unknown)} lines with unknown tags kept as they are: {', '.join(tags)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ import textwrap
 from pathlib import Path
 
 from graph_slam_ros.recordings.bag import Bag
-from graph_slam_ros.recordings.contents import TopicContents, look
+from graph_slam_ros.recordings.contents import TopicContents, recording_of
 from graph_slam_ros.runs.suggestion import Suggestion
 
 
@@ -16,7 +16,7 @@ def describe(bag: Bag, path: Path) -> tuple[list[str], bool]:
     lines : the command is the last
     fits : whether there is one
     """
-    recording = look(bag)
+    recording = recording_of(bag)
     lines = [_line(one) for _, one in sorted(recording.topics.items())]
     read = [one for one in recording.topics.values() if one.last_ns]
     if read:
@@ -33,7 +33,7 @@ def describe(bag: Bag, path: Path) -> tuple[list[str], bool]:
 
 
 def _line(one: TopicContents) -> str:
-    topic, took_s = one.topic, (one.last_ns - one.first_ns) * 1e-9
-    rate = f"{(topic.count - 1) / took_s:.1f} Hz" if took_s > 0 else "-"
+    topic, elapsed_s = one.topic, (one.last_ns - one.first_ns) * 1e-9
+    rate = f"{(topic.count - 1) / elapsed_s:.1f} Hz" if elapsed_s > 0 else "-"
     frames = " -> ".join(filter(None, (one.frame, one.child)))
     return f"{topic.name:28s} {topic.type:40s} {topic.count:8d}  {rate:>10s}  {one.trouble or frames}".rstrip()

@@ -14,9 +14,9 @@ def export(args: argparse.Namespace) -> int:
     console.check_file(*files_of(args.out, args.to), force=args.force)
     losses: list[str] = []
     files = exported(args.run_folder, args.out, args.to, losses, last_drive=args.last_drive)
-    console.say(*(f"wrote {file}" for file in files))
+    console.show(*(f"wrote {file}" for file in files))
     _then_use(args)
-    return console.told(losses)
+    return console.report_losses(losses)
 
 
 def _then_use(args: argparse.Namespace) -> None:
@@ -34,11 +34,11 @@ def diff(args: argparse.Namespace) -> int:
 
     losses: list[str] = []
     found = compared(args.a, args.b, losses)
-    console.say(*([json.dumps(found.as_dict())] if args.json else found.lines()))
+    console.show(*([json.dumps(found.as_dict())] if args.json else found.lines()))
     if not args.json:
         merged = console.command("merge", args.a, args.b, "--out", "MERGED")
         console.then("nothing: they are the same" if found.is_same else f"{merged} (one map of both)")
-    return console.told(losses) or (console.DONE if found.is_same else console.DIFFERENT)
+    return console.report_losses(losses) or (console.DONE if found.is_same else console.DIFFERENT)
 
 
 def merge(args: argparse.Namespace) -> int:
@@ -48,14 +48,14 @@ def merge(args: argparse.Namespace) -> int:
 
     done = merged(args.a, args.b, args.out, force=args.force)
     agree = done.shared - len(done.left_out)
-    console.say(*outcome.text(done.summary), f"{agree} of {done.shared} landmarks of both lay B on A")
-    console.say(f"results in {args.out}")
+    console.show(*outcome.text(done.summary), f"{agree} of {done.shared} landmarks of both lay B on A")
+    console.show(f"results in {args.out}")
     console.then(f"{console.command('freeze', args.out, '--out', 'SITE')} (a map that stays as it is)")
     moved = [
         f"landmark {name} is {metres:.2f} m ({sigmas:.0f} sigmas) elsewhere in B: what B saw of it is left out"
         for name, (metres, sigmas) in done.left_out.items()
     ]
-    return console.told(done.losses, moved)
+    return console.report_losses(done.losses, moved)
 
 
 def freeze(args: argparse.Namespace) -> int:
@@ -64,6 +64,8 @@ def freeze(args: argparse.Namespace) -> int:
     from graph_slam_ros.runs import outcome
 
     summary = frozen(args.run_folder, args.out, force=args.force)
-    console.say(*outcome.text(summary), f"results in {args.out}: what is there now stays, whatever is seen from now on")
+    console.show(
+        *outcome.text(summary), f"results in {args.out}: what is there now stays, whatever is seen from now on"
+    )
     console.then(f"the node locates itself in it with output.load:={args.out.name}, its folder beside output.folder")
-    return console.told(summary["losses"])
+    return console.report_losses(summary["losses"])

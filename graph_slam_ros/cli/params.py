@@ -16,7 +16,7 @@ def params(args: argparse.Namespace) -> int:
     if not found:
         raise GraphSlamError(f"no parameter matches {args.pattern!r} (without a pattern all are listed)")
     for p in found:
-        console.say(*_lines(p))
+        console.show(*_lines(p))
     console.then(f"set one with --set {found[0].name}={_word(found[0].default)}, or in a parameter file (--config)")
     return console.DONE
 

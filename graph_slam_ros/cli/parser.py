@@ -297,7 +297,7 @@ def _world_options() -> str:
     from graph_slam_ros.simulation.faults import KINDS
     from graph_slam_ros.simulation.options import options_of
 
-    def told(cls: type) -> list[str]:
+    def option_lines(cls: type) -> list[str]:
         lines = []
         for o in options_of(cls):
             choices = f": {', '.join(o.choices)}" if o.choices else ""
@@ -307,11 +307,11 @@ def _world_options() -> str:
 
     lines = ["options of the worlds, for --set:"]
     for name, world in WORLDS.items():
-        lines += [f"  {name}: {world.about}", *told(world.options)]
-    lines += ["  every world: a satellite receiver and an IMU besides", *told(Instruments)]
+        lines += [f"  {name}: {world.about}", *option_lines(world.options)]
+    lines += ["  every world: a satellite receiver and an IMU besides", *option_lines(Instruments)]
     lines += ["", "faults, and what of them can be set; what is wrong then is in OUT.faults.csv:"]
     for name, kind in KINDS.items():
-        lines += [f"  {name}: {kind.about}", *told(kind.options)]
+        lines += [f"  {name}: {kind.about}", *option_lines(kind.options)]
     lines += ["", "example: graph_slam simulate warehouse --out world.mcap --set gnss=5 --set imu=100"]
     return "\n".join(lines)
 

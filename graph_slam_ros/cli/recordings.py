@@ -31,11 +31,11 @@ def replay(args: argparse.Namespace) -> int:
     topics = {"odometry": args.odom, "landmarks": args.landmarks, "map_folder": args.map}
     done = replayed(args.bag, args.out, own, **topics, force=args.force, progress=console.progress("replay"))
     code = max([_say_earlier(run.folder, run.summary) for run in done.earlier], default=console.DONE)
-    code = max(code, _say_run(args.bag, done.summary))
-    console.say(f"results in {args.out}")
+    code = max(code, _print_summary(args.bag, done.summary))
+    console.show(f"results in {args.out}")
     _draw(args.out)
-    _then_look(args.out)
-    return console.told(done.losses, done.warnings) or code
+    _suggest_next(args.out)
+    return console.report_losses(done.losses, done.warnings) or code
 
 
 def _replay_live(args: argparse.Namespace, config: "Config") -> int:
@@ -61,12 +61,12 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
             played = play(bag, inputs, own=own, **options)
         summary = json.loads(read_text(args.out / SUMMARY))
         asked = {name: counts for name, counts in summary["inputs"].items() if name in inputs.topics}
-        code = _say_run(args.bag, summary | {"inputs": asked})
+        code = _print_summary(args.bag, summary | {"inputs": asked})
         _draw(args.out)
-    console.say(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
-    _then_look(Path(played.saved))
+    console.show(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
+    _suggest_next(Path(played.saved))
     losses = bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else [])
-    return console.told(losses, bag.warnings) or code
+    return console.report_losses(losses, bag.warnings) or code
 
 
 def recover(args: argparse.Namespace) -> int:
@@ -75,10 +75,10 @@ def recover(args: argparse.Namespace) -> int:
     from graph_slam_ros.runs import recover as recovered
 
     summary = recovered(args.run_folder, args.out, force=args.force) if args.out else complete(args.run_folder)
-    code = _say_run(args.run_folder, summary)
-    console.say(f"results in {args.out or args.run_folder}")
-    _then_look(args.out or args.run_folder)
-    return console.told(summary["losses"]) or code
+    code = _print_summary(args.run_folder, summary)
+    console.show(f"results in {args.out or args.run_folder}")
+    _suggest_next(args.out or args.run_folder)
+    return console.report_losses(summary["losses"]) or code
 
 
 def info(args: argparse.Namespace) -> int:
@@ -88,12 +88,12 @@ def info(args: argparse.Namespace) -> int:
     from graph_slam_ros.runs import is_run, suggested_out
 
     if is_run(args.bag):
-        console.say(f"an earlier run: {console.command('replay', args.bag, '--out', suggested_out(args.bag))}")
+        console.show(f"an earlier run: {console.command('replay', args.bag, '--out', suggested_out(args.bag))}")
         return console.DONE
     bag = open_bag(args.bag)
     lines, fits = describe(bag, args.bag)
-    console.say(*lines)
-    return console.told(bag.losses, bag.warnings) or (console.DONE if fits else console.LOSSES)
+    console.show(*lines)
+    return console.report_losses(bag.losses, bag.warnings) or (console.DONE if fits else console.LOSSES)
 
 
 def evaluate(args: argparse.Namespace) -> int:
@@ -106,11 +106,11 @@ def evaluate(args: argparse.Namespace) -> int:
     console.check_file(args.plot, force=args.force)
     truth = read_truth(args.truth, args.topic, input_topics(args.run_folder))
     scores = compared(args.run_folder, truth, args.estimate, align=not args.no_align)
-    console.say(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
+    console.show(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
     _draw(args.run_folder, truth, args.plot, align=not args.no_align, quiet=args.json)
     if not args.json:
         console.then(f"{console.command('explain', args.run_folder)} (what the run believed, and what not)")
-    return console.told(scores.losses, [*scores.warnings, *changed_since(args.run_folder)])
+    return console.report_losses(scores.losses, [*scores.warnings, *changed_since(args.run_folder)])
 
 
 def plot(args: argparse.Namespace) -> int:
@@ -127,9 +127,9 @@ def plot(args: argparse.Namespace) -> int:
     console.check_file(args.out, force=args.force)
     picture = args.out or args.run_folder / PICTURE
     draw_run(args.run_folder, args.truth, picture, args.topic, align=not args.no_align)
-    console.say(f"picture in {picture}")
-    _then_look(args.run_folder)
-    return console.told([], changed_since(args.run_folder))
+    console.show(f"picture in {picture}")
+    _suggest_next(args.run_folder)
+    return console.report_losses([], changed_since(args.run_folder))
 
 
 def _animate(args: argparse.Namespace) -> int:
@@ -141,9 +141,9 @@ def _animate(args: argparse.Namespace) -> int:
         raise GraphSlamError("plot: --animate has no use for --truth or --out")
     console.check_file(args.animate, force=args.force)
     animate_run(args.run_folder, args.animate)
-    console.say(f"animation in {args.animate}")
-    _then_look(args.run_folder)
-    return console.told([], changed_since(args.run_folder))
+    console.show(f"animation in {args.animate}")
+    _suggest_next(args.run_folder)
+    return console.report_losses([], changed_since(args.run_folder))
 
 
 def _draw(run: Path, truth: Any = None, out: Path | None = None, *, align: bool = True, quiet: bool = False) -> None:
@@ -151,7 +151,7 @@ def _draw(run: Path, truth: Any = None, out: Path | None = None, *, align: bool 
     from graph_slam_ros.runs import PICTURE
 
     if not _has_matplotlib():
-        return console.tell(f"no picture: {_NO_MATPLOTLIB}")
+        return console.warn(f"no picture: {_NO_MATPLOTLIB}")
     from graph_slam_ros.analysis.plots import draw_run
 
     picture = out or run / PICTURE
@@ -160,9 +160,9 @@ def _draw(run: Path, truth: Any = None, out: Path | None = None, *, align: bool 
     except GraphSlamError as error:
         if out is not None:  # it was asked for
             raise
-        return console.tell(f"no picture: {error}")
+        return console.warn(f"no picture: {error}")
     if not quiet:
-        console.say(f"picture in {picture}")
+        console.show(f"picture in {picture}")
 
 
 def _has_matplotlib() -> bool:
@@ -173,7 +173,7 @@ def warmup(args: argparse.Namespace) -> int:
     """Compile the kernels."""
     from graph_slam_ros.warmup import warmup as compiled
 
-    console.tell(f"kernels ready after {compiled():.1f} s")
+    console.warn(f"kernels ready after {compiled():.1f} s")
     console.then(console.command("info", "RECORDING"))
     return console.DONE
 
@@ -182,7 +182,7 @@ def demo(args: argparse.Namespace) -> int:
     """Run the demonstration."""
     from graph_slam_ros.cli.demo import demo as shown
 
-    code = shown(args.out, live=console.has_ros(), force=args.force, progress=console.progress, say=console.say)
+    code = shown(args.out, live=console.has_ros(), force=args.force, progress=console.progress, show=console.show)
     console.then(f"a recording of your own: {console.command('info', 'RECORDING')}")
     return code
 
@@ -223,11 +223,11 @@ def _config(args: argparse.Namespace) -> "Config":
         raise GraphSlamError(f"{file}: {error}" if file and not args.set else str(error)) from None
 
 
-def _say_run(source: Path, summary: dict[str, Any]) -> int:
+def _print_summary(source: Path, summary: dict[str, Any]) -> int:
     """What came of a run; returns the exit code, 3 where that is less than what was asked for."""
     from graph_slam_ros.runs import outcome
 
-    console.say(*outcome.text(summary))
+    console.show(*outcome.text(summary))
     if not summary["keyframes"]:
         why = f": {summary['losses'][0]}" if summary.get("losses") else ", see what was counted and graph_slam info"
         raise GraphSlamError(f"{source}: no odometry of it could be used{why}")
@@ -235,12 +235,12 @@ def _say_run(source: Path, summary: dict[str, Any]) -> int:
 
 
 def _say_earlier(folder: Path, summary: dict[str, Any]) -> int:
-    """Say what came of a run that ended where time jumped back; returns as ``_say_run``."""
+    """Say what came of a run that ended where time jumped back; returns as ``_print_summary``."""
     from graph_slam_ros.runs import outcome
 
-    console.say(*outcome.text(summary))
+    console.show(*outcome.text(summary))
     code = _say_shortcomings(summary)
-    console.say(f"odometry went back in time, and time.on_jump is reset: the run until then is in {folder}")
+    console.show(f"odometry went back in time, and time.on_jump is reset: the run until then is in {folder}")
     _draw(folder)
     return code
 
@@ -250,10 +250,10 @@ def _say_shortcomings(summary: dict[str, Any]) -> int:
 
     shortcomings = list(outcome.shortcomings(summary))
     for sentence in shortcomings:
-        console.tell(sentence, most=_SENTENCE)
+        console.warn(sentence, most=_SENTENCE)
     return console.LOSSES if shortcomings else console.DONE
 
 
-def _then_look(run: Path) -> None:
+def _suggest_next(run: Path) -> None:
     why, errors = console.command("explain", run), console.command("evaluate", run, "--truth", "TRUTH")
     console.then(f"{why} (what was believed, and what not), or where there is a truth {errors}")

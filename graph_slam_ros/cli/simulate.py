@@ -26,8 +26,8 @@ def simulate(args: argparse.Namespace) -> int:
     of_file = args.scenario not in (*WORLDS, CITY) and Path(args.scenario).is_file()
     if (of_file or args.scenario == CITY) and not as_graph:
         raise GraphSlamError(f"{args.out}: {args.scenario} is a graph: --out FILE.g2o")
-    beside = [".faults.csv"] * bool(faults) + [".truth.tum"] * (as_graph and not of_file)
-    written, source = [_beside(args.out, ending) for ending in beside], Path(args.scenario) if of_file else None
+    companions = [".faults.csv"] * bool(faults) + [".truth.tum"] * (as_graph and not of_file)
+    written, source = [_companion(args.out, ending) for ending in companions], Path(args.scenario) if of_file else None
     console.check_file(args.out, *written, force=args.force, source=source)
     if of_file:
         return _spoil(args, faults)
@@ -47,10 +47,10 @@ def _write_bag(args: argparse.Namespace, faults: "list[Fault]") -> None:
 
     recording, wrong = faulty_recording(_recorded(args), faults, args.seed)
     write_bag(recording, args.out)
-    console.say(f"wrote {args.out}")
+    console.show(f"wrote {args.out}")
     if faults:
-        write_table(_beside(args.out, ".faults.csv"), WrongMessage, wrong)
-        console.say(f"wrote {_beside(args.out, '.faults.csv')}: {len(wrong)} measurements are wrong")
+        write_table(_companion(args.out, ".faults.csv"), WrongMessage, wrong)
+        console.show(f"wrote {_companion(args.out, '.faults.csv')}: {len(wrong)} measurements are wrong")
 
 
 def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
@@ -72,9 +72,9 @@ def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
         truth = truth_of(recording, graph)
     file = G2oFile(graph, list(range(graph.vertex_count)), [0])
     _write_faulty(args, file, truth, faults)
-    path = _beside(args.out, ".truth.tum")
+    path = _companion(args.out, ".truth.tum")
     write_graph(path, file, values_of(graph, truth), "tum")
-    console.say(f"wrote {path}: the true poses")
+    console.show(f"wrote {path}: the true poses")
 
 
 def _spoil(args: argparse.Namespace, faults: "list[Fault]") -> int:
@@ -101,10 +101,10 @@ def _write_faulty(args: argparse.Namespace, file: "G2oFile", truth: Any, faults:
 
     out, wrong = faulty_graph(file, truth, faults, args.seed)
     write_g2o(args.out, out, values_of(out.graph, out.graph.initial.values))
-    console.say(f"wrote {args.out}")
+    console.show(f"wrote {args.out}")
     if faults:
-        write_table(_beside(args.out, ".faults.csv"), WrongLine, wrong)
-        console.say(f"wrote {_beside(args.out, '.faults.csv')}: {len(wrong)} edges are wrong")
+        write_table(_companion(args.out, ".faults.csv"), WrongLine, wrong)
+        console.show(f"wrote {_companion(args.out, '.faults.csv')}: {len(wrong)} edges are wrong")
 
 
 def _recorded(args: argparse.Namespace) -> "Recording":
@@ -128,7 +128,7 @@ def _options(args: argparse.Namespace) -> dict[str, Any]:
     return options
 
 
-def _beside(out: Path, ending: str) -> Path:
+def _companion(out: Path, ending: str) -> Path:
     """``world.mcap`` and ``world.g2o.gz`` have a ``world.faults.csv``."""
     whole = out.with_suffix("") if out.suffix.lower() == ".gz" else out
     return whole.with_suffix(ending)

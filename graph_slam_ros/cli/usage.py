@@ -36,5 +36,5 @@ class CommandParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Refuse the command line."""
-        console.tell(f"{message} (--help shows what there is)", self.prog)
+        console.warn(f"{message} (--help shows what there is)", self.prog)
         self.exit(console.REFUSED)

@@ -27,21 +27,21 @@ class AppendedFile:
         self._fd = _NOT_MADE
         self._is_named = False  # on the disk
         self._end = 0
-        self._waiting = bytearray()
+        self._unwritten = bytearray()
 
     def write(self, data: bytes) -> int:
         """Append; it is in the file after the next flush."""
-        self._waiting += data
+        self._unwritten += data
         return len(data)
 
     def tell(self) -> int:
         """Where the next byte goes."""
-        return self._end + len(self._waiting)
+        return self._end + len(self._unwritten)
 
     @property
-    def waiting(self) -> int:
+    def unwritten(self) -> int:
         """Bytes that are not in the file yet."""
-        return len(self._waiting)
+        return len(self._unwritten)
 
     def flush(self) -> None:
         """Write what waits. Raises OSError: then some of it waits still."""
@@ -50,10 +50,10 @@ class AppendedFile:
         if not self._is_named and self._fd >= 0:
             sync_folder(self._path.parent)
             self._is_named = True
-        while self._waiting:
-            written = os.pwrite(self._fd, self._waiting, self._end)
+        while self._unwritten:
+            written = os.pwrite(self._fd, self._unwritten, self._end)
             self._end += written
-            del self._waiting[:written]
+            del self._unwritten[:written]
 
     def sync(self) -> None:
         """Have the disk take what was flushed, if anything was. May be called from another thread; raises OSError."""

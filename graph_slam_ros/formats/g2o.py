@@ -75,7 +75,7 @@ class _Reader:
             raise FormatError(message)
         self.skipped.append(message)
 
-    def take(self, line: int, text: str) -> None:
+    def read_line(self, line: int, text: str) -> None:
         words = text.split()
         if not words or words[0].startswith("#"):
             labelled = _CLASS.fullmatch(text.strip())
@@ -291,7 +291,7 @@ def read_g2o(
     )
     reader = _Reader(path.name, lenient, Text(dialect, raw, LANDMARK_IDS_FROM if own_numbers else 0))
     for number, text in lines(path, follow=follow):
-        reader.take(number, text)
+        reader.read_line(number, text)
     if not reader.vertices:
         reader.declare_all()
     if not reader.vertices:

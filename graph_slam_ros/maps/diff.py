@@ -12,7 +12,7 @@ import numpy as np
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on, positions
-from graph_slam_ros.runs import taken_up
+from graph_slam_ros.runs import restored
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.typing import Array, Numbers
 
@@ -134,11 +134,11 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
     GraphSlamError
         One of them has no map, or another number of dimensions.
     """
-    one, two = (taken_up(folder, losses) for folder in (a, b))
+    one, two = (restored(folder, losses) for folder in (a, b))
     refuse_other_space(one, two, a, b)
     common = shared_landmarks(one, two)
     aligned, by, T_a_b = _aligned(one, two, common)
-    apart = _keyframes_apart(one, two, T_a_b)
+    apart = _keyframe_distances(one, two, T_a_b)
     known = [set(slam.landmarks) for slam in (one, two)]
     edges, verdicts = _edges(one, two)
     moved = [MovedLandmark(name, *aligned.distance(k)) for k, name in enumerate(common)]
@@ -161,8 +161,8 @@ def refuse_other_space(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None
     """Raise GraphSlamError where one is in the plane and one in space."""
     if one.space is not two.space:
         dimensions = (slam.space.dimensions for slam in (one, two))
-        told = " and ".join(f"{folder}: {n}" for folder, n in zip((a, b), dimensions, strict=True))
-        raise GraphSlamError(f"world.dimensions differ ({told})")
+        counts = " and ".join(f"{folder}: {n}" for folder, n in zip((a, b), dimensions, strict=True))
+        raise GraphSlamError(f"world.dimensions differ ({counts})")
 
 
 def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
@@ -204,7 +204,7 @@ def _by_stamp(slam: GraphSlam) -> dict[tuple[int, int], int]:
     return out
 
 
-def _keyframes_apart(one: GraphSlam, two: GraphSlam, T_a_b: Numbers) -> Array:
+def _keyframe_distances(one: GraphSlam, two: GraphSlam, T_a_b: Numbers) -> Array:
     a, b = _of_one_stamp(one, two)
     n = one.space.dimensions
     moved = np.stack(one.space.group.act(T_a_b, tuple(b[:, :n].T)), axis=-1).reshape(-1, n)
@@ -222,13 +222,13 @@ def _edges(one: GraphSlam, two: GraphSlam) -> tuple[Counts, list[Judged]]:
     """Those of one type between the same with the same measurement, and those of them that are not judged alike."""
     a, b, names = _by_meaning(one), _by_meaning(two), _names(one)
     pairs = [pair for key in a if key in b for pair in zip(a[key], b[key], strict=False)]
-    verdicts = []
+    unlike = []
     for in_a, in_b in pairs:
-        said = one.ledger.verdict_of(in_a), two.ledger.verdict_of(in_b)
-        if said[0] is not said[1]:
-            words = [verdict.name.lower() for verdict in said]
-            verdicts.append(Judged(_about(one, names, in_a), in_a, in_b, *words))
-    return Counts(one.graph.edge_count, two.graph.edge_count, len(pairs)), verdicts
+        verdicts = one.ledger.verdict_of(in_a), two.ledger.verdict_of(in_b)
+        if verdicts[0] is not verdicts[1]:
+            words = [verdict.name.lower() for verdict in verdicts]
+            unlike.append(Judged(_about(one, names, in_a), in_a, in_b, *words))
+    return Counts(one.graph.edge_count, two.graph.edge_count, len(pairs)), unlike
 
 
 def _by_meaning(slam: GraphSlam) -> dict[Any, list[int]]:

@@ -11,7 +11,7 @@ from graph_slam_ros.formats.strict import is_gzipped
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.messages import results, to_msg
 from graph_slam_ros.recordings.bag import BagWriter
-from graph_slam_ros.runs import RunError, graph_file, is_run, numbered, taken_up
+from graph_slam_ros.runs import RunError, graph_file, is_run, numbered, restored
 from graph_slam_ros.slam import GraphSlam
 
 
@@ -30,7 +30,7 @@ def export(folder: Path, out: Path, target: str, losses: list[str], *, last_driv
         raise RunError(f"{out}: a run is there, with files of its own")
     if target == "mcap" and out.suffix != ".mcap":
         raise RunError(f"{out}: what reads mcap wants a name that ends in .mcap")
-    slam = taken_up(folder, losses)
+    slam = restored(folder, losses)
     if last_drive:
         if target != "tum":
             raise RunError(f"--last-drive: {target} holds a whole map; with --to tum it is the path of the last drive")
@@ -55,10 +55,10 @@ def _tum(slam: GraphSlam, out: Path, first: int = 0) -> list[Path]:
 def _g2o(slam: GraphSlam, out: Path) -> list[Path]:
     """All that is believed; g2o has neither stamps nor names: these are in a table beside it."""
     ids, table = numbered(slam)
-    _, beside = files_of(out, "g2o")
+    _, names_file = files_of(out, "g2o")
     write_g2o(out, graph_file(slam, ids), slam.solver.estimate)
-    write_text(beside, table)
-    return [out, beside]
+    write_text(names_file, table)
+    return [out, names_file]
 
 
 def _mcap(slam: GraphSlam, out: Path) -> list[Path]:

@@ -16,7 +16,7 @@ from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.maps.alignment import Alignment, align, positions
 from graph_slam_ros.maps.diff import refuse_other_space, shared_landmarks
-from graph_slam_ros.runs import check_room, record_run, settled, stopwatch
+from graph_slam_ros.runs import check_room, record_run, restored_and_solved, stopwatch
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.landmarks.anonymous import NAME, last_number
@@ -56,7 +56,7 @@ def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     for folder in (a, b):
         check_room(out, folder, force=force)
     losses: list[str] = []
-    one, two = settled(a, losses), settled(b, losses)
+    one, two = restored_and_solved(a, losses), restored_and_solved(b, losses)
     refuse_other_space(one, two, a, b)
     _refuse_other_datum(one, two, a, b)
     shared = _shared(one, two, a, b)
@@ -110,8 +110,8 @@ def _aligned(one: GraphSlam, two: GraphSlam, shared: list[str]) -> Alignment:
     found = align(one.space, positions(one, shared), positions(two, shared), robust.gate, robust.noise_factor)
     agree = 0 if found is None else int(found.fits.sum())
     if found is None or 2 * agree < len(shared):
-        told = f"{agree} of them agree" if agree else "too few agree, or they stand too close together"
-        raise GraphSlamError(f"{len(shared)} landmarks are in both maps, and {told} on how one lies on the other")
+        why = f"{agree} of them agree" if agree else "too few agree, or they stand too close together"
+        raise GraphSlamError(f"{len(shared)} landmarks are in both maps, and {why} on how one lies on the other")
     return found
 
 
@@ -140,28 +140,28 @@ class _Second:
 
     def record(self) -> Record:
         """With the numbers that vertices, edges and keyframes have after those of the first."""
-        told, first = MapGrowth().since(self._two), self._keyframes
+        growth, first = MapGrowth().since(self._two), self._keyframes
         others = MapGrowth().since(self._one)["edges"]
         known = {(label, *vertices) for _, vertices, *_, label, _ in others if label in _ONCE}
-        edges = [self._edge(edge) for edge in told["edges"]]
+        edges = [self._edge(edge) for edge in growth["edges"]]
         kept = [k for k, (_, vertices, *_, label, _) in enumerate(edges) if (label, *vertices) not in known]
         number = {edge: self._one.graph.edge_count + k for k, edge in enumerate(kept)}
         return {
-            "vertices": [self._value(vertex, told["vertices"][vertex][0]) for vertex in self._new],
+            "vertices": [self._value(vertex, growth["vertices"][vertex][0]) for vertex in self._new],
             "edges": [edges[k] for k in kept],
-            "judged": [[first + keyframe, *rest] for keyframe, *rest in (told["judged"][k] for k in kept)],
-            "changes": [[number[edge], first + keyframe, *rest] for edge, keyframe, *rest in told.get("changes", ())],
-            "keyframes": [[self._vertex[vertex], *rest] for vertex, *rest in told["keyframes"]],
-            "segments": [first + keyframe for keyframe in told["segments"]],
-            "drives": [first + keyframe for keyframe in told["drives"]],
-            "sightings": [[first + keyframe, *rest] for keyframe, *rest in told.get("sightings", ())],
-            "landmarks": self._landmarks(told.get("landmarks", {})),
+            "judged": [[first + keyframe, *rest] for keyframe, *rest in (growth["judged"][k] for k in kept)],
+            "changes": [[number[edge], first + keyframe, *rest] for edge, keyframe, *rest in growth.get("changes", ())],
+            "keyframes": [[self._vertex[vertex], *rest] for vertex, *rest in growth["keyframes"]],
+            "segments": [first + keyframe for keyframe in growth["segments"]],
+            "drives": [first + keyframe for keyframe in growth["drives"]],
+            "sightings": [[first + keyframe, *rest] for keyframe, *rest in growth.get("sightings", ())],
+            "landmarks": self._landmarks(growth.get("landmarks", {})),
             "seen": [
                 [number[edge], topic, sighting, first + keyframe, self._vertex[vertex], *rest]
-                for edge, topic, sighting, keyframe, vertex, *rest in told.get("seen", ())
+                for edge, topic, sighting, keyframe, vertex, *rest in growth.get("seen", ())
             ],
-            "datum": told.get("datum", self._one.datum),
-            "offsets": {name: self._vertex[vertex] for name, vertex in told.get("offsets", {}).items()},
+            "datum": growth.get("datum", self._one.datum),
+            "offsets": {name: self._vertex[vertex] for name, vertex in growth.get("offsets", {}).items()},
         }
 
     def _value(self, vertex: int, kind: str) -> list[Any]:
@@ -193,11 +193,11 @@ class _Second:
         tag = next(tag for tag, edge_type in EDGE_TAGS.items() if edge_type is space.relative_pose)
         return [tag, ends, measured, np.ravel(root).tolist(), "odometry", ""]
 
-    def _landmarks(self, told: Mapping[str, Any]) -> dict[str, Any]:
+    def _landmarks(self, landmarks: Mapping[str, Any]) -> dict[str, Any]:
         out: dict[str, Any] = {}
         known = self._one.touched_landmarks(0)
-        number = last_number({*known, *told})
-        for name, (vertex, is_unnamed, is_tentative, sightings, first_ns, last_ns) in told.items():
+        number = last_number({*known, *landmarks})
+        for name, (vertex, is_unnamed, is_tentative, sightings, first_ns, last_ns) in landmarks.items():
             if name in self._shared:
                 mark = self._one.landmarks[name]
                 sightings += mark.sightings

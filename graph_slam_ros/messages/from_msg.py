@@ -88,11 +88,11 @@ class MessageConverter:
         self._sources: dict[str, InputContext] = {}
         self._convert: dict[str, Callable[[Any], Any]] = {}
         self._publishers: dict[str, OnePublisher] = {}  # of each odometry
-        self._waiting: deque[tuple[InputContext, Any]] = deque()  # for /tf to tell where their sensors were
+        self._pending: deque[tuple[InputContext, Any]] = deque()  # for /tf to tell where their sensors were
         self._types = {TF_STATIC: TRANSFORMS, TF: TRANSFORMS}
         by_name = {settings.name: settings for settings in config.sources}
-        told = (settings.numbers("datum", 3) for settings in config.sources)
-        self._origin = Origin(next(filter(None, told), ()))
+        datums = (settings.numbers("datum", 3) for settings in config.sources)
+        self._origin = Origin(next(filter(None, datums), ()))
         for name, use in uses(config).items():
             counters.received[name] += 0
             source = self._sources[name] = InputContext(by_name[name], use, config, self._transforms, self._origin)
@@ -110,7 +110,7 @@ class MessageConverter:
         ours = {name: decoder(name) for name in self._types.values() if name in known}
         self._decode = ours | dict(decoders or {})
 
-    def take(self, name: str, cdr: bytes) -> list[Measured]:
+    def convert(self, name: str, cdr: bytes) -> list[Measured]:
         """What a message of an input, of ``tf_static`` or ``tf`` gives, itself or by what has waited for it."""
         source = self._sources[name]
         self._counters.received[name] += 1
@@ -122,20 +122,20 @@ class MessageConverter:
         out = self._converted(source, message)
         if source.use == "odometry":
             publishers = self._publishers[name]
-            out = [one for m in out if isinstance(m, Odometry) for one in publishers.take(m)]
+            out = [one for m in out if isinstance(m, Odometry) for one in publishers.accept(m)]
             self._transforms.now_ns = max([*(m.stamp_ns for m in out), self._transforms.now_ns or 0]) or None
         if name == TF or source.use == "odometry":
-            for _ in range(len(self._waiting)):
-                out += self._converted(*self._waiting.popleft())
-        elif len(self._waiting) > self._config.ordering.max_waiting:
-            out += self._hurried(*self._waiting.popleft())
+            for _ in range(len(self._pending)):
+                out += self._converted(*self._pending.popleft())
+        elif len(self._pending) > self._config.ordering.max_waiting:
+            out += self._hurried(*self._pending.popleft())
         return out
 
     def finish(self, *, is_end: bool = True) -> list[Measured]:
         """What waits for /tf is used or refused; at the end of all messages, odometry that waits, too."""
         out: list[Measured] = [m for one in self._publishers.values() for m in one.finish()] if is_end else []
-        out += [one for waiting in self._waiting for one in self._hurried(*waiting)]
-        self._waiting.clear()
+        out += [one for pending in self._pending for one in self._hurried(*pending)]
+        self._pending.clear()
         return out
 
     def unlinked(self, name: str) -> tuple[tuple[str, str], ...]:
@@ -149,7 +149,7 @@ class MessageConverter:
 
     def initial_pose(self, cdr: bytes) -> list[InitialPose]:
         """What a geometry_msgs/PoseWithCovarianceStamped of ``initialpose`` says, if it can be used."""
-        out: list[Any] = self.take(INITIAL_POSE, cdr)
+        out: list[Any] = self.convert(INITIAL_POSE, cdr)
         return out
 
     def begin_at(self, datum: tuple[float, ...]) -> None:
@@ -158,7 +158,7 @@ class MessageConverter:
 
     def forget_time(self) -> None:
         """Stamps begin anew: what /tf has told of moving joints is of another time."""
-        self._waiting.clear()
+        self._pending.clear()
         for publishers in self._publishers.values():
             publishers.forget_time()
         self._transforms.forget_time()
@@ -185,7 +185,7 @@ class MessageConverter:
                 out += self._convert[source.name](message)
         except NotYet:
             source.tally.clear()
-            self._waiting.append((source, message))
+            self._pending.append((source, message))
             return []
         except MessageError as reason:
             source.count(str(reason))
@@ -195,8 +195,8 @@ class MessageConverter:
         return out
 
     def _add_initial_pose(self) -> None:
-        said = self._config.initialpose
-        settings = InputConfig(INITIAL_POSE, sigma_m=said.sigma_m, sigma_rad=said.sigma_rad)
+        defaults = self._config.initialpose
+        settings = InputConfig(INITIAL_POSE, sigma_m=defaults.sigma_m, sigma_rad=defaults.sigma_rad)
         source = self._sources[INITIAL_POSE] = InputContext(settings, "none", self._config, self._transforms)
         self._types[INITIAL_POSE] = "geometry_msgs/msg/PoseWithCovarianceStamped"
         self._convert[INITIAL_POSE] = partial(fixes.initial_pose, source)

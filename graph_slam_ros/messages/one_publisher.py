@@ -41,7 +41,7 @@ class _Track:
     past : stamp and pose of the last messages, by ascending stamp
     count : messages so far
     first_ns : stamp of its first message
-    is_settled : whether it is another publisher's, which goes on beside the one in use
+    is_established : whether it is another publisher's, which goes on beside the one in use
     since : its messages since the last of the track in use, and one before
     """
 
@@ -49,7 +49,7 @@ class _Track:
     past: deque[tuple[int, Numbers]] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     count: int = 0
     first_ns: int = 0
-    is_settled: bool = False
+    is_established: bool = False
     since: deque[Odometry] = field(default_factory=deque)
 
     def add(self, m: Odometry) -> None:
@@ -117,15 +117,19 @@ class OnePublisher:
         self._labels = 1
         self._usual = 0.0  # misfit of the odometry in use
 
-    def take(self, m: Odometry) -> list[Odometry]:
+    def accept(self, m: Odometry) -> list[Odometry]:
         """What is to be used now that a message has come, in the order it came."""
         newest_ns, room_ns = m.stamp_ns, _GAP_NS
         if self._tracks and (used := self._tracks[0]).past:
             newest_ns = min(m.stamp_ns, used.newest_ns)
             room_ns = max(_GAP_NS, round(_GAP_PERIODS * used.period_ns))
-        return [out for _, one in self._leap.take(m.stamp_ns, m, newest_ns, room_ns) for out in self._take(one)]
+        return [
+            out
+            for _, one in self._leap.accept(m.stamp_ns, m, newest_ns, room_ns)
+            for out in self._follow_publisher(one)
+        ]
 
-    def _take(self, m: Odometry) -> list[Odometry]:
+    def _follow_publisher(self, m: Odometry) -> list[Odometry]:
         if self._labels > _MOST_LABELS:
             return [m]  # these are no publishers: whatever it is, it is used as it comes
         if self._tracks and self._tracks[0].past and m.stamp_ns > self._tracks[0].newest_ns + _AHEAD_NS:
@@ -140,9 +144,9 @@ class OnePublisher:
         if track is used:
             before = self._go_on(m) if self._held or len(self._tracks) > 1 else []
             return [*before, _labelled(m, track)]
-        if track.is_settled:
+        if track.is_established:
             track.since.append(m)
-            return self._taken_over(track)
+            return self._switch_to(track)
         self._held.append((track, m))
         return self._jumped() if len(self._held) > _MOST_HELD or _has_jumped(track, used) else []
 
@@ -212,7 +216,7 @@ class OnePublisher:
         out = [_labelled(m, used) for track, m in self._held if track is used]
         for track, m in self._held:
             if track is not used:
-                track.is_settled = True
+                track.is_established = True
                 track.since.append(m)
         self._held.clear()
         for track in self._tracks[1:]:
@@ -231,10 +235,10 @@ class OnePublisher:
             self._refuse()
         self._held.clear()
         track.label = used.label
-        self._tracks = [track, *(one for one in self._tracks[1:] if one.is_settled)]
+        self._tracks = [track, *(one for one in self._tracks[1:] if one.is_established)]
         return [_labelled(m, track) for m in out]
 
-    def _taken_over(self, track: _Track) -> list[Odometry]:
+    def _switch_to(self, track: _Track) -> list[Odometry]:
         """Nothing, until the track in use has been silent for so long that another one takes over."""
         if track.count < _SURE or track.newest_ns - track.since[0].stamp_ns <= self._timeout_ns:
             self._drop(track.since, _MOST_SINCE)
@@ -245,7 +249,7 @@ class OnePublisher:
         out = [_labelled(m, track) for m in track.since]
         track.since.clear()
         self._tracks.remove(track)
-        self._tracks[0].is_settled, track.is_settled = True, False
+        self._tracks[0].is_established, track.is_established = True, False
         self._tracks.insert(0, track)
         return out
 

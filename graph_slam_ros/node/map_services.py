@@ -6,7 +6,7 @@ from concurrent.futures import Future
 from importlib import import_module
 from typing import Any
 
-from graph_slam_ros.errors import ConfigError, GraphSlamError, said
+from graph_slam_ros.errors import ConfigError, GraphSlamError, message_of
 
 _GIVEN_POSE, _LOCALIZE = 2, 3  # match_type of slam_toolbox/srv/DeserializePoseGraph
 _BAD_NAME, _BAD_MATCH_TYPE, _UNREADABLE, _FAILED = 1, 2, 3, 255  # its result, and that of SerializePoseGraph
@@ -65,7 +65,7 @@ def serve_maps(node: Any, serve_later: Callable[..., None]) -> None:
         if error is None:
             node.get_logger().info(message)
         else:
-            node.get_logger().error(said(error))
+            node.get_logger().error(message_of(error))
         if hasattr(response, "result"):  # some versions answer with nothing
             response.result = _code(response, error)
         return response

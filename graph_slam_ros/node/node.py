@@ -24,7 +24,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import UInt64
 
-from graph_slam_ros.errors import ConfigError, GraphSlamError, said
+from graph_slam_ros.errors import ConfigError, GraphSlamError, message_of
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.node import bond, diagnostics
@@ -124,7 +124,7 @@ class GraphSlamNode(LifecycleNode):
             action()
         except Exception as error:
             self.get_logger().fatal(
-                said(error) if isinstance(error, GraphSlamError) else f"a fault of ours, {said(error)}"
+                message_of(error) if isinstance(error, GraphSlamError) else f"a fault of ours, {message_of(error)}"
             )
             return failed
         return _SUCCESS
@@ -220,7 +220,7 @@ class GraphSlamNode(LifecycleNode):
             try:
                 return answer(request, response)
             except Exception as error:
-                self.get_logger().warn(f"{service.srv_name}: {said(error)}")
+                self.get_logger().warn(f"{service.srv_name}: {message_of(error)}")
                 return service.srv_type.Response()
 
         return answered
@@ -352,7 +352,7 @@ def _run() -> int:
         rclpy.logging.get_logger("graph_slam").fatal(str(error))
         return 2
     except Exception as error:
-        rclpy.logging.get_logger("graph_slam").fatal(f"a fault of ours, {said(error)}")
+        rclpy.logging.get_logger("graph_slam").fatal(f"a fault of ours, {message_of(error)}")
         return 1
     finally:
         rclpy.try_shutdown()

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from graph_slam_ros.errors import GraphSlamError, said
+from graph_slam_ros.errors import GraphSlamError, message_of
 from graph_slam_ros.warmup import Compiling, are_compiled, warmup
 
 
@@ -33,7 +33,7 @@ class Preparation:
             self._log.info(str(error))
             return False
         except Exception as error:
-            self.fault = f"kernels cannot be compiled ({said(error)}): try graph_slam warmup"
+            self.fault = f"kernels cannot be compiled ({message_of(error)}): try graph_slam warmup"
             self._log.error(self.fault)
             return False
         self.said = ""

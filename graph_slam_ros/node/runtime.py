@@ -16,7 +16,7 @@ from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
-from graph_slam_ros.errors import GraphSlamError, said
+from graph_slam_ros.errors import GraphSlamError, message_of
 from graph_slam_ros.measurements.types import Closure, InitialPose, Measured
 from graph_slam_ros.messages import results, to_msg
 from graph_slam_ros.messages.from_msg import Decoder, MessageConverter, twist_of
@@ -264,7 +264,7 @@ class Runtime:
     def tick(self) -> None:
         """Ten times a second: what has waited long enough, and what somebody may have begun to listen to."""
         self._watch()
-        self._session.flush_beside()
+        self._session.flush_in_background()
         self._completion.tick()
         for some in self._ahead.waited():
             self._hand_over(some)
@@ -367,7 +367,7 @@ class Runtime:
 
         def note(done: "Future[Any]") -> None:
             if (error := done.exception()) is not None:
-                self._node.get_logger().error(said(error))
+                self._node.get_logger().error(message_of(error))
 
         future.add_done_callback(note)
 

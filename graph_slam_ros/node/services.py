@@ -7,7 +7,7 @@ from typing import Any
 
 from std_srvs.srv import Trigger
 
-from graph_slam_ros.errors import said
+from graph_slam_ros.errors import message_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class _Later:
 
 
 def _triggered(response: Any, message: str, error: BaseException | None) -> Any:
-    response.success, response.message = error is None, said(error) if error is not None else message
+    response.success, response.message = error is None, message_of(error) if error is not None else message
     return response
 
 

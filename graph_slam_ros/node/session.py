@@ -166,10 +166,10 @@ class Session:
                 for measurement in held:
                     recorder.accept(measurement)
 
-    def flush_beside(self) -> None:
+    def flush_in_background(self) -> None:
         """Have what was accepted written, however busy the worker is."""
         if (recorder := self._recorder) is not None:
-            recorder.flush_beside()
+            recorder.flush_in_background()
 
     def process(self, measurements: Sequence[Measurement]) -> None:
         """Hand measurements that were accepted to the pipeline, in order."""
@@ -283,7 +283,7 @@ class Session:
         events : that were accepted for it; None: they are accepted now
         name : of a run beside the folder that the map is written as, too; empty: none
         """
-        self._recorded(RunRecorder.wait_synced)  # what the disk refused before is told, and is no reason not to save
+        self._recorded(RunRecorder.join_sync)  # what the disk refused before is told, and is no reason not to save
         self.process(self.accept_save() if events is None else events)
         folder = self._write(ended=False)
         return f"{folder}, {self._save_as(Path(folder), name)}" if name else folder
@@ -397,7 +397,7 @@ class Session:
             return ""
         folder, recorder = "", self._recorder
         if not self._is_saved or (self.slam.keyframes and not self._is_ended):
-            self._recorded(RunRecorder.wait_synced)
+            self._recorded(RunRecorder.join_sync)
             for event in (Control("end"), Control("optimize")) if not self._is_saved else ():
                 recorder.accept(event)
                 self._process(event)

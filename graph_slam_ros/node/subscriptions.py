@@ -106,7 +106,7 @@ class Subscriptions:
             heard.received += 1
             measured: list[Measured] = []
             for name in names:
-                given = border.take(name, cdr)
+                given = border.convert(name, cdr)
                 self._used[name] += len(given)
                 measured += given
             self._take(measured, cdr)

@@ -94,11 +94,11 @@ class Bag:
 
     def _merged(self, topics: Collection[str]) -> Iterator[BagMessage]:
         """Of several parts, split by time or by topic; one is opened when its time has come, for there may be many."""
-        waiting = deque(enumerate(self._parts))
+        pending = deque(enumerate(self._parts))
         heads: list[tuple[int, int, BagMessage, Iterator[BagMessage]]] = []
-        while waiting or heads:
-            while waiting and (not heads or waiting[0][1].first_ns <= heads[0][0]):
-                number, part = waiting.popleft()
+        while pending or heads:
+            while pending and (not heads or pending[0][1].first_ns <= heads[0][0]):
+                number, part = pending.popleft()
                 _push(heads, number, self._of(part, topics))
             if heads:
                 _, number, message, rest = heapq.heappop(heads)
@@ -112,8 +112,8 @@ class Bag:
                 yield _plain(message)
             except FormatError as error:
                 losses.append(f"{part.file.name}: a message of {message.topic} was passed over ({error})")
-        for told, new in ((self.losses, losses), (self.warnings, warnings)):
-            told += [line for line in dict.fromkeys(new) if line not in told]  # a file may be read more than once
+        for known, new in ((self.losses, losses), (self.warnings, warnings)):
+            known += [line for line in dict.fromkeys(new) if line not in known]  # a file may be read more than once
 
 
 def open_bag(path: Path | str) -> Bag:

@@ -12,7 +12,7 @@ from graph_slam_ros.messages.inputs import CONVERTERS
 from graph_slam_ros.recordings.bag import Bag, BagError, Topic
 from graph_slam_ros.recordings.definitions import recorded_decoder
 
-_LOOKED_AT = 2000  # messages of each topic but odometry
+_SAMPLED = 2000  # messages of each topic but odometry
 _MOST_NAMES, _LAGS = 1000, 100
 _LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # as for what is counted as out of the plane
 
@@ -87,7 +87,7 @@ def _root(links: dict[str, str], frame: str) -> str:
     return frame
 
 
-def look(bag: Bag) -> Recording:
+def recording_of(bag: Bag) -> Recording:
     """Read a recording once."""
     out = Recording({name: TopicContents(topic) for name, topic in bag.topics.items()})
     decoders = dict(_decoders(out))
@@ -96,7 +96,7 @@ def look(bag: Bag) -> Recording:
         one.first_ns = one.first_ns or message.log_ns
         one.last_ns = message.log_ns
         is_odometry = one.topic.type == "nav_msgs/msg/Odometry"
-        if message.topic not in decoders or (one.read >= _LOOKED_AT and not is_odometry):
+        if message.topic not in decoders or (one.read >= _SAMPLED and not is_odometry):
             continue
         one.read += 1
         try:

@@ -88,8 +88,10 @@ def contents(path: Path) -> Contents:
     except Exception:  # of a damaged file the library raises almost anything
         summary = None
     if summary is not None and summary.statistics is not None and summary.channels:
-        told = summary.statistics
-        return Contents(summary.schemas, summary.channels, told.channel_message_counts, told.message_start_time)
+        statistics = summary.statistics
+        return Contents(
+            summary.schemas, summary.channels, statistics.channel_message_counts, statistics.message_start_time
+        )
     schemas, channels, counts, first_ns = dict[int, Schema](), dict[int, Channel](), dict[int, int](), 2**64
     for record in records(path, []):
         if isinstance(record, Message):
@@ -112,7 +114,7 @@ def records(
     symbolic link.
     """
     known = len(losses)
-    read, unchecked, loose = 0, False, False
+    read, unchecked, is_unindexed = 0, False, False
     with _Stream(path, follow) as stream:
         at = MAGIC_SIZE
         while True:
@@ -136,22 +138,22 @@ def records(
                         f"{path.name}: a damaged chunk of {after - at} bytes was passed over ({_what(error)})"
                     )
             elif isinstance(record, DataEnd):
-                if loose and record.data_section_crc not in (0, _checksum(stream, at)):
+                if is_unindexed and record.data_section_crc not in (0, _checksum(stream, at)):
                     losses.append(f"{path.name}: damaged: its data do not agree with their checksum")
-                unchecked |= loose and not record.data_section_crc
+                unchecked |= is_unindexed and not record.data_section_crc
                 if not _ends_whole(stream):
                     losses.append(f"{path.name}: cut off after {read} messages, in the summary behind them")
                 break
             elif record is not None:
-                loose |= isinstance(record, Message)
+                is_unindexed |= isinstance(record, Message)
                 read += isinstance(record, Message)
                 yield record
             at = after
-        told = _told(stream)
-        if told is not None and told != read:  # a record whose kind is damaged is passed over in silence
-            what = f"{told - read} of its messages could not be read"
-            if read > told:
-                what = f"{read - told} messages too many"
+        announced = _announced(stream)
+        if announced is not None and announced != read:  # a record whose kind is damaged is passed over in silence
+            what = f"{announced - read} of its messages could not be read"
+            if read > announced:
+                what = f"{read - announced} messages too many"
             losses.append(f"{path.name}: {what}")
     if unchecked and len(losses) > known and warnings is not None:
         warnings.append(f"{path.name}: carries no checksums: more of it may be damaged than was found")
@@ -254,7 +256,7 @@ def _summary(stream: _Stream) -> Summary | None:
     return make_reader(stream).get_summary() if _has_whole_summary(stream) else None
 
 
-def _told(stream: _Stream) -> int | None:
+def _announced(stream: _Stream) -> int | None:
     """How many messages there are by the summary; None where it is damaged itself, or does not say."""
     try:
         summary = _summary(stream)

@@ -64,7 +64,7 @@ def _refuse_computed(database: sqlite3.Connection, path: Path, table: str) -> No
 
 def messages(path: Path, topics: Sequence[int], losses: list[str]) -> Iterator[tuple[int, int, bytes]]:
     """Topic, time and bytes of each message of some topics in order of writing; what is lost adds to ``losses``."""
-    if _beside(path, "-journal"):
+    if _has_companion(path, "-journal"):
         losses.append(f"{path.name}: its recorder was stopped while it wrote; what it wrote last may be lost")
     read = 0
     with closing(_connection(path)) as database:
@@ -92,7 +92,7 @@ def damage(path: Path) -> str:
 
 def _connection(path: Path) -> sqlite3.Connection:
     """Nothing is written, nor are locks taken, unless there is a log of writes that must be read with it."""
-    how = "mode=ro" if _beside(path, "-wal") else "mode=ro&immutable=1"
+    how = "mode=ro" if _has_companion(path, "-wal") else "mode=ro&immutable=1"
     database = sqlite3.connect(f"file:{quote(str(path.absolute()))}?{how}", uri=True)
     database.text_factory = _text
     if sys.version_info >= (3, 11):
@@ -109,7 +109,7 @@ def _most(path: Path) -> int:
     return min(MOST_BYTES, max(_LEAST_LIMIT, size))
 
 
-def _beside(path: Path, ending: str) -> bool:
+def _has_companion(path: Path, ending: str) -> bool:
     file = path.with_name(path.name + ending)
     return file.is_file() and file.stat().st_size > 0
 

@@ -40,10 +40,10 @@ from graph_slam_ros.runs.restore import (
     map_of,
     record_run,
     recover,
+    restored,
+    restored_and_solved,
     save_copy,
-    settled,
     stopwatch,
-    taken_up,
 )
 from graph_slam_ros.runs.tables import account, graph_file, numbered, summarize
 
@@ -74,12 +74,12 @@ __all__ = [
     "record_run",
     "recording_of",
     "recover",
+    "restored",
+    "restored_and_solved",
     "run_config",
     "save_copy",
-    "settled",
     "stopwatch",
     "suggested_out",
     "summarize",
     "summary_of",
-    "taken_up",
 ]

@@ -136,14 +136,14 @@ def summary_of(folder: Path) -> dict[str, Any]:
         It is there and cannot be read: what it says must not be taken for missing.
     """
     try:
-        told = json.loads(read_text(folder / SUMMARY))
+        recorded = json.loads(read_text(folder / SUMMARY))
     except OSError as error:
         if error.errno not in _NO_FILE:
             raise RunError(f"{folder / SUMMARY}: {error.strerror}") from None
         return {}
     except (ValueError, RecursionError):
         return {}
-    return told if isinstance(told, dict) else {}
+    return recorded if isinstance(recorded, dict) else {}
 
 
 def recording_of(folder: Path) -> str:
@@ -183,8 +183,8 @@ def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> It
     summary = summary_of(folder)
     if not summary and os.path.lexists(folder / SUMMARY):
         yield f"{SUMMARY} is not the summary of a run: whether its files belong together is not known"
-    told = summary.get(kind)
-    for name, mark in sorted(told.items()) if isinstance(told, dict) else ():
+    recorded = summary.get(kind)
+    for name, mark in sorted(recorded.items()) if isinstance(recorded, dict) else ():
         if name in _RESULTS or name == CONFIG or _RECORDED.fullmatch(name):  # no path out of the folder
             try:
                 if mark_of(folder / name) != mark:
@@ -217,9 +217,9 @@ def ends_of(file: Path) -> str:
 def _parts(folder: Path) -> Iterator[tuple[str, int, int]]:
     """Of each recording of a run that was saved: how many parts it had then and has now."""
     parts = summary_of(folder).get("parts")
-    told: dict[str, Any] = parts if isinstance(parts, dict) else {}
+    recorded: dict[str, Any] = parts if isinstance(parts, dict) else {}
     for name in (INGEST, MAP):
-        if isinstance(then := told.get(name), int):
+        if isinstance(then := recorded.get(name), int):
             yield name, then, len(parts_of(folder, name))
 
 

@@ -91,9 +91,9 @@ class Parts:
             self.begin().write(several)
 
     @property
-    def waiting(self) -> int:
+    def unwritten(self) -> int:
         """Bytes that are not in files yet."""
-        return sum(file.waiting for file in self._files())
+        return sum(file.unwritten for file in self._files())
 
     def flush(self) -> None:
         """Write what waits. Raises OSError: then some of it waits still."""

@@ -165,7 +165,7 @@ def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> Ma
         return None
     if fault := _fault(state):
         raise FormatError(f"{folder.name}/{MAP}.mcap: {fault}")
-    _take_effect(state)
+    _apply_verdicts(state)
     return state
 
 
@@ -181,7 +181,7 @@ def state_of(slam: GraphSlam) -> MapSnapshot:
 def extend(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     """Take a ``growth`` in, after what there is."""
     _grow(state, record)
-    _take_effect(state)
+    _apply_verdicts(state)
 
 
 def _fault(state: MapSnapshot) -> str:
@@ -248,19 +248,22 @@ def _edge(graph: Graph, edge: int) -> list[Any]:
 def _judgement(ledger: Ledger, edge: int) -> list[Any]:
     first, numbers = int(ledger.keyframe.values[edge]), int(ledger.numbers.values[edge])
     verdict, reason = Verdict(int(ledger.verdict.values[edge])), Reason(int(ledger.reason.values[edge]))
-    statistic, threshold = _told(float(ledger.statistic.values[edge])), _told(float(ledger.threshold.values[edge]))
+    statistic, threshold = (
+        _as_json(float(ledger.statistic.values[edge])),
+        _as_json(float(ledger.threshold.values[edge])),
+    )
     return [first, statistic, threshold, numbers, ledger.residual(edge).tolist(), *_named(verdict, reason)]
 
 
 def _change(c: VerdictChange) -> list[Any]:
-    return [c.edge, c.keyframe, *_named(c.verdict, c.reason), _told(c.statistic), _told(c.threshold)]
+    return [c.edge, c.keyframe, *_named(c.verdict, c.reason), _as_json(c.statistic), _as_json(c.threshold)]
 
 
 def _named(verdict: Verdict, reason: Reason) -> tuple[str, str]:
     return verdict.name.lower(), reason.name.lower()
 
 
-def _told(number: float) -> float | str:
+def _as_json(number: float) -> float | str:
     """JSON has no infinity."""
     return number if math.isfinite(number) else repr(number)
 
@@ -285,7 +288,7 @@ def _seen(one: LandmarkEdge) -> list[Any]:
 # -- what is read -----------------------------------------------------------------------------------------------------
 
 
-def _take_effect(state: MapSnapshot) -> None:
+def _apply_verdicts(state: MapSnapshot) -> None:
     """What is not believed pulls no more; what was given to another landmark is withdrawn from the one before."""
     out = np.flatnonzero(np.isin(state.ledger.verdict.values, (Verdict.PENDING, Verdict.REJECTED)))
     state.graph.set_weights(out, 0.0)
@@ -327,24 +330,24 @@ def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     state.held = tuple(record.get("held", state.held))
 
 
-def _count(told: Any) -> int | None:
-    if told is not None and not _is_index(told, 2**63):
-        raise ValueError(f"processed {told!r} is no count")
-    return told
+def _count(value: Any) -> int | None:
+    if value is not None and not _is_index(value, 2**63):
+        raise ValueError(f"processed {value!r} is no count")
+    return value
 
 
 def _judge(ledger: Ledger, judged: Sequence[Any]) -> None:
     if not judged:
         return
     keyframes, statistics, thresholds, numbers, residuals, *named = zip(*judged, strict=True)
-    told = [_verdict(*names) for names in zip(*named, strict=True)]
-    is_judged = np.array([verdict is not Verdict.NOT_EVALUATED for verdict, _ in told])
+    verdicts = [_verdict(*names) for names in zip(*named, strict=True)]
+    is_judged = np.array([verdict is not Verdict.NOT_EVALUATED for verdict, _ in verdicts])
     flat = np.array([number for residual in residuals for number in residual])
     limits = np.array(list(map(float, thresholds)))
     ids = ledger.enter(
         np.array(keyframes), np.array(list(map(float, statistics))), np.array(numbers), limits, flat, is_judged
     )
-    for edge, (verdict, reason) in zip(ids.tolist(), told, strict=True):
+    for edge, (verdict, reason) in zip(ids.tolist(), verdicts, strict=True):
         ledger.put(edge, verdict, reason)
 
 
@@ -353,13 +356,13 @@ def _verdict(verdict: str, reason: str) -> tuple[Verdict, Reason]:
 
 
 def _know(state: MapSnapshot, record: Mapping[str, Any]) -> None:
-    for name, told in record.get("landmarks", {}).items():
+    for name, fields in record.get("landmarks", {}).items():
         before = state.landmarks.get(name)
-        if before is not None and (told is None or told[0] != before.vertex):  # it was given up: another comes last
+        if before is not None and (fields is None or fields[0] != before.vertex):  # it was given up: another comes last
             del state.landmarks[name]
             before = None
-        if told is not None:
-            now = state.landmarks[name] = Landmark(name, *told)
+        if fields is not None:
+            now = state.landmarks[name] = Landmark(name, *fields)
             now.seen = before.seen if before is not None else []
     by_vertex = {mark.vertex: mark for mark in state.landmarks.values()} if record.get("seen") else {}
     for edge, topic, sighting, keyframe, vertex, stamp, pose, covariance in record.get("seen", ()):

@@ -12,7 +12,7 @@ from graph_slam_ros.measurements.reasons import Effect, Reason, explain, remedy
 Summary = Mapping[str, Any]
 
 _WIDTH = 100
-_MOST_REASONS, _MOST_WAITING = 5, 10  # that are listed
+_MOST_REASONS, _MAX_UNDETERMINED = 5, 10  # that are listed
 _COLUMNS = ("received", "used", "believed")
 _OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does not move in a plane
 _MOSTLY = 0.5
@@ -34,9 +34,11 @@ def text(summary: Summary) -> list[str]:
     if "time_s" in summary:
         cpu = f", {summary['cpu_s']:.1f} s of CPU time" if "cpu_s" in summary else ""
         lines.append(f"took       {summary['time_s']:10.1f} s{cpu}")
-    waiting = [f"waiting    {name}: {reason}" for name, reason in summary["waiting"].items()]
-    if len(waiting) > _MOST_WAITING:
-        waiting[_MOST_WAITING:] = [f"waiting    and {len(waiting) - _MOST_WAITING} more, see run.json"]
+    undetermined = [f"waiting    {name}: {reason}" for name, reason in summary["waiting"].items()]
+    if len(undetermined) > _MAX_UNDETERMINED:
+        undetermined[_MAX_UNDETERMINED:] = [
+            f"waiting    and {len(undetermined) - _MAX_UNDETERMINED} more, see run.json"
+        ]
     inputs = summary.get("inputs", {})
     others = [
         line
@@ -45,7 +47,7 @@ def text(summary: Summary) -> list[str]:
         if source not in inputs or explain(reason).effect is not Effect.REFUSED
         for line in _wrapped(f"counted    {source}: {reason} {times} ({explain(reason).meaning})", 11)
     ]
-    return [*lines, *waiting, *others, *table(summary)]
+    return [*lines, *undetermined, *others, *table(summary)]
 
 
 def _wrapped(line: str, indent: int) -> list[str]:

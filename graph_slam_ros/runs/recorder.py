@@ -94,15 +94,15 @@ class RunRecorder:
             raise RunError(f"{self.folder}: {error.strerror}") from None
 
     def accept(self, measurement: Measurement) -> None:
-        """Take a measurement for the journal; it waits for ``flush`` or ``flush_beside``."""
+        """Take a measurement for the journal; it waits for ``flush`` or ``flush_in_background``."""
         self._accepted.append(measurement)
         self.accepted += 1
 
-    def flush_beside(self) -> None:
+    def flush_in_background(self) -> None:
         """Have a thread write what was accepted, if that waits: the one that processes may be busy for long."""
         if self._accepted and not self._is_ended and (self._flushing is None or self._flushing.done()):
             with contextlib.suppress(RuntimeError):  # the recording has just been ended
-                self._flushing = self._beside().submit(self._flush_journal)
+                self._flushing = self._writer_thread().submit(self._flush_journal)
 
     def _flush_journal(self) -> None:
         with contextlib.suppress(OSError), self._writing:  # it waits, and the next flush raises that again
@@ -112,7 +112,7 @@ class RunRecorder:
                 if self._syncing is None or (self._syncing.done() and not self._syncing.exception()):
                     self._syncing = self._sync_if_due()
 
-    def _beside(self) -> ThreadPoolExecutor:
+    def _writer_thread(self) -> ThreadPoolExecutor:
         with self._writing:
             self._disk = self._disk or ThreadPoolExecutor(1, "journal")
             return self._disk
@@ -154,7 +154,7 @@ class RunRecorder:
     @property
     def unwritten(self) -> int:
         """Bytes of the journal that wait for room on the disk."""
-        return self._journal.waiting + self._map.waiting
+        return self._journal.unwritten + self._map.unwritten
 
     def _sync_if_due(self) -> Future[None] | None:
         """The disk may take long: nobody waits for it."""
@@ -162,9 +162,9 @@ class RunRecorder:
         if not self._sync_s or now < self._due_s:
             return None
         self._due_s = now + self._sync_s
-        return self._beside().submit(self._sync)
+        return self._writer_thread().submit(self._sync)
 
-    def wait_synced(self) -> None:
+    def join_sync(self) -> None:
         """Wait until the disk has taken what it was asked to take. Raises OSError: it did not, which is told once."""
         asked, self._syncing = self._syncing, None
         if asked is not None:
@@ -207,9 +207,9 @@ class RunRecorder:
                     self._record_map(slam)
                 self._end_parts()
                 parts = self._ended_parts()
-            waiting = max(0, self.accepted - slam.processed)
-            told = (summary or {}) | parts | {"unprocessed": waiting}
-            save_results(self.folder, slam, told, self._refuse_if_ended)
+            unprocessed = max(0, self.accepted - slam.processed)
+            contents = (summary or {}) | parts | {"unprocessed": unprocessed}
+            save_results(self.folder, slam, contents, self._refuse_if_ended)
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None
         return self.folder
@@ -233,7 +233,7 @@ class RunRecorder:
         OSError
             The disk refuses it.
         """
-        waiting = max(0, self.accepted - processed)
+        unprocessed = max(0, self.accepted - processed)
         with self._writing:
             if self._is_ended:
                 return 0
@@ -241,14 +241,14 @@ class RunRecorder:
             now = {
                 "keyframes": keyframes,
                 "ended": True,
-                "is_incomplete": bool(waiting or keyframes),
-                "unprocessed": waiting,
+                "is_incomplete": bool(unprocessed or keyframes),
+                "unprocessed": unprocessed,
             }
-            told = summary_of(self.folder) | now | counted(counters) | self._ended_parts()
-            _put(self.folder, SUMMARY, json.dumps(told, indent=2) + "\n")
+            contents = summary_of(self.folder) | now | counted(counters) | self._ended_parts()
+            _put(self.folder, SUMMARY, json.dumps(contents, indent=2) + "\n")
             self._is_ended = True
             self._room.close()
-        return waiting
+        return unprocessed
 
     def close(self) -> None:
         """End the recording: somebody else may have the folder.
@@ -330,9 +330,9 @@ def save_results(
         return _put(folder, name, text)
 
     files = {name: put(name, text) for name, text in result_texts(slam).items()}
-    told = {"format": MARK} | summarize(slam) | summary | {"format": MARK, "files": files}
-    told["leverage"] = leverage(slam.solver) if slam.is_solved else {}
-    put(SUMMARY, json.dumps(told, indent=2) + "\n")
+    contents = {"format": MARK} | summarize(slam) | summary | {"format": MARK, "files": files}
+    contents["leverage"] = leverage(slam.solver) if slam.is_solved else {}
+    put(SUMMARY, json.dumps(contents, indent=2) + "\n")
 
 
 def _put(folder: Path, name: str, text: str) -> str:

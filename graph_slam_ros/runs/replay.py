@@ -31,7 +31,7 @@ from graph_slam_ros.runs import (
 )
 from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.runs.restore import Took
+from graph_slam_ros.runs.restore import Stopwatch
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
 from graph_slam_ros.warmup import warmup
@@ -196,10 +196,10 @@ class RecordedRuns:
         bag, by_topic = self._bag, self._inputs.by_topic()
         if TF_STATIC in self._inputs.topics:
             for message in bag.messages({self._inputs.topics[TF_STATIC]}):
-                self._converter.take(TF_STATIC, message.cdr)
+                self._converter.convert(TF_STATIC, message.cdr)
         for message in bag.messages(set(by_topic)):
             names = by_topic[message.topic]
-            yield from self._passed([m for name in names for m in self._converter.take(name, message.cdr)], names)
+            yield from self._passed([m for name in names for m in self._converter.convert(name, message.cdr)], names)
         yield from self._passed(self._converter.finish(), ())
 
     def _passed(self, measured: list[Measured], names: Sequence[str]) -> Iterator[tuple[int, list[Measured | Control]]]:
@@ -277,7 +277,7 @@ def _recorded(
     config: Config | None,
     topics: tuple[str | None, str | None],
     map_folder: Path | None,
-    took: Took,
+    took: Stopwatch,
     progress: Progress,
     *,
     force: bool,

@@ -29,7 +29,7 @@ from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.warmup import warmup
 
 Summary = dict[str, Any]
-Took = Callable[[], dict[str, float]]
+Stopwatch = Callable[[], dict[str, float]]
 
 
 def map_of(folder: Path, losses: list[str], counters: Counters | None = None) -> MapSnapshot:
@@ -96,7 +96,7 @@ def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Co
     return out
 
 
-def taken_up(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
+def restored(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
     """The map of a run, solved; as ``map_of``."""
     lost = len(losses)
     state = map_of(folder, losses, counters)
@@ -105,9 +105,9 @@ def taken_up(folder: Path, losses: list[str], counters: Counters | None = None) 
     return GraphSlam(config, start=state)
 
 
-def settled(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
+def restored_and_solved(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
     """The same with all of it judged. Raises GraphSlamError, too, where it cannot be solved."""
-    slam = taken_up(folder, losses, counters)
+    slam = restored(folder, losses, counters)
     slam.process(Control("optimize"))
     if not slam.is_solved:
         raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
@@ -123,7 +123,7 @@ def record_run(
     *,
     border: Counters | None = None,
     earlier: Counters | None = None,
-    took: Took | None = None,
+    took: Stopwatch | None = None,
     recording: str = "",
     force: bool = False,
 ) -> tuple[GraphSlam, Summary]:
@@ -169,7 +169,7 @@ def record_run(
     return slam, summary
 
 
-def stopwatch() -> Took:
+def stopwatch() -> Stopwatch:
     """Of what follows."""
     start_s, cpu_s = time.perf_counter(), time.process_time()
     return lambda: {"time_s": time.perf_counter() - start_s, "cpu_s": time.process_time() - cpu_s}
@@ -182,8 +182,8 @@ def recover(folder: Path, out: Path, *, force: bool = False) -> Summary:
     losses: list[str] = []
     counters = Counters()
     state = map_of(folder, losses, counters)
-    told: dict[str, Any] = {"earlier": counters, "took": took, "recording": recording_of(folder)}
-    return record_run(out, config_of(folder, state), (), losses, state, force=force, **told)[1]
+    options: dict[str, Any] = {"earlier": counters, "took": took, "recording": recording_of(folder)}
+    return record_run(out, config_of(folder, state), (), losses, state, force=force, **options)[1]
 
 
 def complete(folder: Path) -> Summary:
@@ -199,7 +199,7 @@ def complete(folder: Path) -> Summary:
     try:
         with claimed(folder):
             before, counters = summary_of(folder), Counters()
-            slam = settled(folder, losses, counters)
+            slam = restored_and_solved(folder, losses, counters)
             summary = (
                 before | summarize(slam, counters) | took() | {"losses": losses, "ended": True, "is_incomplete": False}
             )
@@ -235,7 +235,7 @@ def freeze(folder: Path, out: Path, *, force: bool = False) -> Summary:
     took = stopwatch()
     check_room(out, folder, force=force)
     losses: list[str] = []
-    slam = settled(folder, losses)
+    slam = restored_and_solved(folder, losses)
     state = state_of(slam)
     state.freeze()
     return record_run(out, slam.config, [Control("optimize")], losses, state, took=took, force=force)[1]

@@ -302,16 +302,16 @@ class Suggestion:
         if abs(offset_s) > _MOST_OFFSET_S:
             self.unused[topic] = f"its stamps are {offset_s:.0f} s from those of odometry: another clock"
             return
-        told = dict(chosen or {}) | ({} if linked else self._mount(topic, one.frame))
+        settings = dict(chosen or {}) | ({} if linked else self._mount(topic, one.frame))
         if abs(offset_s) > _CLOCKS_DIFFER_S:
-            told["offset_s"] = round(offset_s, 3)
+            settings["offset_s"] = round(offset_s, 3)
             self.notes.append(f"{topic} has another clock than odometry: {offset_s:.3f} s are added to its stamps")
         name = self._free(name)
         if name == "detections":
             self._topics[name] = topic
         else:
-            told = {"type": one.topic.type, "topic": topic} | told
-        self._set(name, told)
+            settings = {"type": one.topic.type, "topic": topic} | settings
+        self._set(name, settings)
 
     def _set(self, name: str, chosen: dict[str, Any]) -> None:
         self._names.append(name)

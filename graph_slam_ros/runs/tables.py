@@ -84,12 +84,12 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     """
     used_as = dict.fromkeys(slam.odometry_sources, "odometry") | uses(slam.config)  # a source need not be an input
     is_of_map = not slam.counters.used  # nothing was measured since: a run that is written from its map
-    believed = _believed(slam, 0 if is_of_map else slam.first_edge)
+    accepted = _accepted_by_input(slam, 0 if is_of_map else slam.first_edge)
     inputs = {}
-    for name in dict.fromkeys([*slam.config.inputs.names.split(), *counters.used, *believed]):
-        if name in counters.received or counters.used[name] or name in believed:
-            used = max(counters.used[name], believed.get(name, 0) if is_of_map else 0)
-            of_input = {"received": counters.received.get(name), "used": used, "believed": believed.get(name)}
+    for name in dict.fromkeys([*slam.config.inputs.names.split(), *counters.used, *accepted]):
+        if name in counters.received or counters.used[name] or name in accepted:
+            used = max(counters.used[name], accepted.get(name, 0) if is_of_map else 0)
+            of_input = {"received": counters.received.get(name), "used": used, "believed": accepted.get(name)}
             inputs[name] = {"use": used_as.get(name, "")} | of_input
     return {"counters": counters.as_dict(), "inputs": inputs}
 
@@ -119,13 +119,13 @@ def counters_of(summary: Mapping[str, Any]) -> Counters:
     return out
 
 
-def _times(told: Any) -> int:
-    if not isinstance(told, int) or isinstance(told, bool) or not 0 <= told < 2**63:
-        raise ValueError(f"{told!r:.20} is no count")
-    return told
+def _times(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**63:
+        raise ValueError(f"{value!r:.20} is no count")
+    return value
 
 
-def _believed(slam: GraphSlam, first_edge: int) -> dict[str, int]:
+def _accepted_by_input(slam: GraphSlam, first_edge: int) -> dict[str, int]:
     """Edges of landmarks, fixes and closures that pull, by input."""
     out = Counter[str]()
     inside = [Verdict.NOT_EVALUATED, *INSIDE]

@@ -63,7 +63,7 @@ def write_bag(recording: Recording, path: Path | str) -> None:
     closed = recording.closures_at()
     twist_covariance = covariance6(recording.twist_covariance, _UNUSED)
     instruments = merge(gnss_messages(recording.gnss), imu_messages(recording.imu), key=_stamp_of)
-    beside = next(instruments, None)
+    instrument = next(instruments, None)
     with replaced(Path(path)) as new, BagWriter(new) as bag:
         first_ns = int(recording.stamps_ns[0])
         for k, stamp_ns in enumerate(recording.stamps_ns.tolist()):
@@ -71,9 +71,9 @@ def write_bag(recording: Recording, path: Path | str) -> None:
                 T_base_sensor = next(s.T_base_sensor for one in recording.seen for s in one.sightings) or space.identity
                 mounted = transform(stamp_ns, "base_link", _SENSOR, T_base_sensor)
                 bag.write("/tf_static", "tf2_msgs/msg/TFMessage", stamp_ns, mounted)
-            while beside is not None and _stamp_of(beside) <= stamp_ns:
-                bag.write(*beside)
-                beside = next(instruments, None)
+            while instrument is not None and _stamp_of(instrument) <= stamp_ns:
+                bag.write(*instrument)
+                instrument = next(instruments, None)
             bag.write(ODOMETRY_TOPIC, "nav_msgs/msg/Odometry", stamp_ns, _odometry(recording, k, twist_covariance))
             if stamp_ns in seen and polar:
                 bag.write(LANDMARKS_TOPIC, _POINTS, stamp_ns, _point_cloud(seen[stamp_ns], names))

@@ -62,9 +62,9 @@ class Draft:
     def __len__(self) -> int:
         return len(self.odometry)
 
-    def pose_at(self, part: float) -> int:
+    def pose_at(self, fraction: float) -> int:
         """The pose at a part of the whole: 0 the first, 1 the last."""
-        return round(part * (len(self) - 1))
+        return round(fraction * (len(self) - 1))
 
     def true_id(self, number: int) -> str:
         """The landmark that a sighting is of, whatever it carries by now."""

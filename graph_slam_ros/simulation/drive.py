@@ -10,7 +10,7 @@ from graph_slam_ros.simulation.recording import LANDMARKS_TOPIC, START_NS, Recor
 from graph_slam_ros.slam import Sighting, Sightings
 from graph_slam_ros.typing import Array, Numbers
 
-Look = Callable[[Numbers], list[Sighting]]
+Observe = Callable[[Numbers], list[Sighting]]
 """From the true pose, what is seen."""
 
 
@@ -20,8 +20,8 @@ def drive(
     twists: Array,
     dt_ns: int,
     noise: VelocityNoise,
-    look: Look,
-    look_every: int,
+    observe: Observe,
+    observe_every: int,
     landmarks: Mapping[str, Numbers],
 ) -> Recording:
     """Drive and record.
@@ -30,7 +30,7 @@ def drive(
     ----------
     start : true pose at the first stamp; odometry begins at the origin
     twists : (n, 3) or (n, 6) true velocities in base_link, each for one tick [m/s, rad/s]
-    look_every : ticks from one look to the next, the first after the first tick
+    observe_every : ticks from one look to the next, the first after the first tick
     landmarks : true poses or points by id
     """
     dt_s = dt_ns * 1e-9
@@ -38,8 +38,8 @@ def drive(
     truth = integrate(start, twists * dt_s)
     stamps_ns = START_NS + dt_ns * np.arange(len(truth), dtype=np.int64)
     seen = []
-    for k in range(look_every, len(truth), look_every):
-        sightings = look(tuple(truth[k].tolist()))
+    for k in range(observe_every, len(truth), observe_every):
+        sightings = observe(tuple(truth[k].tolist()))
         if sightings:
             seen.append(Sightings(int(stamps_ns[k]), LANDMARKS_TOPIC, tuple(sightings)))
     return Recording(

@@ -110,7 +110,7 @@ Draw = Callable[[Generator, Array, Array, int], tuple[Index, Array]]
 def _anywhere(rng: Generator, truth: Array, _root: Array, pairs: int) -> tuple[Index, Array]:
     last = len(truth) - pairs
     a, b = rng.integers(0, last + 1, size=2).tolist()
-    earlier, later = _apart(min(a, b), max(a, b), last)
+    earlier, later = _distant_pair(min(a, b), max(a, b), last)
     return _following(earlier, later, pairs), _same(rng, space_of(truth[0]), pairs)
 
 
@@ -143,7 +143,7 @@ def _aliased(rng: Generator, truth: Array, root: Array, pairs: int) -> tuple[Ind
     return at, np.stack(group.retract(exact, tuple(noise)), axis=1)
 
 
-def _apart(earlier: int, later: int, last: int) -> tuple[int, int]:
+def _distant_pair(earlier: int, later: int, last: int) -> tuple[int, int]:
     """Poses that odometry does not join."""
     if later - earlier >= 2:
         return earlier, later

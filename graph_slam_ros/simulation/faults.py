@@ -111,10 +111,12 @@ def _wrong_ids(draft: Draft, fault: WrongIds, rng: Generator) -> None:
     names = list(_times(draft, 0, 0))
     if len(names) < 2:
         raise GraphSlamError(f"wrong_ids: {len(names)} landmarks are seen; another one's id needs two")
-    for k in _part(rng, len(draft.sightings), fault.rate):
+    for k in _random_subset(rng, len(draft.sightings), fault.rate):
         message = np.flatnonzero(draft.seen_at == draft.seen_at[k]).tolist()
-        beside = {name for j in message for name in (draft.sightings[j].id, draft.true_id(j))}
-        others = [name for name in names if name not in beside] or [n for n in names if n != draft.true_id(k)]
+        others_in_message = {name for j in message for name in (draft.sightings[j].id, draft.true_id(j))}
+        others = [name for name in names if name not in others_in_message] or [
+            n for n in names if n != draft.true_id(k)
+        ]
         draft.spoil(k, "wrong_ids", replace(draft.sightings[k], id=others[rng.integers(len(others))]))
 
 
@@ -151,7 +153,7 @@ def _outliers(draft: Draft, fault: Outliers, rng: Generator) -> None:
     n = draft.space.dimensions
     if not draft.sightings:
         raise GraphSlamError("outliers: no landmark is seen")
-    for k in _part(rng, len(draft.sightings), fault.rate):
+    for k in _random_subset(rng, len(draft.sightings), fault.rate):
         s, longer = draft.sightings[k], float(rng.uniform(0.2, 1.0)) * fault.most_m
         if s.kind == "bearing":
             raise GraphSlamError("outliers: a bearing has no range")
@@ -220,7 +222,7 @@ def _moved_after(draft: Draft, pose: int, to: Sequence[float]) -> Array:
     return moved
 
 
-def _part(rng: Generator, count: int, rate: float) -> list[int]:
+def _random_subset(rng: Generator, count: int, rate: float) -> list[int]:
     """So many of a number of things, in order."""
     return np.sort(rng.permutation(count)[: round(rate * count)]).tolist()
 

@@ -16,7 +16,7 @@ from graph_slam_ros.slam import Sighting
 from graph_slam_ros.typing import Array, Numbers
 
 TICK_NS = 20_000_000  # odometry at 50 Hz
-LOOK_EVERY = 10  # camera at 5 Hz
+OBSERVE_EVERY = 10  # camera at 5 Hz
 SPEED_M_S = 3.0  # on average around the lap
 RAMP_S = 4.0  # from hovering to full speed, and back
 GRAVITY_M_S2 = 9.81
@@ -63,9 +63,9 @@ def simulate(seed: int, options: Flight) -> Recording:
     names, poses = list(tags), np.array(list(tags.values()))
     points = np.array(list(beacons.values())).reshape(-1, 3)
 
-    def look(T_world_base: Numbers) -> list[Sighting]:
-        seen = CAMERA.look(rng, T_world_base, names, poses, options.sensor)
-        return seen + CAMERA.look_at_points(rng, T_world_base, list(beacons), points)
+    def observe(T_world_base: Numbers) -> list[Sighting]:
+        seen = CAMERA.observe(rng, T_world_base, names, poses, options.sensor)
+        return seen + CAMERA.observe_points(rng, T_world_base, list(beacons), points)
 
     path = _path(options)
     steps = se3.local(tuple(path[1:].T), tuple(path[:-1].T))
@@ -81,7 +81,7 @@ def simulate(seed: int, options: Flight) -> Recording:
         options.correlation_time_s,
     )
     twists = np.stack(steps, axis=1) / (TICK_NS * 1e-9)
-    return drive(rng, tuple(path[0].tolist()), twists, TICK_NS, noise, look, LOOK_EVERY, tags | beacons)
+    return drive(rng, tuple(path[0].tolist()), twists, TICK_NS, noise, observe, OBSERVE_EVERY, tags | beacons)
 
 
 def _path(options: Flight) -> Array:

@@ -17,7 +17,7 @@ STEP_M = 1.0
 STEPS_PER_BLOCK = 4
 SPEED_M_S, TURN_RAD_S = 1.0, 0.5 * np.pi  # a step and a turn take a second each
 TICK_NS = 100_000_000
-LOOK_EVERY = 10
+OBSERVE_EVERY = 10
 CURB_M = 1.0  # from the middle of the crossing to the landmark, in x and in y
 SENSOR = RangeBearing(0.1, np.deg2rad(1.0), 5.0)
 _DIRECTIONS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
@@ -73,15 +73,15 @@ def simulate(seed: int, options: Manhattan) -> Recording:
     points = np.asarray(corners * (STEPS_PER_BLOCK * STEP_M) + CURB_M, dtype=np.float64)
     names = [f"{i}/{j}" for i, j in corners.tolist()]
 
-    def look(T_world_base: Numbers) -> list[Sighting]:
-        return SENSOR.look(rng, T_world_base, names, points, options.sensor)
+    def observe(T_world_base: Numbers) -> list[Sighting]:
+        return SENSOR.observe(rng, T_world_base, names, points, options.sensor)
 
     noise = VelocityNoise(
         (options.sigma_speed_m_s, options.sigma_sideways_m_s, options.sigma_turn_rad_s), options.correlation_time_s
     )
     start = (*(STEP_M * cells[0]).tolist(), 0.5 * np.pi * float(ways[0]))
     landmarks = dict(zip(names, map(tuple, points.tolist()), strict=True))
-    return drive(rng, start, _twists(ways), TICK_NS, noise, look, LOOK_EVERY, landmarks)
+    return drive(rng, start, _twists(ways), TICK_NS, noise, observe, OBSERVE_EVERY, landmarks)
 
 
 def _twists(ways: Index) -> Array:

@@ -40,9 +40,9 @@ def simulate(seed: int, options: PythonRobotics) -> Recording:
     points = np.array(LANDMARKS)
     landmarks = {str(k): at for k, at in enumerate(LANDMARKS)}
 
-    def look(T_world_base: Numbers) -> list[Sighting]:
-        return sensor.look(rng, T_world_base, list(landmarks), points, options.sensor)
+    def observe(T_world_base: Numbers) -> list[Sighting]:
+        return sensor.observe(rng, T_world_base, list(landmarks), points, options.sensor)
 
     twists = np.tile([SPEED_M_S, 0.0, TURN_RAD_S], (options.poses, 1))
     noise = VelocityNoise((speed, SIDEWAYS_M_S, turn))
-    return drive(rng, se2.IDENTITY, twists, TICK_NS, noise, look, 1, landmarks)
+    return drive(rng, se2.IDENTITY, twists, TICK_NS, noise, observe, 1, landmarks)

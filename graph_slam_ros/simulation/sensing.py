@@ -48,8 +48,8 @@ class RangeBearing:
         polar += sigmas * rng.standard_normal((len(points), 2))
         variances = np.diag(sigmas**2)
         if kind != "position":
-            said = {"range_bearing": [0, 1], "bearing": [1], "range": [0]}[kind]
-            return polar[:, said], np.tile(variances[np.ix_(said, said)], (len(points), 1, 1))
+            columns = {"range_bearing": [0, 1], "bearing": [1], "range": [0]}[kind]
+            return polar[:, columns], np.tile(variances[np.ix_(columns, columns)], (len(points), 1, 1))
         distance, bearing = polar.T
         c, s = np.cos(bearing), np.sin(bearing)
         jacobian = np.empty((len(points), 2, 2))
@@ -58,7 +58,7 @@ class RangeBearing:
         covariance = jacobian @ variances @ np.swapaxes(jacobian, 1, 2)
         return np.stack([distance * c, distance * s], axis=1), covariance
 
-    def look(
+    def observe(
         self, rng: Generator, T_world_base: Numbers, names: Sequence[str], points: Array, kind: str
     ) -> list[Sighting]:
         """Sightings of those of the points (m, 2) in world that are visible."""
@@ -94,7 +94,7 @@ class TagCamera:
         distance = np.sqrt(x**2 + y**2 + z**2)
         return (distance <= self.max_range_m) & (x >= distance * np.cos(0.5 * self.field_of_view_rad))
 
-    def look(
+    def observe(
         self, rng: Generator, T_world_base: Numbers, names: Sequence[str], tags: Array, kind: str
     ) -> list[Sighting]:
         """Sightings of those of the tags (m, 7) in world that are visible and not too slanted."""
@@ -106,7 +106,7 @@ class TagCamera:
             return sightings(seen, kind, *self._poses(rng, T_world_base, tags[at]))
         return self._points(rng, T_world_base, seen, tags[at, :3], kind)
 
-    def look_at_points(
+    def observe_points(
         self, rng: Generator, T_world_base: Numbers, names: Sequence[str], points: Array
     ) -> list[Sighting]:
         """Sightings of the positions of those of the points (m, 3) in world that are visible."""
@@ -141,9 +141,9 @@ class TagCamera:
         sigmas = np.array([self.sigma_range_m, self.sigma_bearing_rad, self.sigma_bearing_rad])
         flat = np.hypot(x, y)
         polar = np.stack([np.hypot(flat, z), np.arctan2(y, x), np.arctan2(z, flat)], axis=1) + sigmas * noise
-        said = {"range_bearing": [0, 1, 2], "bearing": [1, 2], "range": [0]}[kind]
-        covariance = np.tile(np.diag(sigmas[said] ** 2), (len(points), 1, 1))
-        return sightings(names, kind, polar[:, said], covariance, self.T_base_sensor)
+        columns = {"range_bearing": [0, 1, 2], "bearing": [1, 2], "range": [0]}[kind]
+        covariance = np.tile(np.diag(sigmas[columns] ** 2), (len(points), 1, 1))
+        return sightings(names, kind, polar[:, columns], covariance, self.T_base_sensor)
 
 
 def sightings(

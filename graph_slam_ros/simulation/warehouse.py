@@ -19,7 +19,7 @@ from graph_slam_ros.typing import Array, Numbers
 
 SPEED_M_S = 1.0
 TICK_NS = 20_000_000  # odometry at 50 Hz
-LOOK_EVERY = 8  # camera at 6.25 Hz
+OBSERVE_EVERY = 8  # camera at 6.25 Hz
 AISLE_SPACING_M = 4.0
 RACK_DEPTH_M = 1.6
 TAG_SPACING_M = 2.0
@@ -53,7 +53,7 @@ def simulate(seed: int, options: Warehouse) -> Recording:
     rng = Generator(PCG64(seed))
     names, tags = _tags(options)
 
-    def look(T_world_base: Numbers) -> list[Sighting]:
+    def observe(T_world_base: Numbers) -> list[Sighting]:
         at = CAMERA.visible(T_world_base, tags[:, :2])
         at = at[_is_facing(T_world_base, tags[at])]
         seen = [names[k] for k in at]
@@ -73,7 +73,7 @@ def simulate(seed: int, options: Warehouse) -> Recording:
         (options.sigma_speed_m_s, options.sigma_sideways_m_s, options.sigma_turn_rad_s), options.correlation_time_s
     )
     landmarks = dict(zip(names, (tuple(tag) for tag in tags.tolist()), strict=True))
-    return drive(rng, START, twists, TICK_NS, noise, look, LOOK_EVERY, landmarks)
+    return drive(rng, START, twists, TICK_NS, noise, observe, OBSERVE_EVERY, landmarks)
 
 
 def _tags(options: Warehouse) -> tuple[list[str], Array]:

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from graph_slam_ros.errors import DivergedError, said
+from graph_slam_ros.errors import DivergedError, message_of
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.robust.gating import CANDIDATES, landmark_of
@@ -86,7 +86,7 @@ class FailureGuard:
 
     def _fail(self, error: Exception) -> None:
         self._counters.count("solver", type(error).__name__)
-        self.failing = said(error)
+        self.failing = message_of(error)
         self._in_a_row += 1
         self.go_back()
         self._drop_unmeasured()

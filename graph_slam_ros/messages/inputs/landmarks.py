@@ -141,8 +141,8 @@ def _polar(
         if is_wrapped:
             source.count("bearing_wrapped")
         measured = (*measured[: int(has_range)], *angles[: len(measured) - int(has_range)])
-    told = sigmas is not None and source.settings.noise == "message"
-    out = [float(s) for s in sigmas] if told and sigmas is not None else [0.0] * len(measured)
+    has_covariances = sigmas is not None and source.settings.noise == "message"
+    out = [float(s) for s in sigmas] if has_covariances and sigmas is not None else [0.0] * len(measured)
     for k, sigma in enumerate(out):
         if not math.isfinite(sigma) or sigma < 0.0:
             raise MessageError("nonfinite_covariance")
@@ -150,7 +150,7 @@ def _polar(
             out[k] = source.sigma_m(measured[0]) if has_range and k == 0 else source.settings.sigma_rad
             if out[k] == 0.0:
                 raise MessageError("noise_unknown")
-            if told:
+            if has_covariances:
                 source.count("covariance_unknown")
     if source.space.dimensions == 2 and kind != "range":
         measured, out = _levelled(kind, measured, out, T_base_sensor)

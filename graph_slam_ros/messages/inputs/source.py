@@ -234,7 +234,7 @@ class InputContext:
 
 
 def _mount(settings: InputConfig) -> se3.Pose | None:
-    given = settings.numbers("mount", 6)
-    if not given:
+    mount = settings.numbers("mount", 6)
+    if not mount:
         return None
-    return se3.from_xyz_rpy(given)
+    return se3.from_xyz_rpy(mount)

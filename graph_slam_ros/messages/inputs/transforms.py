@@ -42,7 +42,7 @@ class Transforms:
         joint = self._moving.get(child)
         if joint is None or joint.parent != parent:
             joint = self._moving[child] = _Joint(parent, self._keep_ns, self._refuse)
-        joint.take(stamp_ns, T_parent_child)
+        joint.add(stamp_ns, T_parent_child)
 
     def forget_time(self) -> None:
         """Stamps begin anew; what holds always stays."""
@@ -92,9 +92,9 @@ class _Joint:
         self._stamps_ns: list[int] = []
         self._poses: list[se3.Pose] = []
 
-    def take(self, stamp_ns: int, T_parent_child: se3.Pose) -> None:
+    def add(self, stamp_ns: int, T_parent_child: se3.Pose) -> None:
         newest_ns = self._stamps_ns[-1] if self._stamps_ns else stamp_ns
-        for at_ns, pose in self._leap.take(stamp_ns, T_parent_child, newest_ns, self._keep_ns):
+        for at_ns, pose in self._leap.accept(stamp_ns, T_parent_child, newest_ns, self._keep_ns):
             if self._stamps_ns and at_ns < self._stamps_ns[-1] - self._keep_ns:  # several agree that it is so early
                 self._stamps_ns.clear()
                 self._poses.clear()
