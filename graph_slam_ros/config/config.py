@@ -45,7 +45,7 @@ class FramesConfig:
     """Names of frames, REP-105."""
 
     map: str = setting("map", "frame of the corrected path")
-    odom: str = setting("odom", "frame the odometry is given in")
+    odom: str = setting("odom", "frame of the odometry")
     base: str = setting("base_link", "frame of the robot")
 
 
@@ -53,7 +53,9 @@ class FramesConfig:
 class WorldConfig:
     """Where the robot moves."""
 
-    dimensions: int = setting(2, "2: in a plane, of what is seen only that part is used; 3: in space", low=2, high=3)
+    dimensions: int = setting(
+        2, "2: the robot moves in a plane, measurements are projected onto it; 3: it moves in space", low=2, high=3
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,76 +64,108 @@ class OdometryConfig:
 
     noise: str = setting(
         "twist",
-        "twist: from each message's twist covariance where it has one, else the densities; density: always these",
+        "noise of odometry: twist: from each message's twist covariance, or the densities where it "
+        "has none; density: always the densities",
         choices=("twist", "density"),
     )
     translation_density: float = setting(
-        0.02, "random walk of the position along x of the base", "m/sqrt(s)", low=1e-6, high=10.0
+        0.02, "random walk of the odometry position along x of the base", "m/sqrt(s)", low=1e-6, high=10.0
     )
     lateral_density: float = setting(
         0.005,
-        "random walk across; small for wheels, raise it for what can slide or hover",
+        "random walk of the odometry position along y of the base; small for wheels, larger for "
+        "robots that slide or hover",
         "m/sqrt(s)",
         low=1e-6,
         high=10.0,
     )
-    vertical_density: float = setting(0.005, "random walk upwards, in space", "m/sqrt(s)", low=1e-6, high=10.0)
-    rotation_density: float = setting(0.05, "random walk of the heading", "rad/sqrt(s)", low=1e-6, high=10.0)
+    vertical_density: float = setting(
+        0.005,
+        "random walk of the odometry position along z of the base; used in space only",
+        "m/sqrt(s)",
+        low=1e-6,
+        high=10.0,
+    )
+    rotation_density: float = setting(0.05, "random walk of the odometry heading", "rad/sqrt(s)", low=1e-6, high=10.0)
     tilt_density: float = setting(
-        0.02, "random walk of roll and of pitch, in space", "rad/sqrt(s)", low=1e-6, high=10.0
+        0.02, "random walk of odometry roll and pitch; used in space only", "rad/sqrt(s)", low=1e-6, high=10.0
     )
     twist_correlation_s: float = setting(
         0.25,
-        "how long the error of a velocity lasts: the noise of a step is covariance * dt * max(dt, this)",
+        "correlation time of velocity errors: the noise of a step is covariance * dt * max(dt, this)",
         "s",
         low=0.0,
     )
     still_m_s: float = setting(
         1e-3,
-        "slower than this and the next, or by no more within a second, the robot stands: no noise is added",
+        "below this speed and odometry.still_rad_s, in a step or over a second, the robot counts as "
+        "stationary: no noise is added",
         "m/s",
         low=0.0,
     )
-    still_rad_s: float = setting(1e-3, "see still_m_s", "rad/s", low=0.0)
-    still_m: float = setting(
-        5e-3, "a robot that stands may jitter by this: no noise is added, and no keyframe made", "m", low=0.0
+    still_rad_s: float = setting(
+        1e-3,
+        "below this turn rate and odometry.still_m_s, in a step or over a second, the robot counts as"
+        " stationary: no noise is added",
+        "rad/s",
+        low=0.0,
     )
-    still_rad: float = setting(0.01, "and by this", "rad", low=0.0, high=math.pi)
+    still_m: float = setting(
+        5e-3, "position jitter of a stationary robot: smaller motion adds no noise and no keyframe", "m", low=0.0
+    )
+    still_rad: float = setting(
+        0.01,
+        "heading jitter of a stationary robot: a smaller turn adds no noise and no keyframe",
+        "rad",
+        low=0.0,
+        high=math.pi,
+    )
     timeout_s: float = setting(
         0.5,
-        "an odometry that is silent for longer, in stamp time, gives way to the next of inputs.names",
+        "an odometry input without messages for this long, in stamp time, is replaced by the next of inputs.names",
         "s",
         low=1e-3,
     )
-    max_speed_m_s: float = setting(50.0, "faster than this, odometry has jumped: a new segment begins", "m/s", low=1e-3)
-    jump_sigma_m: float = setting(10.0, "what is known of the motion over a jump: standard deviation", "m", low=1e-3)
-    jump_sigma_rad: float = setting(3.0, "and of the rotation", "rad", low=1e-3)
+    max_speed_m_s: float = setting(
+        50.0, "odometry that moves faster than this has jumped: a new segment of the path begins", "m/s", low=1e-3
+    )
+    jump_sigma_m: float = setting(
+        10.0, "standard deviation of the position change across a jump of odometry", "m", low=1e-3
+    )
+    jump_sigma_rad: float = setting(
+        3.0, "standard deviation of the rotation across a jump of odometry", "rad", low=1e-3
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframesConfig:
     """When the robot's motion earns a new vertex."""
 
-    min_distance_m: float = setting(0.25, "a keyframe after this distance", "m", low=1e-3, live=True)
-    min_angle_rad: float = setting(0.25, "or after this change of heading", "rad", low=1e-3, high=math.pi, live=True)
+    min_distance_m: float = setting(
+        0.25, "a keyframe is added after the robot moved this far", "m", low=1e-3, live=True
+    )
+    min_angle_rad: float = setting(
+        0.25, "a keyframe is added after the robot turned by this much", "rad", low=1e-3, high=math.pi, live=True
+    )
     max_interval_s: float = setting(
         1.0,
-        "or after this much time in motion: odometry's noise grows with time, and sightings in between share it",
+        "a keyframe is added after the robot moved for this long, however slowly",
         "s",
         low=1e-3,
         live=True,
     )
     shared_noise: float = setting(
         0.05,
-        "or at what is seen, where the motion since the last keyframe would add more than this to its variance, and the"
-        " same to all that is seen at once",
+        "a keyframe is added at an observation if the motion since the last keyframe would add more "
+        "than this part to its variance",
         "part of variance",
         low=0.0,
         live=True,
     )
     min_interval_s: float = setting(
         0.1,
-        "but what is seen sooner after a keyframe makes none, unless the motion would add more than its own variance",
+        "an observation sooner than this after a keyframe adds none, unless the motion would more "
+        "than double its variance",
         "s",
         low=0.0,
         live=True,
@@ -142,80 +176,116 @@ class KeyframesConfig:
 class LandmarksConfig:
     """Landmark sightings."""
 
-    id_from: str = setting("id", "which field of a detection is the landmark's identity", choices=("id", "class_id"))
-    sigma_m: float = setting(0.1, "position noise where a message's covariance is all zero (unknown)", "m", low=1e-4)
+    id_from: str = setting("id", "field of a detection that is the landmark's identity", choices=("id", "class_id"))
+    sigma_m: float = setting(
+        0.1, "position noise of an observation whose message has an all-zero (unknown) covariance", "m", low=1e-4
+    )
     added_sigma_m: float = setting(
-        0.05, "position noise added to every sighting for what messages leave out: clocks, mounting, size", "m", low=0.0
+        0.05,
+        "position noise added to every observation for errors that messages leave out: clocks, mounting, size",
+        "m",
+        low=0.0,
     )
     max_per_message: int = setting(
-        1000, "of more in one message the nearest are taken and the others counted", "landmarks", low=1
+        1000, "most landmarks used of one message; the nearest are used, the others counted", "landmarks", low=1
     )
     orientation_known_below_rad: float = setting(
-        0.5, "a landmark is a full pose where its heading's standard deviation is below this", "rad", low=0.0
+        0.5, "a landmark is a full pose if the standard deviation of its heading is below this", "rad", low=0.0
     )
     association: str = setting(
         "id",
-        "none: landmarks are not used; id: by their identity; nearest, joint: those without one are associated, each by"
-        " itself or all of a message together",
+        "data association: none: landmarks are not used; id: by identity; nearest: observations "
+        "without identity one by one; joint: all of a message together",
         choices=("none", "id", "nearest", "joint"),
     )
     gate_same: float = setting(
-        0.999, "a sighting without identity is of a landmark within this probability", "probability", low=0.5, high=1.0
+        0.999,
+        "an observation without identity may belong to a landmark within this probability of the chi2 test",
+        "probability",
+        low=0.5,
+        high=1.0,
     )
     gate_other: float = setting(
-        0.99999, "and of a new one outside this; between the two it is not used", "probability", low=0.5, high=1.0
+        0.99999,
+        "an observation outside this probability of every landmark begins a new one; between "
+        "gate_same and this it is discarded",
+        "probability",
+        low=0.5,
+        high=1.0,
     )
     close_m: float = setting(
-        0.5, "landmarks this close are not told apart by force: what may be of either says less", "m", low=0.0
+        0.5,
+        "landmarks closer together than this are not told apart: an observation that may be of either gets more noise",
+        "m",
+        low=0.0,
     )
     unnamed_sigma_m: float = setting(
-        0.1, "position noise added to sightings without identity: they may be of one close by", "m", low=0.0
+        0.1, "position noise added to observations without identity: they may be of a neighbouring object", "m", low=0.0
     )
     density_per_m: float = setting(
         0.03,
-        "landmarks that there may be to a metre along each axis: a sighting must be likelier to be of a known one",
+        "prior density of landmarks per metre along each axis: an observation must fit a known "
+        "landmark better than a new one",
         "1/m",
         low=1e-4,
     )
-    ambiguity_chi2: float = setting(6.0, "and all else must fit worse by this much", "chi2", low=0.0)
-    confirm_sightings: int = setting(5, "a new landmark is believed after so many sightings", "sightings", low=1)
-    confirm_s: float = setting(2.0, "over so much time", "s", low=0.0)
+    ambiguity_chi2: float = setting(
+        6.0, "an association is used only if every alternative fits worse by this much", "chi2", low=0.0
+    )
+    confirm_sightings: int = setting(5, "observations that confirm a new landmark without identity", "sightings", low=1)
+    confirm_s: float = setting(
+        2.0, "time over which a new landmark without identity must be observed before it is confirmed", "s", low=0.0
+    )
     follow_s: float = setting(
         10.0,
-        "a sighting is compared with landmarks seen not longer ago; what is seen again later is merged",
+        "an observation is compared with landmarks observed within this time; older ones are matched later, by merging",
         "s",
         low=0.0,
     )
-    give_up_s: float = setting(60.0, "or given up where it has not been seen for so long", "s", low=0.0)
-    review_every_keyframes: int = setting(10, "look for all that after so many keyframes", "keyframes", low=1)
+    give_up_s: float = setting(
+        60.0, "a landmark that is not confirmed is removed when it was not observed for this long", "s", low=0.0
+    )
+    review_every_keyframes: int = setting(
+        10,
+        "landmarks without identity are merged, split, confirmed and removed after every so many keyframes",
+        "keyframes",
+        low=1,
+    )
     determined_below: float = setting(
         0.2,
-        "a landmark seen by range or bearing waits until its standard deviation is below this part of its distance",
+        "a landmark from ranges or bearings enters the map when its standard deviation is below this "
+        "part of its distance",
         "m/m",
         low=1e-3,
         high=10.0,
     )
     mirror_chi2: float = setting(
-        12.0, "and until every other place it may be at fits worse by this much", "chi2", low=0.0
+        12.0,
+        "a landmark from ranges or bearings enters the map when every other position, e.g. the mirror"
+        " image, fits worse by this much",
+        "chi2",
+        low=0.0,
     )
     surveyed: str = setting(
         "",
-        "landmarks whose place in the map is known: a header id,x,y,sigma or id,x,y,z,sigma and a line for each",
+        "landmarks with known positions in the map: a header id,x,y,sigma or id,x,y,z,sigma, then a line for each",
         "m",
     )
-    surveyed_file: str = setting("", "file of these lines, read at the start where there are none above")
+    surveyed_file: str = setting("", "file with the lines of landmarks.surveyed, read at the start where that is empty")
     range_offset_sigma_m: float = setting(
         0.0,
-        "standard deviation of an offset that all ranges of a topic share and that is estimated; 0: there is none",
+        "standard deviation of an offset that all ranges of a topic share and that is estimated; 0: no offset",
         "m",
         low=0.0,
     )
     loss: str = setting(
         "huber_then_cauchy",
-        "robust loss of sightings; huber_then_cauchy converges with the first, then with the second",
+        "robust loss of landmark observations; huber_then_cauchy converges with Huber first, then with Cauchy",
         choices=(*LOSSES, "huber_then_cauchy", "huber_then_dcs"),
     )
-    loss_scale: float = setting(3.0, "residuals well below this many standard deviations count fully", "sigma", low=0.1)
+    loss_scale: float = setting(
+        3.0, "landmark residuals well below this many standard deviations keep their full weight", "sigma", low=0.1
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,18 +297,22 @@ class AnchorConfig:
 
     pose: str = setting(
         "",
-        "where the robot starts in the map: x y yaw, or in space x y z roll pitch yaw; empty: where odometry begins",
+        "first pose of the robot in the map: x y yaw, or in space x y z roll pitch yaw; empty: as odometry has it",
         "m, rad",
     )
     sigma_m: float = setting(
         0.0,
-        "standard deviation of its position; 0: 1 mm until a fix or a surveyed landmark tells where the map lies, then"
-        " 1 km, or initialpose.sigma_m of a pose that is given",
+        "standard deviation of the first position; 0: 1 mm until a fix or surveyed landmark locates "
+        "the map, then 1 km, or initialpose.sigma_m if anchor.pose is given",
         "m",
         low=0.0,
     )
     sigma_rad: float = setting(
-        0.0, "standard deviation of its heading; 0: 1 mrad, then 3 rad, or initialpose.sigma_rad", "rad", low=0.0
+        0.0,
+        "standard deviation of the first heading; 0: 1 mrad until a fix or surveyed landmark locates "
+        "the map, then 3 rad, or initialpose.sigma_rad if anchor.pose is given",
+        "rad",
+        low=0.0,
     )
 
     def __post_init__(self) -> None:
@@ -253,7 +327,7 @@ class MapConfig:
 
     localize: bool = setting(
         False,
-        "true: the map stays as it is and the robot is located in it; false: the map grows and is corrected",
+        "true: the map stays fixed and the robot is located in it; false: the map grows and is corrected",
         live=True,
     )
 
@@ -263,13 +337,23 @@ class OrderingConfig:
     """The window in which messages are put in order of stamp."""
 
     window_s: float = setting(
-        0.05, "how much later than newer odometry a message may come, in stamp time", "s", low=0.0
+        0.05,
+        "a message may arrive this much later than newer odometry, in stamp time, and is still sorted by stamp",
+        "s",
+        low=0.0,
     )
     late_s: float = setting(
-        10.0, "sightings, fixes and closures up to this much older than odometry go where they belong", "s", low=0.0
+        10.0,
+        "observations, fixes and closures up to this much older than odometry are used at their own stamp",
+        "s",
+        low=0.0,
     )
     max_waiting: int = setting(
-        1000, "messages that may wait for their turn, or for odometry", "messages", low=1, high=1_000_000
+        1000,
+        "most messages that are held until it is their turn, or until odometry reaches them",
+        "messages",
+        low=1,
+        high=1_000_000,
     )
 
 
@@ -281,56 +365,70 @@ class SolveConfig:
     """When and how the graph is solved: a little at each keyframe, and everything at the end."""
 
     every_keyframes: int = setting(
-        1, "update the estimate after this many keyframes", "keyframes", low=1, high=1_000_000, live=True
+        1, "the estimate is updated after this many keyframes", "keyframes", low=1, high=1_000_000, live=True
     )
     relinearize_above: float = setting(
         _SOLVER.relinearize_above,
-        "linearise a pose or landmark anew when it has moved by more since",
+        "a pose or landmark is linearised again when it has moved by more than this since",
         "m, rad",
         low=0.0,
         live=True,
     )
     relinearize_error: float = setting(
         _SOLVER.relinearize_error,
-        "or when the square of that is more of the standard deviation of its strongest measurement",
+        "a pose or landmark is linearised again when its squared motion exceeds this part of the "
+        "standard deviation of its strongest measurement",
         "sigma",
         low=0.0,
         live=True,
     )
     relinearize_every: int = setting(
         _SOLVER.relinearize_every,
-        "look for those at every so many updates (at each for ten times that far)",
+        "relinearisation is checked at every so many updates (at each update for ten times the threshold)",
         "updates",
         low=1,
         high=1_000_000,
         live=True,
     )
     tolerance: float = setting(
-        _SOLVER.tolerance, "changes up to this are not followed through the graph", "m, rad", low=0.0, live=True
+        _SOLVER.tolerance,
+        "changes of a pose or landmark up to this are not propagated through the graph",
+        "m, rad",
+        low=0.0,
+        live=True,
     )
     tolerance_sigmas: float = setting(
         _SOLVER.tolerance_sigmas,
-        "nor are those up to so many standard deviations of a pose or landmark given its neighbours",
+        "changes up to so many standard deviations of a pose or landmark given its neighbours are not propagated",
         "sigma",
         low=0.0,
         live=True,
     )
     method: str = setting(
         _SOLVER.method,
-        "of the solve at the end: gn (damped only where it fails to converge), lm or dogleg",
+        "method of the solve at the end: gn (Gauss-Newton, damped only where it fails to converge), "
+        "lm (Levenberg-Marquardt) or dogleg",
         choices=METHODS,
         live=True,
     )
     max_iterations: int = setting(
         _SOLVER.max_iterations,
-        "of the solve at the end, of each stage of the losses",
+        "most iterations of the solve at the end, for each stage of the losses",
         "",
         low=1,
         high=10_000,
         live=True,
     )
-    step_tolerance: float = setting(1e-5, "it has converged when no step is larger", "m, rad", low=0.0, live=True)
-    cost_tolerance: float = setting(1e-9, "or when the cost changes by a smaller fraction", "", low=0.0, live=True)
+    step_tolerance: float = setting(
+        1e-5, "the solve at the end has converged when no step is larger than this", "m, rad", low=0.0, live=True
+    )
+    cost_tolerance: float = setting(
+        1e-9,
+        "the solve at the end has converged when the cost changes by a smaller fraction than this",
+        "",
+        low=0.0,
+        live=True,
+    )
 
 
 @dataclass(frozen=True, slots=True)

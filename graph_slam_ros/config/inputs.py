@@ -20,60 +20,75 @@ class InputConfig:
     """
 
     name: str
-    topic: str = setting("", "where it comes from; in a recording without that topic, the only one of its type")
-    type: str = setting("", "type of its messages, package/msg/Name")
+    topic: str = setting(
+        "", "topic of the input; a recording without that topic uses its only topic of the input's type"
+    )
+    type: str = setting("", "message type of the input, package/msg/Name")
     use: str = setting(
         "auto",
-        "what it is used as; auto: what its type is for, the first thing where it is for several; none: not at all",
+        "use of the input; auto: the first use that its type allows; none: the input is ignored",
         choices=("auto", "odometry", "landmarks", "fix", "closure", "none"),
     )
-    frame: str = setting("", "frame it is measured in, whatever its messages say; empty: as they say")
+    frame: str = setting("", "frame of the measurements, instead of the one in the messages; empty: as in the messages")
     mount: str = setting(
         "",
-        "where that frame is on the robot if TF does not tell: x y z roll pitch yaw; empty: refused then, but for an"
-        " antenna, which is taken to be at the base",
+        "pose of the sensor frame on the robot, used where TF has none: x y z roll pitch yaw; empty: "
+        "messages are refused then, except that an antenna is assumed at the base",
         "m, rad",
     )
     noise: str = setting(
         "message",
-        "message: the messages' covariance, the sigmas where it is unknown; sigmas: always these",
+        "noise of the input: message: the messages' covariance, or the sigmas where it is unknown; "
+        "sigmas: always the sigmas",
         choices=("message", "sigmas"),
     )
     sigma_m: float = setting(
-        0.0, "position noise; 0: landmarks.sigma_m of landmarks, others of unknown covariance are refused", "m", low=0.0
+        0.0,
+        "position noise of the input; 0: landmarks.sigma_m for landmarks, other messages of unknown "
+        "covariance are refused",
+        "m",
+        low=0.0,
     )
-    sigma_per_m: float = setting(0.0, "added to sigma_m for each metre of distance", "m/m", low=0.0)
-    sigma_rad: float = setting(0.0, "noise of an orientation or bearing; 0: unknown", "rad", low=0.0, high=math.pi)
+    sigma_per_m: float = setting(
+        0.0, "position noise that is added to sigma_m for each metre of distance", "m/m", low=0.0
+    )
+    sigma_rad: float = setting(
+        0.0, "noise of an orientation or bearing of the input; 0: unknown", "rad", low=0.0, high=math.pi
+    )
     correlation_s: float = setting(
         1.0,
-        "how long an error of its fixes lasts (1/e): of what comes faster one is used each twice this long, or each"
-        " keyframes.max_interval_s with a larger noise; 0: errors are independent, all are used",
+        "correlation time of the errors of fixes: one fix is used each twice this long, or each "
+        "keyframes.max_interval_s with more noise; 0: errors are independent, all are used",
         "s",
         low=0.0,
     )
     offset_s: float = setting(
         0.0,
-        "added to the stamps of its messages: how far its clock is behind",
+        "time added to the stamps of the input: how far its clock is behind",
         "s",
         low=-3600.0,
         high=3600.0,
     )
     max_distance_m: float = setting(
         0.0,
-        "landmarks and closures farther away are refused; 0: ten times as far as it has seen, 1 km at least and 100 km"
-        " at most",
+        "landmarks and closures farther away than this are refused; 0: ten times the distance seen so"
+        " far, within 1 km and 100 km",
         "m",
         low=0.0,
     )
-    id: str = setting("", "identity of the landmark in messages that carry none")
-    id_prefix: str = setting("", "put before every identity, where two inputs have the same for different landmarks")
-    frame_prefix: str = setting("", "of transforms as landmarks: what the names of their frames begin with")
-    hamming_max: int = setting(255, "tags with more corrected bits are left out", "bits", low=0, high=255)
+    id: str = setting("", "landmark identity for messages that carry none")
+    id_prefix: str = setting(
+        "", "text put before every identity of the input, if two inputs use the same identities for different landmarks"
+    )
+    frame_prefix: str = setting("", "beginning of the frame names of landmarks that are published as transforms")
+    hamming_max: int = setting(255, "tags with more corrected bits than this are ignored", "bits", low=0, high=255)
     decision_margin_min: float = setting(
-        0.0, "tags that were told from others by less are left out", "grey levels", low=0.0
+        0.0, "tags with a smaller decision margin than this are ignored", "grey levels", low=0.0
     )
     datum: str = setting(
-        "", "latitude longitude altitude of the map's origin, in degrees and metres; empty: the first fix", "deg, m"
+        "",
+        "latitude, longitude and altitude of the map's origin, in degrees and metres; empty: the first fix",
+        "deg, m",
     )
 
     def __post_init__(self) -> None:

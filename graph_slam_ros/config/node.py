@@ -27,37 +27,50 @@ def check_run_name(what: str, name: str) -> None:
 class NodeConfig:
     """The node as a process."""
 
-    autostart: bool = setting(True, "configure and activate at once; false: a lifecycle manager does that")
+    autostart: bool = setting(True, "true: the node configures and activates itself; false: a lifecycle manager does")
 
 
 @dataclass(frozen=True, slots=True)
 class TfConfig:
     """The transform map -> odom."""
 
-    publish_tf: bool = setting(True, "whether to broadcast map -> odom", live=True)
+    publish_tf: bool = setting(True, "whether map -> odom is broadcast", live=True)
     transform_publish_period: float = setting(
-        0.05, "broadcast this often, at most once per odometry stamp", "s", low=1e-3
+        0.05, "period of the broadcast of map -> odom; at most one broadcast per odometry stamp", "s", low=1e-3
     )
     stamp: str = setting(
         "odometry",
-        "odometry: dated by the newest odometry, and silent when that stops; now: by the clock, silent likewise",
+        "stamp of map -> odom: odometry: that of the newest odometry; now: the clock; without new "
+        "odometry nothing is broadcast in either case",
         choices=("odometry", "now"),
         live=True,
     )
     transform_tolerance: float = setting(
-        0.1, "how far ahead of that the transform is dated", "s", low=0.0, high=10.0, live=True
+        0.1, "time by which map -> odom is dated ahead of tf.stamp", "s", low=0.0, high=10.0, live=True
     )
     max_speed_m_s: float = setting(
-        0.0, "corrections are followed no faster than this; 0: at once", "m/s", low=0.0, live=True
+        0.0, "map -> odom moves no faster than this after a correction; 0: at once", "m/s", low=0.0, live=True
     )
-    max_turn_rad_s: float = setting(0.0, "nor turned faster than this; 0: at once", "rad/s", low=0.0, live=True)
+    max_turn_rad_s: float = setting(
+        0.0, "map -> odom turns no faster than this after a correction; 0: at once", "rad/s", low=0.0, live=True
+    )
     report_jump_m: float = setting(
-        0.5, "a correction larger than this is reported with the edges that caused it", "m", low=0.0, live=True
+        0.5,
+        "a correction that moves map -> odom by more than this is reported with the edges that caused it",
+        "m",
+        low=0.0,
+        live=True,
     )
-    report_jump_rad: float = setting(0.2, "or turned by more than this", "rad", low=0.0, live=True)
+    report_jump_rad: float = setting(
+        0.2,
+        "a correction that turns map -> odom by more than this is reported with the edges that caused it",
+        "rad",
+        low=0.0,
+        live=True,
+    )
     second_authority: str = setting(
         "report",
-        "when somebody else broadcasts map -> odom: report, or also yield and broadcast no more",
+        "reaction to another broadcaster of map -> odom: report: report it; yield: also stop broadcasting",
         choices=("report", "yield"),
         live=True,
     )
@@ -67,17 +80,25 @@ class TfConfig:
 class InputsConfig:
     """What is listened to."""
 
-    names: str = setting(" ".join(USUAL_INPUTS), "the inputs, each with a section of its name")
-    reliable: bool = setting(False, "ask for reliable delivery (a best-effort publisher then does not connect)")
-    depth: int = setting(1000, "messages the middleware may hold for a subscription", "messages", low=1, high=100_000)
-    queue: int = setting(
-        20_000, "messages that may wait for the solver; more are refused and counted", "messages", low=1, high=1_000_000
+    names: str = setting(" ".join(USUAL_INPUTS), "names of the inputs; each has a section of its name")
+    reliable: bool = setting(
+        False, "true: subscriptions ask for reliable delivery; a best-effort publisher then does not connect"
     )
-    tf: bool = setting(True, "whether /tf is listened to, for sensors on moving joints; /tf_static always is")
-    tf_buffer_s: float = setting(10.0, "how long transforms of /tf are kept", "s", low=0.1)
+    depth: int = setting(1000, "messages that the middleware holds for a subscription", "messages", low=1, high=100_000)
+    queue: int = setting(
+        20_000,
+        "most messages that are queued for the solver; more are refused and counted",
+        "messages",
+        low=1,
+        high=1_000_000,
+    )
+    tf: bool = setting(
+        True, "whether the node subscribes to /tf, for sensors on moving joints; it always does to /tf_static"
+    )
+    tf_buffer_s: float = setting(10.0, "time for which transforms of /tf are kept", "s", low=0.1)
     tf_wait_s: float = setting(
         0.2,
-        "how much newer odometry may get before what is seen in a frame that /tf does not tell of is refused",
+        "an observation without a transform of /tf is refused when odometry is this much newer",
         "s",
         low=0.0,
     )
@@ -89,14 +110,22 @@ class InitialPoseConfig:
 
     use: str = setting(
         "segment",
-        "segment: a new segment of the path begins there; prior: the last odometry counts less and the pose is weighed"
-        " with it",
+        "use of a pose from initialpose: segment: a new segment of the path begins there; prior: it "
+        "is a measurement, and the last odometry edge gets more noise",
         choices=("segment", "prior"),
     )
-    sigma_m: float = setting(0.5, "its position where the message's covariance is unknown", "m", low=1e-6)
-    sigma_rad: float = setting(0.26, "and its heading", "rad", low=1e-6)
-    loosen_m: float = setting(1.0, "of a prior: what is added to the last odometry, in position", "m", low=0.0)
-    loosen_rad: float = setting(0.5, "and in rotation", "rad", low=0.0)
+    sigma_m: float = setting(
+        0.5, "position noise of a pose from initialpose whose covariance is unknown", "m", low=1e-6
+    )
+    sigma_rad: float = setting(
+        0.26, "heading noise of a pose from initialpose whose covariance is unknown", "rad", low=1e-6
+    )
+    loosen_m: float = setting(
+        1.0, "position noise added to the last odometry edge if initialpose.use is prior", "m", low=0.0
+    )
+    loosen_rad: float = setting(
+        0.5, "rotation noise added to the last odometry edge if initialpose.use is prior", "rad", low=0.0
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,50 +134,60 @@ class OutputConfig:
 
     folder: str = setting(
         "{node}_run",
-        "run folder written by ~/save and at shutdown; {node} stands for namespace and name of the node,"
-        " as in robot1_graph_slam; empty: none at shutdown",
+        "run folder written by ~/save and at shutdown; {node} stands for namespace and name of the "
+        "node, as in robot1_graph_slam; empty: nothing is written at shutdown",
     )
     keep_earlier: int = setting(
-        5, "earlier runs that are kept, as folder-1, folder-2, ...; 0: replaced", "runs", low=0, high=10_000
+        5,
+        "number of earlier runs that are kept, as folder-1, folder-2, ...; 0: an earlier run is replaced",
+        "runs",
+        low=0,
+        high=10_000,
     )
     load: str = setting(
-        "", "run that ~/load goes on from, a name beside the folder; empty: the newest earlier", live=True
+        "",
+        "name of the run that ~/load loads, a folder in the same directory as output.folder; empty: "
+        "the newest earlier run",
+        live=True,
     )
-    load_at_start: bool = setting(False, "do so when configured")
+    load_at_start: bool = setting(False, "true: the run of output.load is loaded when the node is configured")
     load_pose: str = setting(
         "",
-        "where the robot is in the map when it is loaded: x y yaw or, in space, x y z roll pitch yaw; as uncertain as"
-        " initialpose.* say; empty: unknown, until something is recognised",
+        "pose of the robot in a loaded map: x y yaw or, in space, x y z roll pitch yaw, as uncertain "
+        "as initialpose.sigma_m and initialpose.sigma_rad; empty: unknown until a landmark is "
+        "recognised",
         live=True,
     )
     save_as: str = setting(
         "",
-        "~/save also writes the map as a run of this name beside the folder, for output.load; nothing is replaced;"
-        " empty: no",
+        "name of a run that ~/save also writes the map to, in the same directory as output.folder; an"
+        " existing run is never replaced; empty: none",
         live=True,
     )
-    path_period_s: float = setting(0.2, "publish ~/path and ~/path_updates at most this often", "s", low=0.0, live=True)
+    path_period_s: float = setting(0.2, "shortest period of ~/path and ~/path_updates", "s", low=0.0, live=True)
     path_max_poses: int = setting(
-        10_000, "poses of ~/path; a longer one is thinned out", "poses", low=2, high=10_000_000, live=True
+        10_000, "most poses of ~/path; a longer path is thinned out", "poses", low=2, high=10_000_000, live=True
     )
-    path_moved_m: float = setting(0.02, "~/path_updates tells of keyframes that moved by more", "m", low=0.0)
-    path_moved_rad: float = setting(0.02, "or turned by more", "rad", low=0.0)
+    path_moved_m: float = setting(0.02, "~/path_updates lists keyframes that moved by more than this", "m", low=0.0)
+    path_moved_rad: float = setting(
+        0.02, "~/path_updates lists keyframes that turned by more than this", "rad", low=0.0
+    )
     landmarks_every_keyframes: int = setting(
         20,
-        "publish ~/landmarks after this many keyframes, and after each solve of everything, to subscribers",
+        "~/landmarks is published after this many keyframes and after each solve of everything, if it has subscribers",
         "keyframes",
         low=1,
         high=1_000_000,
         live=True,
     )
-    graph_period_s: float = setting(2.0, "publish ~/graph at most this often", "s", low=0.0, live=True)
+    graph_period_s: float = setting(2.0, "shortest period of ~/graph", "s", low=0.0, live=True)
     graph_max_edges: int = setting(
-        5_000, "edges of ~/graph; of more, the worst fitting are shown first", "edges", low=1, high=1_000_000, live=True
+        5_000, "most edges of ~/graph; the worst fitting come first", "edges", low=1, high=1_000_000, live=True
     )
     pose_covariance_max: float = setting(
         0.25,
-        "variance of z, roll and pitch in the poses of a planar robot, which are taken for zero: half a metre and"
-        " half a radian, about where odometry is counted as out_of_plane; 1e6: unknown (RViz draws a kilometre)",
+        "variance of z, roll and pitch published for a planar robot, whose values are published as 0;"
+        " 1e6: unknown (RViz draws a kilometre)",
         "m^2, rad^2",
         low=0.0,
     )
@@ -163,12 +202,12 @@ class JournalConfig:
     """What of a run outlives whatever ends it."""
 
     resume: bool = setting(
-        True, "when configured, go on in the map of the last run where that was not ended, as if it were loaded"
+        True, "true: a node whose last run did not end resumes its map when configured, as ~/load would"
     )
     sync_s: float = setting(
         1.0,
-        "have the disk take the journal so often at most: what a power cut may lose; the end of the process loses"
-        " nothing that was published",
+        "longest time until the journal is on the disk: what a power cut may lose; the end of the "
+        "process loses nothing that was published",
         "s",
         low=0.05,
         high=3600.0,
@@ -181,14 +220,19 @@ class TimeConfig:
 
     on_jump: str = setting(
         "segment",
-        "when the clock jumps back: segment: go on with a new segment of the path; reset: save and begin anew;"
-        " stop: take nothing more until reset",
+        "reaction to a clock that jumps back: segment: a new segment of the path begins; reset: the "
+        "run is saved and begins anew; stop: measurements are refused until ~/reset",
         choices=("segment", "reset", "stop"),
         live=True,
     )
-    jump_back_s: float = setting(0.2, "that is a jump back; less is messages out of order", "s", low=1e-3)
+    jump_back_s: float = setting(
+        0.2, "time by which the clock must jump back to count as a jump; less is a message out of order", "s", low=1e-3
+    )
     future_s: float = setting(
-        1.0, "messages further ahead of the clock, but of one that is played, are refused; 0: none", "s", low=0.0
+        1.0,
+        "messages further ahead of the clock than this are refused, unless a recording is played; 0: none are refused",
+        "s",
+        low=0.0,
     )
 
 
@@ -196,19 +240,24 @@ class TimeConfig:
 class HealthConfig:
     """When ``/diagnostics`` calls the node degraded."""
 
-    odometry_silent_s: float = setting(1.0, "no odometry for longer", "s", low=0.0, live=True)
+    odometry_silent_s: float = setting(1.0, "degraded: no odometry for longer than this", "s", low=0.0, live=True)
     landmarks_silent_s: float = setting(
-        60.0, "nothing seen for longer, once something was; 0: no matter", "s", low=0.0, live=True
+        60.0, "degraded: no landmark observed for longer than this, after the first; 0: never", "s", low=0.0, live=True
     )
-    lag_s: float = setting(1.0, "the solver is behind by more", "s", low=0.0, live=True)
-    stuck_s: float = setting(10.0, "the solver has been at one thing for longer", "s", low=0.0, live=True)
+    lag_s: float = setting(1.0, "degraded: the solver is behind by more than this", "s", low=0.0, live=True)
+    stuck_s: float = setting(10.0, "degraded: one solve has taken longer than this", "s", low=0.0, live=True)
     memory_mib: float = setting(
         0.0,
-        "the process has more memory: loop closures are refused and no second look is begun; 0: no matter",
+        "degraded: the process uses more memory than this; loop closures are refused and no search "
+        "for hypotheses starts; 0: never",
         "MiB",
         low=0.0,
         live=True,
     )
     chi2_per_dof: float = setting(
-        10.0, "the measurements contradict each other by more", "per degree of freedom", low=0.0, live=True
+        10.0,
+        "degraded: the measurements contradict each other by more than this chi2",
+        "per degree of freedom",
+        low=0.0,
+        live=True,
     )

@@ -13,52 +13,69 @@ LOSSES = ("none", "huber", "cauchy", "geman_mcclure", "dcs")
 class RobustConfig:
     """Which closures, sightings and fixes are believed."""
 
-    decide: bool = setting(True, "whether measurements are held back and taken out; false: the loss alone protects")
+    decide: bool = setting(
+        True, "true: unlikely measurements are held back and outliers removed; false: only the robust loss protects"
+    )
     gate: float = setting(
         0.9999,
-        "a measurement that is less likely than all but this part, given what is known, is held back",
+        "a measurement is held back if its innovation is outside this probability of the chi2 distribution",
         "probability",
         low=0.5,
         high=1.0 - 1e-12,
     )
     noise_factor: float = setting(
         2.0,
-        "noise may be so many times worse than it is said to be, or than residuals show where they are smaller",
+        "the gate allows for noise this many times larger than stated, or than residuals show where these are smaller",
         "times",
         low=1.0,
     )
     loss: str = setting(
-        "dcs", "of closures and fixes; geman_mcclure and dcs let go of what does not fit", choices=LOSSES
+        "dcs", "robust loss of closures and fixes; geman_mcclure and dcs let go of outliers", choices=LOSSES
     )
-    loss_scale: float = setting(2.0, "residuals well below this many standard deviations count fully", "sigma", low=0.1)
+    loss_scale: float = setting(
+        2.0,
+        "residuals of closures and fixes well below this many standard deviations keep their full weight",
+        "sigma",
+        low=0.1,
+    )
     out_below: float = setting(
         0.01,
-        "what pulls with a smaller part of its weight is taken out",
+        "a measurement whose robust weight falls below this is removed as an outlier",
         "part of weight",
         low=0.0,
         high=1.0,
     )
     review_every_keyframes: int = setting(
         20,
-        "verdicts, the newest and others in turn, are looked at again after this many keyframes",
+        "verdicts are reviewed after this many keyframes: the newest, and some of the others in turn",
         "keyframes",
         low=1,
         high=1_000_000,
     )
     retests: int = setting(
-        10, "held back, so many are compared with what is known then, in turn", "edges", low=0, high=1_000_000
+        10, "measurements that are held back and tested again at each review, in turn", "edges", low=0, high=1_000_000
     )
-    rounds: int = setting(10, "of solving everything and looking at all verdicts again", "rounds", low=1, high=1000)
+    rounds: int = setting(
+        10,
+        "most rounds of a search for better hypotheses: solve everything, then review all verdicts",
+        "rounds",
+        low=1,
+        high=1000,
+    )
     second_look_after: int = setting(
         10,
-        "in the background everything is explained anew when so many more are held back or taken out than at the last,"
-        " and half as many again; 0: only at the end or when asked to",
+        "a search for better hypotheses starts in the background when so many more measurements are "
+        "rejected than at the last, and half as many again; 0: only at the end or on request",
         "edges",
         low=0,
         high=1_000_000,
     )
     apply_after_keyframes: int = setting(
-        20, "what that finds is taken over so many keyframes later", "keyframes", low=1, high=1_000_000
+        20,
+        "the result of a search for better hypotheses is adopted this many keyframes after it started",
+        "keyframes",
+        low=1,
+        high=1_000_000,
     )
 
     @property
