@@ -141,7 +141,7 @@ def test_every_help_has_an_example_that_the_command_line_takes(command, capsys):
     code, out, _ = told(capsys, command, "--help")
     assert code == 0
     assert out.startswith(f"usage: graph_slam {command}")
-    assert "Exit codes: 0 done, 1 a fault of ours, 2 refused" in out.replace("\n", " ")
+    assert "Exit codes: 0 done, 1 internal error, 2 refused" in out.replace("\n", " ")
     examples = re.findall(rf"^  graph_slam ({command}\b.*)$", out.partition("\nExample")[2], re.MULTILINE)
     assert examples
     for example in examples:
@@ -340,7 +340,7 @@ def test_a_fault_of_ours_is_one_line_with_code_1(bag, tmp_path, capsys, monkeypa
     code, _, err = told(capsys, "replay", bag, "--out", tmp_path / "run")
     assert code == 1
     assert err == [
-        "graph_slam: a fault of ours, ZeroDivisionError: division by zero (GRAPH_SLAM_TRACEBACK=1 shows where)"
+        "graph_slam: internal error, ZeroDivisionError: division by zero (GRAPH_SLAM_TRACEBACK=1 shows where)"
     ]
 
 

@@ -1,6 +1,6 @@
 """The commands ``graph_slam`` and ``graph_slam_node``.
 
-Exit codes: 0 done, 1 a fault of ours, 2 refused (one line names the culprit), 3 done but something was lost, 130
+Exit codes: 0 done, 1 internal error, 2 refused (one line names the culprit), 3 done but something was lost, 130
 interrupted (Ctrl-C); of ``optimize --certify`` also 4 not certified, 5 the certificate does not apply; of ``diff`` 4
 they differ.
 """
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get("GRAPH_SLAM_TRACEBACK"):
             traceback.print_exc()
         what = " ".join(str(error).split())
-        console.warn(f"a fault of ours, {type(error).__name__}: {what} (GRAPH_SLAM_TRACEBACK=1 shows where)")
+        console.warn(f"internal error, {type(error).__name__}: {what} (GRAPH_SLAM_TRACEBACK=1 shows where)")
         return console.FAULT
 
 

@@ -24,7 +24,10 @@ def parser() -> argparse.ArgumentParser:
     commands = whole.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
     for name, (run, options, about, *examples) in _commands().items():
         sub: CommandParser = commands.add_parser(
-            name, help=about, description=about, examples=[f"graph_slam {name} {one}".rstrip() for one in examples]
+            name,
+            help=about,
+            description=f"{about[0].upper()}{about[1:]}.",
+            examples=[f"graph_slam {name} {one}".rstrip() for one in examples],
         )
         sub.set_defaults(run=run)
         options(sub)
@@ -37,7 +40,7 @@ def _commands() -> "dict[str, tuple[Run, Options, str, *tuple[str, ...]]]":
         "info": (
             recordings.info,
             _info,
-            "topics, types, rates, frames and span of a recording, and how to replay it",
+            "show topics, types, rates, frames and span of a recording, and how to replay it",
             "drive.mcap",
         ),
         "replay": (
@@ -50,43 +53,43 @@ def _commands() -> "dict[str, tuple[Run, Options, str, *tuple[str, ...]]]":
         "evaluate": (
             recordings.evaluate,
             _evaluate,
-            "errors of a run, and whether it knows them; a picture",
+            "compute the errors of a run against the truth, test its covariances, draw a picture",
             "drive_run --truth drive.mcap:/ground_truth",
         ),
         "recover": (
             recordings.recover,
             _recover,
-            "the results of a run that was cut off, without repeating the drive",
+            "write the results of a run that was cut off, without repeating the drive",
             "runs/latest --out recovered",
         ),
         "export": (
             maps.export,
             _export,
-            "a run's path as TUM, its graph as g2o, or both as an mcap of ROS messages",
+            "write a run's path as TUM, its graph as g2o, or both as an mcap of ROS messages",
             "drive_run --to tum --out path.tum",
         ),
         "diff": (
             maps.diff,
             _diff,
-            "what differs between two runs' maps: keyframes, landmarks, verdicts, chi2",
+            "compare the maps of two runs: keyframes, landmarks, verdicts, chi2",
             "monday_run tuesday_run",
         ),
         "merge": (
             maps.merge,
             _merge,
-            "one map of two runs, laid on one another by the landmarks of both",
+            "merge the maps of two runs, aligned by the landmarks that both have",
             "monday_run tuesday_run --out site",
         ),
         "freeze": (
             maps.freeze,
             _freeze,
-            "a run's map as one that stays as it is: load it to be located in it",
+            "write a run's map as a frozen one: it stays fixed when it is loaded for localization",
             "drive_run --out site",
         ),
         "plot": (
             recordings.plot,
             _plot,
-            "a picture of a run: path, landmarks, and the truth where there is one",
+            "draw a run: path, landmarks, and the truth if there is one",
             "drive_run",
             "drive_run --truth drive.mcap:/ground_truth --out drive.png",
             "drive_run --animate drive.gif",
@@ -94,20 +97,20 @@ def _commands() -> "dict[str, tuple[Run, Options, str, *tuple[str, ...]]]":
         "explain": (
             audit.explain,
             _explain,
-            "why: what a run believed and what not, or all about one edge of it",
+            "show which measurements a run accepted or rejected and why, or all about one edge",
             "drive_run",
             "drive_run 142",
         ),
         "solve": (
             audit.solve,
             _solve,
-            "what if: a run's graph without some edges, with others, under another loss",
+            "solve a run's graph again without some edges, with others, or with another loss",
             "drive_run --without 142 143",
         ),
         "influence": (
             audit.influence,
             _influence,
-            "the edges of a run that its last pose hangs on most",
+            "list the edges of a run that its last pose depends on most",
             "drive_run --count 5",
         ),
         "optimize": (
@@ -125,13 +128,13 @@ def _commands() -> "dict[str, tuple[Run, Options, str, *tuple[str, ...]]]":
         "simulate": (
             simulate.simulate,
             _simulate,
-            "record a synthetic world with truth: pythonrobotics, manhattan, warehouse, flight; put faults into it",
+            "simulate a recording with truth and, if asked, faults: pythonrobotics, manhattan, warehouse, flight",
             "warehouse --out world.mcap --seed 7",
         ),
         "params": (
             _later("params"),
             _params,
-            "parameters with default, unit, bounds and meaning",
+            "list the parameters with default, unit, bounds and meaning",
             "keyframes",
             "'odometry.*'",
         ),
@@ -145,7 +148,7 @@ def _commands() -> "dict[str, tuple[Run, Options, str, *tuple[str, ...]]]":
         "completion": (
             _later("completion"),
             _completion,
-            "a script that completes commands and options in a shell: eval it in ~/.bashrc or ~/.zshrc",
+            "print a script for shell completion: eval it in ~/.bashrc or ~/.zshrc",
             "bash",
         ),
     }
@@ -170,25 +173,33 @@ def _replay(sub: "CommandParser") -> None:
     sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: the only one, or /landmarks)")
     _add_config(sub)
     sub.add_argument(
-        "--map", type=Path, metavar="RUN", help="go on in the map of a run, frozen or not, and in its parameters"
+        "--map", type=Path, metavar="RUN", help="continue in the map of a run, frozen or not, with its parameters"
     )
     sub.add_argument("--ros", action="store_true", help="publish into a live ROS graph: a node of its own with --out")
     sub.add_argument(
-        "--rate", type=values.positive, metavar="X", help="with --ros: times real time (default: all it takes)"
+        "--rate",
+        type=values.positive,
+        metavar="X",
+        help="with --ros: multiple of real time (default: as fast as possible)",
     )
-    sub.add_argument("--node", metavar="NAME", help="with --ros and no --out: the running node")
+    sub.add_argument("--node", metavar="NAME", help="with --ros and without --out: name of the running node")
 
 
 def _recover(sub: "CommandParser") -> None:
-    sub.add_argument("run_folder", type=Path, metavar="RUN")
+    sub.add_argument("run_folder", type=Path, metavar="RUN", help="run folder")
     _to_folder(sub, required=False, default="RUN itself")
 
 
 def _export(sub: "CommandParser") -> None:
     _of_run(sub)
-    sub.add_argument("--to", choices=("tum", "g2o", "mcap"), required=True, help="g2o: stamps and names beside it")
+    sub.add_argument(
+        "--to",
+        choices=("tum", "g2o", "mcap"),
+        required=True,
+        help="format; g2o: stamps and names go into a second file",
+    )
     sub.add_argument("--last-drive", action="store_true", help="tum: only the last drive, not those of the loaded map")
-    sub.add_argument("--out", type=Path, required=True, metavar="FILE")
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help="output file")
     _add_force(sub)
 
 
@@ -196,11 +207,11 @@ def _diff(sub: "CommandParser") -> None:
     sub.codes = f"{CODES} 4: they differ."
     sub.add_argument("a", type=Path, metavar="A", help="run folder")
     sub.add_argument("b", type=Path, metavar="B", help="run folder")
-    sub.add_argument("--json", action="store_true", help="all of it as one line")
+    sub.add_argument("--json", action="store_true", help="print all of it as one line of JSON")
 
 
 def _merge(sub: "CommandParser") -> None:
-    sub.add_argument("a", type=Path, metavar="A", help="run folder, in whose map frame and configuration the result is")
+    sub.add_argument("a", type=Path, metavar="A", help="run folder; the result has its map frame and configuration")
     sub.add_argument("b", type=Path, metavar="B", help="run folder")
     _to_folder(sub)
 
@@ -211,83 +222,105 @@ def _freeze(sub: "CommandParser") -> None:
 
 
 def _info(sub: "CommandParser") -> None:
-    sub.add_argument("bag", type=Path, metavar="BAG")
+    sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording")
 
 
 def _optimize(sub: "CommandParser") -> None:
     sub.codes = f"{CODES} With --certify: 4 not certified, 5 the certificate does not apply."
-    sub.add_argument("graph", type=Path, metavar="GRAPH")
+    sub.add_argument("graph", type=Path, metavar="GRAPH", help="file of a graph")
     sub.add_argument(
         "--method",
         type=values.method,
         default="gn",
         metavar="gn|lm|dogleg",
-        help="gn (default) is damped only if it does not converge",
+        help="method of optimisation; gn (default) is damped only if it does not converge",
     )
-    sub.add_argument("--max-iterations", type=values.count, default=100, metavar="N", help="default: 100")
+    sub.add_argument(
+        "--max-iterations", type=values.count, default=100, metavar="N", help="most iterations (default: 100)"
+    )
     sub.add_argument(
         "--tolerance",
         type=values.positive,
         default=1e-6,
         metavar="X",
-        help="relative decrease of cost at the end (1e-6)",
+        help="converged when the cost decreases by a smaller fraction (default: 1e-6)",
     )
     sub.add_argument(
         "--loss",
         type=values.loss,
         default="none",
         metavar="none|huber|cauchy[:SCALE]",
-        help=f"robust loss of all edges but odometry; scale in standard deviations of an edge ({values.LOSS_SCALE:g})",
+        help=f"robust loss of all edges but odometry; SCALE in sigmas (default: {values.LOSS_SCALE:g})",
     )
     sub.add_argument(
         "--init",
         choices=("auto", "file", "tree", "chordal", "online"),
         default="auto",
-        help="where to start; auto: the file (tree without vertices), and where the result is suspicious chordal and"
+        help="initial estimate; auto: the file (tree without vertices), and if the result is suspicious chordal and"
         " then online (pose after pose) as well, of which the best is taken",
     )
-    sub.add_argument("--error-map", choices=("relative", "seed"), default="relative", help="seed: of the inverse")
     sub.add_argument(
-        "--certify", action="store_true", help="prove that it is the global optimum, where poses alone are its unknowns"
+        "--error-map",
+        choices=("relative", "seed"),
+        default="relative",
+        help="error of relative poses; seed: of the inverse",
+    )
+    sub.add_argument(
+        "--certify", action="store_true", help="prove that the result is the global optimum; for graphs of poses only"
     )
     _add_reading(sub)
-    sub.add_argument("--json", action="store_true", help="the answer as one line")
-    sub.add_argument("--out", type=Path, metavar="FILE.g2o", help="the solved graph")
-    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="start and result")
+    sub.add_argument("--json", action="store_true", help="print the answer as one line of JSON")
+    sub.add_argument("--out", type=Path, metavar="FILE.g2o", help="write the solved graph")
+    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the initial estimate and the result")
     _add_force(sub)
 
 
 def _convert(sub: "CommandParser") -> None:
-    sub.codes = f"What the format of B cannot say is left out, told in a line, and ends with 3. {CODES}"
+    sub.codes = f"What the format of B cannot express is left out and reported; the exit code is 3. {CODES}"
     sub.add_argument("graph", type=Path, metavar="A", help="g2o, TORO, iSAM or GTSAM text")
     sub.add_argument(
-        "out", type=Path, metavar="B", help="by its ending: .g2o; .toro, .graph; .gtsam; .tum (poses, id as stamp)"
+        "out",
+        type=Path,
+        metavar="B",
+        help="output file; format by its ending: .g2o; .toro, .graph; .gtsam; .tum (poses, id as stamp)",
     )
-    sub.add_argument("--to", choices=("g2o", "toro", "gtsam", "tum"), help="whatever the ending of B")
+    sub.add_argument(
+        "--to", choices=("g2o", "toro", "gtsam", "tum"), help="format of B, instead of the one of its ending"
+    )
     _add_force(sub)
     _add_reading(sub)
 
 
 def _simulate(sub: "CommandParser") -> None:
     sub.more = _world_options
-    sub.add_argument("scenario", metavar="SCENARIO", help="a world, city (a graph), or the file of a graph")
+    sub.add_argument("scenario", metavar="SCENARIO", help="name of a world, city (a graph), or the file of a graph")
     sub.add_argument(
-        "--out", type=Path, required=True, metavar="BAG.mcap|GRAPH.g2o", help="a recording, or by its ending a graph"
+        "--out",
+        type=Path,
+        required=True,
+        metavar="BAG.mcap|GRAPH.g2o",
+        help="output file; by its ending a recording or a graph",
     )
     _add_force(sub)
-    sub.add_argument("--seed", type=int, default=0, metavar="N")
-    sub.add_argument("--as-original", action="store_true", help="pythonrobotics: its own, squared noise")
-    sub.add_argument("--poses", type=values.count, metavar="N", help="length of the drive, where the world has it")
-    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="an option of the world")
+    sub.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random numbers (default: 0)")
     sub.add_argument(
-        "--closures", type=values.count, metavar="N", help="so many true loop closures besides, on /closures"
+        "--as-original", action="store_true", help="pythonrobotics: with the squared noise of the original"
+    )
+    sub.add_argument(
+        "--poses", type=values.count, metavar="N", help="number of poses of the drive, if the world has that option"
+    )
+    sub.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="option of the world, listed below"
+    )
+    sub.add_argument(
+        "--closures", type=values.count, metavar="N", help="number of true loop closures to add, on /closures"
     )
     sub.add_argument(
         "--fault",
         action="append",
         default=[],
         metavar="KIND[:KEY=VALUE,...]",
-        help="see below; several are put in turn",
+        help="fault to add, listed below; several are added in order",
     )
 
 
@@ -308,8 +341,8 @@ def _world_options() -> str:
     lines = ["options of the worlds, for --set:"]
     for name, world in WORLDS.items():
         lines += [f"  {name}: {world.about}", *option_lines(world.options)]
-    lines += ["  every world: a satellite receiver and an IMU besides", *option_lines(Instruments)]
-    lines += ["", "faults, and what of them can be set; what is wrong then is in OUT.faults.csv:"]
+    lines += ["  every world: with a satellite receiver and an IMU", *option_lines(Instruments)]
+    lines += ["", "faults for --fault with their options; OUT.faults.csv lists what is wrong:"]
     for name, kind in KINDS.items():
         lines += [f"  {name}: {kind.about}", *option_lines(kind.options)]
     lines += ["", "example: graph_slam simulate warehouse --out world.mcap --set gnss=5 --set imu=100"]
@@ -317,29 +350,35 @@ def _world_options() -> str:
 
 
 def _evaluate(sub: "CommandParser") -> None:
-    sub.add_argument("run_folder", type=Path, metavar="RUN")
+    sub.add_argument("run_folder", type=Path, metavar="RUN", help="run folder")
     _add_truth(sub, required=True)
     sub.add_argument(
         "--estimate",
         default="",
         metavar="FILE",
-        help="which trajectory of the run (default: sightings.tum; path.tum where nothing was seen)",
+        help="trajectory to evaluate (default: sightings.tum; path.tum without observations)",
     )
-    sub.add_argument("--json", action="store_true", help="the numbers as one line")
-    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="default: path.png in the run folder")
+    sub.add_argument("--json", action="store_true", help="print the numbers as one line of JSON")
+    sub.add_argument(
+        "--plot", type=Path, metavar="FILE.png", help="file of the picture (default: path.png in the run folder)"
+    )
     _add_force(sub)
 
 
 def _plot(sub: "CommandParser") -> None:
     _of_run(sub)
-    sub.add_argument("--out", type=Path, metavar="PNG", help="default: path.png in the run folder")
-    sub.add_argument("--animate", type=Path, metavar="GIF", help="instead: the drive and its correction, as it went on")
+    sub.add_argument(
+        "--out", type=Path, metavar="PNG", help="file of the picture (default: path.png in the run folder)"
+    )
+    sub.add_argument(
+        "--animate", type=Path, metavar="GIF", help="write an animation of the drive and its correction instead"
+    )
     _add_truth(sub, required=False)
     _add_force(sub)
 
 
 def _add_truth(sub: "CommandParser", *, required: bool) -> None:
-    sub.add_argument("--truth", required=required, metavar="BAG|FILE.tum", help="a recording, or a TUM file")
+    sub.add_argument("--truth", required=required, metavar="BAG|FILE.tum", help="the truth: a recording, or a TUM file")
     sub.add_argument(
         "--topic",
         default="",
@@ -347,7 +386,9 @@ def _add_truth(sub: "CommandParser", *, required: bool) -> None:
         help="topic of the truth: poses, odometry, NavSatFix or PointStamped; of transforms /tf:PARENT:CHILD"
         " (default: /ground_truth, or the only one that may be it)",
     )
-    sub.add_argument("--no-align", action="store_true", help="the map is in the frame of the truth already")
+    sub.add_argument(
+        "--no-align", action="store_true", help="do not align: the map is in the frame of the truth already"
+    )
 
 
 def _explain(sub: "CommandParser") -> None:
@@ -356,7 +397,7 @@ def _explain(sub: "CommandParser") -> None:
         "edge",
         nargs="?",
         metavar="EDGE",
-        help="id of an edge, or the name of a landmark (landmark:7 where that is a number); default: the whole",
+        help="id of an edge or name of a landmark (landmark:7 if the name is a number); default: the whole run",
     )
 
 
@@ -364,7 +405,13 @@ def _solve(sub: "CommandParser") -> None:
     sub.codes = f"Edges have the ids of explain and of the run's ledger. {CODES}"
     _of_run(sub)
     sub.add_argument(
-        "--without", nargs="+", action="extend", type=values.edge, default=[], metavar="EDGE", help="taken out"
+        "--without",
+        nargs="+",
+        action="extend",
+        type=values.edge,
+        default=[],
+        metavar="EDGE",
+        help="ids of edges to remove",
     )
     sub.add_argument(
         "--with",
@@ -374,34 +421,46 @@ def _solve(sub: "CommandParser") -> None:
         type=values.edge,
         default=[],
         metavar="EDGE",
-        help="let in, and fully believed: no loss lets go of it",
+        help="ids of edges to include with full weight, without a robust loss",
     )
     sub.add_argument(
         "--loss",
         type=values.loss,
         metavar="none|huber|cauchy|geman_mcclure|dcs[:SCALE]",
-        help=f"of all that may be wrong, instead of the run's; scale in standard deviations ({values.LOSS_SCALE:g})",
+        help=f"robust loss of all candidates, instead of the run's; SCALE in sigmas ({values.LOSS_SCALE:g})",
     )
 
 
 def _influence(sub: "CommandParser") -> None:
     _of_run(sub)
-    sub.add_argument("--count", type=values.count, default=10, metavar="N", help="edges that are solved without (10)")
+    sub.add_argument(
+        "--count",
+        type=values.count,
+        default=10,
+        metavar="N",
+        help="number of edges that are left out in turn (default: 10)",
+    )
 
 
 def _demo(sub: "CommandParser") -> None:
-    sub.add_argument("--out", type=Path, default=Path("runs/demo"), metavar="DIR", help="default: runs/demo")
+    sub.add_argument(
+        "--out", type=Path, default=Path("runs/demo"), metavar="DIR", help="folder for the results (default: runs/demo)"
+    )
     _add_force(sub)
 
 
 def _params(sub: "CommandParser") -> None:
     sub.add_argument(
-        "pattern", nargs="?", default="", metavar="PATTERN", help="part of a name or meaning, or a name with * (all)"
+        "pattern",
+        nargs="?",
+        default="",
+        metavar="PATTERN",
+        help="part of a name or of its help, or a name with * (default: all)",
     )
 
 
 def _completion(sub: "CommandParser") -> None:
-    sub.add_argument("shell", choices=("bash", "zsh"), help='eval "$(graph_slam completion bash)"')
+    sub.add_argument("shell", choices=("bash", "zsh"), help='shell; use: eval "$(graph_slam completion bash)"')
     sub.set_defaults(parser=parser)
 
 
@@ -423,12 +482,14 @@ def _to_folder(sub: "CommandParser", *, required: bool = True, default: str = ""
 
 
 def _add_force(sub: "CommandParser") -> None:
-    sub.add_argument("--force", action="store_true", help="replace a run or a file that is there; nothing else")
+    sub.add_argument(
+        "--force", action="store_true", help="replace an existing run or file; nothing else is overwritten"
+    )
 
 
 def _add_config(sub: "CommandParser") -> None:
     sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file, as for the node")
-    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one parameter")
+    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="set one parameter")
 
 
 def _add_reading(sub: "CommandParser") -> None:
@@ -436,10 +497,13 @@ def _add_reading(sub: "CommandParser") -> None:
         "--from",
         dest="source",
         choices=("g2o", "toro", "gtsam", "isam", "rows"),
-        help="refuse other lines (default: each by its tag); isam: square roots of the information; rows: information"
-        " of EDGE2 in rows of its upper triangle",
+        help="format of the lines; others are refused (default: each by its tag); isam: square roots of the"
+        " information; rows: information of EDGE2 in rows of its upper triangle",
     )
     sub.add_argument(
-        "--information", choices=("g2o", "raw"), default="g2o", help="of rotations in space in g2o; raw: unscaled"
+        "--information",
+        choices=("g2o", "raw"),
+        default="g2o",
+        help="scale of the information of 3D rotations; raw: unscaled",
     )
     sub.add_argument("--lenient", action="store_true", help="leave out bad lines, list them, exit with 3")

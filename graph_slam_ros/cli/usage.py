@@ -6,7 +6,7 @@ from typing import Any, NoReturn
 
 from graph_slam_ros.cli import console
 
-CODES = "Exit codes: 0 done, 1 a fault of ours, 2 refused, 3 done but something was lost, 130 interrupted."
+CODES = "Exit codes: 0 done, 1 internal error, 2 refused, 3 done but something was lost, 130 interrupted."
 
 
 class _Formatter(argparse.HelpFormatter):

@@ -124,7 +124,7 @@ class GraphSlamNode(LifecycleNode):
             action()
         except Exception as error:
             self.get_logger().fatal(
-                message_of(error) if isinstance(error, GraphSlamError) else f"a fault of ours, {message_of(error)}"
+                message_of(error) if isinstance(error, GraphSlamError) else f"internal error, {message_of(error)}"
             )
             return failed
         return _SUCCESS
@@ -324,7 +324,7 @@ class _Told:
 
 
 def main() -> int:
-    """Run the node until it is told to stop; returns the exit code: 0, 1 our fault, 2 refused to start or save."""
+    """Run the node until it is told to stop; returns the exit code: 0, 1 internal error, 2 refused to start or save."""
     code = _run()
     if any(thread.daemon and thread is not threading.current_thread() for thread in threading.enumerate()):
         sys.stdout.flush()
@@ -352,7 +352,7 @@ def _run() -> int:
         rclpy.logging.get_logger("graph_slam").fatal(str(error))
         return 2
     except Exception as error:
-        rclpy.logging.get_logger("graph_slam").fatal(f"a fault of ours, {message_of(error)}")
+        rclpy.logging.get_logger("graph_slam").fatal(f"internal error, {message_of(error)}")
         return 1
     finally:
         rclpy.try_shutdown()
