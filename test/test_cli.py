@@ -142,6 +142,10 @@ def test_every_help_has_an_example_that_the_command_line_takes(command, capsys):
     assert code == 0
     assert out.startswith(f"usage: graph_slam {command}")
     assert "Exit codes: 0 done, 1 internal error, 2 refused" in out.replace("\n", " ")
+    about = out.split("\n\n")[1]
+    assert about[0].isupper() and about.endswith("."), "a sentence says what it does"
+    nameless = [a.dest for a in subcommands()[command]._actions if not a.help]
+    assert not nameless, f"without help: {nameless}"
     examples = re.findall(rf"^  graph_slam ({command}\b.*)$", out.partition("\nExample")[2], re.MULTILINE)
     assert examples
     for example in examples:
@@ -158,11 +162,11 @@ def test_params_tells_default_unit_bounds_meaning_and_when_it_may_change(capsys)
     code, out, _ = told(capsys, "params", "keyframes.min_distance_m")
     first, meaning, _ = out.splitlines()
     assert first == "keyframes.min_distance_m = 0.25 m   (in [0.001, 1e+09]; may change at any time)"
-    assert meaning == "    a keyframe after this distance"
+    assert meaning == "    a keyframe is added after the robot moved this far"
     only = told(capsys, "params", "odometry.*")[1].splitlines()[:-1:2]
     assert [line.split(" = ")[0] for line in only] == [p.name for p in parameters() if p.name.startswith("odometry.")]
     assert "one of twist, density; read at the start" in only[0]
-    assert "keyframes.min_distance_m" in told(capsys, "params", "after this DISTANCE")[1]
+    assert "keyframes.min_distance_m" in told(capsys, "params", "the robot moved this FAR")[1]
 
 
 @pytest.mark.parametrize(
