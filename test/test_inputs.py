@@ -178,7 +178,7 @@ def test_landmarks_without_identity_are_passed_on_one_by_one_whatever_becomes_of
 
 def test_an_input_that_is_not_used_is_not_there():
     with pytest.raises(KeyError):
-        border(detections={"use": "none"}).take("detections", detections(detection()))
+        border(detections={"use": "none"}).convert("detections", detections(detection()))
 
 
 # -- poses in the map -----------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ CITY_SIGMA_M, CITY_SIGMA_RAD = 0.05, 0.01
 
 def warehouse(seconds: float, odometry_hz: int, landmarks_hz: int) -> Iterator[BagMessage]:
     """Laps through a warehouse with so many odometry and landmark messages a second."""
-    rates = {"TICK_NS": _NS // odometry_hz, "LOOK_EVERY": odometry_hz // landmarks_hz}
+    rates = {"TICK_NS": _NS // odometry_hz, "OBSERVE_EVERY": odometry_hz // landmarks_hz}
     with tempfile.TemporaryDirectory() as folder, patch.multiple(slower, **rates):
         recording = simulate("warehouse", 7, laps=int(seconds / _LAP_S) + 1)
         write_bag(recording, Path(folder) / "drive.mcap")
