@@ -20,7 +20,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
-from graph_slam_ros.slam.robust.ledger import FINAL, Ledger
+from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
@@ -232,7 +232,7 @@ class DisplacementSearch:
 
     def _standing(self) -> list[_Seen]:
         ledger = self._ledger
-        return [one for one in self._seen if one.edge < len(ledger) and ledger.reason.values[one.edge] not in FINAL]
+        return [one for one in self._seen if one.edge < len(ledger) and not ledger.is_withdrawn(one.edge)]
 
     def _window(self) -> _Window | None:
         seen = self._standing()

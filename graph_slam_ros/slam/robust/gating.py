@@ -172,7 +172,7 @@ class OutlierGate:
             if edge >= len(self.ledger):
                 self._solver.set_weight(edge, 0.0)
                 self._withdrawn[edge] = reason
-            elif self.ledger.reason.values[edge] not in FINAL:
+            elif not self.ledger.is_withdrawn(edge):
                 if self.ledger.verdict.values[edge] == Verdict.NOT_EVALUATED:
                     self._solver.set_weight(edge, 0.0)
                 self._reject(edge, keyframe, reason, float(self.ledger.statistic.values[edge]))

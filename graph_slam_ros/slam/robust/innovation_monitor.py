@@ -16,7 +16,6 @@ from scipy.stats import beta, binom
 from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
-from graph_slam_ros.slam.robust.ledger import FINAL
 from graph_slam_ros.solver import Solver
 
 _SURE = 1.0 - 1e-6  # probability with which clean measurements raise no alarm
@@ -89,7 +88,7 @@ class InnovationMonitor:
             self._held_back += not self._ledger.is_inside(one.edge)
 
     def _is_standing(self, one: _Seen) -> bool:
-        return one.edge < len(self._ledger) and self._ledger.reason.values[one.edge] not in FINAL
+        return one.edge < len(self._ledger) and not self._ledger.is_withdrawn(one.edge)
 
     def _is_known(self, one: _Seen) -> bool:
         return self._history.known_from(one.landmark, self._seen[0].edge) < one.keyframe
