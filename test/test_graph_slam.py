@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graph_slam_ros.errors import SingularError
+from graph_slam_ros.errors import FormatError, SingularError
 from graph_slam_ros.formats.g2o_writer import write_g2o
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, SE2, TAG_POSITION
@@ -16,7 +16,7 @@ from graph_slam_ros.measurements.types import from_record, to_record
 from graph_slam_ros.runs import summarize
 from graph_slam_ros.runs.outcome import shortcomings
 from graph_slam_ros.simulation import measurements, simulate
-from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam import Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -557,3 +557,21 @@ def test_an_update_says_what_it_changed():
     assert everything.report is p.report
     assert everything.report.converged
     assert p.solves == 2
+
+
+@pytest.mark.parametrize(
+    "make", [lambda k: Sighting("a", k, (1.0, 0.0), (1.0, 0, 0, 1.0)), lambda k: Fix(1, "gps", k, (0.0,), (1.0,))]
+)
+def test_a_kind_that_is_none_is_refused_where_it_is_written(make):
+    with pytest.raises(FormatError, match=r"'bering' is not one of .*, "):
+        make("bering")
+    assert make("position").kind == "position"
+
+
+def test_of_several_faults_at_once_the_first_is_raised_and_all_count(monkeypatch):
+    slam = GraphSlam(Config())
+    monkeypatch.setattr(slam, "_on_step", lambda step: 1 / 0)
+    monkeypatch.setattr(slam, "_on_observation", lambda m: {}["gone"])
+    with pytest.raises(ZeroDivisionError):
+        slam._use([Odometry(1, (0.0, 0.0, 0.0)), Sightings(1, "tags", ()), Sightings(2, "tags", ())])
+    assert slam.counters["node", "KeyError"] == 2

@@ -10,6 +10,14 @@ from typing import Any, TypeAlias
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.typing import Numbers
 
+SIGHTING_KINDS = ("position", "pose", "range_bearing", "bearing", "range")
+FIX_KINDS = ("pose", "position", "heading", "attitude")
+
+
+def _check_kind(measurement: "Sighting | Fix", kinds: tuple[str, ...]) -> None:
+    if measurement.kind not in kinds:
+        raise FormatError(f"{type(measurement).__name__}: {measurement.kind!r} is not one of {', '.join(kinds)}")
+
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
@@ -40,6 +48,11 @@ class Sighting:
         of ``range`` one number
     covariance : of ``measured``: of a position in the axes of the base frame, of a pose in its tangent space
     T_base_sensor : where the sensor is, for the kinds that are measured in its frame; None: at the base
+
+    Raises
+    ------
+    FormatError
+        ``kind`` is not one of ``SIGHTING_KINDS``.
     """
 
     id: str
@@ -47,6 +60,9 @@ class Sighting:
     measured: Numbers
     covariance: Numbers
     T_base_sensor: Numbers | None = None
+
+    def __post_init__(self) -> None:
+        _check_kind(self, SIGHTING_KINDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +86,11 @@ class Fix:
         axis is not known; of a pose or attitude in its tangent space
     point : of ``position``, the antenna in the base frame; empty: its origin
     datum : of a position on earth, latitude [deg], longitude [deg] and height [m] of the map's origin
+
+    Raises
+    ------
+    FormatError
+        ``kind`` is not one of ``FIX_KINDS``.
     """
 
     stamp_ns: int
@@ -79,6 +100,9 @@ class Fix:
     covariance: Numbers
     point: Numbers = ()
     datum: Numbers = ()
+
+    def __post_init__(self) -> None:
+        _check_kind(self, FIX_KINDS)
 
 
 @dataclass(frozen=True, slots=True)

@@ -457,7 +457,7 @@ class GraphSlam:
     # -- odometry ------------------------------------------------------------------------------------------------
 
     def _use(self, released: list[Odometry | Observation]) -> None:
-        """Each by itself: a fault of one costs none of the others, and is raised in the end."""
+        """Use each by itself: a fault of one costs none of the others; the first is raised in the end, all count."""
         faults = []
         for m in released:
             try:
@@ -468,6 +468,8 @@ class GraphSlam:
                     self._on_observation(m)
             except Exception as fault:
                 faults.append(fault)
+        for other in faults[1:]:  # whoever called counts the one that is raised
+            self.counters.count("node", type(other).__name__)
         if faults:
             raise faults[0]
 
