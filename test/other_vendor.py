@@ -31,7 +31,8 @@ from cyclonedds.util import duration
 RADIUS_M, SPEED_M_S, LANDMARKS = 3.0, 1.0, 8
 TURN_DRIFT = 1.08  # what odometry makes of a turn
 HZ, LOOK_EVERY, LAPS, PACE = 20, 10, 2, 10
-PATIENCE_S = 10.0
+STOP_EVERY, LAG_S = 3 * HZ, 2
+PATIENCE_S = 60.0
 UNKNOWN = 1e6
 
 
@@ -187,12 +188,15 @@ def main() -> None:
         readers[name] = DataReader(participant, Topic(participant, topic, kind, qos=qos), qos=qos)
     ended = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
-    driving = drive(participant) if sys.argv[1] == "drive" else iter(())
+    paths: list[Path] = []
+    driving = drive(participant, paths) if sys.argv[1] == "drive" else iter(())
     while not ended.is_set():
         for name, reader in readers.items():
             for sample in reader.take(100):
                 if not isinstance(sample, (Path, PoseWithCovarianceStamped, TFMessage)):
                     continue  # of a writer that has left there is no message
+                if isinstance(sample, Path):
+                    paths[:] = [sample]
                 tell(name, SAID[name](sample))
         if next(driving, None) is None:
             time.sleep(0.01)
@@ -202,8 +206,12 @@ def tell(what, value) -> None:
     print(json.dumps([what, value]), flush=True)
 
 
-def drive(participant):
-    """Drive, step by step; tells when all is sent, and where the robot then is and where odometry puts it."""
+def drive(participant, paths):
+    """Drive, step by step; tells when all is sent, and where the robot then is and where odometry puts it.
+
+    Of a latched topic only the newest message is kept: now and then it waits for the path to here, so that however busy
+    the machine is some are heard in between.
+    """
     writers = []
     for name, kind in (("rt/odom", Odometry), ("rt/landmarks", Detection3DArray)):
         writers.append(DataWriter(participant, Topic(participant, name, kind, qos=RELIABLE), qos=RELIABLE))
@@ -226,6 +234,15 @@ def drive(participant):
         while time.monotonic() < begin + k / (HZ * PACE):
             time.sleep(0.001)
             yield True
+        if k % STOP_EVERY == STOP_EVERY - 1:
+            stopped, here_ns = time.monotonic(), stamp_ns(head)
+            while not (paths and stamp_ns(paths[0].poses[-1].header) >= here_ns - LAG_S * 10**9):
+                if time.monotonic() > stopped + PATIENCE_S:
+                    tell("fault", f"no path to within {LAG_S} s of here in {PATIENCE_S:g} s")
+                    return
+                time.sleep(0.001)
+                yield True
+            begin += time.monotonic() - stopped
     tell("sent", {"truth": truth, "odometry": reckoned})
 
 

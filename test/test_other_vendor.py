@@ -3,8 +3,6 @@
 import itertools
 import json
 import math
-import os
-import random
 import signal
 import subprocess
 import sys
@@ -20,6 +18,7 @@ pytest.importorskip("vision_msgs")
 pytest.importorskip("tf2_msgs")
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: no wheel for this machine, or ROS is sourced")
 
+from live_nodes import ENVIRONMENT, PATIENCE_S, lenient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -27,9 +26,7 @@ from std_srvs.srv import Trigger
 
 from graph_slam_ros.warmup import warmup
 
-PATIENCE_S = 10.0
 CLIENT = Path(__file__).with_name("other_vendor.py")
-ENVIRONMENT = dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", ROS_DOMAIN_ID=str(random.randint(1, 100)))
 
 
 class Client:
@@ -49,7 +46,7 @@ class Client:
             self.heard[what].append(value)
 
     def until(self, what, condition, patience_s=PATIENCE_S):
-        deadline = time.monotonic() + patience_s
+        deadline = time.monotonic() + lenient(patience_s)
         while not condition(self.heard):
             assert self._process.poll() is None, "the client has ended"
             assert not self.heard["fault"], self.heard["fault"]
@@ -58,12 +55,15 @@ class Client:
 
     def end(self):
         self._process.stdin.close()
-        self._process.wait(timeout=PATIENCE_S)
+        self._process.wait(timeout=lenient(PATIENCE_S))
         self._reader.join()
 
 
 def save():
-    """Call ~/save, with rclpy: its answer."""
+    """Call ~/save, with rclpy: its answer.
+
+    Asked again where none comes: of a client that is new to it, a busy server may not know yet where answers go.
+    """
     context = Context()
     context.init(args=[], domain_id=int(ENVIRONMENT["ROS_DOMAIN_ID"]))
     executor = SingleThreadedExecutor(context=context)
@@ -71,10 +71,13 @@ def save():
         node = Node("saver", context=context)
         executor.add_node(node)
         client = node.create_client(Trigger, "/graph_slam/save")
-        assert client.wait_for_service(timeout_sec=PATIENCE_S)
-        future = client.call_async(Trigger.Request())
-        executor.spin_until_future_complete(future, timeout_sec=PATIENCE_S)
-        return future.result()
+        assert client.wait_for_service(timeout_sec=lenient(PATIENCE_S))
+        for _ in range(3):
+            future = client.call_async(Trigger.Request())
+            executor.spin_until_future_complete(future, timeout_sec=lenient(PATIENCE_S))
+            if future.done():
+                return future.result()
+        raise AssertionError("no answer of ~/save")
     finally:
         executor.shutdown()
         context.try_shutdown()
@@ -101,7 +104,7 @@ def session(tmp_path_factory):
     clients = [Client("drive")]
     try:
         robot = clients[0]
-        robot.until("end of the drive", lambda heard: heard["sent"], 6 * PATIENCE_S)
+        robot.until("end of the drive", lambda heard: heard["sent"], 10 * PATIENCE_S)
         robot.until("transform and pose", lambda heard: heard["tf"] and heard["pose"])
         answer = save()
         assert answer.success, answer.message
@@ -116,7 +119,7 @@ def session(tmp_path_factory):
             client.end()
         node.send_signal(signal.SIGINT)
         try:
-            assert node.wait(timeout=PATIENCE_S) == 0
+            assert node.wait(timeout=lenient(PATIENCE_S)) == 0
         finally:
             if node.poll() is None:
                 node.kill()

@@ -20,7 +20,7 @@ def domain(monkeypatch):
         yield
 
 
-OPTIMIZE = 2000  # solves of everything that are asked for at once: several seconds of work
+BEHIND_S = 4.0  # twice what a node that is told to stop still works
 
 
 def parameters(folder):
@@ -33,6 +33,11 @@ def used(r):
     return int(said[-1][1]["used"]) if said else 0
 
 
+def behind_s(r):
+    """How long ago what the worker has in hand was handed over, by the last of /diagnostics."""
+    return float(r.said()[-1][1]["lag [s]"]) if r.said() else 0.0
+
+
 def stopped_with_a_backlog(folder, number=signal.SIGTERM):
     """Of a node that is stopped while it solves and messages wait: exit code, time, what it said, what it had used."""
     with node(*parameters(folder)) as n, robot(hears=("pose", "/diagnostics")) as r:
@@ -40,11 +45,15 @@ def stopped_with_a_backlog(folder, number=signal.SIGTERM):
         drive = Drive()
         until(lambda: r.heard["pose"], drive.pace(r), "pose")
         drive.go(r, 300)
-        for _ in range(OPTIMIZE):
-            r.ask("optimize")
-        before = used(r)
-        drive.go(r, 100)
-        until(lambda: used(r) >= before + 100, r.spin, "messages behind the solves")
+
+        def press(seconds):
+            """Go on, with solves of everything in between: of requests a busy node takes only some."""
+            for _ in range(20):
+                r.ask("optimize")
+            drive.go(r, 5)
+            r.spin(seconds)
+
+        until(lambda: behind_s(r) > BEHIND_S, press, "backlog", 30.0)
         accepted = used(r)
         code, took_s = n.stop(number)
         return code, took_s, n.said, accepted
@@ -63,7 +72,7 @@ def check_left(run, told):
     assert len(odometry) >= accepted > 300
     summary = json.loads((run / "run.json").read_text())
     assert summary["ended"]
-    assert summary["unprocessed"] > 100, "at least the last messages of odometry"
+    assert summary["unprocessed"] > 0
     assert is_incomplete(run)
     assert not is_cut_off(run), "somebody ended it"
     return odometry
