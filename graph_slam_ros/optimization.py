@@ -22,7 +22,7 @@ _SAME = 1e-6  # part of the cost by which one optimum differs from start to star
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """What one start has led to.
+    """The result of one start.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ def _best_of(first: Solution, settings: Settings | None) -> Solution:
 
 
 def suspicion_of(solution: Solution) -> str:
-    """Why a result may be a local minimum, in some words; empty where nothing speaks for it."""
+    """Return why a result may be a local minimum, in some words; empty where nothing speaks for it."""
     solver, report, graph = solution.solver, solution.report, solution.file.graph
     if not report.converged:
         return f"it did not converge ({report.stop})"

@@ -46,7 +46,7 @@ _KERNELS = 115  # about so many there are; a test compares it with the cache
 
 @dataclass(frozen=True, slots=True)
 class Compiling:
-    """How far the compiler is: kernels in the cache, of about so many, after so long."""
+    """The progress of the compiler: kernels in the cache, of about so many, after so long."""
 
     done: int
     elapsed_s: float
@@ -61,7 +61,7 @@ class Compiling:
 
 
 def are_compiled() -> bool:
-    """Whether all kernels are in the cache."""
+    """Return whether all kernels are in the cache."""
     return COMPILED.exists() or bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
 
 
@@ -120,7 +120,7 @@ def _cached() -> int:
 
 
 def _ended(process: "subprocess.Popen[bytes]") -> bytes | None:
-    """What it said on standard error, if it ends soon."""
+    """The compiler's standard error, if it ends soon."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         return process.communicate(timeout=0.1)[1]
     return None

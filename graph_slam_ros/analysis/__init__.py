@@ -1,1 +1,1 @@
-"""What a run is worth and why: errors against truth, consistency, what is believed and what would change."""
+"""Analysis of a run: errors against truth, consistency, what is believed and what would change."""

@@ -1,4 +1,4 @@
-"""Whether a run's covariances and its configured noise are what its errors say.
+"""Consistency: whether a run's covariances and its configured noise agree with its errors.
 
 NEES is the normalised estimation error squared, ``e' Sigma^-1 e`` (Bar-Shalom, Li, Kirubarajan, "Estimation with
 applications to tracking and navigation", 2001, section 5.4): of a consistent estimate it is chi-square distributed with
@@ -41,7 +41,7 @@ class Nees:
 
     @classmethod
     def of(cls, errors: Array, covariances: Array) -> "Nees | None":
-        """Of errors (n, d) and covariances (n, d, d), NaN where unknown; None where all are."""
+        """The NEES of errors (n, d) and covariances (n, d, d), NaN where unknown; None where all are."""
         known = np.asarray(np.isfinite(errors).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
         known[known] = np.linalg.eigvalsh(covariances[known])[:, 0] > 0.0  # of what is certain no error has a size
         n, dof = int(known.sum()), errors.shape[1]
@@ -57,7 +57,7 @@ class Nees:
 
 @dataclass(frozen=True, slots=True)
 class ClassNoise:
-    """What the residuals of a class of edges say of its sigmas.
+    """The scale of the sigmas of a class of edges, by its residuals.
 
     Attributes
     ----------
@@ -174,7 +174,7 @@ def landmark_errors(
 
 
 def class_noise(classes: Mapping[str, Mapping[str, float]], leverage: Mapping[str, float]) -> dict[str, ClassNoise]:
-    """What each class of edges says of its sigmas, from its chi2, its number of residuals and its leverage.
+    """The scale of the sigmas of each class of edges, from its chi2, its number of residuals and its leverage.
 
     The leverages of all classes add up to the number of unknowns: each has as many degrees of freedom as it has
     residuals beyond the unknowns that it determines itself. A class without any, such as the anchor, is left out.

@@ -1,4 +1,4 @@
-"""How far a run is from the truth: position, orientation, drift and map; and whether it knows how far.
+"""Evaluation of a run against the truth: position, orientation, drift and map; and whether it knows how far.
 
 For the errors the estimate is moved onto the truth by the rigid motion that fits best, of the plane or of space as the
 run was made, without scale; poses are compared where both have a stamp within 0.05 s. Consistency is told in the frame
@@ -139,7 +139,7 @@ class Drive:
 
     @property
     def keyframes(self) -> slice:
-        """Its rows in ``path.tum``."""
+        """The rows of the drive in ``path.tum``."""
         return slice(self.first_keyframe, self.end_keyframe)
 
 
@@ -185,7 +185,7 @@ def evaluate(
 
 
 def dimensions_of(run: Path) -> int:
-    """In how many dimensions a run was made: 2 where it does not say."""
+    """The dimensions of a run's world: 2 where it does not say."""
     return run_config(run).world.dimensions if is_run(run) else 2
 
 
@@ -228,7 +228,7 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
 
 
 def _drives(run: Path) -> list[dict[str, int]]:
-    """Where each drive begins; one where the summary does not say."""
+    """Return where each drive begins; one where the summary does not say."""
     try:
         drives = summary_of(run)["drives"]
         drives = [{key: int(one[key]) for key in ("keyframe", "sighting")} for one in drives]
@@ -262,7 +262,7 @@ def _map_rmse(landmarks: dict[str, Point], true: dict[str, Point], dimensions: i
 
 
 def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
-    """From what the run left; None where it left no covariances."""
+    """The consistency, from what the run left; None where it left no covariances."""
     if not os.path.lexists(run / COVARIANCES):
         return None
     path, covariances = read_tum(run / "path.tum"), read_covariances(run / COVARIANCES)
@@ -292,7 +292,7 @@ def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
 
 
 def _why_no_nees(known: Truth, drive: Drive, path: Trajectory, true: Array, is_held: bool) -> str:
-    """Why errors and covariances cannot be compared at all; empty where they can."""
+    """Return why errors and covariances cannot be compared at all; empty where they can."""
     if not known.trajectory.has_orientation:
         return f"{known.source} has no orientation, which says how the map lies in its frame"
     if is_held:
@@ -322,7 +322,7 @@ def _left_out(
 
 
 def _classes(run: Path) -> tuple[bool, dict[str, ClassNoise]]:
-    """Whether fixes hold the map, and what each class of edges says of its sigmas, by the summary of a run."""
+    """Return whether fixes hold the map, and what each class of edges says of its sigmas, by the summary of a run."""
     try:
         summary = json.loads(read_text(run / SUMMARY))
         return "fixes" in summary["classes"], class_noise(summary["classes"], summary["leverage"])

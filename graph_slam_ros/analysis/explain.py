@@ -1,4 +1,4 @@
-"""Why: what was decided in a saved run, as a whole or about one edge, in sentences."""
+"""Explanation of what was decided in a saved run, as a whole or about one edge, in sentences."""
 
 import json
 import textwrap
@@ -48,7 +48,7 @@ _CHANCE = 1e-4  # that so many would all stay below that, were their noise as it
 
 
 def explain_run(folder: Path) -> Iterator[str]:
-    """How many of each class are in and out and why, what is most surprising, and whether the gates decide anything.
+    """The edges of each class that are in and out and why, the most surprising, and whether the gates decide.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def _table(entries: Sequence[Entry]) -> Iterator[str]:
 
 
 def _worst(entries: Iterable[Entry]) -> Iterator[str]:
-    """Of what is out: where the statistic is farthest above what it was held against."""
+    """The worst of what is out: where the statistic is farthest above what it was held against."""
     worst = sorted(entries, key=lambda e: -e.statistic / e.threshold)[:_SHOWN]
     if worst:
         yield "farthest off, of what is out:"
@@ -86,7 +86,7 @@ def _worst(entries: Iterable[Entry]) -> Iterator[str]:
 
 
 def _least(entries: Iterable[Entry]) -> Iterator[str]:
-    """Of what is in: what fits least now."""
+    """The worst of what is in: what fits least now."""
     least = sorted(entries, key=lambda e: -e.chi2 / e.dof)[:_SHOWN]
     if least:
         yield "fits least, of what is in:"
@@ -119,7 +119,7 @@ def _gates(entries: Sequence[Entry], changes: Sequence[VerdictChange], config: C
 
 
 def _rivals(folder: Path) -> Iterator[str]:
-    """What the last second look could not rule out."""
+    """Return what the last second look could not rule out."""
     file = folder / SUMMARY
     try:
         rows = [
@@ -236,7 +236,7 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
 
 
 def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
-    """What believing it, or doing without it, would do to the map."""
+    """Return what believing it, or doing without it, would do to the map."""
     which = "out" if e.is_in else "in and fully believed"
     try:
         moved = run.moved(run.solve([e.edge] if e.is_in else [], [] if e.is_in else [e.edge]))

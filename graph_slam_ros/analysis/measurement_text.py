@@ -1,4 +1,4 @@
-"""What the numbers of a measurement mean, for who reads them: their names and units, and what was expected instead."""
+"""The numbers of a measurement as text: their names and units, and what was expected instead."""
 
 from collections.abc import Sequence
 
@@ -42,7 +42,7 @@ def with_units(entry: Entry, numbers: Sequence[float]) -> str:
 
 
 def measured(entry: Entry) -> tuple[float, ...]:
-    """What was measured, as many numbers as the residual has; rotations in space as vectors."""
+    """Return what was measured, as many numbers as the residual has; rotations in space as vectors."""
     z = entry.measured
     if entry.tag == "EDGE_ATTITUDE_SE3":
         return _floats(so3.log(z))
@@ -54,7 +54,7 @@ def measured(entry: Entry) -> tuple[float, ...]:
 
 
 def expected(entry: Entry) -> tuple[float, ...]:
-    """What was expected when it was judged first, in the same numbers."""
+    """Return what was expected when it was judged first, in the same numbers."""
     z, r = entry.measured, entry.residual
     if entry.tag in ("EDGE_SE2", "EDGE_PRIOR_SE2"):
         x, y, heading = se2.compose(z, r)

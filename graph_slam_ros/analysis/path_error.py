@@ -1,4 +1,4 @@
-"""How far a path is from the truth: absolute and relative errors of position and angle.
+"""The errors of a path: absolute and relative errors of position and angle.
 
 The absolute error (ATE) is that of each pose once a rigid motion, without scale, has laid the whole path on the truth.
 The relative error (RPE) is that of the motion over one second and over one metre: what drift is.
@@ -68,7 +68,7 @@ class Matched:
 
     @property
     def position_errors_m(self) -> Array:
-        """Of each pose, (n,)."""
+        """Position errors (n,) of all poses."""
         return np.linalg.norm(self.path.poses[:, :3] - self.truth.poses[:, :3], axis=1)
 
 

@@ -201,7 +201,7 @@ def _draw_errors(axes: Any, found: _Placed) -> None:
 
 
 def _box(found: _Placed, points: Array, axis: int) -> tuple[float, float]:
-    """What has to be seen along an axis: estimate and truth, and all else that is not far away from them."""
+    """Return what has to be seen along an axis: estimate and truth, and all else that is not far away from them."""
     sure = [found.path.poses[:, axis]] + ([found.truth.poses[:, axis]] if found.truth is not None else [])
     low, high = float(np.nanmin(np.concatenate(sure))), float(np.nanmax(np.concatenate(sure)))
     reach = max(high - low, 1.0)

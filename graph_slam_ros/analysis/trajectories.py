@@ -39,7 +39,7 @@ Row = tuple[int, tuple[float, ...]]  # stamp [ns] and pose (7,)
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What is known to be true.
+    """The truth.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
 
 
 def _file_and_topic(truth: str) -> tuple[Path, str]:
-    """Before the first colon that a file ends at; a name may hold colons itself."""
+    """Split at the first colon that a file ends at; a name may hold colons itself."""
     path = Path(truth)
     at = truth.find(":")
     while not path.exists() and at >= 0:
@@ -146,7 +146,7 @@ def _rows(bag: Bag, topic: str, kind: str) -> Iterator[Row]:
 
 
 def _transforms(bag: Bag, path: Path, topic: str, frames: str) -> list[Row]:
-    """Of one pair of frames: the named one, or the only one that does not begin or end in a frame of the robot."""
+    """The transforms of one pair of frames: the named one, or the one that does not touch a frame of the robot."""
     found: dict[tuple[str, str], list[Row]] = {}
     for message in _decoded(bag, topic):
         for one in message.transforms:

@@ -1,4 +1,4 @@
-"""What if: the graph of a saved run, solved again with edges taken out or let in or under another loss; what moves.
+"""The what-if analysis: the graph of a saved run, solved again with other edges or another loss; what moves.
 
 All is from ``graph.g2o`` and ``ledger.csv``: nothing is decided again, the drive is not repeated.
 """
@@ -26,7 +26,7 @@ _ACCEPTED = "believed"  # the class of what is let in: it has no loss
 
 @dataclass(frozen=True, slots=True)
 class MovedVertex:
-    """What moves between two solutions of one run.
+    """A vertex that moves between two solutions of one run.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class MovedVertex:
 
 @dataclass(frozen=True, slots=True)
 class Influence:
-    """How far the last keyframe moves, in metres, when an edge is taken out: to first order, and solved again.
+    """The influence of an edge: metres the last keyframe moves without it, to first order and solved again.
 
     The latter is inf where a vertex is undetermined without the edge.
     """
@@ -181,7 +181,7 @@ class SavedGraph:
 
 
 def _graph(folder: Path, entries: Sequence[Entry]) -> tuple[Graph, list[int]]:
-    """And the vertices that are held: those of a map that was frozen."""
+    """The graph, and the vertices that are held: those of a map that was frozen."""
     file, out = read_g2o(folder / GRAPH, follow=False), Graph()
     if sorted(file.ids) != list(range(len(file.ids))):
         raise FormatError(f"{folder / GRAPH}: vertices are not numbered one after another from 0: is it of a run?")
@@ -201,12 +201,12 @@ def _graph(folder: Path, entries: Sequence[Entry]) -> tuple[Graph, list[int]]:
 
 def _check_same_run(folder: Path, file: G2oFile, entries: Iterable[Entry]) -> None:
     """The graph has the edges that are in, and none that the ledger does not know."""
-    told: Counter[tuple[str, ...]] = Counter()
+    edges: Counter[tuple[str, ...]] = Counter()
     tags = {edge: tag for tag, edge in EDGE_TAGS.items()}
     for table in file.graph.tables.values():
-        told.update((tags[table.type], *(str(file.ids[v]) for v in ends)) for ends in table.vertices.values.tolist())
+        edges.update((tags[table.type], *(str(file.ids[v]) for v in ends)) for ends in table.vertices.values.tolist())
     known = [((e.tag, *map(str, e.vertices)), e.is_in) for e in entries]
-    strange = told - Counter(edge for edge, _ in known) or Counter(edge for edge, is_in in known if is_in) - told
+    strange = edges - Counter(edge for edge, _ in known) or Counter(edge for edge, is_in in known if is_in) - edges
     if strange:
         edge = " ".join(min(strange))
         raise FormatError(f"{folder}: {GRAPH} and {LEDGER} are not of one run, or not whole: {edge} is in one alone")

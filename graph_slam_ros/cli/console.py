@@ -1,4 +1,4 @@
-"""What the commands share: exit codes, what is said and where, and whether ROS is here."""
+"""Shared by the commands: exit codes, what is said and where, and whether ROS is here."""
 
 import importlib.util
 import os
@@ -68,7 +68,7 @@ def check_file(*paths: Path | None, force: bool, source: Path | None = None) -> 
 
 
 def warn(what: str, programme: str = "graph_slam", most: int = _MAX_CHARACTERS) -> None:
-    """What stands beside the answer, on standard error: a line, whatever is in the names that it tells.
+    """Print a line on standard error, beside the answer, whatever is in the names that it tells.
 
     Parameters
     ----------
@@ -130,6 +130,6 @@ def progress(label: str) -> Any:
 
 
 def has_ros() -> bool:
-    """Whether the node and the player can run."""
+    """Return whether the node and the player can run."""
     names = ("rclpy", "tf2_msgs", "vision_msgs")
     return all(getattr(importlib.util.find_spec(name), "origin", None) for name in names)

@@ -78,7 +78,7 @@ def _after(args: argparse.Namespace, converged: bool) -> str:
 
 
 def _options(args: argparse.Namespace) -> Iterable[str]:
-    """What was asked for of the solution, as it was typed."""
+    """Return what was asked for of the solution, as it was typed."""
     from graph_slam_ros.cli.parser import parser
 
     usual = parser().parse_args(["optimize", "GRAPH"])
@@ -178,7 +178,7 @@ def _certify(solution: "Solution", settings: "Settings") -> _Proof:
 
 
 def _starts(solution: "Solution") -> dict[str, Any]:
-    """For JSON: which starts were tried, and why more than one."""
+    """The starts for JSON: which were tried, and why more than one."""
     tried = [
         {"start": one.start, "chi2": None if one.failure else one.chi2, "failure": one.failure}
         for one in solution.attempts
@@ -187,7 +187,7 @@ def _starts(solution: "Solution") -> dict[str, Any]:
 
 
 def _starts_text(solution: "Solution") -> Iterable[str]:
-    """Where the first result was suspicious: why, what came of other starts, and which of them is the answer."""
+    """The text on a suspicious first result: why it is, what other starts gave, and which is the answer."""
     if not solution.suspicion:
         return
     first, *others = solution.attempts

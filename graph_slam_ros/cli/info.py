@@ -1,4 +1,4 @@
-"""What a recording holds, and the replay command that fits."""
+"""The contents of a recording, and the replay command that fits."""
 
 import textwrap
 from pathlib import Path

@@ -35,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _commands() -> "dict[str, tuple[Run, Options, str, *tuple[str, ...]]]":
-    """By name: the function, the options, what it is for, and examples of its arguments."""
+    """The commands by name: the function, the options, what it is for, and examples of its arguments."""
     return {
         "info": (
             recordings.info,

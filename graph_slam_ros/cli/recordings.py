@@ -30,7 +30,7 @@ def replay(args: argparse.Namespace) -> int:
     own = config if args.config or args.set or not is_run(args.bag) else None
     topics = {"odometry": args.odom, "landmarks": args.landmarks, "map_folder": args.map}
     done = replayed(args.bag, args.out, own, **topics, force=args.force, progress=console.progress("replay"))
-    code = max([_say_earlier(run.folder, run.summary) for run in done.earlier], default=console.DONE)
+    code = max([_print_earlier(run.folder, run.summary) for run in done.earlier], default=console.DONE)
     code = max(code, _print_summary(args.bag, done.summary))
     console.show(f"results in {args.out}")
     _draw(args.out)
@@ -224,28 +224,28 @@ def _config(args: argparse.Namespace) -> "Config":
 
 
 def _print_summary(source: Path, summary: dict[str, Any]) -> int:
-    """What came of a run; returns the exit code, 3 where that is less than what was asked for."""
+    """Print what came of a run; returns the exit code, 3 where that is less than what was asked for."""
     from graph_slam_ros.runs import outcome
 
     console.show(*outcome.text(summary))
     if not summary["keyframes"]:
         why = f": {summary['losses'][0]}" if summary.get("losses") else ", see what was counted and graph_slam info"
         raise GraphSlamError(f"{source}: no odometry of it could be used{why}")
-    return _say_shortcomings(summary)
+    return _print_shortcomings(summary)
 
 
-def _say_earlier(folder: Path, summary: dict[str, Any]) -> int:
+def _print_earlier(folder: Path, summary: dict[str, Any]) -> int:
     """Say what came of a run that ended where time jumped back; returns as ``_print_summary``."""
     from graph_slam_ros.runs import outcome
 
     console.show(*outcome.text(summary))
-    code = _say_shortcomings(summary)
+    code = _print_shortcomings(summary)
     console.show(f"odometry went back in time, and time.on_jump is reset: the run until then is in {folder}")
     _draw(folder)
     return code
 
 
-def _say_shortcomings(summary: dict[str, Any]) -> int:
+def _print_shortcomings(summary: dict[str, Any]) -> int:
     from graph_slam_ros.runs import outcome
 
     shortcomings = list(outcome.shortcomings(summary))

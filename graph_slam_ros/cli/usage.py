@@ -1,4 +1,4 @@
-"""How the command line says what is wrong, and what its help looks like."""
+"""Usage errors and help of the command line."""
 
 import argparse
 from collections.abc import Callable, Sequence

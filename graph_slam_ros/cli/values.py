@@ -1,4 +1,4 @@
-"""What the values of options may be."""
+"""Types of the values of options."""
 
 import argparse
 import re

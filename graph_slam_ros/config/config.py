@@ -51,7 +51,7 @@ class FramesConfig:
 
 @dataclass(frozen=True, slots=True)
 class WorldConfig:
-    """Where the robot moves."""
+    """The world: a plane or space."""
 
     dimensions: int = setting(
         2, "2: the robot moves in a plane, measurements are projected onto it; 3: it moves in space", low=2, high=3
@@ -139,7 +139,7 @@ class OdometryConfig:
 
 @dataclass(frozen=True, slots=True)
 class KeyframesConfig:
-    """When the robot's motion earns a new vertex."""
+    """The choice of keyframes."""
 
     min_distance_m: float = setting(
         0.25, "a keyframe is added after the robot moved this far", "m", low=1e-3, live=True
@@ -323,7 +323,7 @@ class AnchorConfig:
 
 @dataclass(frozen=True, slots=True)
 class MapConfig:
-    """Whether the map grows."""
+    """Mapping, or localization in a map that is held."""
 
     localize: bool = setting(
         False,
@@ -362,7 +362,7 @@ _SOLVER = Settings()  # its defaults are ours, but for when the solve at the end
 
 @dataclass(frozen=True, slots=True)
 class SolveConfig:
-    """When and how the graph is solved: a little at each keyframe, and everything at the end."""
+    """The solver: a little at each keyframe, and everything at the end."""
 
     every_keyframes: int = setting(
         1, "the estimate is updated after this many keyframes", "keyframes", low=1, high=1_000_000, live=True
@@ -460,7 +460,7 @@ class Config:
     sources: tuple[InputConfig, ...] = DEFAULT_INPUTS
 
     def __repr__(self) -> str:
-        """What is not its default, as ``from_mapping`` takes it."""
+        """The parameters that are not at their default, as ``from_mapping`` takes them."""
         given = dict(flatten(self.as_mapping()))
         usual = {p.name: p.default for p in parameters(one.name for one in self.sources)}
         changed = [f"{name}={value!r}" for name, value in given.items() if value != usual[name]]
@@ -471,7 +471,7 @@ class Config:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> "Config":
-        """From nested or dotted names to values; what is not named keeps its default.
+        """Read nested or dotted names and their values; what is not named keeps its default.
 
         Raises
         ------
@@ -493,7 +493,7 @@ class Config:
         return cls(**trees, sources=tuple(inputs))
 
     def changed(self, values: Mapping[str, Any]) -> "Config":
-        """With other values of some parameters, by dotted name; all of them or none.
+        """The configuration with other values of some parameters, by dotted name; all of them or none.
 
         Raises
         ------
@@ -540,7 +540,7 @@ class Config:
             raise ConfigError(f"landmarks.surveyed: {error}") from None
 
     def solver_settings(self) -> Settings:
-        """How the solver is to be run, online and at the end."""
+        """The settings of the solver, online and at the end."""
         scale = self.landmarks.loss_scale
         stages = [Loss.named(name, scale) for name in self.landmarks.loss.split("_then_")]
         s = self.solve
@@ -569,13 +569,13 @@ def _input_names(text: Any) -> list[str]:
     """Names that are separated by spaces. Raises ConfigError for what cannot be the name of a section of its own."""
     if not isinstance(text, str):
         raise ConfigError(f"inputs.names: {text!r} is not a text of names")
-    names, taken = text.split(), {name for name, _ in _sections()} | {"tf_static"}
+    names, used = text.split(), {name for name, _ in _sections()} | {"tf_static"}
     for name in names:
         if not re.fullmatch(r"[a-zA-Z]\w*", name, re.ASCII):
             raise ConfigError(f"inputs.names: {name!r} is not a name (letters, digits, _)")
-        if name in taken:
-            raise ConfigError(f"inputs.names: {name!r} is taken or given twice")
-        taken.add(name)
+        if name in used:
+            raise ConfigError(f"inputs.names: {name!r} is used or given twice")
+        used.add(name)
     return names
 
 

@@ -110,5 +110,5 @@ DEFAULT_INPUTS = (
 
 
 def default_input(name: str) -> InputConfig:
-    """What is known of an input by its name alone."""
+    """The default input of a name."""
     return next((one for one in DEFAULT_INPUTS if one.name == name), InputConfig(name, topic=name))

@@ -78,7 +78,7 @@ class TfConfig:
 
 @dataclass(frozen=True, slots=True)
 class InputsConfig:
-    """What is listened to."""
+    """The inputs and their subscriptions."""
 
     names: str = setting(" ".join(USUAL_INPUTS), "names of the inputs; each has a section of its name")
     reliable: bool = setting(
@@ -130,7 +130,7 @@ class InitialPoseConfig:
 
 @dataclass(frozen=True, slots=True)
 class OutputConfig:
-    """What the node publishes and leaves behind."""
+    """Published topics and written files."""
 
     folder: str = setting(
         "{node}_run",
@@ -199,7 +199,7 @@ class OutputConfig:
 
 @dataclass(frozen=True, slots=True)
 class JournalConfig:
-    """What of a run outlives whatever ends it."""
+    """The journal of a run, which outlives the process."""
 
     resume: bool = setting(
         True, "true: a node whose last run did not end resumes its map when configured, as ~/load would"
@@ -216,7 +216,7 @@ class JournalConfig:
 
 @dataclass(frozen=True, slots=True)
 class TimeConfig:
-    """What the clock may do."""
+    """Jumps of the clock."""
 
     on_jump: str = setting(
         "segment",
@@ -238,7 +238,7 @@ class TimeConfig:
 
 @dataclass(frozen=True, slots=True)
 class HealthConfig:
-    """When ``/diagnostics`` calls the node degraded."""
+    """The limits above which ``/diagnostics`` calls the node degraded."""
 
     odometry_silent_s: float = setting(1.0, "degraded: no odometry for longer than this", "s", low=0.0, live=True)
     landmarks_silent_s: float = setting(

@@ -11,7 +11,7 @@ from graph_slam_ros.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """What is known of one parameter; ``low`` and ``high`` are inclusive; ``live``: it may change at work."""
+    """A parameter; ``low`` and ``high`` are inclusive; ``live``: it may change at work."""
 
     name: str
     type: type

@@ -11,7 +11,7 @@ LOSSES = ("none", "huber", "cauchy", "geman_mcclure", "dcs")
 
 @dataclass(frozen=True, slots=True)
 class RobustConfig:
-    """Which closures, sightings and fixes are believed."""
+    """Outlier rejection of closures, sightings and fixes."""
 
     decide: bool = setting(
         True, "true: unlikely measurements are held back and outliers removed; false: only the robust loss protects"

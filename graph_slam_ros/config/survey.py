@@ -13,7 +13,7 @@ _HEADERS = (["id", "x", "y", "sigma"], ["id", "x", "y", "z", "sigma"])
 
 @dataclass(frozen=True, slots=True)
 class Surveyed:
-    """Where a landmark is in the map, and how well that is known: standard deviation along each axis."""
+    """The surveyed position of a landmark, and how well that is known: standard deviation along each axis."""
 
     position: Numbers
     sigma_m: float

@@ -20,7 +20,7 @@ NAMES = {"g2o": "g2o", "toro": "TORO", "gtsam": "GTSAM's text", "tum": "TUM"}
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """How many vertices and edges were written, and a line for what the format cannot say."""
+    """The result of writing: how many vertices and edges, and a line for what the format cannot say."""
 
     vertices: int
     edges: int
@@ -28,7 +28,7 @@ class Written:
 
 
 def format_of(path: Path) -> str:
-    """By the ending. Raises FormatError."""
+    """The format by the ending. Raises FormatError."""
     try:
         return ENDINGS[ending(path)]
     except KeyError:

@@ -32,7 +32,7 @@ _UPPER_3D = np.triu_indices(6)
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """How the lines of a text are meant.
+    """The meaning of the lines of a text.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ def in_g2o_words(words: Words, text: Text) -> Words:
 
 
 def may_be_roots(words: Words, text: Text) -> bool:
-    """Whether a line may give the root of its information, and nobody said which: in EDGE3 both look the same."""
+    """Return whether a line may give the root of its information, and it is unknown: in EDGE3 both look the same."""
     if text.dialect or words[0] != "EDGE3" or len(words) != 3 + 6 + 21:
         return False
     return not np.array_equal(numbers(words[9:]), np.eye(6)[_UPPER_3D])  # which is its own root
@@ -243,7 +243,7 @@ def _xyz_rpy(pose: list[float]) -> list[float]:
 
 
 def _is_definite(upper: list[float]) -> bool:
-    """Of the correlations, so that units do not matter."""
+    """Return whether a matrix is positive definite, by its correlations: units do not matter."""
     a, b, c, d, e, f = upper
     if not (a > 0.0 and d > 0.0 and f > 0.0):
         return False
@@ -261,7 +261,7 @@ def _squared(rows: list[float]) -> list[float]:
 
 
 def _inverse(upper: list[float], what: str) -> list[float]:
-    """Of a symmetric matrix by its upper triangle, through the correlations: units may differ by many orders."""
+    """The inverse of a symmetric matrix by its upper triangle and the correlations: units may differ much."""
     size = 3 if len(upper) == 6 else 2
     matrix = np.zeros((size, size))
     at = np.triu_indices(size)

@@ -35,7 +35,7 @@ class AppendedFile:
         return len(data)
 
     def tell(self) -> int:
-        """Where the next byte goes."""
+        """Return where the next byte goes."""
         return self._end + len(self._unwritten)
 
     @property

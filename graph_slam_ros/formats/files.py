@@ -50,7 +50,7 @@ def read_text(path: Path, *, follow: bool = False) -> str:
 
 
 def is_regular(path: Path) -> bool:
-    """Whether a regular file has this name; a link to one is not."""
+    """Return whether a regular file has this name; a link to one is not."""
     try:
         return stat.S_ISREG(path.lstat().st_mode)
     except OSError:
@@ -58,7 +58,7 @@ def is_regular(path: Path) -> bool:
 
 
 def is_empty(path: Path) -> bool:
-    """Whether there is nothing to read: no such file, or a regular one of no bytes.
+    """Return whether there is nothing to read: no such file, or a regular one of no bytes.
 
     A FIFO or a link is not empty, nor is what cannot be looked at: to open it raises the reason.
     """

@@ -202,7 +202,7 @@ class _Reader:
                     yield edge
 
     def _is_at(self, tag: str, edge: _Edge) -> bool:
-        """Whether the place of an edge's sensor is known, and such that its measurement can be used."""
+        """Return whether the place of an edge's sensor is known, and such that its measurement can be used."""
         offset = self.offsets.get(edge.offset or 0)
         if offset is None and edge.offset:  # some files leave out parameter 0, which is then the robot's frame itself
             self.refuse(edge.line, f"parameter {edge.offset}, which is not declared")
@@ -322,7 +322,7 @@ def by_traces(information: Array, lengths: int) -> Array | None:
 
 
 def _quaternion_at(edge: EdgeType) -> int | None:
-    """Where in what an edge measured a quaternion begins, if there is one."""
+    """Return where in what an edge measured a quaternion begins, if there is one."""
     if edge in (RELATIVE_POSE_3D, POSE_PRIOR_3D):
         return 3
     if edge is ATTITUDE_PRIOR_3D:

@@ -35,12 +35,12 @@ def write_g2o(path: Path | str, file: G2oFile, values: Values) -> int:
 
 
 def g2o_text(file: G2oFile, values: Values) -> str:
-    """What ``write_g2o`` writes."""
+    """Return what ``write_g2o`` writes."""
     return "\n".join(graph_lines(file, values)) + "\n"
 
 
 def weightless(graph: Graph) -> int:
-    """How many edges are of weight 0."""
+    """Return how many edges are of weight 0."""
     return sum(int((table.weight.values == 0.0).sum()) for table in graph.tables.values())
 
 

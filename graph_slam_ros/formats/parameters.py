@@ -22,7 +22,7 @@ _NODE = "graph_slam"
 
 
 class _PythonParser(Reader, Scanner, Parser):
-    """What ``CParser`` is where PyYAML was built without libyaml: the same, at a sixth of the speed."""
+    """A stand-in for ``CParser`` where PyYAML was built without libyaml: the same, at a sixth of the speed."""
 
     def __init__(self, stream: str) -> None:
         Reader.__init__(self, stream)

@@ -67,12 +67,12 @@ def _bounded(stream: Any, path: Path, most: int | None) -> Iterator[tuple[int, s
 
 
 def is_gzipped(path: Path) -> bool:
-    """By the ending."""
+    """Return whether the ending says so."""
     return path.suffix.lower() == ".gz"
 
 
 def ending(path: Path) -> str:
-    """What the file is without its compression: ``.g2o`` of ``a.g2o.gz``."""
+    """Return what the file is without its compression: ``.g2o`` of ``a.g2o.gz``."""
     return (path.with_suffix("") if is_gzipped(path) else path).suffix.lower()
 
 

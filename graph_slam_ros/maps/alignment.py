@@ -22,7 +22,7 @@ _SPREAD = 3.0  # standard deviations of a point, so far the points must spread t
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Where map b is in map a, and how far its points then are from where a has them.
+    """The alignment of map b in map a, and how far its points then are from where a has them.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Alignment:
     fits: Mask
 
     def distance(self, k: int) -> tuple[float, float]:
-        """How far a point has moved in metres, and in standard deviations that way."""
+        """Return how far a point has moved in metres, and in standard deviations that way."""
         metres = float(np.linalg.norm(self.apart[k]))
         if metres < _ROUNDING_M:
             return metres, 0.0
@@ -49,7 +49,7 @@ class Alignment:
 
 
 def positions(slam: GraphSlam, names: Sequence[str]) -> tuple[Array, Array]:
-    """Of landmarks (k, n), and their covariance together (k n, k n), in the axes of map."""
+    """Positions of landmarks (k, n), and their covariance together (k n, k n), in the axes of map."""
     space, n = slam.space, slam.space.dimensions
     vertices = [slam.landmarks[name].vertex for name in names]
     values = [tuple(slam.solver.estimate([vertex])[0].tolist()) for vertex in vertices]
@@ -104,7 +104,7 @@ def as_they_are(space: Geometry, a: tuple[Array, Array], b: tuple[Array, Array],
 
 
 def laid_on(space: Geometry, a: Array, b: Array) -> Numbers | None:
-    """Where map b is in map a, by points of which none has moved; None where they are too few, or on a line."""
+    """Return where map b is in map a, by points of which none has moved; None where they are too few, or on a line."""
     spread = np.linalg.svd(b - b.mean(axis=0), compute_uv=False) if len(b) else np.empty(0)
     n = space.dimensions
     if len(spread) < n - 1 or len(b) < n or spread[n - 2] < 1e-6 * len(b):
@@ -128,12 +128,12 @@ def _pose(space: Geometry, turn: Array, shift: Array) -> Numbers:
 
 
 def _variances(*maps: tuple[Array, Array]) -> Array:
-    """Of each point, along an axis, in all maps together (k,)."""
+    """The variance of each point along an axis, in all maps together (k,)."""
     return sum(np.diagonal(c).reshape(p.shape).mean(axis=1) for p, c in maps) + _ROUNDING_M**2
 
 
 def _first(a: tuple[Array, Array], b: tuple[Array, Array], limit: float) -> Mask:
-    """Those that agree best: of as few as tell a motion, tried in turn, or by chance where there are many."""
+    """The points that agree best: of as few as tell a motion, tried in turn, or by chance where there are many."""
     count, n = a[0].shape
     if math.comb(count, n) <= _MOST_TRIALS:
         sets = np.array(list(combinations(range(count), n)))
@@ -148,7 +148,7 @@ def _first(a: tuple[Array, Array], b: tuple[Array, Array], limit: float) -> Mask
 
 
 def _is_determined(a: tuple[Array, Array], b: tuple[Array, Array], fits: Mask) -> bool:
-    """Whether points tell all of a motion: enough of them, not in one place, in space not on a line."""
+    """Return whether points tell all of a motion: enough of them, not in one place, in space not on a line."""
     count, n = int(fits.sum()), a[0].shape[1]
     if count < n:
         return False
@@ -157,7 +157,7 @@ def _is_determined(a: tuple[Array, Array], b: tuple[Array, Array], fits: Mask) -
 
 
 def _covariance(a: tuple[Array, Array], b: tuple[Array, Array], turn: Array, fits: Mask) -> Array:
-    """Of each difference, once those that fit are laid on one another as well as can be (k, n, n)."""
+    """The covariance of each difference, once those that fit are laid on one another as well as can be (k, n, n)."""
     count, n = a[0].shape
     axes = np.kron(np.eye(count), turn)
     total = a[1] + axes @ b[1] @ axes.T
@@ -170,7 +170,7 @@ def _covariance(a: tuple[Array, Array], b: tuple[Array, Array], turn: Array, fit
 
 
 def _derivative(points: Array) -> Array:
-    """Of points that are moved and turned, by how (k n, dof)."""
+    """The derivative of points that are moved and turned, by how (k n, dof)."""
     count, n = points.shape
     about = [(0.0, 0.0, 1.0)] if n == 2 else [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
     turned = [(points @ so3.hat(axis)[:n, :n].T).reshape(-1, 1) for axis in about]

@@ -1,4 +1,4 @@
-"""What differs between the maps of two runs."""
+"""Differences between the maps of two runs."""
 
 import math
 from collections import Counter, defaultdict
@@ -23,7 +23,7 @@ _SHOWN = 10
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """In each map, and those that are in both."""
+    """Counts of each map, and of those that are in both."""
 
     a: int
     b: int
@@ -52,7 +52,7 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """What differs.
+    """The differences between two maps.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Difference:
 
     @property
     def is_same(self) -> bool:
-        """Whether both tell the same, to a millimetre."""
+        """Return whether both tell the same, to a millimetre."""
         counted = (self.keyframes, self.landmarks, self.edges)
         is_there = all(one.a == one.b == one.both for one in counted)
         is_moved = any(one.distance_m > _SAME_M for one in self.moved) or self.keyframes_m[1] > _SAME_M
@@ -92,7 +92,7 @@ class Difference:
         return "\n".join(self.lines())
 
     def lines(self) -> Iterator[str]:
-        """What differs, for people."""
+        """Return what differs, for people."""
         yield f"{'':10s}{'A':>14s}{'B':>14s}{'both':>14s}"
         for name in ("keyframes", "landmarks", "edges"):
             one: Counts = getattr(self, name)
@@ -166,7 +166,7 @@ def refuse_other_space(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None
 
 
 def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
-    """Those of one name that were seen to have it, in both."""
+    """The landmarks of one name that were seen to have it, in both."""
     return [
         name
         for name, mark in one.landmarks.items()
@@ -175,7 +175,7 @@ def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
 
 
 def _aligned(one: GraphSlam, two: GraphSlam, common: list[str]) -> tuple[Alignment, str, Numbers]:
-    """By landmarks, else by stamps, else not at all."""
+    """Align by landmarks, else by stamps, else not at all."""
     space, robust = one.space, one.config.robust
     a, b = positions(one, common), positions(two, common)
     found = align(space, a, b, robust.gate, robust.noise_factor)
@@ -219,7 +219,7 @@ def _chi2(slam: GraphSlam) -> float:
 
 
 def _edges(one: GraphSlam, two: GraphSlam) -> tuple[Counts, list[Judged]]:
-    """Those of one type between the same with the same measurement, and those of them that are not judged alike."""
+    """The edges of one type between the same with the same measurement, and those of them that are not judged alike."""
     a, b, names = _by_meaning(one), _by_meaning(two), _names(one)
     pairs = [pair for key in a if key in b for pair in zip(a[key], b[key], strict=False)]
     unlike = []
@@ -244,13 +244,13 @@ def _by_meaning(slam: GraphSlam) -> dict[Any, list[int]]:
 
 
 def _names(slam: GraphSlam) -> dict[int, int | str]:
-    """What a vertex is in any map: a stamp, or a name."""
+    """Return what a vertex is in any map: a stamp, or a name."""
     poses = dict(zip(slam.keyframes.ids.tolist(), slam.keyframes.stamps_ns.tolist(), strict=True))
     return poses | {mark.vertex: name for name, mark in slam.landmarks.items()}
 
 
 def _about(slam: GraphSlam, names: dict[int, int | str], edge: int) -> str:
-    """Its class, and the landmark it is about or the stamp that it is of."""
+    """The edge's class, and the landmark it is about or the stamp that it is of."""
     table, row = slam.graph.row(edge)
     name = names.get(int(table.vertices.values[row, -1]), "")
     what = f"{name / 1e9:.3f} s" if isinstance(name, int) else name

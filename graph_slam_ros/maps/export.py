@@ -1,4 +1,4 @@
-"""What a run knows, in the formats of others: its path as TUM, its graph as g2o, both for viewers as mcap.
+"""Export of a run to formats of others: its path as TUM, its graph as g2o, both for viewers as mcap.
 
 All is from the run's map, so it works where the run was never ended, too.
 """

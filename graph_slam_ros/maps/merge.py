@@ -30,7 +30,7 @@ _ONCE = ("surveyed", "range_offset")  # what both sessions were told is told onc
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """What came of a merger.
+    """The outcome of a merge.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ def _refuse_other_datum(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> Non
 
 
 def _refuse_same_drive(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
-    """What was measured once would count twice."""
+    """Refuse two maps of one drive: what was measured once would count twice."""
     driven = {(k.stamp_ns, k.T_odom_base) for k in one.keyframes}
     same = sum((k.stamp_ns, k.T_odom_base) in driven for k in two.keyframes)
     if same > 1:  # two robots may begin at one time
@@ -139,7 +139,7 @@ class _Second:
         self._shared = set(shared)
 
     def record(self) -> Record:
-        """With the numbers that vertices, edges and keyframes have after those of the first."""
+        """A record with the numbers that vertices, edges and keyframes have after those of the first."""
         growth, first = MapGrowth().since(self._two), self._keyframes
         others = MapGrowth().since(self._one)["edges"]
         known = {(label, *vertices) for _, vertices, *_, label, _ in others if label in _ONCE}
@@ -165,7 +165,7 @@ class _Second:
         }
 
     def _value(self, vertex: int, kind: str) -> list[Any]:
-        """Where it is in the first map."""
+        """Return where it is in the first map."""
         space, value = self._one.space, tuple(self._two.solver.estimate([vertex])[0].tolist())
         of = self._two.graph.kind_of(vertex)
         if of is space.pose:
@@ -183,7 +183,7 @@ class _Second:
         return [tag, [self._vertex[vertex] for vertex in vertices], measured, root, label, source]
 
     def _bridge(self) -> list[Any]:
-        """From the last keyframe of the first to the first of the second, where it begins its drive: nearly nothing."""
+        """A weak edge from the last keyframe of the first map to the first keyframe of the second."""
         space, config = self._one.space, self._one.config.odometry
         ends = [int(self._one.keyframes.ids[-1]), self._vertex[int(self._two.keyframes.ids[0])]]
         last = tuple(self._one.trajectory()[-1].tolist())

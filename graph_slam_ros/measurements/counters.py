@@ -36,13 +36,13 @@ class Counters:
             own.update(more)
 
     def raise_to(self, other: "Counters") -> None:
-        """Of each count take the larger: both have counted the same."""
+        """Take the larger of each count: both have counted the same."""
         for own, counts in self._with(other):
             for key, times in counts.items():
                 own[key] = max(own[key], times)
 
     def since(self, before: "Counters") -> "Counters":
-        """What was counted after there were these."""
+        """Return what was counted after there were these."""
         out = Counters()
         for counts, own in out._with(self):
             counts.update(own)

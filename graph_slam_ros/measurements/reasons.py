@@ -10,7 +10,7 @@ from enum import Enum
 
 
 class Effect(Enum):
-    """What a reason does to what was measured."""
+    """The effect of a reason: what it does to what was measured."""
 
     REFUSED = "refused"
     """It is not used, and something is lost."""
@@ -283,7 +283,7 @@ def explain(reason: str) -> Reason:
 
 
 def warnings(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """What was repaired and can be mended, of counts by source and reason: a line each."""
+    """Return what was repaired and can be mended, of counts by source and reason: a line each."""
     return [
         f"{source}: {times} times, {explain(reason).meaning}; mend it by {remedy(source, reason)}"
         for source, by_reason in counts.items()
@@ -293,5 +293,5 @@ def warnings(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
 
 
 def remedy(source: str, reason: str) -> str:
-    """What mends it for this input; empty where nothing is to be done."""
+    """Return what mends it for this input; empty where nothing is to be done."""
     return explain(reason).remedy.replace("INPUT", source)

@@ -1,4 +1,4 @@
-"""What can be handed to ``GraphSlam.process``: frozen values, checked at the border, exact in JSON.
+"""Measurements and events for ``GraphSlam.process``: frozen values, checked at the border, exact in JSON.
 
 A pose is (x, y, theta) in the plane and (x, y, z, qx, qy, qz, qw) in space. Covariances are flat, row-major, in tangent
 order: (x, y, theta), or (x, y, z, rotation vector). Nothing here tells which message it came from.
@@ -76,7 +76,7 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """What is known of the robot in the map frame itself: a receiver's position, a compass, a pose from elsewhere.
+    """An absolute measurement in the map frame: a receiver's position, a compass, a pose from elsewhere.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ class Closure:
 
 @dataclass(frozen=True, slots=True)
 class InitialPose:
-    """Where somebody says that the robot is; it holds from the next odometry on.
+    """A pose that somebody gives; it holds from the next odometry on.
 
     Attributes
     ----------

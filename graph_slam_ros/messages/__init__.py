@@ -1,1 +1,1 @@
-"""Between ROS messages and measurements, both ways. Nothing here needs an installed ROS."""
+"""Conversion between ROS messages and measurements, both ways. Nothing here needs an installed ROS."""

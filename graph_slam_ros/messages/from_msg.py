@@ -31,13 +31,13 @@ _POSE_SIZE = 8 * (7 + 36)  # of a geometry_msgs/PoseWithCovariance
 
 
 def decoder(type_name: str) -> Decoder:
-    """From CDR bytes to a message object of our own type store."""
+    """A decoder from CDR bytes to a message object of our own type store."""
     store = typestore()
     return lambda cdr: store.deserialize_cdr(cdr, type_name)
 
 
 def is_correction(cdr: bytes, map_frame: str) -> bool:
-    """Whether a tf2_msgs/TFMessage is about the map frame, by its first transform, without decoding it."""
+    """Return whether a tf2_msgs/TFMessage is about the map frame, by its first transform, without decoding it."""
     if len(cdr) < 20:
         return False
     order = "<" if cdr[1] & 1 else ">"
@@ -111,7 +111,7 @@ class MessageConverter:
         self._decode = ours | dict(decoders or {})
 
     def convert(self, name: str, cdr: bytes) -> list[Measured]:
-        """What a message of an input, of ``tf_static`` or ``tf`` gives, itself or by what has waited for it."""
+        """Convert one message; returns its measurements and those that its transforms complete."""
         source = self._sources[name]
         self._counters.received[name] += 1
         try:
@@ -132,7 +132,7 @@ class MessageConverter:
         return out
 
     def finish(self, *, is_end: bool = True) -> list[Measured]:
-        """What waits for /tf is used or refused; at the end of all messages, odometry that waits, too."""
+        """Use or refuse what is pending for /tf; at the end of all messages, odometry that is pending, too."""
         out: list[Measured] = [m for one in self._publishers.values() for m in one.finish()] if is_end else []
         out += [one for pending in self._pending for one in self._hurried(*pending)]
         self._pending.clear()
@@ -143,12 +143,12 @@ class MessageConverter:
         return tuple(self._sources[name].unlinked)
 
     def not_found(self, name: str) -> str:
-        """Of odometry on /tf of which no transform has come yet: which one, what mends it; else empty."""
+        """The odometry on /tf of which no transform has come yet, and what mends it; else empty."""
         source = self._sources[name]
         return odometry.not_found(source) if source.use == "odometry" else ""
 
     def initial_pose(self, cdr: bytes) -> list[InitialPose]:
-        """What a geometry_msgs/PoseWithCovarianceStamped of ``initialpose`` says, if it can be used."""
+        """Convert a geometry_msgs/PoseWithCovarianceStamped of ``initialpose``, if it can be used."""
         out: list[Any] = self.convert(INITIAL_POSE, cdr)
         return out
 

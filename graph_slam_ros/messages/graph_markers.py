@@ -20,7 +20,7 @@ _COORDINATES = {SE2: 2, SE3: 3, R2: 2, R3: 3}
 
 @dataclass(frozen=True, slots=True)
 class GraphView:
-    """What is drawn of a graph.
+    """The lines and points that are drawn of a graph.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class GraphView:
 
 
 def graph_view(slam: GraphSlam, most: int) -> GraphView:
-    """At most so many keyframes, landmarks and edges of the graph at its estimate.
+    """Draw at most so many keyframes, landmarks and edges of the graph at its estimate.
 
     An edge is a line between what it joins; one of a position alone, from there to the point of the robot that it is
     of. What says nothing of a position is not drawn.
@@ -77,7 +77,7 @@ def _joined(parts: list[Lines]) -> Lines:
 
 
 def _positions(slam: GraphSlam) -> Array:
-    """Of all vertices that have one, (n, 3)."""
+    """Positions of all vertices that have one, (n, 3)."""
     graph, out = slam.graph, np.zeros((slam.graph.vertex_count, 3))
     for code, kind in enumerate(graph.kinds):
         if n := _COORDINATES.get(kind, 0):
@@ -116,7 +116,7 @@ def _of_antenna(slam: GraphSlam, at: Array, table: EdgeTable, rows: Index) -> En
 
 
 def _of_coordinate(slam: GraphSlam, at: Array, table: EdgeTable, rows: Index) -> Ends:
-    """From the nearest point that has the coordinate that was measured."""
+    """A line from the nearest point that has the coordinate that was measured."""
     n, measured, antenna = slam.space.dimensions, table.measured.values[rows], _antenna(slam, table, rows)
     along = measured[:, :n]
     residual = np.einsum("ij,ij->i", along, antenna) - measured[:, n]
@@ -124,7 +124,7 @@ def _of_coordinate(slam: GraphSlam, at: Array, table: EdgeTable, rows: Index) ->
 
 
 def _antenna(slam: GraphSlam, table: EdgeTable, rows: Index) -> Array:
-    """Where the point of the robot is whose position was measured, (n, 2) or (n, 3); it is told at the row's end."""
+    """The antenna, whose position was measured, (n, 2) or (n, 3); it is at the row's end."""
     poses = slam.solver.estimate(table.vertices.values[rows, 0]).reshape(-1, slam.space.pose.size)
     lever = table.measured.values[rows, -slam.space.dimensions :]
     return np.stack(slam.space.group.act(tuple(poses.T), tuple(lever.T)), axis=-1)

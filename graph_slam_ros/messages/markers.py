@@ -95,7 +95,7 @@ def _dashed(lines: Lines) -> Array:
 
 
 def _two_sigma(covariances: Array) -> tuple[Array, Array]:
-    """Of (n, 2, 2) or (n, 3, 3) the orientations (n, 4) and diameters (n, 3) [m].
+    """Ellipses of covariances (n, 2, 2) or (n, 3, 3): the orientations (n, 4) and diameters (n, 3) [m].
 
     These are never too small to see, also where a covariance is unknown.
     """

@@ -66,11 +66,11 @@ class _Track:
 
     @property
     def period_ns(self) -> float:
-        """Between messages."""
+        """The period of its messages."""
         return (self.newest_ns - self.past[0][0]) / (len(self.past) - 1) if len(self.past) > 1 else _USUAL_NS
 
     def misfit(self, m: Odometry) -> float:
-        """How far a message is from where the track leads; up to 1 it may continue the track."""
+        """Return how far a message is from where the track leads; up to 1 it may continue the track."""
         (first_ns, first), (last_ns, last), pose = self.past[0], self.past[-1], m.T_odom_base
         dt = (m.stamp_ns - last_ns) * 1e-9
         span_s, within_s = (last_ns - first_ns) * 1e-9, min(max(abs(dt), _LEAST_S), _MOST_S)
@@ -97,7 +97,7 @@ def _turn(a: Numbers, b: Numbers) -> float:
 
 
 class OnePublisher:
-    """Of the odometry messages of one input, those of one publisher.
+    """Select, of the odometry messages of one input, those of one publisher.
 
     The first publisher that is heard is used. When it falls silent while another goes on, that one takes over under a
     source of its own (``odom#2``): the choice between sources of odometry then links the two.
@@ -118,7 +118,7 @@ class OnePublisher:
         self._usual = 0.0  # misfit of the odometry in use
 
     def accept(self, m: Odometry) -> list[Odometry]:
-        """What is to be used now that a message has come, in the order it came."""
+        """Accept a message; returns those that may be used now, in the order they came."""
         newest_ns, room_ns = m.stamp_ns, _GAP_NS
         if self._tracks and (used := self._tracks[0]).past:
             newest_ns = min(m.stamp_ns, used.newest_ns)
@@ -151,7 +151,7 @@ class OnePublisher:
         return self._jumped() if len(self._held) > _MOST_HELD or _has_jumped(track, used) else []
 
     def _is_older(self, m: Odometry) -> bool:
-        """Whether it is left to the order of stamps."""
+        """Return whether it is left to the order of stamps."""
         used = self._tracks[0]
         return bool(used.past) and m.stamp_ns < used.newest_ns - _BACK_NS
 
@@ -255,7 +255,7 @@ class OnePublisher:
 
 
 def _has_jumped(track: _Track, used: _Track) -> bool:
-    """Whether a new track has gone on for so long without the one in use that this is given up."""
+    """Return whether a new track has gone on for so long without the one in use that this is given up."""
     return track.count >= _SURE and track.newest_ns - track.first_ns >= _PERIODS * used.period_ns
 
 

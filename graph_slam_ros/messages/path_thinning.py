@@ -1,4 +1,4 @@
-"""What is shown of too much: the same as more comes, as long as that can be."""
+"""Thinning of what is shown: the same as more comes, as long as that can be."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from graph_slam_ros.typing import Array, Index
 
 
 def thinned(count: int, most: int) -> Index:
-    """Which of ``count`` to show where no more than ``most`` (two or more; 0: all) may be, the first and last included.
+    """Indices to show of ``count`` if at most ``most`` (two or more; 0: all) may be, with first and last.
 
     Every second, every fourth, and so on: as more come the same are chosen until they are too many, then half of them.
     """
@@ -18,7 +18,7 @@ def thinned(count: int, most: int) -> Index:
 
 
 def worst_and_some(ids: Index, misfit: Array, most: int) -> Index:
-    """Of edges with a misfit (n,) each no more than ``most``, in order of their ids (n,).
+    """Ids of edges with a misfit (n,) each no more than ``most``, in order of their ids (n,).
 
     Half of these are the worst; of the others all whose ids divide by a power of two.
     """

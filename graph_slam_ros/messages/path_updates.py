@@ -59,7 +59,7 @@ class PathUpdates:
         return to_msg.path(slam.config.frames.map, slam.keyframes.stamps_ns[which], now[which], newest_ns)
 
     def _moved(self, n: int, old: Array, now: Array) -> NDArray[np.bool_]:
-        """Whether poses have moved or turned too far; n is the number of coordinates of a position."""
+        """Return whether poses have moved or turned too far; n is the number of coordinates of a position."""
         step = now - old
         far = np.einsum("ij,ij->i", step[:, :n], step[:, :n]) > self._moved_m**2
         if n == 2:

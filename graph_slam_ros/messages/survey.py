@@ -9,7 +9,7 @@ from graph_slam_ros.slam import Config
 
 
 def with_survey(config: Config) -> Config:
-    """With the lines of ``landmarks.surveyed_file``, where there are none yet: a run repeats with those it had.
+    """The configuration with the lines of ``landmarks.surveyed_file``, if it has none yet: a run repeats with its own.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the node publishes, hears beside its inputs and serves: the node, the views and the tests read it here."""
+"""Topics and services of the node besides its inputs: the node, the views and the tests read it here."""
 
 from dataclasses import dataclass
 

@@ -93,7 +93,7 @@ class Bag:
         return _in_order(self._merged(topics))
 
     def _merged(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        """Of several parts, split by time or by topic; one is opened when its time has come, for there may be many."""
+        """The messages of several parts, split by time or topic; a part is opened when its time has come."""
         pending = deque(enumerate(self._parts))
         heads: list[tuple[int, int, BagMessage, Iterator[BagMessage]]] = []
         while pending or heads:
@@ -153,7 +153,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def _part(file: Path) -> "_Part":
-    """By how the file begins: whatever its name says."""
+    """Open a file by how it begins: whatever its name says."""
     with opened(file, follow=True) as stream:
         begins = stream.read(16)
     if not begins:
@@ -280,7 +280,7 @@ class _Ros1Part:
 
 
 def _is_ours(type_name: str, definition: str) -> bool:
-    """Whether a recorded ROS 1 type, and all it is made of, has our fields (a header's ``seq`` aside)."""
+    """Return whether a recorded ROS 1 type, and all it is made of, has our fields (a header's ``seq`` aside)."""
     if len(definition) > MOST_TEXT:
         return False
     try:

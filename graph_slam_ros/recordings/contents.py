@@ -19,7 +19,7 @@ _LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # as for what is counted
 
 @dataclass(slots=True)
 class TopicContents:
-    """What is known of one topic.
+    """The contents of one topic.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class TopicContents:
 
 @dataclass(slots=True)
 class Recording:
-    """What a recording holds.
+    """The contents of a recording.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Recording:
     fixed: dict[str, str] = field(default_factory=dict)
 
     def is_linked(self, frame: str, base: str) -> bool:
-        """Whether TF tells where a frame is on the robot."""
+        """Return whether TF tells where a frame is on the robot."""
         links = self.fixed | {child: parent for child, parent in self.moving.items() if child != base}
         return _root(links, frame) == _root(links, base)
 
@@ -140,7 +140,7 @@ def _plain(frame: str) -> str:
 
 
 def _any(one: TopicContents, m: Any) -> None:
-    """Of packages that need not be there: how many landmarks it holds."""
+    """The number of landmarks in a message of a package that need not be installed."""
     for name in ("landmarks", "markers", "sensed_data", "detections", "poses"):
         if hasattr(m, name):
             one.items += len(getattr(m, name))

@@ -14,7 +14,7 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
 def decompressed(data: bytes, codec: str, size: int) -> bytes:
-    """What was compressed as ``zstd``, ``lz4``, ``bz2``, or not at all (``none`` or empty), of just that size.
+    """Decompress what was compressed as ``zstd``, ``lz4``, ``bz2``, or not at all (``none``, empty), of that size.
 
     The size is checked before anything is decompressed, and no more than that is made, whatever the data hold.
 

@@ -89,7 +89,7 @@ _NEEDED: dict[str, tuple[str, ...]] = {
 
 
 def recorded_decoder(topic: Topic) -> Decoder:
-    """From CDR bytes of a topic to message objects, by the definition recorded with it.
+    """A decoder from CDR bytes of a topic to message objects, by the definition recorded with it.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def recorded_decoder(topic: Topic) -> Decoder:
 
 
 def _length(types: Any, name: str, known: dict[str, float]) -> float:
-    """How many values a message has at least, each sequence with one: rosbags' decoder is as long as that."""
+    """Return how many values a message has at least, each sequence with one: rosbags' decoder is as long as that."""
     known[name] = float("inf")  # of a type that holds itself, there is no end
     total = 0.0
     for _, (kind, of) in types[name][1]:

@@ -47,7 +47,7 @@ _CHUNK_HEAD = 57
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What a file holds: schemas and channels by id, messages by channel id, and the time of the first message."""
+    """The contents of a file: schemas and channels by id, messages by channel id, and the time of the first message."""
 
     schemas: dict[int, Schema]
     channels: dict[int, Channel]
@@ -74,14 +74,14 @@ class _Stream(io.BufferedReader):
 
 
 def begin(profile: str = "", library: str = LIBRARY) -> bytes:
-    """How a file of ours begins."""
+    """Return how a file of ours begins."""
     head = io.BytesIO()
     Writer(head, use_chunking=False).start(profile, library)
     return head.getvalue()
 
 
 def contents(path: Path) -> Contents:
-    """From the summary, or by reading everything where there is no whole one."""
+    """The contents, from the summary or by reading everything where there is no whole one."""
     try:
         with _Stream(path) as stream:
             summary = _summary(stream)
@@ -205,7 +205,7 @@ def _inside(chunk: Chunk) -> Iterator[McapRecord]:
 
 
 def _next_chunk(stream: _Stream, at: int) -> int | None:
-    """Where the next chunk begins that is whole: its head agrees with itself, and its end is in the file.
+    """Return where the next chunk begins that is whole: its head agrees with itself, and its end is in the file.
 
     The blocks that are searched begin small and double: forged heads, one after another, cost little each.
     """
@@ -257,7 +257,7 @@ def _summary(stream: _Stream) -> Summary | None:
 
 
 def _announced(stream: _Stream) -> int | None:
-    """How many messages there are by the summary; None where it is damaged itself, or does not say."""
+    """Return how many messages there are by the summary; None where it is damaged itself, or does not say."""
     try:
         summary = _summary(stream)
     except Exception:  # see contents

@@ -50,7 +50,7 @@ class Contents:
 
 
 def contents(path: Path) -> Contents:
-    """From the index, or by reading everything where there is none or it is damaged. Raises FormatError, OSError."""
+    """The contents, from the index or by reading everything. Raises FormatError, OSError."""
     try:
         return _indexed(path)
     except (FormatError, struct.error, KeyError, ValueError):

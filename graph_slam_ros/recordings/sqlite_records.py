@@ -81,7 +81,7 @@ def messages(path: Path, topics: Sequence[int], losses: list[str]) -> Iterator[t
 
 
 def damage(path: Path) -> str:
-    """What sqlite finds wrong with the file, or nothing: rows may be missing that nobody misses while reading."""
+    """The damage that sqlite finds in the file, or nothing: rows may be missing that reading does not notice."""
     try:
         with closing(_connection(path)) as database:
             (found,) = database.execute("PRAGMA quick_check(1)").fetchone()

@@ -1,4 +1,4 @@
-"""Which folder is a run, which of several is the newest, and what of a folder may be replaced.
+"""Run folders: which folder is a run, which of several is the newest, and what of a folder may be replaced.
 
 A folder is a run if its ``run.json`` says so (``format``); it does from the start of the run on. Only such a folder is
 ever cleared, and only of the files of a run: a recording in it is looked into before it is removed. Runs of earlier
@@ -56,7 +56,7 @@ class RunError(GraphSlamError):
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder holds a run: its ``run.json`` says so, or it is of an earlier version and has our journal.
+    """Return whether a folder holds a run: ``run.json`` says so, or it is of an earlier version and has a journal.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def _is_marked(folder: Path) -> bool:
 
 
 def _is_recorded(file: Path) -> bool:
-    """Whether a file with the name of a run's recording is one: its head and its first record say so."""
+    """Return whether a file with the name of a run's recording is one: its head and its first record say so."""
     name = _RECORDED.fullmatch(file.name)
     if name is None or not is_regular(file):
         return False
@@ -93,7 +93,7 @@ def _is_recorded(file: Path) -> bool:
 
 
 def is_cut_off(folder: Path) -> bool:
-    """Whether the newest run, there or moved out of its way, holds something and was never ended."""
+    """Return whether the newest run, there or moved out of its way, holds something and was never ended."""
     earlier = earlier_runs(folder)
     newest = folder if _holds_something(folder) else earlier[max(earlier)] if earlier else folder
     if not _holds_something(newest):
@@ -108,12 +108,12 @@ def incomplete_runs(folder: Path) -> list[Path]:
 
 
 def is_incomplete(folder: Path) -> bool:
-    """Whether a run was ended before all that it had accepted was processed, and its results are still to be made."""
+    """Return whether a run ended before all that it had accepted was processed: its results are to be made."""
     return summary_of(folder).get("is_incomplete") is True
 
 
 def was_saved_whole(folder: Path) -> bool:
-    """Whether the map of a run has all of its journal, by its summary."""
+    """Return whether the map of a run has all of its journal, by its summary."""
     parts = list(_parts(folder))
     return summary_of(folder).get("unprocessed") == 0 and bool(parts) and all(then == now for _, then, now in parts)
 
@@ -173,13 +173,13 @@ def changed_since(folder: Path) -> list[str]:
 
 
 def missing(folder: Path) -> list[str]:
-    """Of its recordings, those that have fewer parts than when the run was saved, or are not those of then."""
+    """The recordings with fewer parts than when the run was saved, or with other ones."""
     fewer = [f"{name}: {then} parts when it was saved, {now} now" for name, then, now in _parts(folder) if now < then]
     return fewer + list(_not_as_saved(folder, "recorded", ends_of))
 
 
 def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> Iterator[str]:
-    """Of the files whose marks the summary has: those that are gone, cannot be read, or have another mark."""
+    """The files whose mark differs from the summary's, that are gone, or that cannot be read."""
     summary = summary_of(folder)
     if not summary and os.path.lexists(folder / SUMMARY):
         yield f"{SUMMARY} is not the summary of a run: whether its files belong together is not known"
@@ -196,7 +196,7 @@ def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> It
 
 
 def recorded_files(folder: Path) -> dict[str, str]:
-    """What tells the recordings and the configuration of a run from those of another. Raises OSError.
+    """Return what tells the recordings and the configuration of a run from those of another. Raises OSError.
 
     Somebody may have removed the configuration meanwhile, or put a link there: results are saved all the same.
     """
@@ -215,7 +215,7 @@ def ends_of(file: Path) -> str:
 
 
 def _parts(folder: Path) -> Iterator[tuple[str, int, int]]:
-    """Of each recording of a run that was saved: how many parts it had then and has now."""
+    """The parts of each recording of a run that was saved: how many parts it had then and has now."""
     parts = summary_of(folder).get("parts")
     recorded: dict[str, Any] = parts if isinstance(parts, dict) else {}
     for name in (INGEST, MAP):
@@ -311,7 +311,7 @@ def _is_readable_run(folder: Path) -> bool:
 
 
 def is_name_of_earlier(folder: Path, name: str) -> bool:
-    """Whether an earlier run of a folder could have that name, and so be removed with the oldest of these."""
+    """Return whether an earlier run of a folder could have that name, and so be removed with the oldest of these."""
     return _earlier_name(folder).fullmatch(name) is not None
 
 
@@ -391,5 +391,5 @@ def _contents(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _is_unfinished(file: Path) -> bool:
-    """What a process that was killed while it wrote a file has left."""
+    """Return what a process that was killed while it wrote a file has left."""
     return _UNFINISHED.fullmatch(file.name) is not None and is_regular(file)

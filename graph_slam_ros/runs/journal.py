@@ -68,7 +68,7 @@ class RecordWriter:
 
 
 class Parts:
-    """What is recorded under one name in a folder, part after part, each a file of its own.
+    """The records of one name in a folder, part after part, each a file of its own.
 
     What the disk does not take waits, of parts that were ended as of the present one, and is written in that order.
     """
@@ -141,7 +141,7 @@ class _Chunk(int):
 
 
 def part_name(name: str, part: int) -> str:
-    """Of the files that a recording is split over."""
+    """The name of one of the files that a recording is split over."""
     return f"{name}_{part}.mcap" if part else f"{name}.mcap"
 
 
@@ -185,7 +185,7 @@ def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[st
 
 
 def read_records(folder: Path, name: str, losses: list[str]) -> Iterator[dict[str, Any]]:
-    """In the order they were written, up to the first that cannot be read; what is lost adds to ``losses``."""
+    """Records in the order they were written, up to the first that cannot be read; what is lost adds to ``losses``."""
     for file, _, message in _messages(folder, name, losses):
         yield _decoded(file, message)
 

@@ -75,12 +75,12 @@ class Entry:
 
     @property
     def is_in(self) -> bool:
-        """Whether it is part of the problem."""
+        """Return whether it is part of the problem."""
         return self.verdict not in (Verdict.PENDING, Verdict.REJECTED)
 
     @property
     def about(self) -> str:
-        """Its class, and the landmark it is about."""
+        """The edge's class, and the landmark it is about."""
         return f"{self.label} {self.landmark}".strip()
 
     @property
@@ -123,7 +123,7 @@ def read_changes(folder: Path, edges: int) -> list[VerdictChange]:
 
 
 def _fault(entry: Entry) -> str:
-    """What of an edge does not go together."""
+    """Return what of an edge does not go together."""
     edge = EDGE_TAGS.get(entry.tag)
     if edge is None:
         return f"tag {shortened(entry.tag)} is none of a graph"

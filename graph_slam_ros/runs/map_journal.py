@@ -55,7 +55,7 @@ Record = dict[str, Any]
 
 
 class MapGrowth:
-    """What of a map was told already.
+    """The growth of a map since it was last recorded.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class MapGrowth:
             self.first += [self.since(start), _estimate(start.values), {"type": "start"}]
 
     def of(self, slam: GraphSlam) -> Iterator[Record]:
-        """What there is since the last call, and now and then where all of it is thought to be."""
+        """The growth since the last call, and now and then where all of it is thought to be."""
         changed = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
         self._settings = dict(slam.settings)
         used = {"used": [slam.newest_odometry_ns, slam.odometry_source]} if slam.odometry_source else {}
@@ -87,7 +87,7 @@ class MapGrowth:
             yield _estimate(slam.solver.values)
 
     def since(self, a: GraphSlam | MapSnapshot) -> Record:
-        """What there is since the last call."""
+        """The growth since the last call."""
         graph, first_edge = a.graph, self._edges
         out: Record = {"type": "growth"}
         out["vertices"] = [_vertex(graph, v) for v in range(self._vertices, graph.vertex_count)]
@@ -122,12 +122,12 @@ class MapGrowth:
 
 
 def has_map(folder: Path) -> bool:
-    """Whether a run folder has one."""
+    """Return whether a run folder has one."""
     return bool(parts_of(folder, MAP))
 
 
 def grew(folder: Path) -> bool:
-    """Whether there is anything in it."""
+    """Return whether there is anything in it."""
     return any(record.get("type") == "growth" for record in read_records(folder, MAP, []))
 
 
@@ -185,7 +185,7 @@ def extend(state: MapSnapshot, record: Mapping[str, Any]) -> None:
 
 
 def _fault(state: MapSnapshot) -> str:
-    """Where the parts do not fit together; empty if they do."""
+    """Return where the parts do not fit together; empty if they do."""
     graph = state.graph
     kinds = [graph.kinds[code] for code in graph.kind.values.tolist()]
     pose = next((kind for kind in kinds if kind in GROUPS), None)
@@ -274,7 +274,7 @@ def _landmark(mark: Landmark) -> list[Any]:
 
 
 def _newer(seen: Sequence[LandmarkEdge], first_edge: int) -> Iterable[LandmarkEdge]:
-    """Those of new edges: they are at the end."""
+    """The sightings of new edges: they are at the end."""
     count = next((k for k, one in enumerate(reversed(seen)) if one.edge < first_edge), len(seen))
     return seen[len(seen) - count :]
 
@@ -289,7 +289,7 @@ def _seen(one: LandmarkEdge) -> list[Any]:
 
 
 def _apply_verdicts(state: MapSnapshot) -> None:
-    """What is not believed pulls no more; what was given to another landmark is withdrawn from the one before."""
+    """Apply verdicts: what is rejected has no weight; what another landmark got is withdrawn from the first."""
     out = np.flatnonzero(np.isin(state.ledger.verdict.values, (Verdict.PENDING, Verdict.REJECTED)))
     state.graph.set_weights(out, 0.0)
     for mark in state.landmarks.values():

@@ -1,4 +1,4 @@
-"""What came of each input of a run: a table for a person, and what makes the result less than what was asked for.
+"""The outcome of each input of a run: a table for a person, and what makes the result less than what was asked for.
 
 Both are made from ``run.json``, so they are the same for a live run, a replay and a recovered run.
 """
@@ -51,7 +51,7 @@ def text(summary: Summary) -> list[str]:
 
 
 def _wrapped(line: str, indent: int) -> list[str]:
-    """Of a line, as many as it takes; a name that came with a message cannot begin one."""
+    """The words of a line, as many as it takes; a name that came with a message cannot begin one."""
     return textwrap.wrap(" ".join(line.splitlines()), _WIDTH, subsequent_indent=" " * indent)
 
 
@@ -78,7 +78,7 @@ def table(summary: Summary) -> list[str]:
 
 
 def shortcomings(summary: Summary) -> Iterator[str]:
-    """Why the result is less than what was asked for, a sentence each; nothing where it is not."""
+    """Return why the result is less than what was asked for, a sentence each; nothing where it is not."""
     inputs: Mapping[str, Any] = summary.get("inputs", {})
     if summary.get("failing"):
         yield f"the last solve failed ({summary['failing']}), and the estimate is the one before it: {_EXTREME}"

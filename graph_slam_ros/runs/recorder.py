@@ -215,7 +215,7 @@ class RunRecorder:
         return self.folder
 
     def _ended_parts(self) -> dict[str, Any]:
-        """For the summary: how many parts there are (with more of them it went on), and what tells them from others."""
+        """The parts for the summary: their number (with more the run went on), and their marks."""
         parts = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}
         return {"parts": parts, "recorded": recorded_files(self.folder)}
 
@@ -288,7 +288,7 @@ class RunRecorder:
             discard(self.folder)
 
     def _end_parts(self) -> None:
-        """What comes is of the next."""
+        """End the present parts: what comes is of the next."""
         self._fill()
         failed = self._syncing.exception() if self._syncing is not None else None
         self._syncing = None

@@ -143,7 +143,7 @@ def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> 
 def measurements(
     bag: Bag, inputs: Inputs, config: Config, counters: Counters, datum: tuple[float, ...] = ()
 ) -> Iterator[list[Measured | Control]]:
-    """What the border makes of each recorded message, in order, and at the end of what has waited.
+    """The measurements of each recorded message, in order, and at the end of what has waited.
 
     Where the stamps of odometry begin anew, ``time.on_jump`` says what becomes of the run. Static transforms are read
     first: they hold for the whole recording.
@@ -213,12 +213,12 @@ class RecordedRuns:
         yield len(self.counted), [*passage.events, *passage.measured]
 
     def counted_in(self, number: int) -> Counters:
-        """What was counted while a run lasted, by its number; of the last, until now."""
+        """The counts while a run lasted, by its number; of the last, until now."""
         end = self.counted[number] if number < len(self.counted) else self._counters
         return end.since(self.counted[number - 1] if number else Counters())
 
     def _counted_before(self, names: Sequence[str]) -> Counters:
-        """What was counted before a message of these inputs, which is of the next run."""
+        """The counts before a message of these inputs, which is of the next run."""
         before = Counters()
         before.update(self._counters)
         before.received.subtract(names)

@@ -1,4 +1,4 @@
-"""What becomes of a run after it: it is recorded again from its events, or its map is gone on in."""
+"""A run after its end: it is recorded again from its events, or its map is gone on in."""
 
 import os
 import time
@@ -170,7 +170,7 @@ def record_run(
 
 
 def stopwatch() -> Stopwatch:
-    """Of what follows."""
+    """A stopwatch for what follows."""
     start_s, cpu_s = time.perf_counter(), time.process_time()
     return lambda: {"time_s": time.perf_counter() - start_s, "cpu_s": time.process_time() - cpu_s}
 

@@ -72,7 +72,7 @@ class SavedRun:
         return self._trajectory
 
     def odometry(self) -> Trajectory:
-        """What odometry alone says at the keyframes, ``T_odom_base``."""
+        """Return what odometry alone says at the keyframes, ``T_odom_base``."""
         return read_tum(self.folder / "path_odometry.tum")
 
     @cached_property
@@ -81,7 +81,7 @@ class SavedRun:
 
     @cached_property
     def covariances(self) -> Array:
-        """Of the keyframes' poses, (n, 3, 3) or (n, 6, 6), each in its pose's tangent space; NaN where unknown."""
+        """Covariances of the keyframes, (n, 3, 3) or (n, 6, 6), in the tangent space of each; NaN if unknown."""
         return read_covariances(self.folder / COVARIANCES)
 
     @cached_property

@@ -82,7 +82,7 @@ class Suggestion:
             self.trouble = self._refused(bag)
 
     def command(self) -> str:
-        """As it is pasted into a shell."""
+        """The command as it is pasted into a shell."""
         path = str(self._path)
         words = ["graph_slam", "replay", f"./{path}" if path.startswith("-") else path]
         for option, name in (("--odom", "odom"), ("--landmarks", "detections")):
@@ -92,7 +92,7 @@ class Suggestion:
         return shlex.join([*words, "--out", str(suggested_out(self._path))])
 
     def _refused(self, bag: Bag) -> str:
-        """Why the command would be; empty where it is not."""
+        """Return why the command would be; empty where it is not."""
         try:
             config = Config.from_mapping(self.settings)
             choose_inputs(bag, config, self._topics.get("odom"), self._topics.get("detections"))
@@ -318,7 +318,7 @@ class Suggestion:
         self.settings |= {f"{name}.{key}": value for key, value in chosen.items()}
 
     def _mount(self, topic: str, frame: str) -> dict[str, str]:
-        """Where a sensor is that TF does not tell of."""
+        """Return where a sensor is that TF does not tell of."""
         if frame and self._recording.is_linked(frame, self._base):
             return {}
         mount = _OPTICAL if "optical" in frame else "0 0 0 0 0 0"
@@ -345,7 +345,7 @@ def _lag_s(one: TopicContents) -> float:
 
 
 def _is_zero(one: TopicContents) -> bool:
-    """Whether all its stamps are."""
+    """Return whether all its stamps are."""
     return bool(one.lag_s) and not one.is_stamped
 
 

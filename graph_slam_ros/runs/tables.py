@@ -44,7 +44,7 @@ def result_texts(slam: GraphSlam) -> dict[str, str]:
 
 
 def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any]:
-    """What happened, in numbers; ``earlier`` was counted of the same run before this pipeline went on in it."""
+    """Return what happened, in numbers; ``earlier`` was counted of the same run before this pipeline went on in it."""
     counters = Counters()
     for some in (earlier or Counters(), slam.counters):
         counters.update(some)
@@ -73,7 +73,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
 
 
 def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
-    """What was counted, and what came of each input.
+    """Return what was counted, and what came of each input.
 
     ``received`` counts messages, ``used`` what was measured by them, ``believed`` the edges of that (odometry aside)
     that the estimate follows.
@@ -104,7 +104,7 @@ def counted(counters: Counters) -> dict[str, Any]:
 
 
 def counters_of(summary: Mapping[str, Any]) -> Counters:
-    """What ``account`` or ``counted`` was made of. Raises ValueError where a summary has anything else there."""
+    """Return what ``account`` or ``counted`` was made of. Raises ValueError where a summary has anything else there."""
     out = Counters()
     try:
         for source, counts in summary.get("counters", {}).items():
@@ -142,7 +142,7 @@ def _accepted_by_input(slam: GraphSlam, first_edge: int) -> dict[str, int]:
 
 
 def _drives(slam: GraphSlam) -> list[dict[str, int]]:
-    """Where each drive begins in ``path.tum`` and in ``sightings.tum``: rows, from 0."""
+    """Return where each drive begins in ``path.tum`` and in ``sightings.tum``: rows, from 0."""
     of = slam.sighting_poses.ids
     return [{"keyframe": first, "sighting": int(np.sum(of < first))} for first in slam.drives]
 

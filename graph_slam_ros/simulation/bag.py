@@ -94,7 +94,7 @@ def _stamp_of(message: Message) -> int:
 
 
 def recorded_names(recording: Recording) -> dict[str, str]:
-    """What each landmark goes by in a bag: its id, or where messages hold no names a number."""
+    """Return what each landmark goes by in a bag: its id, or where messages hold no names a number."""
     polar = _is_polar(recording)
     return {name: str(k) if polar else name for k, name in enumerate(recording.landmarks)}
 
@@ -137,7 +137,7 @@ def _detections(seen: Sightings, frame: str, space: Geometry) -> bytes:
 
 
 def _closures(several: list[Closure], space: Geometry) -> bytes:
-    """Where the base was earlier, seen from where it is: moving a pose by ``d`` moves its inverse by ``-Ad d``."""
+    """The earlier poses of the base, seen from the later: moving a pose by ``d`` moves its inverse by ``-Ad d``."""
     head, detections = header(several[0].stamp_ns, "base_link"), []
     for one in several:
         back = space.group.adjoint(one.T_from_base)

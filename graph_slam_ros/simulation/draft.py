@@ -1,4 +1,4 @@
-"""What was measured, before it becomes a recording or a graph: what faults are put into, and which of it is wrong then.
+"""A draft of measurements before it becomes a recording or a graph: faults are put into it and listed.
 
 Recordings and graphs are made into the same draft, and the draft into either again; a fault knows the draft alone.
 """
@@ -20,7 +20,7 @@ Measured = Literal["odometry", "sighting", "closure"]
 
 @dataclass(frozen=True, slots=True)
 class Wrong:
-    """What is wrong with a measurement.
+    """A fault of a measurement.
 
     Attributes
     ----------

@@ -48,7 +48,7 @@ class Closures:
 
 
 def count_for(rate: float, true: int) -> int:
-    """How many false closures beside so many true ones are a given part of all: ``p n / (1 - p)``."""
+    """Return how many false closures beside so many true ones are a given part of all: ``p n / (1 - p)``."""
     return round(rate * true / (1.0 - rate))
 
 
@@ -122,7 +122,7 @@ def _local(rng: Generator, truth: Array, _root: Array, pairs: int) -> tuple[Inde
 
 
 def _aliased(rng: Generator, truth: Array, root: Array, pairs: int) -> tuple[Index, Array]:
-    """Of some pairs of stretches that do not overlap the two most alike: the same place seen twice, but for the place.
+    """The two most alike stretches that do not overlap: the same sight at two places.
 
     With W the wrong motion of the second stretch, a pair is measured as ``Ti^-1 W Tj``.
     """

@@ -1,4 +1,4 @@
-"""What goes wrong with real robots, by kind: wrong closures and identities, slipping wheels, what was moved meanwhile.
+"""Faults of real robots, by kind: wrong closures and identities, slipping wheels, what was moved meanwhile.
 
 A fault is put into a ``Draft``, which notes what of it is wrong. The same seed gives the same faults; each draws from a
 stream of its own, so that one more changes none of the others.
@@ -223,12 +223,12 @@ def _moved_after(draft: Draft, pose: int, to: Sequence[float]) -> Array:
 
 
 def _random_subset(rng: Generator, count: int, rate: float) -> list[int]:
-    """So many of a number of things, in order."""
+    """Choose so many of a number of things, in order."""
     return np.sort(rng.permutation(count)[: round(rate * count)]).tolist()
 
 
 def _times(draft: Draft, first: int, end: int) -> Mapping[str, int]:
-    """How often each landmark is seen from a range of poses."""
+    """Return how often each landmark is seen from a range of poses."""
     out: dict[str, int] = {}
     for k, at in enumerate(draft.seen_at.tolist()):
         name = draft.true_id(k)
@@ -295,7 +295,7 @@ class Fault:
 
     @classmethod
     def parsed(cls, text: str) -> "Fault":
-        """From ``KIND`` or ``KIND:KEY=VALUE,...``; as ``named``."""
+        """A fault from ``KIND`` or ``KIND:KEY=VALUE,...``; as ``named``."""
         kind, separator, options = text.partition(":")
         values: dict[str, Any] = {}
         for one in options.split(",") if separator else ():

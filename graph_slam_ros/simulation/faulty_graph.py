@@ -103,7 +103,7 @@ class _Parts:
             self.sightings.append((self.place[ends[0]], edge, seen))
 
     def draft(self) -> Draft:
-        """What faults are put into: odometry as a chain from the origin, closures so that they lead forward."""
+        """Return what faults are put into: odometry as a chain from the origin, closures so that they lead forward."""
         space, group = self.space, self.space.group
         chain: list[Numbers] = [space.identity]
         for k in range(1, len(self.poses)):

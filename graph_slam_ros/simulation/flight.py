@@ -121,7 +121,7 @@ def _tags(options: Flight) -> dict[str, Numbers]:
 
 
 def _tag(ahead: float, left: float, z: float, heading: float, center: float = 0.0) -> Numbers:
-    """Its pose, from where it is seen along its own heading from a point on the middle line."""
+    """The pose of a tag, from where it is seen along its own heading from a point on the middle line."""
     c, s = float(np.cos(heading)), float(np.sin(heading))
     half = 0.5 * heading
     x, y = center + c * ahead - s * left, s * ahead + c * left
@@ -129,7 +129,7 @@ def _tag(ahead: float, left: float, z: float, heading: float, center: float = 0.
 
 
 def _beacons(options: Flight) -> dict[str, Numbers]:
-    """On an ellipse under the roof, a little inside the path."""
+    """Beacons on an ellipse under the roof, a little inside the path."""
     out: dict[str, Numbers] = {}
     for k in range(options.beacons):
         angle = 2.0 * np.pi * k / options.beacons

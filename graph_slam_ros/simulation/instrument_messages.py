@@ -1,4 +1,4 @@
-"""What a satellite receiver and an IMU say as messages, with the transforms that tell where they are."""
+"""Messages of a satellite receiver and an IMU, with the transforms that tell where they are."""
 
 from collections.abc import Iterator
 from typing import TypeAlias

@@ -81,7 +81,7 @@ def _imu(rng: Generator, recording: Recording, options: Instruments) -> Imu:
 
 
 def _second_derivative(positions: Array, dt_s: float) -> Array:
-    """Of positions (n, 3) over time; its ends have that of their neighbours."""
+    """The second derivative of positions (n, 3) over time; its ends have that of their neighbours."""
     out = np.zeros_like(positions)
     if len(positions) > 2:
         out[1:-1] = np.diff(positions, 2, axis=0) / dt_s**2

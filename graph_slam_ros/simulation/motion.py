@@ -50,7 +50,7 @@ class VelocityNoise:
 
 
 def space_of(pose: Sequence[float] | Array) -> Geometry:
-    """Where a pose is, by how many numbers it has."""
+    """Return where a pose is, by how many numbers it has."""
     return PLANAR if len(pose) == PLANAR.pose.size else SPATIAL
 
 
@@ -65,7 +65,7 @@ def integrate(start: Numbers, steps: Array) -> Array:
 
 
 def _integrate_planar(start: Numbers, steps: Array) -> Array:
-    """In closed form, since headings add up; angles wrapped."""
+    """Integrate in closed form, since headings add up; angles wrapped."""
     theta = start[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
     c, s = np.cos(theta[:-1]), np.sin(theta[:-1])
     dx, dy, _ = se2.exp(tuple(steps.T))
@@ -91,6 +91,6 @@ def accumulated(steps: Array, per_tick: Array) -> Array:
 
 
 def _exp(step: Array) -> Numbers:
-    """In plain floats, for the kernels."""
+    """The exponential in plain floats, for the kernels."""
     group = se2 if len(step) == 3 else se3
     return tuple(float(number) for number in group.exp(tuple(step.tolist())))

@@ -13,7 +13,7 @@ Options = TypeVar("Options")
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """What is known of one option; ``low`` and ``high`` are inclusive, ``choices`` those of a text."""
+    """An option; ``low`` and ``high`` are inclusive, ``choices`` those of a text."""
 
     name: str
     default: Any

@@ -1,4 +1,4 @@
-"""What a simulated robot records, and the truth it does not know."""
+"""A simulated recording, and the truth it does not know."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ CLOSURES_TOPIC = "/closures"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gnss:
-    """What a satellite receiver says.
+    """The measurements of a satellite receiver.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Gnss:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Imu:
-    """What an inertial measurement unit says.
+    """The measurements of an inertial measurement unit.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class Recording:
     imu: Imu | None = None
 
     def closures_at(self) -> dict[int, list[Closure]]:
-        """Those of each later stamp."""
+        """The closures of each later stamp."""
         out: dict[int, list[Closure]] = {}
         for closure in self.closures:
             out.setdefault(closure.stamp_ns, []).append(closure)
@@ -98,7 +98,7 @@ class Recording:
 
 
 def measurements(recording: Recording) -> Iterator[Odometry | Sightings | Closure]:
-    """What ``GraphSlam.process`` takes, in order of stamp, odometry before what was seen at the same stamp.
+    """Return what ``GraphSlam.process`` takes, in order of stamp, odometry before what was seen at the same stamp.
 
     What a satellite receiver or an IMU says is not among it: that becomes a fix at the border, from a bag.
     """

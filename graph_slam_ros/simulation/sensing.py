@@ -32,13 +32,13 @@ class RangeBearing:
     field_of_view_rad: float = 2.0 * np.pi
 
     def visible(self, T_world_base: Numbers, points: Array) -> NDArray[np.int64]:
-        """Which of the points (m, 2) in world are in range and in view."""
+        """Return which of the points (m, 2) in world are in range and in view."""
         x, y = se2.act(se2.inverse(T_world_base), tuple(points.T))
         near = np.hypot(x, y) <= self.max_range_m
         return np.flatnonzero(near & (np.abs(np.arctan2(y, x)) <= 0.5 * self.field_of_view_rad))
 
     def measure(self, rng: Generator, T_world_base: Numbers, points: Array, kind: str) -> tuple[Array, Array]:
-        """What it says of points (k, 2) in world: measured (k, m) and its covariance (k, m, m), as in ``Sighting``.
+        """The measurement of points (k, 2) in world: measured (k, m) and its covariance (k, m, m), as in ``Sighting``.
 
         A position's covariance is taken at what was measured: a driver knows no better.
         """
@@ -89,7 +89,7 @@ class TagCamera:
     max_slant_rad: float
 
     def visible(self, T_world_base: Numbers, points: Array) -> NDArray[np.bool_]:
-        """Which of the points (m, 3) in world are in range and in view."""
+        """Return which of the points (m, 3) in world are in range and in view."""
         x, y, z = se3.act(se3.inverse(self._in_world(T_world_base)), tuple(points.T))
         distance = np.sqrt(x**2 + y**2 + z**2)
         return (distance <= self.max_range_m) & (x >= distance * np.cos(0.5 * self.field_of_view_rad))
@@ -149,6 +149,6 @@ class TagCamera:
 def sightings(
     names: Sequence[str], kind: str, measured: Array, covariance: Array, T_base_sensor: Numbers | None = None
 ) -> list[Sighting]:
-    """Of arrays, a row each: measured (k, m) and covariance (k, m, m)."""
+    """Sightings from arrays, a row each: measured (k, m) and covariance (k, m, m)."""
     rows = zip(names, measured.tolist(), covariance, strict=True)
     return [Sighting(name, kind, tuple(z), tuple(c.ravel().tolist()), T_base_sensor) for name, z, c in rows]

@@ -1,4 +1,4 @@
-"""What the robot does: measurements in order of stamp become keyframes, edges and updates."""
+"""The SLAM pipeline: measurements in order of stamp become keyframes, edges and updates."""
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters

@@ -1,4 +1,4 @@
-"""Where the map begins: a prior on the first keyframe, which gives way to what measures where the map lies.
+"""The anchor of the map: a prior on the first keyframe, which gives way to what measures where the map lies.
 
 A fix or a surveyed landmark has its own frame. The first one moves the whole map rigidly onto itself, and from then on
 the prior is loose in every direction that such a measurement determines. Parameters that are set are never loosened.
@@ -64,7 +64,7 @@ class Anchor:
         return looser is not None and self._move(self._onto_fix(m, T_map_base), looser, keyframe)
 
     def align_to_landmark(self, known: Surveyed, at: Array, keyframe: int) -> bool:
-        """As for a fix. ``at`` (n,) is where the landmark is thought to be."""
+        """Loosen the prior for a surveyed landmark, as for a fix. ``at`` (n,) is the landmark's estimate."""
         looser = self._looser(self._position())
         return looser is not None and self._move(self._shifted(np.array(known.position) - at), looser, keyframe)
 
@@ -80,12 +80,12 @@ class Anchor:
         return np.maximum(self._sigmas, wanted) if (wanted > self._sigmas).any() else None
 
     def _position(self) -> Array:
-        """What positions determine."""
+        """The sigmas (dof,) that positions determine."""
         n, angles = self._space.dimensions, self._space.dof - self._space.dimensions
         return np.array([_UNCERTAIN_M] * n + [_TILT_RAD] * (angles - 1) + [_UNCERTAIN_RAD])
 
     def _determined_by(self, m: Fix) -> Array:
-        """What a fix determines, by its kind: sigmas (dof,), zero where it says nothing."""
+        """The sigmas (dof,) that a fix determines, by its kind; zero where it says nothing."""
         space, n = self._space, self._space.dimensions
         out = self._position()
         match m.kind:

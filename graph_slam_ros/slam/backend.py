@@ -67,12 +67,12 @@ class Backend:
 
     @property
     def decides(self) -> bool:
-        """Whether anything is held back and taken out at all."""
+        """Return whether anything is held back and taken out at all."""
         return self._config.decide
 
     @property
     def ledger(self) -> Ledger:
-        """What was decided of each edge."""
+        """The ledger of decisions on all edges."""
         return self.decisions.ledger
 
     def restore(self, vertices: Sequence[int], values: Array, held: tuple[int, int] = (0, 0)) -> Report:
@@ -263,7 +263,7 @@ class Backend:
         return self.solver.evaluate().cost_final > self.solver.evaluate(at=before).cost_final
 
     def _guarded(self, search: Work) -> Outcome | None:
-        """What a second look has found; nothing where it failed, which changes nothing."""
+        """The outcome of a search; None where it failed, which changes nothing."""
         try:
             return search()
         except Exception as error:

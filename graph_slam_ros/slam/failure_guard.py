@@ -1,4 +1,4 @@
-"""What comes of a solve that fails: the last good estimate stays, and soon what has come since is doubted.
+"""Recovery from a solve that fails: the last good estimate stays, and soon what has come since is doubted.
 
 All of it is told by the ingest sequence: a replay fails where the live run did, and recovers as it did.
 """
@@ -50,7 +50,7 @@ class FailureGuard:
         self._in_a_row = 0  # failures since
 
     def solve(self, work: Callable[[], Result], keyframe: int) -> Result | None:
-        """What work returns that solves; None where it fails, or gives what cannot be."""
+        """Solve by ``work`` and return its result; None where it fails, or gives what cannot be."""
         try:
             return self._done(work)
         except Exception as error:
@@ -103,7 +103,7 @@ class FailureGuard:
         self._on_gone(unmeasured)
 
     def _last_good(self) -> Array:
-        """What is newer than the last good estimate is where it was put by it."""
+        """The last good estimate; newer vertices are where they were initialised."""
         out: Array = self._graph.initial.values.copy()
         out[: len(self._good)] = self._good
         return out
@@ -153,7 +153,7 @@ class FailureGuard:
         return list(found.values())
 
     def _to_blame(self, suspects: list[_Suspect]) -> list[_Suspect]:
-        """Of suspects that are out those that cannot come back, half by half; the others are in again."""
+        """The suspects that are out and that cannot come back, half by half; the others are in again."""
         blamed, groups = list[_Suspect](), [suspects] if suspects else []
         for _ in range(_TRIALS):
             if not groups:

@@ -49,7 +49,7 @@ from graph_slam_ros.typing import Array, Numbers
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """How far a solve moved map -> odom, and what new edges, odometry apart, it had to reconcile.
+    """The correction of a solve: how far it moved map -> odom, and what new edges, odometry apart, it had to reconcile.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Correction:
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """What ``process`` changed.
+    """The changes that ``process`` made.
 
     Attributes
     ----------
@@ -253,7 +253,7 @@ class GraphSlam:
 
     @property
     def waiting(self) -> dict[str, str]:
-        """Why each landmark waits that was seen but is not among ``landmarks`` yet, by identity."""
+        """Return why each landmark waits that was seen but is not among ``landmarks`` yet, by identity."""
         tentative = {
             name: f"seen {mark.sightings} times, without an identity: not believed yet"
             for name, mark in self._landmarks.known.items()
@@ -270,7 +270,7 @@ class GraphSlam:
         return self._at_sightings(self.trajectory())
 
     def sighting_odometry(self) -> Array:
-        """What odometry alone says, ``T_odom_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""
+        """Return what odometry alone says, ``T_odom_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""
         return self._at_sightings(self.keyframes.poses)
 
     def _at_sightings(self, keyframe_poses: Array) -> Array:
@@ -317,17 +317,17 @@ class GraphSlam:
 
     @property
     def is_solved(self) -> bool:
-        """Whether the last solve succeeded, and what association had the solver take in since: covariances exist."""
+        """Return whether the last solve succeeded and the solver has all edges since: covariances exist."""
         return self._solved_vertices > 0 and self.solver.is_current
 
     @property
     def failing(self) -> str:
-        """Why the last solve failed; empty where it did not."""
+        """Return why the last solve failed; empty where it did not."""
         return self._failure_guard.failing
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
-        """When the landmarks said that the robot was elsewhere than odometry, in order; the last may go on."""
+        """Alarms: when the landmarks said that the robot was elsewhere than odometry, in order; the last may go on."""
         return tuple(self._kidnaps.alarms)
 
     @property
@@ -352,7 +352,7 @@ class GraphSlam:
 
     @property
     def frozen(self) -> int:
-        """So many vertices, the first, are of a map that is frozen: they stay where they are."""
+        """The number of first vertices that are of a frozen map: they stay where they are."""
         return self.backend.frozen
 
     @property
@@ -362,21 +362,21 @@ class GraphSlam:
 
     @property
     def held(self) -> tuple[int, int]:
-        """So many vertices and edges stay as they are while ``map.localize`` is true; zeros otherwise."""
+        """The number of vertices and edges that stay as they are while ``map.localize`` is true; zeros otherwise."""
         return self.backend.held
 
     @property
     def range_offsets(self) -> dict[str, int]:
-        """By input, the vertex of what all its ranges have in common."""
+        """The vertex of the offset of all ranges of an input, by input."""
         return self._landmarks.offsets
 
     def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
-        """Those that have changed, tentative ones included, but for the first so many changes; None: given up."""
+        """The landmarks that changed after the first so many changes, tentative ones included; None: removed."""
         return {name: self._landmarks.known.get(name) for name in self._landmarks.touched[first:]}
 
     @property
     def landmark_changes(self) -> int:
-        """How often one has changed."""
+        """The number of changes of landmarks."""
         return len(self._landmarks.touched)
 
     @property
@@ -385,7 +385,7 @@ class GraphSlam:
         return max(self.newest_odometry_ns or 0, self.keyframes[-1].stamp_ns)
 
     def _is_of_this_map(self, fix: Fix) -> bool:
-        """Whether its numbers are from where all others of the map are."""
+        """Return whether its numbers are from where all others of the map are."""
         self.datum = self.datum or fix.datum
         if fix.datum and fix.datum != self.datum:
             self.counters.count(fix.topic, "other_datum")
@@ -513,7 +513,7 @@ class GraphSlam:
         self._unsolved_keyframes += 1
 
     def _begin_segment(self, step: Step) -> None:
-        """Where odometry jumped, or time did, nearly nothing is known of the motion; what the robot sees will tell.
+        """Begin a segment: across a jump of odometry or time nearly nothing is known of the motion.
 
         Or somebody tells: an initial pose.
         """
@@ -536,7 +536,7 @@ class GraphSlam:
         self._use_pending(step.stamp_ns)
 
     def _motion_into(self, step: Step) -> tuple[Numbers, Array]:
-        """From the last keyframe, as far as odometry tells: after a jump of time what it says is all there is."""
+        """The motion since the last keyframe by odometry; after a jump of time by its poses alone."""
         motion = self._keyframe_list.motion
         if motion is None:
             T_last_now = self.space.group.between(self.keyframes[-1].T_odom_base, step.T_odom_base)
@@ -548,7 +548,7 @@ class GraphSlam:
         return now.T_keyframe_base, now.covariance
 
     def _added_sigmas(self, given: InitialPose | None, T_last_now: Numbers, *, is_prior: bool) -> tuple[float, float]:
-        """What is added to the noise of that motion, in metres and in radians.
+        """The noise added to the motion into a new segment: sigmas in metres and in radians.
 
         A pose that is given far away must not pull on the path before: it may be wrong.
         """
@@ -628,14 +628,14 @@ class GraphSlam:
         self._solve_if_due()
 
     def _within_reach(self, m: Observation) -> Observation | None:
-        """What of it is not too far away for its sensor."""
+        """The part of an observation that is within the reach of its sensor."""
         within, beyond = self._reach.split(m)
         if beyond:
             self.counters.count(m.topic, "beyond_max_distance", beyond)
         return within
 
     def _thinned(self, m: Observation) -> Observation | None:
-        """As it is to be used; None where that before it says the same."""
+        """The observation as it is to be used; None where that before it says the same."""
         used: Observation | None = m
         if isinstance(m, Sightings) and self._thinning.is_repeated(m, self._keyframe_list.rests):
             used = None
@@ -662,7 +662,7 @@ class GraphSlam:
         self._failure_guard.note_moved()
 
     def _deserves_keyframe(self, m: Observation, where: PoseAtStamp, newest: IntegratedOdometry) -> bool:
-        """Where the motion since the keyframe would be too much of the noise of what was measured."""
+        """Return whether the motion since the keyframe would be too much of the noise of what was measured."""
         if where.keyframe != newest.keyframe or not newest.before_last_ns < where.stamp_ns:
             return False
         is_soon = where.stamp_ns - newest.start_ns < self.config.keyframes.min_interval_s * 1e9
@@ -739,7 +739,7 @@ class GraphSlam:
     def _solved(
         self, keyframe: int, everything: Settings | None
     ) -> tuple[list[tuple[float, int]], Report | None, Array]:
-        """How new edges fitted before, the report of a solve of everything, and the newest pose's covariance."""
+        """Solve; returns the fit of new edges before, the report of a full solve, and the newest pose's covariance."""
         self.backend.hand_over()
         self._kidnaps.add(self.backend.handed_over[1], self._now_ns)
         fits, report = self._fit_of(range(self._solved_edges, self.backend.handed_over[1])), None

@@ -187,7 +187,7 @@ class KidnapDetector:
         self._protect()
 
     def _is_refuted(self, split: _Split, found: DisplacementHypothesis, newest: int) -> bool:
-        """Whether the robot is where it would be without a segment, but for odometry's drift since it began."""
+        """Return whether the robot is where it would be without a segment, but for odometry's drift since it began."""
         before_m, before_rad = self._search.difference(split.T_map_chain_before, found.T_map_chain, newest)
         after_m, _ = self._search.difference(split.T_map_chain, found.T_map_chain, newest)
         drift_m, drift_rad = self._search.drift(split.drift, split.chain, newest)
@@ -227,7 +227,7 @@ class KidnapDetector:
         return found.evidence >= _ALARM and found.landmarks >= _ALARM_LANDMARKS and found.keyframes >= _ALARM_KEYFRAMES
 
     def _is_beyond_noise(self, found: DisplacementHypothesis) -> bool:
-        """Else it is a loop closure that odometry's noise explains."""
+        """Return whether it is beyond noise: else it is a loop closure that odometry's noise explains."""
         held_back = [edge for edge in found.fitting if not self._backend.ledger.is_inside(edge)]
         return self._backend.decisions.are_beyond_noise(held_back[-_TRIED:])
 
@@ -241,7 +241,7 @@ class KidnapDetector:
         )
 
     def _is_calm(self, now: Alarm, stamp_ns: int) -> bool:
-        """Where it was decided, the landmarks must have agreed for a while."""
+        """Return whether the alarm may end: where it was decided, the landmarks must have agreed for a while."""
         if now.segment is not None and (stamp_ns - now.began_ns) * 1e-9 < _CALM_S:
             return False
         return self._monitor.is_calm
@@ -321,7 +321,7 @@ class KidnapDetector:
         return link, motion, Gaussian.from_sigmas(*self._space.sigmas(c.jump_sigma_m, c.jump_sigma_rad))
 
     def _motions(self, found: DisplacementHypothesis) -> dict[int, Numbers]:
-        """How each keyframe from the first displaced one on is moved in map, by its vertex."""
+        """Return how each keyframe from the first displaced one on is moved in map, by its vertex."""
         group, motions = self._space.group, dict[int, Numbers]()
         for vertex in self._search.chained(found.first):
             there = group.compose(found.T_map_chain, self._search.chain(vertex))

@@ -14,7 +14,7 @@ from graph_slam_ros.typing import Array
 
 @dataclass(slots=True)
 class MapSnapshot:
-    """What there is, what is believed of it, and where it is thought to be; named as in ``GraphSlam``.
+    """A map: its graph, its verdicts, and where it is thought to be; named as in ``GraphSlam``.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class MapSnapshot:
 
     @property
     def vertices(self) -> list[int]:
-        """Those of the problem; the others were of landmarks that were given up."""
+        """The vertices of the problem; the others were of landmarks that were given up."""
         poses = {one.vertex for one in self.keyframes}
         points = {mark.vertex for mark in self.landmarks.values()}
         return sorted(poses | points | {*self.range_offsets.values()})

@@ -51,7 +51,7 @@ CONVERTERS: Mapping[str, Mapping[str, Converter]] = {
 
 
 def uses(config: Config) -> dict[str, str]:
-    """What each input is used as, by its name; those that are not used are left out.
+    """Return what each input is used as, by its name; those that are not used are left out.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What every message is judged by, whatever its type: a rule is here once."""
+"""The checks of every message, whatever its type: a rule is here once."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""What a message says of landmarks becomes sightings: one rule for all types.
+"""Observations from landmark messages: one rule for all types.
 
 A converter of a type only reads: it yields one ``ObservedLandmark`` for each landmark of a message.
 """
@@ -73,7 +73,7 @@ def sightings(source: InputContext, found: Iterable[ObservedLandmark]) -> Iterat
 
 
 def _nearest(source: InputContext, found: list[ObservedLandmark]) -> list[ObservedLandmark]:
-    """Of a message's landmarks, as many as are taken."""
+    """The nearest of a message's landmarks, as many as are taken."""
     if len(found) <= (most := source.config.landmarks.max_per_message):
         return found
     source.count("too_many", len(found) - most)
@@ -82,7 +82,7 @@ def _nearest(source: InputContext, found: list[ObservedLandmark]) -> list[Observ
 
 
 def _reach(seen: ObservedLandmark) -> float:
-    """From the frame it is told in; a bearing alone is as good as near."""
+    """The distance from the frame of the message; a bearing alone is as good as near."""
     if seen.polar is None:
         return math.hypot(seen.position.x, seen.position.y, seen.position.z)
     kind, measured = seen.polar

@@ -63,7 +63,7 @@ def _note_similar(source: InputContext, parent: str, child: str, *, is_similar: 
 
 
 def not_found(source: InputContext) -> str:
-    """Of odometry on /tf: what it waits for, as long as that has never come, and what may be meant; else empty."""
+    """The transform of odometry on /tf, if that has never come, and what may be meant; else empty."""
     if source.settings.type != "tf2_msgs/msg/TFMessage" or source.state.get("found"):
         return ""
     frames, name = source.config.frames, source.name
@@ -99,7 +99,7 @@ def _named(source: InputContext, child: str) -> str:
 
 
 def _twist_covariance(source: InputContext, flat: Any) -> Numbers | None:
-    """Of a twist in the base frame; None where it is unknown, in part or altogether."""
+    """The covariance of a twist in the base frame; None where it is unknown, in part or altogether."""
     raw = flat.tobytes()
     if raw != source.state.get("raw"):  # drivers repeat the same one
         source.state.update(raw=raw, judged=_judged(source, np.asarray(flat, dtype=float).reshape(6, 6)))

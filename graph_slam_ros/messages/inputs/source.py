@@ -24,7 +24,7 @@ _LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # of a robot that moves 
 
 @dataclass(slots=True)
 class Origin:
-    """Where on earth the map begins, for all inputs that do not say it themselves; empty before the first fix."""
+    """The datum of the map, for all inputs without their own; empty before the first fix."""
 
     datum: Numbers = ()
 
@@ -34,7 +34,7 @@ class NotYet(Exception):
 
 
 class InputContext:
-    """What a converter knows besides the message.
+    """The context of a converter: what it knows besides the message.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class InputContext:
         self.tally[reason] += times
 
     def stamp_ns(self, stamp: Any) -> int:
-        """Of a header, by the clock of the robot."""
+        """The stamp of a header, by the clock of the robot."""
         out = checks.stamp_ns(stamp) + self._offset_ns
         if not 0 < out <= LATEST_NS:
             raise MessageError("bad_stamp")
@@ -93,11 +93,11 @@ class InputContext:
 
     @property
     def has_mount(self) -> bool:
-        """Whether it is configured where its frame is on the robot."""
+        """Return whether it is configured where its frame is on the robot."""
         return self._mount is not None
 
     def T_base(self, frame: str, stamp_ns: int) -> se3.Pose:
-        """Where a frame was on the robot: by TF, else as configured.
+        """Return where a frame was on the robot: by TF, else as configured.
 
         Raises
         ------
@@ -114,7 +114,7 @@ class InputContext:
         raise NotYet
 
     def mount_position(self, name: str, stamp_ns: int) -> tuple[float, float, float]:
-        """Where the sensor of a message was on the robot; the base, which is counted, where nobody tells of its frame.
+        """The position of the sensor of a message on the robot; the base, counted, if its frame is unknown.
 
         Raises NotYet as ``T_base`` does.
         """
@@ -127,12 +127,12 @@ class InputContext:
         return 0.0, 0.0, 0.0
 
     def _may_come(self, stamp_ns: int) -> bool:
-        """Whether /tf may still tell of a stamp."""
+        """Return whether /tf may still tell of a stamp."""
         now_ns = self.transforms.now_ns
         return not (self.hurried or (now_ns is not None and now_ns > stamp_ns + self._wait_ns))
 
     def T_base_child(self, child: str) -> se3.Pose:
-        """Where a frame always is on the robot; an empty one is where it is configured to be, or the base."""
+        """Return where a frame always is on the robot; an empty one is where it is configured to be, or the base."""
         found = self.transforms.lookup(self.config.frames.base, child) if child else None
         if found is None:
             found = self._mount if self._mount is not None or child else se3.IDENTITY
@@ -141,7 +141,7 @@ class InputContext:
         return found
 
     def T_fixed(self, target: str, frame: str) -> se3.Pose:
-        """Between frames that do not move: a message's, and that of odometry or of the map."""
+        """The transform between frames that do not move: a message's, and that of odometry or of the map."""
         found = self.transforms.lookup(target, frame)
         if found is None and target == self.config.frames.odom:
             raise self._not_linked("odom_frame_unknown", frame, target)
@@ -179,18 +179,18 @@ class InputContext:
         return self.projected(T)
 
     def has_heading(self, T: se3.Pose) -> bool:
-        """In space always; in the plane where the x axis does not point up."""
+        """Return whether a frame has a heading: in space always; in the plane where the x axis does not point up."""
         ahead = so3.act(se3.rotation(T), (1.0, 0.0, 0.0))
         return self.space.dimensions == 3 or bool(math.hypot(ahead[0], ahead[1]) >= _FLAT)
 
     # -- noise -------------------------------------------------------------------------------------------------------
 
     def block(self, covariance: Array) -> Array:
-        """Of a pose's covariance (6, 6), what the space has of it: (3, 3) or all."""
+        """The part of a pose's covariance (6, 6) that the space has of it: (3, 3) or all."""
         return covariance if self.space.dimensions == 3 else covariance[_PLANAR]
 
     def orientation_known(self, covariance: Array) -> bool:
-        """Whether a pose's covariance (6, 6) says so: of the heading in the plane, of all three axes in space."""
+        """Return whether a pose's covariance (6, 6) says so: for the heading in the plane, all axes in space."""
         variances = np.diag(covariance)[5 if self.space.dimensions == 2 else 3 :]
         most = self.config.landmarks.orientation_known_below_rad**2
         return bool(((variances > 0.0) & (variances < most)).all())

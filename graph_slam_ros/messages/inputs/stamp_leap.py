@@ -22,7 +22,7 @@ class StampLeap(Generic[Item]):
         self._held: list[tuple[int, Item]] = []
 
     def accept(self, stamp_ns: int, item: Item, newest_ns: int, room_ns: float) -> list[tuple[int, Item]]:
-        """What may be used now that another has come, with its stamps, in the order it came.
+        """Accept an item; returns those that may be used now, with their stamps, in the order they came.
 
         Parameters
         ----------

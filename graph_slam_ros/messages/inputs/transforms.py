@@ -9,13 +9,13 @@ from graph_slam_ros.messages.inputs.stamp_leap import StampLeap
 
 
 def pose(translation: Any, rotation: so3.Quaternion) -> se3.Pose:
-    """From a translation or position message and a unit quaternion."""
+    """A pose from a translation or position message and a unit quaternion."""
     x, y, z, w = rotation
     return float(translation.x), float(translation.y), float(translation.z), x, y, z, w
 
 
 class Transforms:
-    """What /tf_static and /tf have said so far.
+    """The transforms of /tf_static and /tf so far.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class Transforms:
         self.now_ns = None
 
     def knows(self, frame: str) -> bool:
-        """Whether the frame has a parent."""
+        """Return whether the frame has a parent."""
         return frame in self._fixed or frame in self._moving
 
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> se3.Pose | None:

@@ -1,1 +1,1 @@
-"""From odometry to keyframes: order of stamps, choice of odometry, its integration, pose edges."""
+"""Keyframes from odometry: order of stamps, choice of odometry, its integration, pose edges."""

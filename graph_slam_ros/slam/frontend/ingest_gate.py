@@ -13,7 +13,7 @@ from graph_slam_ros.slam.frontend.time_jump import TimeJumpDetector
 
 @dataclass(frozen=True, slots=True)
 class Passage:
-    """What the gate has decided on one message.
+    """The decision of the gate on one message.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class IngestGate:
         self._jumped_ns = self._now_ns() - by_ns // 2
 
     def is_from_before(self, measured: Sequence[Measured]) -> bool:
-        """Whether measurements were on their way when the clock jumped back: they are dated nearer to that time."""
+        """Return whether measurements were under way when the clock jumped back: they are dated nearer to then."""
         if self._jumped_ns and self._now_ns() >= self._jumped_ns:
             self._jumped_ns = 0
         return 0 < self._jumped_ns < max((m.stamp_ns for m in measured), default=0)

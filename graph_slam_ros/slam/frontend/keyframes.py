@@ -1,4 +1,4 @@
-"""Where the robot was: its keyframes, and the odometry in between as far back as late measurements may reach."""
+"""The path: its keyframes, and the odometry in between as far back as late measurements may reach."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ class Keyframe:
 
 @dataclass(frozen=True, slots=True)
 class SightingPose:
-    """Where the robot was when it saw something: a keyframe, by its index, and the motion since."""
+    """The pose of an observation: a keyframe, by its index, and the motion since."""
 
     keyframe: int
     stamp_ns: int
@@ -53,12 +53,12 @@ class KeyframeList:
 
     @property
     def motion(self) -> IntegratedOdometry | None:
-        """Since the newest keyframe; none where stamps have begun anew since."""
+        """The motion since the newest keyframe; none where stamps have begun anew since."""
         return self._motions[-1] if self._motions else None
 
     @property
     def rests(self) -> bool:
-        """Whether the robot has stood for a second or more."""
+        """Return whether the robot has stood for a second or more."""
         return self._rest.is_on
 
     @property
@@ -68,7 +68,7 @@ class KeyframeList:
 
     @property
     def remembered_ns(self) -> int:
-        """From this stamp on odometry is remembered, message by message."""
+        """The stamp from which on odometry is remembered, message by message."""
         return self._motions[0].start_ns
 
     def append(self, vertex: int, step: Step, late_s: float) -> None:
@@ -92,7 +92,7 @@ class KeyframeList:
         self.forget_time()
 
     def continue_drive(self) -> None:
-        """After ``restore``: the same drive continues, so odometry tells the motion since the last keyframe."""
+        """Continue the drive after ``restore``: odometry has the motion since the last keyframe."""
         last = len(self.keyframes) - 1
         backwards = np.flatnonzero(np.diff(self.keyframes.stamps_ns) < 0)
         self._epoch = max(self.drives[-1], int(backwards[-1]) + 1 if len(backwards) else 0)
@@ -108,7 +108,7 @@ class KeyframeList:
         self._epoch = len(self.keyframes)
 
     def where(self, stamp_ns: int) -> PoseAtStamp:
-        """Where the robot was, by the keyframe before and the odometry in between."""
+        """Return where the robot was, by the keyframe before and the odometry in between."""
         motion = next((m for m in reversed(self._motions) if m.start_ns <= stamp_ns), None)
         if motion is None:
             return self._where_long_ago(stamp_ns)
@@ -117,7 +117,7 @@ class KeyframeList:
         return PoseAtStamp(motion.keyframe, vertex, stamp_ns, moved.T_keyframe_base, moved.covariance)
 
     def _where_long_ago(self, stamp_ns: int) -> PoseAtStamp:
-        """Between two keyframes whose odometry is forgotten: evenly from one to the next."""
+        """Interpolate between two keyframes whose odometry is forgotten: evenly from one to the next."""
         present = self.keyframes.stamps_ns[self._epoch :]
         k = self._epoch + int(np.searchsorted(present, stamp_ns, side="right")) - 1
         group, (a, b) = self._space.group, (self.keyframes[k], self.keyframes[k + 1])

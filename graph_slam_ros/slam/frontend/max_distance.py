@@ -1,4 +1,4 @@
-"""What no sensor can mean: distances beyond its reach are refused, directions straight up or down get regular axes."""
+"""Plausibility: distances beyond a sensor's reach are refused; steep directions get regular axes."""
 
 import math
 from collections.abc import Iterable
@@ -21,7 +21,7 @@ _STEEP = 0.2  # cosine of an elevation: at 78.5 degrees and above the azimuth is
 
 @dataclass(slots=True)
 class _Shown:
-    """What the sensor of one input has shown: how many distances, and the farthest of them, the least first."""
+    """The distances of one input so far: how many distances, and the farthest of them, the least first."""
 
     count: int = 0
     farthest: list[float] = field(default_factory=lambda: [0.0] * _FARTHEST)
@@ -49,7 +49,7 @@ class MaxDistance:
         return min(_MOST_M, max(_ALWAYS_M, _TIMES_FARTHEST * shown.farthest[0]))
 
     def split(self, m: Sightings | Fix | Closure) -> tuple[Sightings | Fix | Closure | None, int]:
-        """What of a measurement is within reach, None where nothing is, and how many sightings or closures are not."""
+        """The part of a measurement within reach, or None, and how many sightings or closures are not."""
         match m:
             case Sightings():
                 within = tuple(s for s in m.sightings if self._is_within(m.topic, self._distance(s)))
@@ -62,7 +62,7 @@ class MaxDistance:
                 return m, 0
 
     def _distance(self, s: Sighting) -> float | None:
-        """From the sensor or, of a position or pose, from the base."""
+        """The distance from the sensor or, of a position or pose, from the base."""
         if s.kind in ("position", "pose"):
             return math.hypot(*s.measured[: self._space.dimensions])
         return None if s.kind == "bearing" else abs(s.measured[0])

@@ -1,4 +1,4 @@
-"""From where the robot was when it measured to the keyframe before: the motion in between, and its noise, are added.
+"""Motion compensation: the motion from the keyframe to a measurement, and its noise, are added.
 
 Throughout, ``T_a_b`` is the base b seen from its keyframe a, with covariance M in right tangent coordinates: the true
 motion is ``T_a_b Exp(m)``. A point p of b then moves by ``B m`` with ``B = [I, -hat(p)]``, in the axes of b.
@@ -21,7 +21,7 @@ _UNKNOWN_M2 = 1e6  # a variance of this or more says that an axis was not measur
 
 @dataclass(frozen=True, slots=True)
 class PoseAtStamp:
-    """Where the robot was at a stamp: a keyframe, and the motion since with its covariance (dof, dof)."""
+    """The pose at a stamp: a keyframe, and the motion since with its covariance (dof, dof)."""
 
     keyframe: int
     vertex: int
@@ -86,7 +86,7 @@ def seen_from_sensor(space: Geometry, s: Sighting, where: PoseAtStamp, p_keyfram
 def motion_noise_dominates(
     space: Geometry, m: Sightings | Fix | Closure, where: PoseAtStamp, most: float, added_sigma_m: float
 ) -> bool:
-    """Whether the motion adds more to the variance than a part of it: all that a message says has that in common.
+    """Return whether the motion adds more to the variance than a part of it, common to the whole message.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def gradient(space: Geometry, kind: str, p: Array) -> Array:
 
 
 def predict(space: Geometry, kind: str, p: Array) -> Array:
-    """What a sensor says (..., m) of points p (..., n) in its frame."""
+    """The measurement (..., m) of a sensor of points p (..., n) in its frame."""
     predicted = []
     if kind in ("range", "range_bearing"):
         predicted.append(np.linalg.norm(p, axis=-1))
@@ -178,7 +178,7 @@ def polar_derivative(space: Geometry, measured: Numbers) -> Array:
 
 
 def fix(space: Geometry, m: Fix, where: PoseAtStamp, T_map_keyframe: Numbers) -> KeyframeMeasurement:
-    """What is known of the robot, as known of its keyframe.
+    """An absolute measurement of the robot, as one of its keyframe.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def fix(space: Geometry, m: Fix, where: PoseAtStamp, T_map_keyframe: Numbers) ->
 
 
 def axes_unknown(covariance: Array) -> NDArray[np.bool_]:
-    """Which axes (n,) a position (n, n) says nothing of."""
+    """Return which axes (n,) a position (n, n) says nothing of."""
     unknown: NDArray[np.bool_] = np.diag(covariance) >= 0.5 * _UNKNOWN_M2
     return unknown
 
@@ -222,7 +222,7 @@ def axes_known(covariance: Array) -> list[tuple[Array, float]]:
 
 
 def closure(space: Geometry, m: Closure, earlier: PoseAtStamp, later: PoseAtStamp) -> KeyframeMeasurement:
-    """Between two keyframes: ``T_a_d = T_a_b T_b_c T_d_c^-1`` for the base b at the earlier stamp, c at the later."""
+    """A closure of keyframes: ``T_a_d = T_a_b T_b_c T_d_c^-1``, the base is b at the earlier stamp, c at the later."""
     group = space.group
     to_c = group.propagate(earlier.covariance, m.T_from_base, as_matrix(m.covariance))
     into = group.adjoint(later.T_keyframe_base)

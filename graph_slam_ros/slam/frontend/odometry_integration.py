@@ -45,7 +45,7 @@ class OdometryNoise:
         self._square: Array = self._density
 
     def stands(self, step: Numbers, dt: float) -> bool:
-        """Whether a step in dt seconds is too slow to be one."""
+        """Return whether a step in dt seconds is too slow to be one."""
         c = self._config
         slow_m, slow_rad = c.still_m_s * dt, c.still_rad_s * dt
         if self._space.dimensions == 2:
@@ -54,7 +54,7 @@ class OdometryNoise:
         return step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < slow_m**2 and turn < slow_rad
 
     def is_jitter(self, moved: Numbers) -> bool:
-        """Whether a motion is so small that it may be odometry's jitter, however long it took."""
+        """Return whether a motion is so small that it may be odometry's jitter, however long it took."""
         c, n = self._config, self._space.dimensions
         return bool(sum(x * x for x in moved[:n]) < c.still_m**2 and self._space.angle(moved) < c.still_rad)
 
@@ -71,7 +71,7 @@ class OdometryNoise:
 
 
 class StationaryDetector:
-    """Whether the robot stands: motion that is slow, or that leads nowhere."""
+    """Detector of a stationary robot: motion that is slow, or that leads nowhere."""
 
     __slots__ = ("_T_odom_base", "_noise", "_since_ns", "_space", "is_on")
 
@@ -82,7 +82,7 @@ class StationaryDetector:
         self.is_on = False
 
     def update(self, step: Step, dt: float) -> bool:
-        """Whether the robot stood during a step of dt seconds."""
+        """Add a step of dt seconds; returns whether the robot stood."""
         stands = self._noise.stands(step.T_last_base, dt)
         if self._T_odom_base is None or step.broken:
             self._begin(step)
@@ -123,7 +123,7 @@ class IntegratedOdometry:
 
     @property
     def now(self) -> OdometrySample:
-        """At the newest odometry."""
+        """The motion at the newest odometry."""
         return self._moved[-1]
 
     @property
@@ -148,7 +148,7 @@ class IntegratedOdometry:
             self._moved.append(moved)
 
     def at(self, stamp_ns: int) -> OdometrySample:
-        """At a stamp from the keyframe's to the newest odometry's, between two odometry messages by interpolation."""
+        """The motion at a stamp since the keyframe, interpolated between two odometry messages."""
         k = bisect_right(self._moved, stamp_ns, key=_stamp) - 1
         a = self._moved[k]
         if a.stamp_ns == stamp_ns or k + 1 == len(self._moved):
@@ -171,7 +171,7 @@ class IntegratedOdometry:
 
     @property
     def is_long(self) -> bool:
-        """Whether it is time to begin another, for what is remembered grows."""
+        """Return whether it is time to begin another, for what is remembered grows."""
         return len(self._moved) >= _MOST
 
     @property

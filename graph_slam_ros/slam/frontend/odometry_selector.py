@@ -99,7 +99,7 @@ class OdometrySelector:
         return m.stamp_ns - used.stamp_ns > self._silent_ns
 
     def _switched(self, past: "deque[Odometry]", used: Odometry) -> list[Step]:
-        """From where the other was used last, by interpolation of this one; not before it reaches back so far."""
+        """The steps from where the other was used last, by interpolation; none before this one reaches back so far."""
         group = self._space.group
         newer = [m for m in past if m.stamp_ns > used.stamp_ns]
         older = [m for m in past if m.stamp_ns <= used.stamp_ns]
@@ -138,7 +138,7 @@ class OdometrySelector:
         return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken))
 
     def _is_reset(self, step: Numbers, to: Odometry) -> bool:
-        """Its driver began anew: exactly where odometry begins, and by more than robots move from message to message.
+        """Return whether its driver began anew: at the origin, and farther away than robots move between messages.
 
         However long it took: while a driver starts, nothing comes.
         """
@@ -148,7 +148,7 @@ class OdometrySelector:
         return far_m > max(_RESET_M, _UNUSUAL * usual_m) or far_rad > max(_RESET_RAD, _UNUSUAL * usual_rad)
 
     def _size(self, pose: Numbers) -> tuple[float, float]:
-        """In metres and radians."""
+        """The size of a motion in metres and radians."""
         return math.hypot(*pose[: self._space.dimensions]), self._space.angle(pose)
 
     def _jumps(self, step: Numbers, dt: float) -> bool:

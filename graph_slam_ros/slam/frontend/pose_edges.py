@@ -1,4 +1,4 @@
-"""What is measured of poses, as edges of the graph: odometry, fixes and loop closures."""
+"""Edges between poses of the graph: odometry, fixes and loop closures."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ class PoseEdges:
         self._graph.add_edge(self._space.relative_pose, vertices, T_last_now, noise, "odometry", source)
 
     def initial_pose(self, vertex: int, pose: InitialPose) -> None:
-        """Where somebody says that the robot is."""
+        """Add a prior for a pose that somebody gives."""
         noise = self._noise("initialpose", motion_compensation.as_matrix(pose.covariance))
         self._graph.add_edge(self._space.pose_prior, [vertex], pose.T_map_base, noise, "initialpose")
 
@@ -49,7 +49,7 @@ class PoseEdges:
         self._counters.used[topic] += 1
 
     def closure(self, m: Closure, earlier: PoseAtStamp, later: PoseAtStamp) -> None:
-        """Between two keyframes."""
+        """Add a closure between two keyframes."""
         if earlier.keyframe == later.keyframe:
             self._counters.count(m.topic, "within_one_keyframe")
             return
@@ -59,5 +59,5 @@ class PoseEdges:
         self._counters.used[m.topic] += 1
 
     def _noise(self, source: str, covariance: Array) -> Gaussian:
-        """Of a pose."""
+        """The noise of a pose."""
         return edge_noise(self._counters, source, covariance, self._space.dimensions)

@@ -33,7 +33,7 @@ class StampOrder:
         self._released_ns: int | None = None
 
     def accepts(self, m: Odometry | Observation) -> bool:
-        """Whether there is room for it, odometry is not older than what was released, and all else is new; or counted.
+        """Return whether there is room, odometry is not older than what was released, and all else is new; or count it.
 
         Odometry newer than all before always has room: it is what makes others leave.
         """
@@ -52,7 +52,7 @@ class StampOrder:
         return True
 
     def _has_room(self, stamp_ns: int) -> bool:
-        """Whether so many wait only, or what is dated latest of all can make room: its turn may never come."""
+        """Return whether so many wait only, or what is dated latest of all can make room: its turn may never come."""
         if len(self._heap) < self._max_pending:
             return True
         latest = max(range(len(self._heap)), key=self._heap.__getitem__)
@@ -66,7 +66,7 @@ class StampOrder:
         return True
 
     def _is_repeated(self, m: Observation) -> bool:
-        """Whether the very same has come before; what comes for the first time is remembered."""
+        """Return whether the very same has come before; what comes for the first time is remembered."""
         recent = self._recent.setdefault(m.topic, {})
         if m in recent:
             return True

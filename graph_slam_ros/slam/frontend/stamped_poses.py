@@ -28,7 +28,7 @@ class StampedPoses(Generic[Instant]):
 
     @property
     def ids(self) -> Index:
-        """What each belongs to, a view: the vertex of a keyframe, the keyframe of a sighting."""
+        """Return what each belongs to, a view: the vertex of a keyframe, the keyframe of a sighting."""
         return self._id.values
 
     @property

@@ -1,4 +1,4 @@
-"""What comes faster than its errors change: less of it is used, with the noise that all of it together has."""
+"""Thinning: what comes faster than its errors change is used in part, with the noise of all of it."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ class ObservationThinning:
         self._observed_ns.clear()
 
     def is_repeated(self, m: Sightings, rests: bool) -> bool:
-        """Whether the robot rests and has looked just now: from one place it sees the same with the same errors."""
+        """Return whether the robot rests and has just observed: it would see the same with the same errors."""
         before_ns = self._observed_ns.get(m.topic)
         if rests and before_ns is not None and 0 <= m.stamp_ns - before_ns < self._most_ns:
             return True

@@ -24,14 +24,14 @@ class TimeJumpDetector:
         self._anew: dict[str, list[int]] = {}  # ascending stamps from which it may go on: the first, the last, how many
 
     def is_jump(self, measured: Iterable[Measured]) -> bool:
-        """Whether it has begun anew with one of these, in the order they came."""
+        """Return whether stamps jumped back with one of these, in the order they came."""
         jumped = [
             self._has_jumped(m) for m in measured if isinstance(m, Odometry)
         ]  # all of them, whatever the first tells
         return any(jumped)
 
     def forget(self) -> None:
-        """What comes next is of another time."""
+        """Forget all stamps: what comes next is of another time."""
         self._newest_ns.clear()
         self._recent_ns.clear()
         self._anew.clear()

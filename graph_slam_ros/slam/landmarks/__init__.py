@@ -1,1 +1,1 @@
-"""From observations to landmarks: triangulation, data association, landmarks with and without ids."""
+"""Landmarks from observations: triangulation, data association, landmarks with and without ids."""

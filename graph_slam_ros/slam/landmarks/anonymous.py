@@ -127,7 +127,7 @@ class AnonymousLandmarks:
         return out
 
     def _widened(self, s: Sighting, where: PoseAtStamp, spread: Array | None) -> Sighting:
-        """With a covariance (n, n) in the keyframe's axes added."""
+        """The sighting with a covariance (n, n) in the keyframe's axes added."""
         added = self._config.unnamed_sigma_m**2 * np.eye(self._space.dimensions)
         spread = added if spread is None else spread + added
         space = self._space
@@ -153,7 +153,7 @@ class AnonymousLandmarks:
         return name if name not in self._landmarks.known else self._new_name()
 
     def _position(self, s: Sighting, where: PoseAtStamp) -> KeyframeMeasurement:
-        """Where it was seen, from the keyframe."""
+        """Return where it was seen, from the keyframe."""
         if s.kind != "range_bearing":
             at = motion_compensation.position(self._space, s, where)
         else:
@@ -198,7 +198,7 @@ class AnonymousLandmarks:
         return [names[k] for k in near], what
 
     def _positions(self, vertices: NDArray[np.int64]) -> Array:
-        """Of landmarks (k, n), in map."""
+        """Positions (k, n) of landmarks in map."""
         n = self._space.dimensions
         out = np.empty((len(vertices), n))
         is_point = np.array([self._landmarks.kind_of(v) is self._space.point for v in vertices.tolist()], dtype=bool)
@@ -210,7 +210,7 @@ class AnonymousLandmarks:
     # -- afterwards ----------------------------------------------------------------------------------------------
 
     def review(self, now_ns: int) -> None:
-        """Look at landmarks again: part, merge, believe, give up."""
+        """Review the landmarks: split, merge, confirm, prune."""
         self._split_wrong_merge()
         known = self._landmarks.known
         unnamed = [name for name, mark in known.items() if mark.is_unnamed]
@@ -253,7 +253,7 @@ class AnonymousLandmarks:
         self._hand_over()
 
     def _plausible(self, pairs: list[tuple[str, str]]) -> MergeCandidate:
-        """Those of the pairs that fit, the likeliest first."""
+        """The pairs that fit, the likeliest first."""
         known, n = self._landmarks.known, self._space.dimensions
         if not pairs:
             return MergeCandidate([], np.empty(0), np.empty((0, 0)))
@@ -280,7 +280,7 @@ class AnonymousLandmarks:
         return some.pairs, Candidates(options, some.residual, some.covariance, excluded)
 
     def _exclude_each_other(self, one: tuple[str, str], two: tuple[str, str]) -> bool:
-        """Whether two landmarks that were seen at once would be the same, or one would be two."""
+        """Return whether two landmarks that were seen at once would be the same, or one would be two."""
         known = self._landmarks.known
         if one[0] == two[0]:
             return True
@@ -335,19 +335,19 @@ class AnonymousLandmarks:
         return self._landmarks.kind_of(landmark.vertex).dof
 
     def _axes(self, landmark: Landmark) -> Array:
-        """From the landmark's tangent space to the map's axes, of its position."""
+        """The rotation from the landmark's tangent space to the map's axes, of its position."""
         if self._landmarks.kind_of(landmark.vertex) is self._space.point:
             return np.eye(self._space.dimensions)
         return self._space.turn(tuple(self._solver.estimate([landmark.vertex])[0].tolist()))
 
     def _is_sure(self, landmark: Landmark) -> bool:
-        """Whether it was seen often enough, for long enough."""
+        """Return whether it was seen often enough, for long enough."""
         c = self._config
         for_long = landmark.last_seen_ns - landmark.first_seen_ns >= round(c.confirm_s * 1e9)
         return landmark.sightings >= c.confirm_sightings and for_long
 
     def _confirm_or_prune(self, name: str, plausible: MergeCandidate, now_ns: int) -> None:
-        """Believe a tentative landmark that is none of the others; give up what was not seen for long."""
+        """Confirm a tentative landmark that is none of the others; prune what was not seen for long."""
         landmark = self._landmarks.known[name]
         if self._is_sure(landmark) and not self._candidates([name], plausible)[0]:
             self._landmarks.confirm(name)

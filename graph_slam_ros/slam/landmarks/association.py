@@ -1,4 +1,4 @@
-"""Which landmark is it? For sightings that do not say: what each may be, by the covariance of robot and map together.
+"""Data association of sightings without identity: what each may be, by the covariance of robot and map together.
 
 The innovation of sighting i with landmark j, ``r = z_i - h_j(x)``, has the covariance ``S = H_j P H_j' + R_i`` with the
 joint covariance P of the keyframe and the landmarks nearby. A pair costs ``r' S^-1 r + log |2 pi S|``, and one that was
@@ -29,7 +29,7 @@ _MOST_WEIGHED = 4000  # pairings of landmarks with older ones; none is clear the
 
 @dataclass(frozen=True, slots=True)
 class Gates:
-    """When a sighting is one of a landmark.
+    """The gates of data association.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Gates:
 
     @property
     def new(self) -> float:
-        """What a landmark costs that was never seen."""
+        """Return what a landmark costs that was never seen."""
         return -2.0 * float(np.log(self.density))
 
     def chi2(self, dof: int) -> float:
@@ -66,13 +66,13 @@ class Gates:
 
 @cache
 def quantile(probability: float, dof: int) -> float:
-    """Of the chi-square distribution; from the special function, since importing scipy.stats takes half a second."""
+    """A quantile of chi-square, by the special function: importing scipy.stats takes half a second."""
     return 2.0 * float(gammaincinv(0.5 * dof, probability))
 
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What landmarks look like from a keyframe.
+    """The expected observations of landmarks from a keyframe.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ def of_sums(jacobian: Array, covariance: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """What a sighting was found to be.
+    """The association of a sighting.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class Match:
 
 
 def associate(gates: Gates, seen: Sequence[KeyframeMeasurement], what: Expected, *, jointly: bool) -> list[Match]:
-    """Of each sighting its landmark, by index."""
+    """Return the landmark of each sighting, by index."""
     statistic, cost = _costs(seen, what)
     n, followed = what.points.shape[1], what.is_followed
     possible = np.where(statistic > gates.chi2(n), np.inf, cost)

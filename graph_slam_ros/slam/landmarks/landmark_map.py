@@ -99,7 +99,7 @@ class Landmarks:
         self.touched: list[str] = []
 
     def add(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
-        """Take a sighting of a landmark with this identity."""
+        """Add a sighting of a landmark with this identity."""
         landmark = self.known.get(name)
         if landmark is not None:
             self._add_edge(topic, landmark, s, where)
@@ -198,7 +198,7 @@ class Landmarks:
         return motion_compensation.seen_from_sensor(self._space, s, where, seen)
 
     def _blurred(self, s: Sighting, compensated: KeyframeMeasurement) -> Array:
-        """With what messages leave out: clocks, mounting, size."""
+        """The covariance with what messages leave out: clocks, mounting, size."""
         covariance, added = compensated.covariance.copy(), self._config.landmarks.added_sigma_m**2
         if s.kind in ("pose", "position"):
             n = self._space.dimensions
@@ -252,7 +252,7 @@ class Landmarks:
         self.confirm(merged)
 
     def confirm(self, name: str) -> None:
-        """It is tentative no more."""
+        """Confirm a tentative landmark."""
         self.known[name].is_tentative = False
         self.touched.append(name)
 
@@ -294,7 +294,7 @@ class Landmarks:
                 self._add_edge(candidate.topic, landmark, s, where)
 
     def _why_not(self, places: list[PositionHypothesis], glances: list[PartialObservation]) -> str:
-        """Why a landmark is not determined; empty where it is."""
+        """Return why a landmark is not determined; empty where it is."""
         settings, count = self._config.landmarks, len(glances)
         if count <= self._space.dimensions - (glances[0].kind != "range"):
             return f"{count} {'sightings' if count > 1 else 'sighting'} by {glances[0].kind}: too few"

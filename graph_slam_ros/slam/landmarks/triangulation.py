@@ -1,4 +1,4 @@
-"""Where a landmark can be, from ranges and bearings taken at known places: all places that fit, and how well.
+"""Triangulation of a landmark from ranges and bearings taken at known places: all places that fit, and how well.
 
 A range from one place leaves a circle, from two places two points; bearings from one place leave a ray. So the search
 begins at many points of the circle, sphere or ray that the first sighting leaves, each followed to the least squares
@@ -46,7 +46,7 @@ class PartialObservation:
 
 @dataclass(frozen=True, slots=True)
 class PositionHypothesis:
-    """Where a landmark may be, its covariance (n, n), infinite where it is loose, and the chi2 of the sightings."""
+    """A possible position of a landmark, its covariance (n, n), infinite if undetermined, and the sightings' chi2."""
 
     position: Array
     covariance: Array
@@ -73,7 +73,7 @@ def places(
 
 
 def _fields(space: Geometry, glances: Sequence[PartialObservation]) -> list[Field]:
-    """By kind: rotations (k, n, n) and positions (k, n) of the sensors, what they said (k, m), whitening (k, m, m)."""
+    """The observations by kind: rotations (k, n, n), positions (k, n), measurements (k, m), whitening (k, m, m)."""
     out = []
     n = space.dimensions
     for kind in dict.fromkeys(glance.kind for glance in glances):

@@ -1,1 +1,1 @@
-"""What is believed: gating, pairwise consistency, alternative hypotheses, displacement, the ledger."""
+"""Robust estimation: gating, pairwise consistency, alternative hypotheses, displacement, the ledger."""

@@ -1,4 +1,4 @@
-"""When a second look is taken while the robot drives on, and when what it found is taken over.
+"""Search for better hypotheses in the background, while the robot drives on.
 
 Both are keyframes, told by the ingest sequence alone, so that a replay decides as the live run did: it begins on a
 frozen copy; at a fixed later keyframe its outcome is taken over, waited for if it must be. Where in between the work is
@@ -31,7 +31,7 @@ class _Job:
 
 
 class Background:
-    """At most one second look at a time, and its outcome at the keyframe it is for."""
+    """Run at most one search at a time; its outcome is due at a fixed keyframe."""
 
     def __init__(self, config: RobustConfig, executor: Executor) -> None:
         self._config, self._executor = config, executor
@@ -39,7 +39,7 @@ class Background:
         self._job: _Job | None = None
 
     def is_due(self, out: int) -> bool:
-        """Whether so many candidates that are out deserve a look."""
+        """Return whether so many candidates that are out deserve a look."""
         after, self._out = self._config.second_look_after, min(self._out, out)
         return self._job is None and after > 0 and out >= max(self._out + after, _MORE * self._out)
 
@@ -51,14 +51,14 @@ class Background:
         self._job = _Job(frozen.keyframe + self._config.apply_after_keyframes, outcome, wanted)
 
     def outcome(self, keyframe: int) -> Outcome | None:
-        """What was found, at the keyframe it is for; waits for it. None, too, where nothing could be."""
+        """The outcome of the search at the keyframe it is for; waits for it. None if there is none."""
         if self._job is None or keyframe < self._job.apply_at:
             return None
         job, self._job = self._job, None
         return job.outcome()
 
     def cancel(self, out: int) -> None:
-        """What is under way is for nobody: all was looked at, and so many are out."""
+        """Cancel the search under way: all was reviewed, and so many are out."""
         if self._job is not None:
             self._job.wanted.still = False
         self._job, self._out = None, out

@@ -1,4 +1,4 @@
-"""Whether the landmarks say that the robot is elsewhere than odometry does: after a slip, or after it was carried.
+"""Search for a displacement after a slip or a kidnap: the landmarks and odometry disagree on the pose.
 
 Odometry that is wrong without a jump leaves traces in what is held back: those sightings agree with one another, at
 another pose of the robot, and not with odometry. Sightings with wrong identities do not agree with one another. The
@@ -170,7 +170,7 @@ class DisplacementSearch:
         )
 
     def _heading(self, edge: int, base: Numbers) -> tuple[float, float]:
-        """Of a landmark seen as a pose in the plane, and its variance."""
+        """The heading of a landmark seen as a pose in the plane, and its variance."""
         table, row = self._graph.row(edge)
         if table.type is not self._space.relative_pose or self._space.dimensions != 2:
             return np.nan, 0.0
@@ -191,7 +191,7 @@ class DisplacementSearch:
         return None
 
     def _variance(self, edge: int, point: Array) -> float:
-        """Of that position, the largest of any direction."""
+        """The variance of that position, the largest of any direction."""
         table, row = self._graph.row(edge)
         root, n = table.sqrt_information.values[row], self._space.dimensions
         covariance = np.linalg.inv(root.T @ root)
@@ -203,7 +203,7 @@ class DisplacementSearch:
 
     @property
     def held_back_count(self) -> int:
-        """Of the newest sightings of landmarks that are well known, how many are held back."""
+        """The number of the newest sightings of well known landmarks that are held back."""
         known = [one for one in self._standing() if self._known_from(one.landmark) < one.keyframe]
         held_back = [not self._ledger.is_inside(one.edge) for one in known]
         self._is_supported |= not all(held_back)
@@ -292,7 +292,7 @@ class DisplacementSearch:
         return motion
 
     def _variances(self, window: _Window, at: int) -> Array:
-        """Of each sighting, with what odometry may have drifted between it and one of them."""
+        """The variance of each sighting, with what odometry may have drifted between it and one of them."""
         drift, lever = np.abs(window.drifts - window.drifts[at]), self._levers(window)
         return np.asarray(window.variances + _MAP_SIGMA_M**2 + drift[:, 0] + drift[:, 1] * lever**2)
 
@@ -316,7 +316,7 @@ class DisplacementSearch:
         return self._history.known_from(landmark, self._seen[0].edge)
 
     def _evidence(self, window: _Window, fits: Flags, motion: tuple[Array, Array]) -> DisplacementHypothesis | None:
-        """From which keyframe on there is most: landmarks that are newer than it tell nothing."""
+        """The evidence from the keyframe on that has most: landmarks that are newer than it tell nothing."""
         for_it, against = fits & ~window.is_in & ~window.fits_now, ~fits & window.is_in
         starts = np.flatnonzero(np.diff(window.keyframes, prepend=-1) != 0)
         known = window.supports[None, :] < window.keyframes[starts][:, None]
@@ -350,7 +350,7 @@ class DisplacementSearch:
     # -- for whoever acts on it ----------------------------------------------------------------------------------
 
     def chain(self, keyframe: int) -> Numbers:
-        """Where the evidence's own frame of odometry has a keyframe, by its vertex."""
+        """Return where the evidence's own frame of odometry has a keyframe, by its vertex."""
         return self._chain[keyframe]
 
     def difference(self, T_map_chain: Numbers, other: Numbers, keyframe: int) -> tuple[float, float]:
@@ -360,7 +360,7 @@ class DisplacementSearch:
         return float(np.linalg.norm(difference[: self._space.dimensions])), float(self._space.angle(difference))
 
     def are_apart(self, T_map_chain: Numbers, other: Numbers, keyframe: int) -> bool:
-        """Whether these are two different poses."""
+        """Return whether these are two different poses."""
         far_m, turned_rad = self.difference(T_map_chain, other, keyframe)
         return far_m > SAME_M or turned_rad > SAME_RAD
 
@@ -388,7 +388,7 @@ class DisplacementSearch:
 
 
 def _are_apart(points: Array) -> bool:
-    """Whether points are far enough from one another, and three not on a line, to tell a rigid motion."""
+    """Return whether points are far enough from one another, and three not on a line, to tell a rigid motion."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[points.shape[1] - 2] >= 0.5 * _LEAST_APART_M)
 

@@ -1,4 +1,4 @@
-"""Which measurements are believed: closures, sightings and fixes are candidates, odometry is not.
+"""Outlier rejection: closures, sightings and fixes are candidates, odometry is not.
 
 A candidate that would be too unlikely given what was known just before is held back: its innovation is compared with
 the joint covariance of what it is between and its own (Neira and Tardos, "Data association in stochastic mapping using
@@ -76,7 +76,7 @@ class OutlierGate:
         return pending
 
     def _is_of_known(self, edge: int) -> bool:
-        """Whether it is of a landmark that the last solve had: without it that is as determined as it was."""
+        """Return whether it is of a landmark that the last solve had: without it that is as determined as it was."""
         landmark = landmark_of(self._graph, edge)
         return landmark is not None and landmark < self._vertices
 
@@ -102,7 +102,7 @@ class OutlierGate:
         return admitted
 
     def fit(self, edges: Sequence[int]) -> bool:
-        """Whether all of some edges fit at the present estimate."""
+        """Return whether all of some edges fit at the present estimate."""
         chi2, _ = self._solver.chi2_of(edges)
         return bool((chi2 <= self.ledger.threshold.values[edges]).all())
 
@@ -138,7 +138,7 @@ class OutlierGate:
             self._readmit(edge, keyframe, fit, self._innovation_gate(edge))
 
     def reclassify(self, keyframe: int) -> bool:
-        """After a solve of everything: what fits is in, what does not is out; whether a verdict has changed."""
+        """Reclassify all candidates after a full solve: in if they fit; returns whether a verdict changed."""
         self.recalibrate()
         ledger, changed = self.ledger, False
         inside, outside = ledger.inside, ledger.outside
@@ -179,14 +179,14 @@ class OutlierGate:
 
     @property
     def gate_scale(self) -> float:
-        """By what the gate of what all else predicts is wider than a quantile of chi2.
+        """The factor by which the gate of an innovation is wider than a quantile of chi2.
 
         ``robust.noise_factor`` squared, times how good odometry has shown itself to be.
         """
         return self._gate_scale
 
     def are_beyond_noise(self, edges: Sequence[int]) -> bool:
-        """Whether most of some edges that are out are farther off than odometry's noise explains.
+        """Return whether most of some edges that are out are farther off than odometry's noise explains.
 
         However good odometry has shown itself to be: it may be ``robust.noise_factor`` times worse than it is said.
         """
@@ -195,7 +195,7 @@ class OutlierGate:
         return 2 * sum(far) > len(far)
 
     def innovations(self, edges: Sequence[int]) -> list[float]:
-        """What believing each of some edges that are out would cost, given all that is in."""
+        """Return what believing each of some edges that are out would cost, given all that is in."""
         return [self._innovation(edge) for edge in edges]
 
     def supersede(self, link: int, keyframe: int, evidence: float) -> None:
@@ -230,7 +230,7 @@ class OutlierGate:
         self._set_verdicts(candidates, np.isin(candidates, edges), keyframe, self.ledger)
 
     def _set_verdicts(self, edges: Index, wanted: NDArray[np.bool_], keyframe: int, judge: Ledger) -> bool:
-        """Those in that are wanted, then the others out, by who judged them; whether a verdict has changed."""
+        """Include the edges that are wanted, exclude the others; returns whether a verdict has changed."""
         inside = np.isin(edges, self.ledger.inside)
         changed = 0
         for edge in edges[wanted & ~inside].tolist():
@@ -244,7 +244,7 @@ class OutlierGate:
         return changed > 0
 
     def _reweight(self, edges: Index, keyframe: int) -> None:
-        """By what their losses leave of each one's weight."""
+        """Down-weight or reject edges by what their losses leave of the weight."""
         ledger = self.ledger
         chi2, _ = self._solver.chi2_of(edges)
         unfit = chi2 > ledger.threshold.values[edges]
@@ -260,7 +260,7 @@ class OutlierGate:
                 ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)
 
     def _innovation(self, edge: int) -> float:
-        """What believing an edge would cost; infinite where no number comes of it."""
+        """Return what believing an edge would cost; infinite where no number comes of it."""
         try:
             return innovation(self._graph, self._solver, edge)
         except (np.linalg.LinAlgError, ValueError):
@@ -270,7 +270,7 @@ class OutlierGate:
         return innovation <= self._innovation_gate(edge)
 
     def _innovation_gate(self, edge: int) -> float:
-        """What an innovation is held against."""
+        """Return what an innovation is held against."""
         return self._gate_scale * quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
 
     # -- one edge ----------------------------------------------------------------------------------------------------
@@ -310,7 +310,7 @@ class OutlierGate:
             among[landmark] = among.get(landmark, 0) + more
 
     def _is_needed(self, edge: int) -> bool:
-        """Whether a landmark may be undetermined without it: its last, or one of the few that do so together."""
+        """Return whether a landmark may be undetermined without it: its last, or one of the few that do so together."""
         found = self._landmark(edge)
         if found is None:
             return False
@@ -324,7 +324,7 @@ class OutlierGate:
     # -- what is too much --------------------------------------------------------------------------------------------
 
     def _limits(self, edges: Index, numbers: Index) -> Array:
-        """What chi2 is held against: the gate, or less where residuals of a class are far below their noise."""
+        """Return what chi2 is held against: the gate, or less where residuals of a class are far below their noise."""
         limit = {int(n): quantile(self._config.gate, int(n)) for n in np.unique(numbers)}
         out = np.array([limit[n] for n in numbers.tolist()], dtype=float)
         for label, tightness in self._tightness.items():

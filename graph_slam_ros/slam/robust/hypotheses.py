@@ -29,7 +29,7 @@ _STORY = 5  # closures that agree with one another and not with the map
 
 @dataclass(frozen=True, slots=True)
 class FrozenGraph:
-    """What a second look begins with: copies, which nobody else changes.
+    """The input of a search: copies, which nobody else changes.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Outcome:
 
 @dataclass(slots=True)
 class CancelToken:
-    """Whether anybody still waits for an outcome."""
+    """A token that cancels a search nobody waits for."""
 
     still: bool = True
 
@@ -125,7 +125,7 @@ def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: Cance
 
 
 def _rival(one: Outcome, best: Outcome) -> Alternative | None:
-    """What another explanation believes against the best, where that is a whole story and not a few edges more."""
+    """Another explanation as an alternative to the best, if a whole group of closures differs."""
     graph = best.frozen.graph
     here, there = (outcome.ledger.inside for outcome in (one, best))
     only_here, only_there = np.setdiff1d(here, there), np.setdiff1d(there, here)
@@ -197,7 +197,7 @@ def _cost(solver: Solver, ledger: Ledger) -> float:
 
 
 def _along_odometry(graph: Graph, values: Array, held: set[int]) -> Array:
-    """Where odometry alone says that the robot was; landmarks, and what is held, stay where they are."""
+    """Return where odometry alone says that the robot was; landmarks, and what is held, stay where they are."""
     out = values.copy()
     for edge in graph.edges_of("odometry").tolist():
         table, row = graph.row(edge)

@@ -1,4 +1,4 @@
-"""How far a measurement is from what all else predicts of it, in units of both their uncertainties."""
+"""The innovation: how far a measurement is from what all else predicts of it, in units of both their uncertainties."""
 
 import numpy as np
 from scipy.optimize import least_squares

@@ -1,4 +1,4 @@
-"""Whether the newest sightings together contradict odometry: a test on the sum of their innovations.
+"""Monitor of whether the newest sightings contradict odometry: a test on the sum of their innovations.
 
 Each sighting has a normalised innovation squared: how far it is from what all else predicts, in sigmas, squared. Over a
 window of the newest, of which no landmark has more than a few (sightings of one landmark err together), the sum is
@@ -28,7 +28,7 @@ _CALM, _CALM_SURE = 12, 0.99  # newest sightings of which three quarters must ag
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """What the monitor has found in its window.
+    """The result of the monitor in its window.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Contradiction:
 
     @property
     def is_significant(self) -> bool:
-        """Whether neither noise nor wrong identities explain it."""
+        """Return whether neither noise nor wrong identities explain it."""
         return self.landmarks >= 2 and self.statistic > self.threshold
 
 
@@ -105,7 +105,7 @@ class InnovationMonitor:
         return out
 
     def contradiction(self) -> Contradiction | None:
-        """What the window tells; None where there is too little in it."""
+        """Return what the window tells; None where there is too little in it."""
         window, ledger = self._window(), self._ledger
         if len(window) < _LEAST:
             return None
@@ -124,7 +124,7 @@ class InnovationMonitor:
 
     @property
     def is_calm(self) -> bool:
-        """Whether most of the newest sightings agree with odometry."""
+        """Return whether most of the newest sightings agree with odometry."""
         newest = np.array([one.edge for one in self._window()[:_CALM]], dtype=np.int64)
         if not len(newest):
             return False
@@ -136,6 +136,6 @@ class InnovationMonitor:
         return float(innovations[counted].sum()) <= limit
 
     def _by_chance(self, count: int) -> int:
-        """How many of a count may be wrong though odometry is right."""
+        """Return how many of a count may be wrong though odometry is right."""
         rate = beta.ppf(_RATE_SURE, 1 + self._held_back, 1 + self._count - self._held_back)
         return int(binom.ppf(_SURE, count, rate))

@@ -1,4 +1,4 @@
-"""When each landmark was first seen: from which keyframe on it is known well enough to compare with."""
+"""The history of landmarks: when each was first seen, and from which keyframe on it is well known."""
 
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.slam.robust.ledger import Ledger

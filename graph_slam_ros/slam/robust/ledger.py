@@ -13,7 +13,7 @@ from graph_slam_ros.typing import Array, Index
 
 
 class Verdict(IntEnum):
-    """What is believed of an edge."""
+    """The verdict on an edge."""
 
     NOT_EVALUATED = 0  # it is odometry, or another edge that nobody doubts
     ACCEPTED = 1
@@ -23,7 +23,7 @@ class Verdict(IntEnum):
 
 
 class Reason(IntEnum):
-    """Why a verdict is not, or no longer, ``ACCEPTED``."""
+    """The reason why a verdict is not, or no longer, ``ACCEPTED``."""
 
     NONE = 0
     UNLIKELY = 1  # too far from what all else predicts, by their joint covariance
@@ -150,21 +150,21 @@ class Ledger:
         self.history.append(VerdictChange(edge, keyframe, verdict, reason, float(statistic), limit))
 
     def residual(self, edge: int) -> Array:
-        """How the measurement differed from what was expected when it came, in its units."""
+        """Return how the measurement differed from what was expected when it came, in its units."""
         first = int(self._residual_at.values[edge])
         out: Array = self._residual.values[first : first + int(self.numbers.values[edge])]
         return out
 
     def verdict_of(self, edge: int) -> Verdict:
-        """On one edge, also where it is too new to have a record."""
+        """The verdict on one edge, also where it is too new to have a record."""
         return Verdict(int(self.verdict.values[edge])) if edge < len(self) else Verdict.NOT_EVALUATED
 
     def is_inside(self, edge: int) -> bool:
-        """Whether an edge pulls."""
+        """Return whether an edge pulls."""
         return int(self.verdict.values[edge]) in _INSIDE
 
     def is_withdrawn(self, edge: int) -> bool:
-        """Whether an edge was taken out for good."""
+        """Return whether an edge was taken out for good."""
         return edge < len(self) and int(self.reason.values[edge]) in FINAL
 
     @property

@@ -1,4 +1,4 @@
-"""Which loop closures agree with a neighbour: two that join the same two stretches of the path, nearly in one place.
+"""Pairwise consistency of loop closures: two that join the same two stretches of the path, nearly in one place.
 
 Odometry between near poses is good, so such a pair and the two short ways between their ends make a loop that must
 close: pairwise consistency (Mangelson et al., "Pairwise consistent measurement set maximization", ICRA 2018, eq. 3),
@@ -66,7 +66,7 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
 
 
 def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
-    """Of each vertex, its place along odometry, -1 if it has none; and of each place, the noise of all steps before."""
+    """The place of each vertex along odometry, -1 if it has none; and of each place, the noise of all steps before."""
     code = graph.labels.index("odometry") if "odometry" in graph.labels else -1
     rows = np.flatnonzero(table.label.values == code)
     order = np.full(graph.vertex_count, -1)
