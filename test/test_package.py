@@ -101,9 +101,12 @@ NEVER = {
     "analysis/evaluation.py": {"matplotlib"},
 }
 SPEAK_RCLPY = {
-    f"node/{name}.py" for name in ("bond", "node", "player", "runtime", "subscriptions", "publishers", "parameters")
+    f"node/{name}.py" for name in ("bond", "node", "player", "ingest", "subscriptions", "publishers", "parameters")
 }
-SPEAK_MESSAGES = SPEAK_RCLPY | {"messages/to_msg.py", "node/tf_broadcaster.py", "node/services.py"}
+SPEAK_MESSAGES = SPEAK_RCLPY | {
+    "messages/to_msg.py",
+    *(f"node/{name}.py" for name in ("tf_broadcaster", "services", "runtime", "fact_collector", "publishing_clock")),
+}
 OUTSIDE_THE_SOLVER = {"cli", "analysis/plots.py"}
 
 

@@ -191,13 +191,13 @@ def test_P7_above_its_limit_of_memory_closures_are_refused_and_counted_and_below
         closure = Closure(
             drive.stamp_ns, drive.stamp_ns - 10**9, "/closures", (0.0, 0.0, 0.0), (1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0)
         )
-        run._take([closure], b"")
+        run._ingest.receive([closure], b"")
         assert run.counters["/closures", "memory"] == 1
         until(lambda: backend.spares_memory, drive.pace(r), "no second looks")
         assert r.set({"health.memory_mib": 10.0 * resident_mib()}) == (True, "")
         r.until_it_says("OK", spin=drive.pace(r))
         until(lambda: not backend.spares_memory, drive.pace(r), "second looks")
-        run._take([closure], b"")
+        run._ingest.receive([closure], b"")
         assert run.counters["/closures", "memory"] == 1
         assert r.save().success
         assert results(tmp_path / "run") == replayed(tmp_path / "run", tmp_path)

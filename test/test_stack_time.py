@@ -214,7 +214,7 @@ def test_B15_what_is_raised_after_a_jump_reaches_nobody_and_is_counted(monkeypat
         for seconds in (100, 40):
             slam.get_clock().set_ros_time_override(Time(seconds=seconds, clock_type=ClockType.ROS_TIME))
             for k in range(2):
-                slam._run._take([Odometry((seconds + k) * NS, (float(k), 0.0, 0.0), None, "odom")], b"")
+                slam._run._ingest.receive([Odometry((seconds + k) * NS, (float(k), 0.0, 0.0), None, "odom")], b"")
             until(lambda: slam._run._session.estimate is not None, time.sleep, "estimate")
         assert len(called) == 1, "those who come after it are called"
         assert slam._run.counters["node", "ZeroDivisionError"] == 1

@@ -12,6 +12,7 @@ from rclpy.duration import Duration
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.node.handle import NodeHandle
 
 _TYPE = "bond/msg/Status"
 _PERIOD_S, _TIMEOUT_S = 0.25, 4.0  # Nav2's
@@ -44,7 +45,7 @@ class Bond:
         The messages are not installed.
     """
 
-    def __init__(self, node: Any) -> None:
+    def __init__(self, node: NodeHandle) -> None:
         self._node, self._instance = node, str(uuid4())
         self._status = message_class(_TYPE)
         self._is_formed = self._is_over = False

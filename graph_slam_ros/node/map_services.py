@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any
 
 from graph_slam_ros.errors import ConfigError, GraphSlamError, message_of
+from graph_slam_ros.node.handle import MapServer
 
 _GIVEN_POSE, _LOCALIZE = 2, 3  # match_type of slam_toolbox/srv/DeserializePoseGraph
 _BAD_NAME, _BAD_MATCH_TYPE, _UNREADABLE, _FAILED = 1, 2, 3, 255  # its result, and that of SerializePoseGraph
@@ -40,7 +41,7 @@ def loaded_from(request: Any, dimensions: int) -> Values:
     return {"output.load": _name(request), "output.load_pose": pose, "map.localize": localizes}
 
 
-def serve_maps(node: Any, serve_later: Callable[..., None]) -> None:
+def serve_maps(node: MapServer, serve_later: Callable[..., None]) -> None:
     """Serve ``~/serialize_map`` and ``~/deserialize_map`` if slam_toolbox is installed; as ``deferred.serve_later``."""
     try:
         types = import_module("slam_toolbox.srv")

@@ -1,4 +1,4 @@
-"""The ROS node: its lifecycle, parameters, services and state. What it does with messages is in ``live/configured``."""
+"""The ROS node: its lifecycle, parameters, services and state. What it does with messages is in ``runtime``."""
 
 import os
 import re
@@ -136,9 +136,9 @@ class GraphSlamNode(LifecycleNode):
             if self.config.journal.resume and run.was_cut_off:
                 unused = "" if self.config.load_pose is None else "; output.load_pose is not used: it has driven since"
                 self.get_logger().warn(f"the last run was never ended: going on in its map{unused}")
-                run.in_passing(run.resume())
+                run.in_background(run.resume())
             elif self.config.output.load_at_start:
-                run.in_passing(run.load())
+                run.in_background(run.load())
 
     def _activate(self) -> None:
         self._configured().activate()

@@ -15,6 +15,7 @@ from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.messages.path_updates import PathUpdates
 from graph_slam_ros.messages.to_msg import Status
 from graph_slam_ros.node import events
+from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.slam import Config, GraphSlam, Update
 
 _LANDMARKS = ("landmarks", "landmarks_estimate")
@@ -43,7 +44,7 @@ class Publishers:
     node : the ROS node
     """
 
-    def __init__(self, node: Any, config: Config) -> None:
+    def __init__(self, node: NodeHandle, config: Config) -> None:
         self._node = node
         self._topics = {
             one.name.removeprefix("~/"): _Topic(

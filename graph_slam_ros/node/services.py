@@ -8,6 +8,7 @@ from typing import Any
 from std_srvs.srv import Trigger
 
 from graph_slam_ros.errors import message_of
+from graph_slam_ros.node.handle import NodeHandle
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +26,7 @@ Answer = Callable[[Any, str, BaseException | None], Any]
 
 
 def serve_later(
-    node: Any, name: str, start: Callable[[Any], "Future[str]"], kind: Any = Trigger, answer: Answer = _triggered
+    node: NodeHandle, name: str, start: Callable[[Any], "Future[str]"], kind: Any = Trigger, answer: Answer = _triggered
 ) -> None:
     """Serve requests, of ``std_srvs/Trigger`` by default: ``start`` begins the work, what comes of it is the message.
 

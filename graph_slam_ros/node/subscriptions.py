@@ -18,6 +18,7 @@ from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageC
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.message_class import message_class
 from graph_slam_ros.node.diagnostics import InputFacts
+from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.recent import Recent
 from graph_slam_ros.slam import Config, Counters
 
@@ -56,7 +57,7 @@ class Subscriptions:
 
     def __init__(
         self,
-        node: Any,
+        node: NodeHandle,
         config: Config,
         border: MessageConverter,
         take: Take,

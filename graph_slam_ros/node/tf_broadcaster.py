@@ -3,11 +3,11 @@
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 from tf2_msgs.msg import TFMessage
 
 from graph_slam_ros.messages import to_msg
+from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.map_to_odom import MapToOdom
 from graph_slam_ros.node.session import Estimate
 from graph_slam_ros.node.subscriptions import full_name
@@ -28,7 +28,7 @@ class TfBroadcaster:
 
     def __init__(
         self,
-        node: Any,
+        node: NodeHandle,
         config: Config,
         guarded: Callable[[Callable[..., None]], Callable[..., None]],
         look: Callable[[], tuple[Config, Estimate | None, Odometry | None]],

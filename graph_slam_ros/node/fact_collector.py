@@ -1,0 +1,93 @@
+"""The facts that the state of the node is judged by, collected from its parts."""
+
+import time
+
+from graph_slam_ros.node.diagnostics import Facts
+from graph_slam_ros.node.handle import NodeHandle
+from graph_slam_ros.node.ingest import Ingest
+from graph_slam_ros.node.preparation import Preparation
+from graph_slam_ros.node.publishers import Publishers
+from graph_slam_ros.node.recent import RecentInputs
+from graph_slam_ros.node.session import Session
+from graph_slam_ros.node.subscriptions import Subscriptions
+from graph_slam_ros.node.tf_broadcaster import TfBroadcaster
+from graph_slam_ros.node.worker import Worker
+from graph_slam_ros.slam import Counters
+
+
+class FactCollector:
+    """Collects facts about once a second; what it calls recent is since the last time.
+
+    Parameters
+    ----------
+    counters : of what is refused before the pipeline
+    """
+
+    def __init__(
+        self,
+        node: NodeHandle,
+        counters: Counters,
+        session: Session,
+        worker: Worker,
+        ingest: Ingest,
+        publishers: Publishers,
+    ) -> None:
+        self._node, self._counters, self._session = node, counters, session
+        self._worker, self._ingest, self._publishers = worker, ingest, publishers
+        self._recent = RecentInputs()
+        self._before = 0, 0, 0  # overflows, failures and restarts until the last time
+
+    def collect(
+        self,
+        lifecycle: str,
+        subscriptions: Subscriptions | None,
+        broadcaster: TfBroadcaster | None,
+        preparation: Preparation,
+    ) -> Facts:
+        """Collect the facts of now.
+
+        Parameters
+        ----------
+        lifecycle : the state of the lifecycle
+        subscriptions, broadcaster : None while the node is not active
+        """
+        session, node, worker, gate = self._session, self._node, self._worker, self._ingest.gate
+        if not worker.waiting and node.now_ns:
+            worker.offer(node.guarded(session.evaluate))
+        pipeline = Counters()
+        pipeline.update(session.slam.counters)
+        counters = Counters()
+        counters.update(self._counters)
+        counters.update(pipeline)
+        counted, processed = counters.as_dict(), self._ingest.processed
+        recent = self._recent.look(time.monotonic(), processed, self._counters.as_dict(), pipeline.as_dict())
+        overflows = sum(of.get("overflow", 0) for of in counted.values())
+        failures, restarts = session.failures, self._counters["node", "worker_restarted"]
+        before, self._before = self._before, (overflows, failures, restarts)
+        rivals = broadcaster.candidates() if broadcaster is not None and broadcaster.has_rival else None
+        return Facts(
+            lifecycle,
+            subscriptions.facts(node.now_ns, counted, recent) if subscriptions is not None else (),
+            session.estimate,
+            waits_for_clock=node.get_parameter("use_sim_time").value and not node.now_ns,
+            is_paused=gate.is_paused,
+            loads=session.loads,
+            is_stopped=gate.is_stopped,
+            lag_s=worker.lag_s,
+            waiting=worker.waiting,
+            busy_s=worker.busy_s,
+            worker_is_alive=worker.is_alive,
+            restarts=restarts - before[2],
+            failing=session.slam.failing,
+            memory_is_short=self._ingest.memory_is_short,
+            overflows=overflows - before[0],
+            failures=failures - before[1],
+            recording_fails=session.recording_fails,
+            path_version=self._publishers.path_version,
+            has_other_authority=rivals is not None,
+            authorities=rivals or (),
+            twins=node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1,
+            tf_behind_s=broadcaster.behind_s if broadcaster is not None else 0.0,
+            preparing=preparation.said,
+            cannot_prepare=preparation.fault,
+        )

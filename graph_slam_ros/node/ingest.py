@@ -1,0 +1,235 @@
+"""The way of measurements from the callbacks to the worker: future stamps, jumps of time, memory, the gate."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from functools import partial
+from typing import Any
+
+from rclpy.clock import JumpThreshold
+from rclpy.duration import Duration
+from rclpy.serialization import deserialize_message
+
+from graph_slam_ros.errors import GraphSlamError, message_of
+from graph_slam_ros.measurements.types import Closure, InitialPose, Measured
+from graph_slam_ros.messages import results, to_msg
+from graph_slam_ros.messages.from_msg import Decoder, MessageConverter, twist_of
+from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.messages.interfaces import typestore
+from graph_slam_ros.messages.message_class import message_class
+from graph_slam_ros.node.future_stamps import FutureStamps
+from graph_slam_ros.node.handle import NodeHandle
+from graph_slam_ros.node.memory import is_short
+from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
+from graph_slam_ros.node.publishers import Publishers
+from graph_slam_ros.node.publishing_clock import PublishingClock
+from graph_slam_ros.node.session import Session
+from graph_slam_ros.node.worker import Worker
+from graph_slam_ros.slam import Config, Control, Counters, Odometry
+from graph_slam_ros.slam.edits import removal
+from graph_slam_ros.slam.frontend.ingest_gate import IngestGate, Passage, input_of, size_of
+
+OnJump = Callable[[Passage, str, str], None]
+
+
+class Ingest:
+    """Hands measurements to the worker in the order they came, or refuses and counts them.
+
+    All but ``_process`` is in the main thread.
+
+    Parameters
+    ----------
+    counters : of what is refused before the pipeline
+    on_jump : called where time jumped back, before anything of the new time goes on: with the decision of the gate,
+        what tells of the jump, and how
+
+    Attributes
+    ----------
+    converter : makes measurements of messages
+    gate : decides what a jump of time, a pause and a full queue mean
+    extrapolator : the pose by the newest odometry
+    processed : things that were handed to the pipeline, by input
+    memory_is_short : whether the process has more memory than it should
+    """
+
+    def __init__(
+        self,
+        node: NodeHandle,
+        config: Config,
+        counters: Counters,
+        session: Session,
+        worker: Worker,
+        publishers: Publishers,
+        clock: PublishingClock,
+        on_jump: OnJump,
+    ) -> None:
+        self._node, self._session, self._worker = node, session, worker
+        self._publishers, self._clock, self._on_jump = publishers, clock, on_jump
+        self._counters = counters
+        self.converter = MessageConverter(config, counters, _installed(config))
+        self.gate = IngestGate(config.time.jump_back_s, counters, lambda: node.now_ns)
+        self.extrapolator = PoseExtrapolator(config)
+        self.processed: Counter[str] = Counter()
+        self.memory_is_short = False
+        self._future_stamps = FutureStamps(config.time.future_s, self._stamp_clock_ns, partial(self.refuse, "future"))
+        self._publishes_odometry = False
+        self._with_twist = {one.name for one in config.sources if one.type == results.ODOMETRY}
+        self._clock_jumps: Any = None
+        create, guarded = node.create_subscription, node.guarded
+        pose, text = message_class(results.POSE), message_class("std_msgs/msg/String")
+        self._subscriptions = (
+            create(pose, "initialpose", guarded(self._on_initial_pose), 10, raw=True),
+            create(text, "~/remove", guarded(self._on_remove), 10),
+        )
+
+    def activate(self) -> None:
+        """Notice jumps of the clock."""
+        back = Duration(nanoseconds=-round(self._node.config.time.jump_back_s * 1e9))
+        threshold = JumpThreshold(min_forward=None, min_backward=back, on_clock_change=True)
+        clock, callback = self._node.get_clock(), self._node.guarded(self._on_clock_jump)
+        self._clock_jumps = clock.create_jump_callback(threshold, post_callback=callback)
+
+    def deactivate(self) -> None:
+        """Notice no jump of the clock any more."""
+        self._clock_jumps.unregister()
+
+    def finish(self) -> None:
+        """Hand over or refuse what waits, and take no more."""
+        for measured in self._future_stamps.give_up():
+            self.hand_over(measured)
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self.hand_over(self.converter.finish())
+
+    def tick(self) -> None:
+        """Hand over what has waited long enough for the clock, ten times a second."""
+        for measured in self._future_stamps.waited():
+            self.hand_over(measured)
+        self._publishes_odometry = self._publishers.has_listeners("odometry")
+
+    def watch_memory(self) -> None:
+        """Have the pipeline spare memory while the process has more than ``health.memory_mib``."""
+        limit, before = self._node.config.health.memory_mib, self.memory_is_short
+        self.memory_is_short = is_short(limit, was_short=before)
+        if self.memory_is_short != before:
+            self.in_background(self.in_sequence([Control("memory", (("is_short", not before),))]))
+
+    # -- measurements ------------------------------------------------------------------------------------------------
+
+    def receive(self, measured: Sequence[Measured], cdr: bytes) -> None:
+        """Pass on the measurements of a message, and those that waited for it.
+
+        Parameters
+        ----------
+        cdr : the message
+        """
+        if self.gate.is_from_before(measured):
+            self.refuse("before_jump", measured)
+            return
+        newest = [m for m in measured if isinstance(m, Odometry) and self._is_newest(m)]
+        if newest and self._publishes_odometry:
+            self._publish_odometry(newest[-1], cdr)
+        if self.memory_is_short:
+            measured = self._without_closures(measured)
+        for some in self._future_stamps.pass_on(measured):
+            self.hand_over(some)
+
+    def hand_over(self, measured: Sequence[Measured]) -> None:
+        """Hand a message to the worker, unless the gate refuses it; then it was not accepted."""
+        passage = self.gate.admit(measured, self._node.config.time.on_jump, has_room=self._worker.has_room)
+        if passage.jump:
+            self._on_jump(passage, "stamps", "odometry has gone back in time and stays there")
+        if passage.measured:
+            self._session.accept(passage.measured)
+            self._worker.offer(self._node.guarded(partial(self._process, passage.measured)))
+        else:
+            self._clock.refused += 1
+
+    def refuse(self, reason: str, measured: Sequence[Measured]) -> None:
+        """Count a message that goes no further."""
+        self.gate.refuse(reason, measured)
+        self._clock.refused += 1
+
+    def _without_closures(self, measured: Sequence[Measured]) -> list[Measured]:
+        for m in measured:
+            if isinstance(m, Closure):
+                self._counters.count(m.topic, "memory")
+        return [m for m in measured if not isinstance(m, Closure)]
+
+    def _process(self, measured: Sequence[Measured]) -> None:
+        """Process a message that was accepted, in the worker's thread."""
+        try:
+            self._session.process(measured)
+        finally:
+            for m in measured:
+                self.processed[input_of(m)] += size_of(m)
+            self._clock.after_message(self._session)
+
+    # -- odometry in the map -----------------------------------------------------------------------------------------
+
+    def _is_newest(self, m: Odometry) -> bool:
+        """Whether odometry says where the robot is now; what is ahead of the clock would be the newest for long."""
+        return not self._future_stamps.is_ahead([m]) and self.extrapolator.hear(m, self._session.estimate)
+
+    def _publish_odometry(self, m: Odometry, cdr: bytes) -> None:
+        estimate, config = self._session.estimate, self._node.config
+        if estimate is None or not estimate.is_located:
+            return
+        frames, unused = config.frames, config.output.pose_covariance_max
+        twist = twist_of(cdr, frames.base) if m.source.partition("#")[0] in self._with_twist else None
+        pose, covariance = self.extrapolator.pose(estimate)
+        self._publishers.odometry(to_msg.odometry(m.stamp_ns, frames.map, frames.base, pose, covariance, unused, twist))
+
+    # -- events ------------------------------------------------------------------------------------------------------
+
+    def in_sequence(self, events: Sequence[Control | InitialPose]) -> "Future[None]":
+        """Accept and process what is no measurement, at its place among those."""
+        self._session.accept(events)
+        return self._worker.call(partial(self._session.process, events))
+
+    def in_background(self, future: "Future[Any]") -> None:
+        """Log where a job fails whose result nobody waits for."""
+
+        def report(done: "Future[Any]") -> None:
+            if (error := done.exception()) is not None:
+                self._node.get_logger().error(message_of(error))
+
+        future.add_done_callback(report)
+
+    def _on_initial_pose(self, cdr: bytes) -> None:
+        for pose in self.converter.initial_pose(cdr):
+            self.in_background(self.in_sequence([pose]))
+
+    def _on_remove(self, message: Any) -> None:
+        try:
+            event = removal(message.data)
+        except GraphSlamError as error:
+            self._node.get_logger().warn(str(error))
+            return
+        self.in_background(self.in_sequence([event]))
+
+    # -- time --------------------------------------------------------------------------------------------------------
+
+    def forget_time(self) -> None:
+        """Drop what is known by the stamps until now: what comes next is of another time."""
+        self.converter.forget_time()
+        self.extrapolator.forget()
+
+    def _stamp_clock_ns(self) -> int:
+        """The clock that stamps are judged by; 0 where a recording is played: it is no better than they are."""
+        return 0 if self._node.get_parameter("use_sim_time").value else self._node.now_ns
+
+    def _on_clock_jump(self, jump: Any) -> None:
+        """Decide on a clock that jumped back, or on another that is used now."""
+        self._future_stamps.forget_time()
+        self.gate.clock_jumped(jump.delta.nanoseconds)
+        if self._session.estimate is None and not self._worker.waiting:
+            return
+        passage = self.gate.begin_anew(self._node.config.time.on_jump)
+        self._on_jump(passage, "clock", f"jumped by {jump.delta.nanoseconds * 1e-9:.3f} s")
+
+
+def _installed(config: Config) -> dict[str, Decoder]:
+    """Decoders of the types whose layout is known to the packages that are installed, and not to us."""
+    names = {one.type for one in config.sources if one.name in uses(config)} - set(typestore().types)
+    return {name: partial(deserialize_message, message_type=message_class(name)) for name in names}

@@ -1,0 +1,78 @@
+"""When results are published: each topic in its period, and never so often that the pipeline falls behind."""
+
+import time
+
+from graph_slam_ros.node import events
+from graph_slam_ros.node.handle import NodeHandle
+from graph_slam_ros.node.publishers import Publishers
+from graph_slam_ros.node.session import Session
+from graph_slam_ros.node.throttle import Throttle
+from graph_slam_ros.node.worker import Worker
+from graph_slam_ros.slam import GraphSlam, Update
+
+ACKNOWLEDGE = 32  # messages
+_MOST_UNPUBLISHED_S, _AGAIN_S = 4.0, 5.0
+
+
+class PublishingClock:
+    """Has the worker publish what is due, and acknowledges messages to a player.
+
+    Parameters
+    ----------
+    publishers : of the results
+
+    Attributes
+    ----------
+    refused, processed : messages that went no further, by the main thread, and that the worker has done
+    """
+
+    def __init__(self, node: NodeHandle, publishers: Publishers, worker: Worker) -> None:
+        self._node, self._publishers, self._worker = node, publishers, worker
+        self.refused = self.processed = 0
+        self._acknowledged = -1
+        self._has_player = False
+        self._is_overdue, self._published_s = False, time.monotonic()  # results, where the worker always has messages
+        self._corrections = Throttle(_AGAIN_S)
+
+    # -- in the main thread ------------------------------------------------------------------------------------------
+
+    def tick(self, session: Session) -> None:
+        """Offer the worker to publish what is due, ten times a second; where it never rests, that becomes overdue."""
+        self._has_player = self._node.has_player
+        self._acknowledge()
+        is_due = self._publishers.are_due(self._node.config)
+        if is_due and self._worker.waiting < ACKNOWLEDGE:
+            self._worker.offer(self._node.guarded(lambda: self.publish_due(session.slam)))
+        elif is_due and time.monotonic() - self._published_s > _MOST_UNPUBLISHED_S:
+            self._is_overdue = True
+
+    def _acknowledge(self) -> None:
+        count = self.refused + self.processed
+        if count != self._acknowledged:
+            self._acknowledged = count
+            self._node.acknowledge(count)
+
+    # -- in the worker's thread --------------------------------------------------------------------------------------
+
+    def after_message(self, session: Session) -> None:
+        """Publish what is overdue, and acknowledge: another message was processed."""
+        self.processed += 1
+        if self._is_overdue:
+            self.publish_due(session.slam)
+        if self._has_player and (not self._worker.waiting or self.processed % ACKNOWLEDGE == 0):
+            self._acknowledge()
+
+    def on_update(self, slam: GraphSlam, update: Update, *, is_located: bool) -> None:
+        """Publish what an update changed, and log where it moved the robot far."""
+        self._publishers.update(slam, update, is_located=is_located)
+        moved, tf = update.correction, slam.config.tf
+        if update.solved and (moved.distance_m > tf.report_jump_m or moved.angle_rad > tf.report_jump_rad):
+            slam.counters.count("tf", "jump")
+            if (left_out := self._corrections.next()) is not None:
+                more = f" ({left_out} more since the last was told)" if left_out else ""
+                self._node.get_logger().warn(events.correction(slam, update).message + more)
+
+    def publish_due(self, slam: GraphSlam) -> None:
+        """Publish what is due now."""
+        self._is_overdue, self._published_s = False, time.monotonic()
+        self._publishers.publish_due(slam)
