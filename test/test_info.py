@@ -228,6 +228,45 @@ def test_a_frame_that_tf_does_not_tell_of_is_assumed_at_the_base_and_it_is_said(
     assert run(words, capsys)[0]["landmarks"] == 3
 
 
+def test_poses_of_single_tags_by_the_camera_are_landmarks(info, capsys):
+    def tag(at):
+        def made(k, stamp_ns, truth, drifting):
+            x, y = map(float, se2.act(se2.inverse(truth), at))
+            return posed("PoseStamped", pose(x, y), "base_link", None, stamp_ns)
+
+        return made
+
+    topics = [(f"/tag_{n}/pose", POSE, tag(at)) for n, at in enumerate(PLACES.values())]
+    code, _, words = info(ODOMETRY, *topics)
+    assert code == 0
+    told, _, _ = run(words, capsys)
+    assert told["landmarks"] == 3
+    assert told["inputs"]["tag"]["use"] == "landmarks"
+
+
+@pytest.mark.parametrize("base", ["base_link", "robot1/base_footprint"])
+def test_odometry_of_a_frame_that_tf_does_not_link_to_the_base_of_the_sensors_is_taken_for_it(info, capsys, base):
+    fixed = transforms((base, "camera", (0.0, 0.0, 0.5), quaternion(yaw=0.0)))
+    static = ("/tf_static", TF, lambda k, *_: None if k else fixed)
+    code, lines, words = info(
+        static, ("/odom", ODOM, odom(child="chassis")), ("/tags", DETECTIONS, seen(frame="camera"))
+    )
+    assert code == 0
+    assert "odom.mount=0 0 0 0 0 0" in words
+    assert f"note: no transform links chassis, which odometry names, to {base}" in " ".join(lines)
+    assert run(words, capsys)[0]["landmarks"] == 3
+
+
+def test_topics_of_types_that_no_input_reads_are_named(info, capsys):
+    scan = ("/scan", "sensor_msgs/msg/LaserScan", lambda k, stamp_ns, *_: None if k else b"\0\1\0\0")
+    code, lines, _words = info(ODOMETRY, scan)
+    assert code == 0
+    assert "note: no input reads /scan (sensor_msgs/msg/LaserScan)" in " ".join(lines)
+    assert "publish them as Detection3DArray" in " ".join(lines)
+    _, lines, _ = info(ODOMETRY, SEEN, name="b.mcap")
+    assert not any("no input reads" in line for line in lines)
+
+
 @pytest.mark.parametrize("fields", [("range", "id"), ("range", "bearing", "id"), ("x", "y", "id"), ("bearing", "id")])
 def test_clouds_of_landmarks_are_offered_by_their_fields(info, capsys, fields):
     code, _, words = info(ODOMETRY, ("/beacons", CLOUD, beacons(*fields)))
@@ -291,6 +330,8 @@ def test_an_imu_is_offered_where_nothing_else_is(info, capsys, covariance):
     _, lines, words = info(ODOMETRY, SEEN, ("/imu/data", IMU, compass()), name="b.mcap")
     assert not any("imu" in word for word in words)
     assert any(line.startswith("not used: /imu/data: its heading may drift") for line in lines)
+    offered = shlex.split(" ".join(lines).split("With it: ")[1].split(" graph_slam replay")[0])
+    assert run([*words[:-2], *offered, "--out", "b_imu"], capsys)[0]["inputs"]["imu"]["believed"] > 0
     _, lines, _ = info(ODOMETRY, ("/imu/raw", IMU, compass(-1.0)), name="c.mcap")
     assert any(line.startswith("not used: /imu/raw: it has no orientation") for line in lines)
 
@@ -377,4 +418,16 @@ def test_an_input_that_is_mostly_not_believed_is_said():
     summary = {"inputs": {"uwb": counts}, "counters": {}, "waiting": {}, "landmarks": 4, "sightings": 90}
     (sentence,) = shortcomings(summary)
     assert sentence.startswith("uwb: only 30 of 90 are believed: ")
+    for hint in ("metres and radians", "uwb.mount", "uwb.offset_s", "--set uwb.noise=sigmas --set uwb.sigma_m"):
+        assert hint in sentence
     assert not [*shortcomings(summary | {"inputs": {"uwb": counts | {"believed": 80}}})]
+
+
+def test_odometry_that_keeps_jumping_is_said(info, capsys):
+    def millimetres(k, stamp_ns, truth, drifting):
+        return odometry(pose(1000 * drifting[0], 1000 * drifting[1]), "odom", "base_link", stamp_ns)
+
+    _, _, words = info(("/odom", ODOM, millimetres), SEEN)
+    told, _, err = run(words, capsys, code=3)
+    assert f"odom: {told['counters']['odom']['jump']} jumps, each begins a segment" in err
+    assert "metres and radians?" in err

@@ -457,6 +457,13 @@ def test_a_configured_mount_does_not_stand_in_for_a_joint_that_tf_is_late_to_tel
     assert only(heard(b, "tf", turret(0.1, 0.0))).measured == pytest.approx((3.0, 0.0))
 
 
+def test_a_configured_mount_counts_where_tf_knows_the_frame_in_a_tree_of_its_own():
+    b = border(("chassis", "eye", (5.0, 0.0, 0.0), quaternion()), detections={"mount": "9 0 0 0 0 0"})
+    found = detections(detection(pose(2.0, 0.0), np.eye(6) * 0.01, "dock"), frame="eye", stamp_ns=STAMP_NS)
+    assert only(heard(b, "detections", found)).measured[0] == pytest.approx(11.0)
+    assert counted(b) == {}
+
+
 def test_what_tf_never_tells_of_is_refused_when_odometry_has_moved_on_or_ends():
     b = border(**MOVING)
     b.convert("tf", turret(-0.1, 0.0))

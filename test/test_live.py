@@ -278,7 +278,7 @@ def test_what_is_wrong_before_the_first_estimate_is_named(facts, state, reason):
                 tags(received=4, silent_s=0.0, recent=refused(4, frame_unknown=4), frames=(("c", "base_link"),)),
             ),
             "/tags: all refused in 10 s (frame_unknown): no transform links c to base_link:"
-            " publish the transform on /tf_static, or tags.mount, or frames.base as the recording names it",
+            " publish the transform on /tf_static, or tags.mount, or frames.base as the messages name it",
         ),
         (
             {},

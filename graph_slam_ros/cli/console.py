@@ -16,6 +16,7 @@ from graph_slam_ros.formats.files import is_regular
 # Control characters, and those that change the direction of a text or are not seen.
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
 _MAX_CHARACTERS, _MAX_LINES = 200, 20  # characters of a line on standard error; lines of losses
+SENTENCE = 1000  # characters of what falls short: reason, meaning and the settings that mend it
 _LEAST_WORD = 40  # characters that a word keeps when it is shortened: the name of a file, and a part of its folder
 _GAP = "..."
 DONE, FAULT, REFUSED, LOSSES, INTERRUPTED = 0, 1, 2, 3, 130
@@ -109,7 +110,7 @@ class Throttled:
 def report_losses(losses: Sequence[str], warnings: Sequence[str] = ()) -> int:
     """Tell what was lost, and what to beware of; returns the exit code."""
     for warning in warnings:
-        warn(f"beware: {warning}")
+        warn(f"beware: {warning}", most=SENTENCE)
     distinct = list(dict.fromkeys(losses))
     for loss in distinct[:_MAX_LINES]:
         warn(f"lost: {loss}")

@@ -12,7 +12,6 @@ from graph_slam_ros.errors import GraphSlamError
 if TYPE_CHECKING:
     from graph_slam_ros.slam import Config
 
-_SENTENCE = 1000  # characters of what falls short: reason, meaning and the settings that mend it
 _NO_MATPLOTLIB = "matplotlib is not installed: pip install matplotlib"
 
 
@@ -250,7 +249,7 @@ def _print_shortcomings(summary: dict[str, Any]) -> int:
 
     shortcomings = list(outcome.shortcomings(summary))
     for sentence in shortcomings:
-        console.warn(sentence, most=_SENTENCE)
+        console.warn(sentence, most=console.SENTENCE)
     return console.LOSSES if shortcomings else console.DONE
 
 

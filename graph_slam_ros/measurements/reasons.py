@@ -39,7 +39,7 @@ class Reason:
 _REFUSED, _REPAIRED, _NOTED = Effect.REFUSED, Effect.REPAIRED, Effect.NOTED
 _COVARIANCE = "correct the driver's covariance, or INPUT.noise=sigmas with INPUT.sigma_m and INPUT.sigma_rad"
 _SIGMAS = "INPUT.sigma_m, INPUT.sigma_rad: its standard deviations; of closures with INPUT.noise=sigmas"
-_FRAMES = "publish the transform on /tf_static, or INPUT.mount, or frames.base as the recording names it"
+_FRAMES = "publish the transform on /tf_static, or INPUT.mount, or frames.base as the messages name it"
 _SPACE = "world.dimensions=3"
 
 REASONS: dict[str, Reason] = {
@@ -145,7 +145,8 @@ REASONS: dict[str, Reason] = {
     "other_publisher": Reason(
         _REFUSED,
         "the pose does not continue the odometry in use: another node publishes on the same topic, or it is an outlier",
-        "one publisher for each odometry topic: ros2 topic info -v TOPIC; a second odometry is an input of its own",
+        "one publisher for each odometry topic: ros2 topic info -v TOPIC; a second odometry is an input of its own; "
+        "where there is one only, metres and radians",
     ),
     "reset_to_zero": Reason(_NOTED, "odometry was set back to zero: a new segment begins"),
     # -- landmarks
@@ -159,7 +160,9 @@ REASONS: dict[str, Reason] = {
         _REFUSED, "the identity is a name that is given to landmarks without one", "INPUT.id_prefix"
     ),
     "unclear_which": Reason(
-        _REFUSED, "a detection without identity may be of several landmarks, or of none", "landmarks.association=joint"
+        _REFUSED,
+        "a detection without identity may be of several landmarks, or of none",
+        "landmarks.association=joint where it is nearest; else smaller noise, where the sensor is better than told",
     ),
     "not_for_a_pose": Reason(
         _REFUSED, "a range or bearing to a landmark that is known as a pose", "INPUT.id_prefix: two identities"
@@ -246,12 +249,13 @@ REASONS: dict[str, Reason] = {
     "displaced": Reason(
         _NOTED,
         "the landmarks showed that the robot was elsewhere than odometry said: it slipped or was carried",
-        "graph_slam explain RUN; if it happens often, correct the odometry",
+        "graph_slam explain RUN; if it happens often, correct the odometry, the sensor's place (INPUT.mount or TF) or "
+        "its clock (INPUT.offset_s)",
     ),
     "displacement_taken_back": Reason(
         _NOTED,
         "a displacement was decided, and later sightings contradict it: landmarks repeat, or ids are used twice",
-        "graph_slam explain RUN; give each landmark an id of its own",
+        "graph_slam explain RUN; give each landmark an id of its own; check the sensor's place (INPUT.mount or TF)",
     ),
     "new_while_elsewhere": Reason(
         _REFUSED,

@@ -121,7 +121,7 @@ class Runtime:
     def _leave(self) -> None:
         waiting, lost = self._session.leave()
         folder, log = self._node.config.output.folder, self._node.get_logger()
-        if folder:
+        if folder and (waiting or self._session.slam.processed):
             log.warn(
                 f"stopped while {waiting} measurements waited: all are in the journal; the next start completes the"
                 f" results, or graph_slam recover {folder}"

@@ -15,9 +15,13 @@ _WIDTH = 100
 _MOST_REASONS, _MAX_UNDETERMINED = 5, 10  # that are listed
 _COLUMNS = ("received", "used", "believed")
 _OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does not move in a plane
+_JUMPY, _MOST_JUMPS = 0.02, 5  # of all messages of an odometry; with more its motion is hardly used
 _MOSTLY = 0.5
+_MENDED = ("displaced", "displacement_taken_back", "jump")  # of what is noted, signs of a wrong setting
 _CONTRADICT = (
-    "graph_slam explain RUN says why; if its noise is larger than told, --set {0}.noise=sigmas {0}.sigma_m=..."
+    "graph_slam explain RUN says why. Check of this sensor and of odometry: metres and radians, y and bearings to the "
+    "left, where the sensor is (TF or {0}.mount), its clock ({0}.offset_s), ids that are used twice. If only its noise "
+    "is larger than told: --set {0}.noise=sigmas --set {0}.sigma_m=..."
 )
 _ON_JUMP = "--set time.on_jump=segment goes on in the same map, reset in another run"
 _EXTREME = "distances or noise that no robot means do that: --set INPUT.max_distance_m=... or INPUT.noise=sigmas"
@@ -45,9 +49,16 @@ def text(summary: Summary) -> list[str]:
         for source, counts in summary["counters"].items()
         for reason, times in counts.items()
         if source not in inputs or explain(reason).effect is not Effect.REFUSED
-        for line in _wrapped(f"counted    {source}: {reason} {times} ({explain(reason).meaning})", 11)
+        for line in _counted_lines(source, reason, times)
     ]
     return [*lines, *undetermined, *others, *table(summary)]
+
+
+def _counted_lines(source: str, reason: str, times: int) -> Iterator[str]:
+    """What was repaired or noted; the line that mends it where it came again and again."""
+    yield from _wrapped(f"counted    {source}: {reason} {times} ({explain(reason).meaning})", 11)
+    if times > 1 and reason in _MENDED and (mend := explain(reason).remedy):
+        yield from textwrap.wrap(f"-> {mend}", _WIDTH, initial_indent=" " * 11, subsequent_indent=" " * 14)
 
 
 def _wrapped(line: str, indent: int) -> list[str]:
@@ -97,6 +108,12 @@ def shortcomings(summary: Summary) -> Iterator[str]:
         out_of_plane = summary["counters"].get(name, {}).get("out_of_plane", 0)
         if is_odometry and out_of_plane > _OUT_OF_PLANE * (counts["received"] or counts["used"]):
             yield f"{name} leaves the plane: these are three dimensions: --set world.dimensions=3"
+        jumps = summary["counters"].get(name, {}).get("jump", 0)
+        if is_odometry and jumps > max(_MOST_JUMPS, _JUMPY * (counts["received"] or counts["used"])):
+            yield (
+                f"{name}: {jumps} jumps, each begins a segment, and the motion across it is not used: odometry in "
+                "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
+            )
     if not sum(counts["believed"] or 0 for counts in inputs.values()):
         yield "this is odometry alone: no landmark, fix or closure is in the result"
     elif summary["landmarks"] and summary["sightings"] == summary["landmarks"]:

@@ -47,10 +47,13 @@ _ESTIMATE = re.compile(
 _FUSED = re.compile(r"filtered|fused|[eu]kf|combined", re.IGNORECASE)
 _NOT_MEASURED = re.compile(r"raw|cmd|desired|target|set_?point|plan", re.IGNORECASE)
 _TAG = re.compile(r"((?:.*[/_])?(?:tag|aruco|marker|fiducial).*?)[:_]?\d+", re.IGNORECASE)
+_TAG_TOPIC = re.compile(r"(?:tag|aruco|marker|fiducial)[_/:]?(\d+)(?:/pose)?$", re.IGNORECASE)
 _CORNERS = re.compile(r"tag|aruco|fiducial", re.IGNORECASE)
 _MAPS = ("map", "earth", "utm")
 _OPTICAL = "0 0 0 -1.5707963 0 -1.5707963"  # z ahead, x to the right
 _OFF_PLANE = 0.05
+_OF_ROS = ("/clock", "/rosout", "/parameter_events", "/diagnostics", "/events/write_split", "/robot_description")
+_MOST_LISTED = 6
 _CLOCKS_DIFFER_S, _MOST_OFFSET_S = 2.0, 3600.0
 
 
@@ -179,8 +182,24 @@ class Suggestion:
         if not child:
             self.settings["odom.mount"] = "0 0 0 0 0 0"
             self.notes.append("odometry names no child frame: that of the robot's base is assumed")
+        elif base := self._unlinked_base(child):
+            self.settings["odom.mount"] = "0 0 0 0 0 0"
+            self.notes.append(
+                f"no transform links {child}, which odometry names, to {base}, which carries the sensors: "
+                "they are taken for one place (odom.mount)"
+            )
+            if base != self._base:
+                self.settings["frames.base"] = self._base = base
         elif child != self._base:
             self.settings["frames.base"] = self._base = child
+
+    def _unlinked_base(self, child: str) -> str:
+        """The base that carries the sensors on /tf_static where odometry's child is not linked to it, else empty."""
+        fixed = self._recording.fixed
+        if child in fixed or child in fixed.values():
+            return ""
+        roots = {parent for parent in fixed.values() if parent not in fixed and "base" in parent}
+        return roots.pop() if len(roots) == 1 else ""
 
     # -- landmarks -----------------------------------------------------------------------------------------------
 
@@ -194,6 +213,9 @@ class Suggestion:
                 self._corners(one)
             else:
                 self._add(_LANDMARKS[one.topic.type], one, linked=one.topic.type == APRILTAGS)
+        for one in self._of_type(POSE, POSE_WITH_COVARIANCE):
+            if number := self._tag_number(one):
+                self._add("tag", one, {"use": "landmarks", "id": number})
         prefixes = {found[1] for found in map(_TAG.fullmatch, self._recording.moving) if found}
         if not any(name.startswith("tags") for name in self._names):
             for prefix in sorted(prefixes):
@@ -204,7 +226,12 @@ class Suggestion:
             if _CORNERS.search(one.topic.type) and one.topic.type not in CONVERTERS:
                 self._corners(one)
             elif one.topic.type == "visualization_msgs/msg/MarkerArray" and not _TRUTH.search(name):
-                self.unused[name] = f"markers are mostly pictures; --set marks.type={one.topic.type} takes them"
+                self.unused[name] = "markers are mostly pictures; an input of this type and topic takes them"
+
+    def _tag_number(self, one: TopicContents) -> str:
+        """Of a topic that has the pose of one tag as the camera sees it; empty of any other."""
+        found = _TAG_TOPIC.search(one.topic.name)
+        return found[1] if found and one.frame not in (*_MAPS, "world", self._odom) else ""
 
     def _corners(self, one: TopicContents) -> None:
         self.unused[one.topic.name] = (
@@ -266,7 +293,9 @@ class Suggestion:
         self._choose_imu(self._of_type(IMU), is_needed=len(self._names) == 1)
         for one in self._of_type(POSE, POSE_WITH_COVARIANCE):
             name = one.topic.name
-            if _ESTIMATE.search(name):
+            if self._tag_number(one):
+                pass  # a landmark
+            elif _ESTIMATE.search(name):
                 self.unused[name] = "the output of a localiser, or a goal: no measurement"
             elif one.frame == self._odom:
                 self.unused[name] = "in the frame of the odometry: it says the same"
@@ -284,7 +313,12 @@ class Suggestion:
             if one.usable < 0.5 * one.read:
                 self.unused[one.topic.name] = "it has no orientation (an IMU with a filter has)"
             elif not is_needed:
-                self.unused[one.topic.name] = "its heading may drift, and there is better: --set imu.type=" + IMU
+                names = " ".join([*self._names, "imu"])
+                mount = "" if self._recording.is_linked(one.frame, self._base) else " --set 'imu.mount=0 0 0 0 0 0'"
+                self.unused[one.topic.name] = (
+                    "its heading may drift, and there is better. With it: "
+                    f"--set 'inputs.names={names}' --set imu.type={IMU} --set imu.topic={one.topic.name}{mount}"
+                )
             else:
                 self._add("imu", one, {} if one.has_noise else {"sigma_rad": 0.05})
                 is_needed = False
@@ -338,6 +372,20 @@ class Suggestion:
             self.settings = {"inputs.names": names} | self.settings
         if self._names == ["odom"]:
             self.notes.append("nothing corrects this odometry: the result will be odometry alone (exit code 3)")
+        self._not_read()
+
+    def _not_read(self) -> None:
+        """Topics of types that no input reads, of which one may be what was hoped for."""
+        found = [
+            f"{name} ({one.topic.type or 'no type'})"
+            for name, one in sorted(self._recording.topics.items())
+            if one.topic.type not in CONVERTERS and name not in self.unused and name not in _OF_ROS
+        ]
+        if found:
+            more = f" and {len(found) - _MOST_LISTED} more" if len(found) > _MOST_LISTED else ""
+            note = f"no input reads {', '.join(found[:_MOST_LISTED])}{more}: their types are none of docs/inputs.md"
+            own = "; landmarks in a type of your own: publish them as Detection3DArray or PointCloud2"
+            self.notes.append(note + own * (self._names == ["odom"]))
 
 
 def _lag_s(one: TopicContents) -> float:

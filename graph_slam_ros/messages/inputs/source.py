@@ -110,6 +110,8 @@ class InputContext:
         if self._mount is not None and not self.transforms.knows(frame):
             return self._mount
         if not self._may_come(stamp_ns):
+            if self._mount is not None and not self.transforms.are_linked(self.config.frames.base, frame):
+                return self._mount
             raise self._not_linked("frame_unknown", frame, self.config.frames.base)
         raise NotYet
 

@@ -53,6 +53,19 @@ class Transforms:
         """Return whether the frame has a parent."""
         return frame in self._fixed or frame in self._moving
 
+    def are_linked(self, a: str, b: str) -> bool:
+        """Whether two frames are in one tree, whatever the stamps of its joints."""
+        return self._root(a) == self._root(b)
+
+    def _root(self, frame: str) -> str:
+        seen = {frame}
+        while frame in self._fixed or frame in self._moving:
+            frame = self._fixed[frame][0] if frame in self._fixed else self._moving[frame].parent
+            if frame in seen:  # a loop
+                break
+            seen.add(frame)
+        return frame
+
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> se3.Pose | None:
         """``T_target_source`` at a stamp, or of what never moves; None where the frames are not linked then."""
         if target == source:
