@@ -33,7 +33,7 @@ class Publisher:
 
     def hear(self, messages):
         for m in messages:
-            self.used += self._one.take(m)
+            self.used += self._one.accept(m)
         return self
 
     def end(self):
