@@ -55,12 +55,15 @@ def told(capsys, *words):
     return code, out, err
 
 
+BEWARE = ("is not the one that run.json was saved with", "run.json is not the summary of a run")
+
+
 def is_refused(capsys, what, command, run, *words):
     """Whether a command does not do it, but tells in one line which part of the run is wrong."""
     code, out, err = told(capsys, command, run, *words)
     if code == 0:
         assert out, (what, command, words)
-        assert all("is not the one that run.json was saved with" in line for line in err.splitlines()), (what, err)
+        assert all(any(word in line for word in BEWARE) for line in err.splitlines()), (what, err)
         return False
     assert (code, out, err.count("\n")) == (2, "", 1), (what, command, words, err)
     assert any(word in err for word in (*READ, run.name, "vertex", "edge")), (what, command, words, err)

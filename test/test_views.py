@@ -73,11 +73,14 @@ def test_every_topic_of_foxglove_is_the_nodes_or_of_a_runs_recording(tmp_path):
 
 
 def test_what_foxglove_plots_is_among_the_nodes_diagnostics():
-    health = pytest.importorskip("graph_slam_ros.node.diagnostics")
-    given = {field.name: 0 for field in dataclasses.fields(health.Estimate)}
-    estimate = health.Estimate(**given | {"correction": Correction()})
-    facts = health.Facts("active", estimate=estimate)
-    told = {status.name: set(status.values) for status in health.statuses(facts, health.Verdict("OK"), "graph_slam")}
+    diagnostics = pytest.importorskip("graph_slam_ros.node.diagnostics")
+    given = {field.name: 0 for field in dataclasses.fields(diagnostics.Estimate)}
+    estimate = diagnostics.Estimate(**given | {"correction": Correction()})
+    facts = diagnostics.Facts("active", estimate=estimate)
+    told = {
+        status.name: set(status.values)
+        for status in diagnostics.statuses(facts, diagnostics.Health("OK"), "graph_slam")
+    }
     plotted = [path["value"] for panel in panels("Plot") for path in panel["paths"] if "diagnostics" in path["value"]]
     assert len(plotted) == 2
     for path in plotted:
