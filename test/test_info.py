@@ -16,7 +16,7 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.lie import se2
 from graph_slam_ros.messages.to_msg import header
 from graph_slam_ros.recordings.bag import BagWriter
-from graph_slam_ros.runs.outcome import shortcomings
+from graph_slam_ros.runs.outcome import doubts, shortcomings
 
 NS = 10**9
 START_NS = 1_700_000_000 * NS
@@ -420,7 +420,12 @@ def test_an_input_that_is_mostly_not_believed_is_said():
     assert sentence.startswith("uwb: only 30 of 90 are believed: ")
     for hint in ("metres and radians", "uwb.mount", "uwb.offset_s", "--set uwb.noise=sigmas --set uwb.sigma_m"):
         assert hint in sentence
-    assert not [*shortcomings(summary | {"inputs": {"uwb": counts | {"believed": 80}}})]
+    assert not [*doubts(summary)], "said already"
+    doubted = summary | {"inputs": {"uwb": counts | {"believed": 80}}}
+    assert not [*shortcomings(doubted)]
+    (sentence,) = doubts(doubted)
+    assert sentence.startswith("uwb: 11 % of 90 are not believed: ") and "uwb.mount" in sentence
+    assert not [*doubts(summary | {"inputs": {"uwb": counts | {"believed": 87}}})]
 
 
 def test_odometry_that_keeps_jumping_is_said(info, capsys):

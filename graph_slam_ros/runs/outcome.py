@@ -17,6 +17,7 @@ _COLUMNS = ("received", "used", "believed")
 _OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does not move in a plane
 _JUMPY, _MOST_JUMPS = 0.02, 5  # of all messages of an odometry; with more its motion is hardly used
 _MOSTLY = 0.5
+_DOUBTED = 0.05  # of an input: as many that are not believed are said
 _MENDED = ("displaced", "displacement_taken_back", "jump")  # of what is noted, signs of a wrong setting
 _CONTRADICT = (
     "graph_slam explain RUN says why. Check of this sensor and of odometry: metres and radians, y and bearings to the "
@@ -118,6 +119,17 @@ def shortcomings(summary: Summary) -> Iterator[str]:
         yield "this is odometry alone: no landmark, fix or closure is in the result"
     elif summary["landmarks"] and summary["sightings"] == summary["landmarks"]:
         yield "no landmark was seen twice, so they correct nothing: do ids change? --set landmarks.association=joint"
+
+
+def doubts(summary: Summary) -> Iterator[str]:
+    """Return a sentence for each input of which more than a few measurements are not believed, but most are."""
+    for name, counts in summary.get("inputs", {}).items():
+        if counts["use"] == "odometry" or not counts["used"]:
+            continue
+        believed = counts["believed"] or 0
+        if _MOSTLY * counts["used"] <= believed < (1.0 - _DOUBTED) * counts["used"]:
+            part = 100.0 * (1.0 - believed / counts["used"])
+            yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {_CONTRADICT.format(name)}"
 
 
 def _unused(summary: Summary, name: str, received: int | None) -> str:

@@ -31,6 +31,7 @@ from graph_slam_ros.runs import (
 )
 from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.outcome import doubts
 from graph_slam_ros.runs.restore import Stopwatch
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
@@ -311,7 +312,7 @@ def _recorded(
 
 
 def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
-    return [*map(str, slam.alarms), *mendable(summary["counters"])]
+    return [*map(str, slam.alarms), *doubts(summary), *mendable(summary["counters"])]
 
 
 def _kept(out: Path) -> Path:
