@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
+from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.node.recent import WINDOW_S, Recent
-from graph_slam_ros.node.session import Estimate
 
 _LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them
 _TF_BEHIND_S = 1.0

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.types import Odometry
-from graph_slam_ros.node.session import Estimate
+from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise, StationaryDetector
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.typing import Numbers

@@ -8,14 +8,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import InitialPose
+from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.node.resumption import Resumption
 from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.runs import (
@@ -34,52 +34,10 @@ from graph_slam_ros.runs import (
     summarize,
 )
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement, Update
-from graph_slam_ros.slam.graph_slam import Correction
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.typing import Numbers
 
 OnUpdate = Callable[[GraphSlam, Update], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """What is known after an update, for whoever must not wait for the next.
-
-    Attributes
-    ----------
-    T_map_odom : the correction; of identity before the first keyframe
-    T_odom_keyframe, covariance, stamp_ns : odometry's pose, tangent covariance and stamp of the newest keyframe
-    source : the odometry in use
-    is_confirmed : whether the robot knows where it is in a map that was loaded
-    fit : chi2 per degree of freedom; NaN before it was looked at
-    rivals : loop closures of other explanations that could not be ruled out
-    displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
-    is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
-    """
-
-    T_map_odom: Numbers
-    T_odom_keyframe: Numbers
-    covariance: Any
-    stamp_ns: int
-    source: str
-    is_confirmed: bool
-    keyframes: int
-    landmarks: int
-    edges: int
-    segments: int
-    solves: int
-    correction: Correction
-    solve_s: float
-    slowest_solve_s: float
-    fit: float
-    rivals: int
-    displaced: str = ""
-    is_resumed: bool = False
-
-    @property
-    def is_located(self) -> bool:
-        """Whether pose and ``map -> odom`` may be published."""
-        return self.is_confirmed or self.is_resumed
 
 
 class Session:
@@ -219,29 +177,17 @@ class Session:
         return True
 
     def _look(self, update: Update, took_s: float) -> None:
-        slam, newest = self.slam, self.slam.keyframes[-1]
-        covariance = slam.pose_covariance
+        slam = self.slam
         if update.solved and not self._is_confirmed and len(slam.keyframes) > self._loaded:
             self._is_confirmed = self._is_sure
-        self.estimate = Estimate(
-            slam.T_map_odom,
-            newest.T_odom_base,
-            covariance,
-            newest.stamp_ns,
-            slam.odometry_source,
-            self._is_confirmed,
-            len(slam.keyframes),
-            len(slam.landmarks),
-            slam.graph.edge_count,
-            len(slam.segments),
-            slam.solves,
+        self.estimate = Estimate.of(
+            slam,
             update.correction,
-            took_s,
-            self._slowest_s,
-            self._fit,
-            sum(len(rival.only_here) for rival in slam.backend.rivals),
-            str(slam.displaced or ""),
-            not self._is_confirmed and self._resumption is not None and self._resumption.goes_on(slam),
+            is_confirmed=self._is_confirmed,
+            is_resumed=not self._is_confirmed and self._resumption is not None and self._resumption.goes_on(slam),
+            solve_s=took_s,
+            slowest_solve_s=self._slowest_s,
+            fit=self._fit,
         )
 
     @property

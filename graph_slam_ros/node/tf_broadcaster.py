@@ -7,9 +7,9 @@ from collections.abc import Callable
 from tf2_msgs.msg import TFMessage
 
 from graph_slam_ros.messages import to_msg
+from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.map_to_odom import MapToOdom
-from graph_slam_ros.node.session import Estimate
 from graph_slam_ros.node.subscriptions import full_name
 from graph_slam_ros.slam import Config, Odometry
 
