@@ -107,9 +107,9 @@ def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_key
     rare, often = round_a_curve(dimensions, 3.2), round_a_curve(dimensions, 0.4)
     reckoning = PoseExtrapolator(rare.config)
     for k in range(heard_from, 21):
-        assert reckoning.hear(drive(dimensions, k), rare.estimate)
+        assert reckoning.on_odometry(drive(dimensions, k), rare.estimate)
     at, covariance = reckoning.pose(rare.estimate)
-    often.convert([drive(dimensions, 20)])
+    often.take([drive(dimensions, 20)])
     slam = often.slam
     assert (slam.keyframes[-1].stamp_ns, len(slam.keyframes)) == (drive(dimensions, 20).stamp_ns, 21)
     assert rare.estimate.keyframes < 10
@@ -126,7 +126,7 @@ def test_asking_at_each_message_or_at_the_last_alone_gives_the_same():
     often, once = PoseExtrapolator(session.config), PoseExtrapolator(session.config)
     for k in range(15, 40):
         for one in (often, once):
-            one.hear(drive(2, k), session.estimate)
+            one.on_odometry(drive(2, k), session.estimate)
         asked = often.pose(session.estimate)
     pose, covariance = once.pose(session.estimate)
     assert (pose, covariance.tolist()) == (asked[0], asked[1].tolist())
@@ -135,10 +135,10 @@ def test_asking_at_each_message_or_at_the_last_alone_gives_the_same():
 def test_another_odometry_or_an_older_message_says_nothing_of_the_robot_in_the_map():
     session = round_a_curve(2, 3.2)
     reckoning = PoseExtrapolator(session.config)
-    assert reckoning.hear(drive(2, 19), session.estimate)
-    assert not reckoning.hear(drive(2, 20, "another"), session.estimate)
-    assert not reckoning.hear(drive(2, 18), session.estimate)
-    assert not reckoning.hear(drive(2, 19), session.estimate)
+    assert reckoning.on_odometry(drive(2, 19), session.estimate)
+    assert not reckoning.on_odometry(drive(2, 20, "another"), session.estimate)
+    assert not reckoning.on_odometry(drive(2, 18), session.estimate)
+    assert not reckoning.on_odometry(drive(2, 19), session.estimate)
     assert reckoning.newest == drive(2, 19)
 
 

@@ -27,7 +27,7 @@ class Completion:
     def tick(self) -> None:
         """See whether one has ended, and begin the next."""
         if self._process is not None and self._process.poll() is not None:
-            self._tell(self._process)
+            self._report(self._process)
             self._process = None
         if self._process is None and self._runs:
             self._begin(self._runs.pop(0))
@@ -51,7 +51,7 @@ class Completion:
         )
         os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICE)
 
-    def _tell(self, process: "subprocess.Popen[str]") -> None:
+    def _report(self, process: "subprocess.Popen[str]") -> None:
         _, said = process.communicate()
         if process.returncode:
             why = said.strip().splitlines()[-1:] or [f"exit code {process.returncode}"]

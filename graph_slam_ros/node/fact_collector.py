@@ -60,7 +60,7 @@ class FactCollector:
         counters.update(self._counters)
         counters.update(pipeline)
         counted, processed = counters.as_dict(), self._ingest.processed
-        recent = self._recent.look(time.monotonic(), processed, self._counters.as_dict(), pipeline.as_dict())
+        recent = self._recent.observe(time.monotonic(), processed, self._counters.as_dict(), pipeline.as_dict())
         overflows = sum(of.get("overflow", 0) for of in counted.values())
         failures, restarts = session.failures, self._counters["node", "worker_restarted"]
         before, self._before = self._before, (overflows, failures, restarts)

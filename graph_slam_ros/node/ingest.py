@@ -169,7 +169,7 @@ class Ingest:
 
     def _is_newest(self, m: Odometry) -> bool:
         """Whether odometry says where the robot is now; what is ahead of the clock would be the newest for long."""
-        return not self._future_stamps.is_ahead([m]) and self.extrapolator.hear(m, self._session.estimate)
+        return not self._future_stamps.is_ahead([m]) and self.extrapolator.on_odometry(m, self._session.estimate)
 
     def _publish_odometry(self, m: Odometry, cdr: bytes) -> None:
         estimate, config = self._session.estimate, self._node.config

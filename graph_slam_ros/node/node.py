@@ -275,11 +275,11 @@ class GraphSlamNode(LifecycleNode):
         since = time.monotonic() - 10.0
         facts = replace(facts, faults=sum(at > since for at in self._faults))
         verdict = diagnostics.judge(facts, self.config)
-        self._tell(verdict)
+        self._log(verdict)
         statuses = diagnostics.statuses(facts, verdict, self.get_fully_qualified_name().lstrip("/"))
         self._diagnostics.publish(to_msg.diagnostics(self.now_ns, statuses))
 
-    def _tell(self, verdict: diagnostics.Health) -> None:
+    def _log(self, verdict: diagnostics.Health) -> None:
         """In the log where it changes, numbers apart; what somebody must do something about, every few seconds.
 
         A node that has just begun to wait is no reason to warn: publishers take a moment to be discovered.

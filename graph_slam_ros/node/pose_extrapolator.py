@@ -32,8 +32,8 @@ class PoseExtrapolator:
         """The newest odometry of the source that is in use."""
         return self._since[-1] if self._since else None
 
-    def hear(self, m: Odometry, estimate: Estimate | None) -> bool:
-        """Take an odometry message; whether it is of the source in use, and newer than the last."""
+    def on_odometry(self, m: Odometry, estimate: Estimate | None) -> bool:
+        """Add an odometry message; return whether it is of the source in use, and newer than the last."""
         if estimate is not None and estimate.source != m.source:
             return False
         if self._since and m.source == self._since[-1].source and m.stamp_ns <= self._since[-1].stamp_ns:

@@ -96,10 +96,10 @@ class Publishers:
             for name in _LANDMARKS:
                 self._topics[name].is_stale = True
         if self._events.get_subscription_count():
-            self.tell(slam.keyframes[-1].stamp_ns, events.of_update(slam, update))
+            self.publish_events(slam.keyframes[-1].stamp_ns, events.of_update(slam, update))
 
-    def tell(self, stamp_ns: int, happened: Iterable[Status]) -> None:
-        """Events, whoever listens."""
+    def publish_events(self, stamp_ns: int, happened: Iterable[Status]) -> None:
+        """Publish events, whoever subscribes."""
         if statuses := list(happened):
             self._events.publish(to_msg.diagnostics(stamp_ns, statuses))
 

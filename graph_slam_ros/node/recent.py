@@ -56,7 +56,7 @@ class RecentInputs:
     def __init__(self) -> None:
         self._past: deque[tuple[float, Counter[str], Counter[tuple[str, str]]]] = deque([(0.0, Counter(), Counter())])
 
-    def look(self, now_s: float, accepted: Mapping[str, int], before: Counts, after: Counts) -> dict[str, Recent]:
+    def observe(self, now_s: float, accepted: Mapping[str, int], before: Counts, after: Counts) -> dict[str, Recent]:
         """What became of each input lately; to be called every second or so.
 
         Parameters

@@ -77,7 +77,7 @@ class Runtime:
         node, config, ingest = self._node, self._node.config, self._ingest
         self._broadcaster = TfBroadcaster(node, config, node.guarded, self._now)
         self._subscriptions = Subscriptions(
-            node, config, ingest.converter, ingest.receive, node.guarded, self._broadcaster.heard, self.counters
+            node, config, ingest.converter, ingest.receive, node.guarded, self._broadcaster.on_correction, self.counters
         )
         ingest.activate()
 

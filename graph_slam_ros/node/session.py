@@ -49,9 +49,9 @@ class Session:
     on_update : called with what an update changed
     """
 
-    def __init__(self, config: Config, border: Counters, on_update: OnUpdate, tell: Callable[[str, str], None]) -> None:
+    def __init__(self, config: Config, border: Counters, on_update: OnUpdate, warn: Callable[[str, str], None]) -> None:
         self.config = config
-        self._border, self._on_update, self._tell = border, on_update, tell
+        self._border, self._on_update, self._warn = border, on_update, warn
         self._folder = Path(config.output.folder) if config.output.folder else None
         self.estimate: Estimate | None = None
         self._recorder: RunRecorder | None = None
@@ -77,7 +77,7 @@ class Session:
                 self.recording_fails = True
                 raise
         self.slam, self._recorder, self.recording_fails = slam, recorder, False
-        self.slam.counters.on_first = self._tell
+        self.slam.counters.on_first = self._warn
         self._refused_before = Counters()
         self._refused_before.update(self._border)
         self.estimate = None
@@ -156,7 +156,7 @@ class Session:
         recorded = self._recorded(lambda recorder: recorder.record(self.slam, update))
         if self._recorded(RunRecorder.flush) and recorded:  # nobody is told of anything that a restart would not know
             self.recording_fails = False
-        self._look(update, took_s)
+        self._update_estimate(update, took_s)
         self._on_update(self.slam, update)
 
     def _recorded(self, write: Callable[[RunRecorder], None]) -> bool:
@@ -167,16 +167,16 @@ class Session:
             write(self._recorder)
         except OSError as error:
             if not self.recording_fails:
-                self._tell("output.folder", error.strerror or type(error).__name__)
+                self._warn("output.folder", error.strerror or type(error).__name__)
             self.recording_fails = True
             if self._recorder.unwritten > _MOST_UNWRITTEN:
                 self._recorder.abandon()
                 self._recorder = None
-                self._tell("output.folder", "recording was given up: too much waits for room")
+                self._warn("output.folder", "recording was given up: too much waits for room")
             return False
         return True
 
-    def _look(self, update: Update, took_s: float) -> None:
+    def _update_estimate(self, update: Update, took_s: float) -> None:
         slam = self.slam
         if update.solved and not self._is_confirmed and len(slam.keyframes) > self._loaded:
             self._is_confirmed = self._is_sure
@@ -311,7 +311,7 @@ class Session:
             at = " ".join(f"{x:.6g}" for x in T_map_base[: self.config.space.dimensions])
             where.append(f"the robot is taken to be at {at}")
         self._recorded(RunRecorder.flush)
-        self._look(Update(), 0.0)
+        self._update_estimate(Update(), 0.0)
         return ": ".join([run.name, f"{len(self.slam.keyframes)} keyframes", *where, *losses[:1]])
 
     def _place(self, T_map_base: Numbers) -> None:

@@ -23,7 +23,7 @@ class TfBroadcaster:
     Parameters
     ----------
     guarded : makes a callback that raises nothing
-    look : gives the configuration, the last estimate and the newest odometry
+    now : gives the configuration, the last estimate and the newest odometry
     """
 
     def __init__(
@@ -31,9 +31,9 @@ class TfBroadcaster:
         node: NodeHandle,
         config: Config,
         guarded: Callable[[Callable[..., None]], Callable[..., None]],
-        look: Callable[[], tuple[Config, Estimate | None, Odometry | None]],
+        now: Callable[[], tuple[Config, Estimate | None, Odometry | None]],
     ) -> None:
-        self._node, self._look = node, look
+        self._node, self._now = node, now
         self._policy = MapToOdom(config)
         self._publisher = node.create_publisher(TFMessage, "/tf", 100)
         self._is_closed = False
@@ -51,7 +51,7 @@ class TfBroadcaster:
         """Stamps begin anew."""
         self._policy.forget_time()
 
-    def heard(self, cdr: bytes) -> None:
+    def on_correction(self, cdr: bytes) -> None:
         """A transform from map, ours or another's."""
         if cdr[4:] not in self._ours:
             self._others_s = time.monotonic()
@@ -73,7 +73,7 @@ class TfBroadcaster:
         return tuple(sorted(names - {own}))
 
     def _tick(self) -> None:
-        config, estimate, newest = self._look()
+        config, estimate, newest = self._now()
         if self._is_closed or estimate is None or newest is None or not config.tf.publish_tf or not estimate.is_located:
             return
         if config.tf.second_authority == "yield" and self.has_rival:
