@@ -220,7 +220,7 @@ def play(seed, type_name, use, dimensions, count, sigma=0.1):
         turret = ("base_link", "turret", (1.0, 0.0, 0.0), quaternion(yaw=0.1 * k))
         out += b.convert("tf", transforms(turret, stamp_ns=STAMP_NS + (k % 20 - 10) * S // 10))
     out += b.finish()
-    assert not b._waiting
+    assert not b._pending
     for m in out:
         check(m)
     assert became["accepted"] + became["rejected"] + became["says nothing"] == count
@@ -232,9 +232,9 @@ def judged(b):
     became, convert = Counter(), b._converted
 
     def converted(source, message):
-        told, waiting = counted(b), len(b._waiting)
+        told, waiting = counted(b), len(b._pending)
         out = convert(source, message)
-        if source.name == "any" and len(b._waiting) == waiting:
+        if source.name == "any" and len(b._pending) == waiting:
             verdict = "accepted" if out else "rejected" if counted(b) != told else "says nothing"
             assert verdict != "says nothing" or not says_something(message)
             became[verdict] += 1
