@@ -82,7 +82,7 @@ class Burst:
     def step(self):
         self.drive.step(self.r)
         what = self.rng.choice(
-            [self.say_pose, self.trigger, self.trigger, self.take_out, self.set, self.set, self.look]
+            [self.say_pose, self.trigger, self.trigger, self.take_out, self.set, self.set, self.query]
         )
         what()
         if len(self.pending) > 20:
@@ -138,7 +138,7 @@ class Burst:
             kind.Request(parameters=given),
         )
 
-    def observe(self):
+    def query(self):
         names = [self.rng.choice(["", "nobody", "solve.method", "a" * 5000, *LIVE]) for _ in range(3)]
         depth = self.rng.choice([0, 1, 2**64 - 1])
         change = ChangeState.Request()
