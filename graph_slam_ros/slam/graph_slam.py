@@ -468,8 +468,8 @@ class GraphSlam:
                     self._on_observation(m)
             except Exception as fault:
                 faults.append(fault)
-        for other in faults[1:]:  # whoever called counts the one that is raised
-            self.counters.count("node", type(other).__name__)
+        for error in faults[1:]:  # whoever called counts the one that is raised
+            self.counters.count("node", type(error).__name__)
         if faults:
             raise faults[0]
 
