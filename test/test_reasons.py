@@ -20,7 +20,7 @@ def _argument(call: ast.Call) -> ast.expr | None:
     at = None
     if name.endswith("ounters.count") or name == "self._count":
         at = 1
-    elif name in ("source.count", "self.count", "MessageError", "self._not_linked", "self._refuse"):
+    elif name in ("source.count", "self.count", "MessageError", "self._not_linked", "self._refuse", "self.refuse"):
         at = 0
     elif name == "partial" and ast.unparse(call.args[0]) == "self._refuse":
         at = 1
