@@ -134,8 +134,8 @@ def test_what_cannot_be_an_input_is_refused_by_name():
         ({"odom": {"use": "none"}}, "inputs.names: none of 'odom detections' is used as odometry"),
         ({"odom": {"mount": "1 2 3"}}, "odom.mount: '1 2 3' is not 6 numbers"),
         ({"odom": {"mount": "0 0 0 0 0 nan"}}, "odom.mount: '0 0 0 0 0 nan' is not 6 numbers"),
-        ({"inputs": {"names": "odom tf"}}, "inputs.names: 'tf' is taken or given twice"),
-        ({"inputs": {"names": "odom odom"}}, "inputs.names: 'odom' is taken or given twice"),
+        ({"inputs": {"names": "odom tf"}}, "inputs.names: 'tf' is reserved or given twice"),
+        ({"inputs": {"names": "odom odom"}}, "inputs.names: 'odom' is reserved or given twice"),
         ({"inputs": {"names": "odom a-b"}}, "inputs.names: 'a-b' is not a name"),
         ({"gps": {"topic": "/fix"}}, r"did you mean .* 'gps' is not in inputs.names \(odom detections\)"),
     ):

@@ -574,7 +574,7 @@ def _input_names(text: Any) -> list[str]:
         if not re.fullmatch(r"[a-zA-Z]\w*", name, re.ASCII):
             raise ConfigError(f"inputs.names: {name!r} is not a name (letters, digits, _)")
         if name in used:
-            raise ConfigError(f"inputs.names: {name!r} is used or given twice")
+            raise ConfigError(f"inputs.names: {name!r} is reserved or given twice")
         used.add(name)
     return names
 

@@ -4,6 +4,7 @@ The main thread has the callbacks, ``Ingest`` and map -> odom; the worker's thre
 publishes its results. Between them stand a queue one way and ``Session.estimate`` the other.
 """
 
+import contextlib
 from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
@@ -47,14 +48,19 @@ class Runtime:
         self._node = node
         self.counters = Counters()
         self.counters.on_first = self._warn
-        self._session = Session(config, self.counters, self._on_update, self._warn)
-        self._publishers = Publishers(node, config)
-        self._worker = Worker(config.inputs.queue)
-        self._clock = PublishingClock(node, self._publishers, self._worker)
-        self._ingest = Ingest(
-            *(node, config, self.counters, self._session, self._worker),
-            *(self._publishers, self._clock, self._begin_anew),
-        )
+        with contextlib.ExitStack() as undo:  # what cannot be configured holds neither the run folder nor a topic
+            self._session = Session(config, self.counters, self._on_update, self._warn)
+            undo.callback(self._session.abandon)
+            self._publishers = Publishers(node, config)
+            undo.callback(self._publishers.close)
+            self._worker = Worker(config.inputs.queue)
+            undo.callback(self._worker.stop, 0.0)
+            self._clock = PublishingClock(node, self._publishers, self._worker)
+            self._ingest = Ingest(
+                *(node, config, self.counters, self._session, self._worker),
+                *(self._publishers, self._clock, self._begin_anew),
+            )
+            undo.pop_all()
         self._facts = FactCollector(node, self.counters, self._session, self._worker, self._ingest, self._publishers)
         self._preparation = Preparation(node.get_logger())
         self._completion = Completion(self._session.incomplete, node.get_logger())

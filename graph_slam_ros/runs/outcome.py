@@ -56,7 +56,7 @@ def text(summary: Summary) -> list[str]:
 
 
 def _counted_lines(source: str, reason: str, times: int) -> Iterator[str]:
-    """What was repaired or noted; the line that mends it where it came again and again."""
+    """Return what was repaired or noted, and the line that mends it where it came again and again."""
     yield from _wrapped(f"counted    {source}: {reason} {times} ({explain(reason).meaning})", 11)
     if times > 1 and reason in _MENDED and (mend := explain(reason).remedy):
         yield from textwrap.wrap(f"-> {mend}", _WIDTH, initial_indent=" " * 11, subsequent_indent=" " * 14)
@@ -126,10 +126,10 @@ def doubts(summary: Summary) -> Iterator[str]:
     for name, counts in summary.get("inputs", {}).items():
         if counts["use"] == "odometry" or not counts["used"]:
             continue
-        believed = counts["believed"] or 0
-        if _MOSTLY * counts["used"] <= believed < (1.0 - _DOUBTED) * counts["used"]:
-            part = 100.0 * (1.0 - believed / counts["used"])
-            yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {_CONTRADICT.format(name)}"
+        accepted = (counts["believed"] or 0) / counts["used"]
+        if _MOSTLY <= accepted < 1.0 - _DOUBTED:
+            part, hint = 100.0 * (1.0 - accepted), _CONTRADICT.format(name)
+            yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {hint}"
 
 
 def _unused(summary: Summary, name: str, received: int | None) -> str:

@@ -229,7 +229,7 @@ class Suggestion:
                 self.unused[name] = "markers are mostly pictures; an input of this type and topic takes them"
 
     def _tag_number(self, one: TopicContents) -> str:
-        """Of a topic that has the pose of one tag as the camera sees it; empty of any other."""
+        """The number of the tag whose pose a topic has, as the camera sees it; empty for any other topic."""
         found = _TAG_TOPIC.search(one.topic.name)
         return found[1] if found and one.frame not in (*_MAPS, "world", self._odom) else ""
 

@@ -54,7 +54,7 @@ class Transforms:
         return frame in self._fixed or frame in self._moving
 
     def are_linked(self, a: str, b: str) -> bool:
-        """Whether two frames are in one tree, whatever the stamps of its joints."""
+        """Return whether two frames are in one tree, whatever the stamps of its joints."""
         return self._root(a) == self._root(b)
 
     def _root(self, frame: str) -> str:
