@@ -264,6 +264,10 @@ def test_the_animation_repeats_the_drive_and_ends_with_the_solved_path(tmp_path,
     capsys.readouterr()
     assert main(["plot", str(run), "--animate", str(gif)]) == 2, "it is there"
     assert main(["plot", str(run), "--animate", str(tmp_path / "drive.png")]) == 2
+    journal = (run / "ingest.mcap").read_bytes()
+    (run / "ingest.mcap").write_bytes(journal[: len(journal) * 9 // 10])
+    assert main(["plot", str(run), "--animate", str(gif), "--force"]) == 3, "a part of the drive is lost"
+    assert "ingest.mcap" in capsys.readouterr().err
     (run / "ingest.mcap").unlink()
     assert main(["plot", str(run), "--animate", str(gif), "--force"]) == 2
     assert "ingest.mcap" in capsys.readouterr().err

@@ -34,7 +34,7 @@ class _Moment:
     landmarks: Array
 
 
-def animate_run(run: Path, out_gif: Path, frames: int = 80) -> None:
+def animate_run(run: Path, out_gif: Path, frames: int = 80) -> list[str]:
     """Repeat a run's drive and draw the estimate of each moment into a GIF, from above.
 
     Dead reckoning is black and begins where the estimate does; the estimate is red. A loop closure is seen as the
@@ -45,6 +45,10 @@ def animate_run(run: Path, out_gif: Path, frames: int = 80) -> None:
     run : folder of a run, with its ``ingest.mcap``
     frames : at equal steps of time
 
+    Returns
+    -------
+    what of the drive could not be read, a line each
+
     Raises
     ------
     GraphSlamError
@@ -52,7 +56,8 @@ def animate_run(run: Path, out_gif: Path, frames: int = 80) -> None:
     """
     if out_gif.suffix != ".gif":
         raise GraphSlamError(f"{out_gif}: an animation is a .gif file")
-    moments = list(_moments(run, frames))
+    losses: list[str] = []
+    moments = list(_moments(run, frames, losses))
     if not moments:
         raise GraphSlamError(f"{run}: nothing of the drive can be repeated: it has no ingest.mcap, or an empty one")
     drawn = io.BytesIO()
@@ -65,16 +70,17 @@ def animate_run(run: Path, out_gif: Path, frames: int = 80) -> None:
         write_whole(out_gif, drawn.getvalue())
     except OSError as error:
         raise GraphSlamError(f"{out_gif}: {error.strerror or error}") from None
+    return losses
 
 
-def _moments(run: Path, frames: int) -> Iterator[_Moment]:
+def _moments(run: Path, frames: int, losses: list[str]) -> Iterator[_Moment]:
     """The estimate at so many stamps, and at the end."""
     stamps_s = read_tum(run / "path.tum").stamps_s
     if not len(stamps_s):
         return
     due_s = list(np.linspace(stamps_s[0], stamps_s[-1], frames)[1:])
-    slam = GraphSlam(run_config(run), start=read_map(run, [], start_only=True))
-    for record in read_ingest(run, []):
+    slam = GraphSlam(run_config(run), start=read_map(run, losses, start_only=True))
+    for record in read_ingest(run, losses):
         slam.process(from_record(record))
         if due_s and len(slam.keyframes) > 1 and 1e-9 * slam.keyframes[-1].stamp_ns >= due_s[0]:
             due_s = [t for t in due_s if t > 1e-9 * slam.keyframes[-1].stamp_ns]

@@ -197,7 +197,7 @@ def _too_far(sigmas: float, verdict: str) -> str:
 
 
 def _distances(a: Array, b: Array) -> Array:
-    """Of points (n, d), after the rigid motion of b that makes their squares least (Kabsch 1976)."""
+    """The distances of points (n, d), after the rigid motion of b that makes their squares least (Kabsch 1976)."""
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
     u, _, vt = np.linalg.svd(b.T @ a)
     sign = np.ones(a.shape[1])

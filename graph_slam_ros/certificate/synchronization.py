@@ -51,7 +51,7 @@ class Edges:
 
     @property
     def dimensions(self) -> int:
-        """Of the space the poses are in."""
+        """The dimensions of the space that the poses are in: 2 or 3."""
         return 2 if self.information.shape[1] == 3 else 3
 
     def anisotropy(self) -> Array:
@@ -151,7 +151,7 @@ class Synchronization:
 
     @property
     def dimensions(self) -> int:
-        """Of the space the poses are in."""
+        """The dimensions of the space that the poses are in: 2 or 3."""
         return int(self.measured.positions.shape[1])
 
     def _root(self) -> csc_array:

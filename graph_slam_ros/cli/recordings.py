@@ -135,14 +135,16 @@ def _animate(args: argparse.Namespace) -> int:
     """Draw the drive as it went on."""
     from graph_slam_ros.analysis.animation import animate_run
     from graph_slam_ros.runs import changed_since
+    from graph_slam_ros.warmup import compile_all
 
     if args.truth or args.out:
         raise GraphSlamError("plot: --animate has no use for --truth or --out")
     console.check_file(args.animate, force=args.force)
-    animate_run(args.run_folder, args.animate)
+    compile_all()
+    losses = animate_run(args.run_folder, args.animate)
     console.show(f"animation in {args.animate}")
     _suggest_next(args.run_folder)
-    return console.report_losses([], changed_since(args.run_folder))
+    return console.report_losses(losses, changed_since(args.run_folder))
 
 
 def _draw(run: Path, truth: Any = None, out: Path | None = None, *, align: bool = True, quiet: bool = False) -> None:

@@ -113,7 +113,7 @@ class Health:
 
     @property
     def level(self) -> int:
-        """Of a DiagnosticStatus."""
+        """The level of a DiagnosticStatus."""
         return _LEVELS.get(self.state, OK)
 
 

@@ -8,7 +8,7 @@ _ENOUGH = 0.95  # of the limit: less, and there is room again
 
 
 def resident_mib() -> float:
-    """Of this process; 0 where there is no /proc to tell."""
+    """The resident memory of this process in MiB; 0 where there is no /proc."""
     try:
         pages = int(_STATM.read_text().split()[1])
     except OSError:

@@ -114,7 +114,7 @@ class GraphSlamNode(LifecycleNode):
 
     @property
     def _state(self) -> str:
-        """Of the lifecycle; rclpy has it."""
+        """The state of the lifecycle, as rclpy has it."""
         return str(self._state_machine.current_state[1])
 
     def _transition(

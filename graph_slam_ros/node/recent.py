@@ -13,7 +13,7 @@ _OF_ITS_OWN = {"overflow"}  # the verdict has a sentence for it
 
 @dataclass(frozen=True, slots=True)
 class Recent:
-    """Of one input, in the last ten seconds; of a message that holds several things, each counts.
+    """The counts of one input in the last ten seconds; of a message that holds several things, each counts.
 
     Attributes
     ----------

@@ -54,5 +54,5 @@ def _size(slam: GraphSlam, pose: Numbers) -> float:
 
 
 def _name(source: str) -> str:
-    """Of the input; its publishers are numbered anew after a restart."""
+    """The name of the input; its publishers are numbered anew after a restart."""
     return source.partition("#")[0]

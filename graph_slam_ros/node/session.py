@@ -370,7 +370,7 @@ class Session:
             raise RunError(f"{recorder.folder}: {error.strerror}") from None
 
     def _counters(self) -> Counters:
-        """Of the run: those of the border since it began, and of the pipeline."""
+        """The counters of the run: those of the border since it began, and those of the pipeline."""
         counters = self._border.since(self._refused_before)
         counters.update(self.slam.counters)
         return counters

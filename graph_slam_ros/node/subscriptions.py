@@ -28,7 +28,7 @@ Take = Callable[[Sequence[Measured], bytes], None]
 
 
 def full_name(endpoint: Any) -> str:
-    """Of the node of a publisher or subscription; one that is just being discovered has none yet."""
+    """The full name of the node of a publisher or subscription; one that is just being discovered has none yet."""
     if endpoint.node_name.startswith("_NODE_NAME"):
         return "a node"
     return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
@@ -36,7 +36,7 @@ def full_name(endpoint: Any) -> str:
 
 @dataclass(slots=True)
 class _Heard:
-    """Of one topic."""
+    """What one topic has received."""
 
     subscription: Any
     received: int = 0
@@ -146,7 +146,7 @@ class Subscriptions:
     def facts(
         self, now_ns: int, counted: Mapping[str, Mapping[str, int]], recent: Mapping[str, Recent]
     ) -> tuple[InputFacts, ...]:
-        """Of each input; with what was counted since the start by its name and reason, and what became of it lately."""
+        """The facts of each input, with its counters since the start and what became of it lately."""
         used = uses(self._config)
         out = []
         for one in self._config.sources:
