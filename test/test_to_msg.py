@@ -7,7 +7,7 @@ import pytest
 
 from graph_slam_ros.graph import R2
 from graph_slam_ros.messages import results, to_msg
-from graph_slam_ros.messages.from_msg import twist_of
+from graph_slam_ros.messages.from_msg import is_correction, twist_of
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 
@@ -160,6 +160,16 @@ def test_of_a_message_that_is_cut_off_there_is_no_twist():
     assert all(twist_of(cdr[:length], "base_link") is None for length in range(len(cdr)))
     slashed = to_msg.odometry(STAMP_NS, "odom", "/base_link", (1.0, 2.0, 3.0), np.eye(3), 1e6)
     assert twist_of(slashed, "base_link") == cdr[-336:]
+
+
+@pytest.mark.parametrize("little_endian", [True, False])
+@pytest.mark.parametrize("frame, expected", [("map", True), ("/map", True), ("mapp", False), ("", False)])
+def test_a_transform_of_the_map_frame_is_known_without_being_decoded(frame, expected, little_endian):
+    store = typestore()
+    message = store.deserialize_cdr(to_msg.transform(STAMP_NS, frame, "odom", (1.0, 2.0, 3.0)), results.TF)
+    cdr = bytes(store.serialize_cdr(message, results.TF, little_endian=little_endian))
+    assert is_correction(cdr, "map") is expected
+    assert not any(is_correction(cdr[:length], "map") for length in range(23)), "cut off: nothing is known"
 
 
 @pytest.mark.parametrize("names", [[], ["a"], ["", "abc", "tag 17"]])

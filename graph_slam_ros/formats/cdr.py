@@ -1,6 +1,7 @@
 """CDR, the bytes of a message, for what would be too slow as objects of a type store."""
 
 import struct
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
@@ -53,3 +54,34 @@ class CdrWriter:
 
     def _align(self, size: int) -> None:
         self._out += bytes(-len(self._out) % size)
+
+
+class CdrReader:
+    """Reads the first fields of a message in their order, of either byte order, without decoding the rest.
+
+    Raises ``struct.error`` where the message ends before the field.
+    """
+
+    __slots__ = ("_at", "_data", "_order")
+
+    def __init__(self, message: bytes) -> None:
+        self._data, self._at = memoryview(message)[4:], 0
+        self._order = "<" if len(message) > 1 and message[1] & 1 else ">"
+
+    def numbers(self, code: str, count: int = 1) -> tuple[Any, ...]:
+        """Numbers of one type, by its letter of ``struct``."""
+        size = struct.calcsize(code)
+        self._at += -self._at % size
+        out = struct.unpack_from(f"{self._order}{count}{code}", self._data, self._at)
+        self._at += count * size
+        return out
+
+    def stamp_ns(self) -> int:
+        """builtin_interfaces/Time in nanoseconds."""
+        return int(self.numbers("i")[0]) * NS + int(self.numbers("I")[0])
+
+    def text(self) -> bytes:
+        """A string, without its zero."""
+        (length,) = self.numbers("I")
+        self._at += length
+        return bytes(self._data[self._at - length : self._at]).rstrip(b"\0")

@@ -14,6 +14,7 @@ import numpy as np
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import InputConfig
+from graph_slam_ros.formats.cdr import CdrReader
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import InitialPose, Measured, Odometry
 from graph_slam_ros.messages.inputs import CONVERTERS, checks, fixes, odometry, uses
@@ -27,7 +28,7 @@ Decoder = Callable[[bytes], Any]
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 TF_STATIC, TF, INITIAL_POSE = "tf_static", "tf", "initialpose"
-_POSE_SIZE = 8 * (7 + 36)  # of a geometry_msgs/PoseWithCovariance
+_POSE_NUMBERS = 7 + 36  # of a geometry_msgs/PoseWithCovariance
 
 
 def decoder(type_name: str) -> Decoder:
@@ -38,11 +39,13 @@ def decoder(type_name: str) -> Decoder:
 
 def is_correction(cdr: bytes, map_frame: str) -> bool:
     """Return whether a tf2_msgs/TFMessage is about the map frame, by its first transform, without decoding it."""
-    if len(cdr) < 20:
+    reader = CdrReader(cdr)
+    try:
+        reader.numbers("I")
+        reader.stamp_ns()
+        return reader.text().lstrip(b"/") == map_frame.encode()
+    except struct.error:
         return False
-    order = "<" if cdr[1] & 1 else ">"
-    (length,) = struct.unpack_from(order + "I", cdr, 16)  # after the encoding, the count and a stamp
-    return cdr[20 : 20 + length].rstrip(b"\0").lstrip(b"/") == map_frame.encode()
 
 
 def twist_of(cdr: bytes, base_frame: str) -> bytes | None:
@@ -50,20 +53,16 @@ def twist_of(cdr: bytes, base_frame: str) -> bytes | None:
 
     None where it is of another frame than the base: what a wheel or a sensor does is not what the robot does.
     """
-    if len(cdr) < 16:
-        return None
-    order = "<" if cdr[1] & 1 else ">"
+    reader = CdrReader(cdr)
     try:
-        (length,) = struct.unpack_from(order + "I", cdr, 12)  # after the encoding and a stamp
-        start = 16 + length + -length % 4
-        (length,) = struct.unpack_from(order + "I", cdr, start)
-        child = cdr[start + 4 : start + 4 + length].rstrip(b"\0").lstrip(b"/")
-        start += 4 + length
-        start += (4 - start) % 8 + _POSE_SIZE
-        numbers = struct.unpack_from(f"{order}42d", cdr, start)
+        reader.stamp_ns()
+        reader.text()
+        child = reader.text().lstrip(b"/")
+        reader.numbers("d", _POSE_NUMBERS)
+        twist = reader.numbers("d", 42)
     except struct.error:
         return None
-    return struct.pack("<42d", *numbers) if child == base_frame.encode() else None
+    return struct.pack("<42d", *twist) if child == base_frame.encode() else None
 
 
 class MessageConverter:

@@ -31,6 +31,7 @@ from std_srvs.srv import Trigger
 
 from graph_slam_ros.config.config import parameters
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.cdr import CdrReader
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.messages import to_msg
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, is_correction
@@ -149,7 +150,14 @@ class Player:
             self._until_received(self._sent - self._lost - _AHEAD // 2)
 
     def _stamp_ns(self, message: BagMessage) -> int:
-        return _stamp_ns(message.cdr, 4 if self._bag.topics[message.topic].type not in _LISTS else 8)
+        """Stamp of the header, or of the first in a list; 0 where the message is too short for one."""
+        reader = CdrReader(message.cdr)
+        try:
+            if self._bag.topics[message.topic].type in _LISTS:
+                reader.numbers("I")
+            return reader.stamp_ns()
+        except struct.error:
+            return 0
 
     def _settle(self) -> None:
         self._until_received(self._sent - self._lost)
@@ -280,11 +288,3 @@ def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subproces
 
 def _has_subscriber(publisher: Any) -> bool:
     return bool(publisher.get_subscription_count())
-
-
-def _stamp_ns(cdr: bytes, at: int = 4) -> int:
-    """Stamp of the header at an offset, without decoding the rest; 0 where the message is too short for one."""
-    if len(cdr) < at + 8:
-        return 0
-    sec, nanosec = struct.unpack_from("<iI" if cdr[1] & 1 else ">iI", cdr, at)
-    return int(sec) * 1_000_000_000 + int(nanosec)
