@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from graph_slam_ros.cli import main
-from graph_slam_ros.config.config import SolveConfig, notes, parameters
+from graph_slam_ros.config.config import notes, parameters
+from graph_slam_ros.config.solve import SolveConfig
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.parameters import parameters_text, parse_setting, read_parameters
 from graph_slam_ros.slam import Config

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from graph_slam_ros.config.config import FramesConfig
+from graph_slam_ros.config.world import FramesConfig
 from graph_slam_ros.messages.topics import PUBLICATIONS, SUBSCRIPTIONS
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.replay import replay

@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Iterator
 
 from graph_slam_ros.cli import console
+from graph_slam_ros.cli.parser import parser
 
 _SCRIPT = """\
 _graph_slam() {
@@ -33,7 +34,7 @@ _ZSH = "autoload -U +X compinit && compinit -u\nautoload -U +X bashcompinit && b
 
 def completion(args: argparse.Namespace) -> int:
     """Print the script."""
-    console.show(*((_ZSH if args.shell == "zsh" else "") + script(args.parser())).splitlines())
+    console.show(*((_ZSH if args.shell == "zsh" else "") + script(parser())).splitlines())
     return console.DONE
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.config.config import OdometryConfig
+from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters

@@ -6,7 +6,7 @@ may come early (it waits for the odometry around it) or late within the window. 
 
 import heapq
 
-from graph_slam_ros.config.config import OrderingConfig
+from graph_slam_ros.config.frontend import OrderingConfig
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Observation, Odometry, Sightings
 

@@ -1,0 +1,366 @@
+"""Options of each command of ``graph_slam``."""
+
+from pathlib import Path
+
+from graph_slam_ros.cli import values
+from graph_slam_ros.cli.usage import CODES, CommandParser
+
+
+def replay(sub: CommandParser) -> None:
+    """Add the options of ``replay``."""
+    sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording, or a run folder")
+    _add_out(sub, required=False)  # not with --ros and --node
+    sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: the only one, or /odom)")
+    sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: the only one, or /landmarks)")
+    _add_config(sub)
+    sub.add_argument(
+        "--map", type=Path, metavar="RUN", help="continue in the map of a run, frozen or not, with its parameters"
+    )
+    sub.add_argument("--ros", action="store_true", help="publish into a live ROS graph: a node of its own with --out")
+    sub.add_argument(
+        "--rate",
+        type=values.positive,
+        metavar="X",
+        help="with --ros: multiple of real time (default: as fast as possible)",
+    )
+    sub.add_argument("--node", metavar="NAME", help="with --ros and without --out: name of the running node")
+
+
+def recover(sub: CommandParser) -> None:
+    """Add the options of ``recover``."""
+    sub.add_argument("run_folder", type=Path, metavar="RUN", help="run folder")
+    _add_out(sub, required=False, default="RUN itself")
+
+
+def export(sub: CommandParser) -> None:
+    """Add the options of ``export``."""
+    _add_run(sub)
+    sub.add_argument(
+        "--to",
+        choices=("tum", "g2o", "mcap"),
+        required=True,
+        help="format; g2o: stamps and names go into a second file",
+    )
+    sub.add_argument("--last-drive", action="store_true", help="tum: only the last drive, not those of the loaded map")
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help="output file")
+    _add_force(sub)
+
+
+def diff(sub: CommandParser) -> None:
+    """Add the options of ``diff``."""
+    sub.codes = f"{CODES} 4: they differ."
+    sub.add_argument("a", type=Path, metavar="A", help="run folder")
+    sub.add_argument("b", type=Path, metavar="B", help="run folder")
+    sub.add_argument("--json", action="store_true", help="print all of it as one line of JSON")
+
+
+def merge(sub: CommandParser) -> None:
+    """Add the options of ``merge``."""
+    sub.add_argument("a", type=Path, metavar="A", help="run folder; the result has its map frame and configuration")
+    sub.add_argument("b", type=Path, metavar="B", help="run folder")
+    _add_out(sub)
+
+
+def freeze(sub: CommandParser) -> None:
+    """Add the options of ``freeze``."""
+    _add_run(sub)
+    _add_out(sub)
+
+
+def info(sub: CommandParser) -> None:
+    """Add the options of ``info``."""
+    sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording")
+
+
+def optimize(sub: CommandParser) -> None:
+    """Add the options of ``optimize``."""
+    sub.codes = f"{CODES} With --certify: 4 not certified, 5 the certificate does not apply."
+    sub.add_argument("graph", type=Path, metavar="GRAPH", help="file of a graph")
+    sub.add_argument(
+        "--method",
+        type=values.method,
+        default="gn",
+        metavar="gn|lm|dogleg",
+        help="method of optimisation; gn (default) is damped only if it does not converge",
+    )
+    sub.add_argument(
+        "--max-iterations", type=values.count, default=100, metavar="N", help="most iterations (default: 100)"
+    )
+    sub.add_argument(
+        "--tolerance",
+        type=values.positive,
+        default=1e-6,
+        metavar="X",
+        help="converged when the cost decreases by a smaller fraction (default: 1e-6)",
+    )
+    sub.add_argument(
+        "--loss",
+        type=values.loss,
+        default="none",
+        metavar="none|huber|cauchy[:SCALE]",
+        help=f"robust loss of all edges but odometry; SCALE in sigmas (default: {values.LOSS_SCALE:g})",
+    )
+    sub.add_argument(
+        "--init",
+        choices=("auto", "file", "tree", "chordal", "online"),
+        default="auto",
+        help="initial estimate; auto: the file (tree without vertices), and if the result is suspicious chordal and"
+        " then online (pose after pose) as well, of which the best is taken",
+    )
+    sub.add_argument(
+        "--error-map",
+        choices=("relative", "seed"),
+        default="relative",
+        help="error of relative poses; seed: of the inverse",
+    )
+    sub.add_argument(
+        "--certify", action="store_true", help="prove that the result is the global optimum; for graphs of poses only"
+    )
+    _add_reading(sub)
+    sub.add_argument("--json", action="store_true", help="print the answer as one line of JSON")
+    sub.add_argument("--out", type=Path, metavar="FILE.g2o", help="write the solved graph")
+    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the initial estimate and the result")
+    _add_force(sub)
+
+
+def convert(sub: CommandParser) -> None:
+    """Add the options of ``convert``."""
+    sub.codes = f"What the format of B cannot express is left out and reported; the exit code is 3. {CODES}"
+    sub.add_argument("graph", type=Path, metavar="A", help="g2o, TORO, iSAM or GTSAM text")
+    sub.add_argument(
+        "out",
+        type=Path,
+        metavar="B",
+        help="output file; format by its ending: .g2o; .toro, .graph; .gtsam; .tum (poses, id as stamp)",
+    )
+    sub.add_argument(
+        "--to", choices=("g2o", "toro", "gtsam", "tum"), help="format of B, instead of the one of its ending"
+    )
+    _add_force(sub)
+    _add_reading(sub)
+
+
+def simulate(sub: CommandParser) -> None:
+    """Add the options of ``simulate``."""
+    sub.more = _world_options
+    sub.add_argument("scenario", metavar="SCENARIO", help="name of a world, city (a graph), or the file of a graph")
+    sub.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="BAG.mcap|GRAPH.g2o",
+        help="output file; by its ending a recording or a graph",
+    )
+    _add_force(sub)
+    sub.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random numbers (default: 0)")
+    sub.add_argument(
+        "--as-original", action="store_true", help="pythonrobotics: with the squared noise of the original"
+    )
+    sub.add_argument(
+        "--poses", type=values.count, metavar="N", help="number of poses of the drive, if the world has that option"
+    )
+    sub.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="option of the world, listed below"
+    )
+    sub.add_argument(
+        "--closures", type=values.count, metavar="N", help="number of true loop closures to add, on /closures"
+    )
+    sub.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="KIND[:KEY=VALUE,...]",
+        help="fault to add, listed below; several are added in order",
+    )
+
+
+def _world_options() -> str:
+    """Every option of the worlds and every kind of fault, with defaults."""
+    from graph_slam_ros.simulation import WORLDS, Instruments
+    from graph_slam_ros.simulation.faults import KINDS
+    from graph_slam_ros.simulation.options import options_of
+
+    def option_lines(cls: type) -> list[str]:
+        lines = []
+        for o in options_of(cls):
+            choices = f": {', '.join(o.choices)}" if o.choices else ""
+            default = str(o.default).lower() if isinstance(o.default, bool) else o.default
+            lines.append(f"    {o.name}={default}{f' [{o.unit}]' if o.unit else ''}  {o.meaning}{choices}")
+        return lines
+
+    lines = ["options of the worlds, for --set:"]
+    for name, world in WORLDS.items():
+        lines += [f"  {name}: {world.about}", *option_lines(world.options)]
+    lines += ["  every world: with a satellite receiver and an IMU", *option_lines(Instruments)]
+    lines += ["", "faults for --fault with their options; OUT.faults.csv lists what is wrong:"]
+    for name, kind in KINDS.items():
+        lines += [f"  {name}: {kind.about}", *option_lines(kind.options)]
+    lines += ["", "example: graph_slam simulate warehouse --out world.mcap --set gnss=5 --set imu=100"]
+    return "\n".join(lines)
+
+
+def evaluate(sub: CommandParser) -> None:
+    """Add the options of ``evaluate``."""
+    sub.add_argument("run_folder", type=Path, metavar="RUN", help="run folder")
+    _add_truth(sub, required=True)
+    sub.add_argument(
+        "--estimate",
+        default="",
+        metavar="FILE",
+        help="trajectory to evaluate (default: sightings.tum; path.tum without observations)",
+    )
+    sub.add_argument("--json", action="store_true", help="print the numbers as one line of JSON")
+    sub.add_argument(
+        "--plot", type=Path, metavar="FILE.png", help="file of the picture (default: path.png in the run folder)"
+    )
+    _add_force(sub)
+
+
+def plot(sub: CommandParser) -> None:
+    """Add the options of ``plot``."""
+    _add_run(sub)
+    sub.add_argument(
+        "--out", type=Path, metavar="PNG", help="file of the picture (default: path.png in the run folder)"
+    )
+    sub.add_argument(
+        "--animate", type=Path, metavar="GIF", help="write an animation of the drive and its correction instead"
+    )
+    _add_truth(sub, required=False)
+    _add_force(sub)
+
+
+def _add_truth(sub: CommandParser, *, required: bool) -> None:
+    sub.add_argument("--truth", required=required, metavar="BAG|FILE.tum", help="the truth: a recording, or a TUM file")
+    sub.add_argument(
+        "--topic",
+        default="",
+        metavar="TOPIC",
+        help="topic of the truth: poses, odometry, NavSatFix or PointStamped; of transforms /tf:PARENT:CHILD"
+        " (default: /ground_truth, or the only one that may be it)",
+    )
+    sub.add_argument(
+        "--no-align", action="store_true", help="do not align: the map is in the frame of the truth already"
+    )
+
+
+def explain(sub: CommandParser) -> None:
+    """Add the options of ``explain``."""
+    _add_run(sub)
+    sub.add_argument(
+        "edge",
+        nargs="?",
+        metavar="EDGE",
+        help="id of an edge or name of a landmark (landmark:7 if the name is a number); default: the whole run",
+    )
+
+
+def solve(sub: CommandParser) -> None:
+    """Add the options of ``solve``."""
+    sub.codes = f"Edges have the ids of explain and of the run's ledger. {CODES}"
+    _add_run(sub)
+    sub.add_argument(
+        "--without",
+        nargs="+",
+        action="extend",
+        type=values.edge,
+        default=[],
+        metavar="EDGE",
+        help="ids of edges to remove",
+    )
+    sub.add_argument(
+        "--with",
+        dest="let_in",
+        nargs="+",
+        action="extend",
+        type=values.edge,
+        default=[],
+        metavar="EDGE",
+        help="ids of edges to include with full weight, without a robust loss",
+    )
+    sub.add_argument(
+        "--loss",
+        type=values.loss,
+        metavar="none|huber|cauchy|geman_mcclure|dcs[:SCALE]",
+        help=f"robust loss of all candidates, instead of the run's; SCALE in sigmas ({values.LOSS_SCALE:g})",
+    )
+
+
+def influence(sub: CommandParser) -> None:
+    """Add the options of ``influence``."""
+    _add_run(sub)
+    sub.add_argument(
+        "--count",
+        type=values.count,
+        default=10,
+        metavar="N",
+        help="number of edges that are left out in turn (default: 10)",
+    )
+
+
+def demo(sub: CommandParser) -> None:
+    """Add the options of ``demo``."""
+    sub.add_argument(
+        "--out", type=Path, default=Path("runs/demo"), metavar="DIR", help="folder for the results (default: runs/demo)"
+    )
+    _add_force(sub)
+
+
+def params(sub: CommandParser) -> None:
+    """Add the options of ``params``."""
+    sub.add_argument(
+        "pattern",
+        nargs="?",
+        default="",
+        metavar="PATTERN",
+        help="part of a name or of its help, or a name with * (default: all)",
+    )
+
+
+def completion(sub: CommandParser) -> None:
+    """Add the options of ``completion``."""
+    sub.add_argument("shell", choices=("bash", "zsh"), help='shell; use: eval "$(graph_slam completion bash)"')
+
+
+def nothing(sub: CommandParser) -> None:
+    """Add no option."""
+
+
+# -- options that commands share ---------------------------------------------------------------------------------------
+
+
+def _add_run(sub: CommandParser) -> None:
+    sub.add_argument("run_folder", type=Path, metavar="RUN", help="run folder")
+
+
+def _add_out(sub: CommandParser, *, required: bool = True, default: str = "") -> None:
+    about = f"folder for the results{f' (default: {default})' if default else ''}"
+    sub.add_argument("--out", type=Path, metavar="DIR", required=required, help=about)
+    _add_force(sub)
+
+
+def _add_force(sub: CommandParser) -> None:
+    sub.add_argument(
+        "--force", action="store_true", help="replace an existing run or file; nothing else is overwritten"
+    )
+
+
+def _add_config(sub: CommandParser) -> None:
+    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file, as for the node")
+    sub.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="set one parameter")
+
+
+def _add_reading(sub: CommandParser) -> None:
+    sub.add_argument(
+        "--from",
+        dest="source",
+        choices=("g2o", "toro", "gtsam", "isam", "rows"),
+        help="format of the lines; others are refused (default: each by its tag); isam: square roots of the"
+        " information; rows: information of EDGE2 in rows of its upper triangle",
+    )
+    sub.add_argument(
+        "--information",
+        choices=("g2o", "raw"),
+        default="g2o",
+        help="scale of the information of 3D rotations; raw: unscaled",
+    )
+    sub.add_argument("--lenient", action="store_true", help="leave out bad lines, list them, exit with 3")

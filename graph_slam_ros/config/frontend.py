@@ -1,0 +1,145 @@
+"""Parameters of the front end: odometry, keyframes, the order of messages."""
+
+import math
+from dataclasses import dataclass
+
+from graph_slam_ros.config.parameter import setting
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryConfig:
+    """Noise of the motion between keyframes."""
+
+    noise: str = setting(
+        "twist",
+        "noise of odometry: twist: from each message's twist covariance, or the densities where it "
+        "has none; density: always the densities",
+        choices=("twist", "density"),
+    )
+    translation_density: float = setting(
+        0.02, "random walk of the odometry position along x of the base", "m/sqrt(s)", low=1e-6, high=10.0
+    )
+    lateral_density: float = setting(
+        0.005,
+        "random walk of the odometry position along y of the base; small for wheels, larger for "
+        "robots that slide or hover",
+        "m/sqrt(s)",
+        low=1e-6,
+        high=10.0,
+    )
+    vertical_density: float = setting(
+        0.005,
+        "random walk of the odometry position along z of the base; used in space only",
+        "m/sqrt(s)",
+        low=1e-6,
+        high=10.0,
+    )
+    rotation_density: float = setting(0.05, "random walk of the odometry heading", "rad/sqrt(s)", low=1e-6, high=10.0)
+    tilt_density: float = setting(
+        0.02, "random walk of odometry roll and pitch; used in space only", "rad/sqrt(s)", low=1e-6, high=10.0
+    )
+    twist_correlation_s: float = setting(
+        0.25,
+        "correlation time of velocity errors: the noise of a step is covariance * dt * max(dt, this)",
+        "s",
+        low=0.0,
+    )
+    still_m_s: float = setting(
+        1e-3,
+        "below this speed and odometry.still_rad_s, in a step or over a second, the robot counts as "
+        "stationary: no noise is added",
+        "m/s",
+        low=0.0,
+    )
+    still_rad_s: float = setting(
+        1e-3,
+        "below this turn rate and odometry.still_m_s, in a step or over a second, the robot counts as"
+        " stationary: no noise is added",
+        "rad/s",
+        low=0.0,
+    )
+    still_m: float = setting(
+        5e-3, "position jitter of a stationary robot: smaller motion adds no noise and no keyframe", "m", low=0.0
+    )
+    still_rad: float = setting(
+        0.01,
+        "heading jitter of a stationary robot: a smaller turn adds no noise and no keyframe",
+        "rad",
+        low=0.0,
+        high=math.pi,
+    )
+    timeout_s: float = setting(
+        0.5,
+        "an odometry input without messages for this long, in stamp time, is replaced by the next of inputs.names",
+        "s",
+        low=1e-3,
+    )
+    max_speed_m_s: float = setting(
+        50.0, "odometry that moves faster than this has jumped: a new segment of the path begins", "m/s", low=1e-3
+    )
+    jump_sigma_m: float = setting(
+        10.0, "standard deviation of the position change across a jump of odometry", "m", low=1e-3
+    )
+    jump_sigma_rad: float = setting(
+        3.0, "standard deviation of the rotation across a jump of odometry", "rad", low=1e-3
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframesConfig:
+    """The choice of keyframes."""
+
+    min_distance_m: float = setting(
+        0.25, "a keyframe is added after the robot moved this far", "m", low=1e-3, live=True
+    )
+    min_angle_rad: float = setting(
+        0.25, "a keyframe is added after the robot turned by this much", "rad", low=1e-3, high=math.pi, live=True
+    )
+    max_interval_s: float = setting(
+        1.0,
+        "a keyframe is added after the robot moved for this long, however slowly",
+        "s",
+        low=1e-3,
+        live=True,
+    )
+    shared_noise: float = setting(
+        0.05,
+        "a keyframe is added at an observation if the motion since the last keyframe would add more "
+        "than this part to its variance",
+        "part of variance",
+        low=0.0,
+        live=True,
+    )
+    min_interval_s: float = setting(
+        0.1,
+        "an observation sooner than this after a keyframe adds none, unless the motion would more "
+        "than double its variance",
+        "s",
+        low=0.0,
+        live=True,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OrderingConfig:
+    """The window in which messages are put in order of stamp."""
+
+    window_s: float = setting(
+        0.05,
+        "a message may arrive this much later than newer odometry, in stamp time, and is still sorted by stamp",
+        "s",
+        low=0.0,
+    )
+    late_s: float = setting(
+        10.0,
+        "observations, fixes and closures up to this much older than odometry are used at their own stamp",
+        "s",
+        low=0.0,
+    )
+    max_waiting: int = setting(
+        1000,
+        "most messages that are held until it is their turn, or until odometry reaches them",
+        "messages",
+        low=1,
+        high=1_000_000,
+    )

@@ -1,0 +1,122 @@
+"""Parameters of landmarks: their noise, identity, association and loss."""
+
+from dataclasses import dataclass
+
+from graph_slam_ros.config.parameter import setting
+from graph_slam_ros.config.robust import LOSSES
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarksConfig:
+    """Landmark sightings."""
+
+    id_from: str = setting("id", "field of a detection that is the landmark's identity", choices=("id", "class_id"))
+    sigma_m: float = setting(
+        0.1, "position noise of an observation whose message has an all-zero (unknown) covariance", "m", low=1e-4
+    )
+    added_sigma_m: float = setting(
+        0.05,
+        "position noise added to every observation for errors that messages leave out: clocks, mounting, size",
+        "m",
+        low=0.0,
+    )
+    max_per_message: int = setting(
+        1000, "most landmarks used of one message; the nearest are used, the others counted", "landmarks", low=1
+    )
+    orientation_known_below_rad: float = setting(
+        0.5, "a landmark is a full pose if the standard deviation of its heading is below this", "rad", low=0.0
+    )
+    association: str = setting(
+        "id",
+        "data association: none: landmarks are not used; id: by identity; nearest: observations "
+        "without identity one by one; joint: all of a message together",
+        choices=("none", "id", "nearest", "joint"),
+    )
+    gate_same: float = setting(
+        0.999,
+        "an observation without identity may belong to a landmark within this probability of the chi2 test",
+        "probability",
+        low=0.5,
+        high=1.0,
+    )
+    gate_other: float = setting(
+        0.99999,
+        "an observation outside this probability of every landmark begins a new one; between "
+        "gate_same and this it is discarded",
+        "probability",
+        low=0.5,
+        high=1.0,
+    )
+    close_m: float = setting(
+        0.5,
+        "landmarks closer together than this are not told apart: an observation that may be of either gets more noise",
+        "m",
+        low=0.0,
+    )
+    unnamed_sigma_m: float = setting(
+        0.1, "position noise added to observations without identity: they may be of a neighbouring object", "m", low=0.0
+    )
+    density_per_m: float = setting(
+        0.03,
+        "prior density of landmarks per metre along each axis: an observation must fit a known "
+        "landmark better than a new one",
+        "1/m",
+        low=1e-4,
+    )
+    ambiguity_chi2: float = setting(
+        6.0, "an association is used only if every alternative fits worse by this much", "chi2", low=0.0
+    )
+    confirm_sightings: int = setting(5, "observations that confirm a new landmark without identity", "sightings", low=1)
+    confirm_s: float = setting(
+        2.0, "time over which a new landmark without identity must be observed before it is confirmed", "s", low=0.0
+    )
+    follow_s: float = setting(
+        10.0,
+        "an observation is compared with landmarks observed within this time; older ones are matched later, by merging",
+        "s",
+        low=0.0,
+    )
+    give_up_s: float = setting(
+        60.0, "a landmark that is not confirmed is removed when it was not observed for this long", "s", low=0.0
+    )
+    review_every_keyframes: int = setting(
+        10,
+        "landmarks without identity are merged, split, confirmed and removed after every so many keyframes",
+        "keyframes",
+        low=1,
+    )
+    determined_below: float = setting(
+        0.2,
+        "a landmark from ranges or bearings enters the map when its standard deviation is below this "
+        "part of its distance",
+        "m/m",
+        low=1e-3,
+        high=10.0,
+    )
+    mirror_chi2: float = setting(
+        12.0,
+        "a landmark from ranges or bearings enters the map when every other position, e.g. the mirror"
+        " image, fits worse by this much",
+        "chi2",
+        low=0.0,
+    )
+    surveyed: str = setting(
+        "",
+        "landmarks with known positions in the map: a header id,x,y,sigma or id,x,y,z,sigma, then a line for each",
+        "m",
+    )
+    surveyed_file: str = setting("", "file with the lines of landmarks.surveyed, read at the start where that is empty")
+    range_offset_sigma_m: float = setting(
+        0.0,
+        "standard deviation of an offset that all ranges of a topic share and that is estimated; 0: no offset",
+        "m",
+        low=0.0,
+    )
+    loss: str = setting(
+        "huber_then_cauchy",
+        "robust loss of landmark observations; huber_then_cauchy converges with Huber first, then with Cauchy",
+        choices=(*LOSSES, "huber_then_cauchy", "huber_then_dcs"),
+    )
+    loss_scale: float = setting(
+        3.0, "landmark residuals well below this many standard deviations keep their full weight", "sigma", low=0.1
+    )
