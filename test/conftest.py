@@ -16,38 +16,22 @@ from graph_slam_ros.warmup import warmup
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
-INTEGRATION = """anchor any_measurement any_message bag certificate consistency convert damaged_runs
-    data displacement evaluation explain false_closures faults graph_cases graph_slam info
-    initialization inputs_replay instruments life localize map_log maps message_cases nav2 nees
-    noise_and_losses odd_files online_graphs pipeline_kinds rates reach run_folder sessions simulation soak
-    timing_cases unnamed views what_if world_graphs"""
-"""Files, without ``test_`` and ``.py``."""
-STARTS_ONE = re.compile(
-    r"^ *(import|from) (confined|fuzzing|multiprocessing|rclpy|subprocess)\b|\b(live_nodes\b|os\.fork\(|mrclam\()",
-    re.MULTILINE,
-)
-"""What a file has that starts processes."""
+KINDS = "unit", "integration", "process"
+"""The folders of test/, each with the folders of the package in it."""
 TRIES = re.compile(r"\b(often|times)\(")
 """What it has that tries more in ``make soak``."""
 _running = []
 STARTS = {"os.exec", "os.fork", "os.forkpty", "os.posix_spawn", "os.system", "subprocess.Popen"}
 
 
-INTEGRATES = {Path(__file__).with_name(f"test_{name}.py") for name in INTEGRATION.split()}
-assert all(file.is_file() for file in INTEGRATES), [file.name for file in INTEGRATES if not file.is_file()]
-
-
-@functools.cache
 def kind(file):  # type: ignore[no-untyped-def]
-    """Of the tests in a file."""
-    if STARTS_ONE.search(file.read_text(encoding="utf-8")):
-        return "process"
-    return "integration" if file in INTEGRATES else "unit"
+    """Return the kind of the tests in a file, by its folder."""
+    return file.relative_to(Path(__file__).parent).parts[0]
 
 
 @functools.cache
 def is_soaked(file):  # type: ignore[no-untyped-def]
-    """Whether ``make soak`` tries more of it."""
+    """Return whether ``make soak`` tries more of a file."""
     return bool(TRIES.search(file.read_text(encoding="utf-8")))
 
 
@@ -76,7 +60,7 @@ def pytest_runtest_protocol(item):  # type: ignore[no-untyped-def]
 
 def _no_process(event: str, arguments: tuple) -> None:
     if event in STARTS and _running and kind(_running[0]) != "process":
-        raise RuntimeError(f"{_running[0].name} starts a process, and nothing in it says so: STARTS_ONE in conftest.py")
+        raise RuntimeError(f"{_running[0].name} starts a process: it belongs into test/process")
 
 
 sys.addaudithook(_no_process)

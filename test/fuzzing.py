@@ -157,7 +157,7 @@ def ros1(folder):
 
 
 def graphs(folder):
-    from test_convert import PLANE, SPACE
+    from graph_texts import PLANE, SPACE
 
     texts = []
     for name, text, endings in (("plane", PLANE, ("g2o", "toro", "gtsam")), ("space", SPACE, ("g2o", "toro"))):

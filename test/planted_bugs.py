@@ -19,7 +19,8 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+from places import ROOT, test_path
+
 NOT_COPIED = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info")
 NOT_COPIED_OF_ROOT = {"benchmarks", "build", "install", "log", "runs", "soak"}
 LIMIT_S, FIRST_LIMIT_S = 300, 1200  # the first compiles the kernels of the copy
@@ -248,7 +249,7 @@ def ended(root, tests, limit_s):
     with (
         (root / "output.txt").open("w") as output,
         subprocess.Popen(
-            [*command, *(f"test/{test}" for test in tests)],
+            [*command, *map(test_path, tests)],
             cwd=root,
             env=environment,
             stdout=output,

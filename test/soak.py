@@ -10,17 +10,18 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parent
+from places import ROOT, test_path
+
+HERE = ROOT / "test"
 OUT = ROOT / "soak"
 PASSED = "soak: passed"
 VOID = "Is the code instrumented for coverage?"  # says a fuzzer that finds nothing to be guided by
 
 
 def tests(*words):
-    return [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words]
+    files = [test_path(word) if word.startswith("test_") else word for word in words]
+    return [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files]
 
 
 def guided(name):
@@ -29,24 +30,24 @@ def guided(name):
 
 DRIVES = "consistency", "displacement", "extreme_fixes", "initialization", "nees", "simulation", "unnamed"
 PROGRAMMES = {
-    "lives": tests("test/test_life.py"),
-    "mutated_bags": tests("test/test_mutated_recordings.py"),
-    "soak": tests("test/test_soak.py"),
-    "large": tests("test/test_large.py"),
-    "bursts": tests("test/test_bursts.py", "test/test_extreme_fixes.py"),
-    "journal": tests("test/test_journal.py"),
-    "messages": tests("test/test_any_message.py", "test/test_any_measurement.py"),
-    "permutations": tests("test/test_timing_cases.py", "-k", "B1"),
-    "solver_faults": tests("test/test_solver_faults.py", "test/test_graph_cases.py"),
-    "recorded": tests("test/test_recorded.py"),
-    "fuzzing": tests("test/test_fuzzing.py"),
-    "kernels": tests("test/test_kernels.py"),
-    "drives": tests(*(f"test/test_{name}.py" for name in DRIVES)),
-    "odd_files": tests("test/test_odd_files.py"),
+    "lives": tests("test_life.py"),
+    "mutated_bags": tests("test_mutated_recordings.py"),
+    "soak": tests("test_soak.py"),
+    "large": tests("test_large.py"),
+    "bursts": tests("test_bursts.py", "test_extreme_fixes.py"),
+    "journal": tests("test_journal.py"),
+    "messages": tests("test_any_message.py", "test_any_measurement.py"),
+    "permutations": tests("test_timing_cases.py", "-k", "B1"),
+    "solver_faults": tests("test_solver_faults.py", "test_graph_cases.py"),
+    "recorded": tests("test_recorded.py"),
+    "fuzzing": tests("test_fuzzing.py"),
+    "kernels": tests("test_kernels.py"),
+    "drives": tests(*(f"test_{name}.py" for name in DRIVES)),
+    "odd_files": tests("test_odd_files.py"),
     **{f"guided_{name}": guided(name) for name in ("g2o", "yaml", "cdr", "journal")},
     "planted_bugs": [sys.executable, "test/planted_bugs.py"],
     "recovery": [sys.executable, "-m", "benchmarks.recovery"],
-    "stack": tests(*sorted(f"test/{file.name}" for file in HERE.glob("test_stack*.py"))),
+    "stack": tests(*sorted(file.name for file in HERE.rglob("test_stack*.py"))),
 }
 """The longest first."""
 

@@ -1,0 +1,162 @@
+"""Recordings with inputs of every kind, through replay and the command line."""
+
+import json
+import re
+import shlex
+
+import numpy as np
+import pytest
+from foreign import DEFINITIONS
+from messages import DATUM, LANDMARKS, STAMP_NS, odometry, pose, quaternion, record_drive, recorded
+from places import ROOT
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.lie import se2
+from graph_slam_ros.measurements.types import from_record
+from graph_slam_ros.messages.inputs import CONVERTERS, uses
+from graph_slam_ros.messages.to_msg import header
+from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
+from graph_slam_ros.runs.journal import read_ingest
+from graph_slam_ros.runs.replay import choose_inputs, replay
+from graph_slam_ros.slam import Config, Fix, Odometry, Sightings
+
+TF = "tf2_msgs/msg/TFMessage"
+EVERYTHING = {
+    "inputs.names": "odom detections gps tags",
+    "gps": {"topic": "/fix", "type": "sensor_msgs/msg/NavSatFix", "datum": " ".join(map(str, DATUM))},
+    "tags": {"topic": "/tf", "type": TF, "use": "landmarks", "frame_prefix": "tag36h11:"},
+}
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    return record_drive(tmp_path_factory.mktemp("drive") / "drive.mcap")
+
+
+def ingested(run):
+    return [from_record(record) for record in read_ingest(run, [])]
+
+
+def replayed(drive, folder, **settings):
+    done = replay(drive, folder, Config.from_mapping(settings))
+    return done.slam, ingested(folder)
+
+
+def where(slam, name):
+    return slam.solver.estimate([slam.landmarks[name].vertex])[0, :2]
+
+
+def test_all_inputs_of_a_recording_are_used_together(drive, tmp_path):
+    slam, events = replayed(drive, tmp_path / "run", **EVERYTHING)
+    assert {m.source for m in events if isinstance(m, Odometry)} == {"odom"}
+    counts = {}
+    for m in events:
+        if isinstance(m, Sightings | Fix):
+            counts[m.topic] = counts.get(m.topic, 0) + 1
+    assert counts == {"detections": 300, "gps": 30, "tags": 300}
+    assert not slam.counters["detections", "frame_unknown"]
+    for name, there in LANDMARKS.items():
+        assert where(slam, name) == pytest.approx(there, abs=0.05)
+
+
+def test_without_tf_a_sensor_on_a_joint_is_nowhere(drive, tmp_path):
+    slam, _ = replayed(drive, tmp_path / "run", inputs={"tf": False})
+    assert slam.counters["detections", "frame_unknown"] == 900
+
+
+def test_odometry_may_come_from_tf_alone(drive, tmp_path):
+    noise = {"odometry": {"noise": "density"}}
+    slam, events = replayed(drive, tmp_path / "tf", odom={"type": TF, "topic": "/tf"}, **noise)
+    other, _ = replayed(drive, tmp_path / "topic", **noise)
+    assert sum(isinstance(m, Odometry) for m in events) == 300
+    assert slam.trajectory() == pytest.approx(other.trajectory(), abs=1e-6)
+
+
+def test_two_odometries_have_their_inputs_names(tmp_path):
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        for k in range(5):
+            for topic, frame in (("/odom", "odom"), ("/vo/odom", "vo")):
+                stamp_ns = STAMP_NS + k * 10**8
+                cdr = odometry(pose(0.1 * k), frame=frame, stamp_ns=stamp_ns)
+                bag.write(topic, "nav_msgs/msg/Odometry", stamp_ns, cdr)
+    settings = {"inputs.names": "odom vo", "vo": {"type": "nav_msgs/msg/Odometry", "topic": "vo/odom", "frame": "odom"}}
+    _, events = replayed(tmp_path / "a.mcap", tmp_path / "run", **settings)
+    assert [m.source for m in events if isinstance(m, Odometry)] == ["odom", "vo"] * 5
+
+
+def test_an_input_without_its_topic_takes_the_only_one_of_its_type_and_else_is_refused(drive):
+    bag = open_bag(drive)
+    gps = {"inputs.names": "odom gps", "gps.type": "sensor_msgs/msg/NavSatFix"}
+    assert choose_inputs(bag, Config.from_mapping(gps)).topics["gps"] == "/fix"
+    with pytest.raises(BagError, match=r"no topic /gnss in the recording; there are .*/fix"):
+        choose_inputs(bag, Config.from_mapping(gps | {"gps.topic": "gnss"}))
+    with pytest.raises(BagError, match="no topic of type sensor_msgs/msg/Imu in the recording"):
+        choose_inputs(bag, Config.from_mapping({"inputs.names": "odom imu", "imu.type": "sensor_msgs/msg/Imu"}))
+    with pytest.raises(BagError, match="no input is used as landmarks: /landmarks cannot be one"):
+        choose_inputs(bag, Config.from_mapping(gps), landmarks="/landmarks")
+
+
+def test_the_command_that_info_prints_uses_what_is_there(drive, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["info", str(drive)]) == 0
+    command = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert "inputs.names=odom detections tags gps" in command
+    assert "tags.frame_prefix=tag36h11" in command
+    assert main(command[1:]) == 0
+    topics = {m.topic for m in ingested(tmp_path / command[-1]) if isinstance(m, Sightings | Fix)}
+    assert topics == {"detections", "gps", "tags"}
+
+
+def test_info_takes_odometry_from_tf_where_it_is_nowhere_else(tmp_path, capsys):
+    whole = record_drive(tmp_path / "drive.mcap", seconds=2)
+    bag = open_bag(whole)
+    with BagWriter(tmp_path / "tf.mcap") as writer:
+        for m in bag.messages({"/tf", "/tf_static", "/landmarks"}):
+            writer.write(m.topic, bag.topics[m.topic].type, m.log_ns, m.cdr)
+    assert main(["info", str(tmp_path / "tf.mcap")]) == 0
+    command = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert main([*command[1:-1], str(tmp_path / "run")]) == 0
+    run = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert run["keyframes"] > 3
+
+
+def test_a_type_that_only_the_recording_defines_is_read_by_its_definition(tmp_path):
+    from recordings import definition, write_mcap
+
+    name = "ros2_aruco_interfaces/msg/ArucoMarkers"
+    _, _, encoded = recorded(name, DEFINITIONS[name])
+    sent = []
+    for k in range(30):
+        stamp_ns, x = STAMP_NS + k * 10**8, 0.1 * k
+        sent.append(("/odom", stamp_ns, odometry(pose(x), stamp_ns=stamp_ns)))
+        seen = pose(3.0 - x, 1.0, 0.0, quaternion(yaw=0.5))
+        cdr = encoded(header=header(stamp_ns, "base_link"), marker_ids=np.array([17], np.int64), poses=[seen])
+        sent.append(("/aruco", stamp_ns, cdr))
+    file = write_mcap(
+        tmp_path / "a.mcap",
+        [type("Sent", (), {"topic": t, "log_ns": s, "cdr": c}) for t, s, c in sent],
+        types={"/odom": "nav_msgs/msg/Odometry", "/aruco": name},
+        text=lambda type_name: DEFINITIONS[name] if type_name == name else definition(type_name),
+    )
+    settings = {"inputs.names": "odom aruco", "aruco": {"type": name, "sigma_m": 0.1, "sigma_rad": 0.1}}
+    slam, _ = replayed(file, tmp_path / "run", **settings)
+    (landmark,) = slam.landmarks
+    assert landmark == "17"
+    at = slam.solver.estimate([slam.landmarks["17"].vertex])[0]
+    assert at == pytest.approx((3.0, 1.0, 0.5), abs=1e-3)
+    assert se2.wrap(at[2]) == pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_page_of_inputs_has_a_row_for_every_type_with_what_it_becomes_and_its_example_is_one(tmp_path):
+    page = (ROOT / "docs/inputs.md").read_text()
+    rows = [line.split("|") for line in page.splitlines() if line.startswith("| ")]
+    for type_name, there in CONVERTERS.items():
+        package, _, name = type_name.split("/")
+        (becomes,) = [row[2] for row in rows if package in row[1] and re.search(rf"\b{name}\b", row[1])]
+        told = dict.fromkeys(re.findall(r"\b(odometry|landmarks|fix|closure)\b", becomes))
+        assert [use for use in told if use in there] == list(there)
+    (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "example.yaml").write_text(example)
+    config = Config.from_mapping(read_parameters(tmp_path / "example.yaml"))
+    assert uses(config) == {"odom": "odometry", "detections": "landmarks", "gps": "fix", "tags": "landmarks"}

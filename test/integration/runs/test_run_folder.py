@@ -1,0 +1,400 @@
+"""What of a folder is a run's, what is never removed, and how its files are opened."""
+
+import ast
+import contextlib
+import itertools
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+from places import ROOT
+
+import graph_slam_ros
+from graph_slam_ros import cli
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.durable import AppendedFile, replaced, write_whole
+from graph_slam_ros.formats.files import opened, read_text
+from graph_slam_ros.recordings.bag import BagWriter
+from graph_slam_ros.runs import RunError, RunRecorder, check_room, is_run, keep_earlier, suggested_out
+from graph_slam_ros.runs.folder import MARK, remove
+from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.simulation import simulate, write_bag
+from graph_slam_ros.slam import Config, Odometry
+
+PACKAGE = Path(graph_slam_ros.__file__).parent
+GOLDEN = ROOT / "test" / "golden"
+NAMES = ("run_1.mcap", "map.mcap", "ingest.mcap", "ingest_2.mcap", "run.mcap", "config.yaml", "graph.g2o", "path.tum")
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    file = tmp_path_factory.mktemp("recorded") / "drive.mcap"
+    write_bag(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0), file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def saved(bag, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("saved") / "run"
+    replay(bag, folder)
+    return folder
+
+
+@pytest.fixture
+def run(saved, tmp_path):
+    return shutil.copytree(saved, tmp_path / "run")
+
+
+def state(folder):
+    """Names, kinds and contents of what is below a folder."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else path.lstat().st_mode
+        for path in folder.rglob("*")
+    }
+
+
+def code_of(*words):
+    try:
+        return cli.main([str(word) for word in words])
+    except SystemExit as end:
+        return end.code
+
+
+# -- what is not ours --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("names", [*([name] for name in NAMES), NAMES, ("run_1.mcap", "map.mcap")])
+def test_a_folder_of_recordings_with_the_names_of_a_run_is_never_cleared(bag, tmp_path, names, force, capsys):
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    for name in names:
+        shutil.copy(bag, mine / name)
+    before = state(mine)
+    assert code_of("replay", bag, "--out", mine, *["--force"] * force) == 2
+    assert "not empty and not an earlier run; nothing was written" in capsys.readouterr().err
+    with pytest.raises(RunError):
+        RunRecorder(mine, Config(), force=force)
+    keep_earlier(mine, 0)
+    assert state(mine) == before
+
+
+def test_a_run_json_of_somebody_else_makes_no_run(bag, tmp_path):
+    contents = ("{}", "[]", '{"format": "theirs"}', '{"keyframes": 9, "ended": true}', "[" * 10**5, "")
+    for k, content in enumerate(contents):
+        mine = tmp_path / str(k)
+        mine.mkdir()
+        shutil.copy(bag, mine / "run_1.mcap")
+        (mine / "run.json").write_text(content)
+        before = state(mine)
+        assert not is_run(mine)
+        with pytest.raises(RunError, match="not an earlier run"):
+            replay(bag, mine, force=True)
+        assert state(mine) == before
+
+
+@pytest.mark.parametrize("name", ["run_7.mcap", "ingest_4.mcap", "map_1.mcap"])
+def test_a_recording_of_the_user_in_a_run_folder_is_not_removed_whatever_its_name(bag, run, name, capsys):
+    shutil.copy(bag, run / name)
+    before = state(run)
+    assert code_of("replay", bag, "--out", run, "--force") == 2
+    assert f"{run / name}: not written by this run, and so never removed" in capsys.readouterr().err
+    with contextlib.suppress(OSError):
+        remove(run)
+    assert (run / name).read_bytes() == bag.read_bytes()
+    (run / name).unlink(), (run / "run.json").write_bytes(before["run.json"])
+    assert code_of("replay", bag, "--out", run, "--force") == 0
+
+
+def test_a_folder_or_a_fifo_with_the_name_of_a_result_is_not_removed(bag, run):
+    for make in (Path.mkdir, os.mkfifo, lambda path: path.symlink_to(bag)):
+        (run / "path.png").unlink(missing_ok=True)
+        make(run / "path.png")
+        before = state(run)
+        with pytest.raises(RunError, match=r"path\.png: not written by this run"):
+            replay(bag, run, force=True)
+        assert state(run) == before
+        with contextlib.suppress(OSError):
+            (run / "path.png").rmdir()
+
+
+def test_what_else_is_in_a_run_folder_stays_when_the_run_is_replaced(bag, run):
+    for name in ("notes.txt", "run_of_last_year.mcap", "path.tum.new", ".hidden.new"):
+        (run / name).write_text("mine")
+    (run / ".0123abcd.new").write_text("left behind by a killed process")
+    before = set(state(run)) - {".0123abcd.new"}
+    replay(bag, run, force=True)
+    assert set(state(run)) == before
+    assert (run / "notes.txt").read_text() == "mine"
+
+
+def test_a_run_is_marked_from_its_first_moment_and_until_it_is_saved_says_that_it_is_not_ended(tmp_path):
+    recorder = RunRecorder(tmp_path / "run", Config())
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["format"] == MARK
+    assert not json.loads((tmp_path / "run" / "run.json").read_text())["ended"]
+    recorder.sink(Odometry(1, (0.0, 0.0, 0.0)))
+    recorder.abandon()
+    for file in (tmp_path / "run").glob("*.mcap"):
+        file.unlink()
+    assert is_run(tmp_path / "run"), "by its mark alone"
+    RunRecorder(tmp_path / "run", Config()).close()  # it held nothing
+
+
+def test_a_run_of_an_earlier_version_is_known_by_its_journal_read_and_never_replaced(bag, tmp_path):
+    (golden,) = GOLDEN.iterdir()
+    old = shutil.copytree(golden, tmp_path / "old")
+    assert is_run(old)
+    cut = shutil.copytree(golden, tmp_path / "cut")
+    (cut / "run.json").unlink()
+    assert is_run(cut), "cut off before it was saved"
+    for folder in (old, cut):
+        before = state(folder)
+        for force in (False, True):
+            with pytest.raises(RunError, match="a run of an earlier version, which is never replaced"):
+                replay(bag, folder, force=force)
+        assert state(folder) == before
+    keep_earlier(old, 0)
+    assert state(tmp_path / "old-1")["ingest.mcap"] == (golden / "ingest.mcap").read_bytes()
+    (cut / "ingest.mcap").write_bytes(bag.read_bytes())
+    assert not is_run(cut), "its journal is a recording"
+
+
+# -- --force -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_or_a_file_that_is_there_is_replaced_with_force_alone(bag, run, tmp_path, capsys):
+    graph, city = tmp_path / "world.g2o", ["simulate", "city", "--poses", "12", "--set", "blocks=2"]
+    assert code_of(*city, "--out", graph) == 0
+    other = shutil.copytree(run, tmp_path / "other")
+    commands = [
+        (["replay", bag], other),
+        (["recover", run], other),
+        (["freeze", run], other),
+        (["export", run, "--to", "tum"], tmp_path / "path.tum"),
+        (["export", run, "--to", "g2o"], tmp_path / "path.g2o"),
+        (["export", run, "--to", "mcap"], tmp_path / "path.mcap"),
+        (["optimize", graph], tmp_path / "solved.g2o"),
+        (["simulate", "manhattan", "--poses", "20", "--set", "blocks=2"], tmp_path / "world.mcap"),
+        (city, tmp_path / "world_2.g2o"),
+    ]
+    for words, out in commands:
+        words = [*words, "--out", out]
+        if out != other:
+            assert code_of(*words) == 0, words
+        before = state(tmp_path)
+        capsys.readouterr()
+        assert code_of(*words) == 2, words
+        (line,) = capsys.readouterr().err.splitlines()
+        assert str(out) in line
+        assert "--force" in line
+        assert state(tmp_path) == before
+        assert code_of(*words, "--force") == 0, words
+    for words, out in ((["convert", graph], tmp_path / "a.toro"), (["optimize", graph, "--plot"], tmp_path / "a.png")):
+        assert code_of(*words, out) in (0, 3)
+        assert code_of(*words, out) == 2
+        assert code_of(*words, out, "--force") in (0, 3)
+
+
+def test_what_lies_beside_a_file_that_is_written_is_not_replaced_either(tmp_path, run, capsys):
+    (tmp_path / "a_vertices.csv").write_text("mine")
+    assert code_of("export", run, "--to", "g2o", "--out", tmp_path / "a.g2o") == 2
+    (tmp_path / "w.truth.tum").write_text("mine")
+    assert code_of("simulate", "city", "--poses", "12", "--out", tmp_path / "w.g2o") == 2
+    (tmp_path / "v.faults.csv").write_text("mine")
+    simulated = ["simulate", "manhattan", "--poses", "20", "--fault", "slip", "--out", tmp_path / "v.mcap"]
+    assert code_of(*simulated) == 2
+    assert not any((tmp_path / name).exists() for name in ("a.g2o", "w.g2o", "v.mcap"))
+    assert {(tmp_path / name).read_text() for name in ("a_vertices.csv", "w.truth.tum", "v.faults.csv")} == {"mine"}
+    assert capsys.readouterr().err.count("exists already") == 3
+
+
+def test_a_file_that_is_not_a_regular_one_is_not_replaced_even_with_force(tmp_path, capsys):
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    (tmp_path / "link.g2o").symlink_to(victim)
+    (tmp_path / "dangling.g2o").symlink_to(tmp_path / "nowhere")
+    os.mkfifo(tmp_path / "fifo.g2o")
+    (tmp_path / "folder.g2o").mkdir()
+    before = state(tmp_path)
+    for name in ("link.g2o", "dangling.g2o", "fifo.g2o", "folder.g2o"):
+        assert code_of("simulate", "city", "--poses", "12", "--out", tmp_path / name, "--force") == 2
+        assert f"{name}: not a regular file, and so not replaced" in capsys.readouterr().err
+    assert state(tmp_path) == before
+
+
+def test_a_name_for_the_run_is_that_of_its_recording_and_free(bag, run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert suggested_out(bag) == Path("drive_run")
+    Path("drive_run").mkdir()
+    assert suggested_out(bag) == Path("drive_run_2")
+    Path("drive_run_2").symlink_to("nowhere")
+    assert suggested_out(bag) == Path("drive_run_3")
+    assert suggested_out(run) == Path("run_again")
+    names = {"a.mcap.zstd": "a_run", "b.bag.active": "b_run", "2026.01.02": "2026.01.02_run", "c.db3": "c_run"}
+    assert {name: str(suggested_out(Path(name))) for name in names} == names
+
+
+# -- one way to open ---------------------------------------------------------------------------------------------------
+
+TABLES = ("run.json", "config.yaml", "graph.g2o", "ledger.csv", "ledger_changes.csv", "path.tum", "covariances.csv")
+SCORED = ("sightings.tum", "odometry.tum", "landmarks.csv")
+READERS = {  # and the files of the run that they need
+    ("explain", "RUN"): ("run.json", "config.yaml", "ledger.csv", "ledger_changes.csv"),
+    ("solve", "RUN", "--without", "3"): ("graph.g2o", "config.yaml", "ledger.csv"),
+    ("influence", "RUN", "--count", "1"): ("graph.g2o",),
+    ("evaluate", "RUN", "--truth", "BAG"): ("run.json", "config.yaml", "path.tum", "covariances.csv", *SCORED),
+    ("plot", "RUN"): ("run.json", "config.yaml", "path.tum", "covariances.csv", *SCORED),
+    ("replay", "RUN", "--out", "OUT"): ("config.yaml", "ingest.mcap"),
+    ("recover", "RUN", "--out", "OUT"): ("config.yaml", "map.mcap"),
+    ("export", "RUN", "--to", "tum", "--out", "OUT"): ("map.mcap",),
+    ("diff", "RUN", "RUN"): ("map.mcap",),
+    ("replay", "BAG", "--out", "RUN", "--force"): (*TABLES[1:], *SCORED, "path.png", "ingest.mcap", "run.mcap"),
+}
+
+
+def fifo(path, victim):
+    os.mkfifo(path)
+
+
+def link(path, victim):
+    path.symlink_to(victim)
+
+
+@pytest.fixture
+def no_wait():
+    """What waits for a FIFO waits for ever: an alarm ends it."""
+
+    def end(*_):
+        raise TimeoutError("it waits")
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("kind", [fifo, link])
+@pytest.mark.parametrize(("words", "name"), [(words, name) for words, names in READERS.items() for name in names])
+def test_no_command_waits_for_a_fifo_in_a_run_folder_or_follows_a_link(
+    bag, run, tmp_path, words, name, kind, no_wait, capsys
+):
+    if words[0] == "evaluate":
+        pytest.importorskip("evo")
+    victim = tmp_path / "victim"
+    victim.write_bytes((run / name).read_bytes() if (run / name).is_file() else b"a picture of mine")
+    before = victim.read_bytes()
+    (run / name).unlink(missing_ok=True)
+    kind(run / name, victim)
+    names = {"RUN": run, "BAG": bag, "OUT": tmp_path / "out"}
+    assert code_of(*(names.get(word, word) for word in words)) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "not a regular file" in line or "a symbolic link" in line or "never removed" in line, line
+    assert victim.read_bytes() == before
+
+
+def test_evaluate_replaces_a_planted_link_and_does_not_write_through_it(bag, run, tmp_path):
+    pytest.importorskip("evo")
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    (run / "path.png").unlink(missing_ok=True)
+    (run / "path.png").symlink_to(victim)
+    assert code_of("evaluate", run, "--truth", bag) == 0
+    assert victim.read_text() == "mine"
+    assert not (run / "path.png").is_symlink()
+    assert (run / "path.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_only_regular_files_are_opened_and_a_name_that_exists_is_never_written_to(tmp_path):
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "file").write_text("text")
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    (tmp_path / "to_fifo").symlink_to(tmp_path / "fifo")
+    for name, follow in itertools.product(("fifo", "to_fifo", "."), (False, True)):
+        with pytest.raises(OSError, match=r"not a regular file|symbolic link"):
+            opened(tmp_path / name, follow=follow)
+    with pytest.raises(OSError, match="a symbolic link, which is not followed here"):
+        opened(tmp_path / "link")
+    assert read_text(tmp_path / "link", follow=True) == read_text(tmp_path / "file") == "text"
+    for name in ("fifo", "file", "link"):
+        file = AppendedFile(tmp_path / name)
+        file.write(b"theirs")
+        with pytest.raises(FileExistsError):
+            file.flush()
+        file.abandon()
+    with pytest.raises(FileExistsError, match="not a regular file"):
+        write_whole(tmp_path / "fifo", b"theirs")
+    write_whole(tmp_path / "link", b"theirs")
+    assert (tmp_path / "file").read_text() == "text"
+    assert (tmp_path / "link").read_text() == "theirs"
+
+
+def test_a_file_is_written_whole_or_not_at_all_whatever_interrupts(tmp_path):
+    (tmp_path / "a").write_text("old")
+    for error in (KeyboardInterrupt, GraphSlamError("no")):
+        with pytest.raises((KeyboardInterrupt, GraphSlamError)), replaced(tmp_path / "a") as new:
+            new.write_text("half")
+            raise error
+        assert state(tmp_path) == {"a": b"old"}
+
+
+# Calls that open, write, rename or remove files, and the only places that have them.
+OPENING = {"open", "read_text", "read_bytes", "write_text", "write_bytes", "unlink", "remove", "rename", "replace"}
+OPENING |= {"rmtree", "rmdir", "FileIO", "fdopen", "savefig", "touch", "move", "copy", "copyfile", "copytree"}
+OF_FILES = {
+    "formats/files.py": {"os.open"},
+    "formats/durable.py": {"os.open", "os.replace", "new.unlink"},
+    "runs/folder.py": {"folder.rename", "file.unlink", "(folder / SUMMARY).unlink", "folder.rmdir"},
+    # not of runs, nor of the user's
+    "node/generate_interfaces.py": None,
+    "node/player.py": {"parameters.write_text", "subprocess.Popen"},
+    "lie/jit.py": None,
+    "warmup.py": {"COMPILED.touch", "subprocess.Popen"},
+    "node/memory.py": {"_STATM.read_text"},
+    "analysis/plots.py": {"figure.savefig"},  # into memory
+    "solver/solver.py": {"self._waiting.touch"},
+}
+
+
+def test_every_file_is_opened_through_the_one_module_for_it():
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = path.relative_to(PACKAGE).as_posix()
+        allowed = OF_FILES.get(name, set())
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Call) or allowed is None:
+                continue
+            called = ast.unparse(node.func)
+            last = called.rpartition(".")[2]
+            if last not in OPENING or called in allowed:
+                continue
+            is_of_a_module = called.startswith(("os.", "shutil.", "io.")) or called == "open"
+            is_of_text = last in ("replace", "remove", "copy", "move", "open") and not is_of_a_module
+            is_function = "." not in called and called != "open"  # of ours
+            assert is_of_text or is_function, f"{name}:{node.lineno}: {called}"
+
+
+def test_a_reader_of_a_run_folder_follows_no_link():
+    """Who reads with ``follow`` reads what the user has named: these, and no others."""
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and any(k.arg == "follow" for k in node.keywords):
+                (value,) = (ast.unparse(k.value) for k in node.keywords if k.arg == "follow")
+                if value == "True":
+                    found.add(f"{path.relative_to(PACKAGE).as_posix()}: {ast.unparse(node.args[0])}")
+    assert found == {"recordings/ros1_records.py: path", "recordings/bag.py: file", "analysis/trajectories.py: path"}
+
+
+def test_the_recordings_of_a_run_are_told_from_those_of_a_simulation(tmp_path, bag):
+    with BagWriter(tmp_path / "run.mcap") as writer:
+        writer.write("/odom", "nav_msgs/msg/Odometry", 1, b"")
+    mine = tmp_path / "mine"
+    recorder = RunRecorder(mine, Config())
+    recorder.close()
+    check_room(mine)
+    shutil.copy(tmp_path / "run.mcap", mine / "run.mcap")
+    with pytest.raises(RunError, match="never removed"):
+        check_room(mine, force=True)

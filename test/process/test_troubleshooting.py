@@ -1,0 +1,117 @@
+"""docs/troubleshooting.md says what the code says: every counter, every reason of a state; its recipes are read.
+
+``python test/process/test_troubleshooting.py`` writes the table of counters anew.
+"""
+
+import ast
+import json
+import re
+from itertools import pairwise
+
+import pytest
+from places import ROOT
+
+from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.measurements.reasons import REASONS
+from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.slam import Config
+
+PAGE = ROOT / "docs/troubleshooting.md"
+HEAD = "| counter | effect | what it means | remedy |\n|---|---|---|---|\n"
+
+
+def table():
+    rows = (f"| `{name}` | {row.effect.value} | {row.meaning} | {row.remedy} |" for name, row in REASONS.items())
+    return HEAD + "\n".join(rows) + "\n"
+
+
+def blocks(kind, text=None):
+    return re.findall(rf"```{kind}\n(.*?)```", text or PAGE.read_text(), re.DOTALL)
+
+
+def test_every_counter_is_on_the_page():
+    assert f"\n\n{table()}\n" in PAGE.read_text(), "python test/process/test_troubleshooting.py writes it"
+
+
+def reasons_of_states():
+    """What the verdict can say, as the constant pieces of each text."""
+    tree = ast.parse((ROOT / "graph_slam_ros/node/diagnostics.py").read_text())
+    for function in ast.walk(tree):
+        if isinstance(function, ast.FunctionDef) and ast.unparse(function.returns) in ("str", "Iterator[str]"):
+            for node in ast.walk(function):
+                if isinstance(node, ast.Yield | ast.Return):
+                    pieces = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant) and type(n.value) is str]
+                    yield from ([piece] for piece in pieces if len(piece.strip()) > 5 and " " in piece.strip())
+
+
+def test_every_reason_of_a_state_is_on_the_page():
+    page, found = PAGE.read_text(), [piece for pieces in reasons_of_states() for piece in pieces]
+    assert len(found) > 25
+    for piece in found:
+        assert piece.strip(" :;,") in page, piece
+
+
+@pytest.mark.parametrize("block", blocks("yaml"), ids=lambda block: re.search(r"type: (\S+),", block)[1])
+def test_a_recipe_is_a_parameter_file_and_its_input_can_be_used_so(block, tmp_path):
+    file = tmp_path / "recipe.yaml"
+    file.write_text(block)
+    config = Config.from_mapping(read_parameters(file))
+    used = uses(config)
+    assert used.pop("odom") == "odometry"
+    ((name, use),) = used.items()
+    assert use == ("fix" if name == "gps" else "landmarks")
+
+
+def test_every_recipe_that_is_promised_is_there():
+    text = PAGE.read_text().partition("## Recipes")[2]
+    titles = [title.lower() for title in re.findall(r"^### (.*)$", text, re.MULTILINE)]
+    for word in ("apriltag_ros", "ros2_aruco", "aruco_opencv", "reflectors", "gnss", "uwb"):
+        assert any(word in title for title in titles), word
+    sections = [*(m.start() for m in re.finditer(r"^### ", text, re.MULTILINE)), len(text)]
+    assert all(blocks("yaml", text[a:b]) for a, b in pairwise(sections))
+
+
+def told(robot, status, key):
+    said = robot.said(status)
+    return int(said[-1][1][key]) if said else 0
+
+
+def test_the_publisher_of_detections_works_with_a_node_as_it_stands(tmp_path):
+    live = pytest.importorskip("live_nodes")
+    import subprocess
+    import sys
+    import time
+
+    from messages import odometry, pose
+
+    (script,) = blocks("python")
+    (tmp_path / "detector.py").write_text(script)
+    detector = subprocess.Popen([sys.executable, "detector.py"], cwd=tmp_path, env=live.ENVIRONMENT)
+    try:
+        with live.node(f"output.folder:={tmp_path / 'run'}") as n, live.robot(hears=("/diagnostics",)) as r:
+            r.wait_for_node()
+
+            def stand(seconds):
+                r.send("/odom", odometry(pose(1.0, 0.0), stamp_ns=time.time_ns()))
+                r.spin(seconds)
+
+            def is_seen():
+                return told(r, "input detections", "used") > 8 and told(r, "input odom", "used") > 20
+
+            live.until(is_seen, stand, "detections that are used")
+            assert r.save().success
+            assert n.stop()[0] == 0
+    finally:
+        detector.kill()
+        detector.wait()
+    inputs = json.loads((tmp_path / "run/run.json").read_text())["inputs"]
+    assert inputs["odom"]["received"] >= inputs["odom"]["used"] > 10, "a live run tells it as a replay does"
+    assert inputs["detections"]["received"] >= inputs["detections"]["used"] >= 1, (
+        "one look a second of a robot that stands"
+    )
+    (line,) = [line for line in (tmp_path / "run/landmarks.csv").read_text().splitlines() if line.startswith("dock")]
+    assert line.split(",")[2:4] == ["3.0", "0.5"]
+
+
+if __name__ == "__main__":
+    PAGE.write_text(re.sub(re.escape(HEAD) + r"(\|.*\n)*", lambda _: table(), PAGE.read_text()))

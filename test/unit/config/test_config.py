@@ -1,0 +1,198 @@
+"""Parameters: one tree of defaults, strict files, and a shipped file that says exactly what the code says."""
+
+import re
+
+import pytest
+from places import ROOT
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.config.config import notes, parameters
+from graph_slam_ros.config.solve import SolveConfig
+from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.formats.parameters import parameters_text, parse_setting, read_parameters
+from graph_slam_ros.slam import Config
+from graph_slam_ros.solver import Settings
+
+CONFIG = ROOT / "config"
+SHIPPED = CONFIG / "planar.yaml"
+IN_SPACE = {"world.dimensions": 3}
+
+
+def read(tmp_path, text):
+    file = tmp_path / "parameters.yaml"
+    file.write_text(text)
+    return Config.from_mapping(read_parameters(file))
+
+
+def test_the_shipped_file_is_exactly_what_the_code_writes_of_its_defaults():
+    assert SHIPPED.read_text() == parameters_text(Config().as_mapping(), notes())
+
+
+def test_the_shipped_file_reads_back_as_the_defaults():
+    assert Config.from_mapping(read_parameters(SHIPPED)) == Config()
+
+
+def test_the_shipped_file_for_space_is_what_the_code_writes_and_differs_in_the_dimensions_alone():
+    config = Config.from_mapping(IN_SPACE)
+    assert (CONFIG / "spatial.yaml").read_text() == parameters_text(config.as_mapping(), notes())
+    assert Config.from_mapping(read_parameters(CONFIG / "spatial.yaml")) == config
+
+
+def test_every_input_has_a_section_and_only_those():
+    config = Config.from_mapping(
+        {"inputs.names": "odom gps", "gps": {"type": "sensor_msgs/msg/NavSatFix", "sigma_m": 2}}
+    )
+    assert [(one.name, one.topic, one.sigma_m) for one in config.sources] == [
+        ("odom", "odom", 0.0),
+        ("gps", "gps", 2.0),
+    ]
+    assert list(config.as_mapping())[-2:] == ["odom", "gps"]
+    assert Config.from_mapping(config.as_mapping()) == config
+    names = {p.name for p in parameters(["odom", "gps"])}
+    assert {"odom.topic", "gps.datum", "inputs.names"} <= names
+    assert "detections.topic" not in names
+
+
+def test_a_section_of_no_input_is_refused_and_says_what_there_is():
+    with pytest.raises(
+        ConfigError, match=r"did you mean 'odom.topic'\? 'gps' is not in inputs.names \(odom detections\)"
+    ):
+        Config.from_mapping({"gps.topic": "fix"})
+
+
+def test_every_parameter_says_what_it_means_and_its_default_is_valid():
+    for p in parameters():
+        assert p.meaning
+        assert p.check(p.default) == p.default
+        assert p.unit or p.type is not float or p.name.endswith("tolerance"), p.name
+
+
+def test_the_solvers_defaults_are_those_of_its_settings_but_for_when_the_last_solve_has_converged():
+    ours, solvers = SolveConfig(), Settings()
+    shared = set(SolveConfig.__slots__) & set(Settings.__slots__)
+    others = {name for name in shared if getattr(ours, name) != getattr(solvers, name)}
+    assert others == {"step_tolerance", "cost_tolerance"} < shared
+    assert set(SolveConfig.__slots__) - shared == {"every_keyframes"}
+
+
+def test_what_is_written_is_read_back_as_it_was(tmp_path):
+    values = {"frames": {"map": 'a "quoted" \\ näme: {x}\n'}, "solve": {"step_tolerance": 1e-300, "method": "lm"}}
+    config = Config.from_mapping({**values, "tf": {"publish_tf": False}})
+    assert read(tmp_path, parameters_text(config.as_mapping())) == config
+
+
+def test_a_file_may_be_flat_dotted_or_wrapped_as_ros_does(tmp_path):
+    for text in (
+        "ordering:\n  window_s: 0.2\n",
+        "ordering.window_s: 0.2\n",
+        "/**:\n  ros__parameters:\n    ordering:\n      window_s: 0.2\n",
+        "graph_slam:\n  ros__parameters:\n    ordering.window_s: 0.2\n",
+    ):
+        assert read(tmp_path, text) == Config.from_mapping({"ordering": {"window_s": 0.2}})
+
+
+def test_an_empty_file_is_the_defaults_and_whole_numbers_do_for_floats(tmp_path):
+    assert read(tmp_path, "") == Config()
+    assert read(tmp_path, "tf:\n  transform_tolerance: 1\n").tf.transform_tolerance == 1.0
+
+
+@pytest.mark.parametrize(
+    "name, nearest",
+    [
+        ("solve.every_keyframe", "solve.every_keyframes"),
+        ("odometry.still_ms", "odometry.still_m_s"),
+        ("landmark.sigma_m", "landmarks.sigma_m"),
+        ("Frames.Odom", "frames.odom"),
+        ("frames", "frames.map"),
+    ],
+)
+def test_F28_an_unknown_key_is_refused_with_the_nearest_known_one(name, nearest):
+    with pytest.raises(ConfigError, match=f"unknown parameter '{re.escape(name)}'; did you mean '{nearest}'"):
+        Config.from_mapping({name: 1.0})
+
+
+@pytest.mark.parametrize(
+    "name, value, complaint",
+    [
+        ("solve.every_keyframes", 2.5, "2.5 is not an integer"),
+        ("solve.every_keyframes", True, "True is not an integer"),
+        ("solve.every_keyframes", 10**400, r"0 is not in \[1, 1e\+06\]"),
+        ("solve.every_keyframes", 0, r"0 is not in \[1, 1e\+06\]"),
+        ("tf.publish_tf", "yes", "'yes' is not true or false"),
+        ("tf.publish_tf", 1, "1 is not true or false"),
+        ("tf.transform_publish_period", "1e-3", "'1e-3' is not a number"),
+        ("tf.transform_publish_period", None, "None is not a number"),
+        ("tf.transform_publish_period", [0.1], r"\[0.1\] is not a number"),
+        ("tf.transform_publish_period", float("nan"), "nan is not finite"),
+        ("tf.transform_tolerance", float("inf"), "inf is not finite"),
+        ("tf.transform_tolerance", 10**400, "is not a number"),
+        ("keyframes.min_angle_rad", 3.2, r"3.2 is not in \[0.001, 3.14159\]"),
+        ("anchor.sigma_m", -1, r"-1.0 is not in \[0, 1e\+09\]"),
+        ("anchor.sigma_m", 1e300, r"1e\+300 is not in \[0, 1e\+09\]"),
+        ("anchor.sigma_rad", 1e-12, r"1e-12 is not 0 or in \[1e-06, 1e\+09\]"),
+        ("frames.map", 3, "3 is not a text"),
+        ("solve.method", "newton", "'newton' is not one of gn, lm"),
+        ("landmarks.id_from", "name", "'name' is not one of id, class_id"),
+    ],
+)
+def test_F29_a_value_of_the_wrong_type_or_out_of_range_is_refused_by_name(name, value, complaint):
+    with pytest.raises(ConfigError, match=f"^{re.escape(name)}: .*{complaint}"):
+        Config.from_mapping({name: value})
+
+
+@pytest.mark.parametrize(
+    "text, complaint",
+    [
+        ("[1, 2]\n", "not a mapping of parameters"),
+        ("tf: {stamp: now\n", "not valid YAML"),
+        ("1: 2\n", "1 is not a name"),
+        ("? [a, b]\n: 1\n", "line 1: a key is not a name"),
+        ("? {a: b}\n: 1\n", "line 1: a key is not a name"),
+        ("tf:\n  period_s: 2001-99-99\n", "not valid YAML"),
+        ("a:\n  ros__parameters: {}\nb:\n  ros__parameters: {}\n", r"several nodes \(a, b\)"),
+        ("graph_slam:\n  ros__parameters: {}\n/**:\n  ros__parameters: {}\n", "several nodes"),
+        ("/**:\n  ros__parameters: 3\n", "ros__parameters is not a mapping"),
+    ],
+    ids=range(9),
+)
+def test_a_file_that_is_not_plain_parameters_is_refused_by_name(tmp_path, text, complaint):
+    with pytest.raises(ConfigError, match=rf"parameters\.yaml: .*{complaint}") as caught:
+        read(tmp_path, text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [None, b"\xff\xfe\x00"])
+def test_a_file_that_is_missing_or_no_text_is_refused_by_name(tmp_path, content):
+    file = tmp_path / "parameters.yaml"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"parameters\.yaml: "):
+        read_parameters(file)
+
+
+def test_a_setting_is_read_as_yaml_reads_it():
+    assert parse_setting("a.b=0.5") == ("a.b", 0.5)
+    assert parse_setting("frames.map=x=y") == ("frames.map", "x=y")
+    assert parse_setting("tf.publish_tf=false") == ("tf.publish_tf", False)
+    assert parse_setting("output.folder=") == ("output.folder", None)
+
+
+@pytest.mark.parametrize("text", ["window_s", "=3", "a=[1", "a={[1]: 2}", "a=2001-99-99", "a={b: 1, b: 2}"])
+def test_a_setting_that_is_not_one_is_refused(text):
+    with pytest.raises(ConfigError):
+        parse_setting(text)
+
+
+def test_the_command_line_names_the_file_or_the_key_that_is_wrong(tmp_path, capsys):
+    file = tmp_path / "mine.yaml"
+    file.write_text("tf:\n  stamps: now\n")
+    for options, culprit in (
+        (["--config", str(file)], "mine.yaml: unknown parameter 'tf.stamps'; did you mean 'tf.stamp'?"),
+        (["--set", "solve.metod=lm"], "unknown parameter 'solve.metod'; did you mean 'solve.method'?"),
+        (["--set", "ordering.window_s=-1"], "ordering.window_s: -1.0 is not in [0, 1e+09]"),
+    ):
+        assert main(["replay", "none.mcap", "--out", str(tmp_path / "run"), *options]) == 2
+        err = capsys.readouterr().err
+        assert culprit in err
+        assert err.count("\n") == 1
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,120 @@
+"""TORO's, iSAM's and GTSAM's texts give the same graph as the g2o file of the same meaning."""
+
+import numpy as np
+import pytest
+from places import DATASETS
+from scipy.spatial.transform import Rotation
+
+from graph_slam_ros.errors import FormatError
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, RELATIVE_POSE_3D
+from graph_slam_ros.solver import Solver, initial_values
+
+GRAPHS = DATASETS
+VICTORIA = GRAPHS / "pose_graphs" / "victoria_park.txt"
+
+
+def read(tmp_path, text, **options):
+    path = tmp_path / "graph.txt"
+    path.write_text(text)
+    return read_g2o(path, **options)
+
+
+def information(file, edge):
+    root = file.graph.tables[edge].sqrt_information.values
+    return np.swapaxes(root, 1, 2) @ root
+
+
+def test_toro_orders_the_information_its_own_way(tmp_path):
+    vertices = "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\n"
+    toro = read(tmp_path, vertices + "EDGE2 0 1 1 0 0.5 4 1 3 9 0.5 0.25\n")  # I11 I12 I22 I33 I13 I23
+    g2o = read(tmp_path, vertices.replace("VERTEX2", "VERTEX_SE2") + "EDGE_SE2 0 1 1 0 0.5 4 1 0.5 3 0.25 9\n")
+    assert np.allclose(information(toro, RELATIVE_POSE), information(g2o, RELATIVE_POSE), rtol=1e-12)
+
+
+def test_edge2_with_rows_of_the_upper_triangle_may_be_square_roots_and_is_asked_for(tmp_path):
+    text = "EDGE2 0 1 1 0 0.5 4 0 0 3 0 9\n"
+    with pytest.raises(FormatError, match=r":1: EDGE2 is not in TORO's order: --from isam .* or --from rows") as error:
+        read(tmp_path, text)
+    assert len(str(error.value)) <= 200
+    rows = read(tmp_path, text, dialect="rows")
+    assert np.allclose(information(rows, RELATIVE_POSE)[0], np.diag([4.0, 3.0, 9.0]))
+    isam = read(tmp_path, text + "LANDMARK 1 7 2 3 5 1 2\n", dialect="isam")
+    assert np.allclose(information(isam, RELATIVE_POSE)[0], np.diag([16.0, 9.0, 81.0]))
+    assert np.allclose(information(isam, LANDMARK_POSITION)[0], [[25.0, 5.0], [5.0, 5.0]])
+    root = np.array([[4.0, 1.0, 2.0], [0.0, 3.0, -1.0], [0.0, 0.0, 9.0]])
+    full = read(tmp_path, "ODOMETRY 0 1 1 0 0.5 4 1 2 3 -1 9\n", dialect="isam")
+    assert np.allclose(information(full, RELATIVE_POSE)[0], root.T @ root)
+
+
+def test_gtsam_text_gives_covariances_and_numbers_landmarks_apart(tmp_path):
+    text = "ODOMETRY 0 1 1 0 0.5 0.25 0 0 0.5 0 0.1\nLANDMARK 1 1 2 3 0.5 0.1 0.25\n"
+    file = read(tmp_path, text)
+    assert file.graph.vertex_count == 3
+    assert not file.has_values
+    assert np.allclose(information(file, RELATIVE_POSE)[0], np.diag([4.0, 2.0, 10.0]))
+    assert np.allclose(information(file, LANDMARK_POSITION)[0], np.linalg.inv([[0.5, 0.1], [0.1, 0.25]]))
+
+
+def test_edge3_turns_roll_pitch_and_yaw_into_a_quaternion_and_needs_no_information(tmp_path):
+    file = read(tmp_path, "VERTEX3 0 0 0 0 0 0 0\nVERTEX3 1 1 2 3 0.1 -0.2 0.3\nEDGE3 0 1 1 2 3 0.1 -0.2 0.3\n")
+    measured = file.graph.tables[RELATIVE_POSE_3D].measured.values[0]
+    assert np.allclose(measured[3:], Rotation.from_euler("xyz", [0.1, -0.2, 0.3]).as_quat())
+    assert np.allclose(information(file, RELATIVE_POSE_3D)[0], np.eye(6))
+
+
+def test_the_information_of_edge3_is_never_scaled(tmp_path):
+    text = "VERTEX3 0 0 0 0 0 0 0\nVERTEX3 1 1 2 3 0.1 -0.2 0.3\nEDGE3 0 1 1 2 3 0.1 -0.2 0.3 " + " ".join(
+        f"{value:g}" for value in np.diag([1.0, 2, 3, 4, 5, 6])[np.triu_indices(6)]
+    )
+    for raw in (False, True):
+        file = read(tmp_path, text + "\n", raw=raw)
+        assert np.allclose(information(file, RELATIVE_POSE_3D)[0], np.diag([1.0, 2, 3, 4, 5, 6]), rtol=1e-14)
+
+
+def test_edge3_may_be_isams_square_root_which_is_said_and_taken_where_it_is_asked_for(tmp_path):
+    root = np.triu(np.random.default_rng(1).uniform(0.1, 1.0, (6, 6))) + 5.0 * np.eye(6)
+
+    def text(of):
+        return "EDGE3 0 1 1 2 3 0.1 -0.2 0.3 " + " ".join(map(repr, of[np.triu_indices(6)].tolist())) + "\n"
+
+    assert np.allclose(information(read(tmp_path, text(root), dialect="isam"), RELATIVE_POSE_3D)[0], root.T @ root)
+    asked = "graph.txt:1: EDGE3 is read as TORO's information (--from toro says that it is)"
+    assert [note.startswith(asked) and note.endswith(": --from isam") for note in read(tmp_path, text(root)).notes] == [
+        True
+    ]
+    for dialect in ("isam", "toro"):
+        assert not read(tmp_path, text(root), dialect=dialect).notes
+    assert not read(tmp_path, text(np.eye(6))).notes, "the identity is its own root"
+
+
+def test_a_graph_of_edges_alone_starts_from_its_tree(tmp_path):
+    file = read(tmp_path, "EDGE_SE2 0 1 1 0 1.5707963267948966 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n")
+    assert np.allclose(initial_values(file.graph, "tree", 0).reshape(-1, 3)[:, :2], [[0, 0], [1, 0], [1, 1]])
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "EDGE2 0 1 1 0",
+        "ODOMETRY 0 1 1 0 0 0 0 0 0 0",
+        "ODOMETRY 0 1 1 0 0 -1 0 0 1 0 1",
+        "LANDMARK 0 1 1 0 1 2 1",
+        "VERTEX2 0 nan 0 0",
+        "EDGE3 0 1 1",
+    ],
+)
+def test_a_bad_line_is_named(tmp_path, line):
+    with pytest.raises(FormatError, match=r"graph\.txt:1: "):
+        read(tmp_path, line + "\n")
+
+
+@pytest.mark.skipif(not VICTORIA.exists(), reason=f"no public graphs under {GRAPHS}")
+def test_victoria_park_starts_where_its_reference_says():
+    file = read_g2o(VICTORIA)
+    solver = Solver(file.graph)
+    solver.add(range(file.graph.vertex_count), range(file.graph.edge_count))
+    solver.start_at(initial_values(file.graph, "tree", 0))
+    solver.hold(0)
+    assert file.graph.vertex_count == 6969 + 151
+    assert solver.optimize(type(solver.settings)(max_iterations=1)).chi2_initial == pytest.approx(1.33018e8, rel=1e-5)

@@ -1,0 +1,218 @@
+"""A whole graph in one call: what holds it, where it starts, and graphs with next to nothing in them."""
+
+import numpy as np
+import pytest
+from places import ROOT
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.graph import (
+    ATTITUDE_PRIOR_3D,
+    HEADING_PRIOR,
+    HUBER,
+    LANDMARK_POSITION,
+    POINT_PRIOR,
+    POSE_PRIOR,
+    POSITION_PRIOR,
+    POSITION_PRIOR_3D,
+    R1,
+    R2,
+    RELATIVE_POSE,
+    RELATIVE_POSE_3D,
+    SE2,
+    SE3,
+    Gaussian,
+    Graph,
+    Loss,
+)
+from graph_slam_ros.lie import se3
+from graph_slam_ros.optimization import optimize
+from graph_slam_ros.solver import Settings, initial_values
+
+CITY = ROOT / "data/city.g2o"
+STARTS = ["file", "tree", "chordal", "online"]
+STEP = (1.0, 0.2, 0.0, *np.array([0.1, -0.2, 0.3, np.sqrt(0.86)]))
+
+
+def unit(size, sigma=1.0):
+    return Gaussian.from_sigmas(*[sigma] * size)
+
+
+def chain(count=4):
+    """Poses in the plane, each 1 m before the last, that begin at (5, 6) and half a radian."""
+    graph = Graph()
+    for k in range(count):
+        graph.add_vertex(SE2, [5.0 + k * np.cos(0.5), 6.0 + k * np.sin(0.5), 0.5])
+        if k:
+            graph.add_edge(RELATIVE_POSE, [k - 1, k], [1, 0, 0], unit(3), "odometry")
+    return graph
+
+
+@pytest.mark.parametrize("init", STARTS)
+def test_graphs_with_next_to_nothing_are_solved_from_any_start(init):
+    nothing = optimize(Graph(), init=init)
+    assert (nothing.report.stop, nothing.poses.shape, nothing.points.shape) == ("nothing_to_do", (0, 0), (0, 0))
+    assert optimize(chain(1), init=init).poses.tolist() == [[5.0, 6.0, 0.5]]
+    points = Graph()
+    points.add_vertices(R2, [[1.0, 2.0], [3.0, 4.0]])
+    for k in range(2):
+        points.add_edge(POINT_PRIOR[R2], [k], [0.0, float(k)], unit(2), "surveyed")
+    solved = optimize(points, init=init)
+    assert solved.start == "file"
+    assert solved.points == pytest.approx(np.array([[0.0, 0.0], [0.0, 1.0]]), abs=1e-12)
+
+
+def without_a_weight(graph):
+    table, row = graph.row(graph.add_edge(POSE_PRIOR, [2], [0, 0, 0], unit(3), "anchor"))
+    table.weight.values[row] = 0.0
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        lambda g: None,
+        lambda g: g.add_edges(POSE_PRIOR, np.empty((0, 1), dtype=int), np.empty((0, 3)), unit(3), "anchor"),
+        without_a_weight,
+        lambda g: g.add_edge(HEADING_PRIOR, [2], [0.5], unit(1), "compass"),
+        lambda g: g.add_edge(POSITION_PRIOR, [0], [5, 6], unit(2), "fixes"),
+        lambda g: g.add_edge(POINT_PRIOR[R1], [g.add_vertex(R1, [0.0])], [0.0], unit(1), "offset"),
+    ],
+    ids=["none", "an empty table", "one of no weight", "a heading", "one position", "an offset of a sensor"],
+)
+@pytest.mark.parametrize("init", STARTS)
+def test_G2_the_first_pose_is_held_where_priors_do_not_fix_position_and_heading(prior, init):
+    graph = chain()
+    prior(graph)
+    solved = optimize(graph, init=init)
+    assert solved.poses[0].tolist() == [5.0, 6.0, 0.5]
+    assert not solved.solver.marginal([0])[0].any()
+    assert solved.report.converged
+
+
+@pytest.mark.parametrize(
+    "priors",
+    [
+        [(POSE_PRIOR, 1, [7, 8, 0.3])],
+        [(POSITION_PRIOR, 1, [7, 8]), (HEADING_PRIOR, 3, [0.3])],
+        [(POSITION_PRIOR, 0, [7, 8]), (POSITION_PRIOR, 2, [9, 8])],
+    ],
+    ids=["a pose", "a position and a heading", "two positions"],
+)
+def test_nothing_is_held_where_priors_fix_the_whole_together(priors):
+    graph = chain()
+    for edge, vertex, measured in priors:
+        graph.add_edge(edge, [vertex], measured, unit(edge.residual_size), "priors")
+    solved = optimize(graph, Settings(step_tolerance=1e-10, cost_tolerance=0.0))
+    assert solved.report.chi2_final == pytest.approx(0.0, abs=1e-15)
+    assert solved.solver.marginal([0])[0].any()
+
+
+@pytest.mark.parametrize(
+    ("priors", "fixed"),
+    [
+        ([(POSITION_PRIOR_3D, k) for k in (0, 1)], False),  # it turns about the line through both
+        ([(POSITION_PRIOR_3D, k) for k in (0, 1, 2)], True),
+        ([(ATTITUDE_PRIOR_3D, 1)], False),
+        ([(POSITION_PRIOR_3D, 2), (ATTITUDE_PRIOR_3D, 1)], True),
+    ],
+)
+def test_in_space_too_priors_fix_the_whole_or_do_not(priors, fixed):
+    graph, pose = Graph(), se3.retract(se3.IDENTITY, (100.0, -50.0, 7.0, 0.3, -0.2, 0.9))
+    for k in range(4):
+        graph.add_vertex(SE3, pose)
+        pose = se3.compose(pose, STEP)
+        if k:
+            graph.add_edge(RELATIVE_POSE_3D, [k - 1, k], STEP, unit(6), "odometry")
+    for edge, vertex in priors:
+        value = graph.initial.values[7 * vertex : 7 * vertex + 7]
+        measured = value[:3] if edge is POSITION_PRIOR_3D else value[3:]
+        graph.add_edge(edge, [vertex], measured, unit(3), "priors")
+    solved = optimize(graph)
+    assert solved.solver.marginal([0])[0].any() == fixed
+
+
+@pytest.mark.parametrize("init", STARTS[1:])
+def test_edges_of_no_weight_do_not_say_where_to_start(init):
+    graph = Graph()
+    graph.add_vertices(SE2, np.zeros((3, 3)))
+    point = graph.add_vertex(R2, [0.0, 0.0])
+    wrong = [graph.add_edge(RELATIVE_POSE, [0, 1], [9, 9, 1], unit(3), "odometry")]
+    wrong += [graph.add_edge(LANDMARK_POSITION, [0, point], [9, 9], unit(2), "landmarks")]
+    for k in range(2):
+        graph.add_edge(RELATIVE_POSE, [k, k + 1], [1, 0, 0], unit(3), "odometry")
+    graph.add_edge(LANDMARK_POSITION, [2, point], [0, 1], unit(2), "landmarks")
+    for edge in wrong:
+        table, row = graph.row(edge)
+        table.weight.values[row] = 0.0
+    expected = [0, 0, 0, 1, 0, 0, 2, 0, 0, 2, 1]
+    assert initial_values(graph, init, 0) == pytest.approx(np.array(expected, dtype=float), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"max_iterations": -3},
+        {"step_tolerance": float("nan")},
+        {"cost_tolerance": -1e-9},
+        {"relinearize_every": 0},
+        {"relinearize_passes": -1},
+        {"tolerance_sigmas": -1.0},
+        {"losses": {"odometry": []}},
+    ],
+)
+def test_settings_that_cannot_be_are_refused_by_name(wrong):
+    (name,) = wrong
+    with pytest.raises(GraphSlamError, match=name):
+        Settings(**wrong)
+    assert Settings(losses={"odometry": [Loss(HUBER)]}).stages()
+
+
+# -- other starts where the first result is suspicious ----------------------------------------------------------------
+
+
+def from_nowhere(spread=2.0):
+    """A city whose initial values are of no use."""
+    file = read_g2o(CITY)
+    values = file.graph.initial.values
+    values[:] += np.random.default_rng(0).normal(0.0, spread, len(values))
+    return file
+
+
+def test_a_good_start_is_solved_once():
+    solution = optimize(CITY)
+    assert (solution.start, solution.suspicion) == ("file", "")
+    assert [one.start for one in solution.attempts] == ["file"]
+
+
+def test_a_local_minimum_is_noticed_and_left_by_another_start():
+    stuck = optimize(from_nowhere(), init="file")
+    assert stuck.report.converged
+    assert stuck.report.chi2_final > 1e5
+    solution = optimize(from_nowhere())
+    assert solution.start == "chordal"
+    assert solution.report.chi2_final == pytest.approx(465.969818, abs=1e-3)
+    assert solution.suspicion == f"chi2 {stuck.report.chi2_final:.6g} is far above its 471 degrees of freedom"
+    assert [one.start for one in solution.attempts] == ["file", "chordal"]
+
+
+def test_a_wrong_closure_is_no_local_minimum_and_all_starts_agree():
+    file = read_g2o(CITY)
+    far = file.graph.vertex_count // 2
+    file.graph.add_edge(RELATIVE_POSE, [0, far], [0, 0, 0], unit(3, 0.1), "closures")
+    solution = optimize(file)
+    assert solution.suspicion
+    assert [one.start for one in solution.attempts] == ["file", "chordal", "online"]
+    least = min(one.cost for one in solution.attempts if not one.failure)
+    assert solution.report.cost_final == pytest.approx(least, rel=1e-6)
+
+
+def test_a_start_that_fails_is_told_and_the_first_result_stays():
+    graph = chain(3)
+    graph.add_vertex(SE2, [5.0, 5.0, 0.0])
+    for at in ([5.0, 5.0, 0.0], [9.0, 5.0, 0.0]):  # on its own, and contradicting itself: no tree leads to it
+        graph.add_edge(POSE_PRIOR, [3], at, unit(3, 0.1), "priors")
+    graph.add_edge(POSE_PRIOR, [0], [5.0, 6.0, 0.5], unit(3), "priors")
+    solution = optimize(graph)
+    assert solution.start == "file"
+    assert "far" in solution.suspicion
+    assert [bool(one.failure) for one in solution.attempts] == [False, True, True]

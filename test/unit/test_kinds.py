@@ -1,0 +1,29 @@
+"""Kinds of tests: each has one by its folder, and a unit test can start no process."""
+
+import os
+
+import pytest
+import soak
+from conftest import KINDS, is_soaked
+from places import ROOT
+
+
+@pytest.mark.parametrize(
+    "start", [lambda: os.system("true"), lambda: os.posix_spawn("/bin/true", ["true"], {})], ids=["system", "spawn"]
+)
+def test_a_unit_test_that_starts_a_process_fails_and_says_what_is_missing(start):
+    with pytest.raises(RuntimeError, match=r"test_kinds\.py starts a process: it belongs into test/process"):
+        start()
+
+
+def test_each_test_is_of_one_kind(request):
+    assert all(sum(map(item.keywords.__contains__, KINDS)) == 1 for item in request.session.items)
+    assert request.node.get_closest_marker("unit")
+
+
+def test_each_file_of_which_more_is_tried_in_make_soak_is_in_a_programme_of_it():
+    """What counts by hand or by ``GRAPH_SLAM_SOAK`` would be cut short for nothing."""
+    words = {word for programme in soak.PROGRAMMES.values() for word in programme}
+    files = [file for file in (ROOT / "test").rglob("test_*.py") if is_soaked(file)]
+    assert len(files) > 10
+    assert [file.name for file in files if str(file.relative_to(ROOT)) not in words] == []

@@ -1,0 +1,181 @@
+"""What a Python program meets: results of a run, short words for objects, and the table of edge types."""
+
+import pydoc
+import re
+import sys
+
+import numpy as np
+import pytest
+from places import ROOT
+
+import graph_slam_ros
+from graph_slam_ros import Config, Control, Graph, GraphSlam, load_run, optimize
+from graph_slam_ros import graph as edge_module
+from graph_slam_ros.config.config import parameters
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.graph import EdgeType
+from graph_slam_ros.simulation import measurements, simulate, write_bag
+from graph_slam_ros.slam import Update
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("library")
+    write_bag(simulate("warehouse", 1, aisles=2, laps=1, aisle_m=4.0), folder / "bag.mcap")
+    replayed = graph_slam_ros.replay(str(folder / "bag.mcap"), str(folder / "run"))
+    return replayed.slam, folder / "run"
+
+
+def test_replay_takes_texts_and_a_run_is_loaded_with_stamps_names_and_covariances(done):
+    slam, folder = done
+    run = load_run(str(folder))
+    path = run.trajectory()
+    assert path.stamps_s == pytest.approx(slam.keyframes.stamps_ns / 1e9, abs=1e-6)
+    assert path.poses[:, :2] == pytest.approx(slam.trajectory()[:, :2])
+    assert run.odometry().poses[:, :2] == pytest.approx(slam.keyframes.poses[:, :2])
+    assert run.covariances == pytest.approx(slam.keyframe_covariances(), nan_ok=True)
+    assert run.landmarks.names == tuple(slam.landmarks)
+    for name, landmark in slam.landmarks.items():
+        at = slam.solver.estimate([landmark.vertex])[0]
+        assert run.landmarks[name] == pytest.approx([*at[:2], 0.0])
+    assert run.landmarks.covariances.shape == (len(slam.landmarks), 3, 3)
+    assert len(run.edges) == slam.graph.edge_count
+    assert run.config == slam.config
+    assert run.summary["recording"] == "bag.mcap"
+    assert run.warnings == []
+    assert repr(run).endswith(f"run': {len(slam.keyframes)} keyframes, {len(slam.landmarks)} landmarks)")
+    with pytest.raises(KeyError):
+        run.landmarks["nowhere"]
+
+
+def test_data_frames_have_a_row_for_each(done):
+    pytest.importorskip("pandas")
+    slam, folder = done
+    run = load_run(folder)
+    path, landmarks, edges = run.trajectory_frame(), run.landmark_frame(), run.edge_frame()
+    assert path["x"].to_numpy() == pytest.approx(slam.trajectory()[:, 0])
+    assert path["odometry_x"].to_numpy() == pytest.approx(slam.keyframes.poses[:, 0])
+    name = next(iter(slam.landmarks))
+    assert landmarks.loc[name, "x"] == pytest.approx(run.landmarks[name][0])
+    assert landmarks.loc[name, "sigma_y"] == pytest.approx(np.sqrt(run.landmarks.covariances[0, 1, 1]))
+    assert len(edges) == slam.graph.edge_count
+    assert set(edges["verdict"]) <= {"accepted", "down_weighted", "not_evaluated", "pending", "rejected"}
+
+
+def test_without_pandas_a_line_says_what_to_install(done, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(GraphSlamError, match="pip install pandas"):
+        load_run(done[1]).landmark_frame()
+
+
+def test_what_is_no_run_or_has_no_results_is_refused(done, tmp_path):
+    with pytest.raises(GraphSlamError, match="not a run's folder"):
+        load_run(tmp_path)
+    for name in ("config.yaml", "ingest.mcap"):
+        (tmp_path / name).write_bytes((done[1] / name).read_bytes())
+    with pytest.raises(GraphSlamError, match="graph_slam recover"):
+        load_run(tmp_path)
+    (tmp_path / "run.json").write_text("[]")
+    with pytest.raises(GraphSlamError, match=r"run\.json"):
+        load_run(tmp_path)
+
+
+def test_objects_say_in_a_line_what_they_are(done):
+    slam, _ = done
+    counts = f"{len(slam.keyframes)} keyframes, {len(slam.landmarks)} landmarks, {slam.graph.edge_count} edges"
+    assert repr(slam) == f"GraphSlam({counts}, {slam.solves} solves)"
+    poses, odometry = len(slam.keyframes) + len(slam.landmarks), len(slam.graph.edges_of("odometry"))
+    assert repr(slam.graph).startswith(f"Graph({slam.graph.vertex_count} vertices: {poses} SE2; ")
+    assert f"{odometry} odometry" in repr(slam.graph)
+    assert repr(Graph()) == "Graph(0 vertices; 0 edges)"
+    solution = optimize(ROOT / "data/city.g2o")
+    assert re.fullmatch(r"Solution\(500 poses, 0 points, chi2 465\.97, \w+, start: file\)", repr(solution))
+    assert repr(Update()) == "Update(nothing)"
+    told = []
+    fresh = GraphSlam()
+    for m in [*measurements(simulate("pythonrobotics", 0, poses=12)), Control("optimize")]:
+        told.append(repr(fresh.process(m)))
+    assert re.fullmatch(r"Update\(\d+ edges?, solved everything, map -> odom moved \S+ m\)", told[-1])
+    assert any(one.startswith("Update(1 keyframe") for one in told)
+    assert repr(Config()) == "Config()"
+    text = repr(Config.from_mapping({"keyframes.min_distance_m": 0.5, "inputs.names": "odom gps", "gps.sigma_m": 2.0}))
+    assert text == "Config(keyframes.min_distance_m=0.5, inputs.names='odom gps', gps.sigma_m=2.0)"
+    assert all(len(repr(one)) < 300 for one in (slam, slam.graph, solution, Config()))
+
+
+def test_help_of_the_parameters_can_be_read_in_a_terminal():
+    text = pydoc.render_doc(Config, renderer=pydoc.plaintext)
+    assert max(map(len, text.splitlines())) <= 130
+    assert "Config(**sections)" in text
+    shown = re.sub(r"\s*\n \|\s*", " ", text)
+    for p in parameters():
+        assert f" {p.name} = {p.default!r} {p.meaning}{f' [{p.unit}]' if p.unit else ''}" in shown
+    assert f"keyframes: {type(Config().keyframes).__doc__.splitlines()[0]}" in text
+    assert Config(frames=Config().frames) == Config()
+    assert "Config.from_mapping(" in text
+
+
+def documented():
+    """Rows of docs/edges.md by the name of the edge type."""
+    for line in (ROOT / "docs/edges.md").read_text().splitlines():
+        if line.startswith("| `"):
+            cells = [cell.strip() for cell in line.strip("|").split("|")]
+            yield cells[0].strip("`"), cells[1].strip("`"), *(listed(cell) for cell in cells[2:6])
+
+
+def listed(cell):
+    return [word.strip() for word in cell.split(",")] if cell else []
+
+
+def edge_types():
+    for name, value in vars(edge_module).items():
+        if isinstance(value, EdgeType):
+            yield name, value
+        elif isinstance(value, dict) and name in ("POINT_PRIOR", "DIFFERENCE"):
+            yield from ((f"{name}[{kind.name}]", edge) for kind, edge in value.items())
+
+
+def test_the_page_of_edge_types_is_the_table_of_edge_types():
+    known, tags = dict(edge_types()), {id(edge): tag for tag, edge in EDGE_TAGS.items()}
+    rows = {name: rest for name, *rest in documented()}
+    assert set(rows) == set(known)
+    units = {"m", "rad"}
+    for name, (tag, vertices, measured, residual, sensor) in rows.items():
+        edge = known[name]
+        assert tag == tags.get(id(edge), ""), name
+        assert [vertex.split()[0] for vertex in vertices] == [kinds[0].name for kinds in edge.accepts], name
+        assert len(measured) + len(sensor) == edge.measured_size, name
+        assert len(sensor) == len(edge.tail), name
+        assert len(residual) == edge.residual_size, name
+        assert set(residual) <= units, name
+
+
+@pytest.mark.parametrize("name, edge", list(edge_types()), ids=lambda value: value if isinstance(value, str) else "")
+def test_the_units_of_a_residual_are_those_of_the_page(name, edge):
+    """Metres scale with the map, radians do not."""
+    rows = {n: rest for n, *rest in documented()}
+    residual, rng = rows[name][3], np.random.default_rng(1)
+    lengths = {"x", "y", "z", "range", "offset", "coordinate"}
+
+    def scaled(words, values, factor):
+        return np.array([v * (factor if word in lengths else 1.0) for word, v in zip(words, values, strict=True)])
+
+    in_vertex = {"SE2": ["x", "y", "theta"], "SE3": ["x", "y", "z", *"abcd"]} | {f"R{k}": ["x"] * k for k in (1, 2, 3)}
+    words = [in_vertex[kinds[0].name] for kinds in edge.accepts]
+    values = [rng.normal(size=len(w)) for w in words]
+    for kinds, value in zip(edge.accepts, values, strict=True):
+        if kinds[0].name == "SE3":
+            value[3:] /= np.linalg.norm(value[3:])
+    measured_words = [*rows[name][2], *rows[name][4]]
+    measured = rng.normal(size=len(measured_words))
+    for quaternion in (k for k, word in enumerate(measured_words) if word == "qx"):
+        measured[quaternion : quaternion + 4] /= np.linalg.norm(measured[quaternion : quaternion + 4])
+    found = []
+    for factor in (1.0, 3.0):
+        x = np.concatenate([scaled(w, v, factor) for w, v in zip(words, values, strict=True)])
+        at = np.cumsum([0, *map(len, words[:-1])])[None]
+        residuals, _ = edge.linearize(x, at, scaled(measured_words, measured, factor)[None])
+        found.append(residuals[0])
+    factors = np.array([3.0 if unit == "m" else 1.0 for unit in residual])
+    assert found[1] == pytest.approx(found[0] * factors)
