@@ -12,7 +12,7 @@ HERE = Path(__file__).resolve().parent
 VERSION = re.search(r'^__version__ = "(.+)"$', (HERE / NAME / "__init__.py").read_text(), re.MULTILINE).group(1)
 
 # ROS 2 Jazzy for machines without ROS, from wheels that exist for Linux on x86-64 only. The versions are fixed because
-# they are one binary set. From cmake on: what generating tf2_msgs and vision_msgs needs (node/generate_interfaces).
+# they are one binary set. From cmake on: what generating tf2_msgs and vision_msgs needs (tools/generate_interfaces.py).
 JAZZY = [
     "ros-jazzy-rclpy[fastrtps]==7.1.6",
     "ros-jazzy-nav-msgs==5.3.6",

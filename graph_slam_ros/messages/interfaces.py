@@ -1,7 +1,8 @@
 """Field layouts of the messages we use that have neither a wheel nor, for vision_msgs, a place in rosbags.
 
-They are the published interfaces of tf2_msgs and vision_msgs, so what is generated from them (`generate_interfaces`),
-what rosbags decodes with them (`typestore`) and an installed ROS exchange messages with each other.
+They are the published interfaces of tf2_msgs and vision_msgs, so what is generated from them (by the script
+``tools/generate_interfaces.py``), what rosbags decodes with them (``typestore``) and an installed ROS exchange messages
+with each other.
 """
 
 from __future__ import annotations

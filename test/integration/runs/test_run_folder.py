@@ -349,7 +349,6 @@ OF_FILES = {
     "formats/durable.py": {"os.open", "os.replace", "new.unlink"},
     "runs/folder.py": {"folder.rename", "file.unlink", "(folder / SUMMARY).unlink", "folder.rmdir"},
     # not of runs, nor of the user's
-    "node/generate_interfaces.py": None,
     "node/player.py": {"parameters.write_text", "subprocess.Popen"},
     "lie/jit.py": None,
     "warmup.py": {"COMPILED.touch", "subprocess.Popen"},

@@ -7,11 +7,11 @@ import sys
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 
+import generate_interfaces
 import numpy as np
 import pytest
 
 from graph_slam_ros.messages.interfaces import INTERFACES, typestore
-from graph_slam_ros.node import generate_interfaces
 
 MESSAGES = [(package, message) for package, messages in INTERFACES.items() for message in messages]
 DETECTIONS = "vision_msgs/msg/Detection3DArray"

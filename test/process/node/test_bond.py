@@ -9,11 +9,11 @@ import sysconfig
 import threading
 from pathlib import Path
 
+import generate_interfaces
 import pytest
 from live_nodes import ENVIRONMENT, lenient, node, own_domain, robot, until
 from places import ROOT
 
-from graph_slam_ros.node import generate_interfaces
 from graph_slam_ros.node.bond import MISSING, is_installed
 
 MANAGER = ROOT.joinpath("test", "bond_manager.py")

@@ -1,4 +1,4 @@
-"""Generate tf2_msgs and vision_msgs into the virtual environment that runs this: ``python -m`` this module.
+"""Generate tf2_msgs and vision_msgs into the virtual environment that runs this file; `make install` does.
 
 A ROS installation has both packages, and then nothing is done. The ROS wheels have neither, but they have everything
 that a message package is built with.
