@@ -11,15 +11,13 @@ from typing import Any
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.simulation import flight, manhattan, pythonrobotics, warehouse
 from graph_slam_ros.simulation.bag import write_bag
-from graph_slam_ros.simulation.closures import with_closures
-from graph_slam_ros.simulation.fault_table import WrongLine, WrongMessage, write_table
+from graph_slam_ros.simulation.draft import WrongLine, WrongMessage, write_table
 from graph_slam_ros.simulation.faults import KINDS, Fault
-from graph_slam_ros.simulation.faulty_graph import faulty_graph
-from graph_slam_ros.simulation.faulty_recording import faulty_recording
+from graph_slam_ros.simulation.faulty import faulty_graph, faulty_recording
 from graph_slam_ros.simulation.instruments import Instruments, with_instruments
 from graph_slam_ros.simulation.options import Option, fill, options_of
 from graph_slam_ros.simulation.pose_graph import CityGraph, city_graph, landmark_graph, write_graph
-from graph_slam_ros.simulation.recording import Recording, measurements
+from graph_slam_ros.simulation.recording import Recording, measurements, with_closures
 
 
 @dataclass(frozen=True, slots=True)

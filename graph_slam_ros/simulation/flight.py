@@ -7,10 +7,9 @@ from numpy.random import PCG64, Generator
 from scipy.spatial.transform import Rotation
 
 from graph_slam_ros.lie import se3
-from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
-from graph_slam_ros.simulation.recording import Recording
+from graph_slam_ros.simulation.recording import Recording, drive
 from graph_slam_ros.simulation.sensing import KINDS, TagCamera
 from graph_slam_ros.slam import Sighting
 from graph_slam_ros.typing import Array, Numbers

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import PCG64, Generator
 
-from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
-from graph_slam_ros.simulation.recording import Recording
+from graph_slam_ros.simulation.recording import Recording, drive
 from graph_slam_ros.simulation.sensing import KINDS, RangeBearing
 from graph_slam_ros.slam import Sighting
 from graph_slam_ros.typing import Array, Index, Numbers

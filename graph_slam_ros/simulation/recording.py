@@ -1,13 +1,16 @@
-"""A simulated recording, and the truth it does not know."""
+"""A simulated recording and the truth it does not know: driven, measured, and with true loop closures."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.random import PCG64, Generator, SeedSequence
 from numpy.typing import NDArray
 
-from graph_slam_ros.slam import Closure, Odometry, Sightings
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.simulation.motion import VelocityNoise, accumulated, integrate, space_of
+from graph_slam_ros.slam import Closure, Odometry, Sighting, Sightings
+from graph_slam_ros.typing import Array, Index, Numbers
 
 Stamps = NDArray[np.int64]
 
@@ -110,3 +113,93 @@ def measurements(recording: Recording) -> Iterator[Odometry | Sightings | Closur
         if stamp_ns in seen:
             yield seen[stamp_ns]
         yield from closed.get(stamp_ns, ())
+
+
+Observe = Callable[[Numbers], list[Sighting]]
+"""From the true pose, what is seen."""
+
+
+def drive(
+    rng: Generator,
+    start: Numbers,
+    twists: Array,
+    dt_ns: int,
+    noise: VelocityNoise,
+    observe: Observe,
+    observe_every: int,
+    landmarks: Mapping[str, Numbers],
+) -> Recording:
+    """Drive and record.
+
+    Parameters
+    ----------
+    start : true pose at the first stamp; odometry begins at the origin
+    twists : (n, 3) or (n, 6) true velocities in base_link, each for one tick [m/s, rad/s]
+    observe_every : ticks from one look to the next, the first after the first tick
+    landmarks : true poses or points by id
+    """
+    dt_s = dt_ns * 1e-9
+    measured = twists + noise.draw(rng, len(twists), dt_s)
+    truth = integrate(start, twists * dt_s)
+    stamps_ns = START_NS + dt_ns * np.arange(len(truth), dtype=np.int64)
+    seen = []
+    for k in range(observe_every, len(truth), observe_every):
+        sightings = observe(tuple(truth[k].tolist()))
+        if sightings:
+            seen.append(Sightings(int(stamps_ns[k]), LANDMARKS_TOPIC, tuple(sightings)))
+    return Recording(
+        stamps_ns=stamps_ns,
+        T_odom_base=integrate(space_of(start).identity, measured * dt_s),
+        twist=np.concatenate([np.zeros((1, twists.shape[1])), measured]),
+        twist_covariance=noise.covariance,
+        odom_covariance=accumulated(measured * dt_s, noise.per_tick(dt_s)),
+        seen=tuple(seen),
+        T_world_base=truth,
+        landmarks=dict(landmarks),
+    )
+
+
+PLACE_M = 0.5  # between the places that closures join, along the way
+REACH_M = 2.0  # from one end of a closure to the other at most
+GAP_NS = 10 * 10**9  # and at least so much later
+SIGMA_M, SIGMA_RAD = 0.05, 0.01
+_STREAM = 0
+
+
+def places(poses: Array) -> Index:
+    """Numbers of the poses (n, 3) or (n, 7) at which so much has been driven since the one before, and the first."""
+    steps = np.linalg.norm(np.diff(poses[:, : space_of(poses[0]).dimensions], axis=0), axis=1)
+    count = np.floor(np.concatenate([[0.0], np.cumsum(steps)]) / PLACE_M)
+    return np.flatnonzero(np.diff(count, prepend=-1.0) > 0.0)
+
+
+def with_closures(recording: Recording, count: int, seed: int) -> Recording:
+    """A recording with so many true closures, evenly among the places that the robot came back to.
+
+    Raises
+    ------
+    GraphSlamError
+        It did not come back so often.
+    """
+    rng = Generator(PCG64(SeedSequence(seed, spawn_key=(_STREAM,))))
+    space, at = space_of(recording.T_world_base[0]), places(recording.T_world_base)
+    n, truth, stamps_ns = space.dimensions, recording.T_world_base[at], recording.stamps_ns[at]
+    back: list[tuple[int, Index]] = []
+    for later, stamp_ns in enumerate(stamps_ns.tolist()):
+        before = int(np.searchsorted(stamps_ns, stamp_ns - GAP_NS, side="right"))
+        away = np.linalg.norm(truth[:before, :n] - truth[later, :n], axis=1)
+        if (near := np.flatnonzero(away <= REACH_M)).size:
+            back.append((later, near))
+    if len(back) < count:
+        raise GraphSlamError(f"{count} closures: the robot came back to {len(back)} places only")
+    sigmas = np.concatenate([np.full(n, SIGMA_M), np.full(space.dof - n, SIGMA_RAD)])
+    covariance = tuple(np.diag(np.square(sigmas)).ravel().tolist())
+    found = []
+    for pick in np.sort(rng.permutation(len(back))[:count]).tolist():
+        later, near = back[pick]
+        earlier = int(near[rng.integers(len(near))])
+        true = space.group.between(tuple(truth[earlier].tolist()), tuple(truth[later].tolist()))
+        noise = tuple((sigmas * rng.standard_normal(space.dof)).tolist())
+        measured = tuple(float(number) for number in space.group.retract(true, noise))
+        found.append(Closure(int(stamps_ns[later]), int(stamps_ns[earlier]), CLOSURES_TOPIC, measured, covariance))
+    return replace(recording, closures=tuple(found))

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.graph.geometry import PLANAR
 from graph_slam_ros.lie import se2
-from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.options import option
-from graph_slam_ros.simulation.recording import Recording
+from graph_slam_ros.simulation.recording import Recording, drive
 from graph_slam_ros.simulation.sensing import KINDS, RangeBearing, sightings
 from graph_slam_ros.slam import Sighting
 from graph_slam_ros.typing import Array, Numbers

@@ -9,8 +9,8 @@ from reliability import times
 
 from graph_slam_ros.graph import R2
 from graph_slam_ros.simulation import measurements
-from graph_slam_ros.simulation.drive import drive
 from graph_slam_ros.simulation.motion import VelocityNoise
+from graph_slam_ros.simulation.recording import drive
 from graph_slam_ros.simulation.sensing import RangeBearing
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 
