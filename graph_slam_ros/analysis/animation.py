@@ -12,9 +12,8 @@ from graph_slam_ros.analysis.plots import canvas, dress
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.lie import se3
-from graph_slam_ros.measurements.types import from_record
 from graph_slam_ros.runs import recording_of, run_config
-from graph_slam_ros.runs.journal import read_ingest
+from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.slam import GraphSlam
@@ -80,8 +79,8 @@ def _moments(run: Path, frames: int, losses: list[str]) -> Iterator[_Moment]:
         return
     due_s = list(np.linspace(stamps_s[0], stamps_s[-1], frames)[1:])
     slam = GraphSlam(run_config(run), start=read_map(run, losses, start_only=True))
-    for record in read_ingest(run, losses):
-        slam.process(from_record(record))
+    for measurement in read_measurements(run, losses):
+        slam.process(measurement)
         if due_s and len(slam.keyframes) > 1 and 1e-9 * slam.keyframes[-1].stamp_ns >= due_s[0]:
             due_s = [t for t in due_s if t > 1e-9 * slam.keyframes[-1].stamp_ns]
             yield _now(slam)

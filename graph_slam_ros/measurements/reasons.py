@@ -270,7 +270,6 @@ REASONS: dict[str, Reason] = {
     "paused": Reason(_NOTED, "it came while the node was paused", "~/resume"),
     "stopped": Reason(_REFUSED, "time jumped back and time.on_jump is stop", "~/reset, or --set time.on_jump=segment"),
     "worker_restarted": Reason(_NOTED, "the solver's thread died and was started again", "report it"),
-    "unknown_event": Reason(_NOTED, "a recorded event of another version"),
     "fault": Reason(
         _NOTED,
         "an exception, counted by its type: of a solve (the last good estimate stands), of a second look, or of a"

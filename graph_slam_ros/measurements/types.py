@@ -5,18 +5,23 @@ order: (x, y, theta), or (x, y, z, rotation vector). Nothing here tells which me
 """
 
 from dataclasses import asdict, dataclass
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.typing import Numbers
 
 SIGHTING_KINDS = ("position", "pose", "range_bearing", "bearing", "range")
 FIX_KINDS = ("pose", "position", "heading", "attitude")
+Event: TypeAlias = Literal[
+    "flush", "end", "optimize", "clear_closures", "time_jump", "set", "remove", "memory", "restart"
+]
+EVENTS: tuple[Event, ...] = get_args(Event)
+_VALUES: dict[Event, dict[str, type]] = {"memory": {"is_short": bool}, "remove": {"edge": int, "landmark": str}}
 
 
-def _check_kind(measurement: "Sighting | Fix", kinds: tuple[str, ...]) -> None:
-    if measurement.kind not in kinds:
-        raise FormatError(f"{type(measurement).__name__}: {measurement.kind!r} is not one of {', '.join(kinds)}")
+def _check_choice(cls: type, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise FormatError(f"{cls.__name__}: {value!r} is not one of {', '.join(choices)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +67,7 @@ class Sighting:
     T_base_sensor: Numbers | None = None
 
     def __post_init__(self) -> None:
-        _check_kind(self, SIGHTING_KINDS)
+        _check_choice(Sighting, self.kind, SIGHTING_KINDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +107,7 @@ class Fix:
     datum: Numbers = ()
 
     def __post_init__(self) -> None:
-        _check_kind(self, FIX_KINDS)
+        _check_choice(Fix, self.kind, FIX_KINDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,14 +145,34 @@ class InitialPose:
 class Control:
     """An event that is not a measurement.
 
-    ``flush`` releases what waits for its turn, ``end`` also gives up what no odometry reached, ``optimize`` solves now,
-    ``clear_closures`` takes all loop closures out, ``time_jump`` begins a segment whose stamps may be older, ``set``
-    changes parameters to ``values``, ``remove`` takes an ``edge`` or a ``landmark`` out, ``memory`` tells that it
-    ``is_short`` or no more, ``restart`` goes back to the last good estimate after a fault outside.
+    Attributes
+    ----------
+    event : ``flush`` processes the measurements that wait for their turn; ``end`` also drops those that no odometry
+        reached; ``optimize`` solves now; ``clear_closures`` removes all loop closures; ``time_jump`` begins a segment
+        whose stamps may be older; ``set`` changes parameters; ``remove`` removes an edge or a landmark; ``memory``
+        begins or ends a shortage of memory; ``restart`` goes back to the last good estimate after a fault outside
+    values : names and values; of ``set``, the parameters; of ``remove``, ``edge`` and its id or ``landmark`` and its
+        name; of ``memory``, ``is_short``; else none
+
+    Raises
+    ------
+    FormatError
+        ``event`` is not one of ``EVENTS``, or ``values`` are not what it needs.
     """
 
-    event: str
+    event: Event
     values: tuple[tuple[str, bool | int | float | str], ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_choice(Control, self.event, EVENTS)
+        if self.event == "set":
+            return
+        known = _VALUES.get(self.event, {})
+        if [known.get(name) for name, _ in self.values] != [type(value) for _, value in self.values] or (
+            len(self.values) != bool(known)
+        ):
+            needed = " or ".join(f"{name} ({kind.__name__})" for name, kind in known.items()) or "no value"
+            raise FormatError(f"Control: {self.event} has {dict(self.values)}; it needs {needed}")
 
 
 Observation: TypeAlias = Sightings | Fix | Closure

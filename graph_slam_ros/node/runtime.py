@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.measurements.types import Event
 from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.node.completion import Completion
 from graph_slam_ros.node.diagnostics import Facts
@@ -233,7 +234,7 @@ class Runtime:
         self._ingest.gate.is_paused = is_paused
         return self._worker.call(lambda: "paused" if is_paused else "takes measurements")
 
-    def control(self, event: str) -> "Future[str]":
+    def control(self, event: Event) -> "Future[str]":
         """An event of the ingest sequence."""
         asked = Control(event)
         self._session.accept([asked])

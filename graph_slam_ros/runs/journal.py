@@ -16,6 +16,7 @@ from mcap.writer import CompressionType, Writer
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import AppendedFile
+from graph_slam_ros.measurements.types import EVENTS, Measurement, from_record
 from graph_slam_ros.recordings.mcap_records import LIBRARY, records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
@@ -162,10 +163,24 @@ def read_ingest(folder: Path, losses: list[str]) -> Iterator[dict[str, Any]]:
             losses.append(f"{part_name(MAP, 0)}: not there, though the run began in a map: what follows is without it")
 
 
-def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) -> list[dict[str, Any]]:
-    """The measurements that a map lacks which came of the first so many records.
+def read_measurements(folder: Path, losses: list[str]) -> Iterator[Measurement]:
+    """The measurements and events of ``read_ingest``; events of another version are left out and add to ``losses``."""
+    return _measurements(read_ingest(folder, losses), losses)
 
-    Those after them, and of those the ones that waited for their turn then: newer than the last odometry that was used.
+
+def _measurements(records: Iterable[dict[str, Any]], losses: list[str]) -> Iterator[Measurement]:
+    for record in records:
+        if record.get("type") != "control" or record.get("event") in EVENTS:
+            yield from_record(record)
+        elif (loss := f"{INGEST}: event {record.get('event')!r} is not known to this version; left out") not in losses:
+            losses.append(loss)
+
+
+def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) -> list[Measurement]:
+    """The measurements that a map lacks which has processed the first so many records.
+
+    These are the records after them, and those before that waited for their turn then: newer than the last odometry
+    that was used. Events of another version add to ``losses``.
     """
     waited: list[dict[str, Any]] = []
     rest: list[dict[str, Any]] = []
@@ -181,7 +196,7 @@ def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[st
         elif channel != "initial_pose" and used_ns is not None and message.log_time > used_ns:
             waited.append(_decoded(file, message))
         count += 1
-    return waited + rest
+    return list(_measurements(waited + rest, losses))
 
 
 def read_records(folder: Path, name: str, losses: list[str]) -> Iterator[dict[str, Any]]:
@@ -192,9 +207,12 @@ def read_records(folder: Path, name: str, losses: list[str]) -> Iterator[dict[st
 
 def _decoded(file: str, message: Message) -> Any:
     try:
-        return json.loads(message.data)
+        record = json.loads(message.data)
     except ValueError:
         raise FormatError(f"{file}: record {message.sequence} is not JSON") from None
+    if not isinstance(record, dict):
+        raise FormatError(f"{file}: record {message.sequence} is not a JSON object")
+    return record
 
 
 def _messages(folder: Path, name: str, losses: list[str]) -> Iterator[tuple[str, str, Message]]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from graph_slam_ros.config.inputs import InputConfig, default_input
 from graph_slam_ros.measurements.reasons import warnings as mendable
-from graph_slam_ros.measurements.types import Measured, from_record
+from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageConverter
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.survey import with_survey
@@ -29,7 +29,7 @@ from graph_slam_ros.runs import (
     run_config,
     stopwatch,
 )
-from graph_slam_ros.runs.journal import read_ingest
+from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.outcome import doubts
 from graph_slam_ros.runs.restore import Stopwatch
@@ -265,7 +265,7 @@ def replay(
     losses = missing(source)
     state = read_map(source, losses, start_only=True)
     warmup()
-    measured = progress((from_record(record) for record in read_ingest(source, losses)), 0)
+    measured = progress(read_measurements(source, losses), 0)
     slam, summary = record_run(
         out, config, measured, losses, state, took=took, recording=recording_of(source), force=force
     )

@@ -8,7 +8,6 @@ from typing import Any
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.durable import claimed
-from graph_slam_ros.measurements.types import from_record
 from graph_slam_ros.runs.folder import (
     SUMMARY,
     RunError,
@@ -20,7 +19,7 @@ from graph_slam_ros.runs.folder import (
     summary_of,
     was_saved_whole,
 )
-from graph_slam_ros.runs.journal import read_ingest, read_rest
+from graph_slam_ros.runs.journal import read_measurements, read_rest
 from graph_slam_ros.runs.map_journal import has_map, read_map, state_of
 from graph_slam_ros.runs.recorder import RunRecorder, save_results
 from graph_slam_ros.runs.tables import counters_of, summarize
@@ -71,8 +70,8 @@ def config_of(folder: Path, state: MapSnapshot) -> Config:
 
 def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapSnapshot:
     slam = GraphSlam(run_config(folder), start=read_map(folder, [], start_only=True))  # its losses are known
-    for record in read_ingest(folder, losses):
-        slam.process(from_record(record))
+    for measurement in read_measurements(folder, losses):
+        slam.process(measurement)
     slam.process(Control("end"))
     counters.raise_to(slam.counters)
     return state_of(slam)
@@ -82,7 +81,7 @@ def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Co
     """The map after those measurements, too, that were accepted and not processed any more."""
     if state.processed is None or was_saved_whole(folder):
         return state
-    rest = [from_record(record) for record in read_rest(folder, state.processed, state.used_ns, losses)]
+    rest = read_rest(folder, state.processed, state.used_ns, losses)
     if not rest:
         return state
     state.continues_with = state.source if state.used_ns is not None else ""

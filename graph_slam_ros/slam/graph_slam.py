@@ -220,8 +220,6 @@ class GraphSlam:
                     self._hold_map(self.config.map.localize)
             case Control("remove", values):
                 self._remove(dict(values))
-            case Control():
-                self.counters.count("control", "unknown_event")
         if len(self.keyframes) == first_new and self.solves == solves:
             return _NOTHING
         new = self.report if self.report is not report else None

@@ -168,10 +168,6 @@ def test_sightings_that_wait_for_odometry_are_bounded():
     assert p.landmarks["a"].sightings == 3
 
 
-def test_an_unknown_control_event_is_counted():
-    assert run(slam(), Control("dance")).counters.as_dict() == {"control": {"unknown_event": 1}}
-
-
 # -- keyframes and motion -------------------------------------------------------------------------------------------
 
 

@@ -148,6 +148,37 @@ def test_every_measurement_survives_its_record_exactly(world):
 
 
 @pytest.mark.parametrize(
+    "event, values, complaint",
+    [
+        ("dance", (), "Control: 'dance' is not one of flush, end, optimize"),
+        ("flush", (("edge", 1),), "Control: flush has {'edge': 1}; it needs no value"),
+        ("memory", (), "memory has {}; it needs is_short (bool)"),
+        ("memory", (("is_short", 1),), "it needs is_short (bool)"),
+        ("remove", (("edge", 1), ("landmark", "a")), "it needs edge (int) or landmark (str)"),
+        ("remove", (("vertex", 1),), "it needs edge (int) or landmark (str)"),
+    ],
+)
+def test_an_event_is_checked_when_it_is_made(event, values, complaint):
+    with pytest.raises(FormatError, match=re.escape(complaint)):
+        Control(event, values)
+
+
+def test_an_event_of_another_version_is_left_out_of_a_replay_and_reported(tmp_path, folder):
+    shutil.copytree(folder, tmp_path / "newer")
+    ingest = tmp_path / "newer" / "ingest.mcap"
+    records = list(read_ingest(folder, []))
+    ingest.unlink()
+    unknown = {"type": "control", "event": "dance", "values": []}
+    writer = RecordWriter(ingest)
+    writer.write([*records[:100], unknown, unknown, *records[100:]])
+    writer.close()
+    again = replay(tmp_path / "newer", tmp_path / "again")
+    (loss,) = (one for one in again.losses if "event" in one)
+    assert loss == "ingest: event 'dance' is not known to this version; left out"
+    assert (tmp_path / "again" / "path.tum").read_bytes() == (folder / "path.tum").read_bytes()
+
+
+@pytest.mark.parametrize(
     "record, complaint",
     [
         ({"type": "sonar", "stamp_ns": 1}, "unknown kind of measurement 'sonar'"),
