@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o import read_g2o
@@ -136,10 +136,10 @@ def suspicion_of(solution: Solution) -> str:
     if not report.converged:
         return f"it did not converge ({report.stop})"
     freedom, edges = solver.degrees_of_freedom, solver.edges
-    if freedom > 0 and report.chi2_final > max(_FAR_ABOVE * freedom, chi2_distribution.isf(_UNLIKELY, freedom)):
+    if freedom > 0 and report.chi2_final > max(_FAR_ABOVE * freedom, chdtri(freedom, _UNLIKELY)):
         return f"chi2 {report.chi2_final:.6g} is far above its {freedom} degrees of freedom"
     chi2, numbers = solver.chi2_of(edges)
-    unlikely = chi2 > chi2_distribution.isf(_UNLIKELY / max(len(edges), 1), numbers)
+    unlikely = chi2 > chdtri(numbers, _UNLIKELY / max(len(edges), 1))
     far = np.flatnonzero(unlikely & (freedom > 0))
     if len(far):
         worst = int(np.argmax(chi2 / numbers))

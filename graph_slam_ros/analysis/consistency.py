@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2 as chi_square
+from scipy.special import gammaincinv
 
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array
@@ -49,8 +49,8 @@ class Nees:
             return None
         e = errors[known]
         values = np.einsum("ni,ni->n", e, np.linalg.solve(covariances[known], e[:, :, None])[:, :, 0])
-        low, high = (float(edge) / n for edge in chi_square.ppf(_BAND, n * dof))
-        single = chi_square.ppf(_BAND, dof)
+        low, high = (2.0 * float(gammaincinv(0.5 * n * dof, edge)) / n for edge in _BAND)
+        single = [2.0 * float(gammaincinv(0.5 * dof, edge)) for edge in _BAND]
         inside = float(((values >= single[0]) & (values <= single[1])).mean())
         return cls(float(values.mean()), dof, (low, high), inside, n, len(known) - n)
 

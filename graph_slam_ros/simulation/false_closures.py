@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.geometry import Geometry
@@ -77,7 +77,7 @@ def false_closures(
     if len(truth) < 2 * pairs + 2:
         raise GraphSlamError(f"false closures: {len(truth)} poses are too few for groups of {pairs}")
     draw = _aliased if policy == "aliased" else _local if policy.startswith("local") else _anywhere
-    limit = margin * float(chi2.ppf(AGREES, roots.shape[-1]))
+    limit = margin * 2.0 * float(gammaincinv(0.5 * roots.shape[-1], AGREES))
     ends, measured, root = [np.empty((0, 2), dtype=np.int64)], [np.empty((0, truth.shape[1]))], [roots[:0]]
     found, tried = 0, 0
     while found < count:

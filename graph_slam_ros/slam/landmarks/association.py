@@ -66,7 +66,7 @@ class Gates:
 
 @cache
 def quantile(probability: float, dof: int) -> float:
-    """A quantile of chi-square, by the special function: importing scipy.stats takes half a second."""
+    """A quantile of chi-square, by the special function."""
     return 2.0 * float(gammaincinv(0.5 * dof, probability))
 
 

@@ -8,6 +8,7 @@ evidence is counted: sightings that are held back and fit the other pose, minus 
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -204,7 +205,8 @@ class DisplacementSearch:
     @property
     def held_back_count(self) -> int:
         """The number of the newest sightings of well known landmarks that are held back."""
-        known = [one for one in self._standing() if self._known_from(one.landmark) < one.keyframe]
+        known_from = cache(self._known_from)  # many are of the same landmark
+        known = [one for one in self._standing() if known_from(one.landmark) < one.keyframe]
         held_back = [not self._ledger.is_inside(one.edge) for one in known]
         self._is_supported |= not all(held_back)
         return sum(held_back)
@@ -254,7 +256,7 @@ class DisplacementSearch:
             np.array([one.heading_variance for one in seen]),
             places,
             np.array([estimate[2] if len(estimate) == 3 and n == 2 else np.nan for estimate in estimates]),
-            np.array([self._known_from(one.landmark) for one in seen]),
+            np.array(list(map(cache(self._known_from), (one.landmark for one in seen)))),
             np.array([self._ledger.is_inside(one.edge) for one in seen]),
             np.array([self._fits_now(one, place) for one, place in zip(seen, places, strict=True)]),
         )

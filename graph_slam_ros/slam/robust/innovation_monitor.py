@@ -9,9 +9,10 @@ So ranges and bearings count as well, which do not tell a pose.
 
 from collections import deque
 from dataclasses import dataclass
+from functools import cache, lru_cache
 
 import numpy as np
-from scipy.stats import beta, binom
+from scipy.special import bdtr, betaincinv
 
 from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.gating import OutlierGate
@@ -83,23 +84,24 @@ class InnovationMonitor:
         self._seen.append(_Seen(edge, keyframe, landmark, stamp_ns))
 
     def _leave_behind(self, one: _Seen) -> None:
-        if self._is_standing(one) and self._is_known(one):
+        if self._is_standing(one) and self._known_from(one.landmark) < one.keyframe:
             self._count += 1
             self._held_back += not self._ledger.is_inside(one.edge)
 
     def _is_standing(self, one: _Seen) -> bool:
         return one.edge < len(self._ledger) and not self._ledger.is_withdrawn(one.edge)
 
-    def _is_known(self, one: _Seen) -> bool:
-        return self._history.known_from(one.landmark, self._seen[0].edge) < one.keyframe
+    def _known_from(self, landmark: int) -> int:
+        return self._history.known_from(landmark, self._seen[0].edge)
 
     def _window(self) -> list[_Seen]:
         """The newest, the newest first."""
-        out, times = list[_Seen](), dict[int, int]()
+        out, times, known_from = list[_Seen](), dict[int, int](), cache(self._known_from)
         for one in reversed(self._seen):
             if len(out) == _WINDOW or (self._seen[-1].stamp_ns - one.stamp_ns) * 1e-9 > _REACH_S:
                 break
-            if times.get(one.landmark, 0) < _PER_LANDMARK and self._is_standing(one) and self._is_known(one):
+            is_full = times.get(one.landmark, 0) == _PER_LANDMARK
+            if not is_full and self._is_standing(one) and known_from(one.landmark) < one.keyframe:
                 times[one.landmark] = times.get(one.landmark, 0) + 1
                 out.append(one)
         return out
@@ -137,5 +139,11 @@ class InnovationMonitor:
 
     def _by_chance(self, count: int) -> int:
         """Return how many of a count may be wrong though odometry is right."""
-        rate = beta.ppf(_RATE_SURE, 1 + self._held_back, 1 + self._count - self._held_back)
-        return int(binom.ppf(_SURE, count, rate))
+        return _wrong_by_chance(count, self._held_back, self._count)
+
+
+@lru_cache(maxsize=64)
+def _wrong_by_chance(count: int, held_back: int, seen: int) -> int:
+    """The most of a count that are wrong, at the rate by which some of those seen were held back."""
+    rate = betaincinv(1 + held_back, 1 + seen - held_back, _RATE_SURE)
+    return next((k for k in range(count) if bdtr(k, count, rate) >= _SURE), count)

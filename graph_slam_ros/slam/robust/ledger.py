@@ -161,7 +161,7 @@ class Ledger:
 
     def is_inside(self, edge: int) -> bool:
         """Return whether an edge pulls."""
-        return int(self.verdict.values[edge]) in _INSIDE
+        return self.verdict.values.item(edge) in _INSIDE
 
     def is_withdrawn(self, edge: int) -> bool:
         """Return whether an edge was taken out for good."""
