@@ -6,7 +6,6 @@ After Kaess and Dellaert, "Covariance recovery from a square root information ma
 import numpy as np
 
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.clique_tree.numeric import front_of
 from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUE,
     DOF,
@@ -21,6 +20,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     PARENT,
     SIZE,
     Tree,
+    front_of,
 )
 from graph_slam_ros.solver.clique_tree.symbolic import mark
 from graph_slam_ros.typing import Array, Index

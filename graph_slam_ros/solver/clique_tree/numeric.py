@@ -8,6 +8,7 @@ import numpy as np
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.dense import partial_cholesky, solve_upper
+from graph_slam_ros.solver.clique_tree.rounding import JUST_MADE, UNKNOWN, is_rounding, suspect_row
 from graph_slam_ros.solver.clique_tree.storage import (
     BLOCK,
     CHILD,
@@ -15,7 +16,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     DOF,
     END,
     FREE,
-    FRONT,
     FRONT_DOF,
     FRONTALS,
     FULL_DOF,
@@ -24,6 +24,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     LINK_EDGE,
     LINK_NEXT,
     LOCAL,
+    MAGNITUDES,
     MARK,
     MEMBERS,
     NOTHING,
@@ -37,12 +38,11 @@ from graph_slam_ros.solver.clique_tree.storage import (
     VALUE,
     WIDTH,
     Tree,
+    front_of,
 )
 from graph_slam_ros.typing import Array, Index
 
 MOVED = -2  # in LOCAL: its step has changed
-SUSPECT = 1e-9  # of its diagonal entry: a pivot below is looked into
-ROUNDING = 2.0**-52  # of the magnitudes that cancelled: a pivot below cannot be told from rounding
 CANCELLED = 1e-4  # of what is taken off a sum: less than that left has lost digits
 
 
@@ -57,6 +57,7 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
     failed = NOTHING
     for c in cliques:
         front, frontal = front_of(clique, fronts, c), clique[c, FRONT_DOF]
+        clique[c, MAGNITUDES] = JUST_MADE
         if len(scale) < frontal:
             scale = np.empty(2 * frontal)
         front[:] = 0.0
@@ -77,83 +78,17 @@ def eliminate(t: Tree, cliques: Index, damping: float) -> int:
             child = clique[child, SIBLING]
         failed = partial_cholesky(front, frontal, scale)
         if failed == NOTHING and damping == 0.0:
-            failed = _suspect(front, frontal, scale)
-            if failed != NOTHING and not _is_rounding(t, c, failed):
+            failed = suspect_row(front, frontal, scale)
+            if failed != NOTHING and not is_rounding(t, c, failed):
                 failed = NOTHING
         if failed != NOTHING:
             failed = _member_at(vertex, clique, members, c, failed)
             break
     for c in cliques:
+        clique[c, MAGNITUDES] = UNKNOWN
         for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
             vertex[members[m], LOCAL] = NOTHING
     return failed
-
-
-@kernel
-def _suspect(front: Array, frontal: int, diagonal: Array) -> int:
-    """The row of the least pivot, as a part of its diagonal entry, if it is suspiciously small, or NOTHING."""
-    found, least = NOTHING, 1.0 / SUSPECT
-    for a in range(frontal):
-        if front[a, a] * front[a, a] * diagonal[a] > least:  # inverted, and its root
-            found, least = a, front[a, a] * front[a, a] * diagonal[a]
-    return found
-
-
-@kernel
-def _is_rounding(t: Tree, c: int, row: int) -> bool:
-    """Whether a pivot cannot be told from rounding.
-
-    In the direction x of its unknown alone, where all that was eliminated before follows, the pivot is x'Hx. It is what
-    is left of a sum over the diagonal, whose rounding is in proportion to it.
-    """
-    vertex, clique, members, fronts = t.vertex, t.clique, t.members, t.fronts
-    step, stack, top = np.zeros(len(t.step)), np.empty(256, np.int64), 1
-    stack[0] = c
-    x, magnitude, front = np.empty(256), 0.0, front_of(clique, fronts, c)
-    pivot = 1.0 / front[row, row] ** 2
-    while top:
-        top -= 1
-        k = stack[top]
-        full, frontal, low = clique[k, FULL_DOF], clique[k, FRONT_DOF], clique[k, MEMBERS]
-        if len(x) < full:
-            x = np.empty(2 * full)
-        x[:full] = 0.0
-        at = frontal
-        if k == c:
-            x[row] = 1.0
-        else:
-            for m in range(low + clique[k, FRONTALS], low + clique[k, SIZE]):
-                for i in range(vertex[members[m], DOF]):
-                    x[at + i] = step[vertex[members[m], STEP] + i]
-                at += vertex[members[m], DOF]
-        front = front_of(clique, fronts, k)
-        for a in range((row if k == c else frontal) - 1, -1, -1):
-            s = 0.0
-            for i in range(a + 1, full):
-                s -= front[a, i] * x[i]
-            x[a] = s * front[a, a]
-        at = 0
-        for m in range(low, low + clique[k, FRONTALS]):
-            for i in range(vertex[members[m], DOF]):
-                d = vertex[members[m], STEP] + i
-                step[d] = x[at]
-                magnitude += t.diagonal[d] * x[at] * x[at]
-                at += 1
-        k = clique[k, CHILD]
-        while k != NOTHING:
-            if top == len(stack):
-                stack = np.concatenate((stack, np.empty(top, np.int64)))
-            stack[top] = k
-            top += 1
-            k = clique[k, SIBLING]
-    return pivot <= ROUNDING * magnitude
-
-
-@kernel
-def front_of(clique: Index, fronts: Array, c: int) -> Array:
-    """The front (full, full + 1): an upper triangle, and the right side as its last column."""
-    full, base = clique[c, FULL_DOF], clique[c, FRONT]
-    return fronts[base : base + full * (full + 1)].reshape(full, full + 1)
 
 
 @kernel

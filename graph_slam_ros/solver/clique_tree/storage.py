@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.graph.edge_type import MOST_SLOTS
+from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.typing import Array, Index
 
 NOTHING = -1
@@ -37,8 +38,11 @@ WIDTH, BLOCK, ACTIVE, OWNER, TAKEN, EDGE_COLUMNS = range(END + MOST_SLOTS, END +
 LINK_EDGE, LINK_NEXT, LINK_COLUMNS = range(3)
 
 # clique: its place in the tree; where its members begin, how many are frontal, how many there are; the same in
-# degrees of freedom; where its front begins; its size class; 1 where an update has marked it
-PARENT, CHILD, SIBLING, MEMBERS, FRONTALS, SIZE, FRONT_DOF, FULL_DOF, FRONT, CLASS, MARK, CLIQUE_COLUMNS = range(12)
+# degrees of freedom; where its front begins; its size class; 1 where an update has marked it; whether the magnitudes of
+# its subtree are known (``rounding``)
+PARENT, CHILD, SIBLING, MEMBERS, FRONTALS, SIZE, FRONT_DOF, FULL_DOF, FRONT, CLASS, MARK, MAGNITUDES, CLIQUE_COLUMNS = (
+    range(13)
+)
 
 # region of the nested dissection: its place in the binary tree; vertices in its subtree, now and when it was made;
 # the first vertex of its own
@@ -68,8 +72,9 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
     CLIQUES_WANTED,
     MEMBERS_WANTED,
     FRONTS_WANTED,
+    LOOKED_INTO,
     STATE_COLUMNS,
-) = range(23)
+) = range(24)
 
 VECTOR, SE2_KIND, SE3_KIND = range(3)
 
@@ -114,6 +119,13 @@ class Tree(NamedTuple):
     step: Array
     value: Array
     estimate: Array
+
+
+@kernel
+def front_of(clique: Index, fronts: Array, c: int) -> Array:
+    """The front (full, full + 1): an upper triangle, and the right side as its last column."""
+    full, base = clique[c, FULL_DOF], clique[c, FRONT]
+    return fronts[base : base + full * (full + 1)].reshape(full, full + 1)
 
 
 def empty_tree() -> Tree:

@@ -69,6 +69,7 @@ class Changes(RuleBasedStateMachine):
         self.graph, self.truth = Graph(), []
         self.solver = Solver(self.graph, self.settings)
         self.inside, self.held, self.removed, self.lacking = [], set(), [], []
+        self.where_held = {}
         self.waits = False  # something since the last update
         self.spoiled = False  # an open direction was not found
         self.new_vertices, self.new_edges = [], []
@@ -199,6 +200,8 @@ class Changes(RuleBasedStateMachine):
         self.solver.remove(v)
         self.inside.remove(v)
         self.removed.append(v)
+        self.held.discard(v)  # it is free again where it comes back
+        self.where_held.pop(v, None)
         self.waits = True
 
     @precondition(lambda self: self.removed)
@@ -316,8 +319,7 @@ class Changes(RuleBasedStateMachine):
     @invariant()
     def held_vertices_stay(self):
         estimate = {v: self.solver.estimate([v])[0] for v in self.held}
-        previous = getattr(self, "where_held", {})
-        assert all(np.array_equal(estimate[v], x) for v, x in previous.items())
+        assert all(np.array_equal(estimate[v], x) for v, x in self.where_held.items())
         self.where_held = estimate
 
 
