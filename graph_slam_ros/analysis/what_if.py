@@ -162,15 +162,14 @@ class SavedGraph:
         Gauss-Newton step without it is ``Sigma A' (I - A Sigma A')^-1 r``, by the matrix inversion lemma.
         """
         solver, graph, last = self._was, self.graph, self.keyframes[-1]
-        table, row = graph.row(edge)
-        ends, values = table.vertices.values[row], solver.values
-        residual, jacobian = linearized(graph, values, table.type, ends, table.measured.values[row])
-        loss = solver.settings.stages()[-1].get(graph.label_of(edge), Loss())
-        root = table.sqrt_information.values[row]
+        one = graph.edge(edge)
+        ends, root = one.vertices, one.sqrt_information
+        residual, jacobian = linearized(graph, solver.values, one.type, ends, one.measured)
+        loss = solver.settings.stages()[-1].get(one.label, Loss())
         white = root @ residual
         share = weight_and_cost(loss.kind, loss.scale, float(white @ white))[0] ** 0.5
         white, a = share * white, share * root @ jacobian
-        among = [*ends.tolist(), *([] if last in ends else [last])]
+        among = [*ends, *([] if last in ends else [last])]
         joint = solver.joint_marginal(among)
         first = np.cumsum([0, *(graph.kind_of(v).dof for v in among)])
         of_last = slice(first[k := among.index(last)], first[k + 1])

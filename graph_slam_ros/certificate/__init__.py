@@ -1,4 +1,4 @@
-"""Whether an estimate is the global optimum: SE-Sync's dual certificate for graphs of relative poses.
+"""The certificate that an estimate is the global optimum: SE-Sync's dual certificate for graphs of relative poses.
 
 * ``synchronization``: the problem it is about, which is chordal and isotropic,
 * ``polish``: from the solver's estimate to a critical point of that problem,

@@ -1,4 +1,4 @@
-"""When SE-Sync's certificate applies to a solved graph, what it says, and how near the two problems' optima are."""
+"""SE-Sync's certificate of a solved graph: if it applies, its verdict, and how near the two problems' optima are."""
 
 from dataclasses import asdict, dataclass
 from math import isnan, nan
@@ -30,7 +30,7 @@ _SAME = 1e-9  # of chi2: no loss has counted
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What is known of the global optimum. Numbers are NaN where they are not known.
+    """The verdict on the global optimum. Numbers are NaN where they are not known.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Certificate:
 
     @property
     def computed(self) -> bool:
-        """Whether there is an eigenvalue, whatever it is worth."""
+        """Return whether the eigenvalue was computed, whatever it is worth."""
         return not isnan(self.lambda_min)
 
     def as_dict(self) -> dict[str, Any]:
@@ -83,7 +83,7 @@ class Certificate:
 
 
 def certify(solution: Solution) -> Certificate:
-    """Whether a solved graph of relative poses is at the global optimum.
+    """Certify that a solved graph of relative poses is at the global optimum.
 
     The certificate belongs to SE-Sync's cost, which is chordal and isotropic (``Edges.precisions``). So its critical
     point near the estimate is found (``polish``) and certified: where ``S = Q - Lambda`` has no negative eigenvalue, by
@@ -139,12 +139,12 @@ def certify(solution: Solution) -> Certificate:
 
 
 def other_start(start: str) -> str:
-    """Where to start next, if an estimate from that start is not certified: from a chordal start most are."""
+    """The start to try next, if an estimate from that start is not certified: from a chordal start most are."""
     return "tree" if start == "chordal" else "chordal"
 
 
 def _no_relative_poses(graph: Graph) -> str:
-    """Why a graph is none of poses and relative poses, priors aside, or an empty string."""
+    """The reason why a graph is none of poses and relative poses, priors aside, or an empty string."""
     others = [kind.name for kind in graph.kinds if kind not in (SE2, SE3)]
     if others:
         return f"there are landmarks: vertices of kind {others[0]}"
@@ -168,7 +168,7 @@ def _anchors(solution: Solution) -> list[int]:
 
 
 def _ill_fitting(solution: Solution, edges: Edges, anchors: list[int]) -> str:
-    """Why SE-Sync's cost is no likeness of what was minimised, or an empty string."""
+    """The reason why SE-Sync's cost is far from what was minimised, or an empty string."""
     report, n = solution.report, solution.file.graph.vertex_count
     links = coo_array((np.ones(len(edges.ends)), tuple(edges.ends.T)), shape=(n, n))
     parts, _ = connected_components(links, directed=False)

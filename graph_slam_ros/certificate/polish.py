@@ -1,4 +1,4 @@
-"""From a nearby estimate to a critical point of SE-Sync's problem, by Newton's method."""
+"""Newton's method from a nearby estimate to a critical point of SE-Sync's problem."""
 
 from dataclasses import dataclass
 

@@ -13,9 +13,9 @@ _FACTOR = 10.0
 
 
 def factorize(matrix: csc_array) -> Callable[[Array], Array] | None:
-    """How to solve with a symmetric sparse matrix; None where it is not positive definite.
+    """A function that solves with a symmetric sparse matrix; None where it is not positive definite.
 
-    Pivots are taken from the diagonal, so the triangular factors are those of ``L D L'`` and the pivots have the signs
+    Pivots come from the diagonal, so the triangular factors are those of ``L D L'`` and the pivots have the signs
     of the eigenvalues (Sylvester).
     """
     try:

@@ -36,7 +36,7 @@ class Edges:
 
     @classmethod
     def of(cls, graph: Graph) -> "Edges":
-        """Those of a graph whose poses are all of one kind."""
+        """Collect the relative poses of a graph whose poses are all of one kind."""
         parts = []
         for table in (graph.tables[edge] for edge in RELATIVE if edge in graph.tables):
             rows = np.flatnonzero(table.weight.values)
@@ -96,7 +96,7 @@ class Poses:
 
     @classmethod
     def of(cls, values: Array) -> "Poses":
-        """From stored numbers (n, 3) or (n, 7)."""
+        """Make them from stored numbers (n, 3) or (n, 7)."""
         if values.shape[1] == 3:
             c, s = np.cos(values[:, 2]), np.sin(values[:, 2])
             return cls(np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=1), values[:, :2])
@@ -146,7 +146,7 @@ class Synchronization:
 
     @classmethod
     def of(cls, edges: Edges, poses: int) -> "Synchronization":
-        """With the isotropic precisions of some edges."""
+        """Make the problem with the isotropic precisions of some edges."""
         return cls(poses, edges.ends, Poses.of(edges.measured), *edges.precisions())
 
     @property

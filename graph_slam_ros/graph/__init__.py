@@ -1,4 +1,4 @@
-"""What the problem is: vertices, edges, their noise and loss. Nothing here knows how it is solved."""
+"""The problem: vertices, edges, their noise and loss. Nothing here knows how it is solved."""
 
 from graph_slam_ros.graph.check_edge import check_edge
 from graph_slam_ros.graph.edge_type import EdgeType, edge_from_residual, numeric_jacobian
@@ -34,6 +34,7 @@ from graph_slam_ros.graph.sensors import (
     RANGE_WITH_OFFSET,
     RANGE_WITH_OFFSET_3D,
 )
+from graph_slam_ros.graph.tables import Edge, Vertex
 from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3, VertexKind
 
 POINT_SEEN_FROM = {SE2: LANDMARK_POSITION, SE3: LANDMARK_POSITION_3D}
@@ -76,10 +77,12 @@ __all__ = [
     "SE3",
     "TAG_POSITION",
     "TAG_POSITION_3D",
+    "Edge",
     "EdgeType",
     "Gaussian",
     "Graph",
     "Loss",
+    "Vertex",
     "VertexKind",
     "check_edge",
     "edge_from_residual",

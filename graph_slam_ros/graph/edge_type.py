@@ -1,4 +1,4 @@
-"""What an edge type is: residual and Jacobian of one kind of measurement, a whole array of edges at a time.
+"""Edge types: residual and Jacobian of one kind of measurement, a whole array of edges at a time.
 
 An edge type's ``linearize(x, at, measured)`` gets
 
@@ -25,7 +25,7 @@ MOST_SLOTS = 3  # vertices of one edge: what the solver's records have room for
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeType:
-    """What was measured, between which vertices, and how it is linearised.
+    """A kind of measurement: its vertices, its residual and its Jacobian.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class EdgeType:
         return tuple(kinds[0].dof for kinds in self.accepts)
 
     def whole(self, measured: ArrayLike) -> Array:
-        """What was measured, (p,) or (n, p), with the tail where it was left out."""
+        """Measurements (p,) or (n, p), completed by ``tail`` where it was left out."""
         given = np.asarray(measured, dtype=np.float64)
         if self.tail and given.shape and given.shape[-1] == self.measured_size - len(self.tail):
             return np.concatenate([given, np.broadcast_to(self.tail, (*given.shape[:-1], len(self.tail)))], axis=-1)

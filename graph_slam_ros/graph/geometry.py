@@ -44,21 +44,21 @@ class Geometry:
 
     @property
     def dof(self) -> int:
-        """Of a pose: 3 or 6."""
+        """Degrees of freedom of a pose: 3 or 6."""
         return self.pose.dof
 
     def sigmas(self, sigma_m: float, sigma_rad: float) -> list[float]:
-        """Of a pose, (dof,), the same for all lengths and for all angles."""
+        """Standard deviations (dof,) of a pose, one for all lengths [m] and one for all angles [rad]."""
         return [sigma_m] * self.dimensions + [sigma_rad] * (self.dof - self.dimensions)
 
     def angle(self, pose: Numbers) -> float:
-        """How far a pose is turned, about whatever axis."""
+        """Angle [rad] by which a pose is turned, about whatever axis."""
         if self.dimensions == 2:
             return abs(pose[2])
         return float(2.0 * np.arctan2(np.linalg.norm(pose[3:6]), abs(pose[6])))
 
     def normalized(self, pose: Numbers) -> Numbers:
-        """With a quaternion of length 1, where there is one."""
+        """The pose with a quaternion of length 1, where it has one."""
         if self.dimensions == 2:
             return pose
         return *pose[:3], *map(float, so3.normalize((pose[3], pose[4], pose[5], pose[6])))

@@ -2,9 +2,7 @@
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,46 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.edge_type import EdgeType
 from graph_slam_ros.graph.noise import Gaussian
+from graph_slam_ros.graph.tables import Column, Edge, EdgeTable, Vertex
 from graph_slam_ros.graph.vertices import VertexKind
 from graph_slam_ros.typing import Array, Index
-
-
-class Column:
-    """An array that grows at its end; ``values`` is a view of what is there."""
-
-    __slots__ = ("_buffer", "_length")
-
-    def __init__(self, dtype: type, *shape: int) -> None:
-        self._buffer: NDArray[Any] = np.empty((16, *shape), dtype=dtype)
-        self._length = 0
-
-    def __len__(self) -> int:
-        return self._length
-
-    @property
-    def values(self) -> NDArray[Any]:
-        """The rows so far, a view."""
-        return self._buffer[: self._length]
-
-    @staticmethod
-    def extend(*parts: tuple["Column", ArrayLike, int]) -> None:
-        """Append to columns, each so many rows (one row, or a scalar, is repeated): to all of them, or to none.
-
-        Half a record would put all later ones out of step.
-        """
-        ends = [column._put(rows, count) for column, rows, count in parts]
-        for (column, _, _), end in zip(parts, ends, strict=True):
-            column._length = end
-
-    def _put(self, rows: ArrayLike, count: int) -> int:
-        """Write beyond the end, where nobody sees it; returns where that ends."""
-        end = self._length + count
-        if end > len(self._buffer):
-            grown = np.empty((max(end, 2 * len(self._buffer)), *self._buffer.shape[1:]), dtype=self._buffer.dtype)
-            grown[: self._length] = self.values
-            self._buffer = grown
-        self._buffer[self._length : end] = rows
-        return end
 
 
 def whole_numbers(ids: ArrayLike, what: str) -> Index:
@@ -60,41 +21,6 @@ def whole_numbers(ids: ArrayLike, what: str) -> Index:
     if given.dtype.kind not in "iu" and given.size:
         raise GraphSlamError(f"{what}: ids must be whole numbers, got {given.ravel()[:5].tolist()}")
     return given.astype(np.int64, copy=False)
-
-
-@dataclass(slots=True, eq=False)
-class EdgeTable:
-    """All edges of one type, a row each.
-
-    Attributes
-    ----------
-    code : its place among the graph's tables
-    id : edge ids; vertices : (n, k) vertex ids; measured : (n, p); sqrt_information : (n, m, m)
-    label, source : codes into ``Graph.labels`` and ``Graph.sources``
-    weight : a factor on the information, 0 = out of the problem
-    """
-
-    type: EdgeType
-    code: int
-    id: Column = field(init=False)
-    vertices: Column = field(init=False)
-    measured: Column = field(init=False)
-    sqrt_information: Column = field(init=False)
-    label: Column = field(init=False)
-    source: Column = field(init=False)
-    weight: Column = field(init=False)
-
-    def __post_init__(self) -> None:
-        m = self.type.residual_size
-        self.id = Column(np.int64)
-        self.vertices = Column(np.int64, len(self.type.accepts))
-        self.measured = Column(np.float64, self.type.measured_size)
-        self.sqrt_information = Column(np.float64, m, m)
-        self.label, self.source = Column(np.int64), Column(np.int64)
-        self.weight = Column(np.float64)
-
-    def __len__(self) -> int:
-        return len(self.id)
 
 
 class Graph:
@@ -221,6 +147,27 @@ class Graph:
         """The kind of one vertex."""
         return self.kinds[self.kind.values[vertex]]
 
+    def vertex(self, vertex_id: int) -> Vertex:
+        """One vertex, by its id; a GraphSlamError where there is none."""
+        kind = self.kind_of(_one(vertex_id, self.vertex_count, "vertex"))
+        begin = int(self.offset.values[vertex_id])
+        stored = slice(begin, begin + kind.size)
+        return Vertex(vertex_id, kind, self.initial.values[stored].copy(), stored)
+
+    def edge(self, edge_id: int) -> Edge:
+        """One edge, by its id; a GraphSlamError where there is none."""
+        table, row = self.row(_one(edge_id, self.edge_count, "edge"))
+        return Edge(
+            edge_id,
+            table.type,
+            tuple(table.vertices.values[row].tolist()),
+            table.measured.values[row].copy(),
+            table.sqrt_information.values[row].copy(),
+            self.labels[table.label.values[row]],
+            self.sources[table.source.values[row]],
+            float(table.weight.values[row]),
+        )
+
     def row(self, edge_id: int) -> tuple[EdgeTable, int]:
         """The table and row of an edge."""
         return self._in_order[self.table_of_edge.values[edge_id]], int(self.row_of_edge.values[edge_id])
@@ -236,7 +183,7 @@ class Graph:
         return self.sources[int(table.source.values[row])]
 
     def set_weights(self, edges: Index, weight: float) -> None:
-        """Of some edges; where a solver has them, they are its to change."""
+        """Set the weight of some edges. Where a solver has them, use ``Solver.set_weight``."""
         for code, table in enumerate(self._in_order):
             of_table = edges[self.table_of_edge.values[edges] == code]
             table.weight.values[self.row_of_edge.values[of_table]] = weight
@@ -247,7 +194,7 @@ class Graph:
         return deepcopy(self, {id(one): one for one in same})
 
     def has_label(self, edges: Index, labels: Sequence[str]) -> NDArray[np.bool_]:
-        """Whether each of some edges is of one of these classes."""
+        """Return whether each of some edges is of one of these classes, (n,)."""
         wanted = np.array([label in labels for label in self.labels], dtype=bool)
         out = np.zeros(len(edges), dtype=bool)
         codes = self.table_of_edge.values[edges]
@@ -294,6 +241,12 @@ class Graph:
                 raise GraphSlamError(
                     f"{edge.name}: vertex {vertex} is {self.kind_of(vertex).name}, not {kinds[0].name}"
                 )
+
+
+def _one(one: int, count: int, what: str) -> int:
+    if not 0 <= one < count:
+        raise GraphSlamError(f"{what} {one} does not exist")
+    return one
 
 
 def _code(names: list[str], name: str) -> int:

@@ -29,7 +29,7 @@ class Loss:
 
     @classmethod
     def named(cls, name: str, scale: float = 1.0) -> "Loss":
-        """From its name, one of ``NAMES``."""
+        """Make a loss from its name, one of ``NAMES``."""
         if name not in NAMES:
             raise GraphSlamError(f"loss {name!r}: choose {', '.join(NAMES)}")
         return cls(NAMES[name], scale)

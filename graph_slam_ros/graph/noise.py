@@ -28,17 +28,17 @@ class Gaussian:
 
     @classmethod
     def from_information(cls, information: ArrayLike) -> "Gaussian":
-        """From Omega, (m, m) or (n, m, m). Raises NoiseError naming the first matrix that is not SPD."""
+        """Make it from Omega, (m, m) or (n, m, m). Raises NoiseError naming the first matrix that is not SPD."""
         return cls(np.swapaxes(_cholesky(information, "information"), -1, -2))
 
     @classmethod
     def from_covariance(cls, covariance: ArrayLike) -> "Gaussian":
-        """From Sigma, (m, m) or (n, m, m). Raises NoiseError naming the first matrix that is not SPD."""
+        """Make it from Sigma, (m, m) or (n, m, m). Raises NoiseError naming the first matrix that is not SPD."""
         return cls(np.asarray(np.linalg.inv(_cholesky(covariance, "covariance")), dtype=np.float64))
 
     @classmethod
     def from_sigmas(cls, *sigmas: float) -> "Gaussian":
-        """From independent standard deviations. Raises NoiseError where one is not positive."""
+        """Make it from independent standard deviations. Raises NoiseError where one is not positive."""
         if not all(sigma > 0.0 for sigma in sigmas):
             raise NoiseError(f"standard deviations {list(sigmas)}: each must be > 0")
         return cls.from_covariance(np.diag(np.square(sigmas)))

@@ -1,4 +1,4 @@
-"""Edge types on one pose alone: what a receiver, a compass or an inertial sensor says of it in the map's axes.
+"""Edge types on one pose alone: what a receiver, a compass or an inertial sensor measures of it in the map's axes.
 
 A fix that knows some axes only, or some better than others in correlated ways, is said by coordinates along the
 principal axes of its covariance: each of them is one number. A position may be that of a point of the robot, an

@@ -72,5 +72,5 @@ def _vector_kind(dof: int) -> VertexKind:
 SE2 = VertexKind("SE2", 3, 3, _retract_se2, _local_se2)
 SE3 = VertexKind("SE3", 7, 6, _retract_se3, _local_se3, _has_unit_quaternion)
 GROUPS = {SE2: se2, SE3: se3}
-"""Of kinds that are rigid motions, the functions of their group."""
+"""The functions of their group, of kinds that are rigid motions."""
 R1, R2, R3 = _vector_kind(1), _vector_kind(2), _vector_kind(3)

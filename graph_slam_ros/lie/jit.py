@@ -1,4 +1,4 @@
-"""How kernels are compiled: Numba with a cache that cannot serve stale code.
+"""Compilation of kernels: Numba with a cache that cannot serve stale code.
 
 Numba keys its cache by the file of the compiled function and sees neither a change in a file imported by it nor another
 setting of the compiler (bounds checks). So the cache lives in one folder per digest of all kernel sources and settings.
@@ -39,7 +39,7 @@ def _digest() -> str:
 
 
 def _place() -> str:
-    """Of these files: Numba compiles anew what lies elsewhere, its older versions also what was touched."""
+    """A digest of where these files lie and when they changed: Numba compiles anew where either is different."""
     return hashlib.sha256(repr([(str(path), int(path.stat().st_mtime)) for path in _sources()]).encode()).hexdigest()
 
 
@@ -66,7 +66,7 @@ def _cache_dir() -> Path:
 
 
 def _is_private(folder: Path) -> bool:
-    """Whether nobody else could have put anything into it: Numba unpickles and runs what it caches.
+    """Return whether nobody else can have put anything into the folder: Numba unpickles and runs what it caches.
 
     A folder of ours that others may write to, as a lax umask leaves it, is closed to them; what is in it must be ours.
     """

@@ -241,7 +241,7 @@ def propagate(covariance: Array, step: Pose, added: Array) -> Array:
 
 @kernel
 def propagate_during(covariance: Array, step: Pose, of_twist: Array) -> Array:
-    """As ``propagate``, for noise that acted all through the step (``noise_during``)."""
+    """The same as ``propagate``, for noise that acted all through the step (``noise_during``)."""
     return propagate(covariance, step, noise_during(step, of_twist))
 
 

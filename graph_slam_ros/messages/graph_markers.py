@@ -7,7 +7,7 @@ import numpy as np
 
 from graph_slam_ros.graph import POINT_PRIOR, R2, R3, SE2, SE3, EdgeType
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.messages.markers import Lines
 from graph_slam_ros.messages.path_thinning import thinned, worst_and_some
 from graph_slam_ros.slam import GraphSlam

@@ -1,4 +1,4 @@
-"""How the problem is solved: linearisation, ordering, the clique tree, online updates and batch optimisation."""
+"""The solution of the problem: linearisation, ordering, the clique tree, online updates and batch optimisation."""
 
 from graph_slam_ros.solver.batch import METHODS, Settings
 from graph_slam_ros.solver.initialization import initial_values

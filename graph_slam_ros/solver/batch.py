@@ -7,8 +7,15 @@ import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError, SingularError
 from graph_slam_ros.graph import Graph, Loss
-from graph_slam_ros.graph.graph import EdgeTable
-from graph_slam_ros.solver.clique_tree.numeric import back_substitute, curvature, eliminate, gradient, settle, step_by
+from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.solver.clique_tree.numeric import (
+    accept_steps,
+    back_substitute,
+    curvature,
+    eliminate,
+    gradient,
+    step_by,
+)
 from graph_slam_ros.solver.clique_tree.storage import NOTHING, Tree
 from graph_slam_ros.solver.clique_tree.symbolic import mark
 from graph_slam_ros.solver.gauge import undetermined
@@ -36,7 +43,7 @@ _LEAST = {  # of the settings that are numbers
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How to solve.
+    """Settings of the solver, online and in batch.
 
     Attributes
     ----------
@@ -83,18 +90,18 @@ class Settings:
         return [{name: s[min(k, len(s) - 1)] for name, s in self.losses.items()} for k in range(count)]
 
     def until_still(self) -> "Settings":
-        """For an estimate that is near: the last stage alone, until nothing moves."""
+        """Settings for an estimate that is near: the last stage alone, until nothing moves."""
         last = {label: stages[-1:] for label, stages in self.losses.items()}
         return replace(self, losses=last, step_tolerance=_STILL, cost_tolerance=0.0)
 
     def on_the_way(self) -> "Settings":
-        """For a stage that another follows."""
+        """Settings for a stage that another follows."""
         return replace(self, cost_tolerance=max(self.cost_tolerance, _ON_THE_WAY))
 
 
 @dataclass(frozen=True, slots=True)
 class _Saved:
-    """Where a problem was."""
+    """Linearisation points of a problem, and what is linearised there."""
 
     value: Array
     blocks: Array
@@ -103,8 +110,8 @@ class _Saved:
     cost: float
 
 
-class Problem:
-    """What is minimised: the edges of a clique tree over its unknowns, from where the estimate is.
+class BatchProblem:
+    """The batch problem: the edges of a clique tree, minimised over its unknowns from the present estimate.
 
     Attributes
     ----------
@@ -117,7 +124,7 @@ class Problem:
         self.edges = np.concatenate([t.id.values[r] for t, r in rows.items()] or [np.empty(0, dtype=np.int64)])
         self._size = len(graph.initial)
         self.chi2 = self.cost = 0.0
-        settle(tree, unknowns)
+        accept_steps(tree, unknowns)
 
     def linearize(self, losses: Losses, *, refuse: bool = False) -> None:
         """Put the blocks of all edges at the linearisation points into the tree; costs not finite may be refused."""
@@ -148,8 +155,8 @@ class Problem:
         return float(np.abs(self.tree.step).max(initial=0.0))
 
     def move(self) -> None:
-        """Take the step: the estimate becomes the linearisation point."""
-        settle(self.tree, self.unknowns)
+        """Accept the step: the estimate becomes the linearisation point."""
+        accept_steps(self.tree, self.unknowns)
 
     def here(self) -> Array:
         """The linearisation points, to come back to."""
@@ -173,13 +180,13 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class _Descent:
-    """How one method went, from where it began."""
+    """The iterations of one method, and why it stopped."""
 
     iterations: list[Iteration]
     stop: str
 
 
-def minimise(problem: Problem, settings: Settings) -> Report:
+def minimise(problem: BatchProblem, settings: Settings) -> Report:
     """Minimise stage after stage of the losses, the last until converged; the tree is left at the last finite iterate.
 
     Gauss-Newton may rise on its way. It has failed when it ends above where it began, or not finite, or without
@@ -218,7 +225,7 @@ def minimise(problem: Problem, settings: Settings) -> Report:
     return Report(used, stop, chi2_initial, end.chi2, cost_initial, end.cost, tuple(iterations), end.classes)
 
 
-def _gauss_newton(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
+def _gauss_newton(problem: BatchProblem, losses: Losses, settings: Settings) -> _Descent:
     start = problem.cost
     iterations: list[Iteration] = []
     for _ in range(settings.max_iterations):
@@ -239,7 +246,7 @@ def _gauss_newton(problem: Problem, losses: Losses, settings: Settings) -> _Desc
     return _Descent(iterations, "max_iterations")
 
 
-def _levenberg_marquardt(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
+def _levenberg_marquardt(problem: BatchProblem, losses: Losses, settings: Settings) -> _Descent:
     """Marquardt 1963: the diagonal is enlarged until the cost falls."""
     damping = _DAMPING_FIRST
     iterations: list[Iteration] = []
@@ -263,7 +270,7 @@ def _levenberg_marquardt(problem: Problem, losses: Losses, settings: Settings) -
     return _Descent(iterations, "max_iterations")
 
 
-def _dogleg(problem: Problem, losses: Losses, settings: Settings) -> _Descent:
+def _dogleg(problem: BatchProblem, losses: Losses, settings: Settings) -> _Descent:
     """Powell 1970: within a radius, from steepest descent's minimum towards the Gauss-Newton step."""
     radius = _RADIUS_FIRST
     iterations: list[Iteration] = []
@@ -316,7 +323,7 @@ def _within(radius: float, newton: Array, steepest: Array) -> Array:
 
 
 def _converged(previous: float, last: Iteration, settings: Settings) -> str:
-    """Which of the two rules of the literature holds, or an empty string."""
+    """The name of the convergence rule that holds, ``step`` or ``cost``, or an empty string."""
     if last.step <= settings.step_tolerance:
         return "step"
     if abs(previous - last.cost) <= settings.cost_tolerance * last.cost + _TINY:
@@ -324,7 +331,7 @@ def _converged(previous: float, last: Iteration, settings: Settings) -> str:
     return ""
 
 
-_DESCENTS: dict[str, Callable[[Problem, Losses, Settings], _Descent]] = {
+_DESCENTS: dict[str, Callable[[BatchProblem, Losses, Settings], _Descent]] = {
     "gn": _gauss_newton,
     "lm": _levenberg_marquardt,
     "dogleg": _dogleg,

@@ -66,7 +66,7 @@ def marginals(t: Tree, vertices: Index) -> Array:
 
 @kernel
 def _place_in(vertex: Index, clique: Index, members: Index, c: int, v: int) -> int:
-    """Where a member begins in a clique's front."""
+    """The row where a member begins in a clique's front."""
     at = 0
     m = clique[c, MEMBERS]
     while members[m] != v:
@@ -77,7 +77,7 @@ def _place_in(vertex: Index, clique: Index, members: Index, c: int, v: int) -> i
 
 @kernel
 def _inherit(t: Tree, c: int, above: Array, covariance: Array) -> None:
-    """Take the covariance of a separator out of the parent's."""
+    """Copy the covariance of a separator out of the parent's."""
     vertex, clique, members = t.vertex, t.clique, t.members
     frontal, full = clique[c, FRONT_DOF], clique[c, FULL_DOF]
     parent = clique[c, PARENT]
@@ -100,7 +100,7 @@ def _inherit(t: Tree, c: int, above: Array, covariance: Array) -> None:
 
 @kernel
 def _complete(front: Array, frontal: int, covariance: Array) -> None:
-    """From the separator's block to the whole: ``U11 X = [1 / U11', 0] - U12 Sigma``, column after column."""
+    """Complete the covariance from the separator's block: ``U11 X = [1 / U11', 0] - U12 Sigma``, column by column."""
     full = len(covariance)
     for j in range(full - 1, -1, -1):
         row = covariance[j]  # symmetric: also its column

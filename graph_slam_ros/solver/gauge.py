@@ -1,4 +1,4 @@
-"""Whether something fixes where the whole is: relative measurements alone leave it to float."""
+"""The gauge: relative measurements alone leave the whole free to move."""
 
 from collections.abc import Mapping
 
@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from graph_slam_ros.errors import GaugeError, SingularError
 from graph_slam_ros.graph import R2, R3, SE2, SE3, Graph, VertexKind
-from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie import so3
 from graph_slam_ros.solver.linearization import Losses, linearize
 from graph_slam_ros.typing import Array, Index
@@ -18,7 +18,7 @@ _LEAST_EIGENVALUE = 1e-9  # of correlations: less is no information
 
 
 def undetermined(vertex: int) -> SingularError:
-    """What to raise where elimination leaves nothing of a vertex."""
+    """The error for a vertex that the edges do not determine."""
     return SingularError(f"a pivot cannot be told from rounding: the edges do not determine vertex {vertex}")
 
 
@@ -40,20 +40,20 @@ def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable,
         _, part = connected_components(links, directed=False)
     else:
         part = np.arange(graph.vertex_count)
-    loose = np.sort(free[~np.isin(part[free], part[fixed])])
-    if len(loose):
-        more = int((part[loose] == part[loose[0]]).sum()) - 1
+    floating = np.sort(free[~np.isin(part[free], part[fixed])])
+    if len(floating):
+        more = int((part[floating] == part[floating[0]]).sum()) - 1
         raise GaugeError(
-            f"nothing fixes the gauge of vertex {int(loose[0])} and {more} more joined to it: add a prior"
+            f"nothing fixes the gauge of vertex {int(floating[0])} and {more} more joined to it: add a prior"
             " (an anchor) or hold a vertex"
         )
 
 
 def fix_the_whole(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index]) -> bool:
-    """Whether edges on one vertex alone together resist every rigid motion of the whole, at the stored values x.
+    """Return whether edges on one vertex alone together resist every rigid motion of the whole, at stored values x.
 
     One position leaves the heading open, and so does one heading the position; several may fix both. In a graph without
-    poses any such edge is taken to do.
+    poses any such edge is enough.
     """
     alone = {table: chosen for table, chosen in rows.items() if len(table.type.accepts) == 1}
     axes = max((_AXES[kind] for kind in graph.kinds if kind in (SE2, SE3)), default=0)

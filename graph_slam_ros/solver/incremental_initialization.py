@@ -90,7 +90,7 @@ class _Drive:
     def _predicted(
         self, pose: int, edges: Sequence[tuple[int, EdgeType, int]], rank: Index, sighting: EdgeType
     ) -> Array:
-        """From the latest earlier pose that an edge joins it to."""
+        """Compose the latest earlier pose that an edge joins it to with that edge."""
         best, value = -1, None
         for _, edge, row in edges:
             i, j = self._ends(edge, row)

@@ -1,4 +1,4 @@
-"""Where to start: initial values from the edges alone, for graphs without values or with a bad start.
+"""Initial values from the edges alone, for graphs without values or with a bad start.
 
 * ``tree``: poses composed along a breadth-first spanning tree of the relative poses.
 * ``online``: pose after pose, in order of time (``replayed_start``).
@@ -30,7 +30,7 @@ from graph_slam_ros.graph import (
     Graph,
     VertexKind,
 )
-from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie import so3
 from graph_slam_ros.solver.incremental_initialization import replayed_values
 from graph_slam_ros.typing import Array, Index

@@ -1,14 +1,14 @@
-"""From edges to whitened blocks: the only place of the solver that looks at an edge type, and only to call it."""
+"""Linearisation of edges to whitened blocks: only here the solver uses an edge type, and only calls it."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import EdgeType, Graph, Loss
-from graph_slam_ros.graph.graph import EdgeTable
 from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.numeric import add_to_diagonal, clear_block
 from graph_slam_ros.solver.clique_tree.storage import BLOCK, Tree
@@ -46,8 +46,8 @@ class Losses:
 
 
 @kernel
-def _take(rows: Index, vertices: Index, offset: Index, measured: Array) -> tuple[Index, Array]:
-    """Where the vertices of some edges begin, and what was measured."""
+def _gather(rows: Index, vertices: Index, offset: Index, measured: Array) -> tuple[Index, Array]:
+    """Offsets (n, k) of the vertices of some edges, and their measurements (n, p)."""
     n, ends = len(rows), vertices.shape[1]
     at, z = np.empty((n, ends), np.int64), np.empty((n, measured.shape[1]))
     for k in range(n):
@@ -107,15 +107,15 @@ def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: L
         columns = table.sqrt_information.values, table.weight.values, table.label.values
         for first in range(0, len(chosen), CHUNK):
             some = chosen[first : first + CHUNK]
-            at, measured = _take(some, table.vertices.values, offset, table.measured.values)
+            at, measured = _gather(some, table.vertices.values, offset, table.measured.values)
             residual, jacobian = table.type.linearize(x, at, measured)
             chi2, cost = _whiten(some, residual, jacobian, *columns, losses.kind, losses.scale)
             yield Block(table, some, residual, jacobian, chi2, cost)
 
 
-def linearized(graph: Graph, x: Array, edge: EdgeType, vertices: Index, measured: Array) -> tuple[Array, Array]:
+def linearized(graph: Graph, x: Array, edge: EdgeType, vertices: Sequence[int], measured: Array) -> tuple[Array, Array]:
     """Residual (m,) and Jacobian (m, width) of one measurement (p,) between vertices (k,) at the stored values x."""
-    residual, jacobian = edge.linearize(x, graph.offset.values[vertices][None], measured[None])
+    residual, jacobian = edge.linearize(x, graph.offset.values[list(vertices)][None], measured[None])
     return residual[0], jacobian[0]
 
 
@@ -127,7 +127,7 @@ def residuals_of(graph: Graph, x: Array, edges: Index) -> Iterator[tuple[Index, 
         for first in range(0, len(of_table), CHUNK):
             some = of_table[first : first + CHUNK]
             rows = graph.row_of_edge.values[edges[some]]
-            at, measured = _take(rows, table.vertices.values, graph.offset.values, table.measured.values)
+            at, measured = _gather(rows, table.vertices.values, graph.offset.values, table.measured.values)
             residual, _ = table.type.linearize(x, at, measured)
             yield some, residual, table.sqrt_information.values[rows]
 

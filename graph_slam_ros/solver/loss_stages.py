@@ -11,7 +11,7 @@ from graph_slam_ros.typing import Array, Index
 
 
 class LossStages:
-    """Which loss each edge has at present.
+    """The stage of the loss that each edge has at present.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class LossStages:
         self._made_for: tuple[int, Settings | None] = 0, None  # so many labels, and their settings
 
     def losses(self, settings: Settings) -> list[Losses]:
-        """Of each stage."""
+        """The losses of each stage."""
         count, made_for = self._made_for
         if count != len(self._graph.labels) or made_for is not settings:
             self._made_for = len(self._graph.labels), settings
@@ -41,11 +41,11 @@ class LossStages:
         return [(edges[young], stages[0]), (edges[~young], stages[-1])]
 
     def begin(self, edges: Index, settings: Settings) -> None:
-        """These arrive; those that were young are so no more."""
+        """Begin the first stage of edges that arrive; those that were young are so no more."""
         self.young = edges if len(self.losses(settings)) > 1 else NONE
 
     def mature(self, values: Array, settings: Settings) -> None:
-        """Only those stay young which the last stage of their loss weighs otherwise than the first."""
+        """Keep as young only edges whose weight differs between the first and the last stage of their loss."""
         if not len(self.young):
             return
         first, *_, last = self.losses(settings)

@@ -1,4 +1,4 @@
-"""What a solver was told since its last update."""
+"""Changes of a problem since its last update."""
 
 from dataclasses import dataclass, field
 
@@ -15,14 +15,14 @@ def _none() -> Index:
 
 @dataclass(slots=True)
 class PendingChanges:
-    """What the next update has to take in.
+    """Changes that the next update integrates.
 
     Attributes
     ----------
     vertices : that were added
     new, back : edges that were added; that came back, or have another weight or a newly held vertex
     touched : vertices that lost an edge or a neighbour
-    loose : whether something that held parts together may be gone
+    may_float : whether something that held parts together may be gone
     broken : whether the tree must be made anew
     """
 
@@ -30,30 +30,30 @@ class PendingChanges:
     new: Index = field(default_factory=_none)
     back: list[Index] = field(default_factory=list)
     touched: Index = field(default_factory=_none)
-    loose: bool = False
+    may_float: bool = False
     broken: bool = False
 
     def __bool__(self) -> bool:
         return bool(len(self.vertices) or len(self.new) or self.back or len(self.touched) or self.broken)
 
     def add(self, vertices: Index, edges: Index) -> None:
-        """New ones."""
+        """Append new vertices and edges."""
         all_vertices = np.concatenate((self.vertices, vertices)) if len(self.vertices) else vertices
         all_new = np.concatenate((self.new, edges)) if len(self.new) else edges
         self.vertices, self.new = all_vertices, all_new  # both, or where memory lacks neither
 
     def again(self, edges: Index) -> None:
-        """Edges that are to be linearised, whether or not they wait already."""
+        """Append edges to be linearised again, also those that are pending already."""
         self.back.append(edges)
 
     def edges(self) -> Index:
-        """All of them, each once."""
+        """All edges to be linearised, each once."""
         return np.unique(np.concatenate((self.new, *self.back))) if self.back else self.new
 
     def touch(self, vertices: Index) -> None:
-        """Vertices that lost an edge or a neighbour."""
+        """Append vertices that lost an edge or a neighbour."""
         self.touched = np.concatenate((self.touched, vertices))
 
     def forget(self, vertex: int) -> None:
-        """A vertex that is gone again before it was taken in."""
+        """Drop a vertex that was removed before an update integrated it."""
         self.vertices = self.vertices[self.vertices != vertex]

@@ -1,4 +1,4 @@
-"""When large steps are looked for, which are linearised anew."""
+"""The schedule of relinearisation: when vertices are searched for large steps."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
 
 
 class RelinearizationSchedule:
-    """Counts updates, and keeps what moved in them until large steps are looked for among all of it."""
+    """Counts updates, and keeps the vertices that moved until all of them are searched for large steps."""
 
     def __init__(self) -> None:
         self._moved: list[Index] = []
@@ -18,16 +18,16 @@ class RelinearizationSchedule:
         self._updates = 0
 
     def note(self, moved: Index) -> None:
-        """Vertices that moved after the last look of an update: the next looks at them."""
+        """Note vertices that moved after the last search of an update: the next searches them."""
         self._moved.append(moved)
         self._unseen = moved
 
     def hasten(self, every: int) -> None:
-        """Have the present update look among all."""
+        """Have the present update search all of them."""
         self._updates = every
 
     def after_update(self, moved: Index, every: int) -> tuple[Index, float]:
-        """Among which vertices to look for large steps now, and beyond how many times the threshold.
+        """The vertices to search for large steps now, and the multiple of the threshold that a step must exceed.
 
         After so many updates among all that moved since, sooner if much moved anyway; else among what this one moved.
         """

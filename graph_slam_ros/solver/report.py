@@ -1,4 +1,4 @@
-"""What an update or a batch optimisation did, and why it stopped."""
+"""Results of an update and of a batch optimisation, and why it stopped."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class Iteration:
 
 @dataclass(frozen=True, slots=True)
 class ClassCost:
-    """How many edges a label has, their share of chi2, and how many residuals it is the sum of."""
+    """The number of edges of a label, their share of chi2, and the number of residuals in it."""
 
     edges: int
     chi2: float
@@ -63,5 +63,5 @@ class Report:
 
     @property
     def converged(self) -> bool:
-        """Whether one of the two convergence rules ended it."""
+        """Return whether one of the two convergence rules ended it."""
         return self.stop in ("step", "cost", "nothing_to_do")

@@ -5,7 +5,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from graph_slam_ros.graph.graph import Column
+from graph_slam_ros.graph.tables import Column
 from graph_slam_ros.typing import Array, Index, Numbers
 
 Instant = TypeVar("Instant")

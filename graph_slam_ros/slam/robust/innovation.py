@@ -1,12 +1,14 @@
 """The innovation: how far a measurement is from what all else predicts of it, in units of both their uncertainties."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.optimize import least_squares
 
-from graph_slam_ros.graph import POINT_SEEN_FROM, SE2, SE3, EdgeType, Graph
+from graph_slam_ros.graph import POINT_SEEN_FROM, SE2, SE3, Edge, Graph
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import linearized
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array
 
 _ANGLES = {SE2: 1, SE3: 3}  # of a pose, its last coordinates
 _MOST_STEPS = 60  # of a search: with extreme numbers it would creep for seconds; the least it has found is taken
@@ -29,29 +31,27 @@ def innovation(graph: Graph, solver: Solver, edge: int) -> float:
     GaugeError, SingularError
         As for ``Solver.marginal``.
     """
-    table, row = graph.row(edge)
-    vertices, measured = table.vertices.values[row], table.measured.values[row]
-    joint, x, root = solver.joint_marginal(vertices), solver.values, table.sqrt_information.values[row]
-    residual, jacobian = linearized(graph, x, table.type, vertices, measured)
+    one, x = graph.edge(edge), solver.values
+    joint, root = solver.joint_marginal(one.vertices), one.sqrt_information
+    residual, jacobian = linearized(graph, x, one.type, one.vertices, one.measured)
     predicted = jacobian @ joint @ jacobian.T
     white = root @ residual
-    if _spread(graph, x, vertices, joint, predicted) <= _LINEAR_RAD2:
+    if _spread(graph, x, one.vertices, joint, predicted) <= _LINEAR_RAD2:
         spread = root @ predicted @ root.T + np.eye(len(white))
         least = float(white @ np.linalg.lstsq(spread, white, rcond=None)[0])
         return least if np.isfinite(least) else np.inf
-    return _least_cost(graph, x, table.type, vertices, measured, root, joint)
+    return _least_cost(graph, x, one, joint)
 
 
-def _least_cost(
-    graph: Graph, x: Array, edge: EdgeType, vertices: Index, measured: Array, root: Array, joint: Array
-) -> float:
+def _least_cost(graph: Graph, x: Array, edge: Edge, joint: Array) -> float:
     """The least of ``|u|^2 + |R r|^2`` over steps ``d = L u`` of the vertices, with ``L L' = Sigma``, by search."""
     variances, axes = np.linalg.eigh(joint)
     sigmas = axes * np.sqrt(np.maximum(variances, 0.0))
-    kinds = [graph.kind_of(v) for v in vertices.tolist()]
+    ends = [graph.vertex(v) for v in edge.vertices]
+    kinds = [end.kind for end in ends]
     at = np.cumsum([0] + [kind.size for kind in kinds])
     first = np.cumsum([0] + [kind.dof for kind in kinds])
-    before = [x[o : o + kind.size][None] for o, kind in zip(graph.offset.values[vertices].tolist(), kinds, strict=True)]
+    before = [x[end.stored][None] for end in ends]
 
     found: list[float] = []
 
@@ -68,8 +68,8 @@ def _least_cost(
             kind.retract(value, step[None, k : k + kind.dof])[0]
             for kind, value, k in zip(kinds, before, first.tolist(), strict=False)
         ]
-        residual, _ = edge.linearize(np.concatenate(moved), at[None, :-1], measured[None])
-        return np.concatenate((units, root @ residual[0]))
+        residual, _ = edge.type.linearize(np.concatenate(moved), at[None, :-1], edge.measured[None])
+        return np.concatenate((units, edge.sqrt_information @ residual[0]))
 
     try:
         return float(2.0 * least_squares(counted, np.zeros(len(sigmas)), method="lm").cost)
@@ -77,9 +77,9 @@ def _least_cost(
         return min(found)
 
 
-def _spread(graph: Graph, x: Array, vertices: Index, joint: Array, predicted: Array) -> float:
+def _spread(graph: Graph, x: Array, vertices: Sequence[int], joint: Array, predicted: Array) -> float:
     """Variance [rad^2] of the directions in which the vertices of an edge see one another."""
-    kinds = [graph.kind_of(v) for v in vertices.tolist()]
+    kinds = [graph.kind_of(v) for v in vertices]
     pose = kinds[0]
     if pose not in _ANGLES:
         return 0.0

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.graph.graph import Column
+from graph_slam_ros.graph.tables import Column
 from graph_slam_ros.typing import Array, Index
 
 

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from graph_slam_ros.graph import GROUPS, RELATIVE_POSE, RELATIVE_POSE_3D, SE2, SE3, Graph
-from graph_slam_ros.graph.graph import EdgeTable
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.typing import Array, Index
 
 _NEAR = 5.0  # poses between the ends of neighbours

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from graph_slam_ros.graph.edge_type import MOST_SLOTS
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.clique_tree.numeric import back_substitute, clear_block, eliminate, settle
+from graph_slam_ros.solver.clique_tree.numeric import accept_steps, back_substitute, clear_block, eliminate
 from graph_slam_ros.solver.clique_tree.ordering import key_of, move_tail, neighbourhood
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
@@ -378,5 +378,5 @@ def relinearize(t: Tree, moved: Index, threshold: float, error: float) -> Index:
                 count += 1
     for e in edges[:count]:
         edge[e, TAKEN] = 0
-    settle(t, moving[:many])
+    accept_steps(t, moving[:many])
     return np.sort(edges[:count])

@@ -308,7 +308,7 @@ def keep(vertex: Index, estimate: Array, kept: Array, vertices: Index) -> None:
 
 
 @kernel
-def settle(t: Tree, vertices: Index) -> None:
+def accept_steps(t: Tree, vertices: Index) -> None:
     """The estimate becomes the linearisation point."""
     vertex, step, value, estimate = t.vertex, t.step, t.value, t.estimate
     for v in vertices:

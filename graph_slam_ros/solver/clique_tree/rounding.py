@@ -12,12 +12,12 @@ import numpy as np
 
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.storage import (
+    CHECKED,
     CHILD,
     DOF,
     FRONT_DOF,
     FRONTALS,
     FULL_DOF,
-    LOOKED_INTO,
     MAGNITUDES,
     MEMBERS,
     NOTHING,
@@ -97,7 +97,7 @@ def magnitude_of(t: Tree, c: int, row: int) -> float:
             walk[count] = k
             count += 1
             k = clique[k, SIBLING]
-    t.state[LOOKED_INTO] += count
+    t.state[CHECKED] += count
     place = np.empty(len(t.step), np.int64)
     for k in walk[:count][::-1]:  # children before parents
         if clique[k, MAGNITUDES] == UNKNOWN:

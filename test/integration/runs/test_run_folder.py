@@ -354,7 +354,7 @@ OF_FILES = {
     "warmup.py": {"COMPILED.touch", "subprocess.Popen"},
     "node/memory.py": {"_STATM.read_text"},
     "analysis/plots.py": {"figure.savefig"},  # into memory
-    "solver/solver.py": {"self._waiting.touch"},
+    "solver/problem.py": {"self._pending.touch"},
 }
 
 

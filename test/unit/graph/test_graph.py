@@ -25,7 +25,7 @@ from graph_slam_ros.graph import (
     Graph,
     numeric_jacobian,
 )
-from graph_slam_ros.graph.graph import Column
+from graph_slam_ros.graph.tables import Column
 from graph_slam_ros.solver import Solver
 
 EDGES = [
@@ -304,3 +304,36 @@ def test_a_standard_deviation_that_is_not_positive_is_refused():
     for sigma in (-0.1, 0.0, np.nan):
         with pytest.raises(GraphSlamError, match="must be > 0"):
             Gaussian.from_sigmas(0.1, sigma)
+
+
+def test_a_view_of_an_edge_and_of_a_vertex_has_what_was_added_and_cannot_change_it():
+    graph = Graph()
+    graph.add_vertices(SE2, [[0.0, 0.0, 0.0], [1.0, 2.0, 0.5]])
+    graph.add_vertex(R2, [7.0, 8.0])
+    noise = Gaussian.from_sigmas(0.5, 0.25)
+    graph.add_edge(RELATIVE_POSE, [0, 1], [1.0, 2.0, 0.5], UNIT, "odometry")
+    graph.add_edge(LANDMARK_POSITION, [1, 2], [3.0, 4.0], noise, "landmarks", "/tags")
+    graph.set_weights(np.array([1]), 0.5)
+    edge, vertex = graph.edge(1), graph.vertex(1)
+    assert (edge.id, edge.type, edge.vertices, edge.weight) == (1, LANDMARK_POSITION, (1, 2), 0.5)
+    assert (edge.label, edge.source, graph.edge(0).source) == ("landmarks", "/tags", "")
+    assert edge.measured.tolist() == LANDMARK_POSITION.whole([3.0, 4.0]).tolist()
+    assert np.array_equal(edge.sqrt_information, noise.sqrt_information)
+    assert (vertex.id, vertex.kind, vertex.initial.tolist()) == (1, SE2, [1.0, 2.0, 0.5])
+    assert graph.initial.values[vertex.stored].tolist() == [1.0, 2.0, 0.5]
+    assert graph.initial.values[graph.vertex(2).stored].tolist() == [7.0, 8.0]
+    edge.measured[:], edge.sqrt_information[:], vertex.initial[:] = 9.0, 9.0, 9.0
+    assert graph.edge(1).measured[0] == 3.0
+    assert np.array_equal(graph.edge(1).sqrt_information, noise.sqrt_information)
+    assert graph.vertex(1).initial[0] == 1.0
+
+
+@pytest.mark.parametrize("one", [-1, 2])
+def test_a_view_of_what_does_not_exist_is_refused(one):
+    graph = Graph()
+    graph.add_vertices(R1, [[0.0], [1.0]])
+    graph.add_edges(DIFFERENCE[R1], [[0, 1], [1, 0]], [[1.0], [-1.0]], Gaussian.from_sigmas(1.0), "odometry")
+    with pytest.raises(GraphSlamError, match=f"vertex {one} does not exist"):
+        graph.vertex(one)
+    with pytest.raises(GraphSlamError, match=f"edge {one} does not exist"):
+        graph.edge(one)

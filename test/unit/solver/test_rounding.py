@@ -9,10 +9,10 @@ from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.clique_tree.rounding import KEPT, magnitude_of
 from graph_slam_ros.solver.clique_tree.storage import (
     AFFECTED,
+    CHECKED,
     CLIQUES,
     DOF,
     FRONTALS,
-    LOOKED_INTO,
     MAGNITUDES,
     MEMBERS,
     STEP,
@@ -81,10 +81,10 @@ def test_an_update_of_a_long_open_drive_looks_at_what_changed_not_at_the_whole_t
     for _ in range(1600):
         drive.on((1.0, 0.0, 0.02 * rng.standard_normal()))
     state = drive.solver._tree.state
-    looked, again = state[LOOKED_INTO], state[AFFECTED]
+    looked, again = state[CHECKED], state[AFFECTED]
     for _ in range(50):
         drive.on((1.0, 0.0, 0.02 * rng.standard_normal()))
     state = drive.solver._tree.state
-    looked, again = state[LOOKED_INTO] - looked, state[AFFECTED] - again
+    looked, again = state[CHECKED] - looked, state[AFFECTED] - again
     assert 50 <= looked <= 3 * again
     assert state[CLIQUES] > 150

@@ -1,0 +1,168 @@
+"""The records of a graph as growing columns, and views of them: some edges of one type, one edge, one vertex."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from graph_slam_ros.graph.edge_type import EdgeType
+from graph_slam_ros.graph.vertices import VertexKind
+from graph_slam_ros.typing import Array, Index
+
+
+class Column:
+    """An array that grows at its end; ``values`` is a view of what is there."""
+
+    __slots__ = ("_buffer", "_length")
+
+    def __init__(self, dtype: type, *shape: int) -> None:
+        self._buffer: NDArray[Any] = np.empty((16, *shape), dtype=dtype)
+        self._length = 0
+
+    def __len__(self) -> int:
+        return self._length
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """The rows so far, a view."""
+        return self._buffer[: self._length]
+
+    @staticmethod
+    def extend(*parts: tuple["Column", ArrayLike, int]) -> None:
+        """Append to columns, each so many rows (one row, or a scalar, is repeated): to all of them, or to none.
+
+        Half a record would put all later ones out of step.
+        """
+        ends = [column._put(rows, count) for column, rows, count in parts]
+        for (column, _, _), end in zip(parts, ends, strict=True):
+            column._length = end
+
+    def _put(self, rows: ArrayLike, count: int) -> int:
+        """Write beyond the end, where nobody sees it; returns where that ends."""
+        end = self._length + count
+        if end > len(self._buffer):
+            grown = np.empty((max(end, 2 * len(self._buffer)), *self._buffer.shape[1:]), dtype=self._buffer.dtype)
+            grown[: self._length] = self.values
+            self._buffer = grown
+        self._buffer[self._length : end] = rows
+        return end
+
+
+@dataclass(slots=True, eq=False)
+class EdgeTable:
+    """All edges of one type, a row each.
+
+    Attributes
+    ----------
+    code : its place among the graph's tables
+    id : edge ids; vertices : (n, k) vertex ids; measured : (n, p); sqrt_information : (n, m, m)
+    label, source : codes into ``Graph.labels`` and ``Graph.sources``
+    weight : a factor on the information, 0 = out of the problem
+    """
+
+    type: EdgeType
+    code: int
+    id: Column = field(init=False)
+    vertices: Column = field(init=False)
+    measured: Column = field(init=False)
+    sqrt_information: Column = field(init=False)
+    label: Column = field(init=False)
+    source: Column = field(init=False)
+    weight: Column = field(init=False)
+
+    def __post_init__(self) -> None:
+        m = self.type.residual_size
+        self.id = Column(np.int64)
+        self.vertices = Column(np.int64, len(self.type.accepts))
+        self.measured = Column(np.float64, self.type.measured_size)
+        self.sqrt_information = Column(np.float64, m, m)
+        self.label, self.source = Column(np.int64), Column(np.int64)
+        self.weight = Column(np.float64)
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def at(self, rows: Index) -> "EdgeRows":
+        """Some rows, as arrays."""
+        return EdgeRows(self, rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeRows:
+    """Some of the edges of one type, as arrays that are copied when they are asked for."""
+
+    table: EdgeTable
+    rows: Index
+
+    @property
+    def ids(self) -> Index:
+        """Edge ids, (n,)."""
+        return self.table.id.values[self.rows]
+
+    @property
+    def vertices(self) -> Index:
+        """Vertex ids, (n, k)."""
+        return self.table.vertices.values[self.rows]
+
+    @property
+    def measured(self) -> Array:
+        """Measurements, (n, p)."""
+        return self.table.measured.values[self.rows]
+
+    @property
+    def sqrt_information(self) -> Array:
+        """Square root information matrices, (n, m, m)."""
+        return self.table.sqrt_information.values[self.rows]
+
+    @property
+    def label(self) -> Index:
+        """Codes into ``Graph.labels``, (n,)."""
+        return self.table.label.values[self.rows]
+
+    @property
+    def source(self) -> Index:
+        """Codes into ``Graph.sources``, (n,)."""
+        return self.table.source.values[self.rows]
+
+    @property
+    def weight(self) -> Array:
+        """Factors on the information, (n,)."""
+        return self.table.weight.values[self.rows]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edge:
+    """One edge, copied out of the graph: what is done to it does not change the graph.
+
+    Attributes
+    ----------
+    vertices : ids; measured : (p,); sqrt_information : (m, m)
+    label : the class it is counted under; source : the input that measured it, or empty
+    weight : a factor on the information at this time, 0 = out of the problem
+    """
+
+    id: int
+    type: EdgeType
+    vertices: tuple[int, ...]
+    measured: Array
+    sqrt_information: Array
+    label: str
+    source: str
+    weight: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vertex:
+    """One vertex, copied out of the graph: what is done to it does not change the graph.
+
+    Attributes
+    ----------
+    initial : (size,), the value it was added with
+    stored : where its numbers are in ``Graph.initial`` and ``Solver.values``
+    """
+
+    id: int
+    kind: VertexKind
+    initial: Array
+    stored: slice

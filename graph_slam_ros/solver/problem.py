@@ -1,0 +1,312 @@
+"""The problem: which vertices and edges of a graph are solved for, and the edits that the next update integrates."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph import SE2, SE3, Graph
+from graph_slam_ros.graph.graph import whole_numbers
+from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.solver.clique_tree import incremental
+from graph_slam_ros.solver.clique_tree.numeric import accept_steps
+from graph_slam_ros.solver.clique_tree.storage import (
+    ACTIVE,
+    BLOCKS_TOP,
+    FREE,
+    KEY,
+    LINKS,
+    NOTHING,
+    SE2_KIND,
+    SE3_KIND,
+    TAIL_END,
+    TAIL_FIRST,
+    VECTOR,
+    empty_tree,
+    longer,
+    with_room,
+)
+from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole
+from graph_slam_ros.solver.linearization import rows_of
+from graph_slam_ros.solver.pending import NONE, PendingChanges
+from graph_slam_ros.typing import Array, Index
+
+_KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
+
+
+class Problem:
+    """Vertices and edges of a graph that are solved for, which of them are held, and the edits since the last update.
+
+    Edits are pending until an update integrates them; one that fails leaves them pending.
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self._tree = empty_tree()
+        self._vertices = 0  # of the graph, that have a record in the tree
+        self._inside = np.zeros(0, dtype=bool)  # vertices of the problem
+        self._held = np.zeros(0, dtype=bool)
+        self._edge_inside = np.zeros(0, dtype=bool)  # edges of the problem
+        self._pending = PendingChanges()
+        self._kept = np.zeros(0)  # the estimate that the last call left
+
+    def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
+        """Add vertices (at their initial values) and edges of the graph to the problem, by id, each once."""
+        self._grow()
+        new, new_edges = whole_numbers(vertices, "vertex").ravel(), whole_numbers(edges, "edge").ravel()
+        _refuse_unfit(new, self._inside, self._vertices, "vertex")
+        _refuse_unfit(new_edges, self._edge_inside, self.graph.edge_count, "edge")
+        rows = rows_of(self.graph, new_edges)
+        for table, chosen in rows.items():
+            missing = incremental.outside(chosen, table.vertices.values, table.weight.values, self._inside, new)
+            if missing != NOTHING:
+                raise GraphSlamError(f"an edge needs vertex {missing}, which was not added")
+        for table, chosen in rows.items():
+            self._record(table, chosen)
+        there = (self._tree.vertex[new, KEY] != NOTHING).any()  # removed before: they are in the order still
+        self._pending.broken |= bool(there)
+        self._pending.add(new, new_edges)
+        self._inside[new], self._edge_inside[new_edges] = True, True
+
+    def start_at(self, values: Array) -> None:
+        """Begin from other values than the graph's initial ones: the stored numbers of all vertices, end to end."""
+        self._grow()
+        size = len(self.graph.initial)
+        if values.shape != (size,) or not np.isfinite(values).all():
+            raise GraphSlamError(f"start: expected {size} finite numbers, got an array {values.shape}")
+        self._set_estimate(values)
+        self._pending.broken = True
+
+    def place(self, vertex: int, value: ArrayLike) -> None:
+        """Begin with another value than the graph's initial one for a vertex that is not in the problem yet."""
+        self._grow()
+        existing([vertex], self._vertices, "vertex")
+        if self._inside[vertex]:
+            raise GraphSlamError(f"vertex {vertex} is in the problem: it has an estimate")
+        numbers, at = np.asarray(value, dtype=float), int(self.graph.offset.values[vertex])
+        kind = self.graph.kind_of(vertex)
+        if numbers.shape != (kind.size,) or kind.fault(numbers[None]) is not None:
+            raise GraphSlamError(
+                f"vertex {vertex}: expected {kind.size} finite numbers of {kind.name}, got {numbers.tolist()}"
+            )
+        for array in (self._tree.value, self._tree.estimate, self._kept):
+            array[at : at + kind.size] = numbers
+
+    def set_weight(self, edge: int, weight: float) -> None:
+        """Multiply the information of an edge; 0 removes it from the structure, another value adds it again."""
+        if not (np.isfinite(weight) and weight >= 0.0):
+            raise GraphSlamError(f"edge {edge}: weight {weight} is not a finite number >= 0")
+        self._grow()
+        one = existing([edge], self.graph.edge_count, "edge")
+        table, row = self.graph.row(edge)
+        ends = table.vertices.values[row]
+        if weight and self._edge_inside[edge] and not self._inside[ends].all():
+            raise GraphSlamError(f"edge {edge} needs vertex {int(ends[~self._inside[ends]][0])}, which was removed")
+        table.weight.values[row] = weight
+        if not self._edge_inside[edge]:
+            return
+        if weight:
+            self._pending.again(one)
+        elif self._tree.edge[edge, ACTIVE]:
+            self._pending.touch(ends)
+            self._pending.may_float = True
+            incremental.deactivate(self._tree, one)
+
+    def hold(self, vertex: int) -> None:
+        """Keep a vertex at its present estimate."""
+        self._grow()
+        one = existing([vertex], self._vertices, "vertex")
+        self._held[vertex] = True
+        if self._tree.vertex[vertex, FREE]:
+            on_it = incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
+            on_it = on_it[self._tree.edge[on_it, ACTIVE] == 1]  # they are linearised where it is held
+            self._pending.again(on_it)
+            self._fix_at_estimate(one)
+
+    @property
+    def held(self) -> Index:
+        """Ids of the vertices that are kept where they are."""
+        return np.flatnonzero(self._held)
+
+    def is_held(self, vertex: int) -> bool:
+        """Return whether a vertex is kept where it is."""
+        return vertex < len(self._held) and bool(self._held[vertex])
+
+    def remove(self, vertex: int) -> None:
+        """Remove a vertex from the problem; all its edges must have weight 0 before."""
+        self._grow()
+        one = existing([vertex], self._vertices, "vertex")
+        if not self._inside[vertex]:
+            raise GraphSlamError(f"vertex {vertex} is not in the problem")
+        there = self._weighted(self.edges_on(vertex))
+        if len(there):
+            raise GraphSlamError(f"vertex {vertex} is needed by edge {int(there[0])}")
+        self._inside[vertex] = self._held[vertex] = False
+        self._pending.forget(vertex)
+        self._fix_at_estimate(one)
+
+    def edges_on(self, vertex: int) -> Index:
+        """Ids of the edges of the problem on one vertex, also those of weight 0."""
+        self._grow()
+        existing([vertex], self._vertices, "vertex")
+        return incremental.edges_of(self._tree.vertex, self._tree.link, vertex)
+
+    @property
+    def vertices(self) -> Index:
+        """Ids of the vertices of the problem."""
+        self._grow()
+        return np.flatnonzero(self._inside)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Numbers measured, without edges of weight 0, less numbers to be estimated."""
+        self._grow()
+        graph, tables = self.graph, self.graph.tables.values()
+        measured = sum(table.type.residual_size * int(np.count_nonzero(table.weight.values)) for table in tables)
+        sizes = np.array([kind.dof for kind in graph.kinds], dtype=np.int64)
+        return measured - int(sizes[graph.kind.values[self._unknowns()]].sum())
+
+    @property
+    def edges(self) -> Index:
+        """Ids of the edges of the problem that have a weight."""
+        self._grow()
+        return self._weighted(np.flatnonzero(self._edge_inside))
+
+    def is_fixed(self) -> bool:
+        """Return whether a held vertex, or the edges on one vertex alone, fix position and heading of the whole."""
+        self._grow()
+        if (self._inside & self._held).any():
+            return True
+        rows = rows_of(self.graph, self.edges)
+        return fix_the_whole(self.graph, self._tree.estimate, rows)
+
+    @property
+    def values(self) -> Array:
+        """The estimates of all vertices, as ``Graph.initial`` has them: what ``start_at`` takes."""
+        self._grow()
+        return self._tree.estimate[: len(self.graph.initial)].copy()
+
+    # -- for the solution --------------------------------------------------------------------------------------------
+
+    def _grow(self) -> None:
+        """Follow the graph's growth: new vertices start at their initial values."""
+        graph, known = self.graph, self._vertices
+        if graph.vertex_count > known:
+            count, size = graph.vertex_count, len(graph.initial)
+            self._tree = with_room(self._tree, vertex=count, region=2 * count, tail=2 * count)
+            self._tree = with_room(self._tree, diagonal=size, step=size, value=size, estimate=size)
+            self._inside, self._held = longer(self._inside, count), longer(self._held, count)
+            self._kept = longer(self._kept, len(self._tree.estimate))
+            first = int(graph.offset.values[known])
+            self._kept[first:size] = graph.initial.values[first:]
+            shapes = np.array([(k.dof, k.size, _KINDS.get(k, VECTOR)) for k in graph.kinds])
+            incremental.append_vertices(
+                self._tree, known, graph.offset.values[known:], graph.initial.values, shapes[graph.kind.values[known:]]
+            )
+            self._vertices = graph.vertex_count
+        if graph.edge_count > len(self._edge_inside):
+            self._tree = with_room(self._tree, edge=graph.edge_count)
+            self._edge_inside = longer(self._edge_inside, graph.edge_count)
+
+    def _record(self, table: EdgeTable, rows: Index) -> None:
+        """Link edges to their vertices; they are not in the structure yet."""
+        state, width = self._tree.state, sum(table.type.dofs)
+        links = int(state[LINKS]) + len(rows) * len(table.type.accepts)
+        blocks = int(state[BLOCKS_TOP]) + len(rows) * width * (width + 1)
+        self._tree = with_room(self._tree, link=links, blocks=blocks)
+        incremental.append_edges(self._tree, rows, table.id.values, table.vertices.values)
+
+    def _unknowns(self) -> Index:
+        return np.flatnonzero(self._tree.vertex[: self._vertices, FREE])
+
+    def _active(self) -> Index:
+        return np.flatnonzero(self._tree.edge[:, ACTIVE])
+
+    def _active_rows(self) -> dict[EdgeTable, Index]:
+        return rows_of(self.graph, self._active())
+
+    def _weighted(self, edges: Index) -> Index:
+        """The edges among these that have a weight."""
+        for table, rows in rows_of(self.graph, edges).items():
+            weight = table.weight.values[rows]
+            if not weight.all():
+                edges = np.setdiff1d(edges, table.id.values[rows[weight == 0.0]])
+        return edges
+
+    def _arriving(self, *, surely: bool = False) -> tuple[Index, Index]:
+        """The unknowns and edges that will be part of the problem; all is as it was.
+
+        Raises
+        ------
+        GaugeError
+            With them, nothing fixes a part of it; that is checked where it may be so, or ``surely``.
+        """
+        self._grow()
+        pending, tree = self._pending, self._tree
+        vertices, edges = pending.vertices, self._weighted(pending.edges())
+        wanted = self._inside[vertices] & ~self._held[vertices]
+        if not wanted.all():
+            vertices = vertices[wanted]
+        if (
+            surely
+            or pending.may_float
+            or pending.broken
+            or not incremental.anchored(tree.vertex, tree.edge, tree.link, vertices, edges)
+        ):
+            self._refuse_floating()
+        return vertices, edges
+
+    @contextmanager
+    def _entering(self, vertices: Index, edges: Index) -> Iterator[None]:
+        """Let vertices and edges enter; an error undoes it: they are pending again, and the estimate stays.
+
+        The tree is then made anew at the next update: its numbers are half old and half new.
+        """
+        pending, tree = self._pending, self._tree
+        try:
+            incremental.enter(tree, vertices, edges)
+            yield
+        except BaseException:
+            pending.broken = True
+            tree.state[TAIL_FIRST] = tree.state[TAIL_END] = 0  # it is filled anew with the tree
+            self._set_estimate(self._kept)
+            incremental.leave(self._tree, vertices, edges)  # the last: it needs memory
+            raise
+        self._pending = PendingChanges()
+
+    def _fix_at_estimate(self, one: Index) -> None:
+        """Make a vertex no unknown any more; it stays at its estimate."""
+        accept_steps(self._tree, one)
+        if self._tree.vertex[one[0], FREE]:
+            self._pending.touch(incremental.leave(self._tree, one, NONE))
+
+    def _set_estimate(self, values: Array) -> None:
+        for array in (self._tree.value, self._tree.estimate, self._kept):
+            array[: len(values)] = values
+        self._tree.step[:] = 0.0
+
+    def _refuse_floating(self) -> None:
+        """Raise GaugeError where nothing fixes a part of the problem, with all that is pending."""
+        rows = rows_of(self.graph, self.edges)
+        check_gauge(
+            self.graph, np.flatnonzero(self._inside & ~self._held), np.flatnonzero(self._inside & self._held), rows
+        )
+
+
+def existing(ids: ArrayLike, count: int, what: str) -> Index:
+    """Ids as an array; raises GraphSlamError for one that is not below ``count``."""
+    at = whole_numbers(ids, what).ravel()
+    strange = (at < 0) | (at >= count)
+    if strange.any():
+        raise GraphSlamError(f"{what} {int(at[strange][0])} does not exist")
+    return at
+
+
+def _refuse_unfit(ids: Index, inside: NDArray[np.bool_], count: int, what: str) -> None:
+    """Raise where an id does not exist, is inside or is given twice."""
+    unfit = incremental.unfit(ids, inside, count)
+    if unfit != NOTHING:
+        existing(ids[unfit], count, what)
+        raise GraphSlamError(f"{what} {int(ids[unfit])} was added before")
