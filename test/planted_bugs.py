@@ -166,7 +166,7 @@ BUGS = (
     Bug(  # below the node, where clock and stamps both tell of a jump
         "ignored_time_jump",
         "after time has jumped back all that comes is refused as late",
-        (Change("slam/graph_slam.py", "GraphSlam._forget_time", "pass"),),
+        (Change("slam/frontend/keyframe_frontend.py", "KeyframeFrontend.forget_time", "pass"),),
         ("test_timing_cases.py::test_B7_after_a_jump_of_time_what_is_older_than_the_map_is_used_and_begins_a_segment",),
     ),
     Bug(

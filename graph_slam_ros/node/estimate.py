@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.graph_slam import Correction
+from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.typing import Numbers
 
 

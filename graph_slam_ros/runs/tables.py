@@ -84,7 +84,8 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     """
     used_as = dict.fromkeys(slam.odometry_sources, "odometry") | uses(slam.config)  # a source need not be an input
     is_of_map = not slam.counters.used  # nothing was measured since: a run that is written from its map
-    accepted = _accepted_by_input(slam, 0 if is_of_map else slam.first_edge)
+    begins = 0 if is_of_map or not slam.drives else slam.keyframes[slam.drives[-1]].vertex
+    accepted = _accepted_by_input(slam, begins)
     inputs = {}
     for name in dict.fromkeys([*slam.config.inputs.names.split(), *counters.used, *accepted]):
         if name in counters.received or counters.used[name] or name in accepted:
@@ -125,15 +126,15 @@ def _times(value: Any) -> int:
     return value
 
 
-def _accepted_by_input(slam: GraphSlam, first_edge: int) -> dict[str, int]:
-    """Edges of landmarks, fixes and closures that pull, by input."""
+def _accepted_by_input(slam: GraphSlam, first: int) -> dict[str, int]:
+    """Edges of landmarks, fixes and closures that pull, from the keyframe of a vertex on, by input."""
     out = Counter[str]()
     inside = [Verdict.NOT_EVALUATED, *INSIDE]
     verdicts = slam.ledger.verdict.values
     for table in slam.graph.tables.values():
         labels = np.array([label in CANDIDATES for label in slam.graph.labels], dtype=bool)
         ids = table.id.values
-        chosen = labels[table.label.values] & (ids >= first_edge)
+        chosen = labels[table.label.values] & (table.vertices.values[:, 0] >= first)  # measured from there
         judged = chosen & (ids < len(verdicts))
         chosen[judged] = np.isin(verdicts[ids[judged]], inside)
         for code, count in zip(*np.unique(table.source.values[chosen], return_counts=True), strict=True):

@@ -1,6 +1,7 @@
 """Edits by hand: an edge, or a landmark with all of its edges, is taken out of the graph while the robot drives."""
 
 import re
+from collections.abc import Mapping
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
@@ -41,6 +42,21 @@ class Edits:
 
     def __init__(self, backend: Backend, landmarks: Landmarks, counters: Counters) -> None:
         self._backend, self._landmarks, self._counters = backend, landmarks, counters
+
+    def remove(self, what: Mapping[str, bool | int | float | str], keyframe: int) -> bool:
+        """Remove what a control event names, an edge or a landmark; returns whether it was there."""
+        is_removed = "edge" in what and self.remove_edge(int(what["edge"]), keyframe)
+        return ("landmark" in what and self.remove_landmark(str(what["landmark"]), keyframe)) or is_removed
+
+    def clear_closures(self, keyframe: int) -> bool:
+        """Remove all loop closures, but for those of a frozen map; returns whether there was any."""
+        ledger = self._backend.ledger
+        self._backend.hand_over()
+        closures = [edge for edge in self._backend.graph.edges_of("closures").tolist() if edge >= ledger.final]
+        self._backend.withdraw(closures, keyframe)
+        if closures:
+            self._counters.count("closures", "cleared", len(closures))
+        return bool(closures)
 
     def remove_edge(self, edge: int, keyframe: int) -> bool:
         """Remove a loop closure, a fix or an observation of a landmark, by its id; returns whether it was there.

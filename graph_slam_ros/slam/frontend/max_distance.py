@@ -8,7 +8,7 @@ import numpy as np
 
 from graph_slam_ros.config.inputs import InputConfig
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.measurements.types import Closure, Fix, Sighting, Sightings
+from graph_slam_ros.measurements.types import Closure, Observation, Sighting, Sightings
 from graph_slam_ros.slam.frontend import motion_compensation
 
 _LEARNED_AFTER = 30  # distances of an input
@@ -28,11 +28,13 @@ class _Shown:
 
 
 class MaxDistance:
-    """The farthest distance [m] that each input may measure: its ``max_distance_m``, or learned from its measurements.
+    """Gate for the distance [m] that each input may measure at most: its ``max_distance_m``, or learned from it.
 
     A limit is learned from the accepted measurements alone, in their order, so a replay refuses what the live run
     refused. A bearing has no distance; a fix has one from the map's origin, which may be anywhere.
     """
+
+    reason = "beyond_max_distance"
 
     def __init__(self, space: Geometry, inputs: Iterable[InputConfig]) -> None:
         self._space = space
@@ -48,18 +50,18 @@ class MaxDistance:
             return _MOST_M
         return min(_MOST_M, max(_ALWAYS_M, _TIMES_FARTHEST * shown.farthest[0]))
 
-    def split(self, m: Sightings | Fix | Closure) -> tuple[Sightings | Fix | Closure | None, int]:
-        """The part of a measurement within reach, or None, and how many sightings or closures are not."""
+    def admit(self, m: Observation) -> Observation | None:
+        """The part of an observation that is within reach; None where nothing of it is."""
         match m:
             case Sightings():
                 within = tuple(s for s in m.sightings if self._is_within(m.topic, self._distance(s)))
-                beyond = len(m.sightings) - len(within)
-                return (replace(m, sightings=within) if beyond else m) if within or not beyond else None, beyond
+                if len(within) == len(m.sightings):
+                    return m
+                return replace(m, sightings=within) if within else None
             case Closure():
-                is_within = self._is_within(m.topic, math.hypot(*m.T_from_base[: self._space.dimensions]))
-                return (m, 0) if is_within else (None, 1)
+                return m if self._is_within(m.topic, math.hypot(*m.T_from_base[: self._space.dimensions])) else None
             case _:
-                return m, 0
+                return m
 
     def _distance(self, s: Sighting) -> float | None:
         """The distance from the sensor or, of a position or pose, from the base."""

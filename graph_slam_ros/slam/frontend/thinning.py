@@ -3,20 +3,28 @@
 from dataclasses import replace
 
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.measurements.types import Fix, Sightings
+from graph_slam_ros.measurements.types import Fix, Observation, Sightings
+from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 
 
 class ObservationThinning:
-    """Chooses fixes, and what a robot sees while it rests, by their stamps, input by input.
+    """Gate that chooses fixes, and what a robot sees while it rests, by their stamps, input by input.
 
     An error that lasts tau (exponentially correlated) leaves of n fixes over a long time T the information of
     T / (2 tau) independent ones. One fix each 2 tau therefore says as much as all; fixes d < 2 tau apart say as much
     where each has 2 tau / d times the variance.
+
+    Parameters
+    ----------
+    path : tells whether the robot rests
     """
 
-    def __init__(self, config: Config) -> None:
+    reason = "thinned"
+
+    def __init__(self, config: Config, path: KeyframeList) -> None:
         self._lasting_ns = {one.name: round(2e9 * one.correlation_s) for one in config.sources}
         self._most_ns = round(1e9 * config.keyframes.max_interval_s)
+        self._path = path
         self._used_ns: dict[str, int] = {}
         self._observed_ns: dict[str, int] = {}
 
@@ -25,16 +33,25 @@ class ObservationThinning:
         self._used_ns.clear()
         self._observed_ns.clear()
 
-    def is_repeated(self, m: Sightings, rests: bool) -> bool:
+    def admit(self, m: Observation) -> Observation | None:
+        """The observation as it is to be used; None where one before says all that it does."""
+        match m:
+            case Sightings():
+                return None if self._is_repeated(m) else m
+            case Fix():
+                return self._thinned(m)
+            case _:
+                return m
+
+    def _is_repeated(self, m: Sightings) -> bool:
         """Return whether the robot rests and has just observed: it would see the same with the same errors."""
         before_ns = self._observed_ns.get(m.topic)
-        if rests and before_ns is not None and 0 <= m.stamp_ns - before_ns < self._most_ns:
+        if self._path.rests and before_ns is not None and 0 <= m.stamp_ns - before_ns < self._most_ns:
             return True
         self._observed_ns[m.topic] = m.stamp_ns
         return False
 
-    def thinned(self, m: Fix) -> Fix | None:
-        """The fix as it is to be used; None where the one before says all that it does."""
+    def _thinned(self, m: Fix) -> Fix | None:
         lasting_ns, before_ns = self._lasting_ns.get(m.topic, 0), self._used_ns.get(m.topic)
         interval_ns = lasting_ns if before_ns is None else abs(m.stamp_ns - before_ns)
         if interval_ns < min(lasting_ns, self._most_ns):

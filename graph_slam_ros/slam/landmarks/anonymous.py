@@ -93,7 +93,7 @@ class AnonymousLandmarks:
         self._begun = last_number(name for name, mark in self._landmarks.known.items() if mark.is_unnamed)
 
     def identified(self, m: Sightings, where: PoseAtStamp) -> list[tuple[str, Sighting]]:
-        """The sightings of a message that can be used, each with an identity; the others are counted."""
+        """The sightings of a message that can be used, each with an identity, or ``NOT_IN_MAP``; others are counted."""
         known = self._landmarks.known
         named = [(s.id, s) for s in m.sightings if s.id]
         out = [(name, s) for name, s in named if name not in known or not known[name].is_unnamed]
@@ -105,10 +105,7 @@ class AnonymousLandmarks:
         found = self._associate(unnamed, where) if unnamed else []
         if len(found) < len(unnamed):
             self._counters.count(m.topic, "unclear_which", len(unnamed) - len(found))
-        in_map = [one for one in found if one[0] != NOT_IN_MAP]
-        if len(in_map) < len(found):
-            self._counters.count(m.topic, "not_in_map", len(found) - len(in_map))
-        return out + in_map
+        return out + found
 
     def _associate(self, sightings: list[Sighting], where: PoseAtStamp) -> list[tuple[str, Sighting]]:
         seen = [self._position(s, where) for s in sightings]

@@ -103,8 +103,6 @@ class Landmarks:
         landmark = self.known.get(name)
         if landmark is not None:
             self._add_edge(topic, landmark, s, where)
-        elif not self.begins_new:
-            self._counters.count(topic, "not_in_map")
         elif s.kind == "pose":
             self._begin(topic, name, s, where, motion_compensation.pose(self._space, s, where).measured)
         elif s.kind == "position":

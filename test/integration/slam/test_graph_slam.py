@@ -565,9 +565,23 @@ def test_a_kind_that_is_none_is_refused_where_it_is_written(make):
 
 
 def test_of_several_faults_at_once_the_first_is_raised_and_all_count(monkeypatch):
-    slam = GraphSlam(Config())
-    monkeypatch.setattr(slam, "_on_step", lambda step: 1 / 0)
-    monkeypatch.setattr(slam, "_on_observation", lambda m: {}["gone"])
+    p = slam(ordering={"window_s": 5.0})
+    add, faults = p._landmarks.map.add, {"a": ZeroDivisionError, "c": KeyError, "d": KeyError}
+    for k in range(3):
+        p.process(odometry(k, (k, 0, 0)))
+    p.process(seen(1.5, point("a"), point("b"), point("c")))
+    p.process(seen(1.75, point("d"), point("e")))
+    p.process(seen(3, point("f")))
+
+    def faulty(topic, name, *others):
+        if name in faults:
+            raise faults[name]
+        add(topic, name, *others)
+
+    monkeypatch.setattr(p._landmarks.map, "add", faulty)
     with pytest.raises(ZeroDivisionError):
-        slam._use([Odometry(1, (0.0, 0.0, 0.0)), Sightings(1, "tags", ()), Sightings(2, "tags", ())])
-    assert slam.counters["node", "KeyError"] == 2
+        p.process(Control("end"))
+    assert p.counters["node", "KeyError"] == 2
+    assert set(p.landmarks) == {"b", "e"}  # of the same messages
+    assert p.counters["/landmarks", "after_odometry"] == 1
+    assert not p.process(Control("end"))  # a fault is raised once

@@ -6,7 +6,7 @@ from driven import without_names
 
 from graph_slam_ros.runs.map_journal import state_of
 from graph_slam_ros.simulation import measurements, simulate
-from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.robust.ledger import Verdict
 
 
@@ -55,6 +55,22 @@ def test_while_the_map_is_held_it_stays_to_the_bit_and_the_robot_is_located_in_i
     assert held.landmark_covariances()[0].max() == 0.0
 
 
+def test_a_surveyed_landmark_that_the_held_map_does_not_have_does_not_move_the_map():
+    def observed(k, *names):
+        measured = [Sighting(name, "position", (1.0, 1.0), (0.01, 0.0, 0.0, 0.01)) for name in names]
+        return [Odometry(k * 10**9, (0.5 * k, 0.0, 0.0)), Sightings(k * 10**9, "tags", tuple(measured))]
+
+    held = GraphSlam(
+        Config.from_mapping({"landmarks.surveyed": "id,x,y,sigma\ndock,9,9,0.1", "ordering.window_s": 0.0})
+    )
+    driven(held, [*observed(0, "a"), *observed(1, "a"), HOLD])
+    there, path = places(held), held.trajectory()
+    driven(held, [*observed(2, "a"), *observed(3, "a", "dock")])
+    assert places(held) == there
+    assert held.trajectory()[:2].tobytes() == path.tobytes()
+    assert held.counters.as_dict() == {"tags": {"not_in_map": 1}}
+
+
 def test_what_the_held_map_does_not_have_is_counted_and_begins_no_landmark(world):
     before, after = split(world, 0.2)
     held = driven(GraphSlam(), [*before, HOLD])
@@ -83,7 +99,7 @@ def test_unnamed_sightings_are_matched_to_the_held_map_and_begin_nothing(world):
     before, after = split(list(without_names(world)), 0.2)
     config = Config.from_mapping({"landmarks.association": "nearest"})
     held = driven(GraphSlam(config), [*before, HOLD])
-    there, known = places(held), held._landmarks.known
+    there, known = places(held), held._landmarks.map.known
     names, sightings = set(known), sum(mark.sightings for mark in known.values())
     driven(held, after)
     assert (places(held), set(known)) == (there, names)

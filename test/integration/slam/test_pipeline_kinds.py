@@ -158,7 +158,7 @@ def test_G5_both_mirror_places_of_a_landmark_are_kept_until_the_robot_turns():
     for k in range(160):
         pipeline.process(Odometry(stamp(k), at))
         if k == 60:  # straight ahead all the way: the beacon is on the left or on the right
-            waiting = pipeline._landmarks.undetermined["a"]
+            waiting = pipeline._landmarks.map.undetermined["a"]
             assert "2 places fit" in pipeline.waiting["a"]
             found = sorted((place.position.tolist() for place in waiting.places), key=lambda at: at[1])
             assert np.array(found) == pytest.approx(np.array([[2.0, -3.0], [2.0, 3.0]]), abs=0.01)

@@ -144,7 +144,7 @@ def test_a_merger_whose_sightings_do_not_fit_is_parted_again():
     slam = pipeline("joint")
     standing(slam, lambda t_s: [(8.0, 2.0), (9.0, -3.0)], 10.0)
     first, second = slam.landmarks
-    slam._anonymous._merge_into(first, second)
+    slam._landmarks.anonymous._merge_into(first, second)
     slam.process(Control("optimize"))
     assert list(slam.landmarks) == [first]
     standing(slam, lambda t_s: [], 10.0, begin_s=10.0)

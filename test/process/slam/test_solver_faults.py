@@ -233,14 +233,14 @@ def test_P21_a_fault_of_one_measurement_costs_none_of_those_that_are_released_wi
         p.process(Odometry(stamp(0) + k * S // 2, (0.5 * k, 0.0, 0.0)))
         seen = [Sighting(name, "position", (1.0, 1.0), (0.01, 0.0, 0.0, 0.01)) for name in (f"{k}",)]
         p.process(Sightings(stamp(0) + k * S // 2, "/landmarks", tuple(seen)))
-    add = p._landmarks.add
+    add = p._landmarks.map.add
 
     def faulty(topic, name, *others):
         if name == "1":
             raise RuntimeError("injected")
         add(topic, name, *others)
 
-    p._landmarks.add = faulty
+    p._landmarks.map.add = faulty
     with pytest.raises(RuntimeError, match="injected"):
         p.process(Control("flush"))
     run(p, END)

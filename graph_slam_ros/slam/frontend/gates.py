@@ -1,0 +1,76 @@
+"""Gates: each refuses a part of what arrives, counted under its reason, and passes the rest on to the next."""
+
+from collections.abc import Callable, Sequence
+from typing import Generic, Protocol, TypeVar
+
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import Fix, Observation
+
+
+class Arrival(Protocol):
+    """Anything that arrives on a topic."""
+
+    @property
+    def topic(self) -> str:
+        """The input that it is counted under."""
+
+
+Item = TypeVar("Item", bound=Arrival)
+
+
+class Gate(Protocol[Item]):
+    """One check of what arrives."""
+
+    @property
+    def reason(self) -> str:
+        """The reason under which the refused is counted."""
+
+    def admit(self, m: Item) -> Item | None:
+        """The part that passes; None where nothing of it does."""
+
+
+class GateChain(Generic[Item]):
+    """Gates one after the other.
+
+    Parameters
+    ----------
+    size : the number of things in an item; each that is refused counts
+    """
+
+    def __init__(self, gates: Sequence[Gate[Item]], size: Callable[[Item], int], counters: Counters) -> None:
+        self._gates, self._size, self._counters = gates, size, counters
+
+    def admit(self, m: Item) -> Item | None:
+        """The part that passes all gates; None where nothing of it does."""
+        for gate in self._gates:
+            passed = gate.admit(m)
+            refused = self._size(m) - (self._size(passed) if passed is not None else 0)
+            if refused or passed is None:
+                reason = gate.reason
+                self._counters.count(m.topic, reason, refused)
+            if passed is None:
+                return None
+            m = passed
+        return m
+
+
+class DatumGate:
+    """Refuses fixes whose numbers are from elsewhere on earth than all others of the map.
+
+    Parameters
+    ----------
+    datum : latitude, longitude and height that the fixes of the map are from; empty: the first fix tells
+    """
+
+    reason = "other_datum"
+
+    def __init__(self, datum: tuple[float, ...] = ()) -> None:
+        self.datum = datum
+
+    def admit(self, m: Observation) -> Observation | None:
+        """The observation, unless it is such a fix."""
+        if isinstance(m, Fix):
+            self.datum = self.datum or m.datum
+            if m.datum and m.datum != self.datum:
+                return None
+        return m

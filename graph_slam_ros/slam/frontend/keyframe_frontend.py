@@ -1,0 +1,249 @@
+"""The front end: odometry becomes keyframes, each a vertex that odometry joins to the one before."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import Closure, InitialPose, Observation, Odometry
+from graph_slam_ros.slam.frontend import motion_compensation
+from graph_slam_ros.slam.frontend.gates import DatumGate, GateChain
+from graph_slam_ros.slam.frontend.ingest_gate import size_of
+from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList, SightingPose
+from graph_slam_ros.slam.frontend.max_distance import MaxDistance
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise
+from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector, Step
+from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.frontend.thinning import ObservationThinning
+from graph_slam_ros.slam.frontend.time_alignment import ClosureStart, TimeAlignment
+from graph_slam_ros.typing import Array, Numbers
+
+_UNCERTAIN, _MAX_UNCERTAIN_M = 10.0, 1e5  # times as far as a given pose is away: so little odometry is trusted there
+_SHARED_WHEN_SOON = 1.0  # of a variance: with more, what comes fast would seem better than it is
+
+
+class KeyframeFrontend:
+    """Integrates odometry, chooses keyframes, and adds them and the motion between them to the graph.
+
+    Parameters
+    ----------
+    graph : gets the vertices and edges
+    pose_of : the present estimate of a vertex
+    datum : of a map that is loaded
+
+    Attributes
+    ----------
+    config : the present parameters
+    path : the keyframes
+    sighting_poses : where the robot observed landmarks
+    datum : where on earth the map begins
+    alignment : brings measurements into the order of their stamps
+    gates : what an observation passes before it is used
+    edges : adds edges between poses
+    covariance : (dof, dof) of the newest keyframe's pose, by the last solve and the odometry since
+    initial_pose : the pose that is given for the next odometry
+    held_covariance : (dof, dof) of the newest pose when the map was held, for the next odometry
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        graph: Graph,
+        counters: Counters,
+        pose_of: Callable[[int], Numbers],
+        datum: tuple[float, ...] = (),
+    ) -> None:
+        self.config, self._space, self._graph, self._pose_of = config, config.space, graph, pose_of
+        self._noise = OdometryNoise(config.odometry, self._space)
+        self.odometry = OdometrySelector(config.odometry, config.inputs.names.split(), self._space, counters)
+        self.path = KeyframeList(self._noise, self._space)
+        self.sighting_poses = StampedPoses(SightingPose, self._space.pose.size)
+        self.alignment = TimeAlignment(config.ordering, self.path, self.odometry, counters)
+        self.datum = DatumGate(datum)
+        self._arrivals = GateChain[Observation]((self.datum,), size_of, counters)
+        self._thinning = ObservationThinning(config, self.path)
+        self.gates = GateChain[Observation](
+            (ClosureStart(self.path, self.odometry), MaxDistance(self._space, config.sources), self._thinning),
+            size_of,
+            counters,
+        )
+        self.edges = PoseEdges(self._space, graph, counters)
+        self.covariance = np.zeros((self._space.dof, self._space.dof))
+        self.initial_pose: InitialPose | None = None
+        self.held_covariance: Array | None = None
+
+    @property
+    def source(self) -> str:
+        """The odometry in use, by the name of its input; empty before the first."""
+        return self.odometry.used.source if self.odometry.used else ""
+
+    @property
+    def now_ns(self) -> int:
+        """Stamp of the newest odometry, or keyframe."""
+        return max(self.odometry.newest_ns or 0, self.path.keyframes[-1].stamp_ns)
+
+    def restore(
+        self,
+        keyframes: Sequence[Keyframe],
+        segments: Sequence[int],
+        drives: Sequence[int],
+        sighting_poses: Sequence[SightingPose],
+        continues_with: str,
+    ) -> None:
+        """Go on after the keyframes of a map; in their drive, where its odometry goes on with an input."""
+        self.path.restore(keyframes, segments, drives)
+        if continues_with:
+            newest = keyframes[-1]
+            self.path.continue_drive()
+            self.odometry.continue_drive(newest.stamp_ns, newest.T_odom_base, continues_with)
+        for pose in sighting_poses:
+            self.sighting_poses.append(pose.keyframe, pose.stamp_ns, pose.T_keyframe_base)
+
+    def forget_time(self) -> None:
+        """Stamps begin anew, the map stays: the next odometry begins a segment."""
+        self.alignment.forget()
+        self.odometry.forget()
+        self.path.forget_time()
+        self._thinning.forget_time()
+
+    def accepts(self, m: Odometry | Observation) -> bool:
+        """Return whether a measurement may be used when its turn comes; else it is counted."""
+        return self.alignment.accepts(m) and (isinstance(m, Odometry) or self._arrivals.admit(m) is not None)
+
+    # -- the motion since the last keyframe ------------------------------------------------------------------------
+
+    def begins_segment(self, step: Step) -> bool:
+        """Return whether little is known of the motion up to a step: odometry or time jumped, or a pose is given."""
+        return self.path.motion is None or step.broken or self.initial_pose is not None
+
+    def integrate(self, step: Step) -> int:
+        """Add a step to the motion since the last keyframe, unless it is no motion; returns how far that reaches."""
+        motion = self.path.motion
+        if motion is None:
+            return step.stamp_ns
+        if not step.broken:
+            motion.step(step)
+        return motion.now.stamp_ns
+
+    def is_due(self) -> bool:
+        """Return whether the motion since the last keyframe deserves another."""
+        motion, due, n = self.path.motion, self.config.keyframes, self._space.dimensions
+        if motion is None or self.held_covariance is not None:
+            return motion is not None
+        at = motion.now.T_keyframe_base
+        far = sum(x * x for x in at[:n]) >= due.min_distance_m**2 or self._space.angle(at) >= due.min_angle_rad
+        return far or motion.is_long or (motion.moving_ns >= due.max_interval_s * 1e9 and not self._noise.is_jitter(at))
+
+    # -- keyframes -------------------------------------------------------------------------------------------------
+
+    def begin(self, step: Step, anchor: Callable[[int, Numbers], Array]) -> None:
+        """Add the first keyframe: the map begins where odometry begins, or the robot where it is said to.
+
+        Parameters
+        ----------
+        anchor : holds a vertex at a pose, and returns its covariance
+        """
+        T_map_base = self.config.start_pose or step.T_odom_base
+        vertex = self._graph.add_vertex(self._space.pose, T_map_base)
+        self.covariance = anchor(vertex, T_map_base)
+        self.path.segments.append(0)
+        self.path.append(vertex, step, self.config.ordering.late_s)
+
+    def add(self, step: Step) -> None:
+        """Add a keyframe at a step that was integrated."""
+        now = self._motion.now
+        covariance, held = now.covariance, self.held_covariance
+        if held is not None:  # the first that is free in a held map is as uncertain as the pose was then
+            covariance, self.held_covariance = self._space.group.propagate(held, now.T_keyframe_base, covariance), None
+        self._append(step, now.T_keyframe_base, covariance)
+
+    def begin_segment(self, step: Step) -> bool:
+        """Add a keyframe across a jump of odometry or time, or at a pose that is given; returns whether one is."""
+        given, self.initial_pose, self.held_covariance = self.initial_pose, None, None
+        motion, keyframes = self.path.motion, self.path.keyframes
+        is_prior = given is not None and motion is not None and self.config.initialpose.use == "prior"
+        if motion is not None:
+            T_last_now, covariance = motion.now.T_keyframe_base, motion.now.covariance
+        else:  # of a loaded map, too: its odometry was that of another drive
+            T_last_now = self._space.group.between(keyframes[-1].T_odom_base, step.T_odom_base)
+            covariance = np.zeros_like(self.covariance)
+        if not is_prior:
+            self.path.segments.append(len(keyframes))
+        added_sigmas = self._added_sigmas(given, T_last_now, is_prior=is_prior)
+        covariance = covariance + np.diag(np.square(self._space.sigmas(*added_sigmas)))
+        self._append(step, T_last_now, covariance, given.T_map_base if given else None)
+        if given:
+            self.edges.initial_pose(keyframes[-1].vertex, given)
+        return given is not None
+
+    def add_closure(self, m: Closure, where: PoseAtStamp) -> None:
+        """Add a loop closure from an earlier pose to that of its stamp."""
+        self.edges.closure(m, self.path.where(m.from_stamp_ns), where)
+
+    def where(self, m: Observation) -> PoseAtStamp:
+        """The pose at an observation, from a keyframe there if odometry's noise since the last one would matter."""
+        where, motion = self.path.where(m.stamp_ns), self.path.motion
+        if motion is None or not self._deserves_keyframe(m, where, motion):
+            return where
+        return self._keyframe_at(where, motion)
+
+    @property
+    def _motion(self) -> IntegratedOdometry:
+        motion = self.path.motion
+        assert motion is not None
+        return motion
+
+    def _append(self, step: Step, T_last_now: Numbers, covariance: Array, at: Numbers | None = None) -> None:
+        """A vertex where odometry is now, or where it is said to be, and the motion to it from the last as an edge."""
+        group, last = self._space.group, self.path.keyframes[-1].vertex
+        vertex = self._graph.add_vertex(self._space.pose, at or group.compose(self._pose_of(last), T_last_now))
+        self.edges.odometry([last, vertex], T_last_now, covariance, self.source)
+        self.covariance = group.propagate(self.covariance, T_last_now, covariance)
+        self.path.append(vertex, step, self.config.ordering.late_s)
+
+    def _added_sigmas(self, given: InitialPose | None, T_last_now: Numbers, *, is_prior: bool) -> tuple[float, float]:
+        """The noise added to the motion into a new segment: sigmas in metres and in radians.
+
+        A pose that is given far away must not pull on the path before: it may be wrong.
+        """
+        jump_m, jump_rad = self.config.odometry.jump_sigma_m, self.config.odometry.jump_sigma_rad
+        if given is None:
+            return jump_m, jump_rad
+        if is_prior:
+            return self.config.initialpose.loosen_m, self.config.initialpose.loosen_rad
+        group, last = self._space.group, self._pose_of(self.path.keyframes[-1].vertex)
+        away = group.between(group.compose(last, T_last_now), given.T_map_base)
+        far_m = math.hypot(*away[: self._space.dimensions])
+        return max(jump_m, min(_UNCERTAIN * far_m, _MAX_UNCERTAIN_M)), max(jump_rad, _UNCERTAIN * math.pi)
+
+    def _deserves_keyframe(self, m: Observation, where: PoseAtStamp, newest: IntegratedOdometry) -> bool:
+        """Return whether the motion since the keyframe would be too much of the noise of what was measured."""
+        if where.keyframe != newest.keyframe or not newest.before_last_ns < where.stamp_ns:
+            return False
+        is_soon = where.stamp_ns - newest.start_ns < self.config.keyframes.min_interval_s * 1e9
+        if self._noise.is_jitter(where.T_keyframe_base):
+            return False
+        most, added_sigma_m = self.config.keyframes.shared_noise, self.config.landmarks.added_sigma_m
+        if is_soon:
+            most = max(most, _SHARED_WHEN_SOON)
+        return motion_compensation.motion_noise_dominates(self._space, m, where, most, added_sigma_m)
+
+    def _keyframe_at(self, where: PoseAtStamp, motion: IntegratedOdometry) -> PoseAtStamp:
+        """A keyframe at a stamp within the last step of odometry, which is cut in two."""
+        group, size, keyframes = self._space.group, self._space.dof, self.path.keyframes
+        T_odom_base = group.compose(keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
+        stood = motion.now.stands
+        rest = motion.cut(where.stamp_ns)
+        self._append(
+            Step(where.stamp_ns, self._space.identity, T_odom_base), motion.now.T_keyframe_base, where.covariance
+        )
+        if rest is not None:
+            self._motion.resume_after_cut(rest, stood)
+        keyframe = len(keyframes) - 1
+        at_keyframe = self._space.identity, np.zeros((size, size))
+        return PoseAtStamp(keyframe, keyframes[keyframe].vertex, where.stamp_ns, *at_keyframe)

@@ -1,0 +1,125 @@
+"""Landmarks from sightings: which landmark each is of, what passes, and the review of those without identity."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import Sighting, Sightings
+from graph_slam_ros.slam.frontend.gates import GateChain
+from graph_slam_ros.slam.frontend.max_distance import off_the_pole
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
+from graph_slam_ros.slam.landmarks.landmark_map import Landmark, Landmarks
+from graph_slam_ros.solver import Solver
+
+Named = tuple[str, Sighting]
+
+
+@dataclass(frozen=True, slots=True)
+class NamedSightings:
+    """Sightings of one message, each with the name of its landmark."""
+
+    topic: str
+    named: tuple[Named, ...]
+
+    def only(self, known: Mapping[str, Landmark]) -> "NamedSightings | None":
+        """The sightings of known landmarks; None where there is none."""
+        named = tuple(one for one in self.named if one[0] in known)
+        return replace(self, named=named) if named else None
+
+
+class HeldMapGate:
+    """Refuses new landmarks while the map is held."""
+
+    reason = "not_in_map"
+
+    def __init__(self, landmarks: Landmarks) -> None:
+        self._landmarks = landmarks
+
+    def admit(self, m: NamedSightings) -> NamedSightings | None:
+        """The sightings of landmarks of the map."""
+        return m if self._landmarks.begins_new else m.only(self._landmarks.known)
+
+
+class AlarmGate:
+    """Refuses new landmarks while an alarm cannot be decided: nobody knows where the robot is.
+
+    Parameters
+    ----------
+    trusts_sightings : whether it can be decided, or there is none
+    """
+
+    reason = "new_while_elsewhere"
+
+    def __init__(self, landmarks: Landmarks, trusts_sightings: Callable[[], bool]) -> None:
+        self._landmarks, self._trusts_sightings = landmarks, trusts_sightings
+
+    def admit(self, m: NamedSightings) -> NamedSightings | None:
+        """The sightings of landmarks that are in the map."""
+        return m if self._trusts_sightings() else m.only(self._landmarks.known)
+
+
+class LandmarkFrontend:
+    """Associates sightings with landmarks.
+
+    Parameters
+    ----------
+    withdraw : takes edges out for good
+    hand_over : gives the solver what is new in the graph
+    trusts_sightings : whether new landmarks may begin: not so while an alarm cannot be decided
+
+    Attributes
+    ----------
+    map : the landmarks
+    anonymous : the association of those without identity
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        graph: Graph,
+        solver: Solver,
+        counters: Counters,
+        *,
+        withdraw: Callable[[Sequence[int]], None],
+        hand_over: Callable[[], None],
+        trusts_sightings: Callable[[], bool],
+    ) -> None:
+        self._config, self._space, self._counters = config.landmarks, config.space, counters
+        self.map = Landmarks(config, graph, solver, counters, withdraw)
+        self.anonymous = AnonymousLandmarks(config, self.map, solver, counters, hand_over)
+        self._gates = GateChain[NamedSightings](
+            (HeldMapGate(self.map), AlarmGate(self.map, trusts_sightings)), lambda m: len(m.named), counters
+        )
+
+    def restore(self, landmarks: dict[str, Landmark], range_offsets: dict[str, int]) -> None:
+        """Go on with the landmarks of a map."""
+        self.map.restore(landmarks, range_offsets)
+        self.anonymous.restore()
+
+    def identified(self, m: Sightings, where: PoseAtStamp) -> Sequence[Named]:
+        """The sightings to be used, each with the landmark it is of; the others are counted."""
+        m = replace(m, sightings=tuple(off_the_pole(self._space, s) for s in m.sightings))
+        named = self._named(m, where)
+        passed = self._gates.admit(NamedSightings(m.topic, tuple(named))) if named else None
+        return passed.named if passed else ()
+
+    def _named(self, m: Sightings, where: PoseAtStamp) -> list[Named]:
+        how = self._config.association
+        if how == "none":
+            self._counters.count(m.topic, "not_used", len(m.sightings))
+            return []
+        if how == "id":
+            named = [(s.id, s) for s in m.sightings if s.id]
+            if len(named) < len(m.sightings):
+                self._counters.count(m.topic, "no_id", len(m.sightings) - len(named))
+            return named
+        return self.anonymous.identified(m, where)
+
+    def review_if_due(self, keyframes: int, stamp_ns: int) -> None:
+        """Review the landmarks without identity now and then; what that changes is part of the next solve."""
+        is_due = keyframes % self._config.review_every_keyframes == 0
+        if self.map.begins_new and self._config.association in ("nearest", "joint") and is_due:
+            self.anonymous.review(stamp_ns)

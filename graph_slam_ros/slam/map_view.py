@@ -1,0 +1,243 @@
+"""The reading side of the pipeline: path, landmarks, covariances, statistics and health. Reading changes nothing."""
+
+from collections.abc import Set
+
+import numpy as np
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
+from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.kidnap_detector import Alarm, KidnapDetector
+from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
+from graph_slam_ros.slam.landmarks.landmark_map import Landmark
+from graph_slam_ros.slam.robust.ledger import Ledger
+from graph_slam_ros.slam.solution import Correction, Solution
+from graph_slam_ros.solver import Report, Solver
+from graph_slam_ros.typing import Array, Numbers
+
+
+class MapView:
+    """The map, the path and the health of a pipeline, read from its parts.
+
+    Attributes
+    ----------
+    config : the present parameters
+    backend : the graph, its solver and the verdicts on its edges
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        backend: Backend,
+        frontend: KeyframeFrontend,
+        landmarks: LandmarkFrontend,
+        kidnaps: KidnapDetector,
+        solution: Solution,
+    ) -> None:
+        self.config, self.backend = config, backend
+        self._frontend, self._landmarks = frontend, landmarks
+        self._kidnaps, self._solution = kidnaps, solution
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.keyframes)} keyframes, {len(self.landmarks)} landmarks, {self.graph.edge_count} edges"
+        return f"{type(self).__name__}({counts}, {self.solves} solves)"
+
+    @property
+    def space(self) -> Geometry:
+        """The plane or space."""
+        return self.config.space
+
+    # -- the path ------------------------------------------------------------------------------------------------
+
+    @property
+    def keyframes(self) -> StampedPoses[Keyframe]:
+        """The keyframes, in order of time."""
+        return self._frontend.path.keyframes
+
+    @property
+    def segments(self) -> list[int]:
+        """Indices of the keyframes at which odometry began, or began anew."""
+        return self._frontend.path.segments
+
+    @property
+    def drives(self) -> list[int]:
+        """The first keyframe of each drive, by its index; the last drive is the present one."""
+        return self._frontend.path.drives
+
+    @property
+    def sighting_poses(self) -> StampedPoses[SightingPose]:
+        """The poses at the stamps of the sightings, each by a keyframe."""
+        return self._frontend.sighting_poses
+
+    def trajectory(self) -> Array:
+        """Estimated poses ``T_map_base`` of all keyframes, (n, 3) or (n, 7)."""
+        return self.solver.estimate(self.keyframes.ids).reshape(-1, self.space.pose.size)
+
+    def sighting_trajectory(self) -> Array:
+        """Estimated poses ``T_map_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""
+        return self._at_sightings(self.trajectory())
+
+    def sighting_odometry(self) -> Array:
+        """Return what odometry alone says, ``T_odom_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""
+        return self._at_sightings(self.keyframes.poses)
+
+    def _at_sightings(self, keyframe_poses: Array) -> Array:
+        keyframes = keyframe_poses[self.sighting_poses.ids]
+        return np.stack(self.space.group.compose(tuple(keyframes.T), tuple(self.sighting_poses.poses.T)), axis=-1)
+
+    @property
+    def T_map_odom(self) -> Numbers:
+        """The correction: odometry's drift at the newest keyframe."""
+        return self._solution.T_map_odom(self.keyframes[-1]) if self.keyframes else self.space.identity
+
+    @property
+    def newest_odometry_ns(self) -> int | None:
+        """Stamp of the last odometry that was used."""
+        return self._frontend.odometry.newest_ns
+
+    @property
+    def odometry_source(self) -> str:
+        """The odometry in use, by the name of its input; empty before the first."""
+        return self._frontend.source
+
+    @property
+    def odometry_sources(self) -> Set[str]:
+        """Sources of odometry that have been used."""
+        return self._frontend.odometry.sources
+
+    # -- landmarks -------------------------------------------------------------------------------------------------
+
+    @property
+    def landmarks(self) -> dict[str, Landmark]:
+        """Landmarks of the graph, by identity; but for tentative ones."""
+        return {name: mark for name, mark in self._landmarks.map.known.items() if not mark.is_tentative}
+
+    @property
+    def waiting(self) -> dict[str, str]:
+        """Return why each landmark waits that was seen but is not among ``landmarks`` yet, by identity."""
+        tentative = {
+            name: f"seen {mark.sightings} times, without an identity: not believed yet"
+            for name, mark in self._landmarks.map.known.items()
+            if mark.is_tentative
+        }
+        return {name: mark.reason for name, mark in self._landmarks.map.undetermined.items()} | tentative
+
+    @property
+    def range_offsets(self) -> dict[str, int]:
+        """The vertex of the offset of all ranges of an input, by input."""
+        return self._landmarks.map.offsets
+
+    def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
+        """The landmarks that changed after the first so many changes, tentative ones included; None: removed."""
+        return {name: self._landmarks.map.known.get(name) for name in self._landmarks.map.touched[first:]}
+
+    @property
+    def landmark_changes(self) -> int:
+        """The number of changes of landmarks."""
+        return len(self._landmarks.map.touched)
+
+    # -- covariances -----------------------------------------------------------------------------------------------
+
+    @property
+    def pose_covariance(self) -> Array:
+        """Covariance (3, 3) or (6, 6) of the newest keyframe's pose in its tangent space.
+
+        The marginal of the last solve, lengthened by the odometry since.
+        """
+        return self._frontend.covariance.copy()
+
+    def landmark_covariances(self) -> list[Array]:
+        """Marginal of each landmark, in the map's axes, or of a pose in its tangent space; NaN where unknown."""
+        return self._marginals([landmark.vertex for landmark in self.landmarks.values()])
+
+    def keyframe_covariances(self) -> Array:
+        """Marginal of every keyframe in its tangent space, (n, 3, 3) or (n, 6, 6); NaN where unknown."""
+        dof = self.space.dof
+        return np.array(self._marginals(self.keyframes.ids.tolist())).reshape(-1, dof, dof)
+
+    def _marginals(self, vertices: list[int]) -> list[Array]:
+        """All since the last solve are unknown until the next, and all are where that failed."""
+        out = [np.full((dof, dof), np.nan) for dof in (self.graph.kind_of(vertex).dof for vertex in vertices)]
+        solved = self._solution.vertices if self.is_solved else 0
+        known = [k for k, vertex in enumerate(vertices) if vertex < solved]
+        for k, marginal in zip(known, self.solver.marginal([vertices[k] for k in known]), strict=True):
+            out[k] = marginal
+        return out
+
+    # -- the graph and its solution --------------------------------------------------------------------------------
+
+    @property
+    def graph(self) -> Graph:
+        """The graph of vertices and edges."""
+        return self.backend.graph
+
+    @property
+    def solver(self) -> Solver:
+        """The solver of the graph."""
+        return self.backend.solver
+
+    @property
+    def ledger(self) -> Ledger:
+        """The ledger of decisions on all edges."""
+        return self.backend.ledger
+
+    @property
+    def is_solved(self) -> bool:
+        """Return whether the last solve succeeded and the solver has all edges since: covariances exist."""
+        return self._solution.vertices > 0 and self.solver.is_current
+
+    @property
+    def solves(self) -> int:
+        """The number of solves that succeeded."""
+        return self._solution.solves
+
+    @property
+    def report(self) -> Report | None:
+        """The report of the last solve of everything."""
+        return self._solution.report
+
+    @property
+    def correction(self) -> Correction:
+        """The correction of the last solve."""
+        return self._solution.correction
+
+    @property
+    def frozen(self) -> int:
+        """The number of first vertices that are of a frozen map: they stay where they are."""
+        return self.backend.frozen
+
+    @property
+    def frozen_edges(self) -> int:
+        """Verdicts on so many edges, the first, are of that map: they stay."""
+        return self.backend.frozen_edges
+
+    @property
+    def held(self) -> tuple[int, int]:
+        """The number of vertices and edges that stay as they are while ``map.localize`` is true; zeros otherwise."""
+        return self.backend.held
+
+    @property
+    def datum(self) -> tuple[float, ...]:
+        """The latitude, longitude and height at which the map begins, by the first fix; empty: no fix has them."""
+        return self._frontend.datum.datum
+
+    # -- health ----------------------------------------------------------------------------------------------------
+
+    @property
+    def failing(self) -> str:
+        """Return why the last solve failed; empty where it did not."""
+        return self._solution.guard.failing
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """Alarms: when the landmarks said that the robot was elsewhere than odometry, in order; the last may go on."""
+        return tuple(self._kidnaps.alarms)
+
+    @property
+    def displaced(self) -> Alarm | None:
+        """The alarm that goes on: the landmarks say that the robot is elsewhere."""
+        return self._kidnaps.now

@@ -1,0 +1,126 @@
+"""The solution: what the last solve gave, and how far it moved map -> odom."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.failure_guard import FailureGuard
+from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.solver import Report
+from graph_slam_ros.typing import Array, Numbers
+
+_BLAMED = 5  # edges that are named as the cause of a correction
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """The correction of a solve: how far it moved map -> odom, and what new edges, odometry apart, it had to reconcile.
+
+    Attributes
+    ----------
+    distance_m, angle_rad : of the robot's newest keyframe, the jump that a user sees
+    edges : ids, the one that fitted least before first
+    chi2 : of each, per number measured, before the solve
+    """
+
+    distance_m: float = 0.0
+    angle_rad: float = 0.0
+    edges: tuple[int, ...] = ()
+    chi2: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """The result of a solve.
+
+    Attributes
+    ----------
+    fits : (chi2 per number measured, edge) of the new edges that fitted least before
+    report : of a solve of everything
+    covariance : (dof, dof) of the newest keyframe's pose
+    """
+
+    fits: list[tuple[float, int]]
+    report: Report | None
+    covariance: Array
+
+
+class Solution:
+    """The outcome of the last solve, and what is unsolved since.
+
+    Attributes
+    ----------
+    guard : keeps the estimate a good one where a solve fails
+    solves : that succeeded
+    report : of the last solve of everything
+    correction : of the last solve
+    vertices : the first so many were part of the last solve; 0 where it failed
+    resting : observations at rest since the last solve
+    """
+
+    def __init__(self, space: Geometry, backend: Backend, guard: FailureGuard) -> None:
+        self._space, self._backend, self.guard = space, backend, guard
+        self.solves = 0
+        self.report: Report | None = None
+        self.correction = Correction()
+        self.vertices = self.resting = 0
+        self._edges = 0  # that the last solve had
+        self._keyframes = 0  # when the last solve was tried
+        self._T_map_odom = space.identity  # by the last solve
+
+    def pose(self, vertex: int) -> Numbers:
+        """The present estimate of a pose."""
+        return tuple(self._backend.solver.estimate([vertex])[0].tolist())
+
+    def T_map_odom(self, newest: Keyframe) -> Numbers:
+        """The correction of odometry's drift at the newest keyframe."""
+        group = self._space.group
+        out: Numbers = group.compose(self.pose(newest.vertex), group.inverse(newest.T_odom_base))
+        return out
+
+    def begin(self, newest: Keyframe, keyframes: int) -> None:
+        """The map begins, with so many keyframes."""
+        self._T_map_odom, self._keyframes = self.T_map_odom(newest), keyframes
+
+    def restore(self, report: Report, newest: Keyframe, keyframes: int) -> None:
+        """A map was solved that was loaded."""
+        self.guard.note_good()
+        self.report = report
+        self.vertices, self._edges = self._backend.handed_over
+        self.begin(newest, keyframes)
+
+    def is_due(self, keyframes: int, every_keyframes: int) -> bool:
+        """Return whether there is enough that is unsolved."""
+        return keyframes - self._keyframes + self.resting >= every_keyframes
+
+    def solve(self, work: Callable[[], Solved], newest: Keyframe, keyframes: int) -> Solved | None:
+        """Solve by some work; None where that fails: the last estimate stays, and it is counted."""
+        self._keyframes, self.resting, self.vertices = keyframes, 0, 0
+        solved = self.guard.solve(work, keyframes - 1)
+        if solved is None:
+            return None
+        self.report = solved.report or self.report
+        self.solves += 1
+        self.vertices, self._edges = self._backend.handed_over
+        self._note_correction(solved.fits, newest)
+        return solved
+
+    def fits(self) -> list[tuple[float, int]]:
+        """(chi2 per number measured, edge) of the new edges that fit least: what may move the map."""
+        edges = range(self._edges, self._backend.handed_over[1])
+        chi2, numbers = self._backend.solver.chi2_of(edges)
+        fit = chi2 / numbers
+        return [(float(fit[k]), edges[k]) for k in np.argsort(-fit, kind="stable")[:_BLAMED].tolist()]
+
+    def _note_correction(self, fits: list[tuple[float, int]], newest: Keyframe) -> None:
+        """Against where the robot would be by the last solve and its odometry."""
+        group = self._space.group
+        before, self._T_map_odom = self._T_map_odom, self.T_map_odom(newest)
+        moved = group.between(group.compose(before, newest.T_odom_base), self.pose(newest.vertex))
+        distance_m = math.hypot(*moved[: self._space.dimensions])
+        chi2, edges = zip(*fits, strict=True) if fits else ((), ())
+        self.correction = Correction(distance_m, float(self._space.angle(moved)), edges, chi2)

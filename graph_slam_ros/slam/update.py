@@ -1,0 +1,95 @@
+"""The outcome of ``GraphSlam.process``: what one measurement changed."""
+
+from dataclasses import dataclass
+
+from graph_slam_ros.slam.kidnap_detector import Alarm
+from graph_slam_ros.slam.map_view import MapView
+from graph_slam_ros.slam.robust.ledger import VerdictChange
+from graph_slam_ros.slam.solution import Correction
+from graph_slam_ros.solver import Report
+
+_NO_CORRECTION = Correction()
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """The changes that ``process`` made.
+
+    Attributes
+    ----------
+    keyframes : indices of new ones
+    edges : ids of new ones that the solver has
+    solved : whether it solved
+    report : of a solve of everything
+    correction : of the last solve
+    changes : of verdicts, since the last update that told any
+    alarms : that began, were decided or ended since then: the landmarks say that the robot is elsewhere
+    """
+
+    keyframes: tuple[int, ...] = ()
+    edges: range = range(0)
+    solved: bool = False
+    report: Report | None = None
+    correction: Correction = _NO_CORRECTION
+    changes: tuple[VerdictChange, ...] = ()
+    alarms: tuple[Alarm, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.keyframes) or self.solved
+
+    def __repr__(self) -> str:
+        parts = [_counted(len(self.keyframes), "keyframe")] if self.keyframes else []
+        parts += [_counted(len(self.edges), "edge")] if self.edges else []
+        if self.solved:
+            moved = f", map -> odom moved {self.correction.distance_m:.3g} m"
+            parts.append(("solved everything" if self.report else "solved") + moved)
+        parts += [_counted(len(self.changes), "changed verdict")] if self.changes else []
+        return f"Update({', '.join(parts) or 'nothing'})"
+
+
+NOTHING = Update()
+
+
+class UpdateLog:
+    """Makes each update of the difference to the one before."""
+
+    def __init__(self, view: MapView) -> None:
+        self._view = view
+        self._keyframes = self._edges = self._solves = 0
+        self._report: Report | None = None
+        self._changes = len(view.ledger.history)  # of verdicts, that updates have reported
+        self._alarms = view.alarms
+
+    def begin(self) -> None:
+        """The next update begins here."""
+        view = self._view
+        self._keyframes, self._edges = len(view.keyframes), view.backend.handed_over[1]
+        self._solves, self._report = view.solves, view.report
+
+    def update(self) -> Update:
+        """The changes since ``begin``; of verdicts and alarms, since the last update."""
+        view = self._view
+        solved, keyframes = view.solves > self._solves, range(self._keyframes, len(view.keyframes))
+        if not solved and not keyframes:
+            return NOTHING
+        changes, self._changes = tuple(view.ledger.history[self._changes :]), len(view.ledger.history)
+        before, self._alarms = self._alarms, view.alarms
+        known = set(map(_state, before))
+        return Update(
+            tuple(keyframes),
+            range(self._edges, view.backend.handed_over[1]),
+            solved,
+            view.report if view.report is not self._report else None,
+            view.correction if solved else _NO_CORRECTION,
+            changes,
+            tuple(one for one in self._alarms if _state(one) not in known),
+        )
+
+
+def _state(alarm: Alarm) -> tuple[int, int | None, int | None, str]:
+    """The part of an alarm that changes when it begins, is decided or ends."""
+    return alarm.began_ns, alarm.segment, alarm.ended_ns, alarm.outcome
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
