@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
+from statistics import median
 from typing import Any
 
 from graph_slam_ros.lie import so3
@@ -57,6 +58,16 @@ class TopicContents:
     off_plane: int = 0
     last_at: tuple[float, float, float] | None = None
     height_m: float = 0.0
+
+    @property
+    def typical_lag_s(self) -> float:
+        """Median of ``lag_s``."""
+        return median(self.lag_s) if self.lag_s else 0.0
+
+    @property
+    def is_zero(self) -> bool:
+        """Return whether all its stamps are zero."""
+        return bool(self.lag_s) and not self.is_stamped
 
 
 @dataclass(slots=True)

@@ -4,7 +4,6 @@ import re
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 from graph_slam_ros.errors import GraphSlamError
@@ -132,7 +131,7 @@ class Suggestion:
         for one in self._of_type(ODOMETRY):
             if one.frame in _MAPS:
                 self.unused[one.topic.name] = f"in frame {one.frame}: somebody's estimate, not odometry"
-            elif _is_zero(one):
+            elif one.is_zero:
                 self.unused[one.topic.name] = "its stamps are zero: have the driver fill in header.stamp"
             else:
                 found.append(one)
@@ -144,7 +143,7 @@ class Suggestion:
                 self.unused[one.topic.name] = "another odometry"
         if len(found) > 1:
             self.notes.append(f"{len(found)} odometries: {best.topic.name} is chosen; --odom takes another")
-        self._topics["odom"], self._lag_s = best.topic.name, _lag_s(best)
+        self._topics["odom"], self._lag_s = best.topic.name, best.typical_lag_s
         self._frames(best.frame, best.child)
         if best.off_plane > _OFF_PLANE * best.read:
             self.settings["world.dimensions"] = 3
@@ -327,12 +326,12 @@ class Suggestion:
 
     def _add(self, name: str, one: TopicContents, chosen: dict[str, Any] | None = None, linked: bool = False) -> None:
         topic = one.topic.name
-        if _is_zero(one):
+        if one.is_zero:
             self.unused[topic] = "its stamps are zero: have the driver fill in header.stamp"
             return
         offset_s = 0.0
         if self._lag_s is not None and one.lag_s:
-            offset_s = _lag_s(one) - self._lag_s
+            offset_s = one.typical_lag_s - self._lag_s
         if abs(offset_s) > _MOST_OFFSET_S:
             self.unused[topic] = f"its stamps are {offset_s:.0f} s from those of odometry: another clock"
             return
@@ -386,15 +385,6 @@ class Suggestion:
             note = f"no input reads {', '.join(found[:_MOST_LISTED])}{more}: their types are none of docs/inputs.md"
             own = "; landmarks in a type of your own: publish them as Detection3DArray or PointCloud2"
             self.notes.append(note + own * (self._names == ["odom"]))
-
-
-def _lag_s(one: TopicContents) -> float:
-    return median(one.lag_s) if one.lag_s else 0.0
-
-
-def _is_zero(one: TopicContents) -> bool:
-    """Return whether all its stamps are."""
-    return bool(one.lag_s) and not one.is_stamped
 
 
 def _assignment(key: str, value: Any) -> str:

@@ -14,6 +14,7 @@ from places import ROOT, test_path
 from planted_bugs import BUGS, Bug, Change
 
 import graph_slam_ros
+from graph_slam_ros.slam import GraphSlam
 
 PACKAGE = ROOT / "graph_slam_ros"
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
@@ -182,6 +183,24 @@ def test_a_folder_imports_only_the_libraries_it_is_built_on(name):
         assert "rclpy" not in tops
     if name not in SPEAK_MESSAGES:
         assert not [top for top in tops if re.fullmatch(r"\w+_(msgs|srvs|interfaces)", top)]
+
+
+MOST_LINES, MOST_OF_A_FUNCTION, MOST_ATTRIBUTES = 400, 60, 15
+STILL_LONGER = {"solver/solver.py", "solver/clique_tree/symbolic.py", "solver/clique_tree/numeric.py"}
+
+
+@pytest.mark.parametrize("name", sorted(FILES.keys() - STILL_LONGER))
+def test_modules_and_functions_are_short(name):
+    text = FILES[name].read_text()
+    assert len(text.splitlines()) <= MOST_LINES
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            assert node.end_lineno - node.lineno + 1 <= MOST_OF_A_FUNCTION, node.name
+
+
+def test_the_pipeline_has_few_attributes_and_one_short_class():
+    assert len(vars(GraphSlam())) <= MOST_ATTRIBUTES
+    assert len(FILES["slam/graph_slam.py"].read_text().splitlines()) <= 300
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -22,6 +22,7 @@ from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.ledger import Ledger
+from graph_slam_ros.slam.robust.rigid_alignment import aligned, are_spread
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
@@ -32,7 +33,6 @@ REACH_S = 20.0  # sightings that are older are not compared with the newest
 _SEEDS = 10  # newest held back sightings from which another pose is computed
 _FIT = 0.999  # probability with which a true sighting fits the other pose
 _MAP_SIGMA_M = 0.1  # error of a landmark of the map, beside its neighbours
-_LEAST_APART_M = 0.5  # two landmarks nearer to each other tell little of a heading
 _VAGUE_M, _VAGUE = 0.2, 0.3  # a sighting that fits within more than this, and this part of its distance, tells nothing
 _HEADING_SIGMA_RAD = 0.05  # error of a landmark's heading in the map
 SAME_M, SAME_RAD = 1.0, 0.3  # poses farther from each other are two
@@ -274,14 +274,14 @@ class DisplacementSearch:
         for several in combinations(out, self._space.dimensions):
             seeds = list(several)
             p, m = window.points[seeds], window.places[seeds]
-            if len(set(window.landmarks[seeds].tolist())) < len(seeds) or not _are_apart(p) or not _are_apart(m):
+            if len(set(window.landmarks[seeds].tolist())) < len(seeds) or not are_spread(p) or not are_spread(m):
                 continue
             allowed = 3.0 * np.sqrt(self._variances(window, seeds[0])[seeds].sum())
             if all(
                 abs(np.linalg.norm(p[i] - p[j]) - np.linalg.norm(m[i] - m[j])) < allowed
                 for i, j in combinations(range(len(seeds)), 2)
             ):
-                yield self._refined(window, _aligned(p, m, np.ones(len(seeds))), seeds[0]), seeds[0]
+                yield self._refined(window, aligned(p, m, np.ones(len(seeds))), seeds[0]), seeds[0]
 
     def _refined(self, window: _Window, motion: tuple[Array, Array], at: int) -> tuple[Array, Array]:
         """The motion by all sightings that are held back and fit it, the vaguer the less."""
@@ -290,7 +290,7 @@ class DisplacementSearch:
             if np.count_nonzero(fits) < self._space.dimensions:
                 return motion
             weights = 1.0 / self._variances(window, at)[fits]
-            motion = _aligned(window.points[fits], window.places[fits], weights)
+            motion = aligned(window.points[fits], window.places[fits], weights)
         return motion
 
     def _variances(self, window: _Window, at: int) -> Array:
@@ -387,20 +387,3 @@ class DisplacementSearch:
     def initial_poses(self, first: int) -> list[int]:
         """Edges of initial poses from a keyframe on."""
         return [edge for vertex, edges in self._poses.items() if vertex >= first for edge in edges]
-
-
-def _are_apart(points: Array) -> bool:
-    """Return whether points are far enough from one another, and three not on a line, to tell a rigid motion."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[points.shape[1] - 2] >= 0.5 * _LEAST_APART_M)
-
-
-def _aligned(points: Array, places: Array, weights: Array) -> tuple[Array, Array]:
-    """Rotation and shift that lay points on places with the least weighted squares (Kabsch)."""
-    w = weights / weights.sum()
-    p, m = w @ points, w @ places
-    u, _, vt = np.linalg.svd((points - p).T @ ((places - m) * w[:, None]))
-    mirror = np.ones(points.shape[1])
-    mirror[-1] = np.sign(np.linalg.det(vt.T @ u.T))
-    turn = vt.T @ np.diag(mirror) @ u.T
-    return turn, m - turn @ p
