@@ -32,10 +32,8 @@ def test_the_shipped_file_reads_back_as_the_defaults():
     assert Config.from_mapping(read_parameters(SHIPPED)) == Config()
 
 
-def test_the_shipped_file_for_space_is_what_the_code_writes_and_differs_in_the_dimensions_alone():
-    config = Config.from_mapping(IN_SPACE)
-    assert (CONFIG / "spatial.yaml").read_text() == parameters_text(config.as_mapping(), notes())
-    assert Config.from_mapping(read_parameters(CONFIG / "spatial.yaml")) == config
+def test_the_shipped_file_for_space_says_the_dimensions_alone():
+    assert Config.from_mapping(read_parameters(CONFIG / "spatial.yaml")) == Config.from_mapping(IN_SPACE)
 
 
 def test_every_input_has_a_section_and_only_those():
