@@ -2,17 +2,11 @@
 
 import json
 import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
-from yaml.composer import Composer
-from yaml.constructor import SafeConstructor
-from yaml.parser import Parser
-from yaml.reader import Reader
-from yaml.resolver import Resolver
-from yaml.scanner import Scanner
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.files import opened
@@ -21,33 +15,17 @@ _MAX_BYTES, _MAX_DEPTH, _MAX_NODES = 2**20, 50, 20_000
 _NODE = "graph_slam"
 
 
-class _PythonParser(Reader, Scanner, Parser):
-    """A stand-in for ``CParser`` where PyYAML was built without libyaml: the same, at a sixth of the speed."""
-
-    def __init__(self, stream: str) -> None:
-        Reader.__init__(self, stream)
-        Scanner.__init__(self)
-        Parser.__init__(self)
-
-
-_Events: Any = yaml.cyaml.CParser if yaml.__with_libyaml__ else _PythonParser  # type: ignore[attr-defined]
-
-
-class _StrictLoader(Composer, _Events, SafeConstructor, Resolver):  # type: ignore[misc]
+class _StrictLoader(yaml.SafeLoader):
     """Refuses what YAML would silently read as something else, and what is made to exhaust its reader.
 
     A key given twice, of which the last would be kept; numbers and words that YAML 1.1 reads in its own way; aliases,
     which ROS does not read either, and by which a few lines may grow without end.
     """
 
-    def __init__(self, stream: str) -> None:
-        _Events.__init__(self, stream)
-        for part in (Composer, SafeConstructor, Resolver):
-            part.__init__(self)
-        self._depth = self._nodes = 0
+    _depth = _nodes = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        event = self.peek_event()
+        event = self.peek_event()  # type: ignore[no-untyped-call]
         self._nodes += 1
         if isinstance(event, yaml.AliasEvent):
             raise _fault(event, "aliases are not read")
@@ -71,35 +49,33 @@ class _StrictLoader(Composer, _Events, SafeConstructor, Resolver):  # type: igno
             seen.add(key)
         return super().construct_mapping(node, deep)
 
-    def construct_plain(self, node: yaml.ScalarNode) -> Any:
-        """A number or a truth value, as everybody reads it."""
-        value = _CONSTRUCT[node.tag](self, node)
-        if not _AS_EVERYBODY[node.tag].fullmatch(node.value):
-            usual = repr(value).lower() if isinstance(value, bool) else repr(value)
-            raise _fault(node, f"{node.value} is {usual} to YAML: write {usual}, or '{node.value}' for a text")
-        return value
-
 
 def _fault(at: Any, what: str) -> ConfigError:
     return ConfigError(f"line {at.start_mark.line + 1}: {what}")
 
 
+def _as_everybody(pattern: str, construct: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """A constructor of a number or a truth value that refuses what people read otherwise than YAML 1.1."""
+
+    def constructed(loader: _StrictLoader, node: yaml.ScalarNode) -> Any:
+        value = construct(loader, node)
+        if not re.fullmatch(pattern, node.value, re.ASCII):
+            usual = repr(value).lower() if isinstance(value, bool) else repr(value)
+            raise _fault(node, f"{node.value} is {usual} to YAML: write {usual}, or '{node.value}' for a text")
+        return value
+
+    return constructed
+
+
 _TAGS = (None, "tag:yaml.org,2002:str")  # the others have ways of their own to fail
+_NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
 _FLOAT, _INT, _BOOL = (f"tag:yaml.org,2002:{kind}" for kind in ("float", "int", "bool"))
-_CONSTRUCT: dict[str, Any] = {
-    _FLOAT: yaml.SafeLoader.construct_yaml_float,
-    _INT: yaml.SafeLoader.construct_yaml_int,
-    _BOOL: yaml.SafeLoader.construct_yaml_bool,
-}
-_AS_EVERYBODY = {
-    _FLOAT: re.compile(
-        r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)", re.ASCII
-    ),
-    _INT: re.compile(r"[-+]?(?:0|[1-9]\d*)|0x[0-9a-fA-F]+", re.ASCII),
-    _BOOL: re.compile("true|false", re.IGNORECASE),
-}
-for _tag in _CONSTRUCT:
-    _StrictLoader.add_constructor(_tag, _StrictLoader.construct_plain)
+for _tag, _pattern, _construct in (
+    (_FLOAT, _NUMBER, yaml.SafeLoader.construct_yaml_float),
+    (_INT, r"[-+]?(?:0|[1-9]\d*)|0x[0-9a-fA-F]+", yaml.SafeLoader.construct_yaml_int),
+    (_BOOL, "(?i:true|false)", yaml.SafeLoader.construct_yaml_bool),
+):
+    _StrictLoader.add_constructor(_tag, _as_everybody(_pattern, _construct))
 # YAML 1.1 reads 1e-3 as a text; ROS and people read a number
 _StrictLoader.add_implicit_resolver(
     _FLOAT, re.compile(r"^[-+]?(?:\d+(?:\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")

@@ -15,6 +15,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 from places import ROOT
 from yaml.constructor import BaseConstructor, SafeConstructor
 
@@ -99,7 +100,7 @@ def test_X1_no_file_of_the_package_can_run_code_of_a_file():
 
 def test_X1_the_loader_of_parameters_makes_plain_values_alone():
     constructors = [one for one in _StrictLoader.__mro__ if issubclass(one, BaseConstructor)]
-    assert constructors == [_StrictLoader, SafeConstructor, BaseConstructor]
+    assert constructors == [_StrictLoader, yaml.SafeLoader, SafeConstructor, BaseConstructor]
 
 
 @pytest.mark.parametrize(
