@@ -214,7 +214,7 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
     elif facts.failures:
         yield f"{facts.failures} solves failed: the last good estimate stands"
     if facts.restarts:
-        yield "the solver's thread had died and was started again"
+        yield "a job would have ended the solver's thread, which went on"
     if facts.memory_is_short:
         yield "the process has more memory than health.memory_mib: loop closures are refused"
     if facts.busy_s > health.stuck_s and not facts.loads:

@@ -54,7 +54,7 @@ class Runtime:
             undo.callback(self._session.abandon)
             self._publishers = Publishers(node, config)
             undo.callback(self._publishers.close)
-            self._worker = Worker(config.inputs.queue)
+            self._worker = Worker(config.inputs.queue, self._on_exit_of_a_job)
             undo.callback(self._worker.stop, 0.0)
             self._clock = PublishingClock(node, self._publishers, self._worker)
             self._ingest = Ingest(
@@ -112,7 +112,6 @@ class Runtime:
         """
         self.deactivate()
         self._preparation.stop()
-        self._watch()
         self._ingest.finish()
         saved = self._worker.call(self._session.finish)
         try:
@@ -141,7 +140,7 @@ class Runtime:
 
     def tick(self) -> None:
         """Do what is due ten times a second."""
-        self._watch()
+        self._ingest.watch_memory()
         self._session.flush_in_background()
         self._completion.tick()
         self._ingest.tick()
@@ -149,12 +148,11 @@ class Runtime:
             self._subscriptions.tick(self._node.now_ns)
         self._clock.tick(self._session)
 
-    def _watch(self) -> None:
-        """Watch over the worker's thread and the memory of the process."""
-        if self._worker.revive(self._session.restart):
-            self.counters.count("node", "worker_restarted")
-            self._node.get_logger().error("the solver's thread has died; another goes on with the graph that there is")
-        self._ingest.watch_memory()
+    def _on_exit_of_a_job(self) -> None:
+        """Go on after what a job raised would have ended its thread, from the last good estimate."""
+        self.counters.count("node", "worker_restarted")
+        self._node.get_logger().error("a job has ended the solver's thread; it goes on with the graph that there is")
+        self._session.slam.restart()
 
     def _begin_anew(self, passage: Passage, source: str, why: str) -> None:
         """Do what the gate has decided on a jump of time."""

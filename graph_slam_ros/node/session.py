@@ -142,10 +142,6 @@ class Session:
         self.accept(measurements)
         self.process(measurements)
 
-    def restart(self) -> None:
-        """Go on after the thread has died, from the last good estimate; a replay needs no such step."""
-        self.slam.restart()
-
     def _process(self, measurement: Measurement) -> None:
         start = time.perf_counter()
         update = self.slam.process(measurement)

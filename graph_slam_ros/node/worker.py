@@ -21,16 +21,17 @@ class Worker:
     Parameters
     ----------
     most : jobs that may wait; ``offer`` refuses more, ``call`` is always taken
+    on_exit : called in the thread after a job that would have ended it, as ``SystemExit`` does; the next job follows
     """
 
-    def __init__(self, most: int) -> None:
-        self._most = most
+    def __init__(self, most: int, on_exit: Callable[[], None] = lambda: None) -> None:
+        self._most, self._on_exit = most, on_exit
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any] | None, float] | None] = queue.SimpleQueue()
         self._since: float | None = None
         self._begun: float | None = None
-        self._future: Future[Any] | None = None  # of the job in hand
-        self._is_stopped = self._is_left = False
-        self._thread = self._started(None)
+        self._is_left = False
+        self._thread = threading.Thread(target=self._run, name="graph_slam_worker", daemon=True)
+        self._thread.start()
 
     def offer(self, job: Callable[[], None]) -> bool:
         """Have a job done that raises nothing; False where too many wait, and nothing is taken."""
@@ -67,15 +68,6 @@ class Worker:
         """Whether the thread runs."""
         return self._thread.is_alive()
 
-    def revive(self, first: Callable[[], Any]) -> bool:
-        """Where the thread has died of a job, have another go on with the next, after ``first``; whether it had."""
-        if self._is_stopped or self._is_left or self._thread.is_alive():
-            return False
-        if self._future is not None and not self._future.done():
-            self._future.set_exception(RuntimeError("the thread has died of it"))
-        self._thread = self._started(first)
-        return True
-
     @property
     def has_room(self) -> bool:
         """Whether ``offer`` would take another job."""
@@ -93,7 +85,6 @@ class Worker:
         timeout_s : None: as long as it takes
         is_urgent : asked meanwhile; from then on it may take ``URGENT_S``
         """
-        self._is_stopped = True
         self._jobs.put(None)
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
         while self._thread.is_alive() and time.monotonic() < deadline:
@@ -103,29 +94,23 @@ class Worker:
         self._is_left |= self._thread.is_alive()
         return not self._thread.is_alive()
 
-    def _started(self, first: Callable[[], Any] | None) -> threading.Thread:
-        thread = threading.Thread(target=self._run, args=(first,), name="graph_slam_worker", daemon=True)
-        thread.start()
-        return thread
-
-    def _run(self, first: Callable[[], Any] | None) -> None:
-        self._since = self._begun = self._future = None
-        if first is not None:
-            _do(first, None)
+    def _run(self) -> None:
         while (item := self._jobs.get()) is not None and not self._is_left:
-            job, self._future, self._since = item
+            job, future, self._since = item
             self._begun = time.monotonic()
-            _do(job, self._future)
+            if not isinstance(_failure(job, future), Exception | None):
+                _failure(self._on_exit, None)
             self._since = self._begun = None
 
 
-def _do(job: Callable[[], Any], future: "Future[Any] | None") -> None:
-    """What fails must not end the thread; who offered a job that raises finds nothing of it."""
+def _failure(job: Callable[[], Any], future: "Future[Any] | None") -> BaseException | None:
+    """Do a job; what it raises must not end the thread, and is told to who waits for it alone."""
     try:
         result = job()
-    except Exception as error:
+    except BaseException as error:
         if future is not None:
-            future.set_exception(error)
-        return
+            future.set_exception(error if isinstance(error, Exception) else RuntimeError(f"it ended with {error!r}"))
+        return error
     if future is not None:
         future.set_result(result)
+    return None

@@ -9,7 +9,6 @@ import itertools
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 from live_drive import Drive
@@ -203,8 +202,7 @@ def test_P7_above_its_limit_of_memory_closures_are_refused_and_counted_and_below
         assert results(tmp_path / "run") == replayed(tmp_path / "run", tmp_path)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_P23_where_the_solvers_thread_dies_another_goes_on_with_the_graph_that_there_is(monkeypatch):
+def test_P23_what_would_end_the_solvers_thread_does_not_and_it_goes_on_with_the_graph_that_there_is(monkeypatch):
     with at_work() as (slam, r, drive):
         run = slam._run
         slam_before, before = run._session.slam, len(run._session.slam.keyframes)
@@ -215,7 +213,7 @@ def test_P23_where_the_solvers_thread_dies_another_goes_on_with_the_graph_that_t
             raise SystemExit
 
         monkeypatch.setattr(GraphSlam, "process", dies)
-        until(lambda: run.counters["node", "worker_restarted"] == 1, drive.pace(r), "another thread")
+        until(lambda: run.counters["node", "worker_restarted"] == 1, drive.pace(r), "the counter")
         r.until_it_says("OK", spin=drive.pace(r))
         until(lambda: len(run._session.slam.keyframes) > before + 5, drive.pace(r), "keyframes")
         assert run._session.slam is slam_before
@@ -223,23 +221,21 @@ def test_P23_where_the_solvers_thread_dies_another_goes_on_with_the_graph_that_t
         assert not slam_before.failing
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_P23_who_waits_for_a_job_that_its_thread_died_of_is_told():
-    worker, done = Worker(10), []
+def test_P23_who_waits_for_a_job_that_would_have_ended_its_thread_is_told():
+    done = []
+    worker = Worker(10, lambda: done.append("first"))
 
-    def die():
+    def ends():
         raise SystemExit
 
-    future, after = worker.call(die), worker.call(lambda: done.append("after"))
-    until(lambda: not worker.is_alive, time.sleep, "end of the thread")
-    assert worker.revive(lambda: done.append("first"))
-    with pytest.raises(RuntimeError, match="died"):
+    future, after = worker.call(ends), worker.call(lambda: done.append("after"))
+    with pytest.raises(RuntimeError, match="SystemExit"):
         future.result(10.0)
     after.result(10.0)
+    with pytest.raises(ZeroDivisionError):
+        worker.call(lambda: 1 // 0).result(10.0)
     assert done == ["first", "after"]
-    assert not worker.revive(done.clear)
     assert worker.stop(10.0)
-    assert not worker.revive(done.clear)
 
 
 def test_P21_exceptions_of_callbacks_are_counted_told_once_and_an_error_from_a_hundred_on(monkeypatch, capfd):
