@@ -1,6 +1,5 @@
 """Explanation of what was decided in a saved run, as a whole or about one edge, in sentences."""
 
-import json
 import textwrap
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -12,9 +11,9 @@ from scipy.special import gammainc
 from graph_slam_ros.analysis import measurement_text
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
-from graph_slam_ros.formats.strict import integer, lines
-from graph_slam_ros.runs import SUMMARY, run_config
-from graph_slam_ros.runs.ledger_file import Entry, read_changes, read_ledger
+from graph_slam_ros.formats.strict import integer
+from graph_slam_ros.runs import SUMMARY, summary_of
+from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.ledger import FINAL, Reason, Verdict, VerdictChange
@@ -47,24 +46,23 @@ _CHANCE = 1e-4  # that so many would all stay below that, were their noise as it
 # -- the whole ---------------------------------------------------------------------------------------------------------
 
 
-def explain_run(folder: Path) -> Iterator[str]:
+def explain_run(run: SavedGraph) -> Iterator[str]:
     """The edges of each class that are in and out and why, the most surprising, and whether the gates decide.
 
     Raises
     ------
     FormatError
-        A file of the run is missing, or is not what it should be.
+        The summary of the run is not what it should be.
     """
-    entries, config = read_ledger(folder), run_config(folder)
-    changes = read_changes(folder, len(entries))
+    entries = run.entries
     judged = [entry for entry in entries if entry.verdict]
     yield f"{len(entries)} edges, {len(judged)} of them judged; {len(entries) - len(judged)} are taken for granted"
     if judged:
         yield from _table(judged)
     yield from _worst(e for e in judged if not e.is_in and e.reason not in FINAL)
     yield from _least(e for e in judged if e.is_in)
-    yield from _gates(judged, changes, config)
-    yield from _rivals(folder)
+    yield from _gates(judged, run.changes, run.config)
+    yield from _rivals(run.folder)
 
 
 def _table(entries: Sequence[Entry]) -> Iterator[str]:
@@ -120,14 +118,10 @@ def _gates(entries: Sequence[Entry], changes: Sequence[VerdictChange], config: C
 
 def _rivals(folder: Path) -> Iterator[str]:
     """Return what the last second look could not rule out."""
-    file = folder / SUMMARY
     try:
-        rows = [
-            _rival(folder, rival)
-            for rival in json.loads("".join(text for _, text in lines(file, follow=False)))["rivals"]
-        ]
-    except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise FormatError(f"{file}: not the summary of a run: {error!r}") from None
+        rows = [_rival(folder, rival) for rival in summary_of(folder).get("rivals", ())]
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise FormatError(f"{folder / SUMMARY}: not the summary of a run: {error!r}") from None
     yield from rows
 
 
@@ -141,26 +135,21 @@ def _rival(folder: Path, rival: Mapping[str, Any]) -> str:
 # -- one edge, or a landmark's -----------------------------------------------------------------------------------------
 
 
-def explain_edge(folder: Path, which: str) -> Iterator[str]:
+def explain_edge(run: SavedGraph, which: str) -> Iterator[str]:
     """Everything about an edge, by id, or about the sightings of a landmark, by name.
 
     Where its name is a number, ``landmark:7`` is not edge 7.
 
     Raises
     ------
-    FormatError
-        A file of the run is missing, or is not what it should be.
     GraphSlamError
         There is no such edge or landmark.
     """
-    if which.isdecimal():
-        run = SavedGraph(folder)
-        return _edge(run, integer(which), read_changes(folder, len(run.entries)), run_config(folder))
-    return _landmark(folder, which.removeprefix("landmark:"))
+    return _edge(run, integer(which)) if which.isdecimal() else _landmark(run, which.removeprefix("landmark:"))
 
 
-def _landmark(folder: Path, name: str) -> Iterator[str]:
-    entries = read_ledger(folder)
+def _landmark(run: SavedGraph, name: str) -> Iterator[str]:
+    entries = run.entries
     seen = [e for e in entries if e.landmark == name]
     if not seen:
         names = sorted({e.landmark for e in entries} - {""})
@@ -172,12 +161,12 @@ def _landmark(folder: Path, name: str) -> Iterator[str]:
     yield from _worst(out)
     yield from _least(e for e in seen if e.is_in)
     if out:
-        yield f"graph_slam explain {folder} {out[0].edge} tells more of the first"
+        yield f"graph_slam explain {run.folder} {out[0].edge} tells more of the first"
 
 
-def _edge(run: SavedGraph, edge: int, changes: Iterable[VerdictChange], config: Config) -> Iterator[str]:
+def _edge(run: SavedGraph, edge: int) -> Iterator[str]:
     e = run.edge(edge)
-    history = [change for change in changes if change.edge == edge]
+    history = [change for change in run.changes if change.edge == edge]
     kind, of, by = _KIND.get(e.label, e.label), e.landmark and f" of {e.landmark}", e.source and f" by {e.source}"
     yield f"edge {edge}: {kind}{of}{by}: {_state(e.verdict, e.reason)}"
     yield from _line("stamp", f"{e.stamp_ns / 1e9:.3f} s, of the newest keyframe that it is attached to")
@@ -188,7 +177,7 @@ def _edge(run: SavedGraph, edge: int, changes: Iterable[VerdictChange], config: 
     yield from _line(
         "expected", f"{measurement_text.with_units(e, measurement_text.expected(e))}, when it was judged first"
     )
-    yield from _line("decided", _decided(e, history, config))
+    yield from _line("decided", _decided(e, history, run.config))
     if not e.verdict:
         return
     yield from _line("now", f"chi2 {e.chi2:.4g} by its own noise; {100.0 * e.weight:.3g} % of its weight counts")
@@ -278,4 +267,4 @@ def _line(what: str, text: str) -> Iterator[str]:
 def _vertex(run: SavedGraph, e: Entry, vertex: int) -> str:
     if run.keyframe(vertex) is not None:
         return f"keyframe {run.keyframe(vertex)}"
-    return f"landmark {e.landmark}" if e.landmark else f"vertex {vertex}"
+    return f"landmark {e.landmark}" if e.landmark else f"vertex {run.ids[vertex]}"

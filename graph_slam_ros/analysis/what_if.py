@@ -1,22 +1,20 @@
-"""The what-if analysis: the graph of a saved run, solved again with other edges or another loss; what moves.
+"""The what-if analysis: the graph of a run, solved again with other edges or another loss; what moves.
 
-All is from ``graph.g2o`` and ``ledger.csv``: nothing is decided again, the drive is not repeated.
+All is from the run's map: nothing is decided again, the drive is not repeated.
 """
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
-from graph_slam_ros.formats.g2o import read_g2o
-from graph_slam_ros.formats.graph_file import EDGE_TAGS, G2oFile
+from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.graph import Gaussian, Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
-from graph_slam_ros.runs import GRAPH, run_config
-from graph_slam_ros.runs.ledger_file import LEDGER, Entry, read_ledger
+from graph_slam_ros.runs import RunError, numbered, restored
+from graph_slam_ros.runs.ledger_file import Entry, ledger_entries
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.solver.linearization import linearized
 from graph_slam_ros.typing import Array
@@ -56,29 +54,34 @@ class Influence:
 
 
 class SavedGraph:
-    """The graph of a run: vertices as ``graph.g2o`` numbers them, edges as ``ledger.csv`` does, those that are out too.
+    """The graph of a run, and what was decided about its edges, those that are out too.
+
+    Parameters
+    ----------
+    losses : what could not be read of the run is added
 
     Raises
     ------
-    FormatError
-        A file is missing, or is not what it should be.
+    GraphSlamError
+        There is no map, it cannot be read, or it cannot be solved.
     """
 
-    def __init__(self, folder: Path) -> None:
-        config = run_config(folder)
-        self.space, self._settings = config.space, config.solver_settings()
-        self.entries = read_ledger(folder)
-        self.graph, self._held = _graph(folder, self.entries)
-        ends = (k for e in self.entries if e.label in ("anchor", "odometry") for k in e.vertices[-1:])
-        self.keyframes = list(dict.fromkeys(ends))  # an anchor that gave way has another after it
-        for vertex in self.keyframes:
-            if self.graph.kind_of(vertex) is not self.space.pose:
-                kind, wanted = self.graph.kind_of(vertex).name, self.space.pose.name
-                raise FormatError(f"{folder / GRAPH}: vertex {vertex} is {kind}, where {LEDGER} has a pose, {wanted}")
-        if not self.keyframes:
-            raise GraphSlamError(f"{folder}: no keyframe in it, so there is nothing to solve")
+    def __init__(self, folder: Path, losses: list[str]) -> None:
+        slam = restored(folder, losses)
+        if not slam.is_solved:
+            raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
+        self.folder, self.space, self.config = folder, slam.space, slam.config
+        self.graph, self._held = slam.graph.copy(), slam.solver.held
+        self.graph.initial.values[:] = slam.solver.values
+        self.entries = list(ledger_entries(slam, range(self.graph.vertex_count)))
+        self.changes = slam.ledger.history
+        self.ids, _ = numbered(slam)
+        self.keyframes: list[int] = slam.keyframes.ids.tolist()
         self._numbers = {vertex: k for k, vertex in enumerate(self.keyframes)}
-        self._was = self.solve()
+
+    @cached_property
+    def _was(self) -> Solver:
+        return self.solve()
 
     def keyframe(self, vertex: int) -> int | None:
         """The number of the keyframe that a vertex is, if it is one."""
@@ -110,10 +113,10 @@ class SavedGraph:
         if gone & set(let_in):
             raise GraphSlamError(f"edge {min(gone & set(let_in))}: cannot be taken out and let in at once")
         edges = [e.edge for e in self.entries if e.is_in and e.edge not in gone]
-        graph, settings = self.graph, self._settings
+        graph, settings = self.graph, self.config.solver_settings()
         if let_in:
             graph = graph.copy()
-            edges += [_add(graph, self.edge(e), _ACCEPTED) for e in let_in]
+            edges += [_believed(graph, self.edge(e)) for e in let_in]
             edges = [e for e in edges if e not in set(let_in)]
         if loss is not None:
             settings = replace(settings, losses={label: [loss] for label in settings.losses})
@@ -179,41 +182,11 @@ class SavedGraph:
         return step
 
 
-def _graph(folder: Path, entries: Sequence[Entry]) -> tuple[Graph, list[int]]:
-    """The graph, and the vertices that are held: those of a map that was frozen."""
-    file, out = read_g2o(folder / GRAPH, follow=False), Graph()
-    if sorted(file.ids) != list(range(len(file.ids))):
-        raise FormatError(f"{folder / GRAPH}: vertices are not numbered one after another from 0: is it of a run?")
-    at, initial = file.graph.offset.values.tolist(), file.graph.initial.values
-    for vertex in np.argsort(file.ids).tolist():
-        kind = file.graph.kind_of(vertex)
-        out.add_vertex(kind, initial[at[vertex] : at[vertex] + kind.size])
-    for entry in entries:
-        try:
-            _add(out, entry, entry.label)
-        except GraphSlamError as error:
-            message = f"edge {entry.edge}: {error} (or {GRAPH} is not of the same run)"
-            raise FormatError(f"{folder / LEDGER}: {message}") from None
-    _check_same_run(folder, file, entries)
-    return out, [file.ids[vertex] for vertex in file.fixed]
-
-
-def _check_same_run(folder: Path, file: G2oFile, entries: Iterable[Entry]) -> None:
-    """The graph has the edges that are in, and none that the ledger does not know."""
-    edges: Counter[tuple[str, ...]] = Counter()
-    tags = {edge: tag for tag, edge in EDGE_TAGS.items()}
-    for table in file.graph.tables.values():
-        edges.update((tags[table.type], *(str(file.ids[v]) for v in ends)) for ends in table.vertices.values.tolist())
-    known = [((e.tag, *map(str, e.vertices)), e.is_in) for e in entries]
-    strange = edges - Counter(edge for edge, _ in known) or Counter(edge for edge, is_in in known if is_in) - edges
-    if strange:
-        edge = " ".join(min(strange))
-        raise FormatError(f"{folder}: {GRAPH} and {LEDGER} are not of one run, or not whole: {edge} is in one alone")
-
-
-def _add(graph: Graph, entry: Entry, label: str) -> int:
+def _believed(graph: Graph, entry: Entry) -> int:
+    """Add an edge that is out once more, as one that nothing takes out."""
+    table, _ = graph.row(entry.edge)
     noise = Gaussian.from_information(entry.information_matrix)
-    return graph.add_edge(EDGE_TAGS[entry.tag], entry.vertices, entry.measured, noise, label)
+    return graph.add_edge(table.type, entry.vertices, entry.measured, noise, _ACCEPTED)
 
 
 def _ends(graph: Graph, edge: int) -> list[int]:

@@ -18,38 +18,40 @@ _SHOWN = 10  # edges that fit worse
 def explain(args: argparse.Namespace) -> int:
     """Say why."""
     from graph_slam_ros.analysis.explain import explain_edge, explain_run
-    from graph_slam_ros.runs import changed_since
+    from graph_slam_ros.analysis.what_if import SavedGraph
 
-    console.show(*(explain_edge(args.run_folder, args.edge) if args.edge else explain_run(args.run_folder)))
+    losses: list[str] = []
+    run = SavedGraph(args.run_folder, losses)
+    console.show(*(explain_edge(run, args.edge) if args.edge else explain_run(run)))
     if args.edge:
         console.then(f"{console.command('solve', args.run_folder, '--without', 'EDGE')} (the drive without an edge)")
     else:
         console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (all about one edge or landmark)")
-    return console.report_losses([], changed_since(args.run_folder))
+    return console.report_losses(losses)
 
 
 def solve(args: argparse.Namespace) -> int:
     """Solve a run's graph again with other edges in, or another loss; say what moves."""
     from graph_slam_ros.analysis.what_if import SavedGraph
-    from graph_slam_ros.runs import changed_since
 
     if not (args.without or args.let_in or args.loss):
         raise GraphSlamError("solve needs --without EDGE, --with EDGE or --loss NAME: what would be otherwise")
-    run = SavedGraph(args.run_folder)
+    losses: list[str] = []
+    run = SavedGraph(args.run_folder, losses)
     start = time.process_time()
     solver = run.solve(args.without, args.let_in, args.loss)
     elapsed_s = time.process_time() - start
     console.show(*_moved_text(run, run.moved(solver)), f"solved in {1e3 * elapsed_s:.0f} ms of CPU time")
     console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (why the run judged an edge as it did)")
-    return console.report_losses([], changed_since(args.run_folder))
+    return console.report_losses(losses)
 
 
 def influence(args: argparse.Namespace) -> int:
     """Say which edges the last pose hangs on."""
     from graph_slam_ros.analysis.what_if import SavedGraph
-    from graph_slam_ros.runs import changed_since
 
-    run = SavedGraph(args.run_folder)
+    losses: list[str] = []
+    run = SavedGraph(args.run_folder, losses)
     console.show(
         f"the last pose without each edge, the {args.count} of most influence to first order",
         f"  {'edge':<8s} {'':24s} {'first order':>12s} {'solved again':>12s}",
@@ -59,7 +61,7 @@ def influence(args: argparse.Namespace) -> int:
         text = f"{one.first_order_m:10.4f} m {exact}"
         console.show(f"  {one.edge:<8d} {run.edge(one.edge).about:24s} {text}")
     console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (all about one of them)")
-    return console.report_losses([], changed_since(args.run_folder))
+    return console.report_losses(losses)
 
 
 def _moved_text(run: "SavedGraph", moved: "MovedVertex") -> Iterable[str]:

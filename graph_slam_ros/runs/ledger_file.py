@@ -6,7 +6,7 @@ Rows are in order of the edges' ids. A list of numbers is one field, with spaces
 import csv
 import io
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from pathlib import Path
@@ -93,7 +93,7 @@ class Entry:
 
 def ledger_text(slam: GraphSlam, ids: list[int]) -> str:
     """All edges that were judged or taken for granted; ``ids`` are the numbers of the vertices in the file."""
-    return _text(Entry, _entries(slam, ids))
+    return _text(Entry, ledger_entries(slam, ids))
 
 
 def changes_text(slam: GraphSlam) -> str:
@@ -110,16 +110,6 @@ def read_ledger(folder: Path) -> list[Entry]:
             raise FormatError(f"{folder / LEDGER}:{line}: {fault}")
         entries.append(entry)
     return entries
-
-
-def read_changes(folder: Path, edges: int) -> list[VerdictChange]:
-    """The history of a run of so many edges, in order. Raises FormatError naming the line."""
-    changes = list[VerdictChange]()
-    for line, change in _read(VerdictChange, folder / CHANGES):
-        if not 0 <= change.edge < edges:
-            raise FormatError(f"{folder / CHANGES}:{line}: edge {change.edge} is none of the {edges} of {LEDGER}")
-        changes.append(change)
-    return changes
 
 
 def _fault(entry: Entry) -> str:
@@ -143,7 +133,8 @@ def _fault(entry: Entry) -> str:
     return next((f"{name}: {n} is too small" for name, low in least.items() if (n := getattr(entry, name)) < low), "")
 
 
-def _entries(slam: GraphSlam, ids: list[int]) -> Iterable[Entry]:
+def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
+    """Each edge that was judged or taken for granted; ``ids`` are the numbers that its vertices are to have."""
     graph, ledger = slam.graph, slam.ledger
     tags = {edge: tag for tag, edge in EDGE_TAGS.items()}
     names = {mark.vertex: name for name, mark in slam.landmarks.items()}

@@ -12,8 +12,11 @@ from faulty import faulty_run
 
 from graph_slam_ros import cli
 from graph_slam_ros.analysis import measurement_text
+from graph_slam_ros.analysis.explain import explain_edge
+from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
-from graph_slam_ros.runs.ledger_file import LEDGER, Entry, read_ledger
+from graph_slam_ros.runs import GRAPH
+from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, Entry, read_ledger
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
@@ -85,19 +88,30 @@ def test_a_landmark_is_explained_by_name_and_an_unknown_one_is_refused(run, caps
     assert (code, "no edge 99999: their ids are below" in err) == (2, True)
 
 
-def test_each_verdict_is_explained_in_its_words(run, tmp_path, capsys):
-    entry = first(run, label="closures", verdict=Verdict.ACCEPTED)
-    copy = copied(run, tmp_path)
-    rows = (run / LEDGER).read_text().splitlines()
+def test_each_verdict_is_explained_in_its_words(run):
+    saved = SavedGraph(run, [])
+    entry = next(e for e in saved.entries if (e.label, e.verdict) == ("closures", Verdict.ACCEPTED))
     for verdict, reason, words in (
-        ("rejected", "does_not_fit", "with everything solved it was off by"),
-        ("rejected", "outvoted", "in the cheapest explanation of everything"),
-        ("rejected", "withdrawn", "what was withdrawn stays out"),
-        ("down_weighted", "none", "it stays in, but its loss leaves it little"),
+        (Verdict.REJECTED, Reason.DOES_NOT_FIT, "with everything solved it was off by"),
+        (Verdict.REJECTED, Reason.OUTVOTED, "in the cheapest explanation of everything"),
+        (Verdict.REJECTED, Reason.WITHDRAWN, "what was withdrawn stays out"),
+        (Verdict.DOWN_WEIGHTED, Reason.NONE, "it stays in, but its loss leaves it little"),
     ):
-        changed = rows[entry.edge + 1].removesuffix("accepted,none") + f"{verdict},{reason}"
-        (copy / LEDGER).write_text("\n".join([*rows[: entry.edge + 1], changed, *rows[entry.edge + 2 :]]) + "\n")
-        assert words in told(capsys, copy, entry.edge)[1]
+        saved.entries[entry.edge] = dataclasses.replace(entry, verdict=verdict, reason=reason)
+        assert words in " ".join(" ".join(explain_edge(saved, str(entry.edge))).split())
+
+
+@pytest.mark.parametrize("words", [("explain",), ("explain", 3), ("solve", "--without", 3), ("influence",)])
+def test_a_run_that_was_never_saved_is_explained_from_its_map(run, tmp_path, words, capsys):
+    copy = copied(run, tmp_path)
+    for name in (LEDGER, CHANGES, GRAPH):
+        (copy / name).unlink()
+    answers = []
+    for folder in (run, copy):
+        assert cli.main([words[0], str(folder), *map(str, words[1:])]) == 0
+        lines = capsys.readouterr().out.replace(str(folder), "RUN").splitlines()
+        answers.append([line for line in lines if not line.startswith("solved in")])
+    assert answers[0] == answers[1] != []
 
 
 def test_a_gate_that_decides_nothing_is_warned_of(tmp_path, capsys):

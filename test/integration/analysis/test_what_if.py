@@ -22,7 +22,7 @@ def replayed(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def saved(replayed):
-    return SavedGraph(replayed[1])
+    return SavedGraph(replayed[1], [])
 
 
 def told(capsys, *words):
@@ -121,7 +121,7 @@ def test_influence_tells_which_edges_cannot_be_done_without(tmp_path, capsys):
     slam.process(Control("optimize"))
     run = recorder.save(slam)
     landmarks = {e.edge for e in read_ledger(run) if e.label == "landmarks"}
-    assert {one.edge for one in SavedGraph(run).influences(5) if one.exact_m == np.inf} == landmarks
+    assert {one.edge for one in SavedGraph(run, []).influences(5) if one.exact_m == np.inf} == landmarks
     assert len(landmarks) == 2
     code, out, err = told(capsys, "influence", run)
     assert (code, out.count("undetermined"), err) == (0, 2, "")

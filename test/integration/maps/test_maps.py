@@ -450,7 +450,7 @@ def test_in_a_frozen_map_the_robot_is_located_as_well_as_in_one_that_goes_on(fir
 
 def test_what_is_asked_of_a_run_in_a_frozen_map_leaves_that_where_it_is(frozen, world, tmp_path):
     slam = gone_on(tmp_path / "run", frozen, world)
-    saved = SavedGraph(tmp_path / "run")
+    saved = SavedGraph(tmp_path / "run", [])
     first_new = len(read_map(frozen, []).keyframes)
     edges = [e for e in saved.entries if e.is_in and e.verdict and max(e.vertices[:1]) >= first_new][:20]
     after = saved.solve([e.edge for e in edges])

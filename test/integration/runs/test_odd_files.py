@@ -81,14 +81,13 @@ def test_a_line_of_an_error_keeps_its_beginning_and_its_end(tmp_path):
 
 # -- files of a run ----------------------------------------------------------------------------------------------------
 
-LEDGERS = ("ledger.csv", "ledger_changes.csv")
 SCORED = ("run.json", "config.yaml", "path.tum", "sightings.tum", "odometry.tum", "landmarks.csv", "covariances.csv")
 OF_MAP = ("run.json", "config.yaml", "map.mcap")
 NEEDS = {  # what each command reads of a run
-    ("explain", "RUN"): ("run.json", "config.yaml", *LEDGERS),
-    ("explain", "RUN", "3"): ("run.json", "config.yaml", "graph.g2o", *LEDGERS),
-    ("solve", "RUN", "--without", "3"): ("run.json", "config.yaml", "graph.g2o", "ledger.csv"),
-    ("influence", "RUN", "--count", "1"): ("run.json", "config.yaml", "graph.g2o", "ledger.csv"),
+    ("explain", "RUN"): OF_MAP,
+    ("explain", "RUN", "3"): OF_MAP,
+    ("solve", "RUN", "--without", "3"): OF_MAP,
+    ("influence", "RUN", "--count", "1"): OF_MAP,
     ("evaluate", "RUN", "--truth", "BAG"): SCORED,
     ("plot", "RUN"): SCORED,
     ("replay", "RUN", "--out", "OUT"): ("run.json", "config.yaml", "ingest.mcap"),

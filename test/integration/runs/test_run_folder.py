@@ -242,9 +242,9 @@ def test_a_name_for_the_run_is_that_of_its_recording_and_free(bag, run, tmp_path
 TABLES = ("run.json", "config.yaml", "graph.g2o", "ledger.csv", "ledger_changes.csv", "path.tum", "covariances.csv")
 SCORED = ("sightings.tum", "odometry.tum", "landmarks.csv")
 READERS = {  # and the files of the run that they need
-    ("explain", "RUN"): ("run.json", "config.yaml", "ledger.csv", "ledger_changes.csv"),
-    ("solve", "RUN", "--without", "3"): ("graph.g2o", "config.yaml", "ledger.csv"),
-    ("influence", "RUN", "--count", "1"): ("graph.g2o",),
+    ("explain", "RUN"): ("run.json", "config.yaml", "map.mcap"),
+    ("solve", "RUN", "--without", "3"): ("config.yaml", "map.mcap"),
+    ("influence", "RUN", "--count", "1"): ("map.mcap",),
     ("evaluate", "RUN", "--truth", "BAG"): ("run.json", "config.yaml", "path.tum", "covariances.csv", *SCORED),
     ("plot", "RUN"): ("run.json", "config.yaml", "path.tum", "covariances.csv", *SCORED),
     ("replay", "RUN", "--out", "OUT"): ("config.yaml", "ingest.mcap"),
