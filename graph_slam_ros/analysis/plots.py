@@ -259,8 +259,8 @@ def draw_graph(
         is_point[landmarks] = True
     for axes, values, title in zip(pair, (initial, final), ("initial", "optimised"), strict=True):
         axes.set_title(title, loc="left", fontsize=11, color="#333333")
-        for order, (label, ends) in enumerate(edges.items()):
-            _draw_edges(axes, values[:, :2], np.asarray(ends).reshape(-1, 2), label, order)
+        for label, ends in edges.items():
+            _draw_edges(axes, values[:, :2], np.asarray(ends).reshape(-1, 2), label)
         if is_point.any():
             _draw_stars(axes, values[is_point, :2])
         elif not edges:
@@ -289,7 +289,7 @@ def _with_gaps(truth: Trajectory) -> Trajectory:
     return Trajectory(np.insert(truth.stamps_s, gaps, np.nan), np.insert(truth.poses, gaps, np.nan, axis=0))
 
 
-def _draw_edges(axes: Any, points: Array, ends: Index, label: str, order: int) -> None:
+def _draw_edges(axes: Any, points: Array, ends: Index, label: str) -> None:
     from matplotlib.collections import LineCollection
 
     style = {"odometry": (_ODOMETRY, 1.0, 0.9, 4), "landmarks": (_SIGHTING, 0.4, 0.25, 2)}

@@ -6,7 +6,6 @@ that agrees with the truth is no false closure, and drawn again, as McGann et al
 and mapping (riSAM)", 2023).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,9 +101,6 @@ def disagreement(poses: Array, ends: Index, measured: Array, root: Array) -> Arr
     space = space_of(poses[0])
     residual, _ = space.relative_pose.linearize(poses.ravel(), poses.shape[1] * ends, measured)
     return np.asarray(np.square(np.einsum("...ij,...j->...i", root, residual)).sum(axis=-1))
-
-
-Draw = Callable[[Generator, Array, Array, int], tuple[Index, Array]]
 
 
 def _anywhere(rng: Generator, truth: Array, _root: Array, pairs: int) -> tuple[Index, Array]:
