@@ -270,7 +270,6 @@ REASONS: dict[str, Reason] = {
     "paused": Reason(_NOTED, "it came while the node was paused", "~/resume"),
     "stopped": Reason(_REFUSED, "time jumped back and time.on_jump is stop", "~/reset, or --set time.on_jump=segment"),
     "worker_restarted": Reason(_NOTED, "a job would have ended the solver's thread, which went on", "report it"),
-    "worker_restarted": Reason(_NOTED, "a job would have ended the solver's thread, which went on", "report it"),
     "fault": Reason(
         _NOTED,
         "an exception, counted by its type: of a solve (the last good estimate stands), of a second look, or of a"
