@@ -14,8 +14,8 @@ import numpy as np
 from benchmarks.live.streams import AFTER_NS, BEFORE_NS, CITY_SIGMA_M, CITY_SIGMA_RAD, STEP_NS
 from benchmarks.problem import city_problem
 from graph_slam_ros.lie import se2
-from graph_slam_ros.runs import RunRecorder
 from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import Closure, Config, Control, GraphSlam, Odometry
 from graph_slam_ros.warmup import warmup
 

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from graph_slam_ros.runs import RunRecorder
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import Control, GraphSlam, Sightings
 
 

@@ -28,9 +28,9 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import NEW, AppendedFile
 from graph_slam_ros.measurements.types import from_record
 from graph_slam_ros.node.session import Session
-from graph_slam_ros.runs import RunError, RunRecorder, check_room, earlier_runs, is_run, run_config
-from graph_slam_ros.runs.folder import BEGUN
+from graph_slam_ros.runs.folder import BEGUN, RunError, check_room, earlier_runs, is_run, run_config
 from graph_slam_ros.runs.journal import read_ingest
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Counters, GraphSlam
 from graph_slam_ros.warmup import warmup

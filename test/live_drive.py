@@ -7,7 +7,7 @@ import numpy as np
 from messages import detection, detections, odometry, pose, quaternion
 
 from graph_slam_ros.lie import se2
-from graph_slam_ros.runs import RunRecorder
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import Config, Odometry, Sighting, Sightings
 
 TAGS = {"north": (0.0, 5.0), "east": (5.0, 1.0), "south": (1.0, -4.0), "west": (-4.0, 0.0)}

@@ -12,7 +12,7 @@ from graph_slam_ros.analysis.plots import canvas, dress
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.lie import se3
-from graph_slam_ros.runs import recording_of, run_config
+from graph_slam_ros.runs.folder import recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.trajectory import read_tum

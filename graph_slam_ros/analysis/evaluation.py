@@ -28,7 +28,7 @@ from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import is_empty, read_text
 from graph_slam_ros.lie import se3
-from graph_slam_ros.runs import COVARIANCES, SUMMARY, is_run, run_config, summary_of
+from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, is_run, run_config, summary_of
 from graph_slam_ros.runs.trajectory import Point, Trajectory, read_covariances, read_landmarks, read_tum
 from graph_slam_ros.typing import Array
 

@@ -16,7 +16,7 @@ from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.lie import se3
-from graph_slam_ros.runs import COVARIANCES, recording_of
+from graph_slam_ros.runs.folder import COVARIANCES, recording_of
 from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_tum
 from graph_slam_ros.typing import Array, Index
 

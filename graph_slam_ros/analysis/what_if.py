@@ -13,8 +13,10 @@ import numpy as np
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.graph import Gaussian, Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
-from graph_slam_ros.runs import RunError, numbered, restored
+from graph_slam_ros.runs.folder import RunError
 from graph_slam_ros.runs.ledger_file import Entry, ledger_entries
+from graph_slam_ros.runs.restore import restored
+from graph_slam_ros.runs.tables import numbered
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.solver.linearization import linearized
 from graph_slam_ros.typing import Array
@@ -116,7 +118,7 @@ class SavedGraph:
         graph, settings = self.graph, self.config.solver_settings()
         if let_in:
             graph = graph.copy()
-            edges += [_believed(graph, self.edge(e)) for e in let_in]
+            edges += [_let_in(graph, self.edge(e)) for e in let_in]
             edges = [e for e in edges if e not in set(let_in)]
         if loss is not None:
             settings = replace(settings, losses={label: [loss] for label in settings.losses})
@@ -182,7 +184,7 @@ class SavedGraph:
         return step
 
 
-def _believed(graph: Graph, entry: Entry) -> int:
+def _let_in(graph: Graph, entry: Entry) -> int:
     """Add an edge that is out once more, as one that nothing takes out."""
     table, _ = graph.row(entry.edge)
     noise = Gaussian.from_information(entry.information_matrix)

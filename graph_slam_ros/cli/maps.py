@@ -60,8 +60,8 @@ def merge(args: argparse.Namespace) -> int:
 
 def freeze(args: argparse.Namespace) -> int:
     """Make a map in which to be located, and which nothing changes."""
-    from graph_slam_ros.runs import freeze as frozen
     from graph_slam_ros.runs import outcome
+    from graph_slam_ros.runs.restore import freeze as frozen
 
     summary = frozen(args.run_folder, args.out, force=args.force)
     console.show(

@@ -17,7 +17,7 @@ _NO_MATPLOTLIB = "matplotlib is not installed: pip install matplotlib"
 
 def replay(args: argparse.Namespace) -> int:
     """Run a recording, or an earlier run, through the pipeline, or play it into a live ROS graph."""
-    from graph_slam_ros.runs import is_run
+    from graph_slam_ros.runs.folder import is_run
     from graph_slam_ros.runs.replay import replay as replayed
 
     _refuse_idle_options(args, is_run(args.bag))
@@ -46,7 +46,7 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
         raise GraphSlamError("--ros needs ROS 2 (no rclpy here); without --ros the same replay runs without it")
     bag, code = open_bag(args.bag), console.DONE
     from graph_slam_ros.node.player import config_of, own_node, play
-    from graph_slam_ros.runs import SUMMARY, check_room
+    from graph_slam_ros.runs.folder import SUMMARY, check_room
 
     node_name = args.node or "/graph_slam"
     config = config_of(node_name) if args.out is None else config
@@ -70,8 +70,8 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
 
 def recover(args: argparse.Namespace) -> int:
     """Write the results of a run that was never ended, or before all was processed."""
-    from graph_slam_ros.runs import complete
-    from graph_slam_ros.runs import recover as recovered
+    from graph_slam_ros.runs.restore import complete
+    from graph_slam_ros.runs.restore import recover as recovered
 
     summary = recovered(args.run_folder, args.out, force=args.force) if args.out else complete(args.run_folder)
     code = _print_summary(args.run_folder, summary)
@@ -84,7 +84,7 @@ def info(args: argparse.Namespace) -> int:
     """Say what a recording holds."""
     from graph_slam_ros.cli.info import describe
     from graph_slam_ros.recordings.bag import open_bag
-    from graph_slam_ros.runs import is_run, suggested_out
+    from graph_slam_ros.runs.folder import is_run, suggested_out
 
     if is_run(args.bag):
         console.show(f"an earlier run: {console.command('replay', args.bag, '--out', suggested_out(args.bag))}")
@@ -100,7 +100,7 @@ def evaluate(args: argparse.Namespace) -> int:
     from graph_slam_ros.analysis.evaluation import evaluate as compared
     from graph_slam_ros.analysis.evaluation import input_topics
     from graph_slam_ros.analysis.trajectories import read_truth
-    from graph_slam_ros.runs import changed_since
+    from graph_slam_ros.runs.folder import changed_since
 
     console.check_file(args.plot, force=args.force)
     truth = read_truth(args.truth, args.topic, input_topics(args.run_folder))
@@ -115,7 +115,7 @@ def evaluate(args: argparse.Namespace) -> int:
 def plot(args: argparse.Namespace) -> int:
     """Draw a run."""
     from graph_slam_ros.analysis.plots import draw_run
-    from graph_slam_ros.runs import PICTURE, changed_since
+    from graph_slam_ros.runs.folder import PICTURE, changed_since
 
     if not args.truth and (args.topic or args.no_align):
         raise GraphSlamError("plot: no use for --topic or --no-align without --truth")
@@ -134,7 +134,7 @@ def plot(args: argparse.Namespace) -> int:
 def _animate(args: argparse.Namespace) -> int:
     """Draw the drive as it went on."""
     from graph_slam_ros.analysis.animation import animate_run
-    from graph_slam_ros.runs import changed_since
+    from graph_slam_ros.runs.folder import changed_since
     from graph_slam_ros.warmup import compile_all
 
     if args.truth or args.out:
@@ -149,7 +149,7 @@ def _animate(args: argparse.Namespace) -> int:
 
 def _draw(run: Path, truth: Any = None, out: Path | None = None, *, align: bool = True, quiet: bool = False) -> None:
     """Draw a run besides something else, which does not fail where this cannot be done."""
-    from graph_slam_ros.runs import PICTURE
+    from graph_slam_ros.runs.folder import PICTURE
 
     if not _has_matplotlib():
         return console.warn(f"no picture: {_NO_MATPLOTLIB}")
@@ -210,7 +210,7 @@ def _config(args: argparse.Namespace) -> "Config":
     """Defaults, then the run's own or the given file, then single settings."""
     from graph_slam_ros.config.config import flatten
     from graph_slam_ros.formats.parameters import parse_setting, read_parameters
-    from graph_slam_ros.runs import is_run
+    from graph_slam_ros.runs.folder import is_run
     from graph_slam_ros.slam import Config
 
     run = args.map or (args.bag if is_run(args.bag) else None)

@@ -12,7 +12,7 @@ import numpy as np
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on, positions
-from graph_slam_ros.runs import restored
+from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.typing import Array, Numbers
 

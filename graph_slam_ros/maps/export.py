@@ -11,7 +11,9 @@ from graph_slam_ros.formats.strict import is_gzipped
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.messages import results, to_msg
 from graph_slam_ros.recordings.bag import BagWriter
-from graph_slam_ros.runs import RunError, graph_file, is_run, numbered, restored
+from graph_slam_ros.runs.folder import RunError, is_run
+from graph_slam_ros.runs.restore import restored
+from graph_slam_ros.runs.tables import graph_file, numbered
 from graph_slam_ros.slam import GraphSlam
 
 

@@ -16,8 +16,9 @@ from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.maps.alignment import Alignment, align, positions
 from graph_slam_ros.maps.diff import refuse_other_space, shared_landmarks
-from graph_slam_ros.runs import check_room, record_run, restored_and_solved, stopwatch
+from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
+from graph_slam_ros.runs.restore import record_run, restored_and_solved, stopwatch
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.landmarks.anonymous import NAME, last_number
 from graph_slam_ros.slam.robust.gating import landmark_of

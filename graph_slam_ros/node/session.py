@@ -18,21 +18,19 @@ from graph_slam_ros.measurements.types import InitialPose
 from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.node.resumption import Resumption
 from graph_slam_ros.node.threads import run_in_thread
-from graph_slam_ros.runs import (
+from graph_slam_ros.runs.folder import (
     RunError,
-    RunRecorder,
-    account,
     earlier_runs,
     incomplete_runs,
     is_cut_off,
     is_name_of_earlier,
     is_run,
     keep_earlier,
-    map_of,
     run_config,
-    save_copy,
-    summarize,
 )
+from graph_slam_ros.runs.recorder import RunRecorder
+from graph_slam_ros.runs.restore import map_of, save_copy
+from graph_slam_ros.runs.tables import account, summarize
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.typing import Numbers

@@ -16,23 +16,11 @@ from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.recordings.bag import Bag, BagError, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
-from graph_slam_ros.runs import (
-    RunError,
-    check_room,
-    config_of,
-    is_run,
-    keep_earlier,
-    map_of,
-    missing,
-    record_run,
-    recording_of,
-    run_config,
-    stopwatch,
-)
+from graph_slam_ros.runs.folder import RunError, check_room, is_run, keep_earlier, missing, recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.outcome import doubts
-from graph_slam_ros.runs.restore import Stopwatch
+from graph_slam_ros.runs.restore import Stopwatch, config_of, map_of, record_run, stopwatch
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
 from graph_slam_ros.warmup import warmup

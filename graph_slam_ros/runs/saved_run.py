@@ -10,7 +10,7 @@ import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_text
-from graph_slam_ros.runs import COVARIANCES, SUMMARY, RunError, changed_since, is_run, run_config
+from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, RunError, changed_since, is_run, run_config
 from graph_slam_ros.runs.ledger_file import Entry, read_ledger
 from graph_slam_ros.runs.trajectory import Trajectory, read_covariances, read_landmarks, read_tum
 from graph_slam_ros.slam import Config

@@ -12,7 +12,7 @@ from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs import CONVERTERS
 from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents
-from graph_slam_ros.runs import suggested_out
+from graph_slam_ros.runs.folder import suggested_out
 from graph_slam_ros.runs.replay import TF_TOPIC, choose_inputs
 from graph_slam_ros.slam import Config
 

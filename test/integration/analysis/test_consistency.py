@@ -12,7 +12,7 @@ from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.runs import RunRecorder
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.trajectory import Trajectory, read_covariances
 from graph_slam_ros.simulation import measurements, simulate, write_bag

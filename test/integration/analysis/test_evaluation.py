@@ -13,8 +13,8 @@ from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.messages.to_msg import encode, header, heading, make, point, pose, pose_stamped, vector
 from graph_slam_ros.recordings.bag import BagWriter
-from graph_slam_ros.runs import map_of, record_run
 from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.runs.trajectory import Trajectory, read_tum
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control

@@ -10,8 +10,8 @@ from graph_slam_ros import cli
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Loss
-from graph_slam_ros.runs import RunRecorder
 from graph_slam_ros.runs.ledger_file import read_ledger
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 
 

@@ -13,8 +13,10 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.maps.alignment import laid_on
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import open_bag
-from graph_slam_ros.runs import RunRecorder, map_of, restored, run_config
+from graph_slam_ros.runs.folder import run_config
 from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.recorder import RunRecorder
+from graph_slam_ros.runs.restore import map_of, restored
 from graph_slam_ros.simulation import measurements, simulate, with_closures
 from graph_slam_ros.slam import Config, Control, GraphSlam, Sightings
 

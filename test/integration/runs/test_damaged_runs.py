@@ -11,7 +11,7 @@ import pytest
 from graph_slam_ros import cli, load_run
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.runs import GRAPH, SUMMARY
+from graph_slam_ros.runs.folder import GRAPH, SUMMARY
 from graph_slam_ros.runs.ledger_file import LEDGER, read_ledger
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config

@@ -10,10 +10,12 @@ from places import ROOT
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.runs import RunError, RunRecorder, is_cut_off, keep_earlier, map_of, run_config
+from graph_slam_ros.runs.folder import RunError, is_cut_off, keep_earlier, run_config
 from graph_slam_ros.runs.journal import RecordWriter, read_records
 from graph_slam_ros.runs.map_journal import MAP, MapGrowth, read_map, state_of
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.runs.restore import map_of
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 

@@ -18,8 +18,8 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import AppendedFile, replaced, write_whole
 from graph_slam_ros.formats.files import opened, read_text
 from graph_slam_ros.recordings.bag import BagWriter
-from graph_slam_ros.runs import RunError, RunRecorder, check_room, is_run, keep_earlier, suggested_out
-from graph_slam_ros.runs.folder import MARK, remove
+from graph_slam_ros.runs.folder import MARK, RunError, check_room, is_run, keep_earlier, remove, suggested_out
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config, Odometry

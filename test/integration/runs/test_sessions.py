@@ -14,10 +14,12 @@ from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.measurements.types import Fix, Odometry
 from graph_slam_ros.node.session import Session
-from graph_slam_ros.runs import RunError, RunRecorder, changed_since, complete, is_cut_off, is_run, recover, run_config
+from graph_slam_ros.runs.folder import RunError, changed_since, is_cut_off, is_run, run_config
 from graph_slam_ros.runs.journal import RecordWriter, read_ingest
 from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.runs.restore import complete, recover
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, Counters
 from graph_slam_ros.slam.backend import Backend

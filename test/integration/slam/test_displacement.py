@@ -8,7 +8,7 @@ from reliability import times
 
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import InitialPose
-from graph_slam_ros.runs import map_of, record_run
+from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict

@@ -27,7 +27,8 @@ from graph_slam_ros.graph import (
 )
 from graph_slam_ros.lie import se2, so3
 from graph_slam_ros.measurements.types import Closure
-from graph_slam_ros.runs import RunRecorder, map_of
+from graph_slam_ros.runs.recorder import RunRecorder
+from graph_slam_ros.runs.restore import map_of
 from graph_slam_ros.slam import Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.solver import Settings, Solver

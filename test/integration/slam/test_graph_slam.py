@@ -13,8 +13,8 @@ from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import LANDMARK_POSITION, RELATIVE_POSE, SE2, TAG_POSITION
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import from_record, to_record
-from graph_slam_ros.runs import summarize
 from graph_slam_ros.runs.outcome import shortcomings
+from graph_slam_ros.runs.tables import summarize
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, Fix, GraphSlam, Odometry, Sighting, Sightings
 

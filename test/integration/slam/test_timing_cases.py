@@ -24,7 +24,8 @@ from messages import (
 from reliability import tell, times
 
 from graph_slam_ros.graph import RELATIVE_POSE
-from graph_slam_ros.runs import RunRecorder, summarize
+from graph_slam_ros.runs.recorder import RunRecorder
+from graph_slam_ros.runs.tables import summarize
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.frontend.time_jump import TimeJumpDetector

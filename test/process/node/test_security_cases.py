@@ -26,7 +26,7 @@ from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.formats.parameters import _StrictLoader
 from graph_slam_ros.messages.topics import PUBLICATIONS, SERVICES, SUBSCRIPTIONS, Interface
 from graph_slam_ros.node.session import Session
-from graph_slam_ros.runs import changed_since
+from graph_slam_ros.runs.folder import changed_since
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config, Counters, Odometry

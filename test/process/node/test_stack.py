@@ -20,7 +20,7 @@ from reliability import times
 from tf2_msgs.msg import TFMessage
 
 from graph_slam_ros.messages.interfaces import typestore
-from graph_slam_ros.runs import is_run
+from graph_slam_ros.runs.folder import is_run
 
 NS = 10**9
 STATES = ("path", "pose", "landmarks", "landmarks_estimate", "graph", "path_updates")

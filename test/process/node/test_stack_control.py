@@ -23,9 +23,10 @@ from vision_msgs.msg import Detection3DArray
 from graph_slam_ros.config.config import parameters
 from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.measurements.types import from_record
-from graph_slam_ros.runs import check_room, freeze, is_cut_off
+from graph_slam_ros.runs.folder import check_room, is_cut_off
 from graph_slam_ros.runs.journal import read_ingest
 from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.restore import freeze
 from graph_slam_ros.slam import Control
 
 SERVICES = "save", "load", "reset", "pause", "resume", "optimize", "clear_closures"

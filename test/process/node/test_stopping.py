@@ -8,7 +8,7 @@ import pytest
 from live_drive import Drive, distance
 from live_nodes import ENVIRONMENT, graph_slam, lenient, node, own_domain, robot, until
 
-from graph_slam_ros.runs import is_cut_off, is_incomplete
+from graph_slam_ros.runs.folder import is_cut_off, is_incomplete
 from graph_slam_ros.runs.journal import read_ingest
 
 

@@ -27,9 +27,9 @@ from graph_slam_ros.formats.durable import AppendedFile
 from graph_slam_ros.measurements.types import to_record
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.recordings.mcap_records import MAGIC
-from graph_slam_ros.runs import RunError, RunRecorder
-from graph_slam_ros.runs.folder import BEGUN
+from graph_slam_ros.runs.folder import BEGUN, RunError
 from graph_slam_ros.runs.journal import RecordWriter, part_name, read_ingest
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Odometry
 

@@ -19,8 +19,9 @@ from graph_slam_ros.measurements.types import from_record, to_record
 from graph_slam_ros.messages import results
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
-from graph_slam_ros.runs import RunError, RunRecorder, earlier_runs, is_run, keep_earlier, run_config
+from graph_slam_ros.runs.folder import RunError, earlier_runs, is_run, keep_earlier, run_config
 from graph_slam_ros.runs.journal import RecordWriter, parts_of, read_ingest
+from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.simulation import measurements, simulate, write_bag

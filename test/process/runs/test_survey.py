@@ -11,7 +11,7 @@ from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
 from graph_slam_ros.graph import POINT_PRIOR, POSITION_PRIOR, R2, R3, SE2
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.messages.survey import with_survey
-from graph_slam_ros.runs import run_config
+from graph_slam_ros.runs.folder import run_config
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
