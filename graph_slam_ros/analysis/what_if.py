@@ -118,7 +118,7 @@ class SavedGraph:
         graph, settings = self.graph, self.config.solver_settings()
         if let_in:
             graph = graph.copy()
-            edges += [_let_in(graph, self.edge(e)) for e in let_in]
+            edges += [_accepted(graph, self.edge(e)) for e in let_in]
             edges = [e for e in edges if e not in set(let_in)]
         if loss is not None:
             settings = replace(settings, losses={label: [loss] for label in settings.losses})
@@ -184,7 +184,7 @@ class SavedGraph:
         return step
 
 
-def _let_in(graph: Graph, entry: Entry) -> int:
+def _accepted(graph: Graph, entry: Entry) -> int:
     """Add an edge that is out once more, as one that nothing takes out."""
     table, _ = graph.row(entry.edge)
     noise = Gaussian.from_information(entry.information_matrix)
