@@ -1,26 +1,26 @@
 """Faults while one measurement is processed: each part is used by itself, and every fault counts."""
 
-from collections.abc import Callable
-from typing import ParamSpec
+from types import TracebackType
 
 from graph_slam_ros.measurements.counters import Counters
 
-P = ParamSpec("P")
-
 
 class Faults:
-    """Collects faults, so that one of them costs nothing but its own measurement, step or sighting."""
+    """Context that collects what is raised in it: one fault costs its own measurement, step or sighting only."""
 
     def __init__(self, counters: Counters) -> None:
         self._counters = counters
         self._faults: list[Exception] = []
 
-    def collect(self, use: Callable[P, None], *args: P.args, **kwargs: P.kwargs) -> None:
-        """Call a function; what it raises is kept."""
-        try:
-            use(*args, **kwargs)
-        except Exception as fault:
+    def __enter__(self) -> None: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, traceback: TracebackType | None
+    ) -> bool:
+        if isinstance(fault, Exception):
             self._faults.append(fault)
+            return True
+        return False
 
     def raise_first(self) -> None:
         """Raise the first fault, which the caller counts; the others are counted here."""

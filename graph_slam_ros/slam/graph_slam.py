@@ -57,7 +57,6 @@ class GraphSlam(MapView):
 
     Attributes
     ----------
-    config : the present parameters
     counters : all that is refused, repaired or used
     settings : parameters that were changed on the way
     processed : measurements and control events that were handed over
@@ -104,7 +103,8 @@ class GraphSlam(MapView):
             self._sink(measurement)
         self.processed += 1
         self._updates.begin()
-        self._faults.collect(self._process, measurement)
+        with self._faults:
+            self._process(measurement)
         self._faults.raise_first()
         return self._updates.update()
 
@@ -114,20 +114,22 @@ class GraphSlam(MapView):
         elif isinstance(m, InitialPose):
             self._frontend.initial_pose = m
         elif self._frontend.accepts(m):
-            self._use(self._frontend.alignment.push(m))
+            self._use(self._frontend.order.push(m))
 
     def _use(self, released: Iterable[Odometry | Observation]) -> None:
         for m in released:
-            if isinstance(m, Odometry):
-                self._faults.collect(self._on_odometry, m)
-            else:
-                self._faults.collect(self._on_observation, m)
+            with self._faults:
+                if isinstance(m, Odometry):
+                    self._on_odometry(m)
+                else:
+                    self._on_observation(m)
 
     # -- odometry becomes keyframes ------------------------------------------------------------------------------
 
     def _on_odometry(self, m: Odometry) -> None:
         for step in self._frontend.odometry.steps(m):
-            self._faults.collect(self._on_step, step)
+            with self._faults:
+                self._on_step(step)
 
     def _on_step(self, step: Step) -> None:
         """Integrate odometry, use the observations that it reaches, and add a keyframe where one is due."""
@@ -149,14 +151,15 @@ class GraphSlam(MapView):
             self._solve_if_due()
 
     def _use_reached(self, until_ns: int) -> None:
-        for m in self._frontend.alignment.reached(until_ns):
-            self._faults.collect(self._on_observation, m)
+        for m in self._frontend.pending.reached(until_ns):
+            with self._faults:
+                self._on_observation(m)
 
     # -- observations become edges -------------------------------------------------------------------------------
 
     def _on_observation(self, m: Observation) -> None:
         """Pass an observation through the gates, and add what it measured from the keyframe before it."""
-        admitted = self._frontend.gates.admit(m) if self._frontend.alignment.is_reached(m) else None
+        admitted = self._frontend.gates.admit(m) if self._frontend.pending.is_reached(m) else None
         if admitted is None:
             return
         where = self._frontend.where(admitted)
@@ -173,7 +176,8 @@ class GraphSlam(MapView):
         self._solution.resting += self._frontend.path.rests
         self.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
         for name, sighting in self._landmarks.identified(m, where):
-            self._faults.collect(self._add_sighting, m.topic, name, sighting, where)
+            with self._faults:
+                self._add_sighting(m.topic, name, sighting, where)
 
     def _add_sighting(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
         """Add a sighting of a landmark; the first of a surveyed landmark tells where the map lies."""
@@ -228,13 +232,13 @@ class GraphSlam(MapView):
     # -- control events ------------------------------------------------------------------------------------------
 
     def _on_event(self, event: Event, values: dict[str, Value]) -> None:
-        alignment = self._frontend.alignment
+        order, pending = self._frontend.order, self._frontend.pending
         match event:
             case "flush":
-                self._use(alignment.flush())
+                self._use(order.flush())
             case "end" | "time_jump":
-                self._use(alignment.flush())
-                alignment.drop_pending()
+                self._use(order.flush())
+                pending.drop()
                 if event == "time_jump":
                     self._frontend.forget_time()
             case "optimize":
@@ -269,10 +273,7 @@ class GraphSlam(MapView):
     # -- a map that is held or loaded ----------------------------------------------------------------------------
 
     def _hold_map(self, is_held: bool) -> None:
-        """Begin or end localization: the map of now stays where it is, and nothing is added to it but the drive.
-
-        How uncertain the robot's pose is when it begins is kept as noise of the next odometry edge.
-        """
+        """Begin or end localization: the map of now stays, and the pose's covariance adds to the next odometry edge."""
         if is_held:
             self._solve(self.config.solver_settings())
             self._frontend.held_covariance = self.pose_covariance if self.keyframes else None

@@ -4,7 +4,9 @@ from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar
 
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import Fix, Observation
+from graph_slam_ros.measurements.types import Closure, Fix, Observation
+from graph_slam_ros.slam.frontend.keyframes import KeyframeList
+from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector
 
 
 class Arrival(Protocol):
@@ -73,4 +75,19 @@ class DatumGate:
             self.datum = self.datum or m.datum
             if m.datum and m.datum != self.datum:
                 return None
+        return m
+
+
+class ClosureStart:
+    """Refuses a loop closure whose earlier stamp lies before or after all odometry."""
+
+    reason = "from_where_there_was_no_odometry"
+
+    def __init__(self, path: KeyframeList, odometry: OdometrySelector) -> None:
+        self._path, self._odometry = path, odometry
+
+    def admit(self, m: Observation) -> Observation | None:
+        """The observation, unless it is such a closure."""
+        if isinstance(m, Closure) and not self._path.oldest_ns <= m.from_stamp_ns <= (self._odometry.newest_ns or 0):
+            return None
         return m

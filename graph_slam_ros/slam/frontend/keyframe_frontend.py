@@ -8,9 +8,10 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.edge_noise import edge_noise
 from graph_slam_ros.measurements.types import Closure, InitialPose, Observation, Odometry
 from graph_slam_ros.slam.frontend import motion_compensation
-from graph_slam_ros.slam.frontend.gates import DatumGate, GateChain
+from graph_slam_ros.slam.frontend.gates import ClosureStart, DatumGate, GateChain
 from graph_slam_ros.slam.frontend.ingest_gate import size_of
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList, SightingPose
 from graph_slam_ros.slam.frontend.max_distance import MaxDistance
@@ -18,9 +19,9 @@ from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector, Step
 from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
+from graph_slam_ros.slam.frontend.stamp_order import PendingObservations, StampOrder
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.frontend.thinning import ObservationThinning
-from graph_slam_ros.slam.frontend.time_alignment import ClosureStart, TimeAlignment
 from graph_slam_ros.typing import Array, Numbers
 
 _UNCERTAIN, _MAX_UNCERTAIN_M = 10.0, 1e5  # times as far as a given pose is away: so little odometry is trusted there
@@ -42,9 +43,10 @@ class KeyframeFrontend:
     path : the keyframes
     sighting_poses : where the robot observed landmarks
     datum : where on earth the map begins
-    alignment : brings measurements into the order of their stamps
+    order : brings measurements into the order of their stamps
+    pending : observations that odometry has not reached
     gates : what an observation passes before it is used
-    edges : adds edges between poses
+    edges : adds fixes, loop closures and poses that are given
     covariance : (dof, dof) of the newest keyframe's pose, by the last solve and the odometry since
     initial_pose : the pose that is given for the next odometry
     held_covariance : (dof, dof) of the newest pose when the map was held, for the next odometry
@@ -59,11 +61,13 @@ class KeyframeFrontend:
         datum: tuple[float, ...] = (),
     ) -> None:
         self.config, self._space, self._graph, self._pose_of = config, config.space, graph, pose_of
+        self._counters = counters
         self._noise = OdometryNoise(config.odometry, self._space)
         self.odometry = OdometrySelector(config.odometry, config.inputs.names.split(), self._space, counters)
         self.path = KeyframeList(self._noise, self._space)
         self.sighting_poses = StampedPoses(SightingPose, self._space.pose.size)
-        self.alignment = TimeAlignment(config.ordering, self.path, self.odometry, counters)
+        self.order = StampOrder(config.ordering, counters)
+        self.pending = PendingObservations(config.ordering, self.path, self.odometry, counters)
         self.datum = DatumGate(datum)
         self._arrivals = GateChain[Observation]((self.datum,), size_of, counters)
         self._thinning = ObservationThinning(config, self.path)
@@ -106,14 +110,14 @@ class KeyframeFrontend:
 
     def forget_time(self) -> None:
         """Stamps begin anew, the map stays: the next odometry begins a segment."""
-        self.alignment.forget()
+        self.order.forget()
         self.odometry.forget()
         self.path.forget_time()
         self._thinning.forget_time()
 
     def accepts(self, m: Odometry | Observation) -> bool:
         """Return whether a measurement may be used when its turn comes; else it is counted."""
-        return self.alignment.accepts(m) and (isinstance(m, Odometry) or self._arrivals.admit(m) is not None)
+        return self.order.accepts(m) and (isinstance(m, Odometry) or self._arrivals.admit(m) is not None)
 
     # -- the motion since the last keyframe ------------------------------------------------------------------------
 
@@ -202,7 +206,9 @@ class KeyframeFrontend:
         """A vertex where odometry is now, or where it is said to be, and the motion to it from the last as an edge."""
         group, last = self._space.group, self.path.keyframes[-1].vertex
         vertex = self._graph.add_vertex(self._space.pose, at or group.compose(self._pose_of(last), T_last_now))
-        self.edges.odometry([last, vertex], T_last_now, covariance, self.source)
+        noise = edge_noise(self._counters, "odometry", covariance, self._space.dimensions)
+        relative_pose = self._space.relative_pose
+        self._graph.add_edge(relative_pose, [last, vertex], T_last_now, noise, "odometry", self.source)
         self.covariance = group.propagate(self.covariance, T_last_now, covariance)
         self.path.append(vertex, step, self.config.ordering.late_s)
 

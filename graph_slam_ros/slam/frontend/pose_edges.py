@@ -1,4 +1,4 @@
-"""Edges between poses of the graph: odometry, fixes and loop closures."""
+"""Edges of poses of the graph: fixes, loop closures and poses that are given."""
 
 import numpy as np
 
@@ -17,11 +17,6 @@ class PoseEdges:
 
     def __init__(self, space: Geometry, graph: Graph, counters: Counters) -> None:
         self._space, self._graph, self._counters = space, graph, counters
-
-    def odometry(self, vertices: list[int], T_last_now: Numbers, covariance: Array, source: str) -> None:
-        """The motion from one keyframe to the next."""
-        noise = self._noise("odometry", covariance)
-        self._graph.add_edge(self._space.relative_pose, vertices, T_last_now, noise, "odometry", source)
 
     def initial_pose(self, vertex: int, pose: InitialPose) -> None:
         """Add a prior for a pose that somebody gives."""

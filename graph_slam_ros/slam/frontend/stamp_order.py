@@ -1,22 +1,20 @@
 """Measurements arrive nearly in order of stamp; they are used exactly in order of stamp.
 
 Odometry is the clock: what is ``window_s`` of stamp time older than the newest odometry is released. A landmark message
-may come early (it waits for the odometry around it) or late within the window. No wall clock is read.
+may come early (it is pending until odometry has reached its stamp) or late within the window. No wall clock is read.
 """
 
 import heapq
 
 from graph_slam_ros.config.frontend import OrderingConfig
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import Observation, Odometry, Sightings
+from graph_slam_ros.measurements.types import Observation, Odometry
+from graph_slam_ros.slam.frontend.ingest_gate import size_of
+from graph_slam_ros.slam.frontend.keyframes import KeyframeList
+from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector
 
 NS = 1_000_000_000
 _REMEMBERED = 100  # messages of each topic, by which one that comes again is known
-
-
-def _things(m: Observation) -> int:
-    """Each sighting counts."""
-    return len(m.sightings) if isinstance(m, Sightings) else 1
 
 
 class StampOrder:
@@ -40,7 +38,7 @@ class StampOrder:
         if not isinstance(m, Odometry):
             reason = "duplicate" if self._is_repeated(m) else "" if self._has_room(m.stamp_ns) else "overflow"
             if reason:
-                self._counters.count(m.topic, reason, _things(m))
+                self._counters.count(m.topic, reason, size_of(m))
             return not reason
         if self._released_ns is not None and m.stamp_ns < self._released_ns:
             self._counters.count(m.source, "late")
@@ -62,7 +60,7 @@ class StampOrder:
         self._heap[latest] = self._heap[-1]
         self._heap.pop()
         heapq.heapify(self._heap)
-        self._counters.count(m.topic, "overflow", _things(m))
+        self._counters.count(m.topic, "overflow", size_of(m))
         return True
 
     def _is_repeated(self, m: Observation) -> bool:
@@ -104,3 +102,51 @@ class StampOrder:
                 self._released_ns = max(self._released_ns or 0, min(stamp_ns, self._newest_odometry_ns))
             out.append(m)
         return out
+
+
+class PendingObservations:
+    """Observations that are newer than all odometry: each is pending until odometry has reached its stamp.
+
+    Parameters
+    ----------
+    path : tells how far back odometry is remembered
+    odometry : tells how far odometry has come
+    """
+
+    def __init__(
+        self, config: OrderingConfig, path: KeyframeList, odometry: OdometrySelector, counters: Counters
+    ) -> None:
+        self._path, self._odometry, self._counters = path, odometry, counters
+        self._max_pending = config.max_waiting
+        self._pending: list[Observation] = []
+
+    def is_reached(self, m: Observation) -> bool:
+        """Return whether odometry surrounds an observation; else it waits for the next, or is counted."""
+        newest_ns, reason = self._odometry.newest_ns, ""
+        if newest_ns is None or m.stamp_ns < self._path.oldest_ns:
+            reason = "before_odometry"
+        elif m.stamp_ns < self._path.remembered_ns:
+            reason = "late"
+        elif m.stamp_ns <= newest_ns:
+            return True
+        elif len(self._pending) >= self._max_pending:
+            reason = "overflow"
+        if reason:
+            self._counters.count(m.topic, reason, size_of(m))
+        else:
+            self._pending.append(m)
+        return False
+
+    def reached(self, until_ns: int) -> list[Observation]:
+        """The observations that waited for odometry to come so far."""
+        if not self._pending:
+            return []
+        reached = [m for m in self._pending if m.stamp_ns <= until_ns]
+        self._pending = [m for m in self._pending if m.stamp_ns > until_ns]
+        return reached
+
+    def drop(self) -> None:
+        """No odometry comes any more for those that wait."""
+        for m in self._pending:
+            self._counters.count(m.topic, "after_odometry", size_of(m))
+        self._pending.clear()

@@ -119,7 +119,8 @@ def seen_at(*distances, kind="range"):
 
 
 def refused(reach, *distances, **options):
-    return reach.split(seen_at(*distances, **options))[1]
+    within = reach.admit(seen_at(*distances, **options))
+    return len(distances) - (len(within.sightings) if within else 0)
 
 
 def test_the_first_of_a_long_range_sensor_are_used_and_so_is_what_is_a_little_farther():
@@ -145,8 +146,8 @@ def test_a_given_limit_is_kept_to_the_letter_and_a_bearing_has_none():
     reach = MaxDistance(PLANAR, Config.from_mapping({f"{SOURCE}.max_distance_m": 5.0}).sources)
     assert refused(reach, 5.0, 5.1, 4.0, kind="position") == 1
     bearing = Sightings(S, SOURCE, (Sighting("a", "bearing", (1.0,), (0.01,)),))
-    assert reach.split(bearing) == (bearing, 0)
-    assert reach.split(seen_at(6.0)) == (None, 1)
+    assert reach.admit(bearing) == bearing
+    assert reach.admit(seen_at(6.0)) is None
 
 
 def test_a_closure_farther_than_any_is_refused_and_counted():

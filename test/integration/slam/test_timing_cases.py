@@ -28,7 +28,7 @@ from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.runs.tables import summarize
 from graph_slam_ros.simulation import measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-from graph_slam_ros.slam.frontend.time_jump import TimeJumpDetector
+from graph_slam_ros.slam.frontend.ingest_gate import TimeJumpDetector
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
