@@ -123,7 +123,7 @@ class SavedGraph:
         if loss is not None:
             settings = replace(settings, losses={label: [loss] for label in settings.losses})
         solver = Solver(graph, settings)
-        vertices = np.unique([*self.keyframes, *(v for e in edges for v in _ends(graph, e))])
+        vertices = np.unique([*self.keyframes, *(v for e in edges for v in graph.edge(e).vertices)])
         solver.add(vertices, edges)
         for vertex in np.intersect1d(vertices, self._held).tolist():
             solver.hold(vertex)
@@ -186,12 +186,5 @@ class SavedGraph:
 
 def _accepted(graph: Graph, entry: Entry) -> int:
     """Add an edge that is out once more, as one that nothing takes out."""
-    table, _ = graph.row(entry.edge)
     noise = Gaussian.from_information(entry.information_matrix)
-    return graph.add_edge(table.type, entry.vertices, entry.measured, noise, _ACCEPTED)
-
-
-def _ends(graph: Graph, edge: int) -> list[int]:
-    table, row = graph.row(edge)
-    ends: list[int] = table.vertices.values[row].tolist()
-    return ends
+    return graph.add_edge(graph.edge(entry.edge).type, entry.vertices, entry.measured, noise, _ACCEPTED)

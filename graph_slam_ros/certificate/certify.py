@@ -163,7 +163,8 @@ def _anchors(solution: Solution) -> list[int]:
     out = sorted(set(solution.file.fixed))
     for edge in _ANCHORS:
         if edge in tables:
-            out += tables[edge].vertices.values[tables[edge].weight.values != 0.0, 0].tolist()
+            weighted = np.flatnonzero(tables[edge].weight.values)
+            out += tables[edge].at(weighted).vertices[:, 0].tolist()
     return out
 
 
@@ -208,7 +209,8 @@ def _distances(a: Array, b: Array) -> Array:
 def _sigmas(graph: Graph, estimate: Array, here: Poses, there: Poses, root: int) -> float:
     """The largest of ``sqrt(e' Sigma^-1 e)`` of all poses, Sigma being what the root's place leaves open of each."""
     solver = Solver(graph)
-    edges = [table.id.values[table.weight.values != 0.0] for kind, table in graph.tables.items() if kind in RELATIVE]
+    tables = [table for kind, table in graph.tables.items() if kind in RELATIVE]
+    edges = [table.at(np.flatnonzero(table.weight.values)).ids for table in tables]
     others = np.delete(np.arange(graph.vertex_count), root)
     try:
         solver.add(np.arange(graph.vertex_count), np.sort(np.concatenate(edges)))

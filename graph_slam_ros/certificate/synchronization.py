@@ -42,9 +42,10 @@ class Edges:
             rows = np.flatnonzero(table.weight.values)
             if not len(rows):
                 continue
-            root = table.sqrt_information.values[rows]
-            information = (np.swapaxes(root, 1, 2) @ root) * table.weight.values[rows, None, None]
-            parts.append((table.vertices.values[rows], table.measured.values[rows], information))
+            some = table.at(rows)
+            root = some.sqrt_information
+            information = (np.swapaxes(root, 1, 2) @ root) * some.weight[:, None, None]
+            parts.append((some.vertices, some.measured, information))
         if not parts:
             return cls(np.empty((0, 2), dtype=np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
         return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))

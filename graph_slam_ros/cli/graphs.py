@@ -258,6 +258,8 @@ def _plot_graph(out: Path, graph: "Graph", initial: Any, final: Any) -> None:
     for table in graph.tables.values():
         if len(table.type.accepts) == 2:
             for code, label in enumerate(graph.labels):
-                edges.setdefault(label, []).extend(table.vertices.values[table.label.values == code].tolist())
+                edges.setdefault(label, []).extend(
+                    table.at(np.flatnonzero(table.label.values == code)).vertices.tolist()
+                )
     points: Any = np.flatnonzero([graph.kind_of(v).name[0] == "R" for v in range(graph.vertex_count)])
     draw_graph(out, initial, final, {k: np.array(v) for k, v in edges.items() if v}, points if len(points) else None)

@@ -92,21 +92,22 @@ def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
         if edge_type not in tag_of_edge:
             raise FormatError(f"g2o has no tag for an edge {edge_type.name}")
         root, measured = table.sqrt_information.values, table.measured.values
-        numbers = [file.seen_from.get(edge, 0) for edge in table.id.values.tolist()]
+        ids, labels, ends = (column.values.tolist() for column in (table.id, table.label, table.vertices))
+        numbers = [file.seen_from.get(edge, 0) for edge in ids]
         if edge_type is LANDMARK_POSITION_3D:
             back = [se3.inverse(file.offsets.get(number, se3.IDENTITY)) for number in numbers]
             measured, noise = moved(measured, root, back)
             root = noise.sqrt_information
         upper = np.triu_indices(edge_type.residual_size)
-        full = np.swapaxes(root, 1, 2) @ root * table.weight.values[:, None, None]
+        full = np.swapaxes(root, 1, 2) @ root * np.reshape(table.weight.values, (-1, 1, 1))
         if edge_type in HALVED and not file.raw:
             full /= np.outer(HALVED[edge_type], HALVED[edge_type])
         information = full[:, upper[0], upper[1]]
         for row in np.flatnonzero(table.weight.values != 0.0).tolist():
-            words = [tag_of_edge[edge_type], *(str(file.ids[v]) for v in table.vertices.values[row].tolist())]
+            words = [tag_of_edge[edge_type], *(str(file.ids[v]) for v in ends[row])]
             words += [str(numbers[row])] * (words[0] in AT_OFFSET)
             words.append(_text([*_short(edge_type, measured[row].tolist()), *information[row].tolist()]))
-            yield int(table.label.values[row]), int(table.id.values[row]), " ".join(words)
+            yield labels[row], ids[row], " ".join(words)
 
 
 def _short(edge: EdgeType, measured: list[float]) -> list[float]:

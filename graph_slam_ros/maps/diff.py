@@ -236,10 +236,10 @@ def _by_meaning(slam: GraphSlam) -> dict[Any, list[int]]:
     tags = {edge_type: tag for tag, edge_type in EDGE_TAGS.items()}
     out: dict[Any, list[int]] = defaultdict(list)
     for edge in range(slam.graph.edge_count):
-        table, row = slam.graph.row(edge)
-        ends = tuple(names.get(vertex) for vertex in table.vertices.values[row].tolist())
-        measured = tuple(round(x, _DIGITS) + 0.0 for x in table.measured.values[row].tolist())
-        out[tags[table.type], slam.graph.label_of(edge), ends, measured].append(edge)
+        one = slam.graph.edge(edge)
+        ends = tuple(names.get(vertex) for vertex in one.vertices)
+        measured = tuple(round(x, _DIGITS) + 0.0 for x in one.measured.tolist())
+        out[tags[one.type], one.label, ends, measured].append(edge)
     return out
 
 
@@ -251,7 +251,7 @@ def _names(slam: GraphSlam) -> dict[int, int | str]:
 
 def _about(slam: GraphSlam, names: dict[int, int | str], edge: int) -> str:
     """The edge's class, and the landmark it is about or the stamp that it is of."""
-    table, row = slam.graph.row(edge)
-    name = names.get(int(table.vertices.values[row, -1]), "")
+    one = slam.graph.edge(edge)
+    name = names.get(one.vertices[-1], "")
     what = f"{name / 1e9:.3f} s" if isinstance(name, int) else name
-    return f"{slam.graph.label_of(edge)} {what}"
+    return f"{one.label} {what}"

@@ -7,11 +7,11 @@ import numpy as np
 
 from graph_slam_ros.graph import POINT_PRIOR, R2, R3, SE2, SE3, EdgeType
 from graph_slam_ros.graph.geometry import Geometry
-from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.graph.tables import EdgeRows
 from graph_slam_ros.messages.markers import Lines
 from graph_slam_ros.messages.path_thinning import thinned, worst_and_some
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array
 
 Ends = tuple[Array, Array]
 
@@ -53,12 +53,13 @@ def graph_view(slam: GraphSlam, most: int) -> GraphView:
     lines: dict[str, list[Lines]] = {label: [] for label in (*graph.labels, "")}
     for table, ends in drawn.items():
         rows = np.flatnonzero(shown[table.id.values])
-        start, end = ends(slam, at, table, rows)
-        label = np.where(table.weight.values[rows] == 0.0, len(graph.labels), table.label.values[rows])
+        some = table.at(rows)
+        start, end = ends(slam, at, some)
+        label = np.where(some.weight == 0.0, len(graph.labels), some.label)
         for code, name in enumerate(lines):
             of = label == code
             if of.any():
-                lines[name].append(Lines(start[of], end[of], misfit[table.id.values[rows[of]]]))
+                lines[name].append(Lines(start[of], end[of], misfit[some.ids[of]]))
     joined = {name: _joined(parts) for name, parts in lines.items()}
     keyframes = slam.keyframes.ids[thinned(len(slam.keyframes), most)]
     landmarks = np.array([mark.vertex for mark in slam.landmarks.values()], dtype=np.int64)
@@ -89,7 +90,7 @@ def _positions(slam: GraphSlam) -> Array:
 # -- the ends of the lines of some rows of a table ---------------------------------------------------------------------
 
 
-def _drawn(space: Geometry, kind: EdgeType) -> Callable[[GraphSlam, Array, EdgeTable, Index], Ends] | None:
+def _drawn(space: Geometry, kind: EdgeType) -> Callable[[GraphSlam, Array, EdgeRows], Ends] | None:
     if len(kind.accepts) > 1:
         return _between if all(slot[0] in _COORDINATES for slot in kind.accepts[:2]) else None
     return {
@@ -100,33 +101,33 @@ def _drawn(space: Geometry, kind: EdgeType) -> Callable[[GraphSlam, Array, EdgeT
     }.get(kind)
 
 
-def _between(slam: GraphSlam, at: Array, table: EdgeTable, rows: Index) -> Ends:
-    ends = table.vertices.values[rows]
+def _between(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
+    ends = some.vertices
     return at[ends[:, 0]], at[ends[:, 1]]
 
 
-def _of_place(slam: GraphSlam, at: Array, table: EdgeTable, rows: Index) -> Ends:
+def _of_place(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
     n = slam.space.dimensions
-    return _in_space(table.measured.values[rows, :n]), at[table.vertices.values[rows, 0]]
+    return _in_space(some.measured[:, :n]), at[some.vertices[:, 0]]
 
 
-def _of_antenna(slam: GraphSlam, at: Array, table: EdgeTable, rows: Index) -> Ends:
+def _of_antenna(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
     n = slam.space.dimensions
-    return _in_space(table.measured.values[rows, :n]), _in_space(_antenna(slam, table, rows))
+    return _in_space(some.measured[:, :n]), _in_space(_antenna(slam, some))
 
 
-def _of_coordinate(slam: GraphSlam, at: Array, table: EdgeTable, rows: Index) -> Ends:
+def _of_coordinate(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
     """A line from the nearest point that has the coordinate that was measured."""
-    n, measured, antenna = slam.space.dimensions, table.measured.values[rows], _antenna(slam, table, rows)
+    n, measured, antenna = slam.space.dimensions, some.measured, _antenna(slam, some)
     along = measured[:, :n]
     residual = np.einsum("ij,ij->i", along, antenna) - measured[:, n]
     return _in_space(antenna - residual[:, None] * along), _in_space(antenna)
 
 
-def _antenna(slam: GraphSlam, table: EdgeTable, rows: Index) -> Array:
+def _antenna(slam: GraphSlam, some: EdgeRows) -> Array:
     """The antenna, whose position was measured, (n, 2) or (n, 3); it is at the row's end."""
-    poses = slam.solver.estimate(table.vertices.values[rows, 0]).reshape(-1, slam.space.pose.size)
-    lever = table.measured.values[rows, -slam.space.dimensions :]
+    poses = slam.solver.estimate(some.vertices[:, 0]).reshape(-1, slam.space.pose.size)
+    lever = some.measured[:, -slam.space.dimensions :]
     return np.stack(slam.space.group.act(tuple(poses.T), tuple(lever.T)), axis=-1)
 
 

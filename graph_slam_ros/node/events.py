@@ -25,9 +25,8 @@ def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
         if k and k in slam.segments:
             yield happened("segment", f"a new segment begins at keyframe {k}", WARN, **values)
     for edge in list(update.edges)[:_EDGES]:
-        table, row = graph.row(edge)
-        vertices = table.vertices.values[row].tolist()
-        label = graph.label_of(edge)
+        one = graph.edge(edge)
+        label, vertices = one.label, list(one.vertices)
         what, verdict = "closure" if label == "closures" else "edge", slam.ledger.verdict_of(edge).name.lower()
         yield happened(
             what, f"edge {edge}: {label} of {vertices}", edge=edge, label=label, vertices=vertices, verdict=verdict
@@ -87,10 +86,9 @@ def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:
 
 def name_of(slam: GraphSlam, edge: int) -> str:
     """What an edge is of: its class, and the landmark it is about."""
-    table, row = slam.graph.row(edge)
-    vertices = set(table.vertices.values[row].tolist())
-    of = next((name for name, mark in slam.landmarks.items() if mark.vertex in vertices), "")
-    return f"{slam.graph.label_of(edge)} {of}".strip()
+    one = slam.graph.edge(edge)
+    of = next((name for name, mark in slam.landmarks.items() if mark.vertex in one.vertices), "")
+    return f"{one.label} {of}".strip()
 
 
 __all__ = ["ERROR", "OK", "WARN", "correction", "happened", "name_of", "of_update"]

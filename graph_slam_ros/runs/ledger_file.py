@@ -144,27 +144,27 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
     stamps_ns = slam.keyframes.stamps_ns
     judged = {change.edge: change.threshold for change in ledger.history}
     for edge in range(len(ledger)):
-        table, row = graph.row(edge)
-        label, vertices = graph.label_of(edge), table.vertices.values[row].tolist()
-        root, loss, keyframe = table.sqrt_information.values[row], losses.get(label), int(ledger.keyframe.values[edge])
+        one = graph.edge(edge)
+        label, vertices = one.label, one.vertices
+        root, loss, keyframe = one.sqrt_information, losses.get(label), int(ledger.keyframe.values[edge])
         left = weight_and_cost(loss.kind, loss.scale, float(chi2[edge]))[0] if loss else 1.0
         yield Entry(
             edge,
             label,
-            tags[table.type],
-            graph.source_of(edge),
+            tags[one.type],
+            one.source,
             next((names[v] for v in vertices if v in names), ""),
             tuple(ids[v] for v in vertices),
             keyframe,
             Stamp(int(stamps_ns[max((keyframe_of[v] for v in vertices if v in keyframe_of), default=keyframe)])),
-            tuple(table.measured.values[row].tolist()),
+            tuple(one.measured.tolist()),
             tuple((root.T @ root)[np.triu_indices(len(root))].tolist()),
             tuple(ledger.residual(edge).tolist()),
             float(ledger.statistic.values[edge]),
             int(ledger.numbers.values[edge]),
             judged.get(edge, float(ledger.threshold.values[edge])),
             float(chi2[edge]),
-            float(left * table.weight.values[row]),
+            float(left * one.weight),
             Verdict(int(ledger.verdict.values[edge])),
             Reason(int(ledger.reason.values[edge])),
         )

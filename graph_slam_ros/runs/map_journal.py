@@ -234,15 +234,14 @@ def _estimate(values: Any) -> Record:
 
 
 def _vertex(graph: Graph, vertex: int) -> list[Any]:
-    kind, at = graph.kind_of(vertex), int(graph.offset.values[vertex])
-    return [kind.name, graph.initial.values[at : at + kind.size].tolist()]
+    one = graph.vertex(vertex)
+    return [one.kind.name, one.initial.tolist()]
 
 
 def _edge(graph: Graph, edge: int) -> list[Any]:
-    table, row = graph.row(edge)
-    numbers = (table.vertices, table.measured, table.sqrt_information)
-    vertices, measured, root = (column.values[row].ravel().tolist() for column in numbers)
-    return [_TAGS[table.type], vertices, measured, root, graph.label_of(edge), graph.source_of(edge)]
+    one = graph.edge(edge)
+    measured, root = one.measured.tolist(), one.sqrt_information.ravel().tolist()
+    return [_TAGS[one.type], list(one.vertices), measured, root, one.label, one.source]
 
 
 def _judgement(ledger: Ledger, edge: int) -> list[Any]:
@@ -368,6 +367,5 @@ def _know(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     for edge, topic, sighting, keyframe, vertex, stamp, pose, covariance in record.get("seen", ()):
         lists = {name: tuple(value) for name, value in sighting.items() if isinstance(value, list)}
         where = PoseAtStamp(keyframe, vertex, stamp, tuple(pose), np.array(covariance))
-        table, row = state.graph.row(edge)
-        mark = by_vertex[int(table.vertices.values[row, 1])]
+        mark = by_vertex[state.graph.edge(edge).vertices[1]]
         mark.seen.append(LandmarkEdge(edge, topic, Sighting(**sighting | lists), where))

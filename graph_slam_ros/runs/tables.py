@@ -134,10 +134,11 @@ def _accepted_by_input(slam: GraphSlam, first: int) -> dict[str, int]:
     for table in slam.graph.tables.values():
         labels = np.array([label in CANDIDATES for label in slam.graph.labels], dtype=bool)
         ids = table.id.values
-        chosen = labels[table.label.values] & (table.vertices.values[:, 0] >= first)  # measured from there
+        first_end, *_ = table.vertices.values.T
+        chosen = labels[table.label.values] & (first_end >= first)  # measured from there
         judged = chosen & (ids < len(verdicts))
         chosen[judged] = np.isin(verdicts[ids[judged]], inside)
-        for code, count in zip(*np.unique(table.source.values[chosen], return_counts=True), strict=True):
+        for code, count in zip(*np.unique(table.at(np.flatnonzero(chosen)).source, return_counts=True), strict=True):
             out[slam.graph.sources[code]] += int(count)
     return dict(out)
 

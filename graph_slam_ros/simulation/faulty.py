@@ -127,10 +127,10 @@ def faulty_graph(file: G2oFile, truth: Array, faults: Sequence[Fault], seed: int
     rows = []
     for key, wrong in draft.wrong.items():
         if key in edges:
-            table, row = out.graph.row(edges[key])
-            first, second = (out.ids[v] for v in table.vertices.values[row][:2].tolist())
+            edge = out.graph.edge(edges[key])
+            first, second = (out.ids[v] for v in edge.vertices[:2])
             true: int | str = int(wrong.true_id) if wrong.true_id else ""
-            rows.append(WrongLine(line_of[edges[key]], tag_of[table.type], first, second, wrong.fault, true))
+            rows.append(WrongLine(line_of[edges[key]], tag_of[edge.type], first, second, wrong.fault, true))
     return out, sorted(rows, key=lambda row: row.line)
 
 
@@ -162,23 +162,23 @@ class _Parts:
         table = self.file.graph.tables.get(self.space.relative_pose)
         if table is None or "landmarks" not in self.file.graph.labels:
             return set()
-        rows = table.label.values == self.file.graph.labels.index("landmarks")
-        return set(table.vertices.values[rows, 1].tolist())
+        rows = np.flatnonzero(table.label.values == self.file.graph.labels.index("landmarks"))
+        return set(table.at(rows).vertices[:, 1].tolist())
 
     def _sort(self, edge: int) -> None:
-        table, row = self.file.graph.row(edge)
-        ends, measured = table.vertices.values[row].tolist(), table.measured.values[row]
-        if table.type is self.space.relative_pose and ends[0] in self.place and ends[1] in self.place:
+        one = self.file.graph.edge(edge)
+        ends, measured = one.vertices, one.measured
+        if one.type is self.space.relative_pose and ends[0] in self.place and ends[1] in self.place:
             first, second = self.place[ends[0]], self.place[ends[1]]
             if abs(first - second) == 1:
                 self.odometry.setdefault(max(first, second), (edge, first < second))
             else:
-                self.closures.append((first, second, measured, table.sqrt_information.values[row]))
-        elif table.type in self.kinds and ends[0] in self.place and ends[1] not in self.place:
-            size = table.type.measured_size - len(table.type.tail)
+                self.closures.append((first, second, measured, one.sqrt_information))
+        elif one.type in self.kinds and ends[0] in self.place and ends[1] not in self.place:
+            size = one.type.measured_size - len(one.type.tail)
             on_robot = tuple(measured[size:].tolist()) or None
             name, covariance = str(self.file.ids[ends[1]]), ()
-            seen = Sighting(name, self.kinds[table.type], tuple(measured[:size].tolist()), covariance, on_robot)
+            seen = Sighting(name, self.kinds[one.type], tuple(measured[:size].tolist()), covariance, on_robot)
             self.sightings.append((self.place[ends[0]], edge, seen))
 
     def draft(self) -> Draft:
@@ -212,8 +212,7 @@ class _Parts:
         old, group = self.file.graph, self.space.group
         graph = Graph()
         for vertex in range(old.vertex_count):
-            kind, at = old.kind_of(vertex), int(old.offset.values[vertex])
-            graph.add_vertex(kind, old.initial.values[at : at + kind.size])
+            graph.add_vertex(old.kind_of(vertex), old.vertex(vertex).initial)
         vertex_of = {str(file_id): vertex for vertex, file_id in enumerate(self.file.ids)}
         changed: dict[int, tuple[list[int], Array]] = {}
         edges: dict[tuple[str, int], int] = {}
@@ -221,25 +220,23 @@ class _Parts:
             edges["odometry", k] = edge
             if ("odometry", k) in draft.wrong:
                 a, b = (tuple(draft.odometry[p].tolist()) for p in ((k - 1, k) if forward else (k, k - 1)))
-                table, row = old.row(edge)
-                changed[edge] = table.vertices.values[row].tolist(), np.array(group.between(a, b))
+                changed[edge] = list(old.edge(edge).vertices), np.array(group.between(a, b))
         for k, ((_, edge, _), s) in enumerate(zip(self.sightings, draft.sightings, strict=True)):
             edges["sighting", k] = edge
             if ("sighting", k) in draft.wrong:
-                table, row = old.row(edge)
-                ends = table.vertices.values[row].tolist()
+                ends = list(old.edge(edge).vertices)
                 ends[1] = vertex_of[s.id]
                 changed[edge] = ends, np.array([*s.measured, *(s.T_base_sensor or ())])
         now: dict[int, int] = {}
         for edge in range(old.edge_count):
-            table, row = old.row(edge)
-            ends, measured = changed.get(edge, (table.vertices.values[row].tolist(), table.measured.values[row]))
+            one = old.edge(edge)
+            ends, measured = changed.get(edge, (list(one.vertices), one.measured))
             now[edge] = graph.add_edge(
-                _fitting(table.type, self.space, graph, ends),
+                _fitting(one.type, self.space, graph, ends),
                 ends,
                 measured,
-                Gaussian(table.sqrt_information.values[row]),
-                old.labels[table.label.values[row]],
+                Gaussian(one.sqrt_information),
+                one.label,
             )
         edges = {key: now[edge] for key, edge in edges.items()}
         true = len(self.closures)
@@ -256,9 +253,7 @@ class _Parts:
         return replace(self.file, graph=graph, seen_from=seen_from), edges
 
     def _true(self, vertex: int) -> Array:
-        graph = self.file.graph
-        at = int(graph.offset.values[vertex])
-        return self.truth[at : at + graph.kind_of(vertex).size]
+        return self.truth[self.file.graph.vertex(vertex).stored]
 
     def _step(self, later: int) -> Numbers:
         """Measured by odometry; where there is none, the true one."""
@@ -267,8 +262,7 @@ class _Parts:
             earlier, this = (tuple(self._true(int(v)).tolist()) for v in self.poses[later - 1 : later + 1])
             return tuple(float(x) for x in group.between(earlier, this))
         edge, forward = self.odometry[later]
-        table, row = self.file.graph.row(edge)
-        measured = tuple(table.measured.values[row].tolist())
+        measured = tuple(self.file.graph.edge(edge).measured.tolist())
         return measured if forward else tuple(float(x) for x in group.inverse(measured))
 
 

@@ -44,12 +44,12 @@ class Anchor:
     def restore(self) -> None:
         """Go on with the prior of a map that was loaded, if it can still be loosened."""
         for edge in self._graph.edges_of("anchor").tolist():
-            table, row = self._graph.row(edge)
-            vertex = int(table.vertices.values[row][0])
+            one = self._graph.edge(edge)
+            (vertex,) = one.vertices
             if vertex >= self._backend.frozen and not self._backend.ledger.is_withdrawn(edge):
-                root = table.sqrt_information.values[row]
-                at = tuple(table.measured.values[row].tolist())
-                covariance = self._space.in_parent_axes(at, np.linalg.inv(root.T @ root))
+                root, at = one.sqrt_information, tuple(one.measured.tolist())
+                tangent = np.asarray(np.linalg.inv(root.T @ root), dtype=np.float64)
+                covariance = self._space.in_parent_axes(at, tangent)
                 self._edge, self._vertex, self._sigmas = edge, vertex, np.sqrt(np.diag(covariance))
 
     def align_to_fix(self, m: Fix, T_map_base: Numbers, keyframe: int) -> bool:
@@ -139,8 +139,7 @@ class Anchor:
         self._backend.hand_over()
         self._backend.withdraw([self._edge], keyframe)
         self._sigmas = sigmas
-        table, row = self._graph.row(self._edge)
-        begins = self._backend.solver.estimate([self._vertex])[0] if moves else table.measured.values[row]
+        begins = self._backend.solver.estimate([self._vertex])[0] if moves else self._graph.edge(self._edge).measured
         at = tuple(begins.tolist())
         covariance = self._space.in_tangent(at, np.diag(np.square(sigmas)))
         self._add(self._vertex, at, Gaussian.from_covariance(covariance))

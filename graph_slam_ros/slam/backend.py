@@ -199,9 +199,8 @@ class Backend:
         values : stored numbers of all vertices to go on from
         """
         link, motion, noise = replacement
-        table, row = self.graph.row(link)
-        vertices, source = table.vertices.values[row].tolist(), self.graph.source_of(link)
-        edge = self.graph.add_edge(table.type, vertices, motion, noise, "odometry", source)
+        old = self.graph.edge(link)
+        edge = self.graph.add_edge(old.type, old.vertices, motion, noise, "odometry", old.source)
         self.hand_over()
         self.decisions.gate_new(self.handed_over[1], keyframe)
         self.decisions.supersede(link, keyframe, found.evidence)

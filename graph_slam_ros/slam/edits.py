@@ -3,6 +3,8 @@
 import re
 from collections.abc import Mapping
 
+import numpy as np
+
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Control
@@ -102,7 +104,7 @@ class Edits:
     def _edges_of(self, vertex: int) -> list[int]:
         """Edges of a vertex that have not been withdrawn, whether or not they are believed."""
         tables = self._backend.graph.tables.values()
-        found = [table.id.values[(table.vertices.values == vertex).any(axis=1)] for table in tables]
+        found = [table.at(np.flatnonzero((table.vertices.values == vertex).any(axis=1))).ids for table in tables]
         edges = sorted(int(edge) for ids in found for edge in ids)
         return [edge for edge in edges if not self._backend.ledger.is_withdrawn(edge)]
 

@@ -96,8 +96,7 @@ class FailureGuard:
         vertices = self._solver.vertices
         unmeasured = set(vertices[vertices >= self._good_vertices].tolist())
         for edge in range(self._good_edges, self._graph.edge_count):
-            table, row = self._graph.row(edge)
-            unmeasured.difference_update(table.vertices.values[row].tolist())
+            unmeasured.difference_update(self._graph.edge(edge).vertices)
         for vertex in unmeasured:
             self._solver.remove(vertex)
         self._on_gone(unmeasured)

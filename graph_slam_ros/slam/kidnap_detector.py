@@ -151,11 +151,11 @@ class KidnapDetector:
         graph, search = self._backend.graph, self._search
         edges, self._next = range(self._next, count), count
         for edge in edges:
-            table, row = graph.row(edge)
-            vertices = table.vertices.values[row].tolist()
-            match graph.labels[int(table.label.values[row])]:
+            one = graph.edge(edge)
+            vertices = one.vertices
+            match one.label:
                 case "odometry":
-                    search.add_odometry(edge, vertices, tuple(table.measured.values[row].tolist()), stamp_ns)
+                    search.add_odometry(edge, vertices, tuple(one.measured.tolist()), stamp_ns)
                 case "initialpose":
                     search.add_initial_pose(edge, vertices[0])
                 case "surveyed":
@@ -315,8 +315,7 @@ class KidnapDetector:
     def _replacement(self, first: int, there: Numbers) -> tuple[int, Numbers, Gaussian]:
         """Odometry's edge to a keyframe, the motion that the landmarks show instead, and next to no trust in it."""
         link, c = self._search.link(first), self._odometry
-        table, row = self._backend.graph.row(link)
-        before = self._estimate(int(table.vertices.values[row, 0]))
+        before = self._estimate(self._backend.graph.edge(link).vertices[0])
         motion = tuple(map(float, self._space.group.between(before, there)))
         return link, motion, Gaussian.from_sigmas(*self._space.sigmas(c.jump_sigma_m, c.jump_sigma_rad))
 
@@ -337,10 +336,10 @@ class KidnapDetector:
         values, newest = self._backend.solver.values, min(motions)
         for vertex in range(newest, graph.vertex_count):
             newest = vertex if vertex in motions else newest
-            at, kind = int(graph.offset.values[vertex]), graph.kind_of(vertex)
-            numbers = tuple(values[at : at + kind.size].tolist())
-            if kind is space.pose:
-                values[at : at + kind.size] = space.group.compose(motions[newest], numbers)
-            elif kind is space.point:
-                values[at : at + kind.size] = space.group.act(motions[newest], numbers)
+            one = graph.vertex(vertex)
+            numbers = tuple(values[one.stored].tolist())
+            if one.kind is space.pose:
+                values[one.stored] = space.group.compose(motions[newest], numbers)
+            elif one.kind is space.point:
+                values[one.stored] = space.group.act(motions[newest], numbers)
         return values

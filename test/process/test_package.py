@@ -14,6 +14,8 @@ from places import ROOT, test_path
 from planted_bugs import BUGS, Bug, Change
 
 import graph_slam_ros
+from graph_slam_ros.graph import RELATIVE_POSE, Graph
+from graph_slam_ros.graph.tables import Column, EdgeTable
 from graph_slam_ros.slam import GraphSlam
 
 PACKAGE = ROOT / "graph_slam_ros"
@@ -129,6 +131,38 @@ def imported(name):
 def rule(table, name):
     """The rule for a file, else for the nearest of its folders that has one, else None."""
     return next((table[str(at)] for at in (Path(name), *Path(name).parents) if str(at) in table), None)
+
+
+COLUMNS = {
+    name for of in (Graph(), EdgeTable(RELATIVE_POSE, 0)) for name in dir(of) if isinstance(getattr(of, name), Column)
+}
+BULK = {  # the stored numbers of many vertices at once
+    *("slam/backend.py", "slam/robust/pairwise_consistency.py"),
+    *("runs/map_journal.py", "analysis/what_if.py", "simulation/pose_graph.py"),
+}
+
+
+def indexed_columns(tree):
+    """Lines where a column of the graph's tables is indexed, or a row of them is asked for."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Attribute) and node.value.attr == "values":
+            column = node.value.value
+            if isinstance(column, ast.Attribute) and column.attr in COLUMNS:
+                yield node.lineno
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "row":
+            yield node.lineno
+
+
+def test_indexed_columns_are_found():
+    text = "t, k = graph.row(e)\nx = t.weight.values[k]\ny = graph.offset.values[[1, 2]]\nz = ledger.numbers.values[e]"
+    assert {"measured", "offset", "row_of_edge", "weight"} <= COLUMNS
+    assert list(indexed_columns(ast.parse(text))) == [1, 2, 3]
+
+
+def test_nobody_outside_graph_and_solver_indexes_their_tables():
+    found = {name for name, path in FILES.items() if list(indexed_columns(ast.parse(path.read_text())))}
+    outside = {name for name in found if not name.startswith(("graph/", "solver/"))}
+    assert outside == BULK, "use Graph.edge(id), Graph.vertex(id) or EdgeTable.at(rows)"
 
 
 def test_the_version_number_is_the_same_everywhere():

@@ -148,8 +148,7 @@ class DisplacementSearch:
 
     def _drift_of(self, edge: int) -> Array:
         """Variances [m^2, rad^2] of one step of odometry, the largest of any direction."""
-        table, row = self._graph.row(edge)
-        root, n = table.sqrt_information.values[row], self._space.dimensions
+        root, n = self._graph.edge(edge).sqrt_information, self._space.dimensions
         covariance = np.linalg.inv(root.T @ root)
         return np.array([np.diag(covariance)[:n].max(), np.diag(covariance)[n:].max()])
 
@@ -172,20 +171,19 @@ class DisplacementSearch:
 
     def _heading(self, edge: int, base: Numbers) -> tuple[float, float]:
         """The heading of a landmark seen as a pose in the plane, and its variance."""
-        table, row = self._graph.row(edge)
-        if table.type is not self._space.relative_pose or self._space.dimensions != 2:
+        one = self._graph.edge(edge)
+        if one.type is not self._space.relative_pose or self._space.dimensions != 2:
             return np.nan, 0.0
-        root = table.sqrt_information.values[row]
-        variance = float(np.linalg.inv(root.T @ root)[2, 2])
-        return base[2] + float(table.measured.values[row][2]), variance
+        variance = float(np.linalg.inv(one.sqrt_information.T @ one.sqrt_information)[2, 2])
+        return base[2] + float(one.measured[2]), variance
 
     def _point(self, edge: int) -> Array | None:
         """A landmark's position in the keyframe's frame, by one sighting; None where it does not tell one."""
-        table, row = self._graph.row(edge)
-        space, measured = self._space, table.measured.values[row]
-        if table.type in (space.relative_pose, space.tag_position, space.sightings["position"]):
+        one, space = self._graph.edge(edge), self._space
+        measured = one.measured
+        if one.type in (space.relative_pose, space.tag_position, space.sightings["position"]):
             return np.array(measured[: space.dimensions])
-        if table.type is space.sightings["range_bearing"]:
+        if one.type is space.sightings["range_bearing"]:
             n = space.dimensions
             point = motion_compensation.point_of(space, tuple(measured[:n].tolist()))
             return np.array(space.group.act(tuple(measured[n:].tolist()), tuple(point.tolist())))
@@ -193,10 +191,10 @@ class DisplacementSearch:
 
     def _variance(self, edge: int, point: Array) -> float:
         """The variance of that position, the largest of any direction."""
-        table, row = self._graph.row(edge)
-        root, n = table.sqrt_information.values[row], self._space.dimensions
+        one, n = self._graph.edge(edge), self._space.dimensions
+        root = one.sqrt_information
         covariance = np.linalg.inv(root.T @ root)
-        if table.type is self._space.sightings["range_bearing"]:
+        if one.type is self._space.sightings["range_bearing"]:
             return float(max(covariance[0, 0], point @ point * np.diag(covariance)[1:].max()))
         return float(np.linalg.eigvalsh(covariance[:n, :n])[-1])
 

@@ -299,8 +299,7 @@ class OutlierGate:
         landmark = landmark_of(self._graph, edge)
         if landmark is None:
             return None
-        table, _ = self._graph.row(edge)
-        alone = table.type.residual_size >= self._graph.kind_of(landmark).dof
+        alone = self._graph.edge(edge).type.residual_size >= self._graph.kind_of(landmark).dof
         return landmark, self._holds if alone else self._helps
 
     def _count(self, edge: int, more: int) -> None:
@@ -362,8 +361,7 @@ def landmark_of(graph: Graph, edge: int) -> int | None:
     """The vertex of the landmark that an edge is of."""
     if graph.label_of(edge) != "landmarks":
         return None
-    table, row = graph.row(edge)
-    return int(table.vertices.values[row, 1])
+    return graph.edge(edge).vertices[1]
 
 
 def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:

@@ -82,18 +82,17 @@ class Outcome:
         if known == len(values) or not len(odometry):
             out[:known] = self.values
             return out
-        table, row = old.row(int(odometry[-1]))
-        newest, kind = int(table.vertices.values[row, 1]), table.type.accepts[1][0]
-        at = int(graph.offset.values[newest])
-        group, here = GROUPS[kind], slice(at, at + kind.size)
+        newest = graph.vertex(old.edge(int(odometry[-1])).vertices[1])
+        kind, here = newest.kind, newest.stored
+        group = GROUPS[kind]
         moved = group.compose(tuple(self.values[here]), group.inverse(tuple(values[here])))
         for vertex in range(old.vertex_count, graph.vertex_count):
-            at, of = int(graph.offset.values[vertex]), graph.kind_of(vertex)
-            numbers = tuple(values[at : at + of.size])
-            if of is kind:
-                out[at : at + of.size] = group.compose(moved, numbers)
-            elif of.size == (2 if kind is SE2 else 3):
-                out[at : at + of.size] = group.act(moved, numbers)
+            new = graph.vertex(vertex)
+            numbers = tuple(values[new.stored])
+            if new.kind is kind:
+                out[new.stored] = group.compose(moved, numbers)
+            elif new.kind.size == (2 if kind is SE2 else 3):
+                out[new.stored] = group.act(moved, numbers)
         out[:known] = self.values
         return out
 
@@ -200,12 +199,8 @@ def _along_odometry(graph: Graph, values: Array, held: set[int]) -> Array:
     """Return where odometry alone says that the robot was; landmarks, and what is held, stay where they are."""
     out = values.copy()
     for edge in graph.edges_of("odometry").tolist():
-        table, row = graph.row(edge)
-        last, new = table.vertices.values[row].tolist()
-        if new in held:
-            continue
-        a, b = graph.offset.values[[last, new]].tolist()
-        kind = graph.kind_of(new)
-        pose, step = tuple(out[a : a + kind.size]), tuple(table.measured.values[row])
-        out[b : b + kind.size] = GROUPS[kind].compose(pose, step)
+        one = graph.edge(edge)
+        last, new = (graph.vertex(v) for v in one.vertices)
+        if new.id not in held:
+            out[new.stored] = GROUPS[new.kind].compose(tuple(out[last.stored]), tuple(one.measured))
     return out

@@ -35,10 +35,11 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
     of_table = graph.table_of_edge.values[closures] == table.code
     closures, limits = closures[of_table], limits[of_table]
     rows = graph.row_of_edge.values[closures]
-    ends, measured = table.vertices.values[rows], table.measured.values[rows]
+    ends, measured = table.at(rows).vertices, table.at(rows).measured
     order, walked = _along_odometry(graph, table)
     on_path = (order[ends] >= 0).all(axis=1)
-    closures, limits, rows, ends, measured = (each[on_path] for each in (closures, limits, rows, ends, measured))
+    closures, rows, ends = (each[on_path] for each in (closures, rows, ends))
+    limits, measured = limits[on_path], measured[on_path]
     pairs = cKDTree(order[ends]).query_pairs(_NEAR, p=np.inf, output_type="ndarray") if len(ends) else ends
     if not len(pairs):
         return []
@@ -51,7 +52,7 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
     onwards = _compose(group, measured[a], after)
     error = _columns(group.log, _between(group, measured[b], _compose(group, before, onwards)))
 
-    noise = np.linalg.inv(table.sqrt_information.values[rows])
+    noise = np.linalg.inv(table.at(rows).sqrt_information)
     noise = noise @ noise.transpose(0, 2, 1)
     steps = np.abs(walked[order[ends[a]]] - walked[order[ends[b]]])
     covariance = noise[b] + _propagated(group, after, noise[a])
@@ -70,10 +71,10 @@ def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
     code = graph.labels.index("odometry") if "odometry" in graph.labels else -1
     rows = np.flatnonzero(table.label.values == code)
     order = np.full(graph.vertex_count, -1)
-    vertices = table.vertices.values[rows]
+    vertices = table.at(rows).vertices
     order[vertices[:, 0]] = np.arange(len(rows))
     order[vertices[:, 1]] = np.arange(1, len(rows) + 1)
-    inverse = np.linalg.inv(table.sqrt_information.values[rows])
+    inverse = np.linalg.inv(table.at(rows).sqrt_information)
     steps = inverse @ inverse.transpose(0, 2, 1)
     return order, np.concatenate((np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)))
 
