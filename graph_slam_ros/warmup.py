@@ -1,13 +1,18 @@
 """Compile every kernel once, so that nothing is compiled while a robot drives, and load all of them in one order.
 
 A run must repeat byte for byte, and last digits depend on what machine code a process has of a formula. So kernels are
-compiled in a process of their own, for one that compiles a kernel may get other digits from it than those that load it.
+compiled in processes of their own, for one that compiles a kernel may get other digits from it than those that load it.
 And several kernels bring the code of a formula they share, each optimised in its own surroundings: whichever is loaded
 first gives it to all.
+
+Each process compiles one part of the kernels, the same on every machine, however many cores it has: no kernel belongs
+to two parts. What the plane needs is loaded before what space needs in addition, so that a drive in the plane computes
+the same whether or not kernels of space are there.
 """
 
 import contextlib
 import functools
+import gc
 import math
 import os
 import subprocess
@@ -15,9 +20,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
+from numba import types
 
 from graph_slam_ros import graph as graphs
 from graph_slam_ros.errors import GraphSlamError
@@ -25,10 +32,8 @@ from graph_slam_ros.graph import (
     HUBER,
     LANDMARK_POSITION,
     POSE_PRIOR,
-    POSE_PRIOR_3D,
     R2,
     RELATIVE_POSE,
-    RELATIVE_POSE_3D,
     SE2,
     SE3,
     EdgeType,
@@ -37,11 +42,14 @@ from graph_slam_ros.graph import (
     Loss,
 )
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.lie.jit import CACHE_DIR, COMPILED
+from graph_slam_ros.lie.jit import CACHE_DIR
 from graph_slam_ros.progress import report
-from graph_slam_ros.solver import METHODS, Settings, Solver
+from graph_slam_ros.solver import METHODS, Settings, Solver, covariance
+from graph_slam_ros.solver.clique_tree import incremental, indices, numeric, ordering, pools, symbolic
+from graph_slam_ros.solver.clique_tree.storage import empty_tree
 
-_KERNELS = 115  # about so many there are; a test compares it with the cache
+_KERNELS = 125  # about so many there are; a test compares it with the cache
+_SHARED = "shared"  # file that is there when the kernels that two parts call are in the cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,16 +68,21 @@ class Compiling:
         return f"compiling kernels, once per installation: {100 * done / _KERNELS:.0f} %{left}"
 
 
-def are_compiled() -> bool:
-    """Return whether all kernels are in the cache."""
-    return COMPILED.exists() or bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
+def are_compiled(dimensions: int = 3) -> bool:
+    """Return whether all kernels are in the cache that work in the plane (2), or also in space (3)."""
+    return bool(numba.config.DISABLE_JIT) or not _missing(dimensions)  # type: ignore[attr-defined]
 
 
 Tell = Callable[[Compiling], None]
+_Kernel = tuple[Any, tuple[Any, ...]]
 
 
-def warmup(is_told_to_stop: Callable[[], bool] = lambda: False, tell: Tell = lambda now: report(str(now))) -> float:
-    """Compile what is not compiled yet, and load all; returns the seconds it took.
+def warmup(
+    is_told_to_stop: Callable[[], bool] = lambda: False,
+    tell: Tell = lambda now: report(str(now)),
+    dimensions: int = 3,
+) -> float:
+    """Compile what is not compiled yet, and load it; returns the seconds it took.
 
     Before anything is computed whose bytes are to be repeated.
 
@@ -77,6 +90,7 @@ def warmup(is_told_to_stop: Callable[[], bool] = lambda: False, tell: Tell = lam
     ----------
     is_told_to_stop : asked while kernels are compiled, which may take minutes
     tell : called meanwhile, several times a second
+    dimensions : 2 where all is in the plane, which needs fewer kernels
 
     Raises
     ------
@@ -84,32 +98,61 @@ def warmup(is_told_to_stop: Callable[[], bool] = lambda: False, tell: Tell = lam
         Told to stop; the next warm-up goes on from there.
     """
     start = time.perf_counter()
-    compile_all(is_told_to_stop, tell)
-    _use_all()
+    compile_all(is_told_to_stop, tell, dimensions)
+    _load_plane()
+    if dimensions == 3:
+        _load_space()
     return time.perf_counter() - start
 
 
-def compile_all(is_told_to_stop: Callable[[], bool] = lambda: False, tell: Tell = lambda now: report(str(now))) -> None:
+def compile_all(
+    is_told_to_stop: Callable[[], bool] = lambda: False,
+    tell: Tell = lambda now: report(str(now)),
+    dimensions: int = 3,
+) -> None:
     """Compile what is not compiled yet, and load nothing; as ``warmup``."""
-    if not are_compiled():
-        _compile(is_told_to_stop, tell)
+    if not are_compiled(dimensions):
+        _compile(_missing(dimensions), is_told_to_stop, tell)
 
 
-def _compile(is_told_to_stop: Callable[[], bool], tell: Tell) -> None:
-    """Once per installation, into the cache on disk."""
+def _missing(dimensions: int) -> list[str]:
+    """The parts that are not compiled."""
+    return [part for part in list(_PARTS)[:dimensions] if not (CACHE_DIR / f"complete-{part}").exists()]
+
+
+def _compile(parts: list[str], is_told_to_stop: Callable[[], bool], tell: Tell) -> None:
+    """Compile parts, once per installation, into the cache on disk."""
     start, began_with = time.perf_counter(), _cached()
-    command, path = [sys.executable, "-m", __name__], os.pathsep.join(filter(None, sys.path))
-    environment = os.environ | {"PYTHONPATH": path}
-    with subprocess.Popen(command, env=environment, start_new_session=True, stderr=subprocess.PIPE) as compiler:
-        try:
-            while (said := _ended(compiler)) is None:
-                tell(Compiling(_cached(), time.perf_counter() - start, began_with))
-                if is_told_to_stop():
-                    raise GraphSlamError("told to stop before all kernels were compiled")
-        finally:
-            compiler.kill()  # Ctrl-C, which it does not hear itself
-    if compiler.returncode:
-        why = said.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {compiler.returncode}"]
+    at_once = max(2, len(os.sched_getaffinity(0)))  # two wait for each other
+    running: list[subprocess.Popen[bytes]] = []
+    try:
+        while parts or running:
+            while parts and len(running) < at_once:
+                running.append(_started(parts.pop(0)))
+            for process in running[:]:
+                if (said := _ended(process)) is not None:
+                    running.remove(process)
+                    _refuse_failure(process.returncode, said)
+            tell(Compiling(_cached(), time.perf_counter() - start, began_with))
+            if is_told_to_stop():
+                raise GraphSlamError("told to stop before all kernels were compiled")
+    finally:
+        for process in running:  # also at Ctrl-C, which they do not get themselves
+            process.kill()
+            process.communicate()
+
+
+def _started(part: str) -> "subprocess.Popen[bytes]":
+    """Start to compile a part."""
+    path = os.pathsep.join(filter(None, sys.path))
+    command, environment = [sys.executable, "-m", __name__, part], os.environ | {"PYTHONPATH": path}
+    return subprocess.Popen(command, env=environment, start_new_session=True, stderr=subprocess.PIPE)
+
+
+def _refuse_failure(code: int, said: bytes) -> None:
+    """Raise where a part could not be compiled."""
+    if code:
+        why = said.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {code}"]
         remedy = "GRAPH_SLAM_CACHE names a folder with 100 MB of room"
         raise GraphSlamError(f"{CACHE_DIR}: kernels could not be compiled: {why[0]}; {remedy}")
 
@@ -127,20 +170,16 @@ def _ended(process: "subprocess.Popen[bytes]") -> bytes | None:
 
 
 @functools.cache  # what is loaded stays
-def _use_all() -> None:
-    """Linearise every edge type and solve a graph."""
-    for edge in _edge_types():
-        sizes = [kinds[0].size for kinds in edge.accepts]
-        edge.linearize(np.ones(sum(sizes)), np.cumsum([[0, *sizes[:-1]]], axis=1), np.ones((1, edge.measured_size)))
+def _load_plane() -> None:
+    """Linearise every edge type of the plane, and solve a graph."""
+    _load_edges(in_space=False)
+    _make(_shared_kernels() + _structure_kernels() + _number_kernels())
     graph = Graph()
     poses = graph.add_vertices(SE2, np.zeros((2, 3)))
     point = graph.add_vertex(R2, np.zeros(2))
-    space = graph.add_vertices(SE3, [[0, 0, 0, 0, 0, 0, 1.0]] * 2)
-    planar, flat, six = (Gaussian.from_sigmas(*[1.0] * dof) for dof in (3, 2, 6))
+    planar, flat = (Gaussian.from_sigmas(*[1.0] * dof) for dof in (3, 2))
     graph.add_edge(POSE_PRIOR, [poses[0]], [0, 0, 0], planar, "anchor")
     graph.add_edge(RELATIVE_POSE, poses, [1, 0, 0.1], planar, "odometry")
-    graph.add_edge(POSE_PRIOR_3D, [space[0]], [0, 0, 0, 0, 0, 0, 1], six, "anchor")
-    graph.add_edge(RELATIVE_POSE_3D, space, [1, 0, 0, 0, 0, 0, 1], six, "odometry")
     for _ in range(2):
         graph.add_edge(LANDMARK_POSITION, [poses[0], point], [1, 1], flat, "landmarks")
     solver = Solver(
@@ -161,13 +200,26 @@ def _use_all() -> None:
     for method in METHODS:
         solver.start_at(graph.initial.values)
         solver.optimize(Settings(method))
-    SE2.retract(np.zeros((1, 3)), np.zeros((1, 3)))
-    se2.noise_during((1.0, 0.0, 0.1), np.eye(3))
-    se2.propagate_during(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))
-    se2.propagate(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))
-    se3.propagate_during(np.eye(6), se3.IDENTITY, np.eye(6))
-    se3.noise_during(se3.IDENTITY, np.eye(6))
-    se3.propagate(np.eye(6), se3.IDENTITY, np.eye(6))
+
+
+@functools.cache
+def _load_space() -> None:
+    """Linearise every edge type of space."""
+    _load_edges(in_space=True)
+
+
+def _load_edges(*, in_space: bool) -> None:
+    """Linearise an edge of each type with a pose in space, or of each other type, and propagate a covariance."""
+    for edge in _edge_types():
+        if in_space != any(SE3 in kinds for kinds in edge.accepts):
+            continue
+        sizes = [kinds[0].size for kinds in edge.accepts]
+        edge.linearize(np.ones(sum(sizes)), np.cumsum([[0, *sizes[:-1]]], axis=1), np.ones((1, edge.measured_size)))
+    if in_space:
+        se3.propagate_during(np.eye(6), se3.IDENTITY, np.eye(6))
+    else:
+        SE2.retract(np.zeros((1, 3)), np.zeros((1, 3)))
+        se2.propagate_during(np.eye(3), (1.0, 0.0, 0.1), np.eye(3))
 
 
 def _edge_types() -> Iterator[EdgeType]:
@@ -178,6 +230,86 @@ def _edge_types() -> Iterator[EdgeType]:
             yield value
 
 
+def _shared_kernels() -> list[_Kernel]:
+    """List kernels that two parts call, with the types of their arguments."""
+    tree, index, number, _ = _types()
+    return [
+        (indices.ascending, (index,)),
+        (indices.chosen, (index, index)),
+        (indices.in_order, (index,)),
+        (indices.joined, (index, index)),
+        (indices.lengthened, (index, number)),
+        (symbolic.mark, (tree, index)),
+        (numeric.clear_block, (tree, number)),
+        (numeric.accept_steps, (tree, index)),
+    ]
+
+
+def _structure_kernels() -> list[_Kernel]:
+    """List kernels that order vertices and group them into cliques."""
+    tree, index, number, real = _types()
+    return [
+        (ordering.move_tail, (tree, index, index)),
+        (ordering.dissect, (tree, number)),
+        (incremental._regroup, (tree, index, index)),
+        (incremental.relinearize, (tree, index, real, real)),
+        (pools.compact, (tree,)),
+    ]
+
+
+def _number_kernels() -> list[_Kernel]:
+    """List kernels that eliminate, substitute and find covariances."""
+    tree, index, _, real = _types()
+    return [
+        (numeric.eliminate, (tree, index, real)),
+        (numeric.back_substitute, (tree, index, real, real)),
+        (incremental.solve, (tree, index, real, real)),
+        (covariance.marginals, (tree, index)),
+        (covariance.joint, (tree, index)),
+    ]
+
+
+def _compile_structure() -> None:
+    """Compile kernels that two parts call, those of the structure, and, when the plane's are there, what is left."""
+    _make(_shared_kernels())
+    (CACHE_DIR / _SHARED).touch()
+    _make(_structure_kernels())
+    _wait_for("complete-plane")
+    _load_plane()
+
+
+def _compile_plane() -> None:
+    """Compile the edges of the plane, then elimination and covariances."""
+    _load_edges(in_space=False)
+    _wait_for(_SHARED)
+    _make(_number_kernels())
+
+
+def _make(kernels: list[_Kernel]) -> None:
+    """Compile kernels, or load them."""
+    for kernel, given in kernels:
+        kernel.compile(given)
+
+
+def _types() -> tuple[Any, Any, Any, Any]:
+    """Return the types of a tree, of an array of indices, and of numbers, as the kernels get them."""
+    return numba.typeof(empty_tree()), types.int64[::1], types.int64, types.float64  # type: ignore[no-untyped-call]
+
+
+def _wait_for(name: str) -> None:
+    """Let another part come first; where nobody waits for this one any more, stop."""
+    parent = os.getppid()
+    while not (CACHE_DIR / name).exists():
+        if os.getppid() != parent:
+            sys.exit(1)
+        time.sleep(0.05)
+
+
+_PARTS: dict[str, Callable[[], None]] = {"structure": _compile_structure, "plane": _compile_plane, "space": _load_space}
+"""The plane needs the first two. They run at the same time, for each waits for kernels of the other."""
+
+
 if __name__ == "__main__":
-    _use_all()
-    COMPILED.touch()
+    gc.disable()  # an eighth of the time; all goes at the end of the process
+    _PARTS[sys.argv[1]]()
+    (CACHE_DIR / f"complete-{sys.argv[1]}").touch()

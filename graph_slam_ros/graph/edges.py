@@ -1,6 +1,8 @@
 """Edge types in the plane and between vectors; the arguments of their kernels are explained in ``edge_type``.
 
 Derivatives used throughout, with J = [[0, -1], [1, 0]]:  R(theta) Exp([w]) = R(theta) (I + w J).
+
+Kernels write numbers, not slices: for a slice Numba compiles how to say that its shape does not fit, for two seconds.
 """
 
 import numpy as np
@@ -22,7 +24,7 @@ def _relative_pose(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
         z = (measured[e, 0], measured[e, 1], measured[e, 2])
         d = se2.between((x[i], x[i + 1], x[i + 2]), (x[j], x[j + 1], x[j + 2]))
         r = se2.between(z, d)
-        residual[e] = r
+        residual[e, 0], residual[e, 1], residual[e, 2] = r
         c, s = np.cos(z[2]), np.sin(z[2])
         jacobian[e, 0, 0], jacobian[e, 0, 1], jacobian[e, 0, 2] = -c, -s, c * d[1] - s * d[0]
         jacobian[e, 1, 0], jacobian[e, 1, 1], jacobian[e, 1, 2] = s, -c, -s * d[1] - c * d[0]
@@ -44,7 +46,7 @@ def _inverse_relative_pose(x: Array, at: Index, measured: Array) -> tuple[Array,
         z = (measured[e, 0], measured[e, 1], measured[e, 2])
         b = se2.between((x[j], x[j + 1], x[j + 2]), (x[i], x[i + 1], x[i + 2]))
         x_r, y_r, theta = se2.compose(b, z)
-        residual[e] = (x_r, y_r, se2.wrap(theta))
+        residual[e, 0], residual[e, 1], residual[e, 2] = x_r, y_r, se2.wrap(theta)
         c, s = np.cos(b[2]), np.sin(b[2])
         jacobian[e, 0, 0], jacobian[e, 0, 1], jacobian[e, 0, 2] = c, -s, -s * z[0] - c * z[1]
         jacobian[e, 1, 0], jacobian[e, 1, 1], jacobian[e, 1, 2] = s, c, c * z[0] - s * z[1]
@@ -63,7 +65,7 @@ def _pose_prior(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
     for e in range(n):
         i = at[e, 0]
         r = se2.between((measured[e, 0], measured[e, 1], measured[e, 2]), (x[i], x[i + 1], x[i + 2]))
-        residual[e] = r
+        residual[e, 0], residual[e, 1], residual[e, 2] = r
         c, s = np.cos(r[2]), np.sin(r[2])
         jacobian[e, 0, 0], jacobian[e, 0, 1] = c, -s
         jacobian[e, 1, 0], jacobian[e, 1, 1] = s, c
@@ -98,8 +100,9 @@ def _tag_position(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
     for e in range(n):
         j = at[e, 1]
         c, s = np.cos(x[j + 2]), np.sin(x[j + 2])
-        jacobian[e, :, :3] = of_point[e, :, :3]
         for k in range(2):
+            for i in range(3):
+                jacobian[e, k, i] = of_point[e, k, i]
             jacobian[e, k, 3] = c * of_point[e, k, 3] + s * of_point[e, k, 4]
             jacobian[e, k, 4] = c * of_point[e, k, 4] - s * of_point[e, k, 3]
     return residual, jacobian

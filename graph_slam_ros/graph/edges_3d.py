@@ -97,8 +97,9 @@ def _tag_position(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
     jacobian = np.zeros((n, 3, 12))
     for k in range(n):
         turn = so3.matrix(se3.rotation(_pose(x, at[k, 1])))
-        jacobian[k, :, :6] = of_point[k, :, :6]
         for a in range(3):
+            for i in range(6):
+                jacobian[k, a, i] = of_point[k, a, i]
             for b in range(3):
                 for c in range(3):
                     jacobian[k, a, 6 + b] += of_point[k, a, 6 + c] * turn[c, b]

@@ -45,7 +45,8 @@ def _retract_se2(values: Array, steps: Array) -> Array:
     """Compiled: the last digit of NumPy's sine of an array may depend on where in memory the array is."""
     out = np.empty((len(values), 3))
     for i in range(len(values)):
-        out[i] = se2.retract((values[i, 0], values[i, 1], values[i, 2]), (steps[i, 0], steps[i, 1], steps[i, 2]))
+        pose = se2.retract((values[i, 0], values[i, 1], values[i, 2]), (steps[i, 0], steps[i, 1], steps[i, 2]))
+        out[i, 0], out[i, 1], out[i, 2] = pose
     return out
 
 

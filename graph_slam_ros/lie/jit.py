@@ -1,46 +1,58 @@
-"""Compilation of kernels: Numba with a cache that cannot serve stale code.
+"""Compilation of kernels: Numba with a cache that cannot serve stale code, wherever the package lies.
 
-Numba keys its cache by the file of the compiled function and sees neither a change in a file imported by it nor another
-setting of the compiler (bounds checks). So the cache lives in one folder per digest of all kernel sources and settings.
+Numba keys its cache by the place of the compiled function's file. It sees neither a change in a file imported by it nor
+another setting of the compiler (bounds checks). So the cache lives in one folder per digest of all kernel sources, of
+what compiles them, its settings and the processor. Copies of the package that agree in these share it.
 """
 
 import hashlib
 import os
 import stat
+import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import llvmlite
+import llvmlite.binding
 import numba
+import numpy as np
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
 from numba.extending import register_jitable
 
 from graph_slam_ros.errors import GraphSlamError
 
-__all__ = ["CACHE_DIR", "COMPILED", "jitable", "kernel"]
+__all__ = ["CACHE_DIR", "jitable", "kernel"]
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _KERNEL_FOLDERS = ("lie", "graph", "solver")
-_SETTINGS = ("BOUNDSCHECK", "OPT")
+_SETTINGS = ("BOUNDSCHECK", "OPT", "CPU_NAME", "CPU_FEATURES", "ENABLE_AVX", "LOOP_VECTORIZE", "SLP_VECTORIZE")
 
 
 def _sources() -> list[Path]:
-    return [path for folder in _KERNEL_FOLDERS for path in sorted((_PACKAGE / folder).rglob("*.py"))]
+    folders = [path for folder in _KERNEL_FOLDERS for path in sorted((_PACKAGE / folder).rglob("*.py"))]
+    return [*folders, _PACKAGE / "warmup.py"]
+
+
+def _compiler() -> list[str]:
+    """List what else the machine code depends on: versions, settings, the processor."""
+    versions = [sys.version.split()[0], sys.implementation.cache_tag, np.__version__]
+    versions += [numba.__version__, llvmlite.__version__]
+    settings = [f"{name}={getattr(numba.config, name, None)}" for name in _SETTINGS]
+    features = ""
+    with suppress(RuntimeError):  # LLVM does not know them
+        features = llvmlite.binding.get_host_cpu_features().flatten()
+    return [*versions, *settings, llvmlite.binding.get_host_cpu_name(), features]
 
 
 def _digest() -> str:
-    settings = [getattr(numba.config, name, None) for name in _SETTINGS]
-    sha = hashlib.sha256(f"{numba.__version__} {settings}".encode())
+    sha = hashlib.sha256(repr(_compiler()).encode())
     for path in _sources():
         sha.update(path.relative_to(_PACKAGE).as_posix().encode())
         sha.update(path.read_bytes())
     return sha.hexdigest()[:16]
-
-
-def _place() -> str:
-    """A digest of where these files lie and when they changed: Numba compiles anew where either is different."""
-    return hashlib.sha256(repr([(str(path), int(path.stat().st_mtime)) for path in _sources()]).encode()).hexdigest()
 
 
 def _cache_dir() -> Path:
@@ -79,18 +91,51 @@ def _is_private(folder: Path) -> bool:
 
 
 CACHE_DIR = _cache_dir()
-COMPILED = CACHE_DIR / f"complete-{_place()[:16]}"
-"""Is there when all kernels of these files have been compiled into the cache."""
 numba.config.CACHE_DIR = str(CACHE_DIR)  # type: ignore[attr-defined]
 
 
-def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+class _Locator(UserProvidedCacheLocator):
+    """Keeps kernels of this package by their place in it; the folder's digest stands for their sources."""
+
+    def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
+        super().__init__(py_func, py_file)  # type: ignore[no-untyped-call]
+        self._cache_path = str(CACHE_DIR / Path(py_file).resolve().parent.relative_to(_PACKAGE))
+
+    def get_source_stamp(self) -> str:
+        """Return the same for all: what was compiled of other sources lies in another folder."""
+        return CACHE_DIR.name
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Any:
+        """Leave kernels of somebody else's files to Numba."""
+        if not Path(py_file).resolve().is_relative_to(_PACKAGE):
+            return None
+        return super().from_function(py_func, py_file)  # type: ignore[no-untyped-call]
+
+
+class _CacheImpl(CompileResultCacheImpl):
+    _locator_classes = [_Locator, *CompileResultCacheImpl._locator_classes]  # noqa: RUF012
+
+
+class _Cache(FunctionCache):
+    _impl_class = _CacheImpl
+
+
+def kernel(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """Compile a loop over arrays; it runs on one thread, without unsafe maths.
 
     Where it calls BLAS (wide fronts) that library may take more: for the same bytes every time it must have one.
+
+    Parameters
+    ----------
+    options : more of ``numba.njit``
     """
-    compiled: Callable[..., Any] = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    return compiled
+    # nothing here is called through a pointer, as SciPy would
+    settings = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True} | options
+    compiled: Any = numba.njit(**settings)(function)  # type: ignore[call-overload]
+    if compiled is not function:  # it is where compilation is switched off
+        compiled._cache = _Cache(function)  # type: ignore[no-untyped-call]
+    return cast(Callable[..., Any], compiled)
 
 
 def jitable(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -192,7 +192,7 @@ def propagate(covariance: NDArray[np.float64], step: Pose, added: NDArray[np.flo
     return out
 
 
-@kernel
 def propagate_during(covariance: NDArray[np.float64], step: Pose, of_twist: NDArray[np.float64]) -> NDArray[np.float64]:
     """The same as ``propagate``, for noise that acted all through the step (``noise_during``)."""
-    return propagate(covariance, step, noise_during(step, of_twist))
+    out: Array = propagate(covariance, step, noise_during(step, of_twist))
+    return out

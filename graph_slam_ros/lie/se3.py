@@ -195,7 +195,6 @@ def interpolate(a: Pose, b: Pose, fraction: Any) -> Pose:
     )
 
 
-@jitable
 def adjoint(a: Pose) -> Array:
     """Adjoint matrix (6, 6) of one pose, eq. (175): ``a Exp(d) = Exp(Ad d) a``."""
     turn = so3.matrix(rotation(a))
@@ -212,37 +211,75 @@ def right_jacobian(d: Tangent) -> Array:
 
     The series ``sum_k (-ad d)^k / (k + 1)!``, to the last digit: at most 30 terms for rotations up to pi.
     """
-    lie = np.zeros((6, 6))
-    lie[:3, :3] = so3.hat((d[3], d[4], d[5]))
-    lie[:3, 3:] = so3.hat((d[0], d[1], d[2]))
-    lie[3:, 3:] = lie[:3, :3]
-    term, out = np.eye(6), np.eye(6)
+    lie, term, out = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
+    turn, shift = so3.hat((d[3], d[4], d[5])), so3.hat((d[0], d[1], d[2]))
+    for i in range(3):
+        for j in range(3):
+            lie[i, j] = lie[3 + i, 3 + j] = turn[i, j]
+            lie[i, 3 + j] = shift[i, j]
+        term[i, i] = term[3 + i, 3 + i] = out[i, i] = out[3 + i, 3 + i] = 1.0
     for k in range(2, 40):
-        term = term @ lie * (-1.0 / k)
-        out += term
-        if np.abs(term).max() < 1e-17:
+        term = _product(term, lie)
+        largest = 0.0
+        for i in range(6):
+            for j in range(6):
+                term[i, j] *= -1.0 / k
+                out[i, j] += term[i, j]
+                largest = max(largest, abs(term[i, j]))
+        if largest < 1e-17:
             break
+    return out
+
+
+@kernel
+def _product(a: Array, b: Array) -> Array:
+    """The matrix product, without the checks of ``@``, which take seconds to compile."""
+    out = np.zeros((len(a), b.shape[1]))
+    for i in range(len(a)):
+        for k in range(len(b)):
+            for j in range(b.shape[1]):
+                out[i, j] += a[i, k] * b[k, j]
+    return out
+
+
+@kernel
+def _turned(a: Array, covariance: Array) -> Array:
+    """``A Sigma A'``, of matrices (6, 6)."""
+    half, out = _product(a, covariance), np.zeros((6, 6))
+    for i in range(6):
+        for j in range(6):
+            for k in range(6):
+                out[i, j] += half[i, k] * a[j, k]
     return out
 
 
 @kernel
 def noise_during(step: Pose, covariance: Array) -> Array:
     """Noise (6, 6) of velocities that acted all through a step, in the tangent space at its end; see ``se2``."""
-    j = right_jacobian(log(step))
-    return j @ covariance @ j.T
+    return _turned(right_jacobian(log(step)), covariance)
 
 
 @kernel
 def propagate(covariance: Array, step: Pose, added: Array) -> Array:
     """Covariance (6, 6) of a motion lengthened by one step; see ``se2``."""
-    a = adjoint(inverse(step))
-    return a @ covariance @ a.T + added
+    back = inverse(step)
+    turn, shift = so3.matrix(rotation(back)), so3.hat(position(back))
+    moved, a = _product(shift, turn), np.zeros((6, 6))  # a is the adjoint
+    for i in range(3):
+        for j in range(3):
+            a[i, j] = a[3 + i, 3 + j] = turn[i, j]
+            a[i, 3 + j] = moved[i, j]
+    out = _turned(a, covariance)
+    for i in range(6):
+        for j in range(6):
+            out[i, j] += added[i, j]
+    return out
 
 
-@kernel
 def propagate_during(covariance: Array, step: Pose, of_twist: Array) -> Array:
     """The same as ``propagate``, for noise that acted all through the step (``noise_during``)."""
-    return propagate(covariance, step, noise_during(step, of_twist))
+    out: Array = propagate(covariance, step, noise_during(step, of_twist))
+    return out
 
 
 @jitable

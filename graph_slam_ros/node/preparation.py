@@ -17,18 +17,18 @@ class Preparation:
     fault : why it failed; empty where it did not
     """
 
-    def __init__(self, log: Any) -> None:
-        self._log = log
+    def __init__(self, log: Any, dimensions: int) -> None:
+        self._log, self._dimensions = log, dimensions
         self._stopped = threading.Event()
         self.said = self.fault = ""
 
     def run(self, is_told_to_stop: Callable[[], bool]) -> bool:
         """Do it, in the thread of the caller; False where it was stopped or failed."""
         self.said = "loading kernels"
-        if not are_compiled():
-            self._log.info("compiling kernels, once per installation: about a minute or two")
+        if not are_compiled(self._dimensions):
+            self._log.info("compiling kernels, once per installation: about a minute")
         try:
-            took_s = warmup(lambda: self._stopped.is_set() or is_told_to_stop(), self._note)
+            took_s = warmup(lambda: self._stopped.is_set() or is_told_to_stop(), self._note, self._dimensions)
         except GraphSlamError as error:  # told to stop: as somebody wants it
             self._log.info(str(error))
             return False

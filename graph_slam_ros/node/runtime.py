@@ -63,7 +63,7 @@ class Runtime:
             )
             undo.pop_all()
         self._facts = FactCollector(node, self.counters, self._session, self._worker, self._ingest, self._publishers)
-        self._preparation = Preparation(node.get_logger())
+        self._preparation = Preparation(node.get_logger(), config.world.dimensions)
         self._completion = Completion(self._session.incomplete, node.get_logger())
         self._subscriptions: Subscriptions | None = None
         self._broadcaster: TfBroadcaster | None = None

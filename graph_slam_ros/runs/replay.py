@@ -252,7 +252,7 @@ def replay(
         raise RunError(f"{source}: world.dimensions is {own.world.dimensions} there")
     losses = missing(source)
     state = read_map(source, losses, start_only=True)
-    warmup()
+    warmup(dimensions=config.world.dimensions)
     measured = progress(read_measurements(source, losses), 0)
     slam, summary = record_run(
         out, config, measured, losses, state, took=took, recording=recording_of(source), force=force
@@ -282,7 +282,7 @@ def _recorded(
     runs = RecordedRuns(bag, inputs, config, Counters(), state.datum if state is not None else ())
     total = sum(bag.topics[topic].count for topic in inputs.by_topic()) + 3
     bag.losses += losses
-    warmup()
+    warmup(dimensions=config.world.dimensions)
     earlier: list[EarlierRun] = []
     warnings: list[str] = []
     summary: dict[str, Any] = {}

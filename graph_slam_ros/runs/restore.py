@@ -43,7 +43,7 @@ def map_of(folder: Path, losses: list[str], counters: Counters | None = None) ->
     RunError, FormatError
         There is none, or it cannot be read.
     """
-    warmup()
+    warmup(dimensions=run_config(folder).space.dimensions)
     losses += missing(folder)
     counters = Counters() if counters is None else counters
     try:

@@ -6,6 +6,7 @@ After Kaess and Dellaert, "Covariance recovery from a square root information ma
 import numpy as np
 
 from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.indices import ascending, chosen
 from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUE,
     DOF,
@@ -126,10 +127,12 @@ def joint(t: Tree, vertices: Index) -> Array:
         for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
             vertex[members[m], LOCAL] = rows
             rows += vertex[members[m], DOF]
-    size = np.sum(vertex[vertices, DOF])
+    size = 0
+    for v in vertices:
+        size += vertex[v, DOF]
     y, first, end = np.zeros((rows, size)), np.full(rows, size), np.zeros(rows, np.int64)
     column = 0
-    for v in vertices[np.argsort(vertex[vertices, KEY])]:
+    for v in chosen(vertices, _by_key(vertex, vertices)):
         for row in range(vertex[v, LOCAL], vertex[v, LOCAL] + vertex[v, DOF]):
             y[row, column] = 1.0
             first[row], end[row] = column, column + 1
@@ -158,11 +161,20 @@ def joint(t: Tree, vertices: Index) -> Array:
 
 
 @kernel
+def _by_key(vertex: Index, vertices: Index) -> Index:
+    """The places of vertices in order of elimination."""
+    key = np.empty(len(vertices), np.int64)
+    for k in range(len(vertices)):
+        key[k] = vertex[vertices[k], KEY]
+    return ascending(key)
+
+
+@kernel
 def _in_order_asked_for(vertex: Index, vertices: Index, ordered: Array) -> Array:
     """A symmetric matrix over vertices in order of elimination, in the order of ``vertices``."""
     begin = np.empty(len(vertices), np.int64)
     at = 0
-    for k in np.argsort(vertex[vertices, KEY]):
+    for k in _by_key(vertex, vertices):
         begin[k] = at
         at += vertex[vertices[k], DOF]
     place = np.empty(at, np.int64)

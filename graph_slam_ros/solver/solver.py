@@ -12,8 +12,8 @@ from graph_slam_ros.graph.graph import whole_numbers
 from graph_slam_ros.solver.batch import BatchProblem, Settings, minimise
 from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.numeric import keep
+from graph_slam_ros.solver.clique_tree.pools import compact
 from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, NOTHING
-from graph_slam_ros.solver.clique_tree.symbolic import compact
 from graph_slam_ros.solver.covariance import joint, marginals
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.linearization import (
@@ -328,11 +328,10 @@ class Solver(Problem):
 
     def _restructure(self, vertices: Index, edges: Index) -> Index:
         """Order and group what new vertices and edges touch; returns the cliques whose numbers are to be made."""
-        touched = np.concatenate((incremental.ends_of(self._tree, edges), self._pending.touched))
         if self._pending.broken:
             vertices = self._unknowns()
             incremental.reset(self._tree, vertices)
-        self._tree, cliques = incremental.restructure(self._tree, touched, vertices)
+        self._tree, cliques = incremental.restructure(self._tree, edges, self._pending.touched, vertices)
         return cliques
 
     def _renumber_after_batch(self) -> None:

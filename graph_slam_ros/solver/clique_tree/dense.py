@@ -1,14 +1,15 @@
 """Dense kernels of the fronts: partial Cholesky and the triangular solution. Sums may be reordered, nothing more."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-import numba
 import numpy as np
 from numba.core import types
 from numba.extending import overload
 from numba.np.linalg import _BLAS, ensure_blas
 
+from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.storage import NOTHING
 from graph_slam_ros.typing import Array
 
@@ -17,7 +18,7 @@ WIDE = 12  # pivots that are applied to the rows below by matrix products
 FEWEST, SHORTEST = 3, 24  # pivots, and rows below them, for which that pays
 STRIP = 64  # rows of one product: half of what it makes on the diagonal is not needed
 
-dense = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+dense = partial(kernel, fastmath={"reassoc", "contract", "nsz"})
 
 
 def _subtract_product(front: Array, low: int, high: int, first: int, last: int) -> None:
@@ -55,8 +56,7 @@ def partial_cholesky(front: Array, frontal: int, diagonal: Array) -> int:
     rounding, which is judged by the ``diagonal`` of the whole problem. What is below the diagonal is not used.
     """
     n = front.shape[0]
-    done = 0
-    while done < frontal:
+    for done in range(0, frontal, WIDE):
         end = min(done + WIDE, frontal)
         wide = end - done >= FEWEST and n - end >= SHORTEST
         failed = _eliminate_panel(front, done, end, end if wide else n, diagonal)
@@ -65,7 +65,6 @@ def partial_cholesky(front: Array, frontal: int, diagonal: Array) -> int:
         if wide:
             for first in range(end, n, STRIP):
                 _subtract_product(front, done, end, first, min(first + STRIP, n))
-        done = end
     return NOTHING
 
 

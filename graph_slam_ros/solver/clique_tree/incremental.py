@@ -3,10 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.graph.edge_type import MOST_SLOTS
 from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.indices import in_order, lengthened
 from graph_slam_ros.solver.clique_tree.numeric import accept_steps, back_substitute, clear_block, eliminate
-from graph_slam_ros.solver.clique_tree.ordering import key_of, move_tail, neighbourhood
+from graph_slam_ros.solver.clique_tree.ordering import dissect, ends_of, key_of, move_tail, neighbourhood
+from graph_slam_ros.solver.clique_tree.pools import compact, release, room_for
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
     AFFECTED,
@@ -35,6 +36,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     LIVE,
     LIVE_MADE,
     LOCAL,
+    MARKED,
     MEMBERS_TOP,
     MEMBERS_WANTED,
     NEXT,
@@ -48,22 +50,13 @@ from graph_slam_ros.solver.clique_tree.storage import (
     STEP,
     TAIL_END,
     TAIL_FIRST,
-    TAKEN,
     VALUE,
     WIDTH,
+    ZERO,
     Tree,
     with_room,
 )
-from graph_slam_ros.solver.clique_tree.symbolic import (
-    build,
-    cliques_of,
-    collect,
-    compact,
-    mark,
-    release,
-    room_for,
-    structure,
-)
+from graph_slam_ros.solver.clique_tree.symbolic import build, cliques_of, collect, mark, structure
 from graph_slam_ros.typing import Array, Index
 
 SPARSE = 1.2  # of the memory of fronts, as a multiple of those in use: then it is compacted, not lengthened
@@ -154,7 +147,7 @@ def append_edges(t: Tree, rows: Index, all_ids: Index, all_ends: Index) -> None:
             vertex[v, LINK] = link
         edge[e, BLOCK] = state[BLOCKS_TOP]
         state[BLOCKS_TOP] += width * (width + 1)
-        edge[e, WIDTH], edge[e, ACTIVE], edge[e, OWNER], edge[e, TAKEN] = width, 0, NOTHING, 0
+        edge[e, WIDTH], edge[e, ACTIVE], edge[e, OWNER], edge[e, MARKED] = width, 0, NOTHING, 0
         blocks[edge[e, BLOCK] : state[BLOCKS_TOP]] = 0.0
 
 
@@ -167,9 +160,10 @@ def enter(t: Tree, vertices: Index, edges: Index) -> None:
         vertex[v, REGION] = vertex[v, NEXT] = vertex[v, CLIQUE] = NOTHING
         vertex[v, KEY] = key_of(-1, 0, v)
         if state[TAIL_END] == len(tail):  # what is before the first is not needed any more
-            keep = tail[state[TAIL_FIRST] :].copy()
-            tail[: len(keep)] = keep
-            state[TAIL_FIRST], state[TAIL_END] = 0, len(keep)
+            first, kept = state[TAIL_FIRST], state[TAIL_END] - state[TAIL_FIRST]
+            for k in range(kept):
+                tail[k] = tail[first + k]
+            state[TAIL_FIRST], state[TAIL_END] = 0, kept
         tail[state[TAIL_END]] = v
         state[TAIL_END] += 1
     for e in edges:
@@ -200,7 +194,7 @@ def reset(t: Tree, unknowns: Index) -> None:
     """Forget order and cliques, and what a call that failed left in the scratch: all unknowns are new."""
     vertex, region, state = t.vertex, t.region, t.state
     vertex[:, LOCAL] = NOTHING
-    t.edge[:, TAKEN] = 0
+    t.edge[:, MARKED] = 0
     state[CLIQUES] = state[MEMBERS_TOP] = state[FRONTS_TOP] = state[LIVE] = state[LIVE_MADE] = 0
     state[FREE_CLIQUE] = NOTHING
     state[REGIONS], state[FREE_REGION] = 1, NOTHING
@@ -215,11 +209,11 @@ def reset(t: Tree, unknowns: Index) -> None:
 
 @kernel
 def anchored(vertex: Index, edge: Index, link: Index, new: Index, edges: Index) -> bool:
-    """Whether some edges join each of new vertices, by a chain, to an older one or to an edge on one vertex alone."""
+    """Return whether edges join each new vertex, by a chain, to an older one or to an edge on one vertex alone."""
     for v in new:
         vertex[v, LOCAL] = 0
     for e in edges:
-        edge[e, TAKEN] = 1
+        edge[e, MARKED] = 1
     count, gained = 0, len(new) <= FEW
     while gained and count < len(new):
         gained = False
@@ -228,7 +222,7 @@ def anchored(vertex: Index, edge: Index, link: Index, new: Index, edges: Index) 
             while a != NOTHING and vertex[v, LOCAL] == 0:
                 e = link[a, LINK_EDGE]
                 a = link[a, LINK_NEXT]
-                if edge[e, TAKEN] == 0:
+                if edge[e, MARKED] == 0:
                     continue
                 fixed = edge[e, COUNT] == 1
                 for s in range(edge[e, COUNT]):
@@ -240,40 +234,27 @@ def anchored(vertex: Index, edge: Index, link: Index, new: Index, edges: Index) 
     for v in new:
         vertex[v, LOCAL] = NOTHING
     for e in edges:
-        edge[e, TAKEN] = 0
+        edge[e, MARKED] = 0
     return count == len(new)
 
 
 @kernel
 def edges_of(vertex: Index, link: Index, v: int) -> Index:
     """All edges on a vertex, also those that are not in the structure, in order."""
-    out, count = np.empty(16, np.int64), 0
+    out, count = np.empty(16, np.int64), ZERO
     a = vertex[v, LINK]
     while a != NOTHING:
         if count == len(out):
-            out = np.concatenate((out, np.empty(count, np.int64)))
+            out = lengthened(out, count)
         out[count] = link[a, LINK_EDGE]
         count += 1
         a = link[a, LINK_NEXT]
-    return np.sort(out[:count])
+    return in_order(out[:count])
 
 
 @kernel
-def ends_of(t: Tree, edges: Index) -> Index:
-    """The vertices of edges; some more than once."""
-    edge = t.edge
-    out = np.empty(MOST_SLOTS * len(edges), np.int64)
-    count = 0
-    for e in edges:
-        for s in range(edge[e, COUNT]):
-            out[count] = edge[e, END + s]
-            count += 1
-    return out[:count]
-
-
-@kernel
-def _restructure(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
-    """Put changes of the structure into the tree: order again what they touch, and group it into cliques.
+def _regroup(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
+    """Put changes of the structure into the tree: eliminate again what they touch, and group it into cliques.
 
     Parameters
     ----------
@@ -281,11 +262,10 @@ def _restructure(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
 
     Returns
     -------
-    Whether there was room, and then the new cliques; otherwise the vertices to touch when it is tried again: nothing
-    was changed but the order, and ``state`` says how long the pools must be.
+    Whether there was room, and then the new cliques; otherwise nothing was changed, and ``state`` says how long the
+    pools must be.
     """
     clique, state = t.clique, t.state
-    touched = move_tail(t, touched)
     marked = mark(t, touched)
     order, orphans = collect(t, marked, new)
     start, later = structure(t, order, orphans)
@@ -299,7 +279,7 @@ def _restructure(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
         or state[MEMBERS_WANTED] > len(t.members)
         or state[FRONTS_WANTED] > len(t.fronts)
     ):
-        return False, touched
+        return False, new
     release(t, marked)
     state[AFFECTED] += len(order)
     cliques = build(t, order, start, later, group, last, size, orphans)
@@ -307,18 +287,23 @@ def _restructure(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
     return True, cliques
 
 
-def restructure(tree: Tree, touched: Index, new: Index) -> tuple[Tree, Index]:
+def restructure(tree: Tree, edges: Index, touched: Index, new: Index) -> tuple[Tree, Index]:
     """The tree with changes of the structure in it, and its new cliques, whose numbers are to be made.
 
     Parameters
     ----------
-    touched : vertices whose surroundings changed; new : vertices that are not in it yet
+    edges : that are new or have changed
+    touched : other vertices whose surroundings changed; new : vertices that are not in it yet
     """
     while True:
-        done, out = _restructure(tree, touched, new)
+        touched, overgrown = move_tail(tree, edges, touched)
+        edges = edges[:0]
+        if overgrown != NOTHING:
+            touched = np.concatenate((touched, dissect(tree, overgrown)))
+        done, cliques = _regroup(tree, touched, new)
         if done:
-            return tree, out
-        touched, state = out, tree.state
+            return tree, cliques
+        state = tree.state
         if state[FRONTS_TOP] > SPARSE * state[LIVE]:
             compact(tree)
             continue
@@ -340,7 +325,6 @@ def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float) -> tuple[int
     return failed, back_substitute(t, cliques, tolerance, sigmas)
 
 
-@kernel
 def renumber(t: Tree, edges: Index, tolerance: float, sigmas: float) -> tuple[int, Index]:
     """``solve`` where only the numbers of edges have changed."""
     return solve(t, mark(t, ends_of(t, edges)), tolerance, sigmas)
@@ -355,7 +339,7 @@ def relinearize(t: Tree, moved: Index, threshold: float, error: float) -> Index:
     """
     vertex, edge, link, t_step, t_diagonal = t.vertex, t.edge, t.link, t.step, t.diagonal
     edges, moving = np.empty(64, np.int64), np.empty(len(moved), np.int64)
-    count = many = 0
+    count, many = ZERO, 0
     for v in moved:
         step = t_step[vertex[v, STEP] : vertex[v, STEP] + vertex[v, DOF]]
         largest = information = 0.0
@@ -370,13 +354,13 @@ def relinearize(t: Tree, moved: Index, threshold: float, error: float) -> Index:
         while a != NOTHING:
             e = link[a, LINK_EDGE]
             a = link[a, LINK_NEXT]
-            if edge[e, ACTIVE] == 1 and edge[e, TAKEN] == 0:
-                edge[e, TAKEN] = 1
+            if edge[e, ACTIVE] == 1 and edge[e, MARKED] == 0:
+                edge[e, MARKED] = 1
                 if count == len(edges):
-                    edges = np.concatenate((edges, np.empty(count, np.int64)))
+                    edges = lengthened(edges, count)
                 edges[count] = e
                 count += 1
     for e in edges[:count]:
-        edge[e, TAKEN] = 0
+        edge[e, MARKED] = 0
     accept_steps(t, moving[:many])
-    return np.sort(edges[:count])
+    return in_order(edges[:count])

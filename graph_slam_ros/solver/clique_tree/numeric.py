@@ -8,6 +8,7 @@ import numpy as np
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.dense import partial_cholesky, solve_upper
+from graph_slam_ros.solver.clique_tree.indices import lengthened
 from graph_slam_ros.solver.clique_tree.rounding import JUST_MADE, UNKNOWN, is_rounding, suspect_row
 from graph_slam_ros.solver.clique_tree.storage import (
     BLOCK,
@@ -37,6 +38,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     STEP,
     VALUE,
     WIDTH,
+    ZERO,
     Tree,
     front_of,
 )
@@ -168,14 +170,14 @@ def back_substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float) ->
     vertex, clique, members, fronts, step = t.vertex, t.clique, t.members, t.fronts, t.step
     value, estimate, diagonal = t.value, t.estimate, t.diagonal
     limit = sigmas * abs(sigmas)
-    moved, count = np.empty(256, np.int64), 0
-    stack, top = np.empty(256, np.int64), 0
+    moved, count = np.empty(256, np.int64), ZERO
+    stack, top = np.empty(256, np.int64), ZERO
     x = np.empty(256)
     for c in cliques:
         clique[c, MARK] = 1
         if clique[c, PARENT] == NOTHING:
             if top == len(stack):
-                stack = np.concatenate((stack, np.empty(top, np.int64)))
+                stack = lengthened(stack, top)
             stack[top] = c
             top += 1
     while top:
@@ -197,26 +199,13 @@ def back_substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float) ->
             continue
         solve_upper(front_of(clique, fronts, c), frontal, x)
         if count + clique[c, FRONTALS] > len(moved):
-            moved = np.concatenate((moved, np.empty(count + clique[c, FRONTALS], np.int64)))
-        at = 0
-        for m in range(low, low + clique[c, FRONTALS]):
-            v = members[m]
-            first, dof = vertex[v, STEP], vertex[v, DOF]
-            change = error = 0.0
-            for i in range(dof):
-                d = abs(step[first + i] - x[at + i])
-                change, error = max(change, d), max(error, d * d * diagonal[first + i])
-            if not (change <= tolerance or error <= limit):
-                for i in range(dof):
-                    step[first + i] = x[at + i]
-                vertex[v, LOCAL] = MOVED
-                moved[count] = v
-                count += 1
-            at += dof
+            moved = lengthened(moved, count + clique[c, FRONTALS])
+        frontals = members[low : low + clique[c, FRONTALS]]
+        count = _move(vertex, frontals, x, step, diagonal, tolerance, limit, moved, count)
         k = clique[c, CHILD]
         while k != NOTHING:
             if top == len(stack):
-                stack = np.concatenate((stack, np.empty(top, np.int64)))
+                stack = lengthened(stack, top)
             stack[top] = k
             top += 1
             k = clique[k, SIBLING]
@@ -226,6 +215,36 @@ def back_substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float) ->
         vertex[v, LOCAL] = NOTHING
         _retract(vertex, value, step, estimate, v)
     return moved[:count]
+
+
+@kernel
+def _move(
+    vertex: Index,
+    frontals: Index,
+    x: Array,
+    step: Array,
+    diagonal: Array,
+    tolerance: float,
+    limit: float,
+    moved: Index,
+    count: int,
+) -> int:
+    """Give vertices the steps x, but where the change is within the tolerances; returns how many have moved now."""
+    at = 0
+    for v in frontals:
+        first, dof = vertex[v, STEP], vertex[v, DOF]
+        change = error = 0.0
+        for i in range(dof):
+            d = abs(step[first + i] - x[at + i])
+            change, error = max(change, d), max(error, d * d * diagonal[first + i])
+        if not (change <= tolerance or error <= limit):
+            for i in range(dof):
+                step[first + i] = x[at + i]
+            vertex[v, LOCAL] = MOVED
+            moved[count] = v
+            count += 1
+        at += dof
+    return count
 
 
 @kernel
@@ -309,7 +328,7 @@ def keep(vertex: Index, estimate: Array, kept: Array, vertices: Index) -> None:
 
 @kernel
 def accept_steps(t: Tree, vertices: Index) -> None:
-    """The estimate becomes the linearisation point."""
+    """Make the estimates of vertices their linearisation points."""
     vertex, step, value, estimate = t.vertex, t.step, t.value, t.estimate
     for v in vertices:
         x, d, dof = vertex[v, VALUE], vertex[v, STEP], vertex[v, DOF]

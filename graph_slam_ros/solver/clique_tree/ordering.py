@@ -1,4 +1,4 @@
-"""In which order vertices are eliminated: a nested dissection that follows the graph's growth.
+"""The order of elimination: a nested dissection that follows the graph's growth.
 
 Regions form a binary tree. The vertices of an inner region separate those of its two subtrees, so they are eliminated
 after both: a path from any vertex to the root is short, and an update touches little. The newest vertices, the
@@ -8,9 +8,13 @@ grown too much is dissected anew; that is paid for by what was added to it. So i
 fronts have grown as much: by lap after lap along the same places they grow faster than the vertices.
 """
 
+from typing import Any
+
 import numpy as np
 
+from graph_slam_ros.graph.edge_type import MOST_SLOTS
 from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.indices import in_order, joined
 from graph_slam_ros.solver.clique_tree.separator import separate
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
@@ -47,6 +51,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     TAIL_FIRST,
     TAIL_KEPT,
     TAIL_LEAST,
+    ZERO,
     Tree,
 )
 from graph_slam_ros.typing import Index
@@ -54,9 +59,10 @@ from graph_slam_ros.typing import Index
 LEAF = 6  # vertices a region need not be dissected for
 GROWTH = 2.0  # a subtree is dissected anew when it has grown by this factor
 DEEPEST = 200
+ROOT: Any = np.int64(0)  # region; not a literal, for which kernels would be compiled once more
 TAIL_MOST = 128  # vertices that are kept in the tail at most
 SLACK = 8  # vertices beyond these that move down in one go, when a closure comes
-WAITING = 56  # as long as none comes
+SLACK_WITHOUT = 56  # as long as none comes
 INSIDE = 0.9  # share of the recent closures that a longer tail must hold
 
 
@@ -67,17 +73,23 @@ def key_of(depth: int, region: int, vertex: int) -> int:
 
 
 @kernel
-def move_tail(t: Tree, touched: Index) -> Index:
-    """Move the older vertices of a long tail down; returns all vertices this touches.
+def move_tail(t: Tree, edges: Index, touched: Index) -> tuple[Index, int]:
+    """Move the older vertices of a long tail down.
 
-    That waits for a change that goes further back, and so for a while if need be: what odometry alone adds is cheap.
+    This happens at a change that goes further back, or when the tail is very long: what odometry alone adds is cheap.
+
+    Returns
+    -------
+    The touched vertices, those of the edges and all others that this touches; and the region that is to be dissected
+    anew, or NOTHING.
     """
     vertex, region, tail, state = t.vertex, t.region, t.tail, t.state
     first, end = state[TAIL_FIRST], state[TAIL_END]
+    touched = joined(ends_of(t, edges), touched)
     state[RESTRUCTURED] += 1
     if first == end:
-        return touched
-    back, beyond = 0, False
+        return touched, NOTHING
+    back, beyond = ZERO, False
     for v in touched:
         back = max(back, tail[end - 1] - v)
         beyond = beyond or vertex[v, REGION] != NOTHING
@@ -85,16 +97,16 @@ def move_tail(t: Tree, touched: Index) -> Index:
         _decide_length(t, back)
     keep = state[TAIL_KEPT]
     beyond = beyond or (keep > TAIL_LEAST and back > TAIL_LEAST)
-    if end - first <= keep + (SLACK if beyond else WAITING):
-        return touched
+    if end - first <= keep + (SLACK if beyond else SLACK_WITHOUT):
+        return touched, NOTHING
     last = end - keep
     moving = tail[first:last]
     state[TAIL_FIRST] = last
     if last - first > max(region[0, R_COUNT], 4 * TAIL_LEAST):  # as many as there are: all in one go
         for v in moving:
             if vertex[v, FREE] == 1:
-                _enter(t, v, 0)
-        return np.concatenate((touched, dissect(t, 0)))
+                _enter(t, v, ROOT)
+        return touched, ROOT
     overgrown = NOTHING
     for v in moving:
         if vertex[v, FREE] == 0:
@@ -108,11 +120,8 @@ def move_tail(t: Tree, touched: Index) -> Index:
                 overgrown = r
             r = region[r, R_PARENT]
     if state[LIVE] > GROWTH * state[LIVE_MADE] > 0:
-        overgrown = 0
-    touched = np.concatenate((touched, neighbourhood(t, moving)))
-    if overgrown != NOTHING:
-        touched = np.concatenate((touched, dissect(t, overgrown)))
-    return touched
+        overgrown = ROOT
+    return joined(touched, neighbourhood(t, moving)), overgrown
 
 
 @kernel
@@ -124,19 +133,33 @@ def _decide_length(t: Tree, back: int) -> None:
     updates cost while there were few. That is so where a robot sweeps row beside row.
     """
     state, reach = t.state, t.reach
-    reach[:-1] = reach[1:]
+    for k in range(len(reach) - 1):
+        reach[k] = reach[k + 1]
     reach[-1] = back
     updates = state[RESTRUCTURED] - state[RESTRUCTURED_SEEN]
     spent = (state[FLOPS] - state[FLOPS_SEEN]) // updates
     state[RESTRUCTURED_SEEN], state[FLOPS_SEEN] = state[RESTRUCTURED], state[FLOPS]
     if state[TAIL_KEPT] == TAIL_LEAST:
         state[FLOPS_USUAL] += (spent - state[FLOPS_USUAL]) // RECENT
-    enough = np.sort(reach)[int(INSIDE * RECENT)] + 1
+    enough = in_order(reach)[int(INSIDE * RECENT)] + 1
     state[TAIL_KEPT] = TAIL_LEAST
     if enough <= TAIL_MOST:
         size = (enough + SLACK) * t.vertex[t.tail[state[TAIL_END] - 1], DOF]
         if 2 * size**3 <= state[FLOPS_USUAL]:
             state[TAIL_KEPT] = enough
+
+
+@kernel
+def ends_of(t: Tree, edges: Index) -> Index:
+    """The vertices of edges; some more than once."""
+    edge = t.edge
+    out = np.empty(MOST_SLOTS * len(edges), np.int64)
+    count = 0
+    for e in edges:
+        for s in range(edge[e, COUNT]):
+            out[count] = edge[e, END + s]
+            count += 1
+    return out[:count]
 
 
 @kernel
@@ -183,13 +206,14 @@ def _deepest_place(t: Tree, v: int) -> int:
     """The deepest region that has each region of v's neighbours above, at or below it, never beside it."""
     vertex, region = t.vertex, t.region
     deepest = NOTHING
-    for u in neighbourhood(t, np.array([v])):
+    around = neighbourhood(t, np.full(1, v, np.int64))
+    for u in around:
         r = vertex[u, REGION]
         if r != NOTHING and (deepest == NOTHING or region[r, R_DEPTH] > region[deepest, R_DEPTH]):
             deepest = r
     place = max(deepest, 0)
-    beside = False
-    for u in neighbourhood(t, np.array([v])):
+    apart = False
+    for u in around:
         r = vertex[u, REGION]
         if r == NOTHING:
             continue
@@ -197,12 +221,12 @@ def _deepest_place(t: Tree, v: int) -> int:
         while region[a, R_DEPTH] > region[r, R_DEPTH]:
             a = region[a, R_PARENT]
         if a != r:
-            beside = True
+            apart = True
             while a != r:
                 a, r = region[a, R_PARENT], region[r, R_PARENT]
             if region[a, R_DEPTH] < region[place, R_DEPTH]:
                 place = a
-    while not beside and region[place, R_LEFT] != NOTHING:  # beyond a separator: begin in the emptier part
+    while not apart and region[place, R_LEFT] != NOTHING:  # beyond a separator: begin in the emptier part
         left, right = region[place, R_LEFT], region[place, R_RIGHT]
         place = left if region[left, R_COUNT] <= region[right, R_COUNT] else right
     return place
@@ -230,9 +254,11 @@ def _clear(t: Tree, region: int) -> Index:
     vertex, t_region, state = t.vertex, t.region, t.state
     out = np.empty(t_region[region, R_COUNT], np.int64)
     count = 0
-    stack = [region]
-    while len(stack):
-        r = stack.pop()
+    stack, top = np.empty(DEEPEST + 2, np.int64), 1
+    stack[0] = region
+    while top:
+        top -= 1
+        r = stack[top]
         v = t_region[r, R_FIRST]
         while v != NOTHING:
             if vertex[v, FREE] == 1:
@@ -240,8 +266,8 @@ def _clear(t: Tree, region: int) -> Index:
                 count += 1
             v = vertex[v, NEXT]
         if t_region[r, R_LEFT] != NOTHING:
-            stack.append(t_region[r, R_LEFT])
-            stack.append(t_region[r, R_RIGHT])
+            stack[top], stack[top + 1] = t_region[r, R_LEFT], t_region[r, R_RIGHT]
+            top += 2
         if r != region:
             t_region[r, R_PARENT] = state[FREE_REGION]
             state[FREE_REGION] = r
@@ -251,7 +277,7 @@ def _clear(t: Tree, region: int) -> Index:
     while r != NOTHING:
         t_region[r, R_COUNT] -= gone
         r = t_region[r, R_PARENT]
-    return np.sort(out[:count])
+    return in_order(out[:count])
 
 
 @kernel
@@ -259,31 +285,50 @@ def dissect(t: Tree, region: int) -> Index:
     """Divide a subtree anew, from its vertices and the edges among them; returns the vertices."""
     t_region = t.region
     vertices = _clear(t, region)
-    if region == 0:
-        t.state[LIVE_MADE] = 0  # it is told when there are cliques
+    if region == ROOT:
+        t.state[LIVE_MADE] = 0  # known as soon as there are cliques again
     start, neighbour, strength, weight = _graph_of(t, vertices)
     n = len(vertices)
     part = np.arange(n)
     place = np.full(n, NOTHING, np.int64)
-    stack = [(0, n, region)]
-    while len(stack):
-        low, high, r = stack.pop()
-        mine = part[low:high].copy()
-        side = np.full(high - low, 2, np.int64)
+    stack, top = np.empty((DEEPEST + 2, 3), np.int64), 1
+    stack[0, 0], stack[0, 1], stack[0, 2] = 0, n, region
+    while top:
+        top -= 1
+        low, high, r = stack[top, 0], stack[top, 1], stack[top, 2]
+        mine, side = part[low:high].copy(), np.full(high - low, 2, np.int64)
         if high - low > LEAF and t_region[r, R_DEPTH] < DEEPEST - 1:
-            side = separate(*_induced(mine, start, neighbour, strength, weight, place))
-        a, b = int(np.count_nonzero(side == 0)), int(np.count_nonzero(side == 1))
-        part[low : low + a] = mine[side == 0]
-        part[low + a : low + a + b] = mine[side == 1]
-        if a > 0 and b > 0:
+            begin, joins, strong, heavy = _induced(mine, start, neighbour, strength, weight, place)
+            side = separate(begin, joins, strong, heavy)
+        middle, end = _parted(mine, side, part, low)
+        whole = middle == low or end == middle  # it does not fall into two parts
+        if not whole:
             left, right = _new_region(t, r), _new_region(t, r)
             t_region[r, R_LEFT], t_region[r, R_RIGHT] = left, right
-            stack.append((low, low + a, left))
-            stack.append((low + a, low + a + b, right))
-        for k in mine[side == 2] if a > 0 and b > 0 else mine:
-            _enter(t, vertices[k], r)
+            stack[top, 0], stack[top, 1], stack[top, 2] = low, middle, left
+            stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = middle, end, right
+            top += 2
+        for k in range(len(mine)):
+            if whole or side[k] == 2:
+                _enter(t, vertices[mine[k]], r)
         t_region[r, R_MADE] = high - low
     return vertices
+
+
+@kernel
+def _parted(mine: Index, side: Index, part: Index, low: int) -> tuple[int, int]:
+    """Write those of side 0 into ``part`` from ``low`` on, behind them those of side 1; returns where each end."""
+    at = low
+    for k in range(len(mine)):
+        if side[k] == 0:
+            part[at] = mine[k]
+            at += 1
+    middle = at
+    for k in range(len(mine)):
+        if side[k] == 1:
+            part[at] = mine[k]
+            at += 1
+    return middle, at
 
 
 @kernel
@@ -334,14 +379,16 @@ def _induced(
     for k in range(n):
         place[part[k]] = k
         most += start[part[k] + 1] - start[part[k]]
-    begin, joined, strong = np.zeros(n + 1, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
+    begin, heavy = np.zeros(n + 1, np.int64), np.empty(n, np.int64)
+    joins, strong = np.empty(most, np.int64), np.empty(most, np.int64)
     top = 0
     for k in range(n):
         for a in range(start[part[k]], start[part[k] + 1]):
             if place[neighbour[a]] != NOTHING:
-                joined[top], strong[top] = place[neighbour[a]], strength[a]
+                joins[top], strong[top] = place[neighbour[a]], strength[a]
                 top += 1
         begin[k + 1] = top
+        heavy[k] = weight[part[k]]
     for u in part:
         place[u] = NOTHING
-    return begin, joined[:top], strong[:top], weight[part]
+    return begin, joins[:top], strong[:top], heavy

@@ -1,4 +1,4 @@
-"""Whether a pivot can be told from rounding.
+"""Pivots that cannot be told from rounding.
 
 A pivot is x'Hx, where x moves its unknown by one and all unknowns eliminated before follow. It is what is left of a
 sum over the diagonal, whose magnitude is ``sum of H_jj x_j^2``. Its rounding error is in proportion to that magnitude.
@@ -11,6 +11,7 @@ front below the diagonal, which is not used otherwise.
 import numpy as np
 
 from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.indices import lengthened
 from graph_slam_ros.solver.clique_tree.storage import (
     CHECKED,
     CHILD,
@@ -24,6 +25,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     SIBLING,
     SIZE,
     STEP,
+    ZERO,
     Tree,
     front_of,
 )
@@ -47,7 +49,7 @@ def suspect_row(front: Array, frontal: int, diagonal: Array) -> int:
 
 @kernel
 def is_rounding(t: Tree, c: int, row: int) -> bool:
-    """Whether the pivot in a row of a clique's front cannot be told from rounding."""
+    """Return whether the pivot in a row of a clique's front cannot be told from rounding."""
     front = front_of(t.clique, t.fronts, c)
     return 1.0 / front[row, row] ** 2 <= ROUNDING * magnitude_of(t, c, row)
 
@@ -60,7 +62,7 @@ def magnitude_of(t: Tree, c: int, row: int) -> float:
     """
     vertex, clique, members, fronts, diagonal = t.vertex, t.clique, t.members, t.fronts, t.diagonal
     x_of, x = np.empty(len(t.step)), np.empty(256)  # by unknown; of one front
-    walk, seen, count, magnitude = np.empty(256, np.int64), 0, 1, 0.0
+    walk, seen, count, magnitude = np.empty(256, np.int64), 0, ZERO + 1, 0.0
     walk[0] = c
     for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, SIZE]):
         for i in range(vertex[members[m], DOF]):
@@ -93,13 +95,14 @@ def magnitude_of(t: Tree, c: int, row: int) -> float:
         k = clique[k, CHILD]
         while k != NOTHING:
             if count == len(walk):
-                walk = np.concatenate((walk, np.empty(count, np.int64)))
+                walk = lengthened(walk, count)
             walk[count] = k
             count += 1
             k = clique[k, SIBLING]
     t.state[CHECKED] += count
     place = np.empty(len(t.step), np.int64)
-    for k in walk[:count][::-1]:  # children before parents
+    for i in range(count - 1, -1, -1):  # children before parents
+        k = walk[i]
         if clique[k, MAGNITUDES] == UNKNOWN:
             _keep_magnitudes(vertex, clique, members, fronts, diagonal, k, place)
     return magnitude
@@ -107,7 +110,7 @@ def magnitude_of(t: Tree, c: int, row: int) -> float:
 
 @kernel
 def _follow(front: Array, first: int, x: Array) -> None:
-    """How the unknowns of the rows before ``first`` follow those behind them, where nothing pulls at them."""
+    """Move the unknowns of the rows before ``first`` as those behind them ask, where no residual pulls at them."""
     for a in range(first - 1, -1, -1):
         s = 0.0
         for i in range(a + 1, front.shape[0]):

@@ -8,10 +8,13 @@ A graph is (start, neighbour, strength, weight): the neighbours of u are neighbo
 joined by so many edges of the original graph; weight is a vertex's degrees of freedom.
 """
 
+from typing import Any
+
 import numpy as np
 
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.clique_tree.storage import NOTHING
+from graph_slam_ros.solver.clique_tree.indices import ascending, chosen
+from graph_slam_ros.solver.clique_tree.storage import NOTHING, ZERO
 from graph_slam_ros.typing import Array, Index
 
 COARSE = 40  # vertices of the graph that is separated first
@@ -19,6 +22,7 @@ ATTEMPTS = 6  # from different ends
 PASSES = 6  # of refinement on each level, at most
 PATIENCE = 40  # moves without gain before a pass ends
 HEAVIEST = 0.62  # share of one side
+SEPARATOR: Any = np.int64(2)  # side; not a literal, for which kernels would be compiled once more
 
 
 @kernel
@@ -38,7 +42,7 @@ def separate(start: Index, neighbour: Index, strength: Index, weight: Index) -> 
         coarser.append(pair)
     side = _first(starts[-1], neighbours[-1], weights[-1])
     for level in range(len(weights) - 2, -1, -1):
-        side = side[coarser[level + 1]]
+        side = chosen(side, coarser[level + 1])
         _refine(side, starts[level], neighbours[level], weights[level])
     return side
 
@@ -48,10 +52,14 @@ def _match(start: Index, neighbour: Index, strength: Index, weight: Index) -> tu
     """Pair each vertex with the neighbour it is joined to most strongly; returns its pair's number, and their count."""
     n = len(weight)
     pair = np.full(n, NOTHING, np.int64)
-    limit = 3 * weight.sum() // COARSE
+    neighbours, whole = np.empty(n, np.int64), 0
+    for u in range(n):
+        neighbours[u] = start[u + 1] - start[u]
+        whole += weight[u]
+    limit = 3 * whole // COARSE
     count = 0
     # those with few neighbours choose first: they have the least choice
-    for u in np.argsort(start[1:] - start[:-1], kind="mergesort"):
+    for u in ascending(neighbours):
         if pair[u] != NOTHING:
             continue
         best, mate = 0.0, u
@@ -104,20 +112,20 @@ def _contract(
 def _first(start: Index, neighbour: Index, weight: Index) -> Index:
     """The lightest of several separators: of the order as it is, and of the distances from several vertices."""
     n = len(weight)
-    best, chosen = np.inf, np.zeros(n, np.int64)
+    best, lightest = np.inf, np.zeros(n, np.int64)
     order = np.arange(n)
     seed = 0
     for attempt in range(ATTEMPTS):
         side = _sweep(order, start, neighbour, weight)
         score = _refine(side, start, neighbour, weight)
         if score < best:
-            best, chosen = score, side
+            best, lightest = score, side
         if attempt % 2 == 0:
             order = _by_distance(order[n - 1], start, neighbour)
         else:
             seed = (seed * 5 + 3 * n // 7 + 1) % n
             order = _by_distance(seed, start, neighbour)
-    return chosen
+    return lightest
 
 
 @kernel
@@ -153,7 +161,9 @@ def _sweep(order: Index, start: Index, neighbour: Index, weight: Index) -> Index
         position[order[k]] = k
     before, after = np.zeros(n + 2), np.zeros(n + 2)  # weight that begins or ends to separate at each cut
     low, high = position.copy(), position.copy()
+    whole = 0
     for u in range(n):
+        whole += weight[u]
         for a in range(start[u], start[u + 1]):
             q = position[neighbour[a]]
             low[u], high[u] = min(low[u], q), max(high[u], q)
@@ -163,7 +173,7 @@ def _sweep(order: Index, start: Index, neighbour: Index, weight: Index) -> Index
         after[position[u] + 1] -= weight[u]
     best, cut, of_before = np.inf, n // 2, True
     x = y = 0.0
-    passed, half = 0.0, 0.5 * weight.sum()
+    passed, half = 0.0, 0.5 * whole
     for c in range(n):
         x += before[c]
         y += after[c]
@@ -192,14 +202,14 @@ def _refine(side: Index, start: Index, neighbour: Index, weight: Index) -> float
     total = np.zeros(3)
     for u in range(n):
         total[side[u]] += weight[u]
-    most = HEAVIEST * total.sum()
+    most = HEAVIEST * (total[0] + total[1] + total[2])
     moved, was = np.empty(4 * n + 8, np.int64), np.empty(4 * n + 8, np.int64)
     members, locked = np.empty(n, np.int64), np.empty(n, np.uint8)
     score = _score(total)
     for _ in range(PASSES):
-        locked[:] = 0
-        count = 0
+        count = ZERO
         for u in range(n):
+            locked[u] = 0
             if side[u] == 2:
                 members[count] = u
                 count += 1
@@ -218,7 +228,7 @@ def _refine(side: Index, start: Index, neighbour: Index, weight: Index) -> float
                 if side[w] == 1 - to:
                     moved[logged], was[logged] = w, 1 - to
                     logged += 1
-                    _shift(w, 2, side, total, weight)
+                    _shift(w, SEPARATOR, side, total, weight)
                     members[count] = w
                     count += 1
             idle += 1

@@ -23,6 +23,7 @@ from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.typing import Array, Index
 
 NOTHING = -1
+ZERO: Any = np.int64(0)  # no literal: a kernel that is called with one is compiled for it alone
 
 # vertex: degrees of freedom; begin in ``step`` and in ``value``; kind (below); key: the order of elimination;
 # the clique it is frontal in; first link to its edges; its region and the next vertex there; 1 where it is an unknown;
@@ -32,7 +33,7 @@ DOF, STEP, VALUE, KIND, KEY, CLIQUE, LINK, REGION, NEXT, FREE, LOCAL, VERTEX_COL
 # edge: how many vertices, 0 where it is not known yet; these; their degrees of freedom; where its block begins; 1 where
 # it is in the structure; which of its vertices is eliminated first; scratch
 COUNT, END = range(2)
-WIDTH, BLOCK, ACTIVE, OWNER, TAKEN, EDGE_COLUMNS = range(END + MOST_SLOTS, END + MOST_SLOTS + 6)
+WIDTH, BLOCK, ACTIVE, OWNER, MARKED, EDGE_COLUMNS = range(END + MOST_SLOTS, END + MOST_SLOTS + 6)
 
 # link: an edge of a vertex, and the vertex's next link
 LINK_EDGE, LINK_NEXT, LINK_COLUMNS = range(3)

@@ -1,40 +1,35 @@
-"""Which cliques a change touches, and which cliques take their place."""
+"""Symbolic elimination: the cliques that a change touches, and those that replace them."""
 
 import numpy as np
 
 from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.indices import ascending, chosen, lengthened
+from graph_slam_ros.solver.clique_tree.pools import allocate
 from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
-    CAPACITIES,
     CHILD,
-    CLASS,
     CLIQUE,
-    CLIQUES,
     COUNT,
     DOF,
     END,
     FREE,
-    FREE_CLIQUE,
-    FRONT,
     FRONT_DOF,
     FRONTALS,
-    FRONTS_TOP,
     FULL_DOF,
     KEY,
     LINK,
     LINK_EDGE,
     LINK_NEXT,
-    LIVE,
     LOCAL,
     MARK,
     MEMBERS,
-    MEMBERS_TOP,
     NOTHING,
     OWNER,
     PARENT,
     REGION,
     SIBLING,
     SIZE,
+    ZERO,
     Tree,
 )
 from graph_slam_ros.typing import Index
@@ -50,7 +45,7 @@ def mark(t: Tree, touched: Index) -> Index:
     By the tree, not by the keys: where a region was ordered anew, what hangs below it may have later ones.
     """
     vertex, clique = t.vertex, t.clique
-    count = ways = 0
+    count, ways = ZERO, 0
     found, begin = np.empty(64, np.int64), np.empty(len(touched) + 1, np.int64)
     for v in touched:
         c = vertex[v, CLIQUE]
@@ -58,7 +53,7 @@ def mark(t: Tree, touched: Index) -> Index:
         while c != NOTHING and clique[c, MARK] == 0:
             clique[c, MARK] = 1
             if count == len(found):
-                found = np.concatenate((found, np.empty(count, np.int64)))
+                found = lengthened(found, count)
             found[count] = c
             count += 1
             c = clique[c, PARENT]
@@ -76,7 +71,7 @@ def mark(t: Tree, touched: Index) -> Index:
 
 @kernel
 def collect(t: Tree, marked: Index, new: Index) -> tuple[Index, Index]:
-    """What is eliminated again (frontals of marked cliques, and new vertices) in order, and the orphans.
+    """Collect the vertices to eliminate again (frontals of marked cliques, and new ones) in order, and the orphans.
 
     Orphans are unmarked children of marked cliques: their subtrees stay as they are.
     """
@@ -110,16 +105,15 @@ def collect(t: Tree, marked: Index, new: Index) -> tuple[Index, Index]:
             k = clique[k, SIBLING]
     for c in marked:
         clique[c, MARK] = 0
-    affected = affected[:count]
     key = np.empty(count, np.int64)
     for k in range(count):
         key[k] = vertex[affected[k], KEY]
-    return affected[np.argsort(key)], orphans
+    return chosen(affected, ascending(key)), orphans
 
 
 @kernel
 def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
-    """What each eliminated vertex leaves connected: of the k-th, numbers in ``order``, all later, the nearest first.
+    """Find what each eliminated vertex leaves connected: of the k-th, numbers in ``order``, later ones, nearest first.
 
     It is joined by edges, by the separators of orphans, and by what earlier vertices left (its children in the
     elimination tree). Returns where each begins (n + 1) and the numbers.
@@ -133,11 +127,11 @@ def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
     seen = np.full(n, NOTHING, np.int64)
     start = np.zeros(n + 1, np.int64)
     later = np.empty(8 * n + 64, np.int64)
-    top = 0
+    top = ZERO
     for k in range(n):
         start[k] = top
         if top + n - k > len(later):
-            later = np.concatenate((later, np.empty(len(later) + n, np.int64)))
+            later = lengthened(later, len(later) + n)
         top = _joined_by_edges(t, order[k], k, seen, later, top)
         i = orphan_of[k]
         while i != NOTHING:
@@ -149,7 +143,10 @@ def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
                 top = _note(later[m], k, seen, later, top)
             i = child_next[i]
         if top > start[k]:
-            nearest = start[k] + np.argmin(later[start[k] : top])
+            nearest = start[k]
+            for m in range(start[k] + 1, top):
+                if later[m] < later[nearest]:
+                    nearest = m
             later[start[k]], later[nearest] = later[nearest], later[start[k]]
             parent = later[start[k]]
             child_next[k] = child_of[parent]
@@ -247,111 +244,6 @@ def cliques_of(t: Tree, order: Index, start: Index, later: Index) -> tuple[Index
 
 
 @kernel
-def capacity_class(size: int) -> int:
-    """The least size class that has room for so many degrees of freedom."""
-    return int(np.searchsorted(CAPACITIES, size))
-
-
-@kernel
-def room_for(t: Tree, size: Index, leaving: Index) -> tuple[int, int, int]:
-    """What new cliques of these sizes add to the pools: cliques, members, numbers of fronts.
-
-    They take the places of those that leave, and vacant ones, first.
-    """
-    clique, vacant = t.clique, t.vacant
-    wanted = np.zeros(len(CAPACITIES), np.int64)
-    for s in size:
-        wanted[capacity_class(s)] += 1
-    for c in leaving:
-        wanted[clique[c, CLASS]] -= 1
-    count = members = numbers = 0
-    for k in range(len(CAPACITIES)):
-        c = vacant[k]
-        while c != NOTHING and wanted[k] > 0:
-            wanted[k] -= 1
-            c = clique[c, SIBLING]
-        more = max(wanted[k], 0)
-        count += more
-        members += more * CAPACITIES[k]
-        numbers += more * numbers_of(k)
-    return count, members, numbers
-
-
-@kernel
-def release(t: Tree, cliques: Index) -> None:
-    """Give cliques back: their places are used again by the next ones of the same size class, while still in cache."""
-    vertex, clique, vacant, members = t.vertex, t.clique, t.vacant, t.members
-    for c in cliques:
-        for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
-            if vertex[members[m], CLIQUE] == c:  # it is no unknown any more
-                vertex[members[m], CLIQUE] = NOTHING
-        k = clique[c, CLASS]
-        clique[c, SIBLING] = vacant[k]
-        vacant[k] = c
-        t.state[LIVE] -= numbers_of(k)
-
-
-@kernel
-def _take(t: Tree, size: int) -> int:
-    clique, vacant, state = t.clique, t.vacant, t.state
-    k = capacity_class(size)
-    c = vacant[k]
-    state[LIVE] += numbers_of(k)
-    if c != NOTHING:
-        vacant[k] = clique[c, SIBLING]
-        return c
-    c = state[FREE_CLIQUE]
-    if c != NOTHING:
-        state[FREE_CLIQUE] = clique[c, SIBLING]
-    else:
-        c = state[CLIQUES]
-        state[CLIQUES] += 1
-    clique[c, CLASS] = k
-    clique[c, MARK] = 0
-    clique[c, MEMBERS] = state[MEMBERS_TOP]
-    clique[c, FRONT] = state[FRONTS_TOP]
-    state[MEMBERS_TOP] += CAPACITIES[k]
-    state[FRONTS_TOP] += numbers_of(k)
-    return c
-
-
-@kernel
-def numbers_of(size_class: int) -> int:
-    """The numbers of a front."""
-    return CAPACITIES[size_class] * (CAPACITIES[size_class] + 1)
-
-
-@kernel
-def compact(t: Tree) -> None:
-    """Move all cliques together in memory; those that are vacant keep none."""
-    clique, vacant, members, fronts, state = t.clique, t.vacant, t.members, t.fronts, t.state
-    live = np.ones(state[CLIQUES], np.bool_)
-    c = state[FREE_CLIQUE]
-    while c != NOTHING:
-        live[c] = False
-        c = clique[c, SIBLING]
-    for k in range(len(vacant)):
-        while vacant[k] != NOTHING:
-            c = vacant[k]
-            vacant[k] = clique[c, SIBLING]
-            live[c] = False
-            clique[c, SIBLING] = state[FREE_CLIQUE]
-            state[FREE_CLIQUE] = c
-    member = front = 0
-    for c in np.argsort(clique[: state[CLIQUES], FRONT]):  # each goes down, so none is written over before it has moved
-        if live[c]:
-            k = clique[c, CLASS]
-            for i in range(CAPACITIES[k]):
-                members[member + i] = members[clique[c, MEMBERS] + i]
-            for i in range(numbers_of(k)):
-                fronts[front + i] = fronts[clique[c, FRONT] + i]
-            clique[c, MEMBERS], clique[c, FRONT] = member, front
-            member += CAPACITIES[k]
-            front += numbers_of(k)
-    state[MEMBERS_TOP], state[FRONTS_TOP] = member, front
-
-
-@kernel
 def build(
     t: Tree, order: Index, start: Index, later: Index, group: Index, last: Index, size: Index, orphans: Index
 ) -> Index:
@@ -364,7 +256,7 @@ def build(
     for k in range(n):
         frontals[group[k]] += 1
     for j in range(count):
-        c = new[j] = _take(t, size[j])
+        c = new[j] = allocate(t, size[j])
         k = last[j]
         clique[c, FRONTALS] = frontals[j]
         clique[c, SIZE] = frontals[j] + start[k + 1] - start[k]
@@ -387,14 +279,17 @@ def build(
         if start[k + 1] > start[k]:
             _hang(t, new[j], new[group[later[start[k]]]])
     for c in orphans:
-        parent = NOTHING
+        parent = ZERO + NOTHING
         key = np.iinfo(np.int64).max
         for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
             if vertex[members[m], KEY] < key:
                 key = vertex[members[m], KEY]
                 parent = vertex[members[m], CLIQUE]
         _hang(t, c, parent)
-    return new[::-1].copy()
+    upwards = np.empty(count, np.int64)
+    for j in range(count):
+        upwards[j] = new[count - 1 - j]
+    return upwards
 
 
 @kernel

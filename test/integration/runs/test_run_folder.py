@@ -351,7 +351,7 @@ OF_FILES = {
     # not of runs, nor of the user's
     "node/player.py": {"parameters.write_text", "subprocess.Popen"},
     "lie/jit.py": None,
-    "warmup.py": {"COMPILED.touch", "subprocess.Popen"},
+    "warmup.py": {"(CACHE_DIR / _SHARED).touch", "(CACHE_DIR / f'complete-{sys.argv[1]}').touch", "subprocess.Popen"},
     "node/memory.py": {"_STATM.read_text"},
     "analysis/plots.py": {"figure.savefig"},  # into memory
     "solver/problem.py": {"self._pending.touch"},

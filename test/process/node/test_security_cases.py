@@ -268,7 +268,7 @@ def test_X10_what_the_node_tells_has_neither_paths_nor_positions():
                     told.append(ast.unparse(node.args[0]))
     assert sorted(told) == [
         "'bond with the lifecycle manager'",
-        "'compiling kernels, once per installation: about a minute or two'",
+        "'compiling kernels, once per installation: about a minute'",
         "f'kernels ready after {took_s:.1f} s'",
         "f'saved {Path(folder).name}'",
         "f'{run.name} was stopped while measurements waited: its results are being completed'",

@@ -20,7 +20,7 @@ from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import Closure
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
-from graph_slam_ros.solver.clique_tree.storage import LOCAL, NOTHING, TAKEN
+from graph_slam_ros.solver.clique_tree.storage import LOCAL, MARKED, NOTHING
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -283,7 +283,7 @@ def test_T13_what_a_covariance_that_fails_left_in_the_tree_does_no_harm(method, 
     before = solver.joint_marginal(vertices)
 
     def faulty(tree, ids):
-        tree.vertex[ids, LOCAL], tree.edge[:, TAKEN] = 10**6, 1
+        tree.vertex[ids, LOCAL], tree.edge[:, MARKED] = 10**6, 1
         raise MemoryError("injected")
 
     with monkeypatch.context() as patch, pytest.raises(MemoryError, match="injected"):
@@ -291,7 +291,7 @@ def test_T13_what_a_covariance_that_fails_left_in_the_tree_does_no_harm(method, 
         solver.marginal(vertices) if method == "marginals" else solver.joint_marginal(vertices)
     assert solver.joint_marginal(vertices) == pytest.approx(before, rel=1e-6, abs=1e-12)
     assert (solver._tree.vertex[: p.graph.vertex_count, LOCAL] == NOTHING).all()
-    assert not solver._tree.edge[: p.graph.edge_count, TAKEN].any()
+    assert not solver._tree.edge[: p.graph.edge_count, MARKED].any()
 
 
 def fails():

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import venv
 
 import pytest
 from places import ROOT, test_path
@@ -65,19 +66,56 @@ def test_code_compiled_without_bounds_checks_is_not_served_where_they_are_asked_
     assert checked.stdout != plain.stdout
 
 
-MARK = "from graph_slam_ros.lie.jit import CACHE_DIR, COMPILED; print(CACHE_DIR, COMPILED.name)"
+ONE_KERNEL = """
+import numpy as np
+from graph_slam_ros.graph.edges import _pose_prior
+from graph_slam_ros.lie.jit import CACHE_DIR
+_pose_prior(np.zeros(3), np.zeros((1, 1), int), np.zeros((1, 3)))
+stats = _pose_prior.stats
+print(CACHE_DIR, sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
+"""
 
 
-def test_what_was_compiled_of_another_copy_of_the_sources_is_compiled_anew_for_this_one(tmp_path):
-    marks = []
-    for place in ("one", "other"):
+def test_a_moved_copy_and_a_second_environment_load_what_was_compiled(tmp_path):
+    environment = tmp_path / "environment"
+    venv.create(environment, symlinks=True, with_pip=False)
+    libraries = [path for path in sys.path if path.endswith("-packages")]
+
+    def answers(place, executable=sys.executable):
+        path = os.pathsep.join([str(tmp_path / place), *libraries])
+        command = [str(executable), "-c", ONE_KERNEL]
+        variables = os.environ | {"PYTHONPATH": path, "GRAPH_SLAM_CACHE": str(tmp_path / "cache")}
+        done = subprocess.run(command, cwd=tmp_path, env=variables, capture_output=True, text=True, timeout=120)
+        folder, hits, misses = done.stdout.split()
+        return folder, int(hits), int(misses)
+
+    for place in ("one", "moved"):
         package = tmp_path / place / "graph_slam_ros"
-        shutil.copytree(TEST.parent / "graph_slam_ros", package, ignore=shutil.ignore_patterns("__pycache__"))
-        done = python("-c", MARK, PYTHONPATH=str(package.parent), GRAPH_SLAM_CACHE=str(tmp_path))
-        marks.append(done.stdout.split())
-    (one_cache, one), (other_cache, other) = marks
-    assert one_cache == other_cache
-    assert one != other
+        shutil.copytree(ROOT / "graph_slam_ros", package, ignore=shutil.ignore_patterns("__pycache__"))
+    folder, *counts = answers("one")
+    assert counts == [0, 1]
+    for file in package.rglob("*.py"):
+        os.utime(file, (1e9, 1e9))
+    assert answers("moved", environment / "bin" / "python") == (folder, 1, 0)
+    with (package / "lie" / "so3.py").open("a") as file:
+        file.write("# changed\n")
+    other, *counts = answers("moved")
+    assert other != folder
+    assert counts == [0, 1]
+
+
+@pytest.mark.parametrize("cores", times([], [[0], sorted(os.sched_getaffinity(0))]))  # compiles for minutes
+def test_one_core_and_two_compile_code_that_computes_the_same_bytes(tmp_path, cores):
+    """Against the kernels that all tests use."""
+    command = [sys.executable, "-m", "graph_slam_ros.cli", "replay", str(ROOT / "data" / "demo.mcap"), "--out"]
+    new = os.environ | {"GRAPH_SLAM_CACHE": str(tmp_path / "cache")}
+    subprocess.run([*command, str(tmp_path / "old")], check=True, capture_output=True)
+    with_these = {"env": new, "preexec_fn": lambda: os.sched_setaffinity(0, cores)}
+    subprocess.run([*command, str(tmp_path / "new")], check=True, capture_output=True, **with_these)
+    names = {file.name for file in (tmp_path / "old").iterdir()} - {"run.json"}
+    assert len(names) > 10
+    for name in names:
+        assert (tmp_path / "new" / name).read_bytes() == (tmp_path / "old" / name).read_bytes(), name
 
 
 COMPILED_LATER = """
