@@ -1,6 +1,6 @@
 """docs/troubleshooting.md says what the code says: every counter, every reason of a state; its recipes are read.
 
-``python test/process/test_troubleshooting.py`` writes the table of counters anew.
+``PYTHONPATH=test python test/process/test_troubleshooting.py`` writes the table of counters anew.
 """
 
 import ast
@@ -30,7 +30,9 @@ def blocks(kind, text=None):
 
 
 def test_every_counter_is_on_the_page():
-    assert f"\n\n{table()}\n" in PAGE.read_text(), "python test/process/test_troubleshooting.py writes it"
+    assert f"\n\n{table()}\n" in PAGE.read_text(), (
+        "PYTHONPATH=test python test/process/test_troubleshooting.py writes it"
+    )
 
 
 def reasons_of_states():
