@@ -18,6 +18,7 @@ import tempfile
 
 MODULES = {"graph_slam": "graph_slam_ros.cli", "node": "graph_slam_ros.node.node"}
 LONGEST = 2**16  # of a message: some parameters
+DRAWN_WITH = "graph_slam_ros.analysis.plots", "matplotlib.figure", "matplotlib.backends.backend_agg"
 CAN_DIFFER = {"ROS_DOMAIN_ID"}  # all else may have been read when modules were imported
 
 
@@ -146,11 +147,13 @@ def serve(asked):
 def main():
     """What a node imports, but for ROS; then, in each child, the node or the command."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the node does
-    for name in ("cli", "runs.replay", "node.session"):
-        importlib.import_module(f"graph_slam_ros.{name}")
+    for name in ("graph_slam_ros.cli", "graph_slam_ros.runs.replay", "graph_slam_ros.node.session", *DRAWN_WITH):
+        importlib.import_module(name)
+    from graph_slam_ros.messages.interfaces import typestore
     from graph_slam_ros.warmup import warmup
 
     warmup()
+    typestore()
     threads = len(os.listdir("/proc/self/task"))
     assert threads == 1, f"{threads} threads: their locks would be held for ever in the children"
     gc.collect()

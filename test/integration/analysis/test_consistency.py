@@ -155,7 +155,7 @@ def test_a_run_with_the_noise_it_was_told_of_is_consistent_and_its_sigmas_are_ri
     options = {"warehouse": {"aisles": 2, "laps": 1, "aisle_m": 6.0}, "flight": {"laps": 1, "beacons": 3}}[world]
     # a keyframe at each look: what is carried from look to keyframe shares its noise, which is not modelled
     settings = CLEAN | {"world.dimensions": n // 3 + 1, "keyframes.max_interval_s": 0.15}
-    last, runs = [], times(4, 8)
+    last, runs = [], times(2, 8)
     for seed in range(runs):
         recording = simulate(world, seed, **options, correlation_time_s=0.0)
         folder = tmp_path / f"run_{seed}"
@@ -197,16 +197,14 @@ def test_a_flight_is_scored_in_space_in_words_and_in_plain_values(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    "text", ["", "{", "[]", "{}", '{"classes": {"a": {}}, "leverage": {}}', '{"classes": [], "leverage": 1}']
-)
-def test_a_summary_that_is_none_is_refused_by_name(tmp_path, text):
+def test_a_summary_that_is_none_is_refused_by_name(tmp_path):
     recording = simulate("pythonrobotics", 1)
     run(recording, tmp_path / "run", {})
     write_bag(recording, tmp_path / "truth.mcap")
-    (tmp_path / "run" / "run.json").write_text(text)
-    with pytest.raises(GraphSlamError, match=r"run\.json: not a summary of a run"):
-        evaluate(tmp_path / "run", tmp_path / "truth.mcap")
+    for text in ("", "{", "[]", "{}", '{"classes": {"a": {}}, "leverage": {}}', '{"classes": [], "leverage": 1}'):
+        (tmp_path / "run" / "run.json").write_text(text)
+        with pytest.raises(GraphSlamError, match=r"run\.json: not a summary of a run"):
+            evaluate(tmp_path / "run", tmp_path / "truth.mcap")
 
 
 @pytest.mark.parametrize("text", ["", "stamp_ns,a\n1,2\n", "stamp_ns,a\n1,two\n"])
@@ -220,7 +218,8 @@ def test_a_file_that_is_no_table_of_covariances_is_refused_by_name(tmp_path, tex
     "world, sensor", [("flight", "pose"), ("flight", "range_bearing"), ("warehouse", "range_bearing")]
 )
 def test_a_simulated_bag_is_replayed_to_a_run_that_is_near_the_truth_and_knows_it(tmp_path, world, sensor):
-    write_bag(simulate(world, 1, laps=1, sensor=sensor), tmp_path / "bag.mcap")
+    small = {"aisles": 2} if world == "warehouse" else {}
+    write_bag(simulate(world, 1, laps=1, sensor=sensor, **small), tmp_path / "bag.mcap")
     settings = {"world.dimensions": 3 if world == "flight" else 2}
     if sensor != "pose":
         settings |= {"inputs.names": "odom points", "points.type": "sensor_msgs/msg/PointCloud2"}

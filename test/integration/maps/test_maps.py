@@ -226,7 +226,7 @@ def test_diff_without_common_landmarks_is_by_stamps(world, first, tmp_path, caps
 
 
 def test_diff_of_the_plane_and_space_is_refused(first, tmp_path, capsys):
-    flight = list(measurements(simulate("flight", 0)))[:400]
+    flight = list(measurements(simulate("flight", 0, laps=1)))[:120]
     other = ended(tmp_path / "flight", flight, Config.from_mapping({"world.dimensions": 3}))
     assert run("diff", first, other) == 2
     assert "world.dimensions" in capsys.readouterr().err
@@ -371,7 +371,7 @@ def test_merge_refuses_in_one_line(first, elsewhere, world, tmp_path, capsys):
         else m
         for m in world
     ]
-    flight = list(measurements(simulate("flight", 0)))[:400]
+    flight = list(measurements(simulate("flight", 0, laps=1)))[:120]
     surveyed = Config.from_mapping({"landmarks.surveyed": f"id,x,y,sigma\n{keep},1,1,0.1"})
     for other, complaint in (
         (ended(tmp_path / "few", one_only), "it takes 2"),

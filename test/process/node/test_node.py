@@ -74,7 +74,7 @@ def test_live_equals_offline_when_landmarks_come_faster_than_odometry(bag, messa
     """Each message of landmarks is repeated 5 times, 3 ms apart: 28 Hz beside an odometry of 10 Hz."""
     fast = tmp_path / "fast.mcap"
     with BagWriter(fast) as writer:
-        for k, m in enumerate(messages):
+        for k, m in enumerate(messages[: len(messages) // 2]):
             if m.topic == "/odom" and k % 5 == 0:
                 writer.write("/odom", "nav_msgs/msg/Odometry", m.log_ns, m.cdr)
             for step in range(5 if m.topic == "/landmarks" else 0):
@@ -127,7 +127,7 @@ def test_a_recording_with_late_and_broken_messages_is_the_same_live_and_offline(
     file = tmp_path / "garbled.mcap"
     types = {"/odom": "nav_msgs/msg/Odometry", "/landmarks": "vision_msgs/msg/Detection3DArray"}
     with BagWriter(file) as writer:
-        for m in garbled(messages, seed=2):
+        for m in garbled(messages[: len(messages) // 2], seed=2):
             writer.write(m.topic, types[m.topic], m.log_ns, m.cdr)
     replay(file, tmp_path / "offline")
     done = graph_slam("replay", file, "--ros", "--out", tmp_path / "live")
@@ -136,7 +136,7 @@ def test_a_recording_with_late_and_broken_messages_is_the_same_live_and_offline(
 
 
 def test_several_inputs_and_a_sensor_on_a_joint_are_saved_byte_for_byte_as_offline(tmp_path):
-    drive = record_drive(tmp_path / "drive.mcap", seconds=10)
+    drive = record_drive(tmp_path / "drive.mcap", seconds=5)
     inputs = {
         "inputs.names": "odom detections gps tags",
         "gps.topic": "/fix",
