@@ -143,8 +143,9 @@ class _Reader:
     def graph(self, relative_pose: EdgeType) -> G2oFile:
         graph = Graph()
         at: dict[int, int] = {}
-        for file_id, (tag, value) in self.vertices.items():
-            at[file_id] = graph.add_vertex(VERTEX_TAGS[tag], value)
+        for tag, run in itertools.groupby(self.vertices.items(), key=lambda item: item[1][0]):
+            values = {file_id: value for file_id, (_, value) in run}
+            at.update(zip(values, graph.add_vertices(VERTEX_TAGS[tag], list(values.values())).tolist(), strict=True))
         poses = sorted(file_id for file_id, (tag, _) in self.vertices.items() if VERTEX_TAGS[tag] in (SE2, SE3))
         follows = dict(itertools.pairwise(poses))
         seen_from: dict[int, int] = {}
