@@ -564,7 +564,7 @@ def test_a_kind_that_is_none_is_refused_where_it_is_written(make):
     assert make("position").kind == "position"
 
 
-def test_of_several_faults_at_once_the_first_is_raised_and_all_count(monkeypatch):
+def test_P21_of_several_faults_at_once_the_first_is_raised_and_all_count(monkeypatch):
     p = slam(ordering={"window_s": 5.0})
     add, faults = p._landmarks.map.add, {"a": ZeroDivisionError, "c": KeyError, "d": KeyError}
     for k in range(3):
