@@ -31,8 +31,9 @@ def innovation(graph: Graph, solver: Solver, edge: int) -> float:
     GaugeError, SingularError
         As for ``Solver.marginal``.
     """
-    one, x = graph.edge(edge), solver.values
+    one = graph.edge(edge)
     joint, root = solver.joint_marginal(one.vertices), one.sqrt_information
+    x = solver.values  # after the covariance, which integrates pending changes
     residual, jacobian = linearized(graph, x, one.type, one.vertices, one.measured)
     predicted = jacobian @ joint @ jacobian.T
     white = root @ residual

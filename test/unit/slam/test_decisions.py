@@ -174,6 +174,19 @@ def test_the_innovation_is_what_the_cost_would_grow_by():
     assert expected == pytest.approx(solver.evaluate().chi2_final - before, rel=0.05)
 
 
+def test_the_innovation_is_at_the_estimate_that_the_covariance_is_of():
+    drive = Drive().go(40)
+    solver, graph = drive.backend.solver, drive.backend.graph
+    edge = graph.add_edge(RELATIVE_POSE, [10, 39], drive.noisy(10, 39), NOISE, "closures")
+    drive.backend.hand_over()
+    solver.set_weight(edge, 0.0)
+    solver.update()
+    x, y, theta = drive.true[39]
+    graph.add_edge(POSE_PRIOR, [39], (x + 1.0, y, theta), NOISE, "fixes")
+    drive.backend.hand_over()  # it moves the pose when its covariance is asked for
+    assert innovation(graph, solver, edge) == pytest.approx(innovation(graph, solver, edge), rel=1e-9)
+
+
 def test_G11_two_places_that_look_the_same_are_reported_as_ambiguous_with_what_speaks_for_each():
     """After a lap the robot takes the aisle for the next one: ten closures that agree, against five that are true."""
 
