@@ -170,7 +170,7 @@ class SavedGraph:
         one = graph.edge(edge)
         ends, root = one.vertices, one.sqrt_information
         residual, jacobian = linearized(graph, solver.values, one.type, ends, one.measured)
-        loss = solver.settings.stages()[-1].get(one.label, Loss())
+        loss = solver.settings.last_loss(one.label, one.source)
         white = root @ residual
         share = weight_and_cost(loss.kind, loss.scale, float(white @ white))[0] ** 0.5
         white, a = share * white, share * root @ jacobian

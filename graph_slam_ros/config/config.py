@@ -10,13 +10,14 @@ import inspect
 import itertools
 import re
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from graph_slam_ros.config.frontend import KeyframesConfig, OdometryConfig, OrderingConfig
 from graph_slam_ros.config.inputs import DEFAULT_INPUTS, InputConfig, default_input
 from graph_slam_ros.config.landmarks import LandmarksConfig
+from graph_slam_ros.config.loss import landmark_stages, narrow_then_wide
 from graph_slam_ros.config.node import (
     USUAL_INPUTS,
     HealthConfig,
@@ -37,7 +38,7 @@ from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.lie import se3
-from graph_slam_ros.solver import Settings
+from graph_slam_ros.solver import LossKey, Settings
 from graph_slam_ros.typing import Numbers
 
 
@@ -149,17 +150,31 @@ class Config:
         except ConfigError as error:
             raise ConfigError(f"landmarks.surveyed: {error}") from None
 
+    def _losses(self) -> dict[LossKey, Sequence[Loss]]:
+        """The stages of the loss of each class of edges, and of each class and input with a loss of its own."""
+        landmarks, robust = self.landmarks, self.robust
+        others = narrow_then_wide(robust.loss, robust.loss_scale)
+        out: dict[LossKey, Sequence[Loss]] = {"landmarks": landmark_stages(landmarks.loss, landmarks.loss_scale)}
+        out |= dict.fromkeys(("fixes", "closures", "initialpose"), others)
+        for one in self.sources:
+            if one.loss == "auto" and not one.loss_scale:
+                continue
+            name = landmarks.loss if one.loss == "auto" else one.loss
+            out["landmarks", one.name] = landmark_stages(name, one.loss_scale or landmarks.loss_scale)
+            name = robust.loss if one.loss == "auto" else one.loss
+            stages = narrow_then_wide(name, one.loss_scale or robust.loss_scale)
+            out |= {("fixes", one.name): stages, ("closures", one.name): stages}
+        return out
+
     def solver_settings(self) -> Settings:
         """The settings of the solver, online and at the end."""
-        scale = self.landmarks.loss_scale
-        stages = [Loss.named(name, scale) for name in self.landmarks.loss.split("_then_")]
         s = self.solve
         return Settings(
             s.method,
             s.max_iterations,
             s.step_tolerance,
             s.cost_tolerance,
-            {"landmarks": stages, **dict.fromkeys(("fixes", "closures", "initialpose"), self.robust.stages)},
+            self._losses(),
             relinearize_above=s.relinearize_above,
             relinearize_error=s.relinearize_error,
             relinearize_every=s.relinearize_every,

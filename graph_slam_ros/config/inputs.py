@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from graph_slam_ros.config.loss import LEAST_LOSS_SCALE, LOSSES
 from graph_slam_ros.config.parameter import numbers, setting
 from graph_slam_ros.errors import ConfigError
 
@@ -90,6 +91,38 @@ class InputConfig:
         "latitude, longitude and altitude of the map's origin, in degrees and metres; empty: the first fix",
         "deg, m",
     )
+    loss: str = setting(
+        "auto",
+        "robust loss of the input's measurements; auto: landmarks.loss for landmarks, robust.loss for fixes and "
+        "closures; odometry has none",
+        choices=("auto", *LOSSES),
+    )
+    loss_scale: float = setting(
+        0.0,
+        "residuals of the input well below this many standard deviations keep their full weight; 0: "
+        "landmarks.loss_scale for landmarks, robust.loss_scale for fixes and closures",
+        "sigma",
+        low=0.0,
+    )
+    reliability: str = setting(
+        "auto",
+        "QoS reliability that the input's subscription asks for; auto: as inputs.reliable says; reliable: a "
+        "best-effort publisher does not connect; best_effort: every publisher connects, messages may be lost",
+        choices=("auto", "reliable", "best_effort"),
+    )
+    durability: str = setting(
+        "volatile",
+        "QoS durability that the input's subscription asks for; transient_local: also the last messages of a "
+        "latched publisher, a volatile publisher then does not connect",
+        choices=("volatile", "transient_local"),
+    )
+    depth: int = setting(
+        0,
+        "messages that the middleware holds for the input's subscription; 0: inputs.depth",
+        "messages",
+        low=0,
+        high=100_000,
+    )
 
     def __post_init__(self) -> None:
         self.numbers("mount", 6)
@@ -97,6 +130,10 @@ class InputConfig:
         for (name, most, unit), number in zip(limits, self.numbers("datum", 3), strict=False):
             if abs(number) > most:
                 raise ConfigError(f"{self.name}.datum: {name} {number:g} is not in [-{most:g}, {most:g}] {unit}")
+        if 0.0 < self.loss_scale < LEAST_LOSS_SCALE:
+            raise ConfigError(
+                f"{self.name}.loss_scale: {self.loss_scale:g} is not 0 or in [{LEAST_LOSS_SCALE:g}, 1e+09]"
+            )
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
         """Numbers of a text; none if it is empty. Raises ConfigError for anything else than ``count`` of them."""

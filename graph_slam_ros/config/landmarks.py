@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from graph_slam_ros.config.loss import LEAST_LOSS_SCALE, LOSSES
 from graph_slam_ros.config.parameter import setting
-from graph_slam_ros.config.robust import LOSSES
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +115,11 @@ class LandmarksConfig:
     loss: str = setting(
         "huber_then_cauchy",
         "robust loss of landmark observations; huber_then_cauchy converges with Huber first, then with Cauchy",
-        choices=(*LOSSES, "huber_then_cauchy", "huber_then_dcs"),
+        choices=LOSSES,
     )
     loss_scale: float = setting(
-        3.0, "landmark residuals well below this many standard deviations keep their full weight", "sigma", low=0.1
+        3.0,
+        "landmark residuals well below this many standard deviations keep their full weight",
+        "sigma",
+        low=LEAST_LOSS_SCALE,
     )

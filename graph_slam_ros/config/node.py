@@ -82,7 +82,9 @@ class InputsConfig:
 
     names: str = setting(" ".join(USUAL_INPUTS), "names of the inputs; each has a section of its name")
     reliable: bool = setting(
-        False, "true: subscriptions ask for reliable delivery; a best-effort publisher then does not connect"
+        False,
+        "true: subscriptions ask for reliable delivery; a best-effort publisher then does not connect;"
+        " an input's own reliability comes first",
     )
     depth: int = setting(1000, "messages that the middleware holds for a subscription", "messages", low=1, high=100_000)
     queue: int = setting(

@@ -2,11 +2,8 @@
 
 from dataclasses import dataclass
 
+from graph_slam_ros.config.loss import LEAST_LOSS_SCALE, LOSSES
 from graph_slam_ros.config.parameter import setting
-from graph_slam_ros.graph import Loss
-
-_WIDE = 2.3  # times as wide in the end: 4.6 standard deviations, the gate of three numbers
-LOSSES = ("none", "huber", "cauchy", "geman_mcclure", "dcs")
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,13 +27,13 @@ class RobustConfig:
         low=1.0,
     )
     loss: str = setting(
-        "dcs", "robust loss of closures and fixes; geman_mcclure and dcs let go of outliers", choices=LOSSES
+        "dcs", "robust loss of closures and fixes; geman_mcclure and dcs let go of outliers", choices=LOSSES[:5]
     )
     loss_scale: float = setting(
         2.0,
         "residuals of closures and fixes well below this many standard deviations keep their full weight",
         "sigma",
-        low=0.1,
+        low=LEAST_LOSS_SCALE,
     )
     out_below: float = setting(
         0.01,
@@ -77,11 +74,3 @@ class RobustConfig:
         low=1,
         high=1_000_000,
     )
-
-    @property
-    def stages(self) -> list[Loss]:
-        """The loss of closures and fixes: close at first, so that what is far off bends nothing; then wide.
-
-        What fits so well that the gate lets it pass counts fully then: without outliers the optimum is the plain one.
-        """
-        return [Loss.named(self.loss, self.loss_scale), Loss.named(self.loss, _WIDE * self.loss_scale)]

@@ -83,7 +83,7 @@ REASONS: dict[str, Reason] = {
     "lost_in_transport": Reason(
         _REFUSED,
         "the middleware lost it on its way to the node",
-        "inputs.reliable, a larger net.core.rmem_max, or messages that are smaller or fewer",
+        "INPUT.reliability: reliable, a larger net.core.rmem_max, or messages that are smaller or fewer",
     ),
     # -- frames
     "frame_slash_stripped": Reason(_REPAIRED, "the name of a frame began with a slash"),

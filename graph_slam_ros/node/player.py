@@ -266,7 +266,10 @@ def own_node(folder: Path, inputs: Inputs, config: Config) -> Iterator[subproces
     config = replace(
         config,
         inputs=replace(config.inputs, reliable=True),
-        sources=tuple(replace(one, topic=inputs.topics.get(one.name, one.topic)) for one in config.sources),
+        sources=tuple(
+            replace(one, topic=inputs.topics.get(one.name, one.topic), reliability="auto", durability="volatile")
+            for one in config.sources
+        ),
         output=replace(config.output, folder=str(folder), keep_earlier=kept),
         health=replace(config.health, lag_s=max(config.health.lag_s, _OWN_LAG_S)),
     )

@@ -22,6 +22,7 @@ from graph_slam_ros.node.ingest import Ingest
 from graph_slam_ros.node.preparation import Preparation
 from graph_slam_ros.node.publishers import Publishers
 from graph_slam_ros.node.publishing_clock import PublishingClock
+from graph_slam_ros.node.qos import input_topics
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import Subscriptions
 from graph_slam_ros.node.tf_broadcaster import TfBroadcaster
@@ -46,7 +47,7 @@ class Runtime:
 
     def __init__(self, node: NodeHandle) -> None:
         config = with_survey(node.config)
-        self._node = node
+        self._node, self._topics = node, input_topics(node, config)
         self.counters = Counters()
         self.counters.on_first = self._warn
         with contextlib.ExitStack() as undo:  # what cannot be configured holds neither the run folder nor a topic
@@ -84,7 +85,14 @@ class Runtime:
         node, config, ingest = self._node, self._node.config, self._ingest
         self._broadcaster = TfBroadcaster(node, config, node.guarded, self._now)
         self._subscriptions = Subscriptions(
-            node, config, ingest.converter, ingest.receive, node.guarded, self._broadcaster.on_correction, self.counters
+            node,
+            config,
+            self._topics,
+            ingest.converter,
+            ingest.receive,
+            node.guarded,
+            self._broadcaster.on_correction,
+            self.counters,
         )
         ingest.activate()
 

@@ -139,15 +139,15 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
     tags = {edge: tag for tag, edge in EDGE_TAGS.items()}
     names = {mark.vertex: name for name, mark in slam.landmarks.items()}
     chi2, _ = slam.solver.chi2_of(np.arange(len(ledger)))
-    losses = slam.solver.settings.stages()[-1]
+    settings = slam.solver.settings
     keyframe_of = {vertex: k for k, vertex in enumerate(slam.keyframes.ids.tolist())}
     stamps_ns = slam.keyframes.stamps_ns
     judged = {change.edge: change.threshold for change in ledger.history}
     for edge in range(len(ledger)):
         one = graph.edge(edge)
         label, vertices = one.label, one.vertices
-        root, loss, keyframe = one.sqrt_information, losses.get(label), int(ledger.keyframe.values[edge])
-        left = weight_and_cost(loss.kind, loss.scale, float(chi2[edge]))[0] if loss else 1.0
+        root, keyframe, loss = one.sqrt_information, int(ledger.keyframe.values[edge]), settings.last_loss(label, one.source)
+        left = weight_and_cost(loss.kind, loss.scale, float(chi2[edge]))[0]
         yield Entry(
             edge,
             label,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from graph_slam_ros.solver.clique_tree.numeric import (
 from graph_slam_ros.solver.clique_tree.storage import NOTHING, Tree
 from graph_slam_ros.solver.clique_tree.symbolic import mark
 from graph_slam_ros.solver.gauge import undetermined
-from graph_slam_ros.solver.linearization import Losses, costs, linearize, refuse_nonfinite, store
+from graph_slam_ros.solver.linearization import Losses, LossKey, costs, linearize, refuse_nonfinite, store
 from graph_slam_ros.solver.report import Iteration, Report
 from graph_slam_ros.typing import Array, Index
 
@@ -51,8 +52,9 @@ class Settings:
     max_iterations : of each stage
     step_tolerance : converged when no component of a step is larger [m, rad]
     cost_tolerance : converged when the cost changes by a smaller fraction
-    losses : by label, the stages of its loss: each is minimised, the last until converged; a label with fewer stages
-        keeps its last. Online an edge has the first at its first update and the last from then on
+    losses : by label, or by (label, source) for the edges of one source: the stages of the loss. Each is minimised, the
+        last until converged; a loss with fewer stages keeps its last. Online an edge has the first at its first update
+        and the last from then on
     relinearize_above : online, a vertex is linearised anew when a component of its step is larger [m, rad]
     relinearize_error : or when its step squared is more than so many standard deviations of its strongest measurement
     relinearize_every : that is looked for at every so many updates, or after two thirds of these at one that closes a
@@ -66,7 +68,7 @@ class Settings:
     max_iterations: int = 50
     step_tolerance: float = 1e-6
     cost_tolerance: float = 1e-6
-    losses: Mapping[str, Sequence[Loss]] = field(default_factory=dict)
+    losses: Mapping[Any, Sequence[Loss]] = field(default_factory=dict)
     relinearize_above: float = 0.05
     relinearize_error: float = 0.1
     relinearize_every: int = 10
@@ -84,8 +86,13 @@ class Settings:
             if not len(stages):
                 raise GraphSlamError(f"losses: {label!r} has no stage; leave it out, or give it a loss")
 
-    def stages(self) -> list[dict[str, Loss]]:
-        """One loss per label for each stage."""
+    def last_loss(self, label: str, source: str) -> Loss:
+        """The loss of the last stage of an edge."""
+        stages = self.losses.get((label, source)) or self.losses.get(label)
+        return stages[-1] if stages else Loss()
+
+    def stages(self) -> list[dict[LossKey, Loss]]:
+        """One loss for each key of ``losses``, for each stage."""
         count = max((len(stages) for stages in self.losses.values()), default=1)
         return [{name: s[min(k, len(s) - 1)] for name, s in self.losses.items()} for k in range(count)]
 

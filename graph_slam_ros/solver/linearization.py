@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from graph_slam_ros.solver.report import ClassCost
 from graph_slam_ros.typing import Array, Index
 
 CHUNK = 512  # edges
+LossKey: TypeAlias = str | tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +39,25 @@ class Block:
 
 
 class Losses:
-    """The loss of each label of a graph, by its code, as arrays for the kernels."""
+    """The loss of each edge of a graph, as arrays for the kernels: by label or, where one is given, label and source.
 
-    def __init__(self, graph: Graph, by_label: Mapping[str, Loss]) -> None:
-        losses = [by_label.get(label, Loss()) for label in graph.labels]
+    Parameters
+    ----------
+    given : by label, or by (label, source), which comes first; edges without one have none
+    """
+
+    def __init__(self, graph: Graph, given: Mapping[LossKey, Loss]) -> None:
+        sources = graph.sources if any(isinstance(key, tuple) for key in given) else [""]
+        pairs = [(label, source) for label in graph.labels for source in sources]
+        losses = [given.get(pair) or given.get(pair[0]) or Loss() for pair in pairs]
         self.kind = np.array([loss.kind for loss in losses], dtype=np.int64)
         self.scale = np.array([loss.scale for loss in losses])
+        self._sources = len(sources) if sources != [""] else 0
+
+    def codes(self, table: EdgeTable, rows: Index) -> Index:
+        """Places (n,) of the losses of some edges in ``kind`` and ``scale``."""
+        label: Index = table.label.values[rows]
+        return label * self._sources + table.source.values[rows] if self._sources else label
 
 
 @kernel
@@ -65,7 +80,7 @@ def _whiten(
     jacobian: Array,
     sqrt_information: Array,
     weight: Array,
-    label: Index,
+    loss: Index,
     loss_kind: Index,
     loss_scale: Array,
 ) -> tuple[Array, Array]:
@@ -87,7 +102,7 @@ def _whiten(
                     j[a, c] += root * jacobian[e, b, c]
             s += r[a] * r[a]
         s *= weight[row]
-        slope, rho = weight_and_cost(loss_kind[label[row]], loss_scale[label[row]], s)
+        slope, rho = weight_and_cost(loss_kind[loss[e]], loss_scale[loss[e]], s)
         chi2[e], cost[e] = s, rho
         factor = np.sqrt(weight[row] * slope)
         for a in range(m):
@@ -98,18 +113,19 @@ def _whiten(
 
 
 def linearize(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], losses: Losses) -> Iterator[Block]:
-    """Linearise the given rows of each table at the stored values x, with the loss of each edge's label.
+    """Linearise the given rows of each table at the stored values x, with the loss of each edge.
 
     Blocks come some hundred edges at a time: arrays of that size stay in the cache and in the process.
     """
     offset = graph.offset.values
     for table, chosen in rows.items():
-        columns = table.sqrt_information.values, table.weight.values, table.label.values
+        columns = table.sqrt_information.values, table.weight.values
         for first in range(0, len(chosen), CHUNK):
             some = chosen[first : first + CHUNK]
             at, measured = _gather(some, table.vertices.values, offset, table.measured.values)
             residual, jacobian = table.type.linearize(x, at, measured)
-            chi2, cost = _whiten(some, residual, jacobian, *columns, losses.kind, losses.scale)
+            loss = losses.codes(table, some), losses.kind, losses.scale
+            chi2, cost = _whiten(some, residual, jacobian, *columns, *loss)
             yield Block(table, some, residual, jacobian, chi2, cost)
 
 

@@ -22,14 +22,14 @@ class LossStages:
         self.young = NONE
         self._graph = graph
         self._losses: list[Losses] = []
-        self._made_for: tuple[int, Settings | None] = 0, None  # so many labels, and their settings
+        self._made_for: tuple[int, int, Settings | None] = 0, 0, None  # so many labels and sources, and their settings
 
     def losses(self, settings: Settings) -> list[Losses]:
         """The losses of each stage."""
-        count, made_for = self._made_for
-        if count != len(self._graph.labels) or made_for is not settings:
-            self._made_for = len(self._graph.labels), settings
-            self._losses = [Losses(self._graph, by_label) for by_label in settings.stages()]
+        key = len(self._graph.labels), len(self._graph.sources), settings
+        if self._made_for[:2] != key[:2] or self._made_for[2] is not settings:
+            self._made_for = key
+            self._losses = [Losses(self._graph, given) for given in settings.stages()]
         return self._losses
 
     def of(self, edges: Index, settings: Settings) -> list[tuple[Index, Losses]]:
@@ -53,7 +53,7 @@ class LossStages:
         changes = []
         for edge, fit in zip(self.young.tolist(), chi2.tolist(), strict=True):
             table, row = self._graph.row(edge)
-            label, s = int(table.label.values[row]), fit * float(table.weight.values[row])
-            before, after = (weight_and_cost(one.kind[label], one.scale[label], s)[0] for one in (first, last))
+            s, (code,) = fit * float(table.weight.values[row]), last.codes(table, np.array([row])).tolist()
+            before, after = (weight_and_cost(one.kind[code], one.scale[code], s)[0] for one in (first, last))
             changes.append(before != after)
         self.young = self.young[changes]

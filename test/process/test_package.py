@@ -105,7 +105,8 @@ NEVER = {
     "analysis/evaluation.py": {"matplotlib"},
 }
 SPEAK_RCLPY = {
-    f"node/{name}.py" for name in ("bond", "node", "player", "ingest", "subscriptions", "publishers", "parameters")
+    f"node/{name}.py"
+    for name in ("bond", "node", "player", "qos", "ingest", "subscriptions", "publishers", "parameters")
 }
 SPEAK_MESSAGES = SPEAK_RCLPY | {
     "messages/to_msg.py",

@@ -56,7 +56,7 @@ def uses(config: Config) -> dict[str, str]:
     Raises
     ------
     ConfigError
-        An input of a type that is not in the table or cannot be used so, or none is odometry.
+        An input of a type that is not in the table or cannot be used so, or none is odometry, or odometry has a loss.
     """
     out = {settings.name: _use(settings) for settings in config.sources if settings.use != "none"}
     if "odometry" not in out.values():
@@ -71,4 +71,6 @@ def _use(settings: InputConfig) -> str:
     use = next(iter(there)) if settings.use == "auto" else settings.use
     if use not in there:
         raise ConfigError(f"{settings.name}.use: {settings.type} can be {' or '.join(there)}, not {use}")
+    if use == "odometry" and (settings.loss != "auto" or settings.loss_scale):
+        raise ConfigError(f"{settings.name}.loss: {settings.name} is used as odometry, which has no robust loss")
     return use

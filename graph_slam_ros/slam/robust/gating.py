@@ -252,7 +252,7 @@ class OutlierGate:
         for edge, fit in zip(edges[again].tolist(), chi2[again].tolist(), strict=True):
             ledger.note(edge, keyframe, Verdict.ACCEPTED, Reason.NONE, fit)
         for edge, fit in zip(edges[unfit].tolist(), chi2[unfit].tolist(), strict=True):
-            loss = self._solver.settings.losses[self._graph.label_of(edge)][-1]
+            loss = self._solver.settings.last_loss(self._graph.label_of(edge), self._graph.source_of(edge))
             weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
             if weight < self._config.out_below and not self._is_needed(edge):
                 self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)

@@ -124,6 +124,22 @@ def test_B23_a_qos_that_does_not_match_and_all_else_that_keeps_odometry_from_com
     assert "Traceback" not in n.said
 
 
+def test_the_qos_of_one_input_is_its_own_and_a_publisher_that_does_not_connect_is_logged_with_the_parameter():
+    asked = "odom.reliability:=reliable", "detections.durability:=transient_local"
+    with node("output.folder:=''", *asked) as n, robot(hears=("/diagnostics",), sends=()) as other:
+        with robot(name="shy", reliability=ReliabilityPolicy.BEST_EFFORT, hears=()):
+            odometry = "/odom: shy offers best effort, odom.reliability asks for reliable delivery (QoS)"
+            landmarks = "/landmarks: shy offers volatile, detections.durability asks for transient_local (QoS)"
+            other.until_it_says("WAITING", odometry)
+            for line in (odometry, landmarks):
+                until(lambda line=line: line.replace(": shy", ": not connected: shy") in n.said, other.spin, line)
+        assert n.stop()[0] == 0
+    with node("output.folder:=''", "odom.reliability:=sometimes") as n:
+        code, said = n.ended()
+    assert code != 0
+    assert "odom.reliability: 'sometimes' is not one of auto, reliable, best_effort" in said
+
+
 def test_frames_that_nothing_links_to_the_robot_are_named_and_the_rest_goes_on(tmp_path):
     with node("output.folder:=''") as n, robot(hears=("/diagnostics", "path")) as r:
         r.wait_for_node()
