@@ -1,12 +1,12 @@
-"""Who is told how far something is that takes long; light to import."""
+"""Listeners to the progress of long work; light to import."""
 
 from collections.abc import Callable
 
 listeners: list[Callable[[str], None]] = []
-"""Called several times a second while kernels are compiled, with the words for it."""
+"""Called several times a second while kernels are compiled, with a sentence of progress."""
 
 
-def report(said: str) -> None:
-    """Tell all listeners."""
+def report(message: str) -> None:
+    """Call all listeners."""
     for listener in listeners:
-        listener(said)
+        listener(message)

@@ -73,13 +73,13 @@ def are_compiled(dimensions: int = 3) -> bool:
     return bool(numba.config.DISABLE_JIT) or not _missing(dimensions)  # type: ignore[attr-defined]
 
 
-Tell = Callable[[Compiling], None]
+OnProgress = Callable[[Compiling], None]
 _Kernel = tuple[Any, tuple[Any, ...]]
 
 
 def warmup(
-    is_told_to_stop: Callable[[], bool] = lambda: False,
-    tell: Tell = lambda now: report(str(now)),
+    is_stop_requested: Callable[[], bool] = lambda: False,
+    on_progress: OnProgress = lambda now: report(str(now)),
     dimensions: int = 3,
 ) -> float:
     """Compile what is not compiled yet, and load it; returns the seconds it took.
@@ -88,17 +88,17 @@ def warmup(
 
     Parameters
     ----------
-    is_told_to_stop : asked while kernels are compiled, which may take minutes
-    tell : called meanwhile, several times a second
+    is_stop_requested : asked while kernels are compiled, which may take minutes
+    on_progress : called meanwhile, several times a second
     dimensions : 2 where all is in the plane, which needs fewer kernels
 
     Raises
     ------
     GraphSlamError
-        Told to stop; the next warm-up goes on from there.
+        Stopped on request; the next warm-up goes on from there.
     """
     start = time.perf_counter()
-    compile_all(is_told_to_stop, tell, dimensions)
+    compile_all(is_stop_requested, on_progress, dimensions)
     _load_plane()
     if dimensions == 3:
         _load_space()
@@ -106,13 +106,13 @@ def warmup(
 
 
 def compile_all(
-    is_told_to_stop: Callable[[], bool] = lambda: False,
-    tell: Tell = lambda now: report(str(now)),
+    is_stop_requested: Callable[[], bool] = lambda: False,
+    on_progress: OnProgress = lambda now: report(str(now)),
     dimensions: int = 3,
 ) -> None:
     """Compile what is not compiled yet, and load nothing; as ``warmup``."""
     if not are_compiled(dimensions):
-        _compile(_missing(dimensions), is_told_to_stop, tell)
+        _compile(_missing(dimensions), is_stop_requested, on_progress)
 
 
 def _missing(dimensions: int) -> list[str]:
@@ -120,7 +120,7 @@ def _missing(dimensions: int) -> list[str]:
     return [part for part in list(_PARTS)[:dimensions] if not (CACHE_DIR / f"complete-{part}").exists()]
 
 
-def _compile(parts: list[str], is_told_to_stop: Callable[[], bool], tell: Tell) -> None:
+def _compile(parts: list[str], is_stop_requested: Callable[[], bool], on_progress: OnProgress) -> None:
     """Compile parts, once per installation, into the cache on disk."""
     start, began_with = time.perf_counter(), _cached()
     at_once = max(2, len(os.sched_getaffinity(0)))  # two wait for each other
@@ -130,12 +130,12 @@ def _compile(parts: list[str], is_told_to_stop: Callable[[], bool], tell: Tell) 
             while parts and len(running) < at_once:
                 running.append(_started(parts.pop(0)))
             for process in running[:]:
-                if (said := _ended(process)) is not None:
+                if (errors := _ended(process)) is not None:
                     running.remove(process)
-                    _refuse_failure(process.returncode, said)
-            tell(Compiling(_cached(), time.perf_counter() - start, began_with))
-            if is_told_to_stop():
-                raise GraphSlamError("told to stop before all kernels were compiled")
+                    _refuse_failure(process.returncode, errors)
+            on_progress(Compiling(_cached(), time.perf_counter() - start, began_with))
+            if is_stop_requested():
+                raise GraphSlamError("stopped before all kernels were compiled")
     finally:
         for process in running:  # also at Ctrl-C, which they do not get themselves
             process.kill()
@@ -149,10 +149,10 @@ def _started(part: str) -> "subprocess.Popen[bytes]":
     return subprocess.Popen(command, env=environment, start_new_session=True, stderr=subprocess.PIPE)
 
 
-def _refuse_failure(code: int, said: bytes) -> None:
+def _refuse_failure(code: int, errors: bytes) -> None:
     """Raise where a part could not be compiled."""
     if code:
-        why = said.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {code}"]
+        why = errors.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {code}"]
         remedy = "GRAPH_SLAM_CACHE names a folder with 100 MB of room"
         raise GraphSlamError(f"{CACHE_DIR}: kernels could not be compiled: {why[0]}; {remedy}")
 

@@ -65,7 +65,7 @@ def drive(folder, tell, keep_earlier=0, before=lambda k: None):
     session = Session(config_of(folder, keep_earlier), Counters(), lambda *_: tell(UPDATED), lambda *_: None)
     for k, measurement in enumerate(recorded()[:STEPS]):
         before(k)
-        session.take([measurement])
+        session.ingest([measurement])
         if k + 1 in SAVES:
             session.save()
             tell(SAVED)
@@ -427,10 +427,10 @@ class Trial:
                 if self._state == "after a disk-full period" and k == armed_at(self._state):
                     assert session.recording_fails, "a full disk was not told of"
                     faulty.lift()
-                    session.take([])
+                    session.ingest([])
                 full_for_a_while(self._state, faulty, k, (n, act))
                 fails.append(session.recording_fails)
-                session.take([measurement])
+                session.ingest([measurement])
                 if faulty.fired and k % 8 == 7 and armed_at(self._state) != k:
                     faulty.lift()
                 if k + 1 in SAVES:

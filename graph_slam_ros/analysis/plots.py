@@ -282,7 +282,7 @@ def _draw_stars(axes: Any, points: Array) -> None:
 
 
 def _with_gaps(truth: Trajectory) -> Trajectory:
-    """Not a number where nothing was recorded: no line is drawn there."""
+    """The path with NaN where nothing was recorded: no line is drawn there."""
     seconds = np.diff(truth.stamps_s)
     usual_s = float(np.median(seconds)) if len(seconds) else 0.0
     gaps = np.flatnonzero(seconds > max(_GAP_S, _LONG_STEPS * usual_s)) + 1

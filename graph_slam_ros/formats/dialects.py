@@ -106,7 +106,7 @@ def _vertex3(words: Words, _: Text) -> Words:
 
 
 def _edge3(words: Words, text: Text) -> Words:
-    """Without an information matrix it is the identity; its rotations are taken as rotation vectors."""
+    """The words of a g2o line; information is the identity where there is none, rotations are rotation vectors."""
     if len(words) != 9:
         expect(words, 29)
     values = numbers(words[3:])

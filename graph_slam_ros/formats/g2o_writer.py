@@ -111,7 +111,7 @@ def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
 
 
 def _short(edge: EdgeType, measured: list[float]) -> list[float]:
-    """Without the tail where it says nothing."""
+    """The measured values, without a tail that has its default values."""
     head = edge.measured_size - len(edge.tail)
     return measured[:head] if tuple(measured[head:]) == edge.tail else measured
 

@@ -24,7 +24,7 @@ MISSING = (
 
 
 def is_installed() -> bool:
-    """Whether there can be a bond."""
+    """Return whether the messages of a bond are installed."""
     try:
         message_class(_TYPE)
     except ConfigError:
@@ -33,7 +33,7 @@ def is_installed() -> bool:
 
 
 class Bond:
-    """Our end of it, from now on until ``end``.
+    """Our end of a bond, from now on until ``end``.
 
     Parameters
     ----------
@@ -58,27 +58,27 @@ class Bond:
         """Tell the manager that the node goes, so that it need not wait for silence."""
         self._node.destroy_timer(self._timer)
         if not self._is_over:
-            self._say(is_active=False)
+            self._publish(is_active=False)
             self._publisher.wait_for_all_acked(_ACKNOWLEDGED)
         self._node.destroy_subscription(self._subscription)
         self._node.destroy_publisher(self._publisher)
 
     def _beat(self) -> None:
         if not self._is_over:
-            self._say(is_active=True)
+            self._publish(is_active=True)
 
     def _on_status(self, status: Any) -> None:
         if status.id != self._node.get_name() or status.instance_id == self._instance or self._is_over:
             return
         if not status.active:
             self._is_over = True
-            self._say(is_active=False)  # what the manager waits for
+            self._publish(is_active=False)  # what the manager waits for
             self._node.get_logger().warn("the lifecycle manager has ended the bond")
         elif not self._is_formed:
             self._is_formed = True
             self._node.get_logger().info("bond with the lifecycle manager")
 
-    def _say(self, *, is_active: bool) -> None:
+    def _publish(self, *, is_active: bool) -> None:
         status = self._status(
             id=self._node.get_name(),
             instance_id=self._instance,

@@ -52,9 +52,9 @@ class Completion:
         os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICE)
 
     def _report(self, process: "subprocess.Popen[str]") -> None:
-        _, said = process.communicate()
+        _, errors = process.communicate()
         if process.returncode:
-            why = said.strip().splitlines()[-1:] or [f"exit code {process.returncode}"]
+            why = errors.strip().splitlines()[-1:] or [f"exit code {process.returncode}"]
             self._log.error(f"{self._run.name}: its results could not be completed: {why[0]}")
         else:
             self._log.info(f"{self._run.name}: its results are complete")

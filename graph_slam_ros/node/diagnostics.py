@@ -1,4 +1,4 @@
-"""Whether all is well, and if not, why: one verdict with its reasons, from facts that the node gathers.
+"""The state of the node: one verdict with its reasons, from facts that the node gathers.
 
 States: UNCONFIGURED, INACTIVE and FINALIZED by lifecycle; WAITING for what is missing; OK; DEGRADED, where the estimate
 goes on but is not what it could be; ERROR, where somebody must act.
@@ -22,7 +22,7 @@ _UNLINKED = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_
 
 @dataclass(frozen=True, slots=True)
 class InputFacts:
-    """What is known of one input.
+    """The facts of one input.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class InputFacts:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What the verdict is made of.
+    """The facts of the verdict.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class Health:
 
     @property
     def is_healthy(self) -> bool:
-        """Whether nobody need do anything."""
+        """Return whether the state is OK."""
         return self.state == "OK"
 
     @property
@@ -146,7 +146,7 @@ def _errors(facts: Facts) -> Iterator[str]:
 
 
 def _missing(facts: Facts) -> Iterator[str]:
-    """What keeps the first estimate from coming; of landmarks, only what is wrong."""
+    """The reasons why there is no estimate yet; landmarks give one only where something is wrong."""
     if facts.preparing:
         yield facts.preparing
     if facts.loads:
@@ -177,7 +177,7 @@ def _silence(one: InputFacts) -> Iterator[str]:
 
 
 def _refused(one: InputFacts) -> str:
-    """How much of an input was refused lately, for what reason most, and what mends that."""
+    """The part of an input that was refused lately, with the most frequent reason and its remedy."""
     recent = one.recent
     meaning = explain(recent.worst).meaning
     if recent.worst in _UNLINKED and one.frames:
@@ -239,7 +239,7 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
 
 
 def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
-    """For /diagnostics: the verdict, each input, and the graph."""
+    """The statuses of /diagnostics: the verdict, each input, and the graph."""
     message = "; ".join((verdict.state, *verdict.reasons))
     healthy = {"healthy": str(verdict.is_healthy), "state": verdict.state}
     reasons = {f"reason {k}": reason for k, reason in enumerate(verdict.reasons, 1)}
@@ -247,16 +247,16 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
     load |= {"faults in 10 s": str(facts.faults)}
     yield Status(verdict.level, f"{node}: health", message, node, healthy | reasons | load)
     for one in facts.inputs:
-        told = {"topic": one.topic, "use": one.use, "received": str(one.received), "used": str(one.used)}
-        told |= {"came in 10 s": str(one.recent.came), "refused in 10 s": str(one.recent.times)}
-        told |= {"silent [s]": f"{one.silent_s:.1f}", "publishers": ", ".join(one.publishers)}
-        told |= {f"counted: {reason}": str(times) for reason, times in sorted(one.counts.items())}
+        values = {"topic": one.topic, "use": one.use, "received": str(one.received), "used": str(one.used)}
+        values |= {"came in 10 s": str(one.recent.came), "refused in 10 s": str(one.recent.times)}
+        values |= {"silent [s]": f"{one.silent_s:.1f}", "publishers": ", ".join(one.publishers)}
+        values |= {f"counted: {reason}": str(times) for reason, times in sorted(one.counts.items())}
         is_wrong = one.mismatch or one.is_contested or one.recent.is_bad
         level = WARN if is_wrong or (one.use == "odometry" and not one.received) else OK
-        yield Status(level, f"{node}: input {one.name}", one.mismatch or f"{one.received} received", node, told)
+        yield Status(level, f"{node}: input {one.name}", one.mismatch or f"{one.received} received", node, values)
     if facts.estimate:
-        told = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}
-        yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes", node, told)
+        values = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}
+        yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes", node, values)
 
 
 def _graph(e: Estimate) -> dict[str, str]:

@@ -45,7 +45,7 @@ class Estimate:
 
     @property
     def is_located(self) -> bool:
-        """Whether pose and ``map -> odom`` may be published."""
+        """Return whether pose and ``map -> odom`` may be published."""
         return self.is_confirmed or self.is_resumed
 
     @classmethod

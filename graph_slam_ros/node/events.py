@@ -1,4 +1,4 @@
-"""What has happened, as the statuses of ``~/events``: one for each thing, its numbers as values."""
+"""The statuses of ``~/events``: one for each event, its numbers as values."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ from graph_slam_ros.slam import GraphSlam, Update
 from graph_slam_ros.slam.kidnap_detector import Alarm
 from graph_slam_ros.slam.robust.ledger import Verdict, VerdictChange
 
-_EDGES = 1000  # of one update that are told one by one
+_EDGES = 1000  # of one update that are moved one by one
 
 
 def happened(what: str, message: str, level: int = OK, **values: object) -> Status:
@@ -69,23 +69,25 @@ def _alarm(alarm: Alarm) -> Status:
 
 
 def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:
-    """How far a solve moved the robot in the map, and the edges it had to reconcile."""
-    told = update.correction
-    causes = [f"{e} ({name_of(slam, e)}, {fit:.1f})" for e, fit in zip(told.edges, told.chi2, strict=True) if fit > 1.0]
+    """The motion of the robot in the map by a solve, and the edges that caused it."""
+    moved = update.correction
+    causes = [
+        f"{e} ({name_of(slam, e)}, {fit:.1f})" for e, fit in zip(moved.edges, moved.chi2, strict=True) if fit > 1.0
+    ]
     return happened(
         "correction",
-        f"map -> odom moved the robot by {told.distance_m:.3f} m, {told.angle_rad:.3f} rad"
+        f"map -> odom moved the robot by {moved.distance_m:.3f} m, {moved.angle_rad:.3f} rad"
         + (f"; caused by edges {', '.join(causes)}" if causes else ""),
         level,
-        distance_m=f"{told.distance_m:.6f}",
-        angle_rad=f"{told.angle_rad:.6f}",
-        edges=" ".join(map(str, told.edges)),
-        chi2_per_dof=" ".join(f"{fit:.3g}" for fit in told.chi2),
+        distance_m=f"{moved.distance_m:.6f}",
+        angle_rad=f"{moved.angle_rad:.6f}",
+        edges=" ".join(map(str, moved.edges)),
+        chi2_per_dof=" ".join(f"{fit:.3g}" for fit in moved.chi2),
     )
 
 
 def name_of(slam: GraphSlam, edge: int) -> str:
-    """What an edge is of: its class, and the landmark it is about."""
+    """The class of an edge, and the name of its landmark."""
     one = slam.graph.edge(edge)
     of = next((name for name, mark in slam.landmarks.items() if mark.vertex in one.vertices), "")
     return f"{one.label} {of}".strip()

@@ -88,6 +88,6 @@ class FactCollector:
             authorities=rivals or (),
             twins=node.get_node_names_and_namespaces().count((node.get_name(), node.get_namespace())) - 1,
             tf_behind_s=broadcaster.behind_s if broadcaster is not None else 0.0,
-            preparing=preparation.said,
+            preparing=preparation.status,
             cannot_prepare=preparation.fault,
         )

@@ -27,14 +27,14 @@ class FutureStamps:
         self._held: deque[tuple[float, Sequence[Stamped]]] = deque()
 
     def pass_on(self, messages: Sequence[Stamped]) -> Iterable[Sequence[Stamped]]:
-        """The measurements of messages that may go on now, of this one and of those that waited."""
+        """The measurements of messages that are due now: of this one and of those that were held."""
         if not self._held and (not self._most_ns or not self.is_ahead(messages)):
             return (messages,)
         self._held.append((time.monotonic(), messages))
-        return self.waited()
+        return self.due()
 
-    def waited(self) -> list[Sequence[Stamped]]:
-        """Those whose time has come; those who have waited too long are refused."""
+    def due(self) -> list[Sequence[Stamped]]:
+        """The held measurements that are due now; those held for too long are refused."""
         out = []
         while self._held:
             since_s, messages = self._held[0]
@@ -48,7 +48,7 @@ class FutureStamps:
         return out
 
     def is_ahead(self, messages: Sequence[Stamped]) -> bool:
-        """Whether one of them is too far ahead of the clock."""
+        """Return whether one of the messages is too far ahead of the clock."""
         newest_ns = max((m.stamp_ns for m in messages), default=0)
         if newest_ns <= self._until_ns:
             return False
@@ -56,8 +56,8 @@ class FutureStamps:
         self._until_ns = now_ns + self._most_ns if now_ns else 0
         return bool(now_ns) and newest_ns > self._until_ns
 
-    def give_up(self) -> list[Sequence[Stamped]]:
-        """Nothing is waited for any more: what is ahead now is refused, what was behind it may go on."""
+    def drain(self) -> list[Sequence[Stamped]]:
+        """Hold nothing any more: refuse measurements ahead of the clock, and return the others."""
         out: list[Sequence[Stamped]] = []
         for _, messages in self._held:
             if self.is_ahead(messages):

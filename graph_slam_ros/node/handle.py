@@ -42,7 +42,7 @@ class NodeHandle(Protocol):
 
     @property
     def has_player(self) -> bool:
-        """Whether somebody subscribes to the number of received messages."""
+        """Return whether somebody subscribes to the number of received messages."""
 
     def guarded(self, callback: Callback) -> Callback:
         """Return a callback that raises nothing: what the given one raises is counted and logged."""

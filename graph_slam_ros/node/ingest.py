@@ -94,18 +94,18 @@ class Ingest:
         self._clock_jumps.unregister()
 
     def finish(self) -> None:
-        """Hand over or refuse what waits, and take no more."""
-        for measured in self._future_stamps.give_up():
+        """Hand over or refuse all held messages, and unsubscribe."""
+        for measured in self._future_stamps.drain():
             self.hand_over(measured)
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self.hand_over(self.converter.finish())
 
     def tick(self) -> None:
-        """Hand over what has waited long enough for the clock, ten times a second."""
-        for measured in self._future_stamps.waited():
+        """Hand over the held messages that are due, ten times a second."""
+        for measured in self._future_stamps.due():
             self.hand_over(measured)
-        self._publishes_odometry = self._publishers.has_listeners("odometry")
+        self._publishes_odometry = self._publishers.has_subscribers("odometry")
 
     def watch_memory(self) -> None:
         """Have the pipeline spare memory while the process has more than ``health.memory_mib``."""
@@ -168,7 +168,7 @@ class Ingest:
     # -- odometry in the map -----------------------------------------------------------------------------------------
 
     def _is_newest(self, m: Odometry) -> bool:
-        """Whether odometry says where the robot is now; what is ahead of the clock would be the newest for long."""
+        """Return whether odometry is the newest; a message ahead of the clock would be the newest for long."""
         return not self._future_stamps.is_ahead([m]) and self.extrapolator.on_odometry(m, self._session.estimate)
 
     def _publish_odometry(self, m: Odometry, cdr: bytes) -> None:

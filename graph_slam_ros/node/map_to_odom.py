@@ -1,4 +1,4 @@
-"""What is told of map -> odom, and when: each stamp once, never backwards, silent when odometry is."""
+"""The transform map -> odom to broadcast: each stamp once, never backwards, none without new odometry."""
 
 import math
 
@@ -13,14 +13,14 @@ class MapToOdom:
 
     Attributes
     ----------
-    behind_s : how much earlier than the last that was told it would be dated now, so that it is not told
+    behind_s : the time by which the next transform would be dated before the last one; until it is 0, none is sent
     """
 
     def __init__(self, config: Config) -> None:
         self._space: Geometry = config.space
-        self._newest_ns: int | None = None  # odometry that has been told
+        self._newest_ns: int | None = None  # odometry of the last transform
         self._sent_ns: int | None = None
-        self._told: Numbers | None = None
+        self._published: Numbers | None = None
         self.behind_s = 0.0
 
     def forget_time(self) -> None:
@@ -31,7 +31,7 @@ class MapToOdom:
     def next(
         self, config: TfConfig, now_ns: int, odometry_ns: int, T_odom_base: Numbers, T_map_odom: Numbers
     ) -> tuple[int, Numbers] | None:
-        """Stamp and transform to broadcast now; None where there is nothing new to tell.
+        """Stamp and transform to broadcast now; None where there is nothing new to broadcast.
 
         Parameters
         ----------
@@ -47,16 +47,16 @@ class MapToOdom:
         if self._sent_ns is not None and stamp_ns <= self._sent_ns:
             return None
         elapsed_s = 0.0 if self._newest_ns is None else (odometry_ns - self._newest_ns) * 1e-9
-        self._told = self._followed(config, T_map_odom, T_odom_base, elapsed_s)
+        self._published = self._followed(config, T_map_odom, T_odom_base, elapsed_s)
         self._newest_ns, self._sent_ns = odometry_ns, stamp_ns
-        return stamp_ns, self._told
+        return stamp_ns, self._published
 
     def _followed(self, config: TfConfig, T_map_odom: Numbers, T_odom_base: Numbers, elapsed_s: float) -> Numbers:
-        """Towards the estimate, as far as the robot may be moved in map by a correction in that time."""
-        told, group, n = self._told, self._space.group, self._space.dimensions
-        if told is None or told == T_map_odom or not (config.max_speed_m_s or config.max_turn_rad_s):
+        """The last transform moved towards the estimate, as far as the limits of speed allow in that time."""
+        last, group, n = self._published, self._space.group, self._space.dimensions
+        if last is None or last == T_map_odom or not (config.max_speed_m_s or config.max_turn_rad_s):
             return T_map_odom
-        here, there = group.compose(told, T_odom_base), group.compose(T_map_odom, T_odom_base)
+        here, there = group.compose(last, T_odom_base), group.compose(T_map_odom, T_odom_base)
         moved = group.between(here, there)
         far, turn = math.hypot(*group.log(moved)[:n]), self._space.angle(moved)  # along the arc, not across
         part = min(

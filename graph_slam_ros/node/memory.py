@@ -1,4 +1,4 @@
-"""What the process has in memory."""
+"""The memory of the process."""
 
 import os
 from pathlib import Path
@@ -17,5 +17,5 @@ def resident_mib() -> float:
 
 
 def is_short(limit_mib: float, *, was_short: bool) -> bool:
-    """Whether the process has more than it should; no limit is 0."""
+    """Return whether the process has more memory than the limit; 0 is no limit."""
     return 0.0 < (_ENOUGH if was_short else 1.0) * limit_mib < resident_mib()

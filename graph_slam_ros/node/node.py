@@ -49,18 +49,18 @@ class GraphSlamNode(LifecycleNode):
 
     Parameters
     ----------
-    is_told_to_stop : asked while something takes long that may as well not be done
+    is_stop_requested : called during long work that a stop may interrupt
     """
 
-    def __init__(self, is_told_to_stop: Callable[[], bool] = lambda: False, **options: Any) -> None:
+    def __init__(self, is_stop_requested: Callable[[], bool] = lambda: False, **options: Any) -> None:
         super().__init__("graph_slam", **options)
-        self._is_told_to_stop = is_told_to_stop
+        self._is_stop_requested = is_stop_requested
         self.config = declare_parameters(self)
         self.add_on_set_parameters_callback(self._on_set)
         self._run: Runtime | None = None
         self._bond: bond.Bond | None = None
         self._faults: deque[float] = deque(maxlen=1000)
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
         self._verdict = diagnostics.Health("UNCONFIGURED")
         self._logged_s = 0.0
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # whatever becomes of /clock
@@ -97,7 +97,7 @@ class GraphSlamNode(LifecycleNode):
         return self._transition(self._activate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listen no more; what was taken stays."""
+        """Unsubscribe; accepted measurements stay."""
         return self._transition(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -109,7 +109,7 @@ class GraphSlamNode(LifecycleNode):
         return self._transition(self.finish, _FAILURE)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Whatever failed, nothing is left of it and the node can be configured again."""
+        """Remove the run after any fault, so that the node can be configured again."""
         return self._transition(self.finish)
 
     @property
@@ -132,7 +132,7 @@ class GraphSlamNode(LifecycleNode):
     def _configure(self) -> None:
         if self._run is None:
             self._run = run = Runtime(self)
-            run.prepare(self._is_told_to_stop)
+            run.prepare(self._is_stop_requested)
             if self.config.journal.resume and run.was_cut_off:
                 unused = "" if self.config.load_pose is None else "; output.load_pose is not used: it has driven since"
                 self.get_logger().warn(f"the last run was never ended: going on in its map{unused}")
@@ -164,22 +164,22 @@ class GraphSlamNode(LifecycleNode):
 
         Parameters
         ----------
-        patience_s : how long what waits may still take; None: as long as it takes, unless the node is told to stop
+        patience_s : how long what waits may still take; None: as long as it takes, unless a stop is requested
         """
         self._end_bond()
         if self._run is not None:
             run, self._run = self._run, None
-            run.finish(patience_s, self._is_told_to_stop)
+            run.finish(patience_s, self._is_stop_requested)
 
     def destroy_node(self) -> None:
-        """As rclpy's, and at once: its state machine would keep the node in the graph until it is collected."""
+        """Destroy the node at once: rclpy's state machine would keep it in the graph until it is collected."""
         super().destroy_node()
         self._state_machine = None
 
     # -- parameters --------------------------------------------------------------------------------------------------
 
     def set_parameters_atomically(self, parameter_list: Any) -> SetParametersResult:
-        """As rclpy's, but our refusals come first: they name the parameter, and of an unknown one the nearest known.
+        """Set parameters as rclpy does, after our own checks, whose refusals name the parameter.
 
         A whole number is a number, as it is at the start.
         """
@@ -211,8 +211,8 @@ class GraphSlamNode(LifecycleNode):
     def _answered(self, service: Any) -> Callable[[Any, Any], Any]:
         """The callback of a service, which answers that nothing was done where it would raise.
 
-        rclpy's own raise where a transition is told by its number and it is not its turn, or where a parameter has a
-        type that there is not; the executor raises that again, and the node would end.
+        rclpy's own callbacks raise for a transition number that the present state does not have, and for a parameter
+        of an unknown type. The executor raises that again, and the node would end.
         """
         answer = service.callback
 
@@ -229,18 +229,18 @@ class GraphSlamNode(LifecycleNode):
         return start(self.configured())
 
     def configured(self) -> Runtime:
-        """What there is since configuration. Raises GraphSlamError before."""
+        """The run, from configuration on. Raises GraphSlamError before."""
         if self._run is None:
             raise GraphSlamError(f"not active: the node is {self._state}")
         return self._run
 
     def acknowledge(self, count: int) -> None:
-        """Tell a player how many messages were taken."""
+        """Publish the number of messages received, for a player."""
         self._acknowledge.publish(UInt64(data=count))
 
     @property
     def has_player(self) -> bool:
-        """Whether somebody waits for that."""
+        """Return whether a player subscribes to the number of messages received."""
         return self._acknowledge.get_subscription_count() > 0
 
     @property
@@ -249,7 +249,7 @@ class GraphSlamNode(LifecycleNode):
         return int(self.get_clock().now().nanoseconds)
 
     def guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Nothing ends the node: what a callback raises is counted, and told with its origin once."""
+        """Return a callback that raises nothing: an exception is counted, and logged with its traceback once."""
 
         def guarded(*arguments: Any) -> None:
             try:
@@ -259,8 +259,8 @@ class GraphSlamNode(LifecycleNode):
                 if self._run is not None:
                     self._run.counters.count("node", type(error).__name__)
                 key = f"{type(error).__name__}: {error}"
-                if key not in self._told and len(self._told) < 1000:
-                    self._told.add(key)
+                if key not in self._logged and len(self._logged) < 1000:
+                    self._logged.add(key)
                     self.get_logger().error("".join(traceback.format_exception(error)))
                 self.get_logger().error(key, throttle_duration_sec=5.0)
 
@@ -280,7 +280,7 @@ class GraphSlamNode(LifecycleNode):
         self._diagnostics.publish(to_msg.diagnostics(self.now_ns, statuses))
 
     def _log(self, verdict: diagnostics.Health) -> None:
-        """In the log where it changes, numbers apart; what somebody must do something about, every few seconds.
+        """Log a verdict that is new but for its numbers; repeat one that needs action every few seconds.
 
         A node that has just begun to wait is no reason to warn: publishers take a moment to be discovered.
         """
@@ -290,21 +290,21 @@ class GraphSlamNode(LifecycleNode):
         if _without_numbers(before) == _without_numbers(verdict) and not urgent:
             return
         self._logged_s = time.monotonic()
-        said = "; ".join((verdict.state, *verdict.reasons))
+        line = "; ".join((verdict.state, *verdict.reasons))
         if verdict.level == to_msg.OK or (verdict.state == "WAITING" and not urgent):
-            self.get_logger().info(said)
+            self.get_logger().info(line)
         else:
-            self.get_logger().warn(said)
+            self.get_logger().warn(line)
 
 
 def _without_numbers(verdict: diagnostics.Health) -> tuple[str, ...]:
     return (verdict.state, *(re.sub(r"\d+(\.\d+)?", "#", reason) for reason in verdict.reasons))
 
 
-class _Told:
-    """Whether Ctrl-C or SIGTERM came: noted, never raised, so that no message is left half-way.
+class _StopRequest:
+    """Notes Ctrl-C and SIGTERM instead of raising, so that each message is processed as a whole.
 
-    A launch file sends Ctrl-C on to a node that the terminal has told already: what comes twice at once is once.
+    A launch file forwards Ctrl-C to a node that has it from the terminal already: two at once count as one.
     """
 
     def __init__(self) -> None:
@@ -313,18 +313,18 @@ class _Told:
             signal.signal(number, self._note)
 
     @property
-    def to_stop(self) -> bool:
-        """Whether it did."""
+    def is_set(self) -> bool:
+        """Return whether one of them came."""
         return self.at_s > 0.0
 
     def _note(self, number: int, frame: Any) -> None:
-        if self.to_stop and number == signal.SIGINT and time.monotonic() - self.at_s > 1.0:
+        if self.is_set and number == signal.SIGINT and time.monotonic() - self.at_s > 1.0:
             os._exit(128 + number)  # asked for again: at once
         self.at_s = self.at_s or time.monotonic()
 
 
 def main() -> int:
-    """Run the node until it is told to stop; returns the exit code: 0, 1 internal error, 2 refused to start or save."""
+    """Run the node until a stop is requested; returns 0, 1 (internal error) or 2 (refused to start or save)."""
     code = _run()
     if any(thread.daemon and thread is not threading.current_thread() for thread in threading.enumerate()):
         sys.stdout.flush()
@@ -334,16 +334,16 @@ def main() -> int:
 
 
 def _run() -> int:
-    told = _Told()
+    stop = _StopRequest()
     sys.setswitchinterval(_SWITCH_S)
     try:
         _init()
-        node = GraphSlamNode(lambda: told.to_stop)
+        node = GraphSlamNode(lambda: stop.is_set)
         executor = _executor()
         executor.add_node(node)
-        if node.config.node.autostart and not _started(node, told):
+        if node.config.node.autostart and not _started(node, stop):
             return 2
-        while not told.to_stop and rclpy.ok():
+        while not stop.is_set and rclpy.ok():
             executor.spin_once(timeout_sec=0.1)
         node.finish(URGENT_S)
         executor.shutdown()
@@ -359,18 +359,18 @@ def _run() -> int:
     return 0
 
 
-def _started(node: GraphSlamNode, told: _Told) -> bool:
+def _started(node: GraphSlamNode, stop: _StopRequest) -> bool:
     """Configure and activate."""
     for trigger in (node.trigger_configure, node.trigger_activate):
-        if told.to_stop:
+        if stop.is_set:
             return True
         if trigger() != _SUCCESS:
-            return told.to_stop
+            return stop.is_set
     return True
 
 
 def _executor() -> Any:
-    """The quickest there is: rclpy's events executor takes a fifth of the time per message (docs/benchmarks.md)."""
+    """The fastest executor: rclpy's events executor takes a fifth of the time per message (docs/benchmarks.md)."""
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:  # Humble

@@ -1,8 +1,8 @@
 """Plays a recording into a live ROS graph: the recorded bytes, with /clock, as fast as the node keeps up.
 
-The node tells how many messages it has received; the player never runs further ahead than its queues hold, and never
-lets a message of one topic overtake those of another by more than the node's window of stamps. So nothing is lost, and
-what would be is counted.
+The node publishes how many messages it has received. The player never runs further ahead than its queues hold, and
+never lets a message of one topic overtake those of another by more than the node's window of stamps. So no message is
+lost; if one were, it would be counted.
 """
 
 import os
@@ -56,7 +56,7 @@ class PlayError(GraphSlamError):
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """What was sent and what did not arrive, and the folder the node saved."""
+    """The numbers of messages sent and lost, and the folder that the node saved."""
 
     sent: int
     lost: int
@@ -97,18 +97,18 @@ class Player:
             self._wait(partial(_has_subscriber, publisher), f"nobody subscribes to {topic}")
         for message in self._bag.messages({self._static} if self._static else ()):
             self._send(message)
-        self._settle()
+        self._wait_until_received()
         total = sum(self._bag.topics[topic].count for topic in self._topics)
         start_wall, start_log = time.monotonic(), None
         for message in progress(self._bag.messages(self._topics), total):
             if message.topic == self._moving and is_correction(message.cdr, self._map_frame):
-                continue  # of the map, one node tells: now it is ours
+                continue  # one node alone broadcasts map -> odom: now it is ours
             start_log = message.log_ns if start_log is None else start_log
             if rate:
                 self._pause(start_wall + (message.log_ns - start_log) * 1e-9 / rate)
             self._keep_order(message)
             self._send(message)
-        self._settle()
+        self._wait_until_received()
         return Played(self._sent, self._lost, self._save())
 
     def close(self) -> None:
@@ -145,7 +145,7 @@ class Player:
         others = [stamps for topic, stamps in self._on_the_way.items() if topic != message.topic]
         apart = self._overtake_ns
         if any(stamp_ns - oldest >= apart or newest - stamp_ns >= apart for oldest, newest in others):
-            self._settle()
+            self._wait_until_received()
         elif self._sent - self._received - self._lost >= _AHEAD:
             self._until_received(self._sent - self._lost - _AHEAD // 2)
 
@@ -159,7 +159,7 @@ class Player:
         except struct.error:
             return 0
 
-    def _settle(self) -> None:
+    def _wait_until_received(self) -> None:
         self._until_received(self._sent - self._lost)
 
     def _until_received(self, count: int) -> None:

@@ -1,6 +1,6 @@
-"""What the node publishes of a run: at once what is small, the rest when it is due, changed, and somebody listens.
+"""Publishers of results: small messages at once, the others when they are due, have changed and have a subscriber.
 
-A topic that is latched is sent once more to whom comes late, so that nobody waits for the robot to move.
+A latched topic is sent once more to a late subscriber, who need not wait for the robot to move.
 """
 
 import time
@@ -26,14 +26,14 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 
 @dataclass(slots=True)
 class _Topic:
-    """A publisher and what has become of it."""
+    """A publisher and its state."""
 
     publisher: Any
-    listeners: int = 0
+    subscribers: int = 0
     is_stale: bool = False  # something has changed since it was sent
     begins_anew: bool = True  # somebody has nothing of it
     sent_s: float = -1e9
-    took_s: float = 0.0  # to make and send it
+    encode_s: float = 0.0  # to make and send it
 
 
 class Publishers:
@@ -59,7 +59,7 @@ class Publishers:
         self.begin(config)
 
     def begin(self, config: Config, *, has_map: bool = False) -> None:
-        """A new run, perhaps in a map: what was sent is of another."""
+        """Begin a new run, perhaps in a map: earlier messages are of another run."""
         self._has_something |= has_map
         output = config.output
         self._updates = PathUpdates(output.path_moved_m, output.path_moved_rad)
@@ -68,7 +68,7 @@ class Publishers:
             topic.is_stale = topic.begins_anew = True
 
     def forget_time(self) -> None:
-        """Stamps begin anew: who knows poses by their stamps needs all again."""
+        """Begin anew after a jump of time: subscribers that know poses by their stamps need all of them again."""
         self._topics["path_updates"].begins_anew = True
 
     @property
@@ -77,7 +77,7 @@ class Publishers:
         return self._updates.version
 
     def close(self) -> None:
-        """Take the publishers away."""
+        """Remove the publishers."""
         for topic in self._topics.values():
             self._node.destroy_publisher(topic.publisher)
         self._node.destroy_publisher(self._events)
@@ -85,7 +85,7 @@ class Publishers:
     # -- at once -----------------------------------------------------------------------------------------------------
 
     def update(self, slam: GraphSlam, update: Update, *, is_located: bool) -> None:
-        """The pose, what has happened, and a note of what is to be sent."""
+        """Publish pose and events, and note which topics have changed."""
         if is_located:
             self._send("pose", results.pose(slam))
         self._has_something = True
@@ -104,11 +104,11 @@ class Publishers:
             self._events.publish(to_msg.diagnostics(stamp_ns, statuses))
 
     def odometry(self, cdr: bytes) -> None:
-        """The robot in the map."""
+        """Publish the pose of the robot in the map at the newest odometry."""
         self._send("odometry", cdr)
 
-    def has_listeners(self, name: str) -> bool:
-        """Whether somebody subscribes to a topic."""
+    def has_subscribers(self, name: str) -> bool:
+        """Return whether somebody subscribes to a topic."""
         return bool(self._topics[name].publisher.get_subscription_count())
 
     def _send(self, name: str, cdr: bytes) -> None:
@@ -117,12 +117,12 @@ class Publishers:
         topic.is_stale, topic.sent_s = False, time.monotonic()
 
     def _landmarks_due(self, slam: GraphSlam, update: Update) -> bool:
-        """From the first on regularly."""
+        """Return whether landmarks are due: from the first on regularly, and after each solve of everything."""
         regularly = bool(slam.landmarks) and len(slam.keyframes) >= self._landmarks_at
         return update.report is not None or (update.solved and regularly)
 
     def _send_updates(self, slam: GraphSlam) -> None:
-        """All again to whom comes late: what was sent before, nobody can send him."""
+        """Publish changes of the path; a late subscriber lacks the earlier ones, so all of it is sent again."""
         if self._topics["path_updates"].begins_anew:
             self._topics["path_updates"].begins_anew = False
             self._send("path_updates", self._updates.restart(slam))
@@ -132,23 +132,23 @@ class Publishers:
     # -- when due ----------------------------------------------------------------------------------------------------
 
     def are_due(self, config: Config) -> bool:
-        """Whether there is something for ``publish_due``; asked often, from any thread."""
+        """Return whether ``publish_due`` has something to publish; called often, from any thread."""
         now_s = time.monotonic()
         return any(self._is_due(config, name, now_s) for name in _LATER)
 
     def _is_due(self, config: Config, name: str, now_s: float) -> bool:
         topic, output = self._topics[name], config.output
-        listeners = topic.publisher.get_subscription_count()
-        if listeners > topic.listeners:
+        subscribers = topic.publisher.get_subscription_count()
+        if subscribers > topic.subscribers:
             topic.begins_anew = True  # who came late has what was latched, and of what is not latched nothing
             topic.is_stale = topic.is_stale or name == "path_updates"
-        topic.listeners = listeners
+        topic.subscribers = subscribers
         period_s = output.graph_period_s if name == "graph" else output.path_period_s
-        period_s = max(period_s, _SPARE * topic.took_s)  # what takes long comes seldom
-        return self._has_something and topic.is_stale and bool(listeners) and now_s - topic.sent_s >= period_s
+        period_s = max(period_s, _SPARE * topic.encode_s)  # what takes long comes seldom
+        return self._has_something and topic.is_stale and bool(subscribers) and now_s - topic.sent_s >= period_s
 
     def publish_due(self, slam: GraphSlam) -> None:
-        """What has changed and somebody waits for."""
+        """Publish what is due, has changed and has a subscriber."""
         now_s, output = time.monotonic(), slam.config.output
         make: dict[str, Callable[[], bytes]] = {
             "path": lambda: results.path(slam, output.path_max_poses),
@@ -160,6 +160,6 @@ class Publishers:
             if self._is_due(slam.config, name, now_s):
                 start = time.thread_time()
                 self._send(name, encode())
-                self._topics[name].took_s = time.thread_time() - start
+                self._topics[name].encode_s = time.thread_time() - start
         if self._is_due(slam.config, "path_updates", now_s):
             self._send_updates(slam)

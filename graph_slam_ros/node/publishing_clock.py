@@ -1,4 +1,4 @@
-"""When results are published: each topic in its period, and never so often that the pipeline falls behind."""
+"""The schedule of results: each topic in its period, and never so often that the pipeline falls behind."""
 
 import time
 
@@ -69,7 +69,7 @@ class PublishingClock:
         if update.solved and (moved.distance_m > tf.report_jump_m or moved.angle_rad > tf.report_jump_rad):
             slam.counters.count("tf", "jump")
             if (left_out := self._corrections.next()) is not None:
-                more = f" ({left_out} more since the last was told)" if left_out else ""
+                more = f" ({left_out} more since the last one)" if left_out else ""
                 self._node.get_logger().warn(events.correction(slam, update).message + more)
 
     def publish_due(self, slam: GraphSlam) -> None:

@@ -41,7 +41,7 @@ class InputQos:
         return " or ".join(filter(None, (self.reliability, self.durability)))
 
     def mismatch(self, publisher: Any) -> str:
-        """Why a publisher, as the graph of nodes has it, does not connect; empty where it does."""
+        """The reason why a publisher does not connect, by its endpoint info; empty where it does."""
         offers, name = publisher.qos_profile, publisher.node_name
         if self.reliability and offers.reliability == ReliabilityPolicy.BEST_EFFORT:
             return f"{name} offers best effort, {self.reliability} asks for reliable delivery (QoS)"

@@ -1,4 +1,4 @@
-"""What became of each input in the last seconds: a state is judged by now, not by all that was since the start."""
+"""Counts of each input in the last seconds: a state is judged by these, not by all counts since the start."""
 
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ class Recent:
 
     @property
     def times(self) -> int:
-        """How many were refused."""
+        """The number that was refused."""
         return sum(self.refused.values())
 
     @property
@@ -38,12 +38,12 @@ class Recent:
 
     @property
     def is_bad(self) -> bool:
-        """Whether more than a tenth was refused, and still is."""
+        """Return whether more than a tenth was refused, and still is."""
         return self.goes_on and self.times >= _LEAST and self.times > _SHARE * self.came
 
     @property
     def is_nothing_used(self) -> bool:
-        """Whether all of it was refused."""
+        """Return whether all was refused."""
         return self.times >= self.came
 
 
@@ -57,7 +57,7 @@ class RecentInputs:
         self._past: deque[tuple[float, Counter[str], Counter[tuple[str, str]]]] = deque([(0.0, Counter(), Counter())])
 
     def observe(self, now_s: float, accepted: Mapping[str, int], before: Counts, after: Counts) -> dict[str, Recent]:
-        """What became of each input lately; to be called every second or so.
+        """The counts of each input in the last seconds; to be called every second or so.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Whether a drive that was cut off goes on after a restart: its odometry tells."""
+"""The check whether a drive that was cut off goes on after a restart, by its odometry."""
 
 import math
 
@@ -24,7 +24,7 @@ class Resumption:
         self._goes_on: bool | None = None
 
     def goes_on(self, slam: GraphSlam) -> bool:
-        """Whether the odometry of the new drive continues that of the drive before, and has not jumped since."""
+        """Return whether the odometry of the new drive continues the one before it, and has not jumped since."""
         if len(slam.keyframes) <= self._first or slam.segments[-1] != self._first:
             return False
         if self._goes_on is None:
@@ -44,7 +44,7 @@ class Resumption:
 
 
 def _begins_anew(slam: GraphSlam, moved: Numbers, T_odom_base: Numbers) -> bool:
-    """Whether odometry is nearer to where it begins than to where it was; a metre counts as much as a radian."""
+    """Return whether odometry is nearer to its origin than to its last pose; a metre counts as much as a radian."""
     far, from_begin = (_size(slam, pose) for pose in (moved, T_odom_base))
     return far > _NEAR and from_begin < far
 

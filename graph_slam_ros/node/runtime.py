@@ -69,11 +69,11 @@ class Runtime:
         self._subscriptions: Subscriptions | None = None
         self._broadcaster: TfBroadcaster | None = None
 
-    def prepare(self, is_told_to_stop: Callable[[], bool]) -> None:
+    def prepare(self, is_stop_requested: Callable[[], bool]) -> None:
         """Have the worker load the kernels, compiled where they are not yet, before it does anything else."""
 
         def prepare() -> None:
-            if not self._preparation.run(is_told_to_stop):
+            if not self._preparation.run(is_stop_requested):
                 self._worker.leave()
 
         self._worker.call(prepare)
@@ -110,9 +110,9 @@ class Runtime:
         return self._node.config, self._session.estimate, self._ingest.extrapolator.newest
 
     def finish(self, patience_s: float | None, is_urgent: Callable[[], bool] = lambda: False) -> None:
-        """Save what was not saved yet, and take everything away.
+        """Save what is not saved yet, and remove everything.
 
-        What takes longer is left to the next start: all that was accepted is in the journal.
+        The next start completes what takes longer: all accepted measurements are in the journal.
 
         Parameters
         ----------
@@ -175,7 +175,7 @@ class Runtime:
             self.in_background(self._ingest.in_sequence(passage.events))
 
     def _warn(self, source: str, reason: str) -> None:
-        self._node.get_logger().warn(f"{source}: {reason}{_HINTS.get(reason, '')} (told once, counted from now on)")
+        self._node.get_logger().warn(f"{source}: {reason}{_HINTS.get(reason, '')} (logged once, counted from now on)")
 
     def _on_update(self, slam: GraphSlam, update: Update) -> None:
         """Publish what an update changed, in the worker's thread."""
@@ -196,7 +196,7 @@ class Runtime:
 
     @property
     def was_cut_off(self) -> bool:
-        """Whether the last run was never ended: its map can be loaded."""
+        """Return whether the last run was never ended: its map can be loaded."""
         return self._session.was_cut_off
 
     def check_map(self, name: str) -> None:
@@ -241,7 +241,7 @@ class Runtime:
         return self._worker.call(lambda: "paused" if is_paused else "takes measurements")
 
     def control(self, event: Event) -> "Future[str]":
-        """An event of the ingest sequence."""
+        """Process an event at its place in the ingest sequence."""
         asked = Control(event)
         self._session.accept([asked])
         return self._worker.call(partial(self._session.control, asked))
@@ -251,5 +251,5 @@ class Runtime:
         self.in_background(self._ingest.in_sequence([Control("set", tuple(values.items()))]))
 
     def in_background(self, future: "Future[Any]") -> None:
-        """Log where a job fails whose result nobody waits for."""
+        """Log the failure of a job whose result nobody uses."""
         self._ingest.in_background(future)

@@ -99,7 +99,7 @@ class Session:
     # -- measurements ------------------------------------------------------------------------------------------------
 
     def accept(self, measurements: Sequence[Measurement]) -> None:
-        """Put measurements into the journal, before they wait for their turn in ``process``."""
+        """Write measurements to the journal, before they are queued for ``process``."""
         self._has_news = True
         with self._accepting:
             if self._held:
@@ -109,13 +109,13 @@ class Session:
                     recorder.accept(measurement)
 
     def hold(self) -> None:
-        """What is accepted from now on belongs to a run that is still to begin: it waits for ``release``."""
+        """Hold accepted measurements until ``release``: they belong to a run that is still to begin."""
         self._has_news = False
         with self._accepting:
             self._held.append([])
 
     def release(self) -> None:
-        """The run has begun, or the one before goes on."""
+        """Write the held measurements: the run has begun, or the one before goes on."""
         with self._accepting:
             held = self._held.popleft()
             if (recorder := self._recorder) is not None:
@@ -123,38 +123,38 @@ class Session:
                     recorder.accept(measurement)
 
     def flush_in_background(self) -> None:
-        """Have what was accepted written, however busy the worker is."""
+        """Write accepted measurements to the disk, however busy the worker is."""
         if (recorder := self._recorder) is not None:
             recorder.flush_in_background()
 
     def process(self, measurements: Sequence[Measurement]) -> None:
-        """Hand measurements that were accepted to the pipeline, in order."""
+        """Process accepted measurements, in order."""
         for measurement in measurements:
             if self._is_left:
                 return
             self._is_saved = False
             self._process(measurement)
 
-    def take(self, measurements: Sequence[Measurement]) -> None:
-        """Accept and process."""
+    def ingest(self, measurements: Sequence[Measurement]) -> None:
+        """Accept and process measurements."""
         self.accept(measurements)
         self.process(measurements)
 
     def _process(self, measurement: Measurement) -> None:
         start = time.perf_counter()
         update = self.slam.process(measurement)
-        took_s = time.perf_counter() - start
+        solve_s = time.perf_counter() - start
         if not update or self._is_left:
             return
-        self._slowest_s = max(self._slowest_s, took_s) if update.solved else self._slowest_s
+        self._slowest_s = max(self._slowest_s, solve_s) if update.solved else self._slowest_s
         recorded = self._recorded(lambda recorder: recorder.record(self.slam, update))
-        if self._recorded(RunRecorder.flush) and recorded:  # nobody is told of anything that a restart would not know
+        if self._recorded(RunRecorder.flush) and recorded:  # nothing is published that a restart would not know
             self.recording_fails = False
-        self._update_estimate(update, took_s)
+        self._update_estimate(update, solve_s)
         self._on_update(self.slam, update)
 
     def _recorded(self, write: Callable[[RunRecorder], None]) -> bool:
-        """Where the disk fails, the robot goes on; that nothing is recorded is told, and tried again and again."""
+        """Write to the recording; a disk that fails is reported and tried again, while the robot goes on."""
         if self._recorder is None:
             return False
         try:
@@ -170,7 +170,7 @@ class Session:
             return False
         return True
 
-    def _update_estimate(self, update: Update, took_s: float) -> None:
+    def _update_estimate(self, update: Update, solve_s: float) -> None:
         slam = self.slam
         if update.solved and not self._is_confirmed and len(slam.keyframes) > self._loaded:
             self._is_confirmed = self._is_sure
@@ -179,19 +179,19 @@ class Session:
             update.correction,
             is_confirmed=self._is_confirmed,
             is_resumed=not self._is_confirmed and self._resumption is not None and self._resumption.goes_on(slam),
-            solve_s=took_s,
+            solve_s=solve_s,
             slowest_solve_s=self._slowest_s,
             fit=self._fit,
         )
 
     @property
     def _is_sure(self) -> bool:
-        """Whether the newest keyframe's place in the map is known better than over a jump of odometry."""
+        """Return whether the newest keyframe is known better in the map than across a jump of odometry."""
         covariance = self.slam.pose_covariance
         return float(covariance[0, 0] + covariance[1, 1]) ** 0.5 < _CONFIRMED * self.slam.config.odometry.jump_sigma_m
 
     def evaluate(self) -> None:
-        """Look at how well everything fits, when there is nothing else to do, for a fiftieth of the time at most."""
+        """Compute how well all measurements fit, when idle, for a fiftieth of the time at most."""
         if self.estimate is None or self._fitted_at == self.slam.solves or time.perf_counter() < self._fit_due_s:
             return
         start = time.perf_counter()
@@ -216,20 +216,20 @@ class Session:
         return events
 
     def save(self, events: Sequence[Control] | None = None, name: str = "") -> str:
-        """Release what waits, solve, and write the run folder; returns its name.
+        """Process held measurements, solve, and write the run folder; returns its name.
 
         Parameters
         ----------
         events : that were accepted for it; None: they are accepted now
-        name : of a run beside the folder that the map is written as, too; empty: none
+        name : the name of a second run folder in the same directory, which gets the map, too; empty: none
         """
-        self._recorded(RunRecorder.join_sync)  # what the disk refused before is told, and is no reason not to save
+        self._recorded(RunRecorder.join_sync)  # what the disk refused before is reported, and is no reason not to save
         self.process(self.accept_save() if events is None else events)
         folder = self._write(ended=False)
         return f"{folder}, {self._save_as(Path(folder), name)}" if name else folder
 
     def _save_as(self, folder: Path, name: str) -> Path:
-        """Write the map as a run beside the folder, which was saved already."""
+        """Write the map as a run in the same directory as the folder, which was saved already."""
         if is_name_of_earlier(folder, name):
             raise RunError(
                 f"{folder.name} is saved; {name}: earlier runs are called so, and are removed: choose another name"
@@ -252,17 +252,17 @@ class Session:
 
     def reset(self) -> str:
         """Save, keep that, and begin anew."""
-        said = self.finish() or ("recording was given up" if self.recording_fails else "nothing to save")
+        saved = self.finish() or ("recording was given up" if self.recording_fails else "nothing to save")
         self.config = self.slam.config
         self._begin()
-        return said
+        return saved
 
     def load(self, name: str, T_map_base: Numbers | None = None) -> str:
         """Save, keep that, and go on from an earlier run.
 
         Parameters
         ----------
-        T_map_base : where the robot is in its map; None: that is to be found out
+        T_map_base : where the robot is in its map; None: unknown
         """
         return self._load(self.earlier(name), T_map_base)
 
@@ -310,15 +310,15 @@ class Session:
 
     def _place(self, T_map_base: Numbers) -> None:
         """Begin the sequence with where the robot is, as uncertain as a pose on ``initialpose`` without covariance."""
-        said, space = self.config.initialpose, self.config.space
-        sigmas = np.array(space.sigmas(said.sigma_m, said.sigma_rad))
+        prior, space = self.config.initialpose, self.config.space
+        sigmas = np.array(space.sigmas(prior.sigma_m, prior.sigma_rad))
         pose = InitialPose(T_map_base, tuple(np.diag(sigmas**2).ravel().tolist()))
         if (recorder := self._recorder) is not None:
             recorder.accept(pose)  # before what waits for ``release``
         self._process(pose)
 
     def earlier(self, name: str) -> Path:
-        """The run of that name beside the folder; of an empty name, the newest earlier. Raises RunError: none."""
+        """The run of that name in the same directory; of an empty name, the newest earlier. Raises RunError: none."""
         if self._folder is None:
             raise GraphSlamError("output.folder is empty: nothing to load")
         if not name:
@@ -376,7 +376,7 @@ class Session:
             return
         try:
             self._recorder.close()
-        except OSError:  # told when it was to be saved
+        except OSError:  # reported when it was to be saved
             self._recorder.abandon()
 
 

@@ -194,7 +194,7 @@ class Subscriptions:
         return tuple(out)
 
     def _mismatches(self, topic: InputTopic) -> str:
-        """Why publishers of a topic and its subscription do not connect; empty where all do."""
+        """The reasons why publishers of a topic do not connect to its subscription; empty where all do."""
         publishers = self._node.get_publishers_info_by_topic(topic.name)
         return "; ".join(filter(None, (_mismatch(publisher, topic) for publisher in publishers)))
 

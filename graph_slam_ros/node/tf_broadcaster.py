@@ -1,4 +1,4 @@
-"""Broadcasts map -> odom, and notices whether somebody else does."""
+"""The broadcaster of map -> odom, which also notices another one."""
 
 import time
 from collections import deque
@@ -58,16 +58,16 @@ class TfBroadcaster:
 
     @property
     def behind_s(self) -> float:
-        """How much earlier than the last the transform would be dated now: until then it is not sent."""
+        """The time by which the next transform would be dated before the last one; until it is 0, none is sent."""
         return self._policy.behind_s
 
     @property
     def has_rival(self) -> bool:
-        """Whether somebody else has broadcast it lately."""
+        """Return whether another node has broadcast the transform lately."""
         return time.monotonic() - self._others_s < _OTHERS_S
 
     def candidates(self) -> tuple[str, ...]:
-        """Who else publishes on /tf: one of them it must be."""
+        """The other nodes that publish on /tf: one of them broadcasts the transform."""
         own = self._node.get_fully_qualified_name()
         names = set(map(full_name, self._node.get_publishers_info_by_topic("/tf")))
         return tuple(sorted(names - {own}))
@@ -79,10 +79,10 @@ class TfBroadcaster:
         if config.tf.second_authority == "yield" and self.has_rival:
             return
         now_ns = self._node.get_clock().now().nanoseconds
-        told = self._policy.next(config.tf, now_ns, newest.stamp_ns, newest.T_odom_base, estimate.T_map_odom)
-        if told is None:
+        due = self._policy.next(config.tf, now_ns, newest.stamp_ns, newest.T_odom_base, estimate.T_map_odom)
+        if due is None:
             return
-        stamp_ns, T_map_odom = told
+        stamp_ns, T_map_odom = due
         cdr = to_msg.transform(stamp_ns, config.frames.map, config.frames.odom, T_map_odom)
         self._ours.append(cdr[4:])
         self._publisher.publish(cdr)

@@ -1,4 +1,4 @@
-"""Something that is told seldom, and how often it was left out."""
+"""A limit on the rate of log messages."""
 
 import time
 
@@ -17,7 +17,7 @@ class Throttle:
         self._left_out = 0
 
     def next(self) -> int | None:
-        """How many were left out since the last that passed; None where this one is left out, too."""
+        """The number left out since the last that passed; None where this one is left out, too."""
         now_s = time.monotonic()
         if now_s - self._passed_s < self._period_s:
             self._left_out += 1

@@ -1,6 +1,6 @@
-"""The thread that everything goes through which changes the estimate: one thing at a time, in the order it came.
+"""The one thread that changes the estimate, one job at a time, in order.
 
-Callbacks only hand over; what takes long never holds them up.
+Callbacks only queue jobs, so that long work never delays them.
 """
 
 import math
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
-URGENT_S = 2.0  # for what waits when the node is told to stop
+URGENT_S = 2.0  # for queued jobs when the node is stopped
 _POLL_S = 0.05
 
 
@@ -20,7 +20,7 @@ class Worker:
 
     Parameters
     ----------
-    most : jobs that may wait; ``offer`` refuses more, ``call`` is always taken
+    most : jobs that may wait; ``offer`` refuses more, ``call`` never does
     on_exit : called in the thread after a job that would have ended it, as ``SystemExit`` does; the next job follows
     """
 
@@ -34,56 +34,56 @@ class Worker:
         self._thread.start()
 
     def offer(self, job: Callable[[], None]) -> bool:
-        """Have a job done that raises nothing; False where too many wait, and nothing is taken."""
+        """Queue a job that raises nothing; False where the queue is full."""
         if not self.has_room:
             return False
         self._jobs.put((job, None, time.monotonic()))
         return True
 
     def call(self, job: Callable[[], Any]) -> "Future[Any]":
-        """Have a job done, whose result or exception is told."""
+        """Queue a job; the future has its result or exception."""
         future: Future[Any] = Future()
         self._jobs.put((job, future, time.monotonic()))
         return future
 
     @property
     def waiting(self) -> int:
-        """Jobs that wait."""
+        """The number of queued jobs."""
         return self._jobs.qsize()
 
     @property
     def lag_s(self) -> float:
-        """How long ago the job in hand was handed over."""
+        """The time since the job in hand was queued."""
         since = self._since
         return 0.0 if since is None else time.monotonic() - since
 
     @property
     def busy_s(self) -> float:
-        """How long the job in hand has taken."""
+        """The time since the job in hand began."""
         begun = self._begun
         return 0.0 if begun is None else time.monotonic() - begun
 
     @property
     def is_alive(self) -> bool:
-        """Whether the thread runs."""
+        """Return whether the thread runs."""
         return self._thread.is_alive()
 
     @property
     def has_room(self) -> bool:
-        """Whether ``offer`` would take another job."""
+        """Return whether ``offer`` would accept another job."""
         return self._jobs.qsize() < self._most
 
     def leave(self) -> None:
-        """Begin no further job: what waits is not done."""
+        """Begin no further job; queued jobs are not done."""
         self._is_left = True
 
     def stop(self, timeout_s: float | None = None, is_urgent: Callable[[], bool] = lambda: False) -> bool:
-        """Do what waits, then end; False if that takes longer: then no further job is begun.
+        """Do the queued jobs, then end; False if that takes longer: then no further job is begun.
 
         Parameters
         ----------
         timeout_s : None: as long as it takes
-        is_urgent : asked meanwhile; from then on it may take ``URGENT_S``
+        is_urgent : called meanwhile; once it is true, the rest may take ``URGENT_S``
         """
         self._jobs.put(None)
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
@@ -104,7 +104,7 @@ class Worker:
 
 
 def _failure(job: Callable[[], Any], future: "Future[Any] | None") -> BaseException | None:
-    """Do a job; what it raises must not end the thread, and is told to who waits for it alone."""
+    """Run a job; what it raises does not end the thread, and goes to its future if it has one."""
     try:
         result = job()
     except BaseException as error:

@@ -329,7 +329,7 @@ def _in_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
 
 
 def _plain(message: BagMessage) -> BagMessage:
-    """Without the compression of rosbag2's own; CDR never begins so."""
+    """The message without rosbag2's own compression; CDR never begins so."""
     return replace(message, cdr=zstd_message(message.cdr)) if message.cdr.startswith(ZSTD_MAGIC) else message
 
 

@@ -36,7 +36,7 @@ class Trajectory:
         return replace(self, poses=np.stack(se3.compose(T_new_old, tuple(self.poses.T)), axis=1))
 
     def in_plane(self) -> "Trajectory":
-        """Without height, roll and pitch."""
+        """The trajectory in the plane: without height, roll and pitch."""
         return replace(self, poses=se3.in_space(se3.in_plane(self.poses)))
 
     def at(self, index: Any) -> "Trajectory":

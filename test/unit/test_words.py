@@ -7,23 +7,6 @@ import pytest
 from places import ROOT
 
 PACKAGE = ROOT / "graph_slam_ros"
-FOLDERS = (
-    "analysis",
-    "certificate",
-    "cli",
-    "config",
-    "formats",
-    "graph",
-    "lie",
-    "maps",
-    "measurements",
-    "messages",
-    "recordings",
-    "runs",
-    "simulation",
-    "slam",
-    "solver",
-)
 BANNED = {
     *("take", "takes", "took", "taken", "tell", "tells", "told", "hear", "heard", "beside", "settle", "settled"),
     *("look", "looks", "looked", "loose", "say", "says", "said", "believe", "believed", "waiting"),
@@ -35,12 +18,13 @@ KEPT = {  # parameters, what the library documents, and files of the standard li
     *("took", "let_in"),  # the time of a run in its summary; edges of a what-if
 }
 FRAGMENT = re.compile(
-    r"(Of|What|Those|From|As|Whether|Which|Where|By|With|In|On|At|And|But|How|Why|When|Since|After|Before|Else|Between)\b"
+    r"(Of|What|Those|These|From|As|Whether|Which|Where|Who|Whose|Whom|By|With|Without|In|On|At|And|But|How|Why|When|While|"
+    r"Until|Since|After|Before|Else|Between|Among|Towards|If|So|Than|For|To|Not|That|Again|Then)\b"
 )
 
 
 def modules():
-    return [file for folder in FOLDERS for file in sorted((PACKAGE / folder).rglob("*.py"))]
+    return sorted(PACKAGE.rglob("*.py"))
 
 
 def words(name):

@@ -224,7 +224,7 @@ class Landmarks:
         self._solver.remove(landmark.vertex)
 
     def forget(self, vertices: set[int]) -> None:
-        """These are out of the problem already; whatever is seen of them begins others."""
+        """Forget landmarks that were removed from the problem: a new observation of one begins another."""
         for name in [name for name, landmark in self.known.items() if landmark.vertex in vertices]:
             self.touched.append(name)
             del self.known[name]

@@ -127,7 +127,7 @@ class Life:
     # -- and what must hold ------------------------------------------------------------------------------------------
 
     def take(self, m):
-        self.session.take([m])
+        self.session.ingest([m])
 
     def step(self):
         (what,) = self.rng.choices(list(HAPPENS), list(HAPPENS.values()))

@@ -42,7 +42,7 @@ def with_fixes(datum):
 
 def test_fixes_from_another_datum_are_refused_also_in_a_map_that_was_taken_up(tmp_path):
     first = session(tmp_path / "run")
-    first.take(list(with_fixes(MUNICH)))
+    first.ingest(list(with_fixes(MUNICH)))
     first.abandon()
     again = session(tmp_path / "run")
     again.load("")
@@ -50,7 +50,7 @@ def test_fixes_from_another_datum_are_refused_also_in_a_map_that_was_taken_up(tm
     fixes = len(again.slam.graph.edges_of("fixes"))
     later = WORLD[60:90]
     for m in later:
-        again.take([m, Fix(m.stamp_ns, "gps", "position", (0.0, 0.0), (1.0, 0.0, 0.0, 1.0), (), OSLO)])
+        again.ingest([m, Fix(m.stamp_ns, "gps", "position", (0.0, 0.0), (1.0, 0.0, 0.0, 1.0), (), OSLO)])
     again.finish()
     assert again.slam.counters["gps", "other_datum"] > 20
     assert len(again.slam.graph.edges_of("fixes")) == fixes > 3
@@ -59,7 +59,7 @@ def test_fixes_from_another_datum_are_refused_also_in_a_map_that_was_taken_up(tm
 def test_maps_whose_fixes_are_from_other_datums_are_not_merged(tmp_path):
     for name, datum in (("a", MUNICH), ("b", OSLO)):
         one = session(tmp_path / name)
-        one.take(list(with_fixes(datum)))
+        one.ingest(list(with_fixes(datum)))
         one.finish()
     with pytest.raises(Exception, match="configure one datum for both"):
         merge(tmp_path / "a", tmp_path / "b", tmp_path / "out")
@@ -67,7 +67,7 @@ def test_maps_whose_fixes_are_from_other_datums_are_not_merged(tmp_path):
 
 def test_what_was_set_on_the_way_is_in_effect_in_what_is_made_of_the_map(tmp_path):
     one = session(tmp_path / "run")
-    one.take([*WORLD[:50], Control("set", (("robust.gate", 0.5),)), *WORLD[50:90]])
+    one.ingest([*WORLD[:50], Control("set", (("robust.gate", 0.5),)), *WORLD[50:90]])
     one.abandon()
     assert run_config(tmp_path / "run").robust.gate != 0.5
     assert read_map(tmp_path / "run", []).settings == {"robust.gate": 0.5}
@@ -79,7 +79,7 @@ def test_a_folder_that_only_looks_like_an_earlier_run_is_stepped_over(tmp_path):
     (tmp_path / "run-1").mkdir()
     (tmp_path / "run-1" / "notes.txt").write_text("mine")
     one = session(tmp_path / "run")
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     one.reset()
     one.finish()
     assert (tmp_path / "run-1" / "notes.txt").read_text() == "mine"
@@ -89,23 +89,23 @@ def test_a_folder_that_only_looks_like_an_earlier_run_is_stepped_over(tmp_path):
 def test_a_reset_that_cannot_begin_anew_says_that_nothing_is_recorded(tmp_path, monkeypatch):
     told = []
     one = session(tmp_path / "run", told=told)
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     monkeypatch.setattr(RunRecorder, "__init__", lambda *_, **__: (_ for _ in ()).throw(RunError("run: no room")))
     with pytest.raises(RunError, match="no room"):
         one.reset()
     monkeypatch.undo()
     assert one.recording_fails
-    one.take(WORLD[60:90])
+    one.ingest(WORLD[60:90])
     assert one.recording_fails
     assert one.reset() == "recording was given up"
     assert not one.recording_fails
-    one.take(WORLD[90:120])
+    one.ingest(WORLD[90:120])
     assert one.finish() == str(tmp_path / "run")
 
 
 def test_a_folder_that_is_being_recorded_into_is_left_alone_by_everybody_else(tmp_path):
     one = session(tmp_path / "run")
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     bag = tmp_path / "drive.mcap"
     write_bag(simulate("warehouse", 5, aisles=2, laps=1, aisle_m=4.0), bag)
     before = sorted(path.name for path in tmp_path.rglob("*"))
@@ -117,7 +117,7 @@ def test_a_folder_that_is_being_recorded_into_is_left_alone_by_everybody_else(tm
         with pytest.raises(RunError, match="another process records there"):
             other()
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
-    one.take(WORLD[60:90])
+    one.ingest(WORLD[60:90])
     one.finish()
     assert len(read_map(tmp_path / "run", []).keyframes) == len(one.slam.keyframes)
     session(tmp_path / "run").finish()
@@ -131,7 +131,7 @@ def test_where_the_file_system_has_no_locks_it_is_recorded_all_the_same(tmp_path
 
     monkeypatch.setattr(fcntl, "flock", refuse)
     one = session(tmp_path / "run")
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     assert one.finish() == str(tmp_path / "run")
 
 
@@ -140,7 +140,7 @@ def test_whoever_cannot_save_leaves_the_folder_to_the_next(tmp_path, monkeypatch
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     one = session(tmp_path / "run")
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     monkeypatch.setattr(os, "pwrite", full)
     with pytest.raises(RunError, match="No space left"):
         one.finish()
@@ -157,7 +157,7 @@ def test_recordings_that_were_given_up_leave_no_file_open(tmp_path):
         return any(os.readlink(fd).startswith(str(tmp_path)) for fd in fds if fd.is_symlink())
 
     one = session(tmp_path / "run")
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     assert is_open()
     one._recorder.abandon()
     assert not is_open()
@@ -166,12 +166,12 @@ def test_recordings_that_were_given_up_leave_no_file_open(tmp_path):
 def in_a_map(tmp_path):
     """A run that begins in the map of an earlier one, saved twice on its way."""
     first = session(tmp_path / "run")
-    first.take(WORLD[:60])
+    first.ingest(WORLD[:60])
     first.finish()
     one = session(tmp_path / "run")
     one.load("run-1")
     for some in (WORLD[60:90], WORLD[90:120]):
-        one.take(some)
+        one.ingest(some)
         one.save()
     one.finish()
     return tmp_path / "run"
@@ -212,7 +212,7 @@ def test_the_run_whose_map_is_gone_on_in_stays_however_few_are_kept(tmp_path):
     for _ in range(3):
         one = session(run, output__keep_earlier=1, output__load="run-1")
         one.load("run-1")
-        one.take(WORLD[60:90])
+        one.ingest(WORLD[60:90])
         one.finish()
     assert is_run(tmp_path / "run-1")
     assert len(list(tmp_path.glob("run-*"))) == 2
@@ -221,7 +221,7 @@ def test_the_run_whose_map_is_gone_on_in_stays_however_few_are_kept(tmp_path):
 def test_a_map_that_cannot_be_gone_on_in_stays_however_few_are_kept(tmp_path, monkeypatch):
     run = in_a_map(tmp_path)
     one = session(run, output__keep_earlier=2)
-    one.take(WORLD[60:90])
+    one.ingest(WORLD[60:90])
 
     def refused(*_):
         raise GraphSlamError("no solution")
@@ -230,7 +230,7 @@ def test_a_map_that_cannot_be_gone_on_in_stays_however_few_are_kept(tmp_path, mo
         patch.setattr(Backend, "restore", refused)
         one.load("run-1")
     assert is_run(tmp_path / "run-1")
-    one.take(WORLD[90:120])
+    one.ingest(WORLD[90:120])
     assert one.finish() == str(run)
 
 
@@ -238,9 +238,9 @@ def test_counters_of_the_border_are_those_of_the_run(tmp_path):
     border = Counters()
     one = session(tmp_path / "run", border)
     border.count("odom", "nonfinite")
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     one.reset()
-    one.take(WORLD[60:120])
+    one.ingest(WORLD[60:120])
     one.finish()
     counters = [json.loads((tmp_path / name / "run.json").read_text())["counters"] for name in ("run-1", "run")]
     assert ["odom" in some for some in counters] == [True, False]
@@ -260,14 +260,14 @@ def test_what_was_refused_is_told_by_the_results_that_are_made_later(tmp_path, m
     border.count("odom", "nonfinite", 7)
     border.received["odom"] += len(WORLD)
     far = Fix(WORLD[20].stamp_ns, "gps", "position", (0.0, 0.0), (1.0, 0.0, 0.0, 1.0), (), OSLO)
-    one.take([*with_fixes(MUNICH), far, *WORLD[60:100]])
+    one.ingest([*with_fixes(MUNICH), far, *WORLD[60:100]])
     if make == "left":
         later = list(WORLD[100:140])
         one.accept(later)
         one.leave()
     elif make == "cut off":
         one.save()
-        one.take(WORLD[100:140])
+        one.ingest(WORLD[100:140])
         one.abandon()
     else:
         one.finish()
@@ -299,7 +299,7 @@ def test_a_summary_that_tells_nonsense_of_what_was_refused_is_a_loss(tmp_path):
 
 def test_results_are_kept_whose_recordings_are_gone(tmp_path):
     one = session(tmp_path / "run")
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     one.finish()
     for name in ("ingest.mcap", "map.mcap"):
         (tmp_path / "run" / name).write_bytes(b"")
@@ -309,7 +309,7 @@ def test_results_are_kept_whose_recordings_are_gone(tmp_path):
 
 def test_a_newest_run_that_cannot_be_read_is_kept_and_does_not_stop_the_next(tmp_path):
     one = session(tmp_path / "run")
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     one.abandon()
     shutil.copy(tmp_path / "run" / "run.mcap", tmp_path / "run" / "ingest.mcap")
     session(tmp_path / "run")
@@ -318,10 +318,10 @@ def test_a_newest_run_that_cannot_be_read_is_kept_and_does_not_stop_the_next(tmp
 
 def test_of_a_run_that_went_on_its_results_are_told_to_be_older(tmp_path):
     one = session(tmp_path / "run")
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     one.save()
     assert changed_since(tmp_path / "run") == []
-    one.take(WORLD[60:120])
+    one.ingest(WORLD[60:120])
     one.abandon()
     (warning,) = changed_since(tmp_path / "run")
     assert "went on after its results were saved" in warning
@@ -330,9 +330,9 @@ def test_of_a_run_that_went_on_its_results_are_told_to_be_older(tmp_path):
 
 def test_a_part_after_one_that_is_damaged_is_told_to_be_left_out(tmp_path):
     one = session(tmp_path / "run")
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     one.save()
-    one.take(WORLD[60:120])
+    one.ingest(WORLD[60:120])
     one.abandon()
     file = tmp_path / "run" / "ingest.mcap"
     file.write_bytes(file.read_bytes()[:-3])
@@ -343,7 +343,7 @@ def test_a_part_after_one_that_is_damaged_is_told_to_be_left_out(tmp_path):
 @pytest.mark.parametrize("frozen", [["x", 0], [3, "x"], [10**6, 0], [-5, 0], [3, 10**6]])
 def test_a_map_is_frozen_no_farther_than_it_is(frozen, tmp_path):
     one = session(tmp_path / "run")
-    one.take(WORLD[:60])
+    one.ingest(WORLD[:60])
     one.finish()
     writer = RecordWriter(tmp_path / "run" / "map_1.mcap")
     writer.write([{"type": "growth", "frozen": frozen}])
@@ -355,7 +355,7 @@ def test_a_map_is_frozen_no_farther_than_it_is(frozen, tmp_path):
 def test_a_replay_in_other_dimensions_is_refused_before_anything_is_replaced(tmp_path):
     for name in ("run", "out"):
         one = session(tmp_path / name)
-        one.take(WORLD[:60])
+        one.ingest(WORLD[:60])
         one.finish()
     before = (tmp_path / "out" / "path.tum").read_bytes()
     with pytest.raises(RunError, match=r"world\.dimensions is 2 there"):
@@ -376,7 +376,7 @@ def resumed(folder, *later, **config):
     again = session(folder, **config)
     again.resume()
     assert not again.estimate.is_located
-    again.take(list(later))
+    again.ingest(list(later))
     return again, (again.estimate.is_confirmed, again.estimate.is_resumed)
 
 
@@ -409,7 +409,7 @@ def resumed(folder, *later, **config):
 )
 def test_P12_a_drive_that_was_cut_off_is_resumed_where_its_odometry_goes_on(tmp_path, later, goes_on):
     one = session(tmp_path / "run")
-    one.take(straight(0, 41))
+    one.ingest(straight(0, 41))
     before = one.slam.T_map_odom
     one.abandon()
     again, located = resumed(tmp_path / "run", *later)
@@ -420,16 +420,16 @@ def test_P12_a_drive_that_was_cut_off_is_resumed_where_its_odometry_goes_on(tmp_
 
 def test_P12_after_standing_for_long_a_drive_is_resumed_too(tmp_path):
     one = session(tmp_path / "run")
-    one.take(straight(0, 41))
+    one.ingest(straight(0, 41))
     stands = [replace(straight(40, 41)[0], stamp_ns=(20 + s) * 10**9) for s in range(1, 300)]
-    one.take(stands)
+    one.ingest(stands)
     one.abandon()
     assert resumed(tmp_path / "run", *straight(41, 43, since_ns=300 * 10**9))[1] == (False, True)
 
 
 def test_P12_a_drive_whose_place_was_not_known_is_not_resumed(tmp_path):
     one = session(tmp_path / "run")
-    one.take(straight(0, 41))
+    one.ingest(straight(0, 41))
     one.abandon()
     lost, _ = resumed(tmp_path / "run", *straight(0, 41, since_ns=100 * 10**9))
     lost.abandon()
@@ -438,10 +438,10 @@ def test_P12_a_drive_whose_place_was_not_known_is_not_resumed(tmp_path):
 
 def test_P12_what_is_resumed_is_the_run_that_was_cut_off_also_where_another_is_named_to_be_loaded(tmp_path):
     site = session(tmp_path / "site")
-    site.take(straight(0, 10))
+    site.ingest(straight(0, 10))
     site.finish()
     one = session(tmp_path / "run", output__load="site", output__load_at_start=True)
-    one.take(straight(0, 41))
+    one.ingest(straight(0, 41))
     one.abandon()
     again, located = resumed(tmp_path / "run", *straight(41, 43), output__load="site", output__load_at_start=True)
     assert located == (False, True)

@@ -86,7 +86,7 @@ def test_T19_hours_of_driving_parking_and_dying(tmp_path):
             lost += max(0, computer.die())
             reboots += 1
             before = before or usage()
-        computer.session.take([m])
+        computer.session.ingest([m])
     session = computer.session
     after = usage()
     keyframes = len(session.slam.keyframes)

@@ -200,7 +200,7 @@ def test_P25_whatever_is_asked_of_a_driving_node_in_whatever_order_it_answers_an
             burst.step()
         burst.wait()
         assert not raised
-        assert not node._faults, node._told
+        assert not node._faults, node._logged
         assert r.state() == "active"
         assert r.set({name: DEFAULTS[name] for name in LIVE}) == (True, "")
         for name in ("reset", "resume"):

@@ -232,7 +232,7 @@ def test_F27_a_link_in_the_run_folder_is_not_written_through(folders):
         for link in (folders / "now" / name, folders / "now" / f"{name}.new"):
             link.unlink(missing_ok=True)
             link.symlink_to(victim)
-    running.take([Odometry(10**18 + k * 10**8, (0.3 * k, 0.0, 0.0), None) for k in range(20)])
+    running.ingest([Odometry(10**18 + k * 10**8, (0.3 * k, 0.0, 0.0), None) for k in range(20)])
     running.save()
     assert victim.read_text() == "mine"
     assert not (folders / "now" / "path.tum").is_symlink()
@@ -269,7 +269,7 @@ def test_X10_what_the_node_tells_has_neither_paths_nor_positions():
     assert sorted(told) == [
         "'bond with the lifecycle manager'",
         "'compiling kernels, once per installation: about a minute'",
-        "f'kernels ready after {took_s:.1f} s'",
+        "f'kernels ready after {elapsed_s:.1f} s'",
         "f'saved {Path(folder).name}'",
         "f'{run.name} was stopped while measurements waited: its results are being completed'",
         "f'{self._run.name}: its results are complete'",

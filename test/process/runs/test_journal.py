@@ -284,7 +284,7 @@ def test_P4_no_room_for_the_journal_is_told_and_all_is_written_when_there_is_roo
                 assert (tmp_path / "run" / "run.json").read_bytes() == BEGUN  # no result was saved
             if k == 90:
                 resource.setrlimit(resource.RLIMIT_FSIZE, before)
-            session.take([measurement])
+            session.ingest([measurement])
             fails.append(session.recording_fails)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -311,14 +311,14 @@ def test_P4_that_the_disk_did_not_take_it_in_time_is_told_and_does_not_keep_it_f
 
     monkeypatch.setattr(os, "fsync", failing)
     session = session_in(tmp_path / "run", told)
-    session.take(recorded()[:1])
+    session.ingest(recorded()[:1])
     session.flush_in_background()
     assert failed.wait(10.0)
     assert not told
     session.save()
     assert told == [("output.folder", os.strerror(errno.EIO))]
     assert not session.recording_fails
-    session.take(recorded()[1:60])
+    session.ingest(recorded()[1:60])
     session.finish()
     assert len(told) == 1
     assert len(list(read_ingest(tmp_path / "run", []))) > 60
@@ -341,7 +341,7 @@ def test_P3_a_part_that_begins_while_the_disk_is_still_busy_with_another_is_not_
         flush(file)
 
     session = session_in(tmp_path / "run", told)
-    session.take(recorded()[:60])
+    session.ingest(recorded()[:60])
     session.save()
     monkeypatch.setattr(os, "fsync", slow)
     monkeypatch.setattr(AppendedFile, "flush", late)
@@ -350,7 +350,7 @@ def test_P3_a_part_that_begins_while_the_disk_is_still_busy_with_another_is_not_
     session.accept([first])
     session._recorder.flush()  # it asks the disk for the new part
     session.process([first])
-    session.take(others)
+    session.ingest(others)
     assert begins.is_set()
     session.finish()
     assert not told
@@ -408,7 +408,7 @@ def test_P3_a_power_cut_finds_names_and_contents_on_the_disk_before_anything_han
     noted("replace", lambda old, new: (str(old), new.name))
     session = session_in(tmp_path / "run", [])
     for measurement in recorded()[:60]:
-        session.take([measurement])
+        session.ingest([measurement])
     session.finish()
     folder = str(tmp_path / "run")
     assert ("fsync", str(tmp_path)) in calls

@@ -86,7 +86,7 @@ def round_a_curve(dimensions, every_m):
         "output.folder": "",
     }
     session = Session(Config.from_mapping(settings), Counters(), lambda slam, update: None, lambda *_: None)
-    session.take([drive(dimensions, k) for k in range(20)])
+    session.ingest([drive(dimensions, k) for k in range(20)])
     return session
 
 
@@ -109,7 +109,7 @@ def test_odometry_in_the_map_is_ahead_of_the_keyframes_and_as_uncertain_as_a_key
     for k in range(heard_from, 21):
         assert reckoning.on_odometry(drive(dimensions, k), rare.estimate)
     at, covariance = reckoning.pose(rare.estimate)
-    often.take([drive(dimensions, 20)])
+    often.ingest([drive(dimensions, 20)])
     slam = often.slam
     assert (slam.keyframes[-1].stamp_ns, len(slam.keyframes)) == (drive(dimensions, 20).stamp_ns, 21)
     assert rare.estimate.keyframes < 10
@@ -157,12 +157,12 @@ def test_B6_what_is_ahead_of_the_clock_waits_for_it_and_keeps_its_order(monkeypa
     assert list(ahead.pass_on(soon)) == []
     assert list(ahead.pass_on(then)) == []  # behind the other
     clock[0] = 12 * NS
-    assert ahead.waited() == [soon, then]
+    assert ahead.due() == [soon, then]
     assert refused == []
     assert list(ahead.pass_on(seen(20 * NS))) == []
     since = time.monotonic()
     monkeypatch.setattr(time, "monotonic", lambda: since + 1.1)
-    assert ahead.waited() == []
+    assert ahead.due() == []
     assert refused == [seen(20 * NS)]
 
 
