@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.messages.from_msg import TF, TRANSFORMS
@@ -35,10 +35,9 @@ class InputQos:
             durability=DurabilityPolicy.TRANSIENT_LOCAL if self.durability else DurabilityPolicy.VOLATILE,
         )
 
-    @property
-    def asked_by(self) -> str:
-        """The parameters that ask for more than the least."""
-        return " or ".join(filter(None, (self.reliability, self.durability)))
+    def asked_by(self, kind: QoSPolicyKind) -> str:
+        """The parameter that asks for a policy that a publisher does not offer."""
+        return self.durability if kind == QoSPolicyKind.DURABILITY else self.reliability
 
     def mismatch(self, publisher: Any) -> str:
         """The reason why a publisher does not connect, by its endpoint info; empty where it does."""

@@ -115,8 +115,8 @@ class Subscriptions:
 
         def on_incompatible(event: Any) -> None:
             if event.total_count_change:
-                why = self._mismatches(topic) or f"a publisher offers less than {topic.qos.asked_by} asks for (QoS)"
-                self._node.get_logger().warn(f"{topic.name}: not connected: {why}")
+                asked = topic.qos.asked_by(event.last_policy_kind)
+                self._node.get_logger().warn(f"{topic.name}: a publisher offers less than {asked} asks for (QoS)")
 
         self._subscriptions.append(self._created(topic, on_message, on_lost, on_incompatible))
 

@@ -58,7 +58,7 @@ def test_the_minimum_is_that_of_the_sum_of_both_losses(first):
         graph.add_edge(POINT_PRIOR[R1], [vertex], [measured[source]], Gaussian.from_sigmas(1.0), "fixes", source)
     loss = Loss.named("cauchy", 0.5)
     solver = Solver(graph, Settings(losses={"fixes": [Loss()], ("fixes", "b"): [loss]}, cost_tolerance=1e-14))
-    solver.add(np.arange(2))
+    solver.add([vertex], np.arange(2))
     report = solver.optimize()
 
     def cost(x):

@@ -128,11 +128,11 @@ def test_the_qos_of_one_input_is_its_own_and_a_publisher_that_does_not_connect_i
     asked = "odom.reliability:=reliable", "detections.durability:=transient_local"
     with node("output.folder:=''", *asked) as n, robot(hears=("/diagnostics",), sends=()) as other:
         with robot(name="shy", reliability=ReliabilityPolicy.BEST_EFFORT, hears=()):
-            odometry = "/odom: shy offers best effort, odom.reliability asks for reliable delivery (QoS)"
-            landmarks = "/landmarks: shy offers volatile, detections.durability asks for transient_local (QoS)"
-            other.until_it_says("WAITING", odometry)
-            for line in (odometry, landmarks):
-                until(lambda line=line: line.replace(": shy", ": not connected: shy") in n.said, other.spin, line)
+            reliability = "offers best effort, odom.reliability asks for reliable delivery (QoS)"
+            other.until_it_says("WAITING", f"/odom: shy {reliability}")
+            for topic, parameter in (("/odom", "odom.reliability"), ("/landmarks", "detections.durability")):
+                line = f"{topic}: a publisher offers less than {parameter} asks for (QoS)"
+                until(lambda line=line: line in n.said, other.spin, line)
         assert n.stop()[0] == 0
     with node("output.folder:=''", "odom.reliability:=sometimes") as n:
         code, said = n.ended()
