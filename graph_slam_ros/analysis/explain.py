@@ -112,7 +112,7 @@ def _gates(entries: Sequence[Entry], changes: Sequence[VerdictChange], config: C
         if largest < _FAR and below.prod() < _CHANCE:
             yield (
                 f"warning: the gate of {label} is inert: of {len(of_label)} the largest chi2 ever seen is"
-                f" {largest:.2g} of it; their noise is told too large, and what is false may pass"
+                f" {largest:.2g} of it; the stated noise is too large, and false measurements may pass"
             )
 
 
@@ -161,7 +161,7 @@ def _landmark(run: SavedGraph, name: str) -> Iterator[str]:
     yield from _worst(out)
     yield from _least(e for e in seen if e.is_in)
     if out:
-        yield f"graph_slam explain {run.folder} {out[0].edge} tells more of the first"
+        yield f"graph_slam explain {run.folder} {out[0].edge} prints all about the first"
 
 
 def _edge(run: SavedGraph, edge: int) -> Iterator[str]:
@@ -196,16 +196,16 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
     limit = quantile(config.robust.gate, e.dof)
     chance = f"noise alone exceeds {limit:.4g} once in {1.0 / (1.0 - config.robust.gate):.0f} times"
     if e.threshold < _SAME * limit:
-        chance += f", and what was accepted of {e.label} is much smaller than its noise tells"
+        chance += f", and what was accepted of {e.label} is much smaller than its stated noise"
     elif limit < _SAME * e.threshold:
-        chance += ", but all noise may be larger than it is told to be, robust.noise_factor"
+        chance += ", but all noise may be larger than stated, robust.noise_factor"
     numbers = f"chi2 {e.statistic:.4g} with {e.dof} degree{'s' * (e.dof > 1)} of freedom"
-    allowed = f"up to {e.threshold:.4g} would have been let pass ({chance})"
+    allowed = f"up to {e.threshold:.4g} would have passed ({chance})"
     if not e.verdict:
-        return "nothing: what is odometry, or says where the map begins, is never doubted"
+        return "nothing: odometry and the anchor are not judged"
     match e.reason:
         case Reason.UNLIKELY:
-            return f"to believe it would have cost {numbers}, all that must give way for it included; {allowed}"
+            return f"accepting it would have cost {numbers}, with all that must move for it; {allowed}"
         case Reason.DOES_NOT_FIT:
             return f"with everything solved it was off by {numbers}; {allowed}"
         case Reason.OUTVOTED:
@@ -217,7 +217,7 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
         case Reason.DISPLACED:
             return (
                 f"{e.statistic:.0f} sightings more agreed on another pose of the robot than on this motion: it was"
-                " carried, or its wheels slipped; another edge with next to no trust in the motion is in its place"
+                " carried, or its wheels slipped; an edge with very large noise replaces it"
             )
     if e.verdict is Verdict.DOWN_WEIGHTED:
         return f"it stays in, but its loss leaves it little: {numbers}, above {e.threshold:.4g} ({chance})"
@@ -226,7 +226,7 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
 
 def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
     """Return what believing it, or doing without it, would do to the map."""
-    which = "out" if e.is_in else "in and fully believed"
+    which = "out" if e.is_in else "in with its full weight"
     try:
         moved = run.moved(run.solve([e.edge] if e.is_in else [], [] if e.is_in else [e.edge]))
     except (GaugeError, SingularError) as error:
@@ -246,8 +246,8 @@ def _remedy(e: Entry) -> str:
         return f"nothing: what was {_WHY[e.reason]} stays out; replay the run with another configuration"
     factor = (e.statistic / e.threshold) ** 0.5
     return (
-        "it comes back by itself once the map agrees with it. If you know that it is true, noise is told too small,"
-        f" its own or that of what stands against it: with all sigmas {factor:.3g} times as large it would pass"
+        "it comes back by itself once the map agrees with it. If you know that it is true, a stated noise is too small,"
+        f" its own or that of the edges against it: with all sigmas {factor:.3g} times as large it would pass"
         " (robust.noise_factor). robust.decide=false holds nothing back"
     )
 

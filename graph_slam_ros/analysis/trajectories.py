@@ -87,7 +87,7 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
         bag.losses.append(f"{len(rows) - len(finite)} of {len(rows)} poses on {name} are not finite")
     rows = finite
     if not rows:
-        raise GraphSlamError(f"{path}: nothing on {name} that tells where the robot was")
+        raise GraphSlamError(f"{path}: nothing on {name} is a pose of the robot")
     # One rounding, as of the decimal text in a TUM file: equal stamps stay equal.
     stamps_s = np.array([stamp_ns / 10**9 for stamp_ns, _ in rows])
     found = trajectory(stamps_s, np.array([pose for _, pose in rows], dtype=float), f"{path}, {name}")

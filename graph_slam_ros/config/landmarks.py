@@ -49,7 +49,7 @@ class LandmarksConfig:
     )
     close_m: float = setting(
         0.5,
-        "landmarks closer together than this are not told apart: an observation that may be of either gets more noise",
+        "landmarks closer together than this are not distinguished: an observation of either gets more noise",
         "m",
         low=0.0,
     )

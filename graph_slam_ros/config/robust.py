@@ -27,7 +27,7 @@ class RobustConfig:
         low=1.0,
     )
     loss: str = setting(
-        "dcs", "robust loss of closures and fixes; geman_mcclure and dcs let go of outliers", choices=LOSSES[:5]
+        "dcs", "robust loss of closures and fixes; geman_mcclure and dcs give outliers no weight", choices=LOSSES[:5]
     )
     loss_scale: float = setting(
         2.0,

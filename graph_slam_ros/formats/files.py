@@ -22,7 +22,7 @@ class _Regular(io.FileIO):
     def read(self, size: int | None = -1, /) -> bytes:
         found: bytes | None = super().read(-1 if size is None else size)
         if found is None:
-            raise OSError(errno.EAGAIN, "nothing to read, and whoever reads it waits", self.name)
+            raise OSError(errno.EAGAIN, "nothing to read: reading it would block", self.name)
         return found
 
 

@@ -120,7 +120,7 @@ REASONS: dict[str, Reason] = {
         _NOTED, "the pose is more than 0.5 m above or below the first, or tilted by more than 20 degrees", _SPACE
     ),
     # -- noise
-    "noise_unknown": Reason(_REFUSED, "neither the message nor the parameters tell its noise", _SIGMAS),
+    "noise_unknown": Reason(_REFUSED, "neither the message nor the parameters have its noise", _SIGMAS),
     "covariance_unknown": Reason(_REPAIRED, "the covariance is zero: the configured noise is used"),
     "covariance_of_some_axes_unknown": Reason(
         _REPAIRED, "the twist's covariance lacks some axes: the configured densities are used"
@@ -162,7 +162,7 @@ REASONS: dict[str, Reason] = {
     "unclear_which": Reason(
         _REFUSED,
         "a detection without identity may be of several landmarks, or of none",
-        "landmarks.association=joint where it is nearest; else smaller noise, where the sensor is better than told",
+        "landmarks.association=joint where it is nearest; else smaller noise, if the sensor is better than stated",
     ),
     "not_for_a_pose": Reason(
         _REFUSED, "a range or bearing to a landmark that is known as a pose", "INPUT.id_prefix: two identities"
@@ -211,7 +211,7 @@ REASONS: dict[str, Reason] = {
     ),
     "mount_unknown": Reason(
         _REPAIRED,
-        "no transform tells where the antenna is on the robot: it is taken to be at the base",
+        "no transform has the position of the antenna on the robot: the base is assumed",
         '--set INPUT.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there',
     ),
     "map_moved": Reason(

@@ -135,7 +135,7 @@ def _errors(facts: Facts) -> Iterator[str]:
     if facts.faults >= 100:
         yield f"{facts.faults} faults in callbacks in 10 s"
     if facts.has_other_authority:
-        who = ", ".join(facts.authorities) or "a node that does not tell its name"
+        who = ", ".join(facts.authorities) or "a node without a name"
         yield f"somebody else broadcasts map -> odom: {who}"
     if facts.twins:
         yield "another node has this node's name"

@@ -86,7 +86,7 @@ def _code(response: Any, error: BaseException | None) -> int:
 
 def _name(request: Any) -> str:
     if not request.filename:
-        raise ConfigError("filename: is empty: give the name of a run beside output.folder")
+        raise ConfigError("filename: is empty: give the name of a run in the directory of output.folder")
     return str(request.filename)
 
 

@@ -166,7 +166,7 @@ class Session:
             if self._recorder.unwritten > _MOST_UNWRITTEN:
                 self._recorder.abandon()
                 self._recorder = None
-                self._warn("output.folder", "recording was given up: too much waits for room")
+                self._warn("output.folder", "recording was stopped: too much is waiting for room on the disk")
             return False
         return True
 
@@ -243,7 +243,7 @@ class Session:
 
     def _write(self, *, ended: bool) -> str:
         if self._recorder is None:
-            why = "recording was given up" if self._folder else "output.folder is empty"
+            why = "recording was stopped" if self._folder else "output.folder is empty"
             raise GraphSlamError(f"{why}: nowhere to save")
         summary = summarize(self.slam) | account(self.slam, self._counters()) | {"ended": ended}
         folder = str(self._recorder.save(self.slam, summary))
@@ -252,7 +252,7 @@ class Session:
 
     def reset(self) -> str:
         """Save, keep that, and begin anew."""
-        saved = self.finish() or ("recording was given up" if self.recording_fails else "nothing to save")
+        saved = self.finish() or ("recording was stopped" if self.recording_fails else "nothing to save")
         self.config = self.slam.config
         self._begin()
         return saved

@@ -22,7 +22,7 @@ _MENDED = ("displaced", "displacement_taken_back", "jump")  # of what is noted, 
 _CONTRADICT = (
     "graph_slam explain RUN says why. Check of this sensor and of odometry: metres and radians, y and bearings to the "
     "left, where the sensor is (TF or {0}.mount), its clock ({0}.offset_s), ids that are used twice. If only its noise "
-    "is larger than told: --set {0}.noise=sigmas --set {0}.sigma_m=..."
+    "is larger than stated: --set {0}.noise=sigmas --set {0}.sigma_m=..."
 )
 _ON_JUMP = "--set time.on_jump=segment goes on in the same map, reset in another run"
 _EXTREME = "distances or noise that no robot means do that: --set INPUT.max_distance_m=... or INPUT.noise=sigmas"
@@ -138,7 +138,7 @@ def _unused(summary: Summary, name: str, received: int | None) -> str:
     messages = "" if received is None else f" of {received} messages"
     counted = _counted(summary, name, Effect.REFUSED) or _counted(summary, name, Effect.NOTED)
     if not counted and summary["waiting"]:
-        return f"{name}: nothing{messages} was used: {len(summary['waiting'])} landmarks wait, see above"
+        return f"{name}: nothing{messages} was used: {len(summary['waiting'])} landmarks are not determined (waiting)"
     return f"{name}: nothing{messages} was used: {_because(name, counted)}"
 
 

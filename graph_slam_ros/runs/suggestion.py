@@ -252,7 +252,7 @@ class Suggestion:
 
     def _join(self, one: TopicContents) -> None:
         self.settings["landmarks.association"] = "joint"
-        self.notes.append(f"{one.topic.name} has no ids: landmarks are told apart by where they are")
+        self.notes.append(f"{one.topic.name} has no ids: landmarks are associated by their position")
 
     def _cloud(self, one: TopicContents) -> None:
         is_position, is_bearing = {"x", "y"} <= one.fields, "bearing" in one.fields
@@ -266,10 +266,10 @@ class Suggestion:
             has_sigma = one.fields & {"sigma_bearing"} or (one.fields & {"sigma"} and "range" not in one.fields)
             chosen: dict[str, Any] = {"sigma_rad": 0.02} if is_bearing and not has_sigma else {}
             if chosen:
-                self.notes.append(f"{one.topic.name} does not tell the noise of bearings: 0.02 rad is assumed")
+                self.notes.append(f"{one.topic.name} has no noise of bearings: 0.02 rad is assumed")
             if "range" in one.fields and "sigma" not in one.fields:
                 chosen["sigma_m"] = 0.5
-                self.notes.append(f"{one.topic.name} does not tell the noise of ranges: 0.5 m is assumed")
+                self.notes.append(f"{one.topic.name} has no noise of ranges: 0.5 m is assumed")
             if "id" not in one.fields:
                 self._join(one)
             self._add("ranges" if "range" in one.fields else "points", one, chosen)
@@ -288,7 +288,7 @@ class Suggestion:
             self._add("gps", one, {} if one.has_noise else {"sigma_m": 2.0}, linked=True)
             self._mount(one.topic.name, one.frame)  # says what is assumed; the input itself assumes and counts it
             if not one.has_noise:
-                self.notes.append(f"{one.topic.name} does not tell its noise: 2 m is assumed")
+                self.notes.append(f"{one.topic.name} has no covariance: 2 m is assumed")
         self._choose_imu(self._of_type(IMU), is_needed=len(self._names) == 1)
         for one in self._of_type(POSE, POSE_WITH_COVARIANCE):
             name = one.topic.name
@@ -351,13 +351,13 @@ class Suggestion:
         self.settings |= {f"{name}.{key}": value for key, value in chosen.items()}
 
     def _mount(self, topic: str, frame: str) -> dict[str, str]:
-        """Return where a sensor is that TF does not tell of."""
+        """Return where a sensor is that TF does not have."""
         if frame and self._recording.is_linked(frame, self._base):
             return {}
         mount = _OPTICAL if "optical" in frame else "0 0 0 0 0 0"
         where = "at the base, looking ahead" if mount == _OPTICAL else "at the base"
         self.notes.append(
-            f"{topic}: no transform tells where {frame or 'its sensor'} is on the robot: {where} is assumed"
+            f"{topic}: no transform has the pose of {frame or 'its sensor'} on the robot: {where} is assumed"
         )
         return {"mount": mount}
 

@@ -78,7 +78,7 @@ class Slip:
 
     at: float = option(0.5, _HALFWAY, "", 0, 1)
     lasting: float = option(0.02, "for how long, as a part of the whole", "", 0, 1)
-    factor: float = option(1.5, "distance told for a metre driven", "", 0, 100)
+    factor: float = option(1.5, "distance in odometry for each metre driven", "", 0, 100)
 
 
 @dataclass(frozen=True, slots=True)

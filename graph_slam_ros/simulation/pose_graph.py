@@ -169,7 +169,7 @@ def _first_seen(graph: Graph, space: Geometry, T_odom_base: Numbers, s: Sighting
         in_sensor = (flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation))
         seen = group.act(s.T_base_sensor or space.identity, in_sensor[: space.dimensions])
     elif s.kind != "position":
-        raise GraphSlamError(f"a {s.kind} alone does not tell where a landmark is, and a graph needs a start")
+        raise GraphSlamError(f"a {s.kind} alone does not determine a landmark, and a graph needs initial values")
     return graph.add_vertex(space.point, group.act(T_odom_base, seen))
 
 

@@ -68,7 +68,9 @@ class Alarm:
         if not self.evidence:
             why = f"{self.held_back} of the last {self.tested} sightings contradict odometry"
         if self.ended_ns is None:
-            remedy = "" if self.determines_pose else "; ranges or bearings alone do not tell where: give initialpose"
+            remedy = (
+                "" if self.determines_pose else "; ranges or bearings alone do not determine the pose: give initialpose"
+            )
             return f"the landmarks say since {at} that the robot is elsewhere ({why}){remedy}"
         until = f"{self.ended_ns * 1e-9:.1f} s"
         outcome = self.outcome or "it was not so"

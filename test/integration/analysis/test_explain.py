@@ -59,8 +59,8 @@ def test_a_stranger_learns_why_a_closure_was_rejected(run, capsys):
     assert f"edge {false.edge}: a loop closure by closures: held back: unlikely" in out
     assert f"keyframe {false.vertices[0]} and keyframe {false.vertices[1]}" in out
     assert f"chi2 {false.statistic:.4g} with 3 degrees of freedom" in out
-    assert f"up to {false.threshold:.4g} would have been let pass (noise alone exceeds 21.11 once in 10000 times" in out
-    assert re.search(r"what if it were in and fully believed: chi2 \+\d", out)
+    assert f"up to {false.threshold:.4g} would have passed (noise alone exceeds 21.11 once in 10000 times" in out
+    assert re.search(r"what if it were in with its full weight: chi2 \+\d", out)
     strained = [int(edge) for edge in re.findall(r"against edge (\d+)", out)]
     assert strained
     assert all(read_ledger(run)[edge].is_in for edge in strained)

@@ -97,7 +97,7 @@ def test_a_reset_that_cannot_begin_anew_says_that_nothing_is_recorded(tmp_path, 
     assert one.recording_fails
     one.ingest(WORLD[60:90])
     assert one.recording_fails
-    assert one.reset() == "recording was given up"
+    assert one.reset() == "recording was stopped"
     assert not one.recording_fails
     one.ingest(WORLD[90:120])
     assert one.finish() == str(tmp_path / "run")

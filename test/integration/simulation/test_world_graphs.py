@@ -80,4 +80,4 @@ def test_the_truth_beside_a_worlds_graph_explains_it_within_its_noise(tmp_path, 
 def test_of_a_bearing_alone_no_graph_is_made(tmp_path, capsys):
     code, _, err = run(capsys, "simulate", "warehouse", "--set", "sensor=bearing", "--out", tmp_path / "a.g2o")
     assert (code, err.count("\n")) == (2, 1)
-    assert "a bearing alone does not tell where a landmark is" in err
+    assert "a bearing alone does not determine a landmark" in err

@@ -305,7 +305,7 @@ def test_an_antenna_of_which_nothing_is_told_is_at_the_base_and_counted():
         assert counted(b) == {"gps": {"mount_unknown": 1}}
     said = warnings({"gps": {"mount_unknown": 7, "no_altitude": 2}})
     assert said == [
-        "gps: 7 times, no transform tells where the antenna is on the robot: it is taken to be at the base;"
+        "gps: 7 times, no transform has the position of the antenna on the robot: the base is assumed;"
         ' mend it by --set gps.mount="X Y Z 0 0 0", its place from the base in metres; zeros say that it is there'
     ]
     told = listening("gps", "sensor_msgs/msg/NavSatFix", settings={"mount": "0 0 0 0 0 0"})
