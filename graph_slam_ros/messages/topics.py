@@ -40,8 +40,8 @@ PUBLICATIONS = (
         latched=True,
     ),
     Interface("~/graph", "visualization_msgs/msg/MarkerArray", "vertices and edges of the graph", latched=True),
-    Interface("~/events", "diagnostic_msgs/msg/DiagnosticArray", "what has happened, once each"),
-    Interface("~/received", "std_msgs/msg/UInt64", "messages taken, for the player's pace", latched=True),
+    Interface("~/events", "diagnostic_msgs/msg/DiagnosticArray", "events: new keyframes, verdicts, corrections"),
+    Interface("~/received", "std_msgs/msg/UInt64", "messages received, for the player's pace", latched=True),
     Interface("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", "state, counters, chi2, times"),
     Interface("/tf", "tf2_msgs/msg/TFMessage", "map -> odom"),
 )
@@ -49,20 +49,20 @@ PUBLICATIONS = (
 # Beside the inputs (inputs.names); odom and detections are the default ones.
 SUBSCRIPTIONS = (
     Interface("odom", "nav_msgs/msg/Odometry", "odometry"),
-    Interface("landmarks", "vision_msgs/msg/Detection3DArray", "sightings of landmarks"),
-    Interface("initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped", "where the robot is in the map"),
+    Interface("landmarks", "vision_msgs/msg/Detection3DArray", "observations of landmarks"),
+    Interface("initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped", "pose of the robot in the map"),
     Interface("~/remove", "std_msgs/msg/String", "remove one edge or landmark: `edge 231` or `landmark dock`"),
     Interface("/tf", "tf2_msgs/msg/TFMessage", "sensors on moving joints, inputs on TF"),
-    Interface("/tf_static", "tf2_msgs/msg/TFMessage", "where sensors are on the robot", latched=True),
+    Interface("/tf_static", "tf2_msgs/msg/TFMessage", "poses of sensors on the robot", latched=True),
     Interface("/clock", "rosgraph_msgs/msg/Clock", "time, with use_sim_time"),
 )
 
 SERVICES = (
     Interface("~/save", "std_srvs/srv/Trigger", "solve everything and write the run folder"),
-    Interface("~/load", "std_srvs/srv/Trigger", "go on from a run folder"),
-    Interface("~/reset", "std_srvs/srv/Trigger", "forget everything and begin anew"),
-    Interface("~/pause", "std_srvs/srv/Trigger", "take no measurements until resumed"),
-    Interface("~/resume", "std_srvs/srv/Trigger", "take measurements again"),
+    Interface("~/load", "std_srvs/srv/Trigger", "save the run and load the map of another"),
+    Interface("~/reset", "std_srvs/srv/Trigger", "save the run and begin a new one"),
+    Interface("~/pause", "std_srvs/srv/Trigger", "refuse measurements until `~/resume`"),
+    Interface("~/resume", "std_srvs/srv/Trigger", "process measurements again"),
     Interface("~/optimize", "std_srvs/srv/Trigger", "solve everything until converged"),
-    Interface("~/clear_closures", "std_srvs/srv/Trigger", "take the loop closures out of the graph"),
+    Interface("~/clear_closures", "std_srvs/srv/Trigger", "remove all loop closures from the graph"),
 )
