@@ -37,7 +37,7 @@ def inverse(a: Quaternion) -> Quaternion:
 
 @jitable
 def normalize(a: Quaternion) -> Quaternion:
-    """To unit length: products drift by rounding."""
+    """A quaternion scaled to unit length: products drift by rounding."""
     n = np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
     return a[0] / n, a[1] / n, a[2] / n, a[3] / n
 

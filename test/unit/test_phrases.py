@@ -29,7 +29,7 @@ def test_phrases_are_found():
     assert not wrong("The noise of the message; storytelling is fine.")
 
 
-@pytest.mark.parametrize("parameter", parameters(), ids=lambda one: one.name)
+@pytest.mark.parametrize("parameter", list(parameters()), ids=lambda one: one.name)
 def test_the_help_of_a_parameter_stands_alone(parameter):
     assert not wrong(parameter.meaning)
     assert not re.match(r"(and|or|the same|likewise|ditto|as)\b", parameter.meaning), "it begins with what it is"

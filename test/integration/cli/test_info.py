@@ -224,7 +224,7 @@ def test_stamps_that_are_zero_are_said(info):
 def test_a_frame_that_tf_does_not_tell_of_is_assumed_at_the_base_and_it_is_said(info, capsys):
     _code, lines, words = info(ODOMETRY, ("/tags", DETECTIONS, seen(frame="camera")))
     assert "detections.mount=0 0 0 0 0 0" in words
-    assert any("no transform tells where camera is" in line for line in lines)
+    assert any("no transform has the pose of camera" in line for line in lines)
     assert run(words, capsys)[0]["landmarks"] == 3
 
 
@@ -305,7 +305,7 @@ def test_corners_without_poses_are_named_with_what_makes_poses_of_them(tmp_path,
 def test_fixes_are_offered_with_an_antenna_at_the_base(info, capsys):
     code, lines, words = info(ODOMETRY, ("/gps/fix", FIX, satellite()))
     assert code == 0
-    assert any("no transform tells where" in line and "at the base is assumed" in line for line in lines)
+    assert any("no transform has the pose of" in line and "at the base is assumed" in line for line in lines)
     assert not any(word.startswith("gps.mount") for word in words)  # else the run would no more warn of it
     assert not any(word.startswith("anchor.") for word in words)  # it loosens by itself
     told, _, _ = run(words, capsys)
