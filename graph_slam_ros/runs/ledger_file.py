@@ -146,7 +146,8 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
     for edge in range(len(ledger)):
         one = graph.edge(edge)
         label, vertices = one.label, one.vertices
-        root, keyframe, loss = one.sqrt_information, int(ledger.keyframe.values[edge]), settings.last_loss(label, one.source)
+        root, keyframe = one.sqrt_information, int(ledger.keyframe.values[edge])
+        loss = settings.last_loss(label, one.source)
         left = weight_and_cost(loss.kind, loss.scale, float(chi2[edge]))[0]
         yield Entry(
             edge,
