@@ -12,7 +12,7 @@ from graph_slam_ros.slam.robust.ledger import Verdict
 
 @pytest.fixture(scope="module")
 def world():
-    return list(measurements(simulate("warehouse", 0, aisles=2, laps=2)))
+    return list(measurements(simulate("warehouse", 0, aisles=2, laps=2, aisle_m=8.0)))
 
 
 def settings(**values):
