@@ -145,7 +145,7 @@ def test_cut_anywhere_it_is_read_as_far_as_it_goes(run, tmp_path):
         ({"type": "growth", "edges": [["EDGE_SE2", [0, 7], [1, 0, 0], [1] * 9, "odometry", ""]]}, "vertex 7"),
         ({"type": "growth", "keyframes": [[0]]}, "values to unpack"),
         ({"type": "growth", "changes": [[5, 0, "believed", "none", 0, 0]]}, "BELIEVED"),
-        ({"type": "growth", "seen": [[0, "", {}, 0, 0, 0, [], []]]}, "out of bounds|index"),
+        ({"type": "growth", "seen": [[0, "", {}, 0, 0, 0, [], []]]}, "edge 0 does not exist"),
     ],
 )
 def test_what_is_no_map_is_refused_by_record(tmp_path, record, complaint):

@@ -14,7 +14,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from live_drive import TAGS, Drive, distance, earlier_run
-from live_nodes import ENVIRONMENT, MODULE, lenient, node, often, own_domain, replayed, results, robot, until
+from live_nodes import ENVIRONMENT, MODULE, lenient, node, often, own_domain, replayed, results, robot, server, until
 from messages import detection, detections, pose
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
@@ -254,6 +254,7 @@ def test_P5_a_second_node_that_would_record_into_the_folder_of_the_first_does_no
 
 
 def test_P6_told_to_stop_while_kernels_are_compiled_it_does_not_wait_for_them(tmp_path, monkeypatch):
+    server()  # with the usual cache
     monkeypatch.setitem(ENVIRONMENT, "GRAPH_SLAM_CACHE", str(tmp_path / "cache"))
     with node(f"output.folder:={tmp_path / 'run'}") as n:
         until(lambda: list(tmp_path.glob("cache/**/*.nbi")), time.sleep, "first compiled kernel", 60.0)
@@ -265,6 +266,7 @@ def test_P6_told_to_stop_while_kernels_are_compiled_it_does_not_wait_for_them(tm
 
 
 def test_while_kernels_are_compiled_the_node_answers_and_says_how_far_it_is(tmp_path, monkeypatch):
+    server()  # with the usual cache
     monkeypatch.setitem(ENVIRONMENT, "GRAPH_SLAM_CACHE", str(tmp_path / "cache"))
     with managed(tmp_path / "run") as n, robot(hears=("/diagnostics",)) as r:
         until(r.client("change_state", ChangeState).service_is_ready, r.spin, "service", 30.0)
