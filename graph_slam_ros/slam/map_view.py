@@ -78,8 +78,20 @@ class MapView:
         return self.solver.estimate(self.keyframes.ids).reshape(-1, self.space.pose.size)
 
     def sighting_trajectory(self) -> Array:
-        """Estimated poses ``T_map_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""
-        return self._at_sightings(self.trajectory())
+        """Estimated poses ``T_map_base`` at the stamps of the sightings, (n, 3) or (n, 7).
+
+        What odometry was wrong by from one keyframe to the next is spread evenly over the time between.
+        """
+        poses, odometry, group = self.trajectory(), self.keyframes.poses, self.space.group
+        found, stamps_ns = self._at_sightings(poses), self.keyframes.stamps_ns
+        since_ns = self.sighting_poses.stamps_ns - stamps_ns[self.sighting_poses.ids]
+        ends = np.isin(self.sighting_poses.ids + 1, [*self.segments, len(self.keyframes)])
+        a = self.sighting_poses.ids[~ends]
+        motion = group.between(tuple(odometry[a].T), tuple(odometry[a + 1].T))
+        wrong = group.local(tuple(poses[a + 1].T), group.compose(tuple(poses[a].T), motion))
+        part = np.minimum(since_ns[~ends] / (stamps_ns[a + 1] - stamps_ns[a]), 1.0)
+        found[~ends] = np.stack(group.retract(tuple(found[~ends].T), tuple(part * d for d in wrong)), axis=-1)
+        return found
 
     def sighting_odometry(self) -> Array:
         """Return what odometry alone says, ``T_odom_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""

@@ -9,7 +9,7 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import edge_noise
-from graph_slam_ros.measurements.types import Closure, InitialPose, Observation, Odometry
+from graph_slam_ros.measurements.types import Closure, InitialPose, Observation, Odometry, Sightings
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.gates import ClosureStart, DatumGate, GateChain
 from graph_slam_ros.slam.frontend.ingest_gate import size_of
@@ -26,6 +26,7 @@ from graph_slam_ros.typing import Array, Numbers
 
 _UNCERTAIN, _MAX_UNCERTAIN_M = 10.0, 1e5  # times as far as a given pose is away: so little odometry is trusted there
 _SHARED_WHEN_SOON = 1.0  # of a variance: with more, what comes fast would seem better than it is
+_NEAR, _SLOW = 0.15, 3.5  # the same seen from nearer [m, rad] than this is soon for so many times the least interval
 
 
 class KeyframeFrontend:
@@ -80,6 +81,7 @@ class KeyframeFrontend:
         self.covariance = np.zeros((self._space.dof, self._space.dof))
         self.initial_pose: InitialPose | None = None
         self.held_covariance: Array | None = None
+        self._observed_from, self._observed = -1, set[str]()  # a keyframe, and what was observed since
 
     @property
     def source(self) -> str:
@@ -192,9 +194,13 @@ class KeyframeFrontend:
     def where(self, m: Observation) -> PoseAtStamp:
         """The pose at an observation, from a keyframe there if odometry's noise since the last one would matter."""
         where, motion = self.path.where(m.stamp_ns), self.path.motion
-        if motion is None or not self._deserves_keyframe(m, where, motion):
-            return where
-        return self._keyframe_at(where, motion)
+        if motion is not None and self._deserves_keyframe(m, where, motion):
+            where = self._keyframe_at(where, motion)
+        if isinstance(m, Sightings):
+            if where.keyframe != self._observed_from:
+                self._observed_from, self._observed = where.keyframe, set()
+            self._observed.update(s.id for s in m.sightings)
+        return where
 
     @property
     def _motion(self) -> IntegratedOdometry:
@@ -231,13 +237,26 @@ class KeyframeFrontend:
         """Return whether the motion since the keyframe would be too much of the noise of what was measured."""
         if where.keyframe != newest.keyframe or not newest.before_last_ns < where.stamp_ns:
             return False
-        is_soon = where.stamp_ns - newest.start_ns < self.config.keyframes.min_interval_s * 1e9
         if self._noise.is_jitter(where.T_keyframe_base):
             return False
-        most, added_sigma_m = self.config.keyframes.shared_noise, self.config.landmarks.added_sigma_m
-        if is_soon:
-            most = max(most, _SHARED_WHEN_SOON)
-        return motion_compensation.motion_noise_dominates(self._space, m, where, most, added_sigma_m)
+        c, added_sigma_m = self.config.keyframes, self.config.landmarks.added_sigma_m
+        since_s = (where.stamp_ns - newest.start_ns) * 1e-9
+        most = max(c.shared_noise, _SHARED_WHEN_SOON) if since_s < c.min_interval_s else c.shared_noise
+        if not motion_compensation.motion_noise_dominates(self._space, m, where, most, added_sigma_m):
+            return False
+        if since_s >= _SLOW * c.min_interval_s or not self._is_repeated(m, where):
+            return True
+        return motion_compensation.motion_noise_dominates(
+            self._space, m, where, _SHARED_WHEN_SOON, added_sigma_m, sharpest=True
+        )
+
+    def _is_repeated(self, m: Observation, where: PoseAtStamp) -> bool:
+        """Return whether the same was observed since the keyframe, from nearly there; without ids it may be new."""
+        if not isinstance(m, Sightings) or where.keyframe != self._observed_from:
+            return False
+        moved, names = where.T_keyframe_base, {s.id for s in m.sightings}
+        is_near = max(math.hypot(*moved[: self._space.dimensions]), self._space.angle(moved)) < _NEAR
+        return is_near and "" not in names and names <= self._observed
 
     def _keyframe_at(self, where: PoseAtStamp, motion: IntegratedOdometry) -> PoseAtStamp:
         """A keyframe at a stamp within the last step of odometry, which is cut in two."""

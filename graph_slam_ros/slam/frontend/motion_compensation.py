@@ -84,7 +84,12 @@ def seen_from_sensor(space: Geometry, s: Sighting, where: PoseAtStamp, p_keyfram
 
 
 def motion_noise_dominates(
-    space: Geometry, m: Sightings | Fix | Closure, where: PoseAtStamp, most: float, added_sigma_m: float
+    space: Geometry,
+    m: Sightings | Fix | Closure,
+    where: PoseAtStamp,
+    most: float,
+    added_sigma_m: float,
+    sharpest: bool = False,
 ) -> bool:
     """Return whether the motion adds more to the variance than a part of it, common to the whole message.
 
@@ -92,18 +97,19 @@ def motion_noise_dominates(
     ----------
     most : part of the variance
     added_sigma_m : what is added to sightings besides
+    sharpest : the least variance of any direction of a sighting counts, not that of all directions
     """
     n, motion = space.dimensions, where.covariance
     moved, turned = float(np.trace(motion[:n, :n])), float(np.trace(motion[n:, n:]))
     if isinstance(m, Sightings):
-        return any(_adds(space, s, moved, turned, most, added_sigma_m**2) for s in m.sightings)
+        return any(_adds(space, s, moved, turned, most, added_sigma_m**2, sharpest) for s in m.sightings)
     own = float(np.trace(as_matrix(m.covariance)))
     if isinstance(m, Fix) and m.kind != "pose":
         return (moved if m.kind == "position" else turned) > most * own
     return moved + turned > most * own
 
 
-def _adds(space: Geometry, s: Sighting, moved: float, turned: float, most: float, added: float) -> bool:
+def _adds(space: Geometry, s: Sighting, moved: float, turned: float, most: float, added: float, sharpest: bool) -> bool:
     own = np.diag(as_matrix(s.covariance)).tolist()
     if s.kind == "bearing":
         return turned > most * sum(own)
@@ -111,9 +117,14 @@ def _adds(space: Geometry, s: Sighting, moved: float, turned: float, most: float
         return moved > most * (own[0] + added)
     if s.kind == "range_bearing":
         far = s.measured[0]
-        return moved + far**2 * turned > most * (own[0] + far**2 * sum(own[1:]) + added)
+        along, across = own[0], far**2 * np.array(own[1:])
+        variance = min(along, *across) if sharpest else along + sum(across)
+        return bool(moved + far**2 * turned > most * (variance + added))
     n = space.dimensions
     far = float(np.linalg.norm(s.measured[:n]))
+    if sharpest:
+        least = float(np.linalg.eigvalsh(as_matrix(s.covariance)[:n, :n])[0])
+        return moved + far**2 * turned > most * (least + added)
     return moved + far**2 * turned > most * (sum(own[:n]) + n * added)
 
 
