@@ -154,8 +154,8 @@ def wrong_with(odd, words, name, made, folder):
 
 @pytest.mark.parametrize("odd", [unreadable, sparse, of_another_kind, of_another_run])
 def test_an_odd_file_in_the_folder_of_a_run_is_named_by_each_command_that_reads_it(made, tmp_path, odd):
-    """Each command with each file that it needs; a sixth of them in turn, all with ``make soak``."""
-    cases = CASES[len(odd.__name__) % 6 :: reliability.times(6, 1)]
+    """Each command with each file that it needs; a ninth of them in turn, all with ``make soak``."""
+    cases = CASES[len(odd.__name__) % 6 :: reliability.times(9, 1)]
     wrong = [wrong_with(odd, *case, made, tmp_path / str(k)) for k, case in enumerate(cases)]
     reliability.tell("odd_files", tried=len(cases), failed=sum(map(bool, wrong)))
     assert not any(wrong), "\n".join(filter(None, wrong))
