@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.messages.from_msg import TF, TRANSFORMS
@@ -34,10 +34,6 @@ class InputQos:
             reliability=ReliabilityPolicy.RELIABLE if self.reliability else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if self.durability else DurabilityPolicy.VOLATILE,
         )
-
-    def asked_by(self, kind: QoSPolicyKind) -> str:
-        """The parameter that asks for a policy that a publisher does not offer."""
-        return self.durability if kind == QoSPolicyKind.DURABILITY else self.reliability
 
     def mismatch(self, publisher: Any) -> str:
         """The reason why a publisher does not connect, by its endpoint info; empty where it does."""

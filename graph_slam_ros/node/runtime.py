@@ -47,7 +47,7 @@ class Runtime:
 
     def __init__(self, node: NodeHandle) -> None:
         config = with_survey(node.config)
-        self._node, self._topics = node, input_topics(node, config)
+        self._node = node
         self.counters = Counters()
         self.counters.on_first = self._warn
         with contextlib.ExitStack() as undo:  # what cannot be configured holds neither the run folder nor a topic
@@ -87,7 +87,7 @@ class Runtime:
         self._subscriptions = Subscriptions(
             node,
             config,
-            self._topics,
+            input_topics(node, config),
             ingest.converter,
             ingest.receive,
             node.guarded,

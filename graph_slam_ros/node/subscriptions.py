@@ -3,8 +3,8 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 try:
@@ -113,35 +113,15 @@ class Subscriptions:
                 for name in names:
                     self._counters.count(name, "lost_in_transport", event.total_count_change)
 
-        def on_incompatible(event: Any) -> None:
-            if event.total_count_change:
-                asked = topic.qos.asked_by(event.last_policy_kind)
-                self._node.get_logger().warn(f"{topic.name}: a publisher offers less than {asked} asks for (QoS)")
+        self._subscriptions.append(self._created(topic, self._guarded(on_message), self._guarded(on_lost)))
 
-        self._subscriptions.append(self._created(topic, on_message, on_lost, on_incompatible))
-
-    def _created(self, topic: InputTopic, on_message: Callback, on_lost: Callback, on_incompatible: Callback) -> Any:
-        """A subscription, with the events of lost messages and of publishers that do not connect.
-
-        Some middleware has neither event, or one of them.
-        """
-        kind, guarded = message_class(topic.type_name), self._guarded
-        lost, incompatible = guarded(on_lost), guarded(on_incompatible)
-        for events in (
-            SubscriptionEventCallbacks(message_lost=lost, incompatible_qos=incompatible),
-            SubscriptionEventCallbacks(incompatible_qos=incompatible),
-            SubscriptionEventCallbacks(),
-        ):
-            with suppress(UnsupportedEventTypeError):
-                return self._node.create_subscription(
-                    kind,
-                    topic.name,
-                    guarded(on_message),
-                    topic.qos.profile,
-                    raw=True,
-                    event_callbacks=events,
-                )
-        raise AssertionError("a subscription without callbacks needs no events")
+    def _created(self, topic: InputTopic, on_message: Callback, on_lost: Callback) -> Any:
+        """A subscription, with the event of lost messages if the middleware has it."""
+        create = partial(self._node.create_subscription, message_class(topic.type_name), topic.name, on_message)
+        try:
+            return create(topic.qos.profile, raw=True, event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost))
+        except UnsupportedEventTypeError:
+            return create(topic.qos.profile, raw=True)
 
     # -- facts -------------------------------------------------------------------------------------------------------
 

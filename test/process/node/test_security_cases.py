@@ -273,8 +273,8 @@ def test_X10_what_the_node_tells_has_neither_paths_nor_positions():
         "f'saved {Path(folder).name}'",
         "f'{run.name} was stopped while measurements waited: its results are being completed'",
         "f'{self._run.name}: its results are complete'",
+        "line",
         "message",
-        "said",
         "str(error)",
     ]
 
