@@ -15,6 +15,7 @@ from graph_slam_ros.runs.folder import SUMMARY, check_room
 from graph_slam_ros.runs.replay import choose_inputs, replay
 from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import Config
+from graph_slam_ros.warmup import compile_all
 
 _BAG = Path(__file__).resolve().parents[2] / "data" / "demo.mcap"
 
@@ -27,6 +28,7 @@ def demo(out: Path, *, live: bool, force: bool, progress: Callable[[str], Any], 
         if not recording.is_file():  # installed without the source tree
             recording = Path(scratch) / "demo.mcap"
             write_bag(simulate("warehouse", 8, aisle_m=9.0), recording)
+        compile_all(dimensions=2)  # before it: a live node would miss messages meanwhile
         start = time.perf_counter()
         lost = (_live if live else _offline)(recording, out, progress)
         elapsed_s = time.perf_counter() - start
