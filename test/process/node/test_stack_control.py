@@ -386,7 +386,7 @@ def valid(p, rng):
     if p.choices or p.type is bool:
         return rng.choice(p.choices or (False, True))
     if p.type is str:
-        return f"run-{rng.randrange(9)}"
+        return f"{rng.randrange(9)} 0 0.5" if p.name == "output.load_pose" else f"run-{rng.randrange(9)}"
     near = rng.uniform(0.5, 1.5) * (p.default or 1)
     return max(int(near), int(p.low)) if p.type is int else near
 
