@@ -129,7 +129,7 @@ def test_G23_ranges_or_bearings_alone_raise_the_alarm_and_a_given_pose_ends_it(s
     slam, odometry = driven.slam, list(measurements(faulty))
     assert 0.0 < driven.alarmed_s < 5.0  # and none in the drive before
     assert driven.moved_m < 0.05
-    assert "do not tell where: give initialpose" in str(slam.displaced)
+    assert "do not determine the pose: give initialpose" in str(slam.displaced)
     assert slam.segments == [0]
     slam.process(InitialPose((0.0, 0.0, 0.0), tuple((0.01 * np.eye(3)).ravel().tolist())))
     for m in [m for m in odometry if m.stamp_ns > faulty.stamps_ns[until][-1]][:20]:
