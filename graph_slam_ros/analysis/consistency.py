@@ -5,7 +5,7 @@ applications to tracking and navigation", 2001, section 5.4): of a consistent es
 as many degrees of freedom as e has components, which is also its mean.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -13,10 +13,12 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.typing import Array
 
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BAND = (0.025, 0.975)
+_WORTH_SAYING = 0.2  # log of a factor of a sigma
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,37 +58,22 @@ class Nees:
 
 
 @dataclass(frozen=True, slots=True)
-class ClassNoise:
-    """The scale of the sigmas of a class of edges, by its residuals.
-
-    Attributes
-    ----------
-    per_dof : chi2 per degree of freedom: 1 is expected
-    factor : what its sigmas should be multiplied by for that; of a class that is disturbed by outliers it is too large
-    """
-
-    edges: int
-    residuals: int
-    chi2: float
-    dof: float
-    per_dof: float
-    factor: float
-
-
-@dataclass(frozen=True, slots=True)
 class Consistency:
-    """NEES of the last pose, of all poses and of landmarks' positions, each None where it is not known, and classes.
+    """NEES of the last pose, of all poses and of landmarks' positions, each None where it is not known, and the noise.
 
     Attributes
     ----------
+    noise : the scale of the noise of each class of edges, input and part
+    advice : what to do about it; empty where that is nothing
     left_out : why there is no NEES: by ``poses`` and ``landmarks``, a reason for each that is None
     """
 
     last_pose: Nees | None
     poses: Nees | None
     landmarks: Nees | None
-    classes: dict[str, ClassNoise]
+    noise: tuple[NoiseScale, ...] = ()
     left_out: dict[str, str] = field(default_factory=dict)
+    advice: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -106,10 +93,14 @@ class Consistency:
                     f"{name:30s}{nees.mean:10.2f}{nees.dof:10d}{band:>16s}{nees.inside:8.0%}{nees.n:7d}{nees.skipped:9d}"
                 )
         lines += [f"{f'NEES of {name}':30s}left out: {reason}" for name, reason in self.left_out.items()]
-        if self.classes:
-            lines.append(f"{'class of edges':30s}{'residuals':>10s}{'dof':>10s}{'chi2/dof':>16s}   sigmas should be")
-        for name, c in self.classes.items():
-            lines.append(f"{name:30s}{c.residuals:10d}{c.dof:10.1f}{c.per_dof:16.3f}   {c.factor:.3g} times as large")
+        if self.noise:
+            head = f"{'dof':>8s}{'chi2/dof':>10s}{'alike':>8s}"
+            lines.append(f"{'noise of class, input, part':40s}{head}   configured sigmas should be")
+        for one in self.noise:
+            name = " ".join(filter(None, (one.label, one.source, one.part)))
+            should = f"not known: {one.reason}" if one.reason else f"{one.factor:.3g} times as large"
+            lines.append(f"{name:40s}{one.dof:8.0f}{one.per_dof:10.3f}{one.design_effect:8.2f}   {should}")
+        lines += [self.advice] if self.advice else []
         return "\n".join(lines)
 
 
@@ -173,20 +164,17 @@ def landmark_errors(
     return (true - positions)[:, :dimensions], relative
 
 
-def class_noise(classes: Mapping[str, Mapping[str, float]], leverage: Mapping[str, float]) -> dict[str, ClassNoise]:
-    """The scale of the sigmas of each class of edges, from its chi2, its number of residuals and its leverage.
+def noise_advice(noise: Sequence[NoiseScale], *, is_applied: bool) -> str:
+    """Return what a user may do about sigmas that residuals contradict; empty where that is nothing.
 
-    The leverages of all classes add up to the number of unknowns: each has as many degrees of freedom as it has
-    residuals beyond the unknowns that it determines itself. A class without any, such as the anchor, is left out.
+    Parameters
+    ----------
+    is_applied : whether the run used the factors already
     """
-    out = {}
-    for name, c in classes.items():
-        dof = c["residuals"] - leverage.get(name, np.nan)
-        if dof >= 1.0:
-            per_dof = c["chi2"] / dof
-            factor = float(np.sqrt(per_dof))
-            out[name] = ClassNoise(int(c["edges"]), int(c["residuals"]), c["chi2"], dof, per_dof, factor)
-    return out
+    wrong = [one for one in noise if not one.reason and abs(np.log(one.factor)) > _WORTH_SAYING]
+    if is_applied or not wrong:
+        return ""
+    return "replay with --set robust.noise_scale=estimated to use these factors"
 
 
 def _in_six(covariance: Array) -> Array:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.analysis.consistency import ClassNoise, Consistency, Nees, class_noise, landmark_nees, pose_nees
+from graph_slam_ros.analysis.consistency import Consistency, Nees, landmark_nees, noise_advice, pose_nees
 from graph_slam_ros.analysis.path_error import (
     STATISTICS,
     Drift,
@@ -30,6 +30,7 @@ from graph_slam_ros.formats.files import is_empty, read_text
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, is_run, run_config, summary_of
 from graph_slam_ros.runs.trajectory import Point, Trajectory, read_covariances, read_landmarks, read_tum
+from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.typing import Array
 
 _KEYFRAMES = ("path.tum", "path_odometry.tum")  # estimate and dead reckoning
@@ -273,10 +274,11 @@ def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
     path, covariances = path.at(drive.keyframes), covariances[drive.keyframes]
     truth = known.trajectory if covariances.shape[1] == 6 else known.trajectory.in_plane()
     true = interpolated(truth, path.stamps_s)
-    is_held, noise = _classes(run)
+    is_held, noise = _noise(run)
+    advice = noise_advice(noise, is_applied=run_config(run).robust.noise_scale == "estimated")
     reason = _why_no_nees(known, drive, path, true, is_held)
     if reason:
-        return Consistency(None, None, None, noise, {"poses and landmarks": reason})
+        return Consistency(None, None, None, noise, {"poses and landmarks": reason}, advice)
     landmarks = read_landmarks(run / "landmarks.csv")
     unknown = (np.nan, np.nan, np.nan)
     of_landmarks = landmark_nees(
@@ -288,7 +290,8 @@ def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
         covariances[0],
     )
     last, poses = pose_nees(path.poses, true, covariances)
-    return Consistency(last, poses, of_landmarks, noise, _left_out(last, poses, of_landmarks, known, len(landmarks)))
+    left_out = _left_out(last, poses, of_landmarks, known, len(landmarks))
+    return Consistency(last, poses, of_landmarks, noise, left_out, advice)
 
 
 def _why_no_nees(known: Truth, drive: Drive, path: Trajectory, true: Array, is_held: bool) -> str:
@@ -321,10 +324,10 @@ def _left_out(
     return out
 
 
-def _classes(run: Path) -> tuple[bool, dict[str, ClassNoise]]:
-    """Return whether fixes hold the map, and what each class of edges says of its sigmas, by the summary of a run."""
+def _noise(run: Path) -> tuple[bool, tuple[NoiseScale, ...]]:
+    """Return whether fixes hold the map, and what residuals say of the noise, by the summary of a run."""
     try:
         summary = json.loads(read_text(run / SUMMARY))
-        return "fixes" in summary["classes"], class_noise(summary["classes"], summary["leverage"])
+        return "fixes" in summary["classes"], tuple(NoiseScale(**one) for one in summary.get("noise", ()))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run ({type(error).__name__}: {error})") from None

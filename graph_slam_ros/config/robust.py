@@ -26,6 +26,12 @@ class RobustConfig:
         "times",
         low=1.0,
     )
+    noise_scale: str = setting(
+        "configured",
+        "noise of all inputs: configured: as messages and parameters state it; estimated: that times factors from the "
+        "residuals, for each input and class of edges, from 50 keyframes on",
+        choices=("configured", "estimated"),
+    )
     loss: str = setting(
         "dcs", "robust loss of closures and fixes; geman_mcclure and dcs give outliers no weight", choices=LOSSES[:5]
     )

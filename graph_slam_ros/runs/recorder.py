@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,6 @@ from graph_slam_ros.runs.map_journal import GROWTH, MapGrowth
 from graph_slam_ros.runs.tables import counted, result_texts, summarize
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.snapshot import MapSnapshot
-from graph_slam_ros.solver.leverage import leverage
 
 _PATH_GROWTH = 1.1  # the whole path is recorded again when it has grown by a tenth: its total stays linear
 _TOGETHER = 256  # measurements that are written at once: one by one, as they come, each takes several times as long
@@ -331,7 +331,7 @@ def save_results(
 
     files = {name: put(name, text) for name, text in result_texts(slam).items()}
     contents = {"format": MARK} | summarize(slam) | summary | {"format": MARK, "files": files}
-    contents["leverage"] = leverage(slam.solver) if slam.is_solved else {}
+    contents["noise"] = [asdict(one) for one in slam.noise_scale()] if slam.is_solved else []
     put(SUMMARY, json.dumps(contents, indent=2) + "\n")
 
 

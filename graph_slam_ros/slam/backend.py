@@ -9,6 +9,10 @@ from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.graph import Gaussian, Loss
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise
 from graph_slam_ros.slam.robust.background import Background, Executor, Work, run_when_asked
 from graph_slam_ros.slam.robust.displacement import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
@@ -19,6 +23,7 @@ from graph_slam_ros.solver import Report, Settings, Solver
 from graph_slam_ros.typing import Array, Numbers
 
 _MAX_PENDING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
+_NOISE_ROUNDS, _NOISE_ROUNDS_ONLINE = 8, 2  # of estimating the scale of the noise and solving with it
 _UPDATES = 6  # until what was let in fits, before everything is solved for it
 
 
@@ -33,6 +38,7 @@ class Backend:
     Attributes
     ----------
     graph, solver, decisions
+    noise : adds edges to the graph, with noise in scale
     handed_over : vertices and edges of the graph that the solver has
     frozen, frozen_edges : the first so many vertices, and verdicts on the first so many edges, stay for good
     held : the same while the robot is only located (``hold_map``): vertices and edges; zeros otherwise
@@ -53,6 +59,7 @@ class Backend:
         self._config, self._counters = config, counters or Counters()
         start = start or MapSnapshot()
         self.graph = start.graph
+        self.noise = NoiseScales(self.graph, start.noise_factors)
         self.solver = Solver(self.graph, settings)
         self.decisions = OutlierGate(config, self.graph, self.solver, start.ledger)
         self.handed_over, self.frozen = (0, 0), start.frozen
@@ -89,6 +96,8 @@ class Backend:
                 self.solver.hold(vertex)
         if held[0]:
             self._hold(*held)
+        if self._config.noise_scale != "estimated":
+            self.noise.change(dict.fromkeys(self.noise.factors, 1.0), self._first_free_edge)
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         report = self.solver.optimize(self.solver.settings.until_still())  # what is believed was decided before
         self.decisions.recalibrate()
@@ -160,6 +169,45 @@ class Backend:
             report = self.solver.optimize(settings)
         self._background.cancel(self.ledger.outside_count)
         return report
+
+    def scale_noise(self, keyframes: StampedPoses[Keyframe], everything: Settings | None) -> Report | None:
+        """Estimate the scale of the noise where that is due, and solve with it; returns the last report of a solve.
+
+        It is due at 50 keyframes, 100, 200 and so on, and when everything is solved.
+        """
+        is_due = everything is not None or self.noise.is_due(len(keyframes))
+        if self._config.noise_scale != "estimated" or self.holds_back or not is_due:
+            return None
+        first_edge, report = self._first_free_edge, None
+        for _ in range(_NOISE_ROUNDS if everything else _NOISE_ROUNDS_ONLINE):
+            before = dict(self.noise.factors)
+            try:
+                found = {one.key: one.factor for one in self.noise_scale(keyframes) if not one.reason}
+                if not self.noise.change(found, first_edge):
+                    break
+                self.solver.rebuild()
+                report = self.solver.optimize(everything)
+            except Exception as error:
+                self._counters.count("noise_scale", type(error).__name__)
+                if self.noise.change(dict.fromkeys(self.noise.factors, 1.0) | before, first_edge):
+                    self.solver.rebuild()
+                    report = self.solver.optimize(everything)
+                break
+        if report is not None:
+            self.decisions.recalibrate()
+            self._background.cancel(self.ledger.outside_count)
+        return report if everything else None
+
+    def noise_scale(self, keyframes: StampedPoses[Keyframe]) -> list[NoiseScale]:
+        """The scale of the noise at the present estimate; nothing is changed."""
+        stamps = np.zeros(self.graph.vertex_count, dtype=np.int64)
+        stamps[keyframes.ids] = keyframes.stamps_ns
+        return estimate_noise(self.graph, self.solver, self.noise.factors, stamps, self._first_free_edge)
+
+    @property
+    def _first_free_edge(self) -> int:
+        """The first edge that is not of a frozen or held map."""
+        return max(self.frozen_edges, self.held[1])
 
     def move(self, T_new_old: Numbers, space: Geometry) -> None:
         """Move everything rigidly, what a second look works on besides: that is dropped."""

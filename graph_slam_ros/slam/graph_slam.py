@@ -73,18 +73,17 @@ class GraphSlam(MapView):
         self.counters = counters = Counters()
         backend = Backend(config.robust, config.solver_settings(), executor, start, counters)
         landmarks = LandmarkFrontend(
-            *(config, backend.graph, backend.solver, counters),
+            *(config, backend.noise, backend.solver, counters),
             withdraw=self._withdraw,
             hand_over=backend.hand_over,
             trusts_sightings=lambda: backend.trusts_sightings,
         )
         solution = Solution(config.space, backend, FailureGuard(backend, counters, landmarks.map.forget))
-        frontend = KeyframeFrontend(config, backend.graph, counters, solution.pose, start.datum if start else ())
+        frontend = KeyframeFrontend(config, backend.noise, counters, solution.pose, start.datum if start else ())
         kidnaps = KidnapDetector(config.space, config.odometry, backend, counters, frontend.path.segments)
         super().__init__(config, backend, frontend, landmarks, kidnaps, solution)
         self.settings: dict[str, Value] = {}
-        self.processed = 0
-        self._sink = sink
+        self.processed, self._sink = 0, sink
         self._anchor = Anchor(config, backend)
         self._edits = Edits(backend, landmarks.map, counters)
         self._faults = Faults(counters)
@@ -221,6 +220,7 @@ class GraphSlam(MapView):
             self._kidnaps.check(self.keyframes.ids, now_ns)
         else:
             report = self.backend.optimize(keyframe, everything)
+        report = self.backend.scale_noise(self.keyframes, everything) or report
         (covariance,) = self.solver.marginal([self.keyframes[keyframe].vertex])
         if not np.isfinite(covariance).all():
             raise DivergedError("the covariance is not finite")

@@ -1,6 +1,6 @@
 """The reading side of the pipeline: path, landmarks, covariances, statistics and health. Reading changes nothing."""
 
-from collections.abc import Set
+from collections.abc import Sequence, Set
 
 import numpy as np
 
@@ -10,10 +10,12 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
+from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.kidnap_detector import Alarm, KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark
+from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.slam.solution import Correction, Solution
 from graph_slam_ros.solver import Report, Solver
@@ -137,6 +139,26 @@ class MapView:
             if mark.is_tentative
         }
         return {name: mark.reason for name, mark in self._landmarks.map.undetermined.items()} | tentative
+
+    @property
+    def noise_factors(self) -> dict[Key, float]:
+        """The factors by which the configured sigmas of the edges are multiplied, by class, input and part."""
+        return self.backend.noise.factors
+
+    @property
+    def noise_changes(self) -> Sequence[Rescaling]:
+        """The changes of the noise of edges, in order."""
+        return self.backend.noise.history
+
+    def noise_scale(self) -> list[NoiseScale]:
+        """The noise by the residuals: a factor of the configured sigmas for each class, input and part.
+
+        Raises
+        ------
+        GaugeError, SingularError
+            As for ``Solver.joint_marginal``.
+        """
+        return self.backend.noise_scale(self.keyframes)
 
     @property
     def range_offsets(self) -> dict[str, int]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
+from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict
 from graph_slam_ros.typing import Array
@@ -26,6 +27,7 @@ class MapSnapshot:
     processed : records of the ingest sequence that it came of; None where it does not tell
     used_ns : stamp of the last odometry that was used by then; None before the first
     source : the input of that odometry
+    noise_factors : of the configured sigmas, that the edges have, as ``NoiseScales.factors``
     continues_with : the odometry whose next message belongs to the same drive; empty where a new drive begins
     """
 
@@ -46,6 +48,12 @@ class MapSnapshot:
     used_ns: int | None = None
     source: str = ""
     continues_with: str = ""
+    noise_factors: dict[Key, float] = field(default_factory=dict)
+
+    @property
+    def noise_changes(self) -> tuple[Rescaling, ...]:
+        """None: the edges are as they were read."""
+        return ()
 
     @property
     def frozen_edges(self) -> int:

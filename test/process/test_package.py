@@ -138,7 +138,8 @@ def rule(table, name):
 COLUMNS = {
     name for of in (Graph(), EdgeTable(RELATIVE_POSE, 0)) for name in dir(of) if isinstance(getattr(of, name), Column)
 }
-BULK = {  # the stored numbers of many vertices at once
+BULK = {  # the stored numbers of many vertices, or the noise of many edges, at once
+    *("slam/frontend/noise_factors.py", "slam/noise_scale.py"),
     *("slam/backend.py", "slam/robust/pairwise_consistency.py"),
     *("runs/map_journal.py", "analysis/what_if.py", "simulation/pose_graph.py"),
 }

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.graph import Graph
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import edge_noise
 from graph_slam_ros.measurements.types import Closure, InitialPose, Observation, Odometry, Sightings
@@ -16,6 +15,7 @@ from graph_slam_ros.slam.frontend.ingest_gate import size_of
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList, SightingPose
 from graph_slam_ros.slam.frontend.max_distance import MaxDistance
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector, Step
 from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
@@ -34,7 +34,7 @@ class KeyframeFrontend:
 
     Parameters
     ----------
-    graph : gets the vertices and edges
+    edges : adds edges to the graph
     pose_of : the present estimate of a vertex
     datum : of a map that is loaded
 
@@ -56,13 +56,13 @@ class KeyframeFrontend:
     def __init__(
         self,
         config: Config,
-        graph: Graph,
+        edges: NoiseScales,
         counters: Counters,
         pose_of: Callable[[int], Numbers],
         datum: tuple[float, ...] = (),
     ) -> None:
-        self.config, self._space, self._graph, self._pose_of = config, config.space, graph, pose_of
-        self._counters = counters
+        self.config, self._space, self._pose_of = config, config.space, pose_of
+        self._edges, self._graph, self._counters = edges, edges.graph, counters
         self._noise = OdometryNoise(config.odometry, self._space)
         self.odometry = OdometrySelector(config.odometry, config.inputs.names.split(), self._space, counters)
         self.path = KeyframeList(self._noise, self._space)
@@ -77,7 +77,7 @@ class KeyframeFrontend:
             size_of,
             counters,
         )
-        self.edges = PoseEdges(self._space, graph, counters)
+        self.edges = PoseEdges(self._space, edges, counters)
         self.covariance = np.zeros((self._space.dof, self._space.dof))
         self.initial_pose: InitialPose | None = None
         self.held_covariance: Array | None = None
@@ -214,7 +214,7 @@ class KeyframeFrontend:
         vertex = self._graph.add_vertex(self._space.pose, at or group.compose(self._pose_of(last), T_last_now))
         noise = edge_noise(self._counters, "odometry", covariance, self._space.dimensions)
         relative_pose = self._space.relative_pose
-        self._graph.add_edge(relative_pose, [last, vertex], T_last_now, noise, "odometry", self.source)
+        self._edges.add_edge(relative_pose, [last, vertex], T_last_now, noise, "odometry", self.source)
         self.covariance = group.propagate(self.covariance, T_last_now, covariance)
         self.path.append(vertex, step, self.config.ordering.late_s)
 

@@ -2,26 +2,27 @@
 
 import numpy as np
 
-from graph_slam_ros.graph import Gaussian, Graph
+from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import edge_noise
 from graph_slam_ros.measurements.types import Closure, Fix, InitialPose
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.typing import Array, Numbers
 
 
 class PoseEdges:
     """Adds such edges to a graph; what had to be repaired of their noise is counted."""
 
-    def __init__(self, space: Geometry, graph: Graph, counters: Counters) -> None:
-        self._space, self._graph, self._counters = space, graph, counters
+    def __init__(self, space: Geometry, edges: NoiseScales, counters: Counters) -> None:
+        self._space, self._edges, self._counters = space, edges, counters
 
     def initial_pose(self, vertex: int, pose: InitialPose) -> None:
         """Add a prior for a pose that somebody gives."""
         noise = self._noise("initialpose", motion_compensation.as_matrix(pose.covariance))
-        self._graph.add_edge(self._space.pose_prior, [vertex], pose.T_map_base, noise, "initialpose")
+        self._edges.add_edge(self._space.pose_prior, [vertex], pose.T_map_base, noise, "initialpose")
 
     def fix(self, m: Fix, where: PoseAtStamp, T_map_keyframe: Numbers) -> None:
         """A prior on a keyframe; of a position that lacks some axes, one on each principal axis that is known."""
@@ -36,11 +37,11 @@ class PoseEdges:
             noise = edge_noise(self._counters, topic, np.array([[variance]]), 1)
             along = float(axis @ compensated.measured[:n])
             measured = (*axis.tolist(), along, *compensated.measured[n:])
-            self._graph.add_edge(space.coordinate_prior, vertices, measured, noise, "fixes", topic)
+            self._edges.add_edge(space.coordinate_prior, vertices, measured, noise, "fixes", topic)
         if not axes:
             metres = n if m.kind in ("pose", "position") else 0
             noise = edge_noise(self._counters, topic, compensated.covariance, metres)
-            self._graph.add_edge(space.fixes[m.kind], vertices, compensated.measured, noise, "fixes", topic)
+            self._edges.add_edge(space.fixes[m.kind], vertices, compensated.measured, noise, "fixes", topic)
         self._counters.used[topic] += 1
 
     def closure(self, m: Closure, earlier: PoseAtStamp, later: PoseAtStamp) -> None:
@@ -50,7 +51,7 @@ class PoseEdges:
             return
         compensated = motion_compensation.closure(self._space, m, earlier, later)
         noise, vertices = self._noise(m.topic, compensated.covariance), [earlier.vertex, later.vertex]
-        self._graph.add_edge(self._space.relative_pose, vertices, compensated.measured, noise, "closures", m.topic)
+        self._edges.add_edge(self._space.relative_pose, vertices, compensated.measured, noise, "closures", m.topic)
         self._counters.used[m.topic] += 1
 
     def _noise(self, source: str, covariance: Array) -> Gaussian:

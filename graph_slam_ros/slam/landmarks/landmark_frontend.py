@@ -4,12 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.graph import Graph
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Sighting, Sightings
 from graph_slam_ros.slam.frontend.gates import GateChain
 from graph_slam_ros.slam.frontend.max_distance import off_the_pole
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark, Landmarks
 from graph_slam_ros.solver import Solver
@@ -66,6 +66,7 @@ class LandmarkFrontend:
 
     Parameters
     ----------
+    edges : adds edges to the graph
     withdraw : takes edges out for good
     hand_over : gives the solver what is new in the graph
     trusts_sightings : whether new landmarks may begin: not so while an alarm cannot be decided
@@ -79,7 +80,7 @@ class LandmarkFrontend:
     def __init__(
         self,
         config: Config,
-        graph: Graph,
+        edges: NoiseScales,
         solver: Solver,
         counters: Counters,
         *,
@@ -88,7 +89,7 @@ class LandmarkFrontend:
         trusts_sightings: Callable[[], bool],
     ) -> None:
         self._config, self._space, self._counters = config.landmarks, config.space, counters
-        self.map = Landmarks(config, graph, solver, counters, withdraw)
+        self.map = Landmarks(config, edges, solver, counters, withdraw)
         self.anonymous = AnonymousLandmarks(config, self.map, solver, counters, hand_over)
         self._gates = GateChain[NamedSightings](
             (HeldMapGate(self.map), AlarmGate(self.map, trusts_sightings)), lambda m: len(m.named), counters

@@ -8,12 +8,13 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.survey import Surveyed
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian, Graph, VertexKind
+from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian, VertexKind
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import LEAST_RAD2, edge_noise
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.motion_compensation import KeyframeMeasurement, PoseAtStamp
+from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.landmarks import triangulation
 from graph_slam_ros.slam.landmarks.triangulation import PartialObservation, PositionHypothesis
 from graph_slam_ros.solver import Solver
@@ -82,7 +83,7 @@ class Landmarks:
     def __init__(
         self,
         config: Config,
-        graph: Graph,
+        edges: NoiseScales,
         solver: Solver,
         counters: Counters,
         withdraw: Callable[[Sequence[int]], None],
@@ -91,7 +92,8 @@ class Landmarks:
         self.begins_new = True
         self.undetermined: dict[str, UndeterminedLandmark] = {}
         self._config, self._space = config, config.space
-        self._graph, self._solver, self._counters, self._withdraw = graph, solver, counters, withdraw
+        self._edges, self._graph = edges, edges.graph
+        self._solver, self._counters, self._withdraw = solver, counters, withdraw
         if config.landmarks.surveyed_file and not config.landmarks.surveyed:
             raise ConfigError(f"landmarks.surveyed_file: {config.landmarks.surveyed_file} has not been read")
         self._survey = config.survey
@@ -179,7 +181,7 @@ class Landmarks:
                 vertices.append(self._offset(topic))
         distance_m = float(np.linalg.norm(compensated.measured[:metres]))
         noise = edge_noise(self._counters, topic, self._blurred(s, compensated), metres, distance_m)
-        edge = self._graph.add_edge(edge_type, vertices, compensated.measured, noise, LABEL, topic)
+        edge = self._edges.add_edge(edge_type, vertices, compensated.measured, noise, LABEL, topic)
         if not s.id:
             landmark.seen.append(LandmarkEdge(edge, topic, s, where))
             landmark.stamps.add(where.stamp_ns)

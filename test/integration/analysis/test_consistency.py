@@ -1,13 +1,14 @@
 """Consistency: NEES and the noise of classes come out as they were put in, and a good run is found to be good."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 from reliability import times
 from scipy.stats import chi2
 
-from graph_slam_ros.analysis.consistency import Nees, class_noise, landmark_nees, pose_nees
+from graph_slam_ros.analysis.consistency import Nees, landmark_nees, pose_nees
 from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.errors import GraphSlamError
@@ -17,7 +18,6 @@ from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.trajectory import Trajectory, read_covariances
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Config, Control, GraphSlam
-from graph_slam_ros.solver.leverage import leverage
 
 
 def spread(rng, dof):
@@ -111,19 +111,6 @@ def test_the_truth_is_taken_between_its_neighbours_and_not_across_gaps_or_beyond
     )
 
 
-def test_a_class_with_sigmas_half_of_the_true_ones_is_told_to_double_them():
-    classes = {
-        "anchor": {"edges": 1, "residuals": 3, "chi2": 0.0},
-        "odometry": {"edges": 100, "residuals": 300, "chi2": 400.0},
-        "landmarks": {"edges": 300, "residuals": 600, "chi2": 500.0},
-    }
-    found = class_noise(classes, {"anchor": 3.0, "odometry": 200.0, "landmarks": 100.0})
-    assert set(found) == {"odometry", "landmarks"}, "the anchor has nothing beyond what it determines"
-    assert (found["odometry"].dof, found["odometry"].per_dof, found["odometry"].factor) == (100.0, 4.0, 2.0)
-    assert (found["landmarks"].dof, found["landmarks"].factor) == (500.0, 1.0)
-    assert class_noise(classes, {"anchor": np.nan, "odometry": np.nan, "landmarks": np.nan}) == {}
-
-
 CLEAN = {"odometry.twist_correlation_s": 0.0, "landmarks.added_sigma_m": 0.0, "landmarks.loss": "none"}
 
 
@@ -138,16 +125,22 @@ def run(recording, folder, settings):
     return slam
 
 
-def test_leverages_add_up_to_the_unknowns_and_a_sample_of_edges_tells_them_too(tmp_path, monkeypatch):
+def test_what_residuals_say_of_the_noise_is_saved_and_a_sample_of_edges_says_the_same(tmp_path, monkeypatch):
     slam = run(simulate("warehouse", 3, aisles=2, laps=1), tmp_path / "run", CLEAN)
-    told = leverage(slam.solver)
-    monkeypatch.setattr("graph_slam_ros.solver.leverage._MOST", 10**6)
-    exact = leverage(slam.solver)
-    assert sum(exact.values()) == pytest.approx(3 * slam.graph.vertex_count, rel=1e-9)
-    assert exact["anchor"] == pytest.approx(3.0, rel=1e-6)
-    assert told == pytest.approx(exact, rel=0.05)
-    assert told != exact
-    assert json.loads((tmp_path / "run" / "run.json").read_text())["leverage"] == told
+    sampled = slam.noise_scale()
+    monkeypatch.setattr("graph_slam_ros.slam.noise_scale._MOST_SAMPLED", 10**6)
+    exact = slam.noise_scale()
+    measured = sum(3 * one.edges if one.part == "all" else one.edges * (1 + (one.part == "position")) for one in exact)
+    unknowns = (
+        3 * slam.graph.vertex_count - 3
+    )  # the anchor determines one pose; parts of an edge are correlated a little
+    assert measured - sum(one.dof for one in exact) == pytest.approx(unknowns, rel=2e-3)
+    for one, other in zip(sampled, exact, strict=True):
+        assert (one.key, one.edges) == (other.key, other.edges)
+        assert one.dof == pytest.approx(other.dof, rel=0.05)
+    assert [one.dof for one in sampled] != [one.dof for one in exact]
+    saved = json.loads((tmp_path / "run" / "run.json").read_text())["noise"]
+    assert saved == json.loads(json.dumps([asdict(one) for one in sampled]))
 
 
 @pytest.mark.parametrize("world, n", [("warehouse", 3), ("flight", 6)])
@@ -163,7 +156,7 @@ def test_a_run_with_the_noise_it_was_told_of_is_consistent_and_its_sigmas_are_ri
         write_bag(recording, tmp_path / "truth.mcap")
         scores = evaluate(folder, tmp_path / "truth.mcap")
         last.append(scores.consistency.last_pose.mean)
-        for noise in scores.consistency.classes.values():
+        for noise in scores.consistency.noise:
             assert noise.per_dof == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / noise.dof))
     low, high = chi2.ppf([0.001, 0.999], n * runs) / runs
     assert low < np.mean(last) < high
@@ -183,9 +176,9 @@ def test_a_flight_is_scored_in_space_in_words_and_in_plain_values(tmp_path):
     assert plain["consistency"]["poses"]["n"] == len(slam.keyframes) - 1
     assert plain["consistency"]["landmarks"]["dof"] == 3
     assert plain["consistency"]["landmarks"]["n"] == len(slam.landmarks)
-    assert set(plain["consistency"]["classes"]) == {"odometry", "landmarks"}
+    assert {one["label"] for one in plain["consistency"]["noise"]} == {"odometry", "landmarks"}
     text = str(scores)
-    assert all(word in text for word in ("angle [deg]", "NEES", "last pose", "chi2/dof", "times as large"))
+    assert all(word in text for word in ("angle [deg]", "NEES", "last pose", "chi2/dof", "not known: "))
     summary = json.loads((tmp_path / "run" / "run.json").read_text())
     summary["classes"]["fixes"] = {"edges": 1, "residuals": 3, "chi2": 1.0}
     (tmp_path / "run" / "run.json").write_text(json.dumps(summary))
@@ -201,7 +194,7 @@ def test_a_summary_that_is_none_is_refused_by_name(tmp_path):
     recording = simulate("pythonrobotics", 1)
     run(recording, tmp_path / "run", {})
     write_bag(recording, tmp_path / "truth.mcap")
-    for text in ("", "{", "[]", "{}", '{"classes": {"a": {}}, "leverage": {}}', '{"classes": [], "leverage": 1}'):
+    for text in ("", "{", "[]", "{}", '{"classes": {"a": {}}, "noise": 1}', '{"classes": [], "noise": [{"dof": 1}]}'):
         (tmp_path / "run" / "run.json").write_text(text)
         with pytest.raises(GraphSlamError, match=r"run\.json: not a summary of a run"):
             evaluate(tmp_path / "run", tmp_path / "truth.mcap")

@@ -211,4 +211,5 @@ def test_maps_of_every_version_load(version, tmp_path):
     assert len(again.landmarks) == told["landmarks"]
     assert again.report.chi2_final == pytest.approx(told["chi2"], rel=1e-6)
     assert next(read_records(folder, MAP, []))["type"] == "map"
-    assert replay(folder, tmp_path / "again").summary["keyframes"] == told["keyframes"]
+    repeated = replay(folder, tmp_path / "again").summary  # keyframes are where this version makes them
+    assert (repeated["landmarks"], repeated["sightings"]) == (told["landmarks"], told["sightings"])

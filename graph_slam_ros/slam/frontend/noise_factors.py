@@ -1,0 +1,152 @@
+"""Edges whose noise is what is configured, times factors: by class of edges, input and part of the residual."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph_slam_ros.graph import EdgeType, Gaussian, Graph
+from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.typing import Array, Index
+
+CLASSES = ("odometry", "landmarks", "fixes", "closures")
+FIRST_DUE = 50  # keyframes
+LEAST_CHANGE = 0.02  # of a sigma: less changes nothing
+
+Key = tuple[str, str, str]
+"""Class of edges, input, part of the residual."""
+
+
+def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
+    """Split the residual of edges into parts: orthonormal directions (n, m, k) of each.
+
+    Odometry is one part: what little its edges say of their own noise does not tell position from heading.
+
+    Parameters
+    ----------
+    measured : (n, p) what was measured
+    """
+    n, m = len(measured), edge.residual_size
+    axes = np.broadcast_to(np.eye(m), (n, m, m))
+    name = edge.name.removesuffix(" 3D")
+    if name in ("landmark position", "tag position"):
+        return _sight_parts(measured[:, :m])
+    if name == "range and bearing":
+        return {"range": axes[:, :, :1], "bearing": axes[:, :, 1:]}
+    if name in ("relative pose", "pose prior") and label != "odometry":
+        d = {3: 2, 6: 3}[m]
+        return {"position": axes[:, :, :d], "rotation": axes[:, :, d:]}
+    if name.startswith("range") or name == "bearing":
+        return {name.split()[0]: axes}
+    return {"all": axes}
+
+
+def _sight_parts(position: Array) -> dict[str, Array]:
+    """Along the line of sight, and across it."""
+    n, m = position.shape
+    along = np.zeros((n, m))
+    along[:, 0] = 1.0
+    distance = np.linalg.norm(position, axis=1)
+    seen = distance > 0.0
+    along[seen] = position[seen] / distance[seen, None]
+    # The reflection that takes the first axis onto the line of sight takes the others across it.
+    normal = along.copy()
+    normal[:, 0] += np.where(along[:, 0] >= 0.0, 1.0, -1.0)
+    turned = (
+        np.eye(m) - 2.0 * np.einsum("ni,nj->nij", normal, normal) / np.einsum("ni,ni->n", normal, normal)[:, None, None]
+    )
+    return {"range": along[:, :, None], "bearing": turned[:, :, 1:]}
+
+
+@dataclass(frozen=True, slots=True)
+class Rescaling:
+    """A change of the noise of edges that were there.
+
+    Attributes
+    ----------
+    first, last : of the edges; ``last`` is the first that is not among them
+    changed : by how much sigmas of each group were multiplied
+    """
+
+    first: int
+    last: int
+    changed: dict[Key, float]
+
+    def apply(self, graph: Graph) -> None:
+        """Multiply sigmas of those of its edges that are there; whoever has solved with them must begin anew."""
+        for table, rows, label, source in groups(graph, range(self.first, self.last)):
+            factors = _of(self.changed, label, source)
+            if factors:
+                roots = table.sqrt_information.values
+                roots[rows] = _rescaled(table.type, label, table.measured.values[rows], roots[rows], factors)
+
+
+class NoiseScales:
+    """The factors by which configured sigmas are multiplied, and the edges of a graph in step with them.
+
+    Attributes
+    ----------
+    graph
+    factors : by group; what is missing is 1
+    history : all changes of edges that were there, in order
+    """
+
+    def __init__(self, graph: Graph, factors: Mapping[Key, float] | None = None) -> None:
+        self.graph = graph
+        self.factors: dict[Key, float] = dict(factors or {})
+        self.history: list[Rescaling] = []
+        self._due = FIRST_DUE
+
+    def is_due(self, keyframes: int) -> bool:
+        """Return whether there are twice the keyframes of the last estimate."""
+        is_due = keyframes >= self._due
+        while keyframes >= self._due:
+            self._due *= 2
+        return is_due
+
+    def add_edge(
+        self, edge: EdgeType, vertices: Sequence[int], measured: Sequence[float] | Array, noise: Gaussian, *names: str
+    ) -> int:
+        """Add an edge to the graph, as ``Graph.add_edge``, its noise scaled from what is configured."""
+        label, source = (*names, "")[:2]
+        factors = _of(self.factors, label, source)
+        if factors:
+            z = edge.whole(np.asarray(measured, dtype=float)[None])
+            noise = Gaussian(_rescaled(edge, label, z, noise.sqrt_information[None], factors)[0])
+        return self.graph.add_edge(edge, vertices, measured, noise, label, source)
+
+    def change(self, factors: Mapping[Key, float], first_edge: int) -> bool:
+        """Have all edges from a number on, and all that come, scaled by these factors; whether that changed them."""
+        changed = {key: factor / self.factors.get(key, 1.0) for key, factor in factors.items()}
+        if all(abs(np.log(ratio)) < LEAST_CHANGE for ratio in changed.values()):
+            return False
+        rescaling = Rescaling(first_edge, self.graph.edge_count, changed)
+        rescaling.apply(self.graph)
+        self.factors |= factors
+        self.history.append(rescaling)
+        return True
+
+
+def _of(factors: Mapping[Key, float], label: str, source: str) -> dict[str, float]:
+    return {part: factor for (one, other, part), factor in factors.items() if (one, other) == (label, source)}
+
+
+def _rescaled(edge: EdgeType, label: str, measured: Array, roots: Array, factors: Mapping[str, float]) -> Array:
+    narrower = np.zeros((len(measured), edge.residual_size, edge.residual_size))
+    for part, axes in parts_of(edge, label, measured).items():
+        narrower += axes @ np.swapaxes(axes, 1, 2) / factors.get(part, 1.0)
+    return roots @ narrower
+
+
+def groups(graph: Graph, edges: range) -> Iterator[tuple[EdgeTable, Index, str, str]]:
+    """Yield table, rows, class and input of the edges of a range, group by group."""
+    for table in graph.tables.values():
+        ids = table.id.values
+        here = (ids >= edges.start) & (ids < edges.stop)
+        for code, label in enumerate(graph.labels):
+            if label not in CLASSES:
+                continue
+            of_label = here & (table.label.values == code)
+            for origin in np.unique(table.source.values[of_label]).tolist():
+                rows = np.flatnonzero(of_label & (table.source.values == origin))
+                yield table, rows, label, graph.sources[origin]

@@ -1,0 +1,93 @@
+"""Noise that is scaled by its residuals while a robot drives: applied, saved and read back, where it is asked for."""
+
+import json
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.analysis.evaluation import evaluate
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.simulation import measurements, simulate, write_bag
+from graph_slam_ros.slam import Control, GraphSlam
+from graph_slam_ros.slam.frontend.noise_factors import FIRST_DUE
+
+ESTIMATED = Config.from_mapping({"robust.noise_scale": "estimated"})
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A drive whose sightings are better than the default noise says, replayed with either noise."""
+    folder = tmp_path_factory.mktemp("noise")
+    write_bag(simulate("warehouse", 1, laps=3), folder / "bag.mcap")
+    configured = replay(folder / "bag.mcap", folder / "configured")
+    estimated = replay(folder / "bag.mcap", folder / "estimated", ESTIMATED)
+    return folder, configured.slam, estimated.slam
+
+
+def test_the_scale_is_said_always_and_applied_where_it_is_asked_for(drive):
+    folder, configured, estimated = drive
+    assert configured.noise_factors == {}
+    assert estimated.noise_factors["landmarks", "detections", "position"] < 0.75
+    assert len(estimated.noise_changes) > 2  # while it drove
+    errors = []
+    for name, is_advised in (("configured", True), ("estimated", False)):
+        scores = evaluate(folder / name, folder / "bag.mcap")
+        (position,) = [one for one in scores.consistency.noise if one.key == ("landmarks", "detections", "position")]
+        assert position.factor < 0.75
+        assert ("--set robust.noise_scale=estimated" in str(scores)) is is_advised
+    errors = [
+        evaluate(folder / name, folder / "bag.mcap").estimate.position_m["rmse"] for name in ("configured", "estimated")
+    ]
+    assert errors[1] < 1.05 * errors[0]
+
+
+def test_a_saved_map_has_the_noise_of_the_run(drive):
+    folder, _, estimated = drive
+    saved = read_map(folder / "estimated", [])
+    assert saved.noise_factors == estimated.noise_factors
+    for table, other in zip(saved.graph.tables.values(), estimated.graph.tables.values(), strict=True):
+        assert np.array_equal(table.sqrt_information.values, other.sqrt_information.values)
+
+
+@pytest.mark.parametrize("is_estimated", [True, False])
+def test_a_run_that_goes_on_in_the_map_keeps_its_factors_or_goes_back_to_what_is_configured(drive, is_estimated):
+    folder, configured, estimated = drive
+    saved = read_map(folder / "estimated", [])
+    slam = GraphSlam(ESTIMATED if is_estimated else Config(), start=saved)
+    expected = (estimated if is_estimated else configured).graph
+    assert set(slam.noise_factors.values()) == (set(estimated.noise_factors.values()) if is_estimated else {1.0})
+    for table in slam.graph.tables.values():
+        same = expected.tables[table.type]
+        count = min(len(same), len(table))
+        np.testing.assert_allclose(
+            table.sqrt_information.values[:1], same.sqrt_information.values[:1], rtol=1e-9, err_msg=table.type.name
+        )
+        assert count
+
+
+def test_a_scale_that_cannot_be_estimated_is_counted_and_changes_nothing(monkeypatch):
+    slam = GraphSlam(ESTIMATED)
+    recording = simulate("warehouse", 1, laps=1, aisles=2)
+
+    def fails(*_arguments):
+        raise MemoryError
+
+    monkeypatch.setattr("graph_slam_ros.slam.backend.estimate_noise", fails)
+    for m in [*measurements(recording), Control("end"), Control("optimize")]:
+        slam.process(m)
+    assert len(slam.keyframes) > FIRST_DUE
+    assert slam.counters["noise_scale", "MemoryError"] >= 2
+    assert slam.noise_factors == {}
+    assert slam.is_solved
+
+
+def test_the_summary_says_it_by_class_input_and_part(drive):
+    folder, *_ = drive
+    noise = json.loads((folder / "configured" / "run.json").read_text())["noise"]
+    assert {(one["label"], one["source"], one["part"]) for one in noise} == {
+        ("odometry", "odom", "all"),
+        ("landmarks", "detections", "position"),
+        ("landmarks", "detections", "rotation"),
+    }

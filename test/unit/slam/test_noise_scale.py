@@ -1,0 +1,155 @@
+"""The scale of configured noise from residuals: planted factors come out, and edges are rescaled."""
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.graph import (
+    LANDMARK_POSITION,
+    LANDMARK_POSITION_3D,
+    POSE_PRIOR,
+    R2,
+    RANGE_BEARING,
+    RELATIVE_POSE,
+    RELATIVE_POSE_3D,
+    SE2,
+    Gaussian,
+    Graph,
+)
+from graph_slam_ros.lie import se2
+from graph_slam_ros.slam.frontend.noise_factors import NoiseScales, parts_of
+from graph_slam_ros.slam.noise_scale import LARGEST, SMALLEST, estimate_noise
+from graph_slam_ros.solver import Solver
+
+STEP_NS = 500_000_000
+ODOMETRY, RANGE, BEARING = ("odometry", "odom", "all"), ("landmarks", "seen", "range"), ("landmarks", "seen", "bearing")
+SIGMAS = {"odometry": (0.02, 0.02, 0.01), "position": (0.1, 0.05)}  # along and across the line of sight
+
+
+def drive(rng, factors, pass_bias=0.0, poses=1500, laps=4):
+    """A drive in a circle past 12 landmarks, with noise that is so many times as large as its edges say."""
+    graph = Graph()
+    angles = np.arange(poses) * 2 * np.pi * laps / poses
+    true = np.stack([10 * np.cos(angles), 10 * np.sin(angles), angles + np.pi / 2], axis=1)
+    around = np.arange(12) * np.pi / 6
+    points = 13 * np.stack([np.cos(around), np.sin(around)], axis=1)
+    vertices = graph.add_vertices(SE2, true)
+    marks = graph.add_vertices(R2, points)
+    graph.add_edge(POSE_PRIOR, [vertices[0]], true[0], Gaussian.from_sigmas(1e-3, 1e-3, 1e-3), "anchor")
+    step = np.array(SIGMAS["odometry"])
+    for k in range(poses - 1):
+        motion = np.array(se2.between(tuple(true[k]), tuple(true[k + 1])))
+        error = factors["odometry"] * step * rng.normal(size=3)
+        graph.add_edge(RELATIVE_POSE, vertices[k : k + 2], motion + error, Gaussian.from_sigmas(*step), *ODOMETRY[:2])
+    bias = {}
+    for k in range(poses):
+        seen = np.array([se2.act(se2.inverse(tuple(true[k])), tuple(point)) for point in points])
+        for j in np.flatnonzero(np.linalg.norm(seen, axis=1) < 5.0).tolist():
+            one = bias.setdefault((j, round(laps * (k / poses) - j / 12)), pass_bias * rng.normal())
+            along = seen[j] / np.linalg.norm(seen[j])
+            frame = np.stack([along, [-along[1], along[0]]], axis=1)
+            sigmas = np.array(SIGMAS["position"])
+            error = np.array([factors["range"], factors["bearing"]]) * sigmas * rng.normal(size=2)
+            error[0] += one * sigmas[0]
+            noise = Gaussian.from_covariance(frame @ np.diag(sigmas**2) @ frame.T)
+            graph.add_edge(LANDMARK_POSITION, [vertices[k], marks[j]], seen[j] + frame @ error, noise, *RANGE[:2])
+    stamps = np.zeros(graph.vertex_count, dtype=np.int64)
+    stamps[vertices] = np.arange(poses) * STEP_NS
+    return graph, stamps
+
+
+def converged(graph, stamps):
+    """Estimate, rescale and solve until nothing changes."""
+    scales, solver = NoiseScales(graph), Solver(graph)
+    solver.add(np.arange(graph.vertex_count), np.arange(graph.edge_count))
+    for _ in range(8):
+        solver.optimize()
+        found = estimate_noise(graph, solver, scales.factors, stamps)
+        scales.change({one.key: one.factor for one in found if not one.reason}, 0)
+        solver.rebuild()
+    return {one.key: one for one in found}
+
+
+@pytest.mark.parametrize("factors", [(1.0, 1.0, 1.0), (2.0, 1.0, 0.5), (0.6, 2.0, 1.0)])
+def test_planted_factors_come_out(factors):
+    graph, stamps = drive(np.random.default_rng(3), dict(zip(("odometry", "range", "bearing"), factors, strict=True)))
+    found = converged(graph, stamps)
+    for key, planted in zip((ODOMETRY, RANGE, BEARING), factors, strict=True):
+        assert not found[key].reason
+        assert found[key].factor == pytest.approx(planted, rel=0.12)
+
+
+def test_errors_that_are_alike_within_a_pass_make_sigmas_larger_and_others_not():
+    ones = {"odometry": 1.0, "range": 1.0, "bearing": 1.0}
+    found = converged(*drive(np.random.default_rng(5), ones, pass_bias=2.0))
+    assert found[RANGE].design_effect > 3.0
+    assert found[RANGE].factor > 3.0 / 1.2  # sqrt(1 + 2^2) alone would be 2.2
+    assert found[BEARING].design_effect < 1.3
+    assert found[BEARING].factor == pytest.approx(1.0, rel=0.12)
+
+
+def test_what_says_too_little_keeps_its_noise_and_says_why():
+    ones = {"odometry": 1.0, "range": 1.0, "bearing": 1.0}
+    graph, stamps = drive(np.random.default_rng(1), ones, poses=40, laps=1)
+    solver = Solver(graph)
+    solver.add(np.arange(graph.vertex_count), np.arange(graph.edge_count))
+    solver.optimize()
+    found = estimate_noise(graph, solver, {}, stamps)
+    assert {one.factor for one in found} == {1.0}
+    assert all("degrees of freedom, fewer than 200" in one.reason for one in found)
+
+
+def test_smaller_sigmas_are_not_believed_without_passes():
+    factors = {"odometry": 1.0, "range": 0.5, "bearing": 1.0}
+    graph, stamps = drive(np.random.default_rng(2), factors)
+    solver = Solver(graph)
+    solver.add(np.arange(graph.vertex_count), np.arange(graph.edge_count))
+    solver.optimize()
+    far_apart = {one.key: one for one in estimate_noise(graph, solver, {}, stamps * 1000)}
+    assert "passes by landmarks" in far_apart[RANGE].reason
+    assert far_apart[RANGE].factor == 1.0
+
+
+def test_a_factor_is_bounded():
+    for planted, bound in ((10.0, LARGEST), (0.05, SMALLEST)):
+        factors = {"odometry": 1.0, "range": planted, "bearing": 1.0}
+        found = converged(*drive(np.random.default_rng(7), factors))
+        assert found[RANGE].factor == pytest.approx(bound, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("edge", "label", "measured"),
+    [
+        (LANDMARK_POSITION, "landmarks", [3.0, -4.0]),
+        (LANDMARK_POSITION, "landmarks", [-3.0, 0.0]),
+        (LANDMARK_POSITION, "landmarks", [0.0, 0.0]),
+        (LANDMARK_POSITION_3D, "landmarks", [-1.0, 2.0, 0.5]),
+        (RELATIVE_POSE, "closures", [1.0, 2.0, 0.3]),
+        (RELATIVE_POSE, "odometry", [1.0, 2.0, 0.3]),
+        (RELATIVE_POSE_3D, "landmarks", [1.0, 2.0, 0.3, 0.0, 0.0, 0.0, 1.0]),
+        (RANGE_BEARING, "landmarks", [4.0, 0.2, 0.0, 0.0, 0.0]),
+    ],
+)
+def test_parts_are_orthonormal_and_together_the_whole_residual(edge, label, measured):
+    parts = parts_of(edge, label, np.array([measured]))
+    axes = np.concatenate(list(parts.values()), axis=2)[0]
+    assert axes.shape == (edge.residual_size, edge.residual_size)
+    np.testing.assert_allclose(axes.T @ axes, np.eye(len(axes)), atol=1e-12)
+
+
+def test_a_rescaled_edge_has_its_sigma_along_the_line_of_sight_and_a_new_one_the_same():
+    graph = Graph()
+    pose, mark = graph.add_vertex(SE2, [0, 0, 0]), graph.add_vertex(R2, [3, 4])
+    covariance = np.array([[0.04, 0.01], [0.01, 0.09]])
+    one = LANDMARK_POSITION, [pose, mark], [3.0, 4.0], Gaussian.from_covariance(covariance), "landmarks", "seen"
+    scales = NoiseScales(graph)
+    scales.add_edge(*one)
+    scales.change({RANGE: 2.0, BEARING: 0.5}, 0)
+    scales.add_edge(*one)
+    scales.change({RANGE: 3.0, BEARING: 0.5}, 1)  # the first edge is of a frozen map
+    assert [(change.first, change.last) for change in scales.history] == [(0, 1), (1, 2)]
+    roots = graph.tables[LANDMARK_POSITION].sqrt_information.values
+    found = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)
+    frame = np.array([[0.6, -0.8], [0.8, 0.6]])
+    for covariance_now, factors in zip(found, ([2.0, 0.5], [3.0, 0.5]), strict=True):
+        expected = np.diag(factors) @ frame.T @ covariance @ frame @ np.diag(factors)
+        np.testing.assert_allclose(frame.T @ covariance_now @ frame, expected, atol=1e-12)
