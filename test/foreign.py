@@ -44,6 +44,25 @@ geometry_msgs/Pose pose
 string board_name
 geometry_msgs/Pose pose
 """,
+    "aruco_markers_msgs/msg/MarkerArray": f"""std_msgs/Header header
+aruco_markers_msgs/Marker[] markers
+{_RULE}MSG: aruco_markers_msgs/Marker
+std_msgs/Header header
+uint32 id
+geometry_msgs/PoseStamped pose
+float64 pixel_x 0
+float64 pixel_y 0
+""",
+    "fiducial_msgs/msg/FiducialTransformArray": f"""std_msgs/Header header
+int32 image_seq
+FiducialTransform[] transforms
+{_RULE}MSG: fiducial_msgs/FiducialTransform
+int32 fiducial_id
+geometry_msgs/Transform transform
+float64 image_error
+float64 object_error
+float64 fiducial_area
+""",
     "rtabmap_msgs/msg/LandmarkDetections": f"""std_msgs/Header header
 LandmarkDetection[] landmarks
 {_RULE}MSG: rtabmap_msgs/LandmarkDetection

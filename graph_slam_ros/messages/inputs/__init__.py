@@ -42,6 +42,8 @@ CONVERTERS: Mapping[str, Mapping[str, Converter]] = {
     "aruco_msgs/msg/MarkerArray": {"landmarks": _landmarks(detections.aruco_markers)},
     "ros2_aruco_interfaces/msg/ArucoMarkers": {"landmarks": _landmarks(detections.ros2_aruco)},
     "aruco_opencv_msgs/msg/ArucoDetection": {"landmarks": _landmarks(detections.aruco_opencv)},
+    "aruco_markers_msgs/msg/MarkerArray": {"landmarks": _landmarks(detections.aruco_markers)},
+    "fiducial_msgs/msg/FiducialTransformArray": {"landmarks": _landmarks(detections.fiducials)},
     "rtabmap_msgs/msg/LandmarkDetections": {"landmarks": _landmarks(detections.rtabmap)},
     "cartographer_ros_msgs/msg/LandmarkList": {"landmarks": _landmarks(detections.cartographer)},
     "mrpt_msgs/msg/ObservationRangeBearing": {"landmarks": _landmarks(ranges.range_bearing)},

@@ -77,14 +77,16 @@ def apriltags(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
 
 
 def aruco_markers(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """aruco_msgs/MarkerArray: each with a header of its own, else that of the array."""
+    """aruco_msgs and aruco_markers_msgs/MarkerArray: the header of the pose, else of the marker, else of the array.
+
+    The detector aruco_markers stamps the array when it sends it, and poses and markers with the stamp of the image.
+    """
     for one in m.markers:
-        has_own = one.header.stamp.sec or one.header.stamp.nanosec
-        stamp = one.header.stamp if has_own else m.header.stamp
-        frame = one.header.frame_id or m.header.frame_id
-        yield ObservedLandmark(
-            stamp, frame, str(one.id), one.pose.pose.position, one.pose.pose.orientation, one.pose.covariance
-        )
+        headers = [of.header for of in (one.pose, one, m) if hasattr(of, "header")]
+        stamp = next((h.stamp for h in headers if h.stamp.sec or h.stamp.nanosec), m.header.stamp)
+        frame = next((h.frame_id for h in headers if h.frame_id), "")
+        at, covariance = one.pose.pose, getattr(one.pose, "covariance", None)
+        yield ObservedLandmark(stamp, frame, str(one.id), at.position, at.orientation, covariance)
 
 
 def ros2_aruco(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
@@ -100,6 +102,15 @@ def aruco_opencv(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     named = [(str(one.marker_id), one.pose) for one in m.markers] + [(one.board_name, one.pose) for one in m.boards]
     for name, at in named:
         yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, at.position, at.orientation)
+
+
+def fiducials(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
+    """fiducial_msgs/FiducialTransformArray: its errors are of one image, and no covariance."""
+    for one in m.transforms:
+        at = one.transform
+        yield ObservedLandmark(
+            m.header.stamp, m.header.frame_id, str(one.fiducial_id), at.translation, at.rotation
+        )
 
 
 def rtabmap(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:

@@ -279,6 +279,49 @@ def test_aruco_boards_are_landmarks_by_name():
     assert [(s.id, s.measured) for s in m.sightings] == [("4", (1.0, 2.0)), ("door", (3.0, 4.0))]
 
 
+def test_poses_of_aruco_markers_have_a_header_each_that_goes_before_that_of_the_marker_and_of_the_array():
+    """The detector fills the array's stamp with the time of sending, and the others with that of the image."""
+    eye = ("base_link", "eye", (1.0, 0.0, 0.0), quaternion())
+    b, message, encoded = foreign("aruco_markers_msgs/msg/MarkerArray", eye, sigma_m=0.2, sigma_rad=0.1)
+    own, none = header(STAMP_NS + 7, "eye"), header(0, "")
+
+    def marker_of(number, of_pose, of_marker):
+        at = make("geometry_msgs/msg/PoseStamped", header=of_pose, pose=pose(2.0, 1.0, 0.0, quaternion(yaw=0.3)))
+        return message(
+            "aruco_markers_msgs/msg/Marker", header=of_marker, id=number, pose=at, pixel_x=9.0, pixel_y=9.0
+        )
+
+    parts = [marker_of(1, own, HEAD), marker_of(2, none, own), marker_of(2**32 - 1, none, none)]
+    found = [(m.stamp_ns, s) for m in b.convert("seen", encoded(header=HEAD, markers=parts)) for s in m.sightings]
+    assert [(stamp_ns, s.id, s.measured[0]) for stamp_ns, s in sorted(found, key=lambda f: f[1].id)] == [
+        (STAMP_NS + 7, "1", 3.0),
+        (STAMP_NS + 7, "2", 3.0),
+        (STAMP_NS, "4294967295", 2.0),
+    ]
+    assert {s.kind for _, s in found} == {"pose"}
+    assert found[0][1].covariance == pytest.approx(tuple(np.diag([0.04, 0.04, 0.01]).ravel()))
+    assert counted(b) == {}
+
+
+def test_fiducial_transforms_are_landmarks_in_the_frame_of_the_camera_as_the_bytes_say():
+    """The bytes are written out by the rules of CDR here, not by the encoder that the decoder belongs to."""
+    eye = ("base_link", "eye", (1.0, 0.0, 0.5), quaternion())
+    b, _, _ = foreign("fiducial_msgs/msg/FiducialTransformArray", eye, sigma_m=0.2, sigma_rad=0.1)
+    q = quaternion(yaw=0.3)
+    sent = struct.pack("<4sIII4sii", b"\0\1\0\0", STAMP_NS // 10**9, STAMP_NS % 10**9, 4, b"eye\0", 41, 2)
+    for number, x in ((7, 2.0), (107, 3.0)):
+        sent += struct.pack("<i", number) + b"\0" * (-(len(sent) - 4 + 4) % 8)
+        sent += struct.pack("<10d", x, 1.0, 0.0, q.x, q.y, q.z, q.w, 0.5, 0.01, 900.0)
+    m = heard(b, "seen", sent)
+    assert [(s.id, s.kind, s.measured) for s in m.sightings] == [
+        ("7", "pose", pytest.approx((3.0, 1.0, 0.3))),
+        ("107", "pose", pytest.approx((4.0, 1.0, 0.3))),
+    ]
+    assert m.stamp_ns == STAMP_NS
+    assert m.sightings[0].covariance == pytest.approx(tuple(np.diag([0.04, 0.04, 0.01]).ravel()))
+    assert counted(b) == {}
+
+
 def test_rtabmaps_landmarks_have_their_own_frame_and_positive_ids():
     b, message, encoded = foreign(
         "rtabmap_msgs/msg/LandmarkDetections", ("base_link", "eye", (1.0, 0.0, 0.0), quaternion())
