@@ -10,6 +10,7 @@ from typing import Any
 from graph_slam_ros.lie import so3
 from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs import CONVERTERS
+from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS
 from graph_slam_ros.recordings.bag import Bag, BagError, Topic
 from graph_slam_ros.recordings.definitions import recorded_decoder
 
@@ -220,5 +221,5 @@ _OF_TYPE: dict[str, Callable[[TopicContents, Any], None]] = {
     "sensor_msgs/msg/Imu": _imu,
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose,
     "geometry_msgs/msg/PoseStamped": _pose,
-    "apriltag_msgs/msg/AprilTagDetectionArray": _apriltags,
+    APRILTAGS: _apriltags,
 }

@@ -7,6 +7,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from graph_slam_ros.messages.from_msg import Decoder, decoder
+from graph_slam_ros.messages.inputs.landmark_types import fields_used
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import MOST_TEXT, BagError, Topic
 
@@ -40,23 +41,7 @@ _NEEDED = {
     "sensor_msgs/msg/PointField": "name offset datatype",
     "visualization_msgs/msg/MarkerArray": "markers",
     "visualization_msgs/msg/Marker": "header ns id action pose",
-    "apriltag_msgs/msg/AprilTagDetectionArray": "header detections",
-    "apriltag_msgs/msg/AprilTagDetection": "family id hamming decision_margin",
-    "aruco_msgs/msg/MarkerArray": "header markers",
-    "aruco_msgs/msg/Marker": "header id pose",
-    "ros2_aruco_interfaces/msg/ArucoMarkers": "header marker_ids poses",
-    "aruco_opencv_msgs/msg/ArucoDetection": "header markers boards",
-    "aruco_opencv_msgs/msg/MarkerPose": "marker_id pose",
-    "aruco_opencv_msgs/msg/BoardPose": "board_name pose",
-    "rtabmap_msgs/msg/LandmarkDetections": "header landmarks",
-    "rtabmap_msgs/msg/LandmarkDetection": "header id pose",
-    "cartographer_ros_msgs/msg/LandmarkList": "header landmarks",
-    "cartographer_ros_msgs/msg/LandmarkEntry": "id tracking_from_landmark_transform translation_weight rotation_weight",
-    "mrpt_msgs/msg/ObservationRangeBearing": "header sensor_pose_on_robot sensor_std_range sensor_std_yaw"
-    " sensor_std_pitch sensed_data",
-    "mrpt_msgs/msg/SingleRangeBearingObservation": "range yaw pitch id",
-    "mrpt_msgs/msg/ObservationRangeBeacon": "header sensor_pose_on_robot sensor_std_range sensed_data",
-    "mrpt_msgs/msg/SingleRangeBeaconObservation": "range id",
+    **fields_used(),
 }
 """What the converters read of each type. Those of packages that we have no layout of are compared by name only."""
 

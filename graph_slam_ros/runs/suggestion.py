@@ -10,6 +10,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.messages.from_msg import TRANSFORMS
 from graph_slam_ros.messages.inputs import CONVERTERS
+from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS, LANDMARK_TYPES
 from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents
 from graph_slam_ros.runs.folder import suggested_out
@@ -19,18 +20,6 @@ from graph_slam_ros.slam import Config
 ODOMETRY, DETECTIONS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
 CLOUD, GNSS, IMU = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
 POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
-APRILTAGS = "apriltag_msgs/msg/AprilTagDetectionArray"
-_LANDMARKS = {
-    APRILTAGS: "tags",
-    "aruco_msgs/msg/MarkerArray": "tags",
-    "ros2_aruco_interfaces/msg/ArucoMarkers": "tags",
-    "aruco_opencv_msgs/msg/ArucoDetection": "tags",
-    "rtabmap_msgs/msg/LandmarkDetections": "tags",
-    "cartographer_ros_msgs/msg/LandmarkList": "reflectors",
-    "mrpt_msgs/msg/ObservationRangeBearing": "beacons",
-    "mrpt_msgs/msg/ObservationRangeBeacon": "beacons",
-}
-"""Types that are landmarks whenever they are there, and the names of their inputs."""
 
 _WORD = r"(^|[/_])({})([/_\d]|$)"
 _TRUTH = re.compile(
@@ -47,7 +36,7 @@ _FUSED = re.compile(r"filtered|fused|[eu]kf|combined", re.IGNORECASE)
 _NOT_MEASURED = re.compile(r"raw|cmd|desired|target|set_?point|plan", re.IGNORECASE)
 _TAG = re.compile(r"((?:.*[/_])?(?:tag|aruco|marker|fiducial).*?)[:_]?\d+", re.IGNORECASE)
 _TAG_TOPIC = re.compile(r"(?:tag|aruco|marker|fiducial)[_/:]?(\d+)(?:/pose)?$", re.IGNORECASE)
-_CORNERS = re.compile(r"tag|aruco|fiducial", re.IGNORECASE)
+_CORNERS = re.compile(r"^(?!.*map).*(tag|aruco|fiducial)", re.IGNORECASE)
 _MAPS = ("map", "earth", "utm")
 _OPTICAL = "0 0 0 -1.5707963 0 -1.5707963"  # z ahead, x to the right
 _OFF_PLANE = 0.05
@@ -207,11 +196,11 @@ class Suggestion:
             self._detections(one)
         for one in self._of_type(CLOUD):
             self._cloud(one)
-        for one in self._of_type(*_LANDMARKS):
+        for one in self._of_type(*LANDMARK_TYPES):
             if one.topic.type == APRILTAGS and not one.ids & self._recording.moving.keys():
                 self._corners(one)
             else:
-                self._add(_LANDMARKS[one.topic.type], one, linked=one.topic.type == APRILTAGS)
+                self._add(LANDMARK_TYPES[one.topic.type].input_name, one, linked=one.topic.type == APRILTAGS)
         for one in self._of_type(POSE, POSE_WITH_COVARIANCE):
             if number := self._tag_number(one):
                 self._add("tag", one, {"use": "landmarks", "id": number})

@@ -67,7 +67,8 @@ def test_a_recipe_is_a_parameter_file_and_its_input_can_be_used_so(block, tmp_pa
 def test_every_recipe_that_is_promised_is_there():
     text = PAGE.read_text().partition("## Recipes")[2]
     titles = [title.lower() for title in re.findall(r"^### (.*)$", text, re.MULTILINE)]
-    for word in ("apriltag_ros", "ros2_aruco", "aruco_opencv", "reflectors", "gnss", "uwb"):
+    drivers = "apriltag_ros", "ros2_aruco", "aruco_opencv", "aruco_markers", "aruco_detect"
+    for word in (*drivers, "reflectors", "gnss", "uwb"):
         assert any(word in title for title in titles), word
     sections = [*(m.start() for m in re.finditer(r"^### ", text, re.MULTILINE)), len(text)]
     assert all(blocks("yaml", text[a:b]) for a, b in pairwise(sections))

@@ -12,6 +12,7 @@ from graph_slam_ros.config.inputs import InputConfig
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.inputs import detections, fixes, odometry, ranges
+from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark, sightings
 from graph_slam_ros.messages.inputs.source import InputContext
 
@@ -38,16 +39,7 @@ CONVERTERS: Mapping[str, Mapping[str, Converter]] = {
     "vision_msgs/msg/Detection3DArray": {"landmarks": _landmarks(detections.detections), "closure": fixes.closures},
     "sensor_msgs/msg/PointCloud2": {"landmarks": _landmarks(ranges.point_cloud)},
     "visualization_msgs/msg/MarkerArray": {"landmarks": _landmarks(detections.markers)},
-    "apriltag_msgs/msg/AprilTagDetectionArray": {"landmarks": _landmarks(detections.apriltags)},
-    "aruco_msgs/msg/MarkerArray": {"landmarks": _landmarks(detections.aruco_markers)},
-    "ros2_aruco_interfaces/msg/ArucoMarkers": {"landmarks": _landmarks(detections.ros2_aruco)},
-    "aruco_opencv_msgs/msg/ArucoDetection": {"landmarks": _landmarks(detections.aruco_opencv)},
-    "aruco_markers_msgs/msg/MarkerArray": {"landmarks": _landmarks(detections.aruco_markers)},
-    "fiducial_msgs/msg/FiducialTransformArray": {"landmarks": _landmarks(detections.fiducials)},
-    "rtabmap_msgs/msg/LandmarkDetections": {"landmarks": _landmarks(detections.rtabmap)},
-    "cartographer_ros_msgs/msg/LandmarkList": {"landmarks": _landmarks(detections.cartographer)},
-    "mrpt_msgs/msg/ObservationRangeBearing": {"landmarks": _landmarks(ranges.range_bearing)},
-    "mrpt_msgs/msg/ObservationRangeBeacon": {"landmarks": _landmarks(ranges.range_beacon)},
+    **{name: {"landmarks": _landmarks(row.read)} for name, row in LANDMARK_TYPES.items()},
 }
 """By type, then by use; the first use is that of ``auto``."""
 

@@ -62,7 +62,7 @@ def markers(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
         yield ObservedLandmark(one.header.stamp, one.header.frame_id, name, one.pose.position, one.pose.orientation)
 
 
-# -- of packages that need not be there -----------------------------------------------------------------------------
+# -- of packages that need not be there: rows of LANDMARK_TYPES -------------------------------------------------------
 
 
 def apriltags(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
@@ -108,9 +108,7 @@ def fiducials(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """fiducial_msgs/FiducialTransformArray: its errors are of one image, and no covariance."""
     for one in m.transforms:
         at = one.transform
-        yield ObservedLandmark(
-            m.header.stamp, m.header.frame_id, str(one.fiducial_id), at.translation, at.rotation
-        )
+        yield ObservedLandmark(m.header.stamp, m.header.frame_id, str(one.fiducial_id), at.translation, at.rotation)
 
 
 def rtabmap(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:

@@ -14,7 +14,7 @@ from recordings import definition, write_mcap
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.lie import se2
-from graph_slam_ros.messages.to_msg import header
+from graph_slam_ros.messages.to_msg import header, make, vector
 from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.runs.outcome import doubts, shortcomings
 
@@ -297,6 +297,57 @@ def test_corners_without_poses_are_named_with_what_makes_poses_of_them(tmp_path,
     lines = capsys.readouterr().out.splitlines()
     assert "not used: /tags: these are corners without poses: run a pose estimator first" in " ".join(lines)
     assert "inputs.names=odom" in lines[-1]
+
+
+def test_tags_of_packages_that_need_not_be_there_are_offered_and_a_map_of_them_is_not(tmp_path, monkeypatch, capsys):
+    markers, fiducials = "aruco_markers_msgs/msg/MarkerArray", "fiducial_msgs/msg/FiducialTransformArray"
+    fiducial_map = "fiducial_msgs/msg/FiducialMapEntryArray"
+    (_, marker, markers_cdr), (_, fiducial, fiducials_cdr) = (recorded(t, DEFINITIONS[t]) for t in (markers, fiducials))
+    sent, truth = [], se2.IDENTITY
+    for k in range(STEPS):
+        stamp_ns = START_NS + k * NS // 10
+        head, late = header(stamp_ns, "base_link"), header(stamp_ns + NS // 20, "base_link")
+        seen = [pose(*se2.act(se2.inverse(truth), at)) for at in PLACES.values()]
+        poses = [make("geometry_msgs/msg/PoseStamped", header=head, pose=at) for at in seen]
+        moves = [
+            make("geometry_msgs/msg/Transform", translation=vector(at.position.x, at.position.y, 0.0),
+                 rotation=at.orientation)
+            for at in seen
+        ]  # fmt: skip
+        unused = {"image_error": 0.5, "object_error": 0.01, "fiducial_area": 900.0}
+        of_markers = [
+            marker("aruco_markers_msgs/msg/Marker", header=head, id=number, pose=at, pixel_x=0.0, pixel_y=0.0)
+            for number, at in enumerate(poses)
+        ]
+        of_fiducials = [
+            fiducial("fiducial_msgs/msg/FiducialTransform", fiducial_id=100 + number, transform=at, **unused)
+            for number, at in enumerate(moves)
+        ]
+        sent += [
+            ("/odom", stamp_ns, odom()(k, stamp_ns, truth, truth)),
+            ("/aruco/markers", stamp_ns, markers_cdr(header=late, markers=of_markers)),
+            ("/fiducial_transforms", stamp_ns, fiducials_cdr(header=head, image_seq=k, transforms=of_fiducials)),
+            ("/fiducial_map", stamp_ns, b"\0\1\0\0\0\0\0\0"),
+        ]
+        truth = se2.compose(truth, (0.2, 0.0, 0.05))
+    write_mcap(
+        tmp_path / "a.mcap",
+        [SimpleNamespace(topic=topic, log_ns=stamp_ns, cdr=cdr) for topic, stamp_ns, cdr in sent],
+        types={
+            "/odom": ODOM,
+            "/aruco/markers": markers,
+            "/fiducial_transforms": fiducials,
+            "/fiducial_map": fiducial_map,
+        },
+        text=lambda name: "int32[] fiducials\n" if name == fiducial_map else DEFINITIONS.get(name) or definition(name),
+    )
+    monkeypatch.chdir(tmp_path)
+    assert main(["info", "a.mcap"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert f"no input reads /fiducial_map ({fiducial_map})" in " ".join(lines)
+    told, _, _ = run(shlex.split(lines[-1]), capsys)
+    assert told["landmarks"] == 6
+    assert [told["inputs"][name]["believed"] for name in ("tags", "tags_2")] == [3 * STEPS, 3 * STEPS]
 
 
 # -- fixes -------------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from dataclasses import fields
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from rosbags.typesys.base import Nodetype
 
 from graph_slam_ros.measurements.types import to_record
 from graph_slam_ros.messages.inputs import CONVERTERS
+from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES, fields_used
 from graph_slam_ros.messages.interfaces import typestore
 
 S = 1_000_000_000
@@ -256,3 +258,33 @@ def test_whatever_comes_is_used_or_counted_and_nothing_is_raised(type_name, use,
         assert became["accepted"] or not sigma, "some are good"
         assert told["any"].get("undecodable") or not sigma, "some are not even messages"
         tell("messages", tried=sent, rejected=became["rejected"], failed=0)
+
+
+def only_used(name, message, used):
+    """A message with no other fields than those that its row names."""
+    described, out = dict(STORE.fielddefs[name][1]), {}
+    for field in used.get(name, " ".join(described)).split():
+        kind, of = described[field]
+        value = getattr(message, field)
+        if kind == Nodetype.NAME:
+            value = only_used(of, value, used)
+        elif kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and of[0][0] == Nodetype.NAME:
+            value = [only_used(of[0][1], one, used) for one in value]
+        out[field] = value
+    return SimpleNamespace(**out)
+
+
+def test_the_messages_of_every_row_of_landmark_types_are_in_the_tests():
+    assert LANDMARK_TYPES.keys() == DEFINITIONS.keys(), "test/foreign.py has the recorded definition of each"
+
+
+@pytest.mark.parametrize("type_name", LANDMARK_TYPES)
+def test_a_type_of_landmarks_is_read_by_no_other_fields_than_its_row_names(type_name):
+    sender = Sender(0, "landmarks")
+    sender.length = 3
+    source = listening("any", type_name, decoders=DECODERS)._sources["any"]
+    found = []
+    for _ in range(10):
+        message = only_used(type_name, sender.message(type_name), fields_used())
+        found += LANDMARK_TYPES[type_name].read(source, message)
+    assert found

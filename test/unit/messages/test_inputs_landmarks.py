@@ -287,9 +287,7 @@ def test_poses_of_aruco_markers_have_a_header_each_that_goes_before_that_of_the_
 
     def marker_of(number, of_pose, of_marker):
         at = make("geometry_msgs/msg/PoseStamped", header=of_pose, pose=pose(2.0, 1.0, 0.0, quaternion(yaw=0.3)))
-        return message(
-            "aruco_markers_msgs/msg/Marker", header=of_marker, id=number, pose=at, pixel_x=9.0, pixel_y=9.0
-        )
+        return message("aruco_markers_msgs/msg/Marker", header=of_marker, id=number, pose=at, pixel_x=9.0, pixel_y=9.0)
 
     parts = [marker_of(1, own, HEAD), marker_of(2, none, own), marker_of(2**32 - 1, none, none)]
     found = [(m.stamp_ns, s) for m in b.convert("seen", encoded(header=HEAD, markers=parts)) for s in m.sightings]

@@ -1,0 +1,93 @@
+"""Types of landmark messages of packages that need not be installed: one row for each.
+
+A new type is a generator in ``detections`` or ``ranges``, and a row here: the converters, the fields that a recorded
+definition must have, and what ``graph_slam info`` offers are made of these rows.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from graph_slam_ros.messages.inputs import detections, ranges
+from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark
+from graph_slam_ros.messages.inputs.source import InputContext
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkType:
+    """A type of messages, and how they are read.
+
+    Attributes
+    ----------
+    input_name : what ``graph_slam info`` calls an input of this type
+    read : yields one ``ObservedLandmark`` for each landmark of a message
+    fields : the fields that ``read`` uses, by the name of the message and of its parts from the same package
+    """
+
+    input_name: str
+    read: Callable[[InputContext, Any], Iterable[ObservedLandmark]]
+    fields: Mapping[str, str]
+
+
+APRILTAGS = "apriltag_msgs/msg/AprilTagDetectionArray"
+_MRPT = "header sensor_pose_on_robot sensor_std_range"
+
+LANDMARK_TYPES: Mapping[str, LandmarkType] = {
+    APRILTAGS: LandmarkType(
+        "tags",
+        detections.apriltags,
+        {"AprilTagDetectionArray": "header detections", "AprilTagDetection": "family id hamming decision_margin"},
+    ),
+    "aruco_msgs/msg/MarkerArray": LandmarkType(
+        "tags", detections.aruco_markers, {"MarkerArray": "header markers", "Marker": "header id pose"}
+    ),
+    "ros2_aruco_interfaces/msg/ArucoMarkers": LandmarkType(
+        "tags", detections.ros2_aruco, {"ArucoMarkers": "header marker_ids poses"}
+    ),
+    "aruco_opencv_msgs/msg/ArucoDetection": LandmarkType(
+        "tags",
+        detections.aruco_opencv,
+        {"ArucoDetection": "header markers boards", "MarkerPose": "marker_id pose", "BoardPose": "board_name pose"},
+    ),
+    "aruco_markers_msgs/msg/MarkerArray": LandmarkType(
+        "tags", detections.aruco_markers, {"MarkerArray": "header markers", "Marker": "header id pose"}
+    ),
+    "fiducial_msgs/msg/FiducialTransformArray": LandmarkType(
+        "tags",
+        detections.fiducials,
+        {"FiducialTransformArray": "header transforms", "FiducialTransform": "fiducial_id transform"},
+    ),
+    "rtabmap_msgs/msg/LandmarkDetections": LandmarkType(
+        "tags", detections.rtabmap, {"LandmarkDetections": "header landmarks", "LandmarkDetection": "header id pose"}
+    ),
+    "cartographer_ros_msgs/msg/LandmarkList": LandmarkType(
+        "reflectors",
+        detections.cartographer,
+        {
+            "LandmarkList": "header landmarks",
+            "LandmarkEntry": "id tracking_from_landmark_transform translation_weight rotation_weight",
+        },
+    ),
+    "mrpt_msgs/msg/ObservationRangeBearing": LandmarkType(
+        "beacons",
+        ranges.range_bearing,
+        {
+            "ObservationRangeBearing": f"{_MRPT} sensor_std_yaw sensor_std_pitch sensed_data",
+            "SingleRangeBearingObservation": "range yaw pitch id",
+        },
+    ),
+    "mrpt_msgs/msg/ObservationRangeBeacon": LandmarkType(
+        "beacons",
+        ranges.range_beacon,
+        {"ObservationRangeBeacon": f"{_MRPT} sensed_data", "SingleRangeBeaconObservation": "range id"},
+    ),
+}
+
+
+def fields_used() -> dict[str, str]:
+    """Return the fields that these types are read by, by full name of the message and of its parts."""
+    return {
+        f"{type_name.split('/')[0]}/msg/{name}": fields
+        for type_name, row in LANDMARK_TYPES.items()
+        for name, fields in row.fields.items()
+    }
