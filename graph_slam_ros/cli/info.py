@@ -3,13 +3,15 @@
 import textwrap
 from pathlib import Path
 
+from graph_slam_ros.messages.inputs import CONVERTERS
+from graph_slam_ros.messages.inputs.plugins import described
 from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.recordings.contents import TopicContents, recording_of
 from graph_slam_ros.runs.suggestion import Suggestion
 
 
 def describe(bag: Bag, path: Path) -> tuple[list[str], bool]:
-    """Topics, types, rates, frames and span of a recording, then what is to be known of the command that fits, then it.
+    """Topics, types, rates, frames, plugins and span of a recording, then what is to be known of the command, then it.
 
     Returns
     -------
@@ -18,6 +20,7 @@ def describe(bag: Bag, path: Path) -> tuple[list[str], bool]:
     """
     recording = recording_of(bag)
     lines = [_line(one) for _, one in sorted(recording.topics.items())]
+    lines += [f"plugin: {text}" for text in described(CONVERTERS)]
     read = [one for one in recording.topics.values() if one.last_ns]
     if read:
         first, last = min(one.first_ns for one in read), max(one.last_ns for one in read)

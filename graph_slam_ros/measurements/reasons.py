@@ -103,6 +103,11 @@ REASONS: dict[str, Reason] = {
     "child_frame_unknown": Reason(_REFUSED, "no transform links the message's child frame to the robot", _FRAMES),
     # -- numbers
     "undecodable": Reason(_REFUSED, "the bytes are not a message of this type", "INPUT.type, or record it again"),
+    "plugin_failed": Reason(
+        _REFUSED,
+        "the plugin that reads this type failed at a message, or gave what is no measurement",
+        "correct or uninstall the package; the log of the node, or the end of replay, names it with its first error",
+    ),
     "nonfinite": Reason(_REFUSED, "a number is NaN or infinite", "correct the driver"),
     "too_far": Reason(_REFUSED, "a coordinate is beyond 1e9 m", "correct the driver"),
     "beyond_max_distance": Reason(

@@ -17,8 +17,9 @@ from graph_slam_ros.config.inputs import InputConfig
 from graph_slam_ros.formats.cdr import CdrReader
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import InitialPose, Measured, Odometry
-from graph_slam_ros.messages.inputs import CONVERTERS, checks, fixes, odometry, uses
+from graph_slam_ros.messages.inputs import checks, converters, fixes, odometry, uses
 from graph_slam_ros.messages.inputs.checks import MessageError
+from graph_slam_ros.messages.inputs.plugins import PluginFault
 from graph_slam_ros.messages.inputs.source import InputContext, NotYet, Origin
 from graph_slam_ros.messages.inputs.transforms import Transforms, pose
 from graph_slam_ros.messages.interfaces import typestore
@@ -74,6 +75,10 @@ class MessageConverter:
     counters : where refusals and repairs are counted
     decoders : by message type, where a recording's own definition or an installed package is to be used
 
+    Attributes
+    ----------
+    on_fault : is called with the first error of a plugin in each input, in one line
+
     Raises
     ------
     ConfigError
@@ -83,6 +88,7 @@ class MessageConverter:
     def __init__(self, config: Config, counters: Counters, decoders: Mapping[str, Decoder] | None = None) -> None:
         self._config = config
         self._counters = counters
+        self.on_fault: Callable[[str], object] = lambda line: None
         self._transforms = Transforms(round(config.inputs.tf_buffer_s * 1e9), self._is_far_in_time)
         self._sources: dict[str, InputContext] = {}
         self._convert: dict[str, Callable[[Any], Any]] = {}
@@ -96,7 +102,7 @@ class MessageConverter:
             counters.received[name] += 0
             source = self._sources[name] = InputContext(by_name[name], use, config, self._transforms, self._origin)
             self._types[name] = by_name[name].type
-            self._convert[name] = partial(CONVERTERS[by_name[name].type][use], source)
+            self._convert[name] = partial((converters(by_name[name].type) or {})[use], source)
             if use == "odometry":
                 self._publishers[name] = OnePublisher(
                     config.odometry.timeout_s, partial(self._is_of_another, name), partial(self._is_ahead, name)
@@ -186,6 +192,10 @@ class MessageConverter:
             source.tally.clear()
             self._pending.append((source, message))
             return []
+        except PluginFault as fault:
+            source.count("plugin_failed")
+            if source.state.setdefault("first fault", fault) is fault:
+                self.on_fault(f"{source.name}: {fault}")
         except MessageError as reason:
             source.count(str(reason))
         for why, times in source.tally.items():

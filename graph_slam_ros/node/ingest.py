@@ -67,6 +67,7 @@ class Ingest:
         self._publishers, self._clock, self._on_jump = publishers, clock, on_jump
         self._counters = counters
         self.converter = MessageConverter(config, counters, _installed(config))
+        self.converter.on_fault = node.get_logger().error
         self.gate = IngestGate(config.time.jump_back_s, counters, lambda: node.now_ns)
         self.extrapolator = PoseExtrapolator(config)
         self.processed: Counter[str] = Counter()

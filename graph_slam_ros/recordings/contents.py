@@ -7,9 +7,10 @@ from itertools import islice
 from statistics import median
 from typing import Any
 
+from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.lie import so3
 from graph_slam_ros.messages.from_msg import TRANSFORMS
-from graph_slam_ros.messages.inputs import CONVERTERS
+from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS
 from graph_slam_ros.recordings.bag import Bag, BagError, Topic
 from graph_slam_ros.recordings.definitions import recorded_decoder
@@ -119,11 +120,12 @@ def recording_of(bag: Bag) -> Recording:
 
 
 def _decoders(recording: Recording) -> Iterator[tuple[str, Callable[[bytes], Any]]]:
+    known = known_types()
     for name, one in recording.topics.items():
-        if one.topic.type in CONVERTERS:
+        if one.topic.type in known:
             try:
                 yield name, recorded_decoder(one.topic)
-            except BagError as error:
+            except (BagError, ConfigError) as error:
                 one.trouble = str(error)
 
 

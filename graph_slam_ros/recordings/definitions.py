@@ -1,5 +1,6 @@
 """Recorded message definitions: a bag is decoded by what it says of itself, if that has what we need."""
 
+from dataclasses import replace
 from typing import Any
 
 from rosbags.interfaces import Nodetype
@@ -8,6 +9,7 @@ from rosbags.typesys.store import Typestore
 
 from graph_slam_ros.messages.from_msg import Decoder, decoder
 from graph_slam_ros.messages.inputs.landmark_types import fields_used
+from graph_slam_ros.messages.inputs.plugins import input_type
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import MOST_TEXT, BagError, Topic
 
@@ -56,16 +58,23 @@ def recorded_decoder(topic: Topic) -> Decoder:
     """
     if topic.encoding != "cdr":
         raise BagError(f"topic {topic.name}: messages are encoded as {topic.encoding!r}, not cdr")
-    if not topic.definition:
-        if topic.type not in typestore().types:
-            raise BagError(f"topic {topic.name}: no definition of {topic.type} in the recording")
+    if not topic.definition and topic.type in typestore().types:
         return decoder(topic.type)
+    if not topic.definition:
+        plugin = input_type(topic.type)
+        if plugin is None or not plugin.definition:
+            raise BagError(f"topic {topic.name}: no definition of {topic.type} in the recording")
+        return _by_definition(replace(topic, definition=plugin.definition), "the plugin's")
+    return _by_definition(topic, "the recorded")
+
+
+def _by_definition(topic: Topic, whose: str) -> Decoder:
     if len(topic.definition) > MOST_TEXT:
-        raise BagError(f"topic {topic.name}: the recorded definition of {topic.type} is longer than {MOST_TEXT} bytes")
+        raise BagError(f"topic {topic.name}: {whose} definition of {topic.type} is longer than {MOST_TEXT} bytes")
     try:
         recorded = get_types_from_msg(topic.definition, topic.type)
     except Exception as error:  # rosbags' parser raises errors of its own grammar library
-        raise BagError(f"topic {topic.name}: the recorded definition of {topic.type} is not valid") from error
+        raise BagError(f"topic {topic.name}: {whose} definition of {topic.type} is not valid") from error
     ours = typestore().fielddefs
     if all(ours.get(name) == definition for name, definition in recorded.items()):
         return decoder(topic.type)
@@ -78,7 +87,7 @@ def recorded_decoder(topic: Topic) -> Decoder:
             if there[field] != known[field]:
                 raise BagError(f"topic {topic.name}: field {field!r} of {name} has another type in this recording")
     if not _length({**ours, **recorded}, topic.type, {}) <= _MOST_VALUES:
-        raise BagError(f"topic {topic.name}: the recorded {topic.type} has more than {_MOST_VALUES} values")
+        raise BagError(f"topic {topic.name}: {whose} {topic.type} has more than {_MOST_VALUES} values")
     store = _store(recorded)
     return lambda cdr: store.deserialize_cdr(cdr, topic.type)
 

@@ -175,6 +175,7 @@ class RecordedRuns:
         self.counted: list[Counters] = []
         used = [bag.topics[topic] for topic in inputs.topics.values()]
         self._converter = MessageConverter(config, counters, {topic.type: recorded_decoder(topic) for topic in used})
+        self._converter.on_fault = bag.warnings.append
         for name in counters.received.keys() - inputs.topics.keys():
             del counters.received[name]  # nobody asked for it
         if datum:

@@ -9,7 +9,7 @@ from typing import Any
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.messages.from_msg import TRANSFORMS
-from graph_slam_ros.messages.inputs import CONVERTERS
+from graph_slam_ros.messages.inputs import CONVERTERS, converters, known_types
 from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS, LANDMARK_TYPES
 from graph_slam_ros.recordings.bag import Bag
 from graph_slam_ros.recordings.contents import Recording, TopicContents
@@ -210,8 +210,15 @@ class Suggestion:
                 chosen = {"type": TRANSFORMS, "topic": TF_TOPIC, "use": "landmarks", "frame_prefix": prefix}
                 frame = next(p for c, p in self._recording.moving.items() if c.startswith(prefix))
                 self._set(self._free("tags"), chosen | self._mount(TF_TOPIC, frame))
+        known = known_types()
+        for one in self._of_type(*(known - CONVERTERS.keys())):
+            try:
+                converters(one.topic.type)
+                self._add("plugin", one)
+            except GraphSlamError as error:
+                self.unused[one.topic.name] = str(error)
         for name, one in self._recording.topics.items():
-            if _CORNERS.search(one.topic.type) and one.topic.type not in CONVERTERS:
+            if _CORNERS.search(one.topic.type) and one.topic.type not in known:
                 self._corners(one)
             elif one.topic.type == "visualization_msgs/msg/MarkerArray" and not _TRUTH.search(name):
                 self.unused[name] = "markers are mostly pictures; an input of this type and topic takes them"
@@ -364,15 +371,16 @@ class Suggestion:
 
     def _not_read(self) -> None:
         """Topics of types that no input reads, of which one may be what was hoped for."""
+        known = known_types()
         found = [
             f"{name} ({one.topic.type or 'no type'})"
             for name, one in sorted(self._recording.topics.items())
-            if one.topic.type not in CONVERTERS and name not in self.unused and name not in _OF_ROS
+            if one.topic.type not in known and name not in self.unused and name not in _OF_ROS
         ]
         if found:
             more = f" and {len(found) - _MOST_LISTED} more" if len(found) > _MOST_LISTED else ""
             note = f"no input reads {', '.join(found[:_MOST_LISTED])}{more}: their types are none of docs/inputs.md"
-            own = "; landmarks in a type of your own: publish them as Detection3DArray or PointCloud2"
+            own = "; landmarks in a type of your own: a plugin (docs/inputs.md), or publish them as Detection3DArray"
             self.notes.append(note + own * (self._names == ["odom"]))
 
 

@@ -25,6 +25,7 @@ FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.r
 # and typing.py. Each names only what stands above its own line here, so that there is no circle.
 WITHIN = {
     "errors.py": set(),
+    "plugins.py": set(),
     "progress.py": set(),
     "typing.py": set(),
     "lie": set(),
@@ -32,7 +33,7 @@ WITHIN = {
     "solver/clique_tree": {"lie", "graph"},
     "solver": {"lie", "graph", "solver/clique_tree"},
     "warmup.py": {"progress", "lie", "graph", "solver", "solver/clique_tree"},
-    "formats": {"lie", "graph"},
+    "formats": {"plugins", "lie", "graph"},
     "optimization.py": {"graph", "solver", "formats"},
     "certificate": {"lie", "graph", "solver", "optimization"},
     "measurements": {"graph"},
@@ -44,7 +45,7 @@ WITHIN = {
         *("lie", "graph", "solver", "measurements", "config"),
         *("slam/frontend", "slam/landmarks", "slam/robust"),
     },
-    "messages/inputs": {"lie", "graph", "formats", "measurements", "config"},
+    "messages/inputs": {"plugins", "lie", "graph", "formats", "measurements", "config"},
     "messages": {"lie", "graph", "formats", "measurements", "config", "slam", "messages/inputs"},
     "recordings": {"lie", "formats", "messages", "messages/inputs"},
     "runs": {
@@ -66,7 +67,7 @@ WITHIN = {
     },
     "cli": {
         *("progress", "warmup", "graph", "solver", "optimization", "certificate", "formats", "config"),
-        *("slam", "recordings", "runs", "maps", "analysis", "simulation", "node"),
+        *("slam", "messages/inputs", "recordings", "runs", "maps", "analysis", "simulation", "node"),
     },
     "__init__.py": {
         *("graph", "solver", "optimization", "certificate", "formats", "measurements", "config", "slam", "runs"),

@@ -11,10 +11,24 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import InputConfig
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.measurements.types import Measured
-from graph_slam_ros.messages.inputs import detections, fixes, odometry, ranges
+from graph_slam_ros.messages.inputs import detections, fixes, odometry, plugins, ranges
+from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
 from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark, sightings
-from graph_slam_ros.messages.inputs.source import InputContext
+from graph_slam_ros.messages.inputs.plugins import InputType
+from graph_slam_ros.messages.inputs.source import InputContext, NotYet
+
+__all__ = [
+    "CONVERTERS",
+    "InputContext",
+    "InputType",
+    "MessageError",
+    "NotYet",
+    "ObservedLandmark",
+    "converters",
+    "known_types",
+    "uses",
+]
 
 Converter = Callable[[InputContext, Any], Iterable[Measured]]
 
@@ -44,13 +58,30 @@ CONVERTERS: Mapping[str, Mapping[str, Converter]] = {
 """By type, then by use; the first use is that of ``auto``."""
 
 
+def converters(type_name: str) -> Mapping[str, Converter] | None:
+    """Return the converters of a type by use, of the table or else of a plugin; None where neither has it.
+
+    Raises
+    ------
+    ConfigError
+        The plugin of the type cannot be used.
+    """
+    return CONVERTERS.get(type_name) or plugins.converters(type_name)
+
+
+def known_types() -> set[str]:
+    """Return the types that can be inputs, those of installed plugins among them; no plugin is imported."""
+    return {*CONVERTERS, *plugins.types()}
+
+
 def uses(config: Config) -> dict[str, str]:
     """Return what each input is used as, by its name; those that are not used are left out.
 
     Raises
     ------
     ConfigError
-        An input of a type that is not in the table or cannot be used so, or none is odometry, or odometry has a loss.
+        An input of a type that neither the table nor a plugin has or that cannot be used so, or none is odometry, or
+        odometry has a loss.
     """
     out = {settings.name: _use(settings) for settings in config.sources if settings.use != "none"}
     if "odometry" not in out.values():
@@ -59,9 +90,11 @@ def uses(config: Config) -> dict[str, str]:
 
 
 def _use(settings: InputConfig) -> str:
-    there = CONVERTERS.get(settings.type)
+    there = converters(settings.type)
     if there is None:
-        raise ConfigError(f"{settings.name}.type: {settings.type!r} is not one of {', '.join(CONVERTERS)}")
+        raise ConfigError(
+            f"{settings.name}.type: {settings.type!r} is not one of {', '.join(CONVERTERS)}, and no plugin reads it"
+        )
     use = next(iter(there)) if settings.use == "auto" else settings.use
     if use not in there:
         raise ConfigError(f"{settings.name}.use: {settings.type} can be {' or '.join(there)}, not {use}")

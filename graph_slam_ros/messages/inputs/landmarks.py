@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from graph_slam_ros.errors import FormatError
 from graph_slam_ros.graph.geometry import SPATIAL
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.measurements.types import Sighting, Sightings
@@ -21,6 +22,7 @@ from graph_slam_ros.typing import Numbers
 _AGREE_SIGMA = 3.0
 _LONGEST_ID = 128  # bytes
 _UPRIGHT = 1e-6
+_POLAR = {"range": (1,), "bearing": (1, 2), "range_bearing": (2, 3)}  # numbers of each kind, by SIGHTING_KINDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +39,11 @@ class ObservedLandmark:
     polar : (kind, measured) in the sensor's frame, kinds as of ``Sighting``
     sigmas : standard deviations of ``polar``, one for each number of it; None or zero where unknown
     T_frame_sensor : where the sensor is in the frame
+
+    Raises
+    ------
+    FormatError
+        ``polar`` is of no such kind, or has more or fewer numbers.
     """
 
     stamp: Any
@@ -48,6 +55,11 @@ class ObservedLandmark:
     polar: tuple[str, Numbers] | None = None
     sigmas: Sequence[float] | None = None
     T_frame_sensor: se3.Pose = se3.IDENTITY
+
+    def __post_init__(self) -> None:
+        if self.polar is not None and len(self.polar[1]) not in _POLAR.get(self.polar[0], ()):
+            kinds = ", ".join(f"{kind} has {' or '.join(map(str, sizes))}" for kind, sizes in _POLAR.items())
+            raise FormatError(f"polar: {self.polar[0]!r} with {len(self.polar[1])} numbers; {kinds}")
 
 
 def sightings(source: InputContext, found: Iterable[ObservedLandmark]) -> Iterator[Sightings]:

@@ -1,0 +1,60 @@
+"""Plugins of other packages: Python entry points, looked up by group and name when asked for.
+
+Nothing of a plugin is imported before its name is asked for, and a name that is built in is never asked for.
+"""
+
+from collections.abc import Callable
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from graph_slam_ros.errors import ConfigError
+
+INPUTS = "graph_slam_ros.inputs"  # of types of messages: their names with dots, package.msg.Name
+EDGES = "graph_slam_ros.edges"  # of edge types: their tags in g2o files
+
+
+def names(group: str) -> dict[str, str]:
+    """Return the names in a group with the distribution of each; nothing is imported."""
+    return {entry.name: _distribution(entry) for entry in entry_points(group=group)}
+
+
+def load(group: str, name: str, check: Callable[[Any], str]) -> tuple[Any, str] | None:
+    """Import what a plugin has under a name.
+
+    Parameters
+    ----------
+    check : what is wrong with the object, in words; empty where nothing is
+
+    Returns
+    -------
+    tuple or None
+        The object, and the words that name the plugin and its distribution; None where no plugin has the name.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be imported, is not what the group is for, or two distributions have the name.
+    """
+    found = sorted(set(entry_points(group=group, name=name)), key=_distribution)
+    if not found:
+        return None
+    if len(found) > 1:
+        raise ConfigError(f"{name}: plugins of {' and '.join(map(_distribution, found))} have it: uninstall one")
+    plugin = f"plugin {found[0].value} of {_distribution(found[0])}"
+    try:
+        there = found[0].load()
+        wrong = check(there)
+    except (Exception, SystemExit) as error:  # whatever another's module does when it is imported
+        raise ConfigError(f"{name}: {plugin} cannot be loaded: {in_one_line(error)}") from error
+    if wrong:
+        raise ConfigError(f"{name}: {plugin}: {wrong}")
+    return there, plugin
+
+
+def in_one_line(error: BaseException) -> str:
+    """An exception of a plugin: its type, and its words without their line breaks."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _distribution(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown distribution"

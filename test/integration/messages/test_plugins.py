@@ -1,0 +1,174 @@
+"""Message types that a package of its own reads: the example of the page, and plugins that fail."""
+
+import re
+import sys
+from importlib import invalidate_caches
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from messages import STAMP_NS, odometry, pose, quaternion, recorded, transforms
+from places import ROOT
+from recordings import definition, write_mcap
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.lie import se2
+from graph_slam_ros.messages.inputs import converters, plugins
+from graph_slam_ros.messages.to_msg import header
+from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.slam import Config
+
+TYPE, NAME = "my_msgs/msg/Beacons", "my_msgs.msg.Beacons"
+PAGE = (ROOT / "docs/inputs.md").read_text()
+(EXAMPLE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+(POINTS,) = re.findall(r'\[project\.entry-points\."(graph_slam_ros\.inputs)"\]\n"(.*)" = "(.*)"', PAGE)
+DEFINITION = "std_msgs/Header header\nstring[] names\nfloat64[] ranges\n"
+BEACONS = {"north": (2.0, 5.0), "south": (3.0, -4.0), "east": (9.0, 1.0)}
+SETTINGS = {"inputs.names": "odom radio", "radio": {"type": TYPE, "topic": "/radio", "sigma_m": 0.05}}
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Install a module as pip does: the file, and a .dist-info folder with its entry points."""
+    monkeypatch.setattr(plugins, "_loaded", {})
+    modules = set(sys.modules)
+
+    def installed(text, name=NAME, module="my_beacons", at="BEACONS", group="graph_slam_ros.inputs"):
+        site = tmp_path / f"site_{module}"
+        info = site / f"{module}-1.0.dist-info"
+        info.mkdir(parents=True)
+        (site / f"{module}.py").write_text(text)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module.replace('_', '-')}\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {module}:{at}\n")
+        monkeypatch.syspath_prepend(str(site))
+        invalidate_caches()
+
+    yield installed
+    for name in set(sys.modules) - modules:
+        if name.startswith("my_"):
+            del sys.modules[name]
+
+
+def recording(file, *, defined=True):
+    """A circle among beacons, whose messages no built-in type has."""
+    _, _, encoded = recorded(TYPE, DEFINITION)
+    truth, sent = se2.IDENTITY, [("/tf_static", STAMP_NS, transforms())]
+    for k in range(150):
+        stamp_ns = STAMP_NS + k * 10**8
+        sent.append(("/odom", stamp_ns, odometry(pose(*truth[:2], 0.0, quaternion(yaw=truth[2])), stamp_ns=stamp_ns)))
+        ranges = np.array([np.hypot(*se2.act(se2.inverse(truth), at)) for at in BEACONS.values()])
+        cdr = encoded(header=header(stamp_ns, "base_link"), names=list(BEACONS), ranges=ranges)
+        sent.append(("/radio", stamp_ns, cdr))
+        truth = se2.compose(truth, (0.1, 0.0, 0.03))
+    types = {"/odom": "nav_msgs/msg/Odometry", "/radio": TYPE, "/tf_static": "tf2_msgs/msg/TFMessage"}
+    text = DEFINITION if defined else ""
+    return write_mcap(
+        file,
+        [type("Sent", (), {"topic": t, "log_ns": s, "cdr": c}) for t, s, c in sent],
+        types=types,
+        text=lambda type_name: text if type_name == TYPE else definition(type_name),
+    )
+
+
+@pytest.mark.parametrize("defined", [True, False])
+def test_the_example_of_the_page_reads_a_recording_with_its_definition_or_without(defined, install, tmp_path):
+    assert POINTS == ("graph_slam_ros.inputs", NAME, "my_beacons:BEACONS")
+    install(EXAMPLE)
+    done = replay(recording(tmp_path / "a.mcap", defined=defined), tmp_path / "run", Config.from_mapping(SETTINGS))
+    assert set(done.slam.landmarks) == set(BEACONS)
+    for name, at in BEACONS.items():
+        assert done.slam.solver.estimate([done.slam.landmarks[name].vertex])[0] == pytest.approx(at, abs=0.1)
+
+
+def test_info_names_plugins_and_suggests_an_input_of_their_type(install, tmp_path, capsys):
+    install(EXAMPLE)
+    install("X = 1", name="nav_msgs.msg.Odometry", module="my_odometry", at="X")
+    install("import not_there", name="my_msgs.msg.Other", module="my_other", at="X")
+    assert main(["info", str(recording(tmp_path / "a.mcap"))]) == 0
+    out = capsys.readouterr().out
+    assert f"plugin: {TYPE}: read by my-beacons 1.0 as landmarks\n" in out
+    assert "plugin: nav_msgs/msg/Odometry: the plugin of my-odometry 1.0 is not used: the type is built in\n" in out
+    line = "plugin my_other:X of my-other 1.0 cannot be loaded: ModuleNotFoundError: No module named 'not_there'\n"
+    assert f"plugin: my_msgs.msg.Other: {line}" in out
+    assert f"plugin.type={TYPE}" in out.splitlines()[-1]
+    assert "my_odometry" not in sys.modules, "a plugin for a built-in type is not even imported"
+
+
+LINE = rf"{NAME}: plugin my_beacons:BEACONS of my-beacons 1.0"
+INPUT = "from graph_slam_ros.messages.inputs import InputType\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("import not_there", "cannot be loaded: ModuleNotFoundError: No module named 'not_there'"),
+        ("raise ValueError('two\\nlines')", "cannot be loaded: ValueError: two lines"),
+        ("import sys; sys.exit(7)", "cannot be loaded: SystemExit: 7"),
+        ("", "cannot be loaded: AttributeError: .*BEACONS"),
+        ("def BEACONS(source, message): return []", "it is a function, not an InputType"),
+        (f"{INPUT}BEACONS = InputType(dict())", "its converters are not a dictionary by landmarks, fix"),
+        (f"{INPUT}BEACONS = InputType(dict(tags=print))", "its converters are not a dictionary by landmarks, fix"),
+        (f"{INPUT}BEACONS = InputType(dict(fix=print), 3)", "its definition is not a text"),
+        (f"{INPUT}BEACONS = InputType(dict(fix=lambda m: []))", "its converter of fix is not a function of an Inp"),
+        (f"{INPUT}BEACONS = InputType(dict(fix=4))", "its converter of fix is not a function of an InputContext"),
+    ],
+)
+def test_a_plugin_that_cannot_be_used_is_refused_in_one_line(text, line, install):
+    install(text)
+    with pytest.raises(ConfigError, match=rf"\A{LINE}:? {line}") as refused:
+        converters(TYPE)
+    assert "\n" not in str(refused.value)
+
+
+def test_of_two_plugins_for_a_type_neither_is_used_and_without_one_the_type_is_refused(install, tmp_path):
+    file = recording(tmp_path / "a.mcap")
+    with pytest.raises(ConfigError, match=rf"radio.type: '{TYPE}' is not one of nav_msgs.*, and no plugin reads it"):
+        replay(file, tmp_path / "run", Config.from_mapping(SETTINGS))
+    install(EXAMPLE)
+    install(EXAMPLE, module="my_radio")
+    with pytest.raises(ConfigError, match=f"{NAME}: plugins of my-beacons 1.0 and my-radio 1.0 have it: uninstall one"):
+        converters(TYPE)
+
+
+@pytest.mark.parametrize(
+    ("body", "line"),
+    [
+        ("return 1 / 0", "ZeroDivisionError: division by zero"),
+        ("return None", "TypeError: 'NoneType' object is not iterable"),
+        ("return [3]", "as landmarks it gives a int, not ObservedLandmark"),
+        ("return m.field_that_is_not_there", "AttributeError: .*field_that_is_not_there"),
+        ("return [ObservedLandmark(m.header.stamp, 'base_link', 'a', 'here')]", "AttributeError: .*'x'"),
+        ("return [ObservedLandmark(m.header.stamp, 'base_link', 7, polar=('range', (1.0,)))]", "TypeError: "),
+        ("return [ObservedLandmark(m.header.stamp, 'base_link', 'a', polar=('smell', (1.0,)))]", "FormatError: "),
+        ("return [ObservedLandmark(m.header.stamp, 'base_link', 'a', polar=('range', (1.0, 2.0)))]", "FormatError: "),
+        ("raise MessageError('too\\nfoggy')", r"refuses a message: too foggy"),
+        ("raise SystemError", "SystemError: "),
+    ],
+)
+def test_what_a_plugin_fails_at_is_counted_and_named_once_and_other_inputs_go_on(body, line, install, tmp_path):
+    imports = "from graph_slam_ros.messages.inputs import *\n"
+    install(f"{imports}def read(source, m):\n    {body}\nBEACONS = InputType({{'landmarks': read}})\n")
+    done = replay(recording(tmp_path / "a.mcap"), tmp_path / "run", Config.from_mapping(SETTINGS))
+    assert done.summary["counters"]["radio"]["plugin_failed"] == 150
+    assert len(done.slam.keyframes) > 20
+    (told,) = [text for text in done.warnings if "plugin my_beacons" in text]
+    assert re.match(rf"radio: plugin my_beacons:BEACONS of my-beacons 1.0:? {line}", told)
+    assert "\n" not in told
+
+
+def test_a_measurement_that_the_journal_cannot_keep_or_of_another_input_is_a_fault(install):
+    imports = "import numpy as np\nfrom graph_slam_ros.measurements.types import Fix\n"
+    for fix, line in (
+        ("Fix(9, source.name, 'position', np.zeros(2), (1.0, 0.0, 0.0, 1.0))", "TypeError: Object of type ndarray"),
+        ("Fix(9, 'gps', 'position', (0.0, 0.0), (1.0, 0.0, 0.0, 1.0))", "the topic or source of what it gives is not"),
+    ):
+        name = f"my_{len(fix)}"
+        install(
+            f"{imports}from graph_slam_ros.messages.inputs import InputType\n"
+            f"BEACONS = InputType({{'fix': lambda source, m: [{fix}]}})\n",
+            name=f"my_msgs.msg.{name}",
+            module=name,
+        )
+        with pytest.raises(plugins.PluginFault, match=line):
+            converters(f"my_msgs/msg/{name}")["fix"](SimpleNamespace(name="radio"), None)
