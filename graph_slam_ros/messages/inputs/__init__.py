@@ -5,6 +5,7 @@ message is refused, and ``NotYet`` where it is to be tried again when /tf has to
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from difflib import get_close_matches
 from typing import Any
 
 from graph_slam_ros.config.config import Config
@@ -29,6 +30,8 @@ __all__ = [
     "known_types",
     "uses",
 ]
+
+_CLOSE = 0.8  # of 1
 
 Converter = Callable[[InputContext, Any], Iterable[Measured]]
 
@@ -92,9 +95,9 @@ def uses(config: Config) -> dict[str, str]:
 def _use(settings: InputConfig) -> str:
     there = converters(settings.type)
     if there is None:
-        raise ConfigError(
-            f"{settings.name}.type: {settings.type!r} is not one of {', '.join(CONVERTERS)}, and no plugin reads it"
-        )
+        close = " or ".join(get_close_matches(settings.type, sorted(known_types()), 2, _CLOSE))
+        remedy = f"is it {close}?" if close else "docs/inputs.md has a row for each, and no plugin reads it"
+        raise ConfigError(f"{settings.name}.type: {settings.type!r} is no type of an input: {remedy}")
     use = next(iter(there)) if settings.use == "auto" else settings.use
     if use not in there:
         raise ConfigError(f"{settings.name}.use: {settings.type} can be {' or '.join(there)}, not {use}")

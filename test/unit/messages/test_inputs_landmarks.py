@@ -420,6 +420,22 @@ def test_a_recorded_definition_that_lacks_what_is_read_is_refused_by_field():
             recorded_decoder(Topic("/t", type_name, 1, text))
 
 
+@pytest.mark.parametrize(
+    "given, remedy",
+    [
+        ("fiducial_msgs/FiducialTransformArray", "is it fiducial_msgs/msg/FiducialTransformArray?"),
+        ("mrpt_msgs/msg/ObservationRange", "is it mrpt_msgs/msg/ObservationRangeBeacon or "),
+        ("my_msgs/msg/Tags", "docs/inputs.md has a row for each, and no plugin reads it"),
+    ],
+)
+def test_a_type_that_no_input_reads_is_refused_with_the_one_that_is_meant(given, remedy):
+    with pytest.raises(ConfigError) as refused:
+        listening("seen", given)
+    said = str(refused.value)
+    assert said.startswith(f"seen.type: '{given}' is no type of an input: {remedy}")
+    assert len(said) < 180, "a line of the command has 200 characters"
+
+
 def test_a_package_that_is_not_installed_is_refused_by_name():
     from graph_slam_ros.messages.message_class import message_class
 
