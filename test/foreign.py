@@ -97,3 +97,10 @@ float64 range
 int32 id
 """,
 }
+
+
+def parts(type_name):
+    """The definitions of the package that are in one of these, as .msg files have them: text by name."""
+    package, _, name = type_name.split("/")
+    whole, *others = DEFINITIONS[type_name].replace(f"{package}/", "").split(_RULE)
+    return {one.partition("\n")[0].removeprefix("MSG: "): one.partition("\n")[2] for one in others} | {name: whole}

@@ -1,15 +1,12 @@
 """The bond with Nav2's lifecycle manager, whose end is in a process of its own and follows the protocol of bondcpp."""
 
 import contextlib
-import os
 import signal
 import subprocess
 import sys
-import sysconfig
 import threading
-from pathlib import Path
 
-import generate_interfaces
+import built_packages
 import pytest
 from live_nodes import ENVIRONMENT, lenient, node, own_domain, robot, until
 from places import ROOT
@@ -26,24 +23,8 @@ STATUS = (
 
 @pytest.fixture
 def with_bond(request, tmp_path_factory, monkeypatch):
-    """The environment of processes that have the messages: an installed ROS, else they are built once and kept.
-
-    Without the cache of pytest they are built each time.
-    """
-    if is_installed():
-        return
-    if reason := generate_interfaces.obstacle(["bond"]):
-        pytest.skip(reason)
-    cache = getattr(request.config, "cache", None)
-    name = f"bond_{sysconfig.get_python_version()}"
-    built = Path(cache.mkdir(name)) if cache else tmp_path_factory.mktemp(name)
-    if not (done := built / "built").exists():
-        monkeypatch.setitem(generate_interfaces.INTERFACES, "bond", {"Status": STATUS})
-        generate_interfaces.generate(["bond"], Path(sys.prefix), built)
-        done.touch()
-    packages = built / "lib" / f"python{sysconfig.get_python_version()}" / "site-packages"
-    for name, folder in (("PYTHONPATH", packages), ("LD_LIBRARY_PATH", built / "lib")):
-        monkeypatch.setitem(ENVIRONMENT, name, os.pathsep.join(filter(None, (str(folder), ENVIRONMENT.get(name)))))
+    """The environment of processes that have the messages."""
+    built_packages.use("bond", {"Status": STATUS}, request, tmp_path_factory, monkeypatch)
 
 
 @pytest.fixture(autouse=True)

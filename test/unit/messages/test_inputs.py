@@ -129,7 +129,10 @@ def test_in_space_a_tag_is_a_pose_only_where_all_of_its_orientation_is_known():
 
 def test_what_cannot_be_an_input_is_refused_by_name():
     for sections, complaint in (
-        ({"odom": {"type": "nav_msgs/msg/Path"}}, "odom.type: 'nav_msgs/msg/Path' is no type of an input: docs/inputs.md has a row for each"),
+        (
+            {"odom": {"type": "nav_msgs/msg/Path"}},
+            "odom.type: 'nav_msgs/msg/Path' is no type of an input: docs/inputs.md has a row for each",
+        ),
         ({"odom": {"use": "landmarks"}}, "odom.use: nav_msgs/msg/Odometry can be odometry or fix, not landmarks"),
         ({"odom": {"use": "none"}}, "inputs.names: none of 'odom detections' is used as odometry"),
         ({"odom": {"mount": "1 2 3"}}, "odom.mount: '1 2 3' is not 6 numbers"),
