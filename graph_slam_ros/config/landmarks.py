@@ -102,8 +102,9 @@ class LandmarksConfig:
     )
     surveyed: str = setting(
         "",
-        "landmarks with known positions in the map: a header id,x,y,sigma or id,x,y,z,sigma, then a line for each",
-        "m",
+        "landmarks with known positions in the map: a header id,x,y,sigma or id,x,y,z,sigma, then a line for each;"
+        " with columns for an orientation and other noise as in docs/inputs.md",
+        "m, rad",
     )
     surveyed_file: str = setting("", "file with the lines of landmarks.surveyed, read at the start where that is empty")
     range_offset_sigma_m: float = setting(

@@ -64,9 +64,21 @@ class Anchor:
         return looser is not None and self._move(self._onto_fix(m, T_map_base), looser, keyframe)
 
     def align_to_landmark(self, known: Surveyed, at: Array, keyframe: int) -> bool:
-        """Loosen the prior for a surveyed landmark, as for a fix. ``at`` (n,) is the landmark's estimate."""
-        looser = self._looser(self._position())
-        return looser is not None and self._move(self._shifted(np.array(known.position) - at), looser, keyframe)
+        """Loosen the prior for a surveyed landmark, as for a fix; returns whether the map has moved.
+
+        Parameters
+        ----------
+        at : the landmark's estimate: a pose where its orientation counts, else a position (n,)
+        keyframe : the newest
+        """
+        n, group = self._space.dimensions, self._space.group
+        wanted = self._position()
+        T_new_old = self._shifted(np.array(known.position) - at[:n])
+        if len(at) > n and not self._config.anchor.sigma_rad:
+            wanted[n:] = _UNCERTAIN_RAD
+            T_new_old = _floats(group.compose(known.pose, group.inverse(tuple(at.tolist()))))
+        looser = self._looser(wanted)
+        return looser is not None and self._move(T_new_old, looser, keyframe)
 
     # -- how far ---------------------------------------------------------------------------------------------------
 

@@ -120,9 +120,15 @@ class Landmarks:
             self._note_undetermined(topic, name, s, where)
 
     def survey_of(self, name: str, s: Sighting, where: PoseAtStamp) -> tuple[Surveyed, Array] | None:
-        """The survey of a landmark that was not seen before, and where (n,) a sighting puts it, or may put it."""
+        """The survey of a landmark that was not seen before, and where a sighting puts it, or may put it.
+
+        That is a pose where both the survey and the sighting have the orientation, else a position (n,).
+        """
         if name not in self._survey or name in self.known:
             return None
+        if s.kind == "pose" and self._survey[name].orientation:
+            measured = motion_compensation.pose(self._space, s, where).measured
+            return self._survey[name], np.array(self._space.group.compose(self._pose(where), measured))
         if s.kind in ("pose", "position"):
             return self._survey[name], np.array(
                 self._in_map(where, motion_compensation.position(self._space, s, where).measured)
@@ -153,13 +159,16 @@ class Landmarks:
         self._add_edge(topic, landmark, s, where)
 
     def _hold(self, landmark: Landmark, known: Surveyed) -> None:
-        """A prior on the position; without a loss, what contradicts it is the sightings' fault."""
-        space = self._space
+        """A prior on what was surveyed; without a loss, what contradicts it is the sightings' fault."""
+        space, vertices = self._space, [landmark.vertex]
         is_pose = self._graph.kind_of(landmark.vertex) is space.pose
+        if is_pose and known.orientation:
+            noise = Gaussian.from_covariance(space.in_tangent(known.pose, np.array(known.covariance)))
+            self._graph.add_edge(space.pose_prior, vertices, known.pose, noise, "surveyed")
+            return
         edge_type = space.fixes["position"] if is_pose else POINT_PRIOR[space.point]
-        noise = Gaussian.from_sigmas(*[known.sigma_m] * space.dimensions)
-        measured = edge_type.whole(known.position)
-        self._graph.add_edge(edge_type, [landmark.vertex], measured, noise, "surveyed")
+        noise = Gaussian.from_covariance(known.position_covariance)
+        self._graph.add_edge(edge_type, vertices, edge_type.whole(known.position), noise, "surveyed")
 
     def _add_edge(self, topic: str, landmark: Landmark, s: Sighting, where: PoseAtStamp) -> None:
         space = self._space

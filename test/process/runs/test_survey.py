@@ -172,21 +172,25 @@ def test_in_space_start_pose_and_survey_have_all_their_axes():
 SPACE = "id,x,y,z,sigma"
 
 
+def within(sigma, n):
+    """The covariance of a position that has one sigma along each axis."""
+    return tuple(map(tuple, (sigma * sigma * np.eye(n)).tolist()))
+
+
 def test_a_table_is_read_as_spreadsheets_write_it():
     text = 'id, x, y, z, sigma\r\n\r\n"door, left", 1.5, -2e0, 0.7, 0.05\r\ntag36h11:5,3,4,1,0.1\r\n'
     assert surveyed(text, 2) == {
-        "door, left": Surveyed((1.5, -2.0), 0.05),
-        "tag36h11:5": Surveyed((3.0, 4.0), 0.1),
+        "door, left": Surveyed((1.5, -2.0), within(0.05, 2)),
+        "tag36h11:5": Surveyed((3.0, 4.0), within(0.1, 2)),
     }
-    assert surveyed(text, 3)["tag36h11:5"] == Surveyed((3.0, 4.0, 1.0), 0.1)
+    assert surveyed(text, 3)["tag36h11:5"] == Surveyed((3.0, 4.0, 1.0), within(0.1, 3))
     assert surveyed("", 2) == {}
 
 
 @pytest.mark.parametrize(
     "text, dimensions, said",
     [
-        ("a,1,2,0.1\n", 2, "line 1: the header is 'a,1,2,0.1', not id,x,y,sigma or id,x,y,z,sigma"),
-        (table([("a", 1, 2, 0.1)]), 3, "line 1: the header is 'id,x,y,sigma', not id,x,y,z,sigma"),
+        (table([("a", 1, 2, 0.1)]), 3, "line 1: columns of a position: id,x,y, expected id,x,y,z"),
         (table([("a", 1, 2)]), 2, "line 2: 3 values, not id,x,y,sigma"),
         (table([("a", 1, 2, 0.1), ("b", 1, "2,5", 0.1)]), 2, "line 3: 5 values, not id,x,y,sigma"),
         (table([("a", "east", 2, 0.1)]), 2, "line 2: x 'east' is not a finite number"),
@@ -227,7 +231,7 @@ def test_a_file_is_read_at_the_border_and_named_where_it_is_wrong(tmp_path):
     with pytest.raises(ConfigError, match="has not been read"):
         GraphSlam(config)
     file.write_text("\ufeff" + table([("a", 1, 2, 0.1)]), encoding="utf-8")
-    assert with_survey(config).survey == {"a": Surveyed((1.0, 2.0), 0.1)}
+    assert with_survey(config).survey == {"a": Surveyed((1.0, 2.0), within(0.1, 2))}
     for text, said in ((table([("a", 1, 2, -1)]), "line 2: sigma -1 is not above 0"), ("", "no landmark in it")):
         file.write_text(text)
         with pytest.raises(ConfigError) as told:
