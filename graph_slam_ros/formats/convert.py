@@ -8,8 +8,9 @@ import numpy as np
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.dialects import LANDMARK_IDS_FROM, Text, from_g2o_words
+from graph_slam_ros.formats.edge_tags import tag_of
 from graph_slam_ros.formats.g2o_writer import graph_lines, weightless, write_text
-from graph_slam_ros.formats.graph_file import EDGE_TAGS, VERTEX_TAGS, G2oFile, Values
+from graph_slam_ros.formats.graph_file import VERTEX_TAGS, G2oFile, Values
 from graph_slam_ros.formats.strict import ending
 from graph_slam_ros.formats.tum import NS, tum_text
 from graph_slam_ros.graph import R2, SE2, SE3, Graph, VertexKind
@@ -55,7 +56,7 @@ def write_graph(path: Path, file: G2oFile, values: Values | None, target: str) -
     if target != "g2o":
         lines, missing = _translated(lines, Text(target, file.raw, _landmarks_from(file, target)))
     left_out = weightless(file.graph)
-    edges = file.graph.edge_count - left_out - sum(n for tag, n in missing.items() if tag in EDGE_TAGS)
+    edges = file.graph.edge_count - left_out - sum(missing[tag] for tag in set(map(tag_of, file.graph.tables)))
     if file.graph.edge_count and not edges:
         raise FormatError(f"{path}: {NAMES[target]} can say no edge of this graph")
     write_text(path, "\n".join(lines) + "\n")

@@ -12,12 +12,14 @@ import itertools
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from graph_slam_ros.errors import FormatError, NoiseError
 from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, in_g2o_words, may_be_roots
+from graph_slam_ros.formats.edge_tags import edge_of, plugin_tags
 from graph_slam_ros.formats.graph_file import AT_OFFSET, EDGE_TAGS, HALVED, OFFSET, VERTEX_TAGS, G2oFile, moved
 from graph_slam_ros.formats.strict import expect, integer, lines, numbers
 from graph_slam_ros.graph import (
@@ -75,6 +77,11 @@ class _Reader:
             raise FormatError(message)
         self.skipped.append(message)
 
+    @cached_property
+    def plugin_tags(self) -> frozenset[str]:
+        """Tags of plugins; looked up when the first tag comes that is not built in."""
+        return plugin_tags()
+
     def read_line(self, line: int, text: str) -> None:
         words = text.split()
         if not words or words[0].startswith("#"):
@@ -95,6 +102,8 @@ class _Reader:
                 if len(words) < 2:
                     raise FormatError("FIX names no vertex")
                 self.fixed += [(line, integer(word)) for word in words[1:]]
+            elif tag in self.plugin_tags:
+                self.edges.setdefault(tag, []).append(self._edge(line, tag, words))
             else:
                 self.unknown.append(text.strip())
         except FormatError as error:
@@ -114,7 +123,7 @@ class _Reader:
         self.offsets[integer(words[1])] = (x, y, z, q[0], q[1], q[2], q[3])
 
     def _edge(self, line: int, tag: str, words: list[str]) -> _Edge:
-        edge = EDGE_TAGS[tag]
+        edge = edge_of(tag)
         slots, m, from_offset = len(edge.accepts), edge.residual_size, tag in AT_OFFSET
         others, size = slots + from_offset + m * (m + 1) // 2, edge.measured_size
         if len(words) - 1 == others + size - len(edge.tail):
@@ -133,7 +142,7 @@ class _Reader:
         tags = {kind: tag for tag, kind in VERTEX_TAGS.items()}
         for tag, edges in self.edges.items():
             for edge in edges:
-                for vertex, accepted in zip(edge.vertices, EDGE_TAGS[tag].accepts, strict=True):
+                for vertex, accepted in zip(edge.vertices, edge_of(tag).accepts, strict=True):
                     kinds.setdefault(vertex, tags[accepted[0]])
         nowhere = {"VERTEX_SE3:QUAT": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
         for vertex in sorted(kinds):
@@ -150,7 +159,7 @@ class _Reader:
         follows = dict(itertools.pairwise(poses))
         seen_from: dict[int, int] = {}
         for tag, edges in self.edges.items():
-            edge_type = relative_pose if tag == "EDGE_SE2" else EDGE_TAGS[tag]
+            edge_type = relative_pose if tag == "EDGE_SE2" else edge_of(tag)
             for label, members in _by_label(tag, self._known(tag, edges), follows).items():
                 seen_from |= self._add(graph, edge_type, label, members, at)
         fixed = []
@@ -188,7 +197,7 @@ class _Reader:
     def _known(self, tag: str, edges: Sequence[_Edge]) -> Iterator[_Edge]:
         """Edges whose vertices exist and are of the right kind, and whose information is positive definite."""
         for edge in edges:
-            for file_id, kinds in zip(edge.vertices, EDGE_TAGS[tag].accepts, strict=True):
+            for file_id, kinds in zip(edge.vertices, edge_of(tag).accepts, strict=True):
                 declared = self.vertices.get(file_id)
                 if declared is None:
                     self.refuse(edge.line, f"edge to vertex {file_id}, which is not declared")
@@ -353,7 +362,7 @@ def _by_label(tag: str, edges: Iterable[_Edge], follows: dict[int, int]) -> dict
 def _usual_label(tag: str, edge: _Edge, follows: dict[int, int]) -> str:
     if tag in _RELATIVE:
         return "odometry" if follows.get(min(edge.vertices)) == max(edge.vertices) else "closures"
-    return "priors" if len(EDGE_TAGS[tag].accepts) == 1 else "landmarks"
+    return "priors" if len(edge_of(tag).accepts) == 1 else "landmarks"
 
 
 def _symmetric(upper: Array, size: int) -> Array:

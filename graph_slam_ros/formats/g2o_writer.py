@@ -9,9 +9,9 @@ import numpy as np
 
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import write_whole
+from graph_slam_ros.formats.edge_tags import tag_of
 from graph_slam_ros.formats.graph_file import (
     AT_OFFSET,
-    EDGE_TAGS,
     HALVED,
     OFFSET,
     VERTEX_TAGS,
@@ -20,7 +20,7 @@ from graph_slam_ros.formats.graph_file import (
     moved,
 )
 from graph_slam_ros.formats.strict import is_gzipped
-from graph_slam_ros.graph import INVERSE_RELATIVE_POSE, LANDMARK_POSITION_3D, POSE_PRIOR_3D, EdgeType, Graph
+from graph_slam_ros.graph import LANDMARK_POSITION_3D, POSE_PRIOR_3D, EdgeType, Graph
 from graph_slam_ros.lie import se3
 
 
@@ -87,10 +87,8 @@ def _vertex_lines(file: G2oFile, values: Values) -> list[str]:
 
 def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
     """Code of the label, id and line of each edge in the problem."""
-    tag_of_edge = {edge: tag for tag, edge in EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
     for edge_type, table in file.graph.tables.items():
-        if edge_type not in tag_of_edge:
-            raise FormatError(f"g2o has no tag for an edge {edge_type.name}")
+        tag = tag_of(edge_type)
         root, measured = table.sqrt_information.values, table.measured.values
         ids, labels, ends = (column.values.tolist() for column in (table.id, table.label, table.vertices))
         numbers = [file.seen_from.get(edge, 0) for edge in ids]
@@ -104,8 +102,8 @@ def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
             full /= np.outer(HALVED[edge_type], HALVED[edge_type])
         information = full[:, upper[0], upper[1]]
         for row in np.flatnonzero(table.weight.values != 0.0).tolist():
-            words = [tag_of_edge[edge_type], *(str(file.ids[v]) for v in ends[row])]
-            words += [str(numbers[row])] * (words[0] in AT_OFFSET)
+            words = [tag, *(str(file.ids[v]) for v in ends[row])]
+            words += [str(numbers[row])] * (tag in AT_OFFSET)
             words.append(_text([*_short(edge_type, measured[row].tolist()), *information[row].tolist()]))
             yield labels[row], ids[row], " ".join(words)
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from graph_slam_ros import plugins
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.measurements.reasons import REASONS
 from graph_slam_ros.measurements.types import Closure, Fix, Measured, Odometry, to_record
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark, sightings
 from graph_slam_ros.messages.inputs.source import InputContext, NotYet
+from graph_slam_ros.plugins import INPUTS, in_one_line, load, names
 
 _YIELDS: Mapping[str, type] = {"landmarks": ObservedLandmark, "fix": Fix, "closure": Closure, "odometry": Odometry}
 
@@ -51,7 +51,7 @@ def input_type(type_name: str) -> InputType | None:
         The plugin cannot be used.
     """
     if type_name not in _loaded:
-        found = plugins.load(plugins.INPUTS, type_name.replace("/", "."), _wrong)
+        found = load(INPUTS, type_name.replace("/", "."), _wrong)
         if found is None:
             return None
         _loaded[type_name] = found
@@ -69,13 +69,13 @@ def converters(type_name: str) -> Mapping[str, Callable[[InputContext, Any], Ite
 
 def types() -> set[str]:
     """Return the types that installed plugins have, usable or not."""
-    return {name.replace(".", "/") for name in plugins.names(plugins.INPUTS)}
+    return {name.replace(".", "/") for name in names(INPUTS)}
 
 
 def described(built_in: Iterable[str]) -> list[str]:
     """Return a line for each type that an installed plugin reads, and why it cannot be used where that is so."""
     lines = []
-    for name, distribution in sorted(plugins.names(plugins.INPUTS).items()):
+    for name, distribution in sorted(names(INPUTS).items()):
         type_name = name.replace(".", "/")
         if type_name in built_in:
             lines.append(f"{type_name}: the plugin of {distribution} is not used: the type is built in")
@@ -126,5 +126,5 @@ def _converted(
             raise
         raise PluginFault(f"{plugin} refuses a message: {' '.join(str(reason).split())}") from None
     except Exception as error:  # whatever another's function does
-        raise PluginFault(f"{plugin}: {plugins.in_one_line(error)}") from error
+        raise PluginFault(f"{plugin}: {in_one_line(error)}") from error
     return out

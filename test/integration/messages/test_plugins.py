@@ -2,11 +2,11 @@
 
 import re
 import sys
-from importlib import invalidate_caches
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from installed import installer
 from messages import STAMP_NS, odometry, pose, quaternion, recorded, transforms
 from places import ROOT
 from recordings import definition, write_mcap
@@ -30,24 +30,13 @@ SETTINGS = {"inputs.names": "odom radio", "radio": {"type": TYPE, "topic": "/rad
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Install a module as pip does: the file, and a .dist-info folder with its entry points."""
     monkeypatch.setattr(plugins, "_loaded", {})
-    modules = set(sys.modules)
+    with installer(tmp_path, monkeypatch) as put:
 
-    def installed(text, name=NAME, module="my_beacons", at="BEACONS", group="graph_slam_ros.inputs"):
-        site = tmp_path / f"site_{module}"
-        info = site / f"{module}-1.0.dist-info"
-        info.mkdir(parents=True)
-        (site / f"{module}.py").write_text(text)
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module.replace('_', '-')}\nVersion: 1.0\n")
-        (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {module}:{at}\n")
-        monkeypatch.syspath_prepend(str(site))
-        invalidate_caches()
+        def installed(text, name=NAME, module="my_beacons", at="BEACONS"):
+            return put(text, group=plugins.INPUTS, name=name, module=module, at=at)
 
-    yield installed
-    for name in set(sys.modules) - modules:
-        if name.startswith("my_"):
-            del sys.modules[name]
+        yield installed
 
 
 def recording(file, *, defined=True):

@@ -1,0 +1,99 @@
+"""Edge types of a package of its own: the example of the page in g2o files, and plugins that fail."""
+
+import re
+
+import pytest
+from installed import installer
+from places import ROOT
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.formats import edge_tags
+from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.graph import LANDMARK_POSITION
+
+PAGE = (ROOT / "docs/library.md").read_text()
+(EXAMPLE,) = re.findall(r"```python\n(import numpy as np\n.*?)check_edge\(tdoa\)", PAGE, re.DOTALL)
+(ENTRY,) = re.findall(r'\[project\.entry-points\."(.*)"\]\n(\w+) = "(\w+):(\w+)"', PAGE)
+LINES = ["EDGE_TDOA 0 1 2 -2.4 10000", "EDGE_TDOA 0 1 3 -3.6 10000", "EDGE_TDOA 0 1 4 -1.2 10000"]
+GRAPH = "\n".join(
+    [
+        "VERTEX_SE2 0 1 1 0",
+        *(f"VERTEX_XY {k} {x} {y}" for k, (x, y) in enumerate([(0, 0), (8, 0), (8, 6), (0, 6)], start=1)),
+        "FIX 1 2 3 4",
+        "EDGE_PRIOR_SE2 0 1 1 0 0.0123 0 0 0.0123 0 100",
+        *LINES,
+        "",
+    ]
+)
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    monkeypatch.setattr(edge_tags, "_loaded", {})
+    monkeypatch.setattr(edge_tags, "_tags", {})
+    with installer(tmp_path, monkeypatch) as put:
+        group, tag, module, at = ENTRY
+
+        def installed(text, name=tag, module=module):
+            return put(text, group=group, name=name, module=module, at=at)
+
+        yield installed
+
+
+@pytest.fixture
+def graph(tmp_path):
+    (tmp_path / "tdoa.g2o").write_text(GRAPH)
+    return tmp_path / "tdoa.g2o"
+
+
+def test_a_tag_of_a_plugin_is_read_solved_written_and_read_again(install, graph, tmp_path, capsys):
+    install(EXAMPLE)
+    solved = tmp_path / "solved.g2o"
+    assert main(["optimize", str(graph), "--out", str(solved)]) == 0, capsys.readouterr().err
+    assert "unknown" not in capsys.readouterr().err
+    (pose,) = [line.split() for line in solved.read_text().splitlines() if line.startswith("VERTEX_SE2")]
+    assert [float(x) for x in pose[2:4]] == pytest.approx([2.53, 2.12], abs=0.01)
+    again = [line.split() for line in solved.read_text().splitlines() if line.startswith("EDGE_TDOA")]
+    assert [[float(x) for x in words[1:]] for words in again] == [[float(x) for x in s.split()[1:]] for s in LINES]
+    file = read_g2o(solved)
+    (edge,) = [one for one in file.graph.tables if one.name == "difference of ranges"]
+    assert len(file.graph.tables[edge].id.values) == 3
+
+
+def test_an_edge_type_of_a_program_is_written_with_the_tag_of_its_plugin(install, monkeypatch):
+    install(EXAMPLE)
+    from my_tdoa import tdoa
+
+    assert edge_tags.tag_of(tdoa) == "EDGE_TDOA"
+
+
+def test_without_the_plugin_the_lines_are_named_and_no_part_of_the_graph(graph, capsys):
+    assert main(["optimize", str(graph)]) == 0
+    assert "3 lines with unknown tags kept as they are: EDGE_TDOA" in capsys.readouterr().err
+
+
+def test_a_built_in_tag_is_never_a_plugins(install):
+    install(EXAMPLE, name="EDGE_SE2_XY")
+    assert edge_tags.edge_of("EDGE_SE2_XY") is LANDMARK_POSITION
+    assert "EDGE_SE2_XY" not in edge_tags.plugin_tags()
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("import not_there", "cannot be loaded: ModuleNotFoundError: No module named 'not_there'"),
+        ("tdoa = 3", "it is a int, not an EdgeType"),
+        (
+            "from graph_slam_ros.graph import *\ntdoa = edge_from_residual('mine', (), 1, 1, len)",
+            "cannot be loaded: Graph",
+        ),
+        (EXAMPLE.replace("pose, one, other = values", "1 / 0"), "ZeroDivisionError: division by zero"),
+        (EXAMPLE.replace("    return [", "    return [1.0, 2.0, "), "ValueError: could not broadcast"),
+    ],
+)
+def test_a_plugin_that_cannot_be_used_or_raises_is_named_in_one_line(text, line, install, graph, capsys):
+    install(text)
+    assert main(["optimize", str(graph)]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "plugin my_tdoa:tdoa of my-tdoa 1.0" in said
+    assert line in said
