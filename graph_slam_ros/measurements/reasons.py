@@ -169,6 +169,11 @@ REASONS: dict[str, Reason] = {
         "a detection without identity may be of several landmarks, or of none",
         "landmarks.association=joint where it is nearest; else smaller noise, if the sensor is better than stated",
     ),
+    "surveyed_orientation_unused": Reason(
+        _NOTED,
+        "a landmark whose orientation was surveyed was first seen without one: its surveyed position alone is used",
+        "landmarks.orientation_known_below_rad; a detector that measures orientations",
+    ),
     "not_for_a_pose": Reason(
         _REFUSED, "a range or bearing to a landmark that is known as a pose", "INPUT.id_prefix: two identities"
     ),

@@ -155,10 +155,10 @@ class Landmarks:
             value = self._space.group.compose(self._pose(where), value)
         landmark = self.known[name] = Landmark(name, self._graph.add_vertex(kind, value), not s.id, not s.id)
         if name in self._survey:
-            self._hold(landmark, self._survey[name])
+            self._hold(topic, landmark, self._survey[name])
         self._add_edge(topic, landmark, s, where)
 
-    def _hold(self, landmark: Landmark, known: Surveyed) -> None:
+    def _hold(self, topic: str, landmark: Landmark, known: Surveyed) -> None:
         """A prior on what was surveyed; without a loss, what contradicts it is the sightings' fault."""
         space, vertices = self._space, [landmark.vertex]
         is_pose = self._graph.kind_of(landmark.vertex) is space.pose
@@ -166,6 +166,8 @@ class Landmarks:
             noise = Gaussian.from_covariance(space.in_tangent(known.pose, np.array(known.covariance)))
             self._graph.add_edge(space.pose_prior, vertices, known.pose, noise, "surveyed")
             return
+        if known.orientation:
+            self._counters.count(topic, "surveyed_orientation_unused")
         edge_type = space.fixes["position"] if is_pose else POINT_PRIOR[space.point]
         noise = Gaussian.from_covariance(known.position_covariance)
         self._graph.add_edge(edge_type, vertices, edge_type.whole(known.position), noise, "surveyed")

@@ -154,6 +154,7 @@ def test_of_a_tag_that_is_seen_without_its_orientation_the_surveyed_position_is_
     prior = slam.graph.tables[POINT_PRIOR[R2]]
     assert prior.measured.values.tolist() == [[2.0, 1.0]]
     assert prior.sqrt_information.values[0] == pytest.approx(10.0 * np.eye(2))
+    assert slam.counters.as_dict()["tags"]["surveyed_orientation_unused"] == 1, "it is not silent"
 
 
 # -- runs -------------------------------------------------------------------------------------------------------------
