@@ -4,13 +4,13 @@
 # demo          install, then the demonstration
 # check         style, types and the unit tests, in two minutes: after each change; no process, no ROS
 # test          install, then style, types and all tests; some of them: TESTS='-m "not process"', -m integration, a file
-# soak          what takes too long for every test run: up to three hours, resumed where it was; ONLY=name,name
+# soak          the tests that take too long for every run: up to three hours, resumed where it was; ONLY=name,name
 # colcon        build and test as ROS does, in a scratch folder; colcon goes into .venv-colcon; TESTS=, too
 # test-oldest   the tests without ROS, in .venv-oldest with the lowest versions that setup.py allows
-# lint, format  style and types: tell, mend
+# lint, format  check style and types; correct the style
 # lock          write requirements.txt and constraints-oldest.txt from setup.py; LOCK=--upgrade takes newer versions
 # bench         measure ours against GTSAM, g2o and python-graphslam into docs/benchmarks.md and accuracy.md; hours
-# robust        how ours and peers bear false closures and wrong ids, into docs/robustness.md; two hours, resumed where it was
+# robust        measure ours and GTSAM with false closures and wrong ids, into docs/robustness.md; two hours, resumed where it was
 # clean         remove what these made
 
 PYTHON ?= python3

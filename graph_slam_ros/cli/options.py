@@ -104,8 +104,8 @@ def optimize(sub: CommandParser) -> None:
         "--init",
         choices=("auto", "file", "tree", "chordal", "online"),
         default="auto",
-        help="initial estimate; auto: the file (tree without vertices), and if the result is suspicious chordal and"
-        " then online (pose after pose) as well, of which the best is taken",
+        help="initial estimate; auto: the values of the file (without vertices: tree); if the result is suspicious,"
+        " chordal and then online (pose by pose) are tried, and the best result is used",
     )
     sub.add_argument(
         "--error-map",

@@ -25,7 +25,7 @@ _HALFWAY = "when, as a part of the whole: 0 the first pose, 1 the last"
 
 @dataclass(frozen=True, slots=True)
 class FalseClosures:
-    """Closures between places that are not one; a draw that agrees with the truth is not used."""
+    """Closures between different places; one that agrees with the truth is drawn again."""
 
     policy: str = option("random", "which poses, see ``false_closures``", choices=POLICIES)
     rate: float = option(0.3, "false of all closures", "", 0, 0.99)
@@ -35,7 +35,7 @@ class FalseClosures:
 
 @dataclass(frozen=True, slots=True)
 class WrongIds:
-    """Sightings that carry the id of another landmark, of one that is not in the same message where there is one."""
+    """Sightings with the id of another landmark, if possible one that is not in the same message."""
 
     rate: float = option(0.05, "of all sightings", "", 0, 1)
 
@@ -50,7 +50,7 @@ class SwappedIds:
 
 @dataclass(frozen=True, slots=True)
 class ReusedIds:
-    """Pairs of landmarks of which both carry the id of the first."""
+    """Pairs of landmarks that both have the id of the first."""
 
     pairs: int = option(1, "how many", "", 1, 1e4)
 
@@ -83,7 +83,7 @@ class Slip:
 
 @dataclass(frozen=True, slots=True)
 class Carried:
-    """A robot that is carried along its way, its wheels in the air: odometry stands still, its sensors see on."""
+    """A robot that is carried along its way: odometry stands still, its sensors still measure."""
 
     at: float = option(0.5, _HALFWAY, "", 0, 1)
     distance_m: float = option(10.0, "how far from where it was lifted it is set down, at least", "m", 1e-3, 1e5)

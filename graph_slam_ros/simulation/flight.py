@@ -45,7 +45,7 @@ class Flight:
     laps: int = option(3, "how often around", "", 1, 1000)
     length_m: float = option(22.0, "length of the hall", "m", 12, 1000)
     width_m: float = option(16.0, "width of the hall", "m", 12, 1000)
-    sensor: str = option("pose", "what it says of a tag", choices=("pose", *KINDS))
+    sensor: str = option("pose", "what the sensor measures of a tag", choices=("pose", *KINDS))
     beacons: int = option(0, "points under the roof whose position is seen besides, in range and in view", "", 0, 1000)
     sigma_forward_m_s: float = option(0.05, "error of the measured speed ahead", "m/s", 1e-6, 1)
     sigma_sideways_m_s: float = option(0.03, "error of the measured speed to the left", "m/s", 1e-6, 1)

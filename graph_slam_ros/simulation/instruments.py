@@ -34,7 +34,7 @@ class Instruments:
     gnss: float = option(0.0, "fixes of a satellite receiver, on /gps/fix; 0: there is none", "Hz", 0, 100)
     gnss_sigma_m: float = option(0.3, "error of a fix east and north; twice that upwards", "m", 1e-3, 100)
     gnss_correlation_s: float = option(2.0, "how long such an error lasts (1/e)", "s", 0, 1e4)
-    gnss_outage_s: float = option(0.0, "in the middle of the drive, it says for so long that it has no fix", "s", 0)
+    gnss_outage_s: float = option(0.0, "time without a fix, in the middle of the drive", "s", 0)
     gnss_tf: bool = option(True, "whether /tf_static says where the antenna is: 0.3 m ahead, 0.1 left, 0.8 up")
     imu: float = option(0.0, "messages of an IMU with orientation, on /imu/data; 0: there is none", "Hz", 0, 1000)
     imu_sigma_rad: float = option(0.02, "error of its roll, pitch and heading", "rad", 1e-6, 1)

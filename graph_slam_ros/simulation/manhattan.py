@@ -27,7 +27,7 @@ class Manhattan:
     """Options: blocks of 4 m; the robot drives 1 m a step and chooses its way at every crossing."""
 
     poses: int = option(500, "steps to drive, 1 m each", "", 1, 1e6)
-    sensor: str = option("position", "what it says of a landmark", choices=KINDS)
+    sensor: str = option("position", "what the sensor measures of a landmark", choices=KINDS)
     blocks: int = option(60, "the city is this many blocks wide and deep", "", 1, 1000)
     sigma_speed_m_s: float = option(0.05, "error of the measured speed", "m/s", 1e-6, 1)
     sigma_sideways_m_s: float = option(0.01, "speed of slipping sideways", "m/s", 1e-6, 1)

@@ -25,7 +25,7 @@ class PythonRobotics:
     """Options: 1 m/s and 0.1 rad/s in ticks of 2 s, everything within 30 m seen at every tick."""
 
     poses: int = option(50, "ticks to drive, 2 s each", "", 1, 1e6)
-    sensor: str = option("position", "what it says of a landmark", choices=KINDS)
+    sensor: str = option("position", "what the sensor measures of a landmark", choices=KINDS)
     as_original: bool = option(False, "squared noise as the original has it: 0.01 m/s, 0.03 rad/s, 0.04 m, 3e-4 rad")
 
 

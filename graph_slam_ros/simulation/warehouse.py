@@ -40,7 +40,7 @@ class Warehouse:
     laps: int = option(
         2, "how often all aisles are driven; with an odd number of them, from the other end each time", "", 1, 1000
     )
-    sensor: str = option("pose", "what it says of a tag", choices=("pose", *KINDS))
+    sensor: str = option("pose", "what the sensor measures of a tag", choices=("pose", *KINDS))
     sigma_speed_m_s: float = option(0.05, "error of the measured speed", "m/s", 1e-6, 1)
     sigma_sideways_m_s: float = option(0.01, "speed of slipping sideways", "m/s", 1e-6, 1)
     sigma_turn_rad_s: float = option(0.05, "error of the measured turning speed", "rad/s", 1e-6, 1)
