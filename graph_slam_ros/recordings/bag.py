@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
-from rosbags.typesys import get_types_from_msg
+from rosbags.typesys.store import Typestore
 
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats.durable import AppendedFile
@@ -22,12 +22,10 @@ from graph_slam_ros.formats.files import opened
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings import mcap_records, ros1_records, sqlite_records
 from graph_slam_ros.recordings.decompression import ZSTD_MAGIC, zstd_message
+from graph_slam_ros.recordings.recorded_types import ros1_store
 
 _SUFFIXES = (".mcap", ".db3", ".bag", ".bag.active", ".mcap.zstd", ".db3.zstd")
 _PACKED = {b"\x1f\x8b": "gzip", ZSTD_MAGIC: "zstd", b"BZh": "bzip2", b"\x04\x22\x4d\x18": "lz4"}
-_OF_ROS1 = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")  # words of its language
-MOST_TEXT = 2**16
-"""Of a recorded definition; rosbags' parser takes a minute for two megabytes of blank lines."""
 _WINDOW_BYTES, _OVERHEAD = 64 * 2**20, 256
 
 
@@ -239,7 +237,7 @@ class _SqlitePart:
 
 
 class _Ros1Part:
-    """A ROS 1 bag; messages are turned into CDR where their type is ours."""
+    """A ROS 1 bag; messages are turned into CDR where what their type holds of ours is as ours."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -247,17 +245,18 @@ class _Ros1Part:
         if not found.connections:
             raise BagError(f"{file}: no topic in it{' that is whole; ' + found.lost if found.lost else ''}")
         self.first_ns = found.first_ns
-        self._is_ours: dict[str, bool] = {}
+        self._stores: dict[str, Typestore | None] = {}
         by_name: dict[str, Topic] = {}
         for number, connection in found.connections.items():
             count = found.counts.get(number, 0) + (
                 by_name[connection.topic].count if connection.topic in by_name else 0
             )
             type_name = connection.type.replace("/", "/msg/")
-            if type_name not in self._is_ours:
-                self._is_ours[type_name] = _is_ours(type_name, connection.definition)
-            encoding = "cdr" if self._is_ours[type_name] else "ros1"
-            by_name[connection.topic] = Topic(connection.topic, type_name, count, encoding=encoding)
+            if type_name not in self._stores:
+                self._stores[type_name] = ros1_store(type_name, connection.definition)
+            store = self._stores[type_name]
+            text = store.generate_msgdef(type_name, ros_version=2)[0] if store and store is not typestore() else ""
+            by_name[connection.topic] = Topic(connection.topic, type_name, count, text, "cdr" if store else "ros1")
         self.topics = list(by_name.values())
 
     def messages(self, topics: Collection[str], losses: list[str], warnings: list[str]) -> Iterator[BagMessage]:
@@ -268,36 +267,15 @@ class _Ros1Part:
             if type_name is None:
                 continue
             cdr = message.data
-            if self._is_ours[type_name]:
+            if store := self._stores[type_name]:
                 try:
-                    cdr = bytes(typestore().ros1_to_cdr(cdr, type_name))
+                    cdr = bytes(store.ros1_to_cdr(cdr, type_name))
                 except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors
                     damaged += 1
                     continue
             yield BagMessage(message.topic, message.log_ns, cdr)
         if damaged:
             losses.append(f"{self.file.name}: {damaged} of its messages are not what their types say")
-
-
-def _is_ours(type_name: str, definition: str) -> bool:
-    """Return whether a recorded ROS 1 type, and all it is made of, has our fields (a header's ``seq`` aside)."""
-    if len(definition) > MOST_TEXT:
-        return False
-    try:
-        recorded = get_types_from_msg(definition, type_name)
-    except Exception:  # rosbags' parser raises errors of its own grammar library
-        return False
-    ours = typestore().fielddefs
-
-    def same(name: str) -> bool:
-        if name in _OF_ROS1:
-            return True
-        if name not in recorded or name not in ours:
-            return False
-        theirs = [field for field in recorded[name][1] if field[0] != "seq"]
-        return theirs == list(ours[name][1]) and all(map(same, set(re.findall(r"\w+/msg/\w+", repr(theirs)))))
-
-    return same(type_name)
 
 
 # By how a file begins. rosbags reads whole files alone, and of a damaged one nothing.

@@ -1,19 +1,15 @@
 """Recorded message definitions: a bag is decoded by what it says of itself, if that has what we need."""
 
 from dataclasses import replace
-from typing import Any
 
-from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
+from rosbags.typesys import get_types_from_msg
 
 from graph_slam_ros.messages.from_msg import Decoder, decoder
 from graph_slam_ros.messages.inputs.landmark_types import fields_used
 from graph_slam_ros.messages.inputs.plugins import input_type
 from graph_slam_ros.messages.interfaces import typestore
-from graph_slam_ros.recordings.bag import MOST_TEXT, BagError, Topic
-
-_MOST_VALUES = 10_000
+from graph_slam_ros.recordings.bag import BagError, Topic
+from graph_slam_ros.recordings.recorded_types import MOST_TEXT, MOST_VALUES, has_too_many_values, store_with
 
 _NEEDED = {
     "nav_msgs/msg/Odometry": "header child_frame_id pose twist",
@@ -86,31 +82,7 @@ def _by_definition(topic: Topic, whose: str) -> Decoder:
                 raise BagError(f"topic {topic.name}: {name} of this recording has no field {field!r}")
             if there[field] != known[field]:
                 raise BagError(f"topic {topic.name}: field {field!r} of {name} has another type in this recording")
-    if not _length({**ours, **recorded}, topic.type, {}) <= _MOST_VALUES:
-        raise BagError(f"topic {topic.name}: {whose} {topic.type} has more than {_MOST_VALUES} values")
-    store = _store(recorded)
+    if has_too_many_values(recorded, topic.type):
+        raise BagError(f"topic {topic.name}: {whose} {topic.type} has more than {MOST_VALUES} values")
+    store = store_with(recorded)
     return lambda cdr: store.deserialize_cdr(cdr, topic.type)
-
-
-def _length(types: Any, name: str, known: dict[str, float]) -> float:
-    """Return how many values a message has at least, each sequence with one: rosbags' decoder is as long as that."""
-    known[name] = float("inf")  # of a type that holds itself, there is no end
-    total = 0.0
-    for _, (kind, of) in types[name][1]:
-        count = 1
-        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            (inner, of), count = of[0], of[1] if kind == Nodetype.ARRAY else 1
-            kind, count = inner, count if inner == Nodetype.NAME else 1
-        if kind == Nodetype.NAME and of in types:
-            total += count * (known[of] if of in known else _length(types, of, known))
-        else:
-            total += 1
-    known[name] = total
-    return total
-
-
-def _store(recorded: Any) -> Typestore:
-    store = get_typestore(Stores.EMPTY)
-    basic = {name: fields for name, fields in typestore().fielddefs.items() if name not in recorded}
-    store.register({**basic, **recorded})
-    return store

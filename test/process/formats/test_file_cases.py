@@ -47,6 +47,7 @@ from graph_slam_ros.optimization import optimize
 from graph_slam_ros.recordings import mcap_records
 from graph_slam_ros.recordings.bag import BagError, Topic, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
+from graph_slam_ros.recordings.recorded_types import ros1_store
 from graph_slam_ros.runs.replay import choose_inputs, replay
 from graph_slam_ros.slam import Config
 
@@ -326,6 +327,15 @@ def test_F11_a_schema_that_would_take_for_ever_is_refused_at_once(tmp_path, mess
     begun = time.process_time()
     with pytest.raises(BagError, match=f"topic /odom: the recorded .*{complaint}"):
         replay_with(tmp_path, messages, text=lambda name: text if name == ODOMETRY else definition(name))
+    assert time.process_time() - begun < 5.0
+
+
+@pytest.mark.parametrize("kind", ENDLESS)
+def test_F11_a_definition_of_ros_1_that_would_take_for_ever_is_not_used(kind):
+    fiducials = "fiducial_msgs/msg/FiducialTransformArray"
+    assert ros1_store(fiducials, definition(ODOMETRY)) is not None
+    begun = time.process_time()
+    assert ros1_store(fiducials, ENDLESS[kind][0].replace("nav_msgs/Odometry again", f"{fiducials} again")) is None
     assert time.process_time() - begun < 5.0
 
 
