@@ -13,7 +13,7 @@ from graph_slam_ros.formats.g2o_writer import g2o_text
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.messages import results
-from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.messages.inputs import recorded_uses
 from graph_slam_ros.runs.folder import COVARIANCES, GRAPH, LANDMARKS, ODOMETRY, PATH, PATH_ODOMETRY, SIGHTINGS, VERTICES
 from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, changes_text, ledger_text
 from graph_slam_ros.slam import Counters, GraphSlam
@@ -82,7 +82,8 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     ----------
     counters : those of the pipeline, of what stands before it, and of an earlier part of the run
     """
-    used_as = dict.fromkeys(slam.odometry_sources, "odometry") | uses(slam.config)  # a source need not be an input
+    odometries = dict.fromkeys(slam.odometry_sources, "odometry")  # a source need not be an input
+    used_as = odometries | recorded_uses(slam.config)
     is_of_map = not slam.counters.used  # nothing was measured since: a run that is written from its map
     begins = 0 if is_of_map or not slam.drives else slam.keyframes[slam.drives[-1]].vertex
     accepted = _accepted_by_input(slam, begins)

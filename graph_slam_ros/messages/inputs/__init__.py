@@ -5,6 +5,7 @@ message is refused, and ``NotYet`` where it is to be tried again when /tf has to
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from difflib import get_close_matches
 from typing import Any
 
@@ -28,6 +29,7 @@ __all__ = [
     "ObservedLandmark",
     "converters",
     "known_types",
+    "recorded_uses",
     "uses",
 ]
 
@@ -89,6 +91,15 @@ def uses(config: Config) -> dict[str, str]:
     out = {settings.name: _use(settings) for settings in config.sources if settings.use != "none"}
     if "odometry" not in out.values():
         raise ConfigError(f"inputs.names: none of {config.inputs.names!r} is used as odometry")
+    return out
+
+
+def recorded_uses(config: Config) -> dict[str, str]:
+    """Return what each input of a recorded run was used as, without those whose plugin is not installed here."""
+    out = {}
+    for settings in config.sources:
+        with suppress(ConfigError):
+            out[settings.name] = "" if settings.use == "none" else _use(settings)
     return out
 
 

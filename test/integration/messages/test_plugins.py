@@ -4,27 +4,21 @@ import re
 import sys
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
+from beacons import BEACONS, TYPE, recording
 from installed import installer
-from messages import STAMP_NS, odometry, pose, quaternion, recorded, transforms
 from places import ROOT
-from recordings import definition, write_mcap
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.lie import se2
 from graph_slam_ros.messages.inputs import converters, plugins
-from graph_slam_ros.messages.to_msg import header
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
 
-TYPE, NAME = "my_msgs/msg/Beacons", "my_msgs.msg.Beacons"
+NAME = TYPE.replace("/", ".")
 PAGE = (ROOT / "docs/inputs.md").read_text()
 (EXAMPLE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 (POINTS,) = re.findall(r'\[project\.entry-points\."(graph_slam_ros\.inputs)"\]\n"(.*)" = "(.*)"', PAGE)
-DEFINITION = "std_msgs/Header header\nstring[] names\nfloat64[] ranges\n"
-BEACONS = {"north": (2.0, 5.0), "south": (3.0, -4.0), "east": (9.0, 1.0)}
 SETTINGS = {"inputs.names": "odom radio", "radio": {"type": TYPE, "topic": "/radio", "sigma_m": 0.05}}
 
 
@@ -37,27 +31,6 @@ def install(tmp_path, monkeypatch):
             return put(text, group=plugins.INPUTS, name=name, module=module, at=at)
 
         yield installed
-
-
-def recording(file, *, defined=True):
-    """A circle among beacons, whose messages no built-in type has."""
-    _, _, encoded = recorded(TYPE, DEFINITION)
-    truth, sent = se2.IDENTITY, [("/tf_static", STAMP_NS, transforms())]
-    for k in range(150):
-        stamp_ns = STAMP_NS + k * 10**8
-        sent.append(("/odom", stamp_ns, odometry(pose(*truth[:2], 0.0, quaternion(yaw=truth[2])), stamp_ns=stamp_ns)))
-        ranges = np.array([np.hypot(*se2.act(se2.inverse(truth), at)) for at in BEACONS.values()])
-        cdr = encoded(header=header(stamp_ns, "base_link"), names=list(BEACONS), ranges=ranges)
-        sent.append(("/radio", stamp_ns, cdr))
-        truth = se2.compose(truth, (0.1, 0.0, 0.03))
-    types = {"/odom": "nav_msgs/msg/Odometry", "/radio": TYPE, "/tf_static": "tf2_msgs/msg/TFMessage"}
-    text = DEFINITION if defined else ""
-    return write_mcap(
-        file,
-        [type("Sent", (), {"topic": t, "log_ns": s, "cdr": c}) for t, s, c in sent],
-        types=types,
-        text=lambda type_name: text if type_name == TYPE else definition(type_name),
-    )
 
 
 @pytest.mark.parametrize("defined", [True, False])
@@ -161,3 +134,15 @@ def test_a_measurement_that_the_journal_cannot_keep_or_of_another_input_is_a_fau
         )
         with pytest.raises(plugins.PluginFault, match=line):
             converters(f"my_msgs/msg/{name}")["fix"](SimpleNamespace(name="radio"), None)
+
+
+def test_a_run_is_repeated_and_recovered_where_its_plugin_is_not_installed_any_more(install, tmp_path, monkeypatch):
+    site = install(EXAMPLE)
+    replay(recording(tmp_path / "a.mcap"), tmp_path / "run", Config.from_mapping(SETTINGS))
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path != str(site)])
+    monkeypatch.setattr(plugins, "_loaded", {})
+    assert converters(TYPE) is None
+    assert main(["replay", str(tmp_path / "run"), "--out", str(tmp_path / "again")]) == 0
+    for name in ("graph.g2o", "path.tum", "landmarks.csv"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+    assert main(["recover", str(tmp_path / "run"), "--out", str(tmp_path / "recovered")]) == 0
