@@ -7,7 +7,7 @@ import numpy as np
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.survey import Surveyed
-from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.errors import ConfigError, NoiseError
 from graph_slam_ros.graph import POINT_PRIOR, R1, Gaussian, VertexKind
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import LEAST_RAD2, edge_noise
@@ -97,6 +97,9 @@ class Landmarks:
         if config.landmarks.surveyed_file and not config.landmarks.surveyed:
             raise ConfigError(f"landmarks.surveyed_file: {config.landmarks.surveyed_file} has not been read")
         self._survey = config.survey
+        for name, known in self._survey.items():
+            if known.orientation:
+                self._noise_of_pose(name, known)
         self.offsets: dict[str, int] = {}
         self.touched: list[str] = []
 
@@ -163,7 +166,7 @@ class Landmarks:
         space, vertices = self._space, [landmark.vertex]
         is_pose = self._graph.kind_of(landmark.vertex) is space.pose
         if is_pose and known.orientation:
-            noise = Gaussian.from_covariance(space.in_tangent(known.pose, np.array(known.covariance)))
+            noise = self._noise_of_pose(landmark.name, known)
             self._graph.add_edge(space.pose_prior, vertices, known.pose, noise, "surveyed")
             return
         if known.orientation:
@@ -171,6 +174,13 @@ class Landmarks:
         edge_type = space.fixes["position"] if is_pose else POINT_PRIOR[space.point]
         noise = Gaussian.from_covariance(known.position_covariance)
         self._graph.add_edge(edge_type, vertices, edge_type.whole(known.position), noise, "surveyed")
+
+    def _noise_of_pose(self, name: str, known: Surveyed) -> Gaussian:
+        try:
+            return Gaussian.from_covariance(self._space.in_tangent(known.pose, np.array(known.covariance)))
+        except NoiseError:
+            why = "the sigmas of its axes differ too much, expected less than 1e7 times"
+            raise ConfigError(f"landmarks.surveyed: {name!r}: {why}") from None
 
     def _add_edge(self, topic: str, landmark: Landmark, s: Sighting, where: PoseAtStamp) -> None:
         space = self._space

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.graph import POINT_PRIOR, R2
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.runs.replay import replay
@@ -155,6 +156,13 @@ def test_of_a_tag_that_is_seen_without_its_orientation_the_surveyed_position_is_
     assert prior.measured.values.tolist() == [[2.0, 1.0]]
     assert prior.sqrt_information.values[0] == pytest.approx(10.0 * np.eye(2))
     assert slam.counters.as_dict()["tags"]["surveyed_orientation_unused"] == 1, "it is not silent"
+
+
+def test_sigmas_that_leave_no_covariance_once_turned_are_refused_at_the_start():
+    text = "id,x,y,sigma_x,sigma_y,yaw,sigma_yaw\nb,2,1,1e3,1e-3,0.7,0.01\na,2,1,{},1e-6,0.7,0.01"
+    GraphSlam(Config.from_mapping({"landmarks.surveyed": text.format("0.1")}))
+    with pytest.raises(ConfigError, match=r"^landmarks\.surveyed: 'a': the sigmas of its axes differ too much"):
+        GraphSlam(Config.from_mapping({"landmarks.surveyed": text.format("1e3")}))
 
 
 # -- runs -------------------------------------------------------------------------------------------------------------
