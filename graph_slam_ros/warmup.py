@@ -287,6 +287,8 @@ def _compile_plane() -> None:
 
 def _make(kernels: list[_Kernel]) -> None:
     """Compile kernels, or load them."""
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        return
     for kernel, given in kernels:
         kernel.compile(given)
 

@@ -12,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import AppendedFile, write_whole
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.measurements.types import to_record
@@ -331,7 +332,9 @@ def save_results(
 
     files = {name: put(name, text) for name, text in result_texts(slam).items()}
     contents = {"format": MARK} | summarize(slam) | summary | {"format": MARK, "files": files}
-    contents["noise"] = [asdict(one) for one in slam.noise_scale()] if slam.is_solved else []
+    contents["noise"] = []
+    with contextlib.suppress(GraphSlamError):  # what cannot be said of a singular map must not cost its results
+        contents["noise"] = [asdict(one) for one in slam.noise_scale()] if slam.is_solved else []
     put(SUMMARY, json.dumps(contents, indent=2) + "\n")
 
 

@@ -202,7 +202,8 @@ class Backend:
         """The scale of the noise at the present estimate; nothing is changed."""
         stamps = np.zeros(self.graph.vertex_count, dtype=np.int64)
         stamps[keyframes.ids] = keyframes.stamps_ns
-        return estimate_noise(self.graph, self.solver, self.noise.factors, stamps, self._first_free_edge)
+        edges = range(self._first_free_edge, self.handed_over[1])
+        return estimate_noise(self.graph, self.solver, self.noise.factors, stamps, edges)
 
     @property
     def _first_free_edge(self) -> int:

@@ -52,7 +52,7 @@ class FailureGuard:
     def solve(self, work: Callable[[], Result], keyframe: int) -> Result | None:
         """Solve by ``work`` and return its result; None where it fails, or gives what cannot be."""
         try:
-            return self._done(work)
+            return self._done(lambda: self._damped(work))
         except Exception as error:
             self._fail(error)
         if self._in_a_row == 1 or self._in_a_row.bit_count() > 1:  # then at 2, 4, 8, ...: it costs some solves
@@ -77,6 +77,17 @@ class FailureGuard:
         self._solver.start_at(self._last_good())
         with suppress(Exception):  # e.g. no memory for it: the estimate is good without
             self._solver.rebuild()
+
+    def _damped(self, work: Callable[[], Result]) -> Result:
+        """Work; where its steps overshoot since much turns, once more from a damped solve of everything."""
+        done = work()
+        try:
+            self._refuse_absurd()
+        except DivergedError:
+            self.go_back()
+            self._solver.optimize()
+            done = work()
+        return done
 
     def _done(self, work: Callable[[], Result]) -> Result:
         done = work()

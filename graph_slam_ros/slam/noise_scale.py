@@ -80,7 +80,7 @@ class _Sums:
 
 
 def estimate_noise(
-    graph: Graph, solver: Solver, factors: Mapping[Key, float], stamp_of: Index, first_edge: int = 0
+    graph: Graph, solver: Solver, factors: Mapping[Key, float], stamp_of: Index, edges: range
 ) -> list[NoiseScale]:
     """Estimate the noise of each group of residuals at the solver's estimate.
 
@@ -88,7 +88,7 @@ def estimate_noise(
     ----------
     factors : of the configured sigmas, that the graph's edges have now
     stamp_of : (vertices,) nanoseconds of each pose, 0 elsewhere
-    first_edge : edges before it are left out
+    edges : that are looked at, by their ids; the solver has them
 
     Raises
     ------
@@ -99,7 +99,7 @@ def estimate_noise(
         solver.update()  # covariances are of all there is: so must be the values
     sums: dict[Key, _Sums] = {}
     values, losses = solver.values, Losses(graph, solver.settings.stages()[-1])
-    for table, every, label, source in groups(graph, range(first_edge, graph.edge_count)):
+    for table, every, label, source in groups(graph, edges):
         rows = every[table.weight.values[every] > 0.0]
         if len(rows):
             block = _Block(table, rows, label, solver, values, losses)

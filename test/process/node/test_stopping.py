@@ -48,7 +48,7 @@ def stopped_with_a_backlog(folder, number=signal.SIGTERM):
 
         def press(seconds):
             """Go on, with solves of everything in between: of requests a busy node takes only some."""
-            for _ in range(20):
+            for _ in range(4):
                 r.ask("optimize")
             drive.go(r, 5)
             r.spin(seconds)

@@ -63,7 +63,7 @@ def converged(graph, stamps):
     solver.add(np.arange(graph.vertex_count), np.arange(graph.edge_count))
     for _ in range(8):
         solver.optimize()
-        found = estimate_noise(graph, solver, scales.factors, stamps)
+        found = estimate_noise(graph, solver, scales.factors, stamps, range(graph.edge_count))
         scales.change({one.key: one.factor for one in found if not one.reason}, 0)
         solver.rebuild()
     return {one.key: one for one in found}
@@ -93,7 +93,7 @@ def test_what_says_too_little_keeps_its_noise_and_says_why():
     solver = Solver(graph)
     solver.add(np.arange(graph.vertex_count), np.arange(graph.edge_count))
     solver.optimize()
-    found = estimate_noise(graph, solver, {}, stamps)
+    found = estimate_noise(graph, solver, {}, stamps, range(graph.edge_count))
     assert {one.factor for one in found} == {1.0}
     assert all("degrees of freedom, fewer than 200" in one.reason for one in found)
 
@@ -104,7 +104,7 @@ def test_smaller_sigmas_are_not_believed_without_passes():
     solver = Solver(graph)
     solver.add(np.arange(graph.vertex_count), np.arange(graph.edge_count))
     solver.optimize()
-    far_apart = {one.key: one for one in estimate_noise(graph, solver, {}, stamps * 1000)}
+    far_apart = {one.key: one for one in estimate_noise(graph, solver, {}, stamps * 1000, range(graph.edge_count))}
     assert "passes by landmarks" in far_apart[RANGE].reason
     assert far_apart[RANGE].factor == 1.0
 
