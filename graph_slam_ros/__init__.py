@@ -1,7 +1,7 @@
-"""Online pose-graph SLAM for robots that bring their own odometry and landmark sightings.
+"""Online pose-graph SLAM for robots with odometry and observations of landmarks.
 
-Names are imported when they are first used, so that ``import graph_slam_ros`` costs nothing and none of them needs ROS.
-Kinds of vertices, edge types and losses are in ``graph_slam_ros.graph``.
+No name here needs ROS. Each is imported when it is first used, so ``import graph_slam_ros`` is fast. Vertex types, edge
+types and losses are in ``graph_slam_ros.graph``.
 """
 
 __version__ = "0.1.0"

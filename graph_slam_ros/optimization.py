@@ -1,4 +1,4 @@
-"""A whole graph solved in one call: where it starts, what holds it, and what came out."""
+"""Solve a whole graph in one call: initial values, gauge, solution."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,8 +27,8 @@ class Attempt:
     Attributes
     ----------
     start : ``file``, ``tree``, ``chordal`` or ``online``
-    chi2, cost : of the result; NaN where there is none
-    failure : why there is none; empty where there is one
+    chi2, cost : of the result; NaN if there is none
+    failure : the reason if there is no result; else empty
     """
 
     start: str
@@ -43,12 +43,12 @@ class Solution:
 
     Attributes
     ----------
-    file : the graph, and what a file says of it: ``write_g2o(path, solution.file, solution.solver.estimate)``
-    solver : has the estimates and marginals of all vertices, by their ids in the graph
-    report : how it went, and why it stopped
-    start : where the initial values were from: ``file``, ``tree``, ``chordal`` or ``online``
-    suspicion : why the first result may be a local minimum, so that other starts were tried; empty where it was not
-    attempts : all starts that were tried, in order; the one with the least cost is this solution
+    file : the graph with the ids of its file, for ``write_g2o(path, solution.file, solution.solver.estimate)``
+    solver : the solver; it has estimates and marginals of all vertices, by their ids in the graph
+    report : iterations, chi2, and why the solve stopped
+    start : origin of the initial values: ``file``, ``tree``, ``chordal`` or ``online``
+    suspicion : why the first result may be a local minimum, so that other starts were tried; empty if it is good
+    attempts : all starts that were tried, in order; this solution is the one with the lowest cost
     """
 
     file: G2oFile
@@ -75,24 +75,26 @@ class Solution:
 
 
 def optimize(source: Graph | G2oFile | Path | str, settings: Settings | None = None, *, init: str = "auto") -> Solution:
-    """Solve a whole graph: of a file, as read from one, or made by hand.
+    """Solve a whole graph: that of a file, or one that was built by a program.
 
-    What FIX lines name is held; where there are none, and priors do not fix both position and heading, the first pose
-    is.
+    Vertices in FIX lines are held. If there are none, and priors do not fix both position and heading, the first pose
+    is held.
 
     Parameters
     ----------
-    init : where to start: ``file`` (initial values as they are; the tree where a file has none), ``tree`` (poses
-        composed along a spanning tree), ``chordal``, or ``online`` (pose after pose, in order of id). Without
-        poses it is always the first. ``auto``: from the file, and where the result is suspicious also from
-        ``chordal`` and then ``online``; the least cost wins
+    source : a graph, the path of a g2o file, or the result of ``read_g2o``
+    settings : settings of the solver
+    init : initial values. ``file``: those of the file (``tree`` if it has none). ``tree``: poses composed along a
+        spanning tree. ``chordal``: the chordal relaxation. ``online``: pose by pose, in order of id. A graph without
+        poses always starts from ``file``. ``auto``: from ``file``, and if the result is suspicious also from
+        ``chordal`` and then ``online``; the solution with the lowest cost is returned
 
     Raises
     ------
     FormatError
         The file cannot be read.
     GaugeError, SingularError
-        The edges leave a vertex open.
+        The edges do not determine a vertex.
     """
     if isinstance(source, Graph):
         file = G2oFile(source, list(range(source.vertex_count)))

@@ -1,8 +1,8 @@
 """Consistency: whether a run's covariances and its configured noise agree with its errors.
 
 NEES is the normalised estimation error squared, ``e' Sigma^-1 e`` (Bar-Shalom, Li, Kirubarajan, "Estimation with
-applications to tracking and navigation", 2001, section 5.4): of a consistent estimate it is chi-square distributed with
-as many degrees of freedom as e has components, which is also its mean.
+applications to tracking and navigation", 2001, section 5.4). For a consistent estimate it is chi-square
+distributed, with as many degrees of freedom as e has components. This number is also its mean.
 """
 
 from collections.abc import Sequence
@@ -27,10 +27,10 @@ class Nees:
 
     Attributes
     ----------
-    mean : ``dof`` is expected; more: the estimate is too sure of itself; less: it is more cautious than need be
-    band : where the mean lies in 95 % of runs, were the n errors independent. Those of a path hardly are: then the band
-        is too narrow, and ``inside`` tells more
-    inside : the share of single ones in their own 95 % band
+    mean : ``dof`` is expected; if it is larger, the covariances are too small; if it is smaller, they are too large
+    band : contains the mean in 95 % of runs if the n errors are independent. Those of a path are correlated, so the
+        band is too narrow for a path; use ``inside`` there
+    inside : the part of the single values in their own 95 % band
     n, skipped : how many were used, and had no covariance or no truth
     """
 
@@ -59,12 +59,12 @@ class Nees:
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """NEES of the last pose, of all poses and of landmarks' positions, each None where it is not known, and the noise.
+    """NEES of the last pose, of all poses and of landmarks' positions, each None if unknown, and the noise.
 
     Attributes
     ----------
     noise : the scale of the noise of each class of edges, input and part
-    advice : what to do about it; empty where that is nothing
+    advice : what the user can do; empty if nothing
     left_out : why there is no NEES: by ``poses`` and ``landmarks``, a reason for each that is None
     """
 
@@ -115,9 +115,9 @@ def pose_nees(estimate: Array, truth: Array, covariances: Array) -> tuple[Nees |
 def pose_errors(estimate: Array, truth: Array, covariances: Array) -> tuple[Array, Array]:
     """Errors (n - 1, d) of all poses but the first, in their tangent spaces, and their covariances (n - 1, d, d).
 
-    A map begins where the robot did: what is known of its place in the world is no error of the estimate. So the first
-    pose is moved onto its truth, and its covariance, which all others inherit, is taken off theirs. That holds where
-    the first pose alone holds the map.
+    The origin of a map is the robot's first pose, so its position in the world is not an error of the estimate. The
+    first pose is moved onto its true pose. All other covariances contain that of the first pose, so it is subtracted.
+    This is valid if only the first pose holds the map.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def landmark_errors(
 
 
 def noise_advice(noise: Sequence[NoiseScale], *, is_applied: bool) -> str:
-    """Return what a user may do about sigmas that residuals contradict; empty where that is nothing.
+    """The advice if residuals contradict the configured sigmas; else empty.
 
     Parameters
     ----------

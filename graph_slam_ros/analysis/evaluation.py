@@ -1,8 +1,8 @@
-"""Evaluation of a run against the truth: position, orientation, drift and map; and whether it knows how far.
+"""Evaluation of a run against the truth: errors of position, orientation, drift and map, and consistency.
 
-For the errors the estimate is moved onto the truth by the rigid motion that fits best, of the plane or of space as the
-run was made, without scale; poses are compared where both have a stamp within 0.05 s. Consistency is told in the frame
-that both share at the run's first pose.
+For the errors, the estimate is aligned to the truth by the rigid motion that fits best, without scale. The motion is in
+the plane or in space, as the run is. Poses are compared if their stamps differ by at most 0.05 s. Consistency is
+computed in the frame of the run's first pose.
 """
 
 import json
@@ -44,12 +44,13 @@ class Scores:
 
     Attributes
     ----------
-    odometry : the same for dead reckoning, or None where the run has none
-    map_rmse_m : of landmarks with the same id, aligned by themselves; None with too few to align or without truth
-    consistency : of the run, or None where it left no covariances
+    estimate : errors of the estimate
+    odometry : errors of dead reckoning; None if the run has none
+    map_rmse_m : RMSE of landmarks with the same id, aligned separately; None with too few landmarks or without truth
+    consistency : of the run; None if it has no covariances
     dimensions : 2 or 3
-    losses : what of the truth could not be read
-    warnings : why the errors may mean less than they seem to
+    losses : what could not be read of the truth
+    warnings : reasons why the errors may be misleading
     scored : what was compared with what, in words
     """
 
@@ -67,7 +68,7 @@ class Scores:
         return "heading" if self.dimensions == 2 else "angle"
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values; what there is not is None. Angles are ``heading_rad`` in the plane, ``angle_rad`` in space."""
+        """Plain values; missing ones are None. Angles are ``heading_rad`` in the plane, ``angle_rad`` in space."""
 
         def drift(one: Drift | None, unit: str) -> dict[str, Any] | None:
             angle = f"{self._angle}_rad_per_{unit}"
@@ -121,13 +122,14 @@ def _line(name: str, values: Statistics, factor: float, digits: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """The part of a run's folder that is scored: the paths of one drive.
+    """The part of a run that is evaluated: the paths of one drive.
 
     Attributes
     ----------
-    estimate, odometry : with the names of their files; odometry is None where there is none
-    number, count : which of how many, from 1; the others were in the map that was loaded
-    first_keyframe, end_keyframe : its rows in ``path.tum``, the second not included; None: to the end
+    estimate, odometry : the paths; odometry is None if there is none
+    names : the names of their files
+    number, count : number of the drive, from 1, and number of drives; the others were in the loaded map
+    first_keyframe, end_keyframe : its rows in ``path.tum``, without the second one; None: to the end
     """
 
     estimate: Trajectory
@@ -151,10 +153,11 @@ def evaluate(
 
     Parameters
     ----------
-    truth : ``BAG``, ``BAG:TOPIC`` or ``FILE.tum``, or what ``read_truth`` has read
-    estimate : which path of the run is scored; default: ``sightings.tum``, or ``path.tum`` where nothing was seen
-    topic : of the truth, as in ``read_truth``
-    align : without, the map is taken to be in the frame of the truth
+    run : the run folder
+    truth : ``BAG``, ``BAG:TOPIC`` or ``FILE.tum``, or the result of ``read_truth``
+    estimate : file of the path to evaluate; default: ``sightings.tum``, or ``path.tum`` without observations
+    topic : topic of the truth, as in ``read_truth``
+    align : align the run to the truth; False: the map is already in the frame of the truth
 
     Raises
     ------
@@ -186,17 +189,17 @@ def evaluate(
 
 
 def dimensions_of(run: Path) -> int:
-    """The dimensions of a run's world: 2 where it does not say."""
+    """The dimensions of a run's world; 2 if the folder is not a run."""
     return run_config(run).world.dimensions if is_run(run) else 2
 
 
 def input_topics(run: Path) -> set[str]:
-    """Topics that a run listened to, by its configuration."""
+    """The topics of the inputs in the configuration of a run."""
     return {f"/{one.topic.lstrip('/')}" for one in run_config(run).sources} if is_run(run) else set()
 
 
 def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Drive:
-    """The last drive of a run that was under way while the truth was recorded; the last where there is no truth.
+    """The last drive of a run that overlaps with the truth in time; without truth, the last drive.
 
     Raises
     ------
@@ -229,7 +232,7 @@ def scored_drive(run: Path, truth: Trajectory | None, estimate: str = "") -> Dri
 
 
 def _drives(run: Path) -> list[dict[str, int]]:
-    """Return where each drive begins; one where the summary does not say."""
+    """The first keyframe and sighting of each drive; a single drive if the summary has none."""
     try:
         drives = summary_of(run)["drives"]
         drives = [{key: int(one[key]) for key in ("keyframe", "sighting")} for one in drives]
@@ -252,7 +255,7 @@ def _described(drive: Drive) -> str:
 
 
 def _map_rmse(landmarks: dict[str, Point], true: dict[str, Point], dimensions: int) -> float | None:
-    """RMSE in metres of the landmarks whose ids both have."""
+    """RMSE [m] of the landmarks with the same id; None with too few."""
     shared = sorted(set(landmarks) & set(true))
     if len(shared) < dimensions:
         return None
@@ -263,7 +266,7 @@ def _map_rmse(landmarks: dict[str, Point], true: dict[str, Point], dimensions: i
 
 
 def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
-    """The consistency, from what the run left; None where it left no covariances."""
+    """The consistency of a run; None if it has no covariances."""
     if not os.path.lexists(run / COVARIANCES):
         return None
     path, covariances = read_tum(run / "path.tum"), read_covariances(run / COVARIANCES)
@@ -295,7 +298,7 @@ def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
 
 
 def _why_no_nees(known: Truth, drive: Drive, path: Trajectory, true: Array, is_held: bool) -> str:
-    """Return why errors and covariances cannot be compared at all; empty where they can."""
+    """The reason why errors and covariances cannot be compared; empty if they can."""
     if not known.trajectory.has_orientation:
         return f"{known.source} has no orientation, which says how the map lies in its frame"
     if is_held:
@@ -325,7 +328,7 @@ def _left_out(
 
 
 def _noise(run: Path) -> tuple[bool, tuple[NoiseScale, ...]]:
-    """Return whether fixes hold the map, and what residuals say of the noise, by the summary of a run."""
+    """Return whether fixes hold the map, and the noise estimated from residuals, from the summary of a run."""
     try:
         summary = json.loads(read_text(run / SUMMARY))
         return "fixes" in summary["classes"], tuple(NoiseScale(**one) for one in summary.get("noise", ()))

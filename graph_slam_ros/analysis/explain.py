@@ -1,4 +1,4 @@
-"""Explanation of what was decided in a saved run, as a whole or about one edge, in sentences."""
+"""Explain the decisions of a saved run, as a whole or for one edge, in sentences."""
 
 import textwrap
 from collections import Counter
@@ -47,12 +47,12 @@ _CHANCE = 1e-4  # that so many would all stay below that, were their noise as it
 
 
 def explain_run(run: SavedGraph) -> Iterator[str]:
-    """The edges of each class that are in and out and why, the most surprising, and whether the gates decide.
+    """Count the edges by class, verdict and reason, list the worst, and warn of gates that reject nothing.
 
     Raises
     ------
     FormatError
-        The summary of the run is not what it should be.
+        The summary of the run is invalid.
     """
     entries = run.entries
     judged = [entry for entry in entries if entry.verdict]
@@ -76,7 +76,7 @@ def _table(entries: Sequence[Entry]) -> Iterator[str]:
 
 
 def _worst(entries: Iterable[Entry]) -> Iterator[str]:
-    """The worst of what is out: where the statistic is farthest above what it was held against."""
+    """The worst rejected edges: those whose statistic is farthest above its threshold."""
     worst = sorted(entries, key=lambda e: -e.statistic / e.threshold)[:_SHOWN]
     if worst:
         yield "farthest off, of what is out:"
@@ -84,7 +84,7 @@ def _worst(entries: Iterable[Entry]) -> Iterator[str]:
 
 
 def _least(entries: Iterable[Entry]) -> Iterator[str]:
-    """The worst of what is in: what fits least now."""
+    """The accepted edges that fit worst now."""
     least = sorted(entries, key=lambda e: -e.chi2 / e.dof)[:_SHOWN]
     if least:
         yield "fits least, of what is in:"
@@ -96,7 +96,7 @@ def _row(e: Entry, numbers: str) -> str:
 
 
 def _gates(entries: Sequence[Entry], changes: Sequence[VerdictChange], config: Config) -> Iterator[str]:
-    """Gates that decide nothing: all that was ever seen is far below them, more so than noise that is told right."""
+    """Warn of gates that reject nothing: every statistic is far below them, more than correct noise explains."""
     if not config.robust.decide:
         yield "warning: robust.decide is false: nothing was held back or taken out, whatever it said"
         return
@@ -117,7 +117,7 @@ def _gates(entries: Sequence[Entry], changes: Sequence[VerdictChange], config: C
 
 
 def _rivals(folder: Path) -> Iterator[str]:
-    """Return what the last second look could not rule out."""
+    """The hypotheses that the last search could not rule out."""
     try:
         rows = [_rival(folder, rival) for rival in summary_of(folder).get("rivals", ())]
     except (LookupError, TypeError, ValueError, AttributeError) as error:
@@ -136,9 +136,9 @@ def _rival(folder: Path, rival: Mapping[str, Any]) -> str:
 
 
 def explain_edge(run: SavedGraph, which: str) -> Iterator[str]:
-    """Everything about an edge, by id, or about the sightings of a landmark, by name.
+    """Explain an edge, by id, or the observations of a landmark, by name.
 
-    Where its name is a number, ``landmark:7`` is not edge 7.
+    If the name of a landmark is a number, write ``landmark:7``; ``7`` is edge 7.
 
     Raises
     ------
@@ -225,7 +225,7 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
 
 
 def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
-    """Return what believing it, or doing without it, would do to the map."""
+    """The effect on the map if this edge were accepted, or rejected."""
     which = "out" if e.is_in else "in with its full weight"
     try:
         moved = run.moved(run.solve([e.edge] if e.is_in else [], [] if e.is_in else [e.edge]))
@@ -260,7 +260,7 @@ def _state(verdict: Verdict, reason: Reason) -> str:
 
 
 def _line(what: str, text: str) -> Iterator[str]:
-    """A paragraph beside its name."""
+    """A paragraph with its name at the left."""
     yield from textwrap.wrap(text, _WIDTH, initial_indent=f"{what:11s}", subsequent_indent=" " * 11)
 
 

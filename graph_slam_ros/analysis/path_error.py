@@ -1,7 +1,7 @@
 """The errors of a path: absolute and relative errors of position and angle.
 
-The absolute error (ATE) is that of each pose once a rigid motion, without scale, has laid the whole path on the truth.
-The relative error (RPE) is that of the motion over one second and over one metre: what drift is.
+The absolute error (ATE) is the error of each pose after the whole path was aligned to the truth by a rigid motion,
+without scale. The relative error (RPE) is the error of the motion over one second and over one metre, which is drift.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,9 @@ class Drift:
 
     Attributes
     ----------
-    position : [m/s] or [m/m]; angle : [rad/s] or [rad/m], None where the truth has no orientation
+    position : [m/s] or [m/m]
+    angle : [rad/s] or [rad/m]; None if the truth has no orientation
+    n : number of motions
     """
 
     position: Statistics
@@ -44,10 +46,11 @@ class PathError:
 
     Attributes
     ----------
-    position_m, angle_rad : absolute errors (ATE), each as {rmse, median, max}; no angle without true orientations
-    n : poses that have a truth within 0.05 s
-    of : poses of the path
-    per_s, per_m : relative errors (RPE); None where no two poses are one to three seconds, or metres, apart
+    position_m, angle_rad : absolute errors (ATE), each as {rmse, median, max}; angle_rad is None without true
+        orientations
+    n : number of poses that have a true pose within 0.05 s
+    of : number of poses of the path
+    per_s, per_m : relative errors (RPE); None if no two poses are one to three seconds, or metres, apart
     """
 
     position_m: Statistics

@@ -1,6 +1,6 @@
-"""The what-if analysis: the graph of a run, solved again with other edges or another loss; what moves.
+"""The what-if analysis: solve the graph of a run again, with other edges or another loss, and see what moves.
 
-All is from the run's map: nothing is decided again, the drive is not repeated.
+It uses the map of the run. No verdict changes, and the drive is not repeated.
 """
 
 from collections.abc import Iterable, Sequence
@@ -30,10 +30,10 @@ class MovedVertex:
 
     Attributes
     ----------
-    before, after : chi2, cost and classes of all that is in
-    final : how far the last keyframe moves, in metres and in radians
-    most : the keyframe that moves farthest, and how far, in metres
-    worse : edges that fit worse after, with their chi2 before and after; the one that has lost most first
+    before, after : chi2, cost and classes of the accepted edges
+    final : motion of the last keyframe [m, rad]
+    most : the keyframe that moves farthest, and its motion [m]
+    worse : edges that fit worse afterwards, with their chi2 before and after; the largest increase comes first
     """
 
     before: Report
@@ -45,9 +45,12 @@ class MovedVertex:
 
 @dataclass(frozen=True, slots=True)
 class Influence:
-    """The influence of an edge: metres the last keyframe moves without it, to first order and solved again.
+    """The influence of an edge: the motion of the last keyframe without it [m].
 
-    The latter is inf where a vertex is undetermined without the edge.
+    Attributes
+    ----------
+    first_order_m : by one Gauss-Newton step
+    exact_m : by solving again; inf if a vertex is undetermined without the edge
     """
 
     edge: int
@@ -56,11 +59,11 @@ class Influence:
 
 
 class SavedGraph:
-    """The graph of a run, and what was decided about its edges, those that are out too.
+    """The graph of a run, and the verdicts on all its edges, rejected ones included.
 
     Parameters
     ----------
-    losses : what could not be read of the run is added
+    losses : a line is added for each part of the run that could not be read
 
     Raises
     ------
@@ -86,23 +89,23 @@ class SavedGraph:
         return self.solve()
 
     def keyframe(self, vertex: int) -> int | None:
-        """The number of the keyframe that a vertex is, if it is one."""
+        """The number of the keyframe of a vertex; None if it is not a keyframe."""
         return self._numbers.get(vertex)
 
     def edge(self, edge: int) -> Entry:
-        """One of them. Raises GraphSlamError."""
+        """The ledger entry of an edge. Raises GraphSlamError for an unknown id."""
         if not 0 <= edge < len(self.entries):
             raise GraphSlamError(f"no edge {edge}: their ids are below {len(self.entries)}")
         return self.entries[edge]
 
     def solve(self, without: Iterable[int] = (), let_in: Sequence[int] = (), loss: Loss | None = None) -> Solver:
-        """Solve what is in, but for some edges, and with others, which then count fully; from the saved estimate.
+        """Solve the accepted edges without some, and with others at full weight, from the saved estimate.
 
-        A landmark that is left without edges is left out; a keyframe is not.
+        A landmark without edges is left out. A keyframe without edges is an error.
 
         Parameters
         ----------
-        loss : of everything that may be wrong, instead of the run's
+        loss : robust loss of all edges that may be outliers, instead of the run's
 
         Raises
         ------
@@ -147,7 +150,7 @@ class SavedGraph:
         )
 
     def influences(self, count: int) -> list[Influence]:
-        """The judged edges whose absence would move the last keyframe most, of all of them to first order."""
+        """The judged edges without which the last keyframe would move most, ranked to first order."""
         judged = [e for e in self.entries if e.is_in and e.verdict]
         first = np.array([np.linalg.norm(self.first_order(e.edge)[: self.space.dimensions]) for e in judged])
         out = []
@@ -161,7 +164,7 @@ class SavedGraph:
         return sorted(out, key=lambda one: -one.exact_m)
 
     def first_order(self, edge: int) -> Array:
-        """The step (dof,) of the last keyframe, in its tangent space, that taking an edge out would cause.
+        """The step (dof,) of the last keyframe, in its tangent space, if an edge is removed.
 
         With A and r its whitened Jacobian and residual at the optimum and Sigma the joint covariance of its vertices, a
         Gauss-Newton step without it is ``Sigma A' (I - A Sigma A')^-1 r``, by the matrix inversion lemma.
@@ -185,6 +188,6 @@ class SavedGraph:
 
 
 def _accepted(graph: Graph, entry: Entry) -> int:
-    """Add an edge that is out once more, as one that nothing takes out."""
+    """Add a rejected edge again, as one that is never rejected."""
     noise = Gaussian.from_information(entry.information_matrix)
     return graph.add_edge(graph.edge(entry.edge).type, entry.vertices, entry.measured, noise, _ACCEPTED)

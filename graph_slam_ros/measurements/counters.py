@@ -1,4 +1,4 @@
-"""Nothing is dropped or repaired silently: each case adds to a counter by (source, reason)."""
+"""Counters of what was dropped, repaired or used, by (source, reason)."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -6,13 +6,13 @@ from typing import Any
 
 
 class Counters:
-    """Counts by (source, reason); a source is a topic or an input's name.
+    """Counts by (source, reason); a source is the name of a topic or of an input.
 
     Attributes
     ----------
-    on_first : called with source and reason the first time each is counted
-    received : messages of each input, zero included
-    used : measurements of each input that the estimate is made of: odometry messages, sightings, fixes, closures
+    on_first : called with source and reason when they are counted for the first time
+    received : number of messages of each input, zero included
+    used : number of measurements of each input that were used: odometry messages, sightings, fixes, closures
     """
 
     def __init__(self) -> None:
@@ -31,18 +31,18 @@ class Counters:
         return self._counts[key]
 
     def update(self, other: "Counters") -> None:
-        """Add all counts of another."""
+        """Add the counts of another object."""
         for own, more in self._with(other):
             own.update(more)
 
     def raise_to(self, other: "Counters") -> None:
-        """Take the larger of each count: both have counted the same."""
+        """Keep the larger of each count, if both have counted the same things."""
         for own, counts in self._with(other):
             for key, times in counts.items():
                 own[key] = max(own[key], times)
 
     def since(self, before: "Counters") -> "Counters":
-        """Return what was counted after there were these."""
+        """Return the counts of this object minus those of an earlier copy."""
         out = Counters()
         for counts, own in out._with(self):
             counts.update(own)
@@ -52,7 +52,7 @@ class Counters:
         return out
 
     def _with(self, other: "Counters") -> Iterator[tuple[Counter[Any], Counter[Any]]]:
-        """Each kind of count beside a copy of the other's: another thread may be counting there."""
+        """Pairs of own counts and a copy of the other's, in which another thread may be counting."""
         yield self._counts, Counter(other._counts)
         yield self.received, Counter(other.received)
         yield self.used, Counter(other.used)

@@ -1,4 +1,4 @@
-"""The noise of an edge from a covariance that was added up: nothing is certain, and rounding is mended and counted."""
+"""The noise of an edge from a propagated covariance, with a lower bound; rounding errors are repaired and counted."""
 
 import numpy as np
 
@@ -13,12 +13,12 @@ _LEAST_EIGENVALUE = 1e-9  # of the largest, where rounding has left a covariance
 
 
 def edge_noise(counters: Counters, source: str, covariance: Array, metres: int, distance_m: float = 0.0) -> Gaussian:
-    """Made before anything is added to the graph: it must not fail half-way.
+    """Return the noise of an edge. Call it before anything is added to the graph, so that nothing fails half-way.
 
     Parameters
     ----------
     covariance : (m, m); its first ``metres`` rows are lengths, the others angles
-    distance_m : how far away what was measured is: nothing is known better than to a millionth of it
+    distance_m : distance of what was measured; the standard deviation is at least a millionth of it
     """
     size = len(covariance)
     least_m2 = max(LEAST_M2, (_FINEST * distance_m) ** 2)

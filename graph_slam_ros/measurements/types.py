@@ -1,7 +1,8 @@
-"""Measurements and events for ``GraphSlam.process``: frozen values, checked at the border, exact in JSON.
+"""Measurements and events for ``GraphSlam.process``: immutable values, which JSON keeps exactly.
 
-A pose is (x, y, theta) in the plane and (x, y, z, qx, qy, qz, qw) in space. Covariances are flat, row-major, in tangent
-order: (x, y, theta), or (x, y, z, rotation vector). Nothing here tells which message it came from.
+A pose is (x, y, theta) in the plane and (x, y, z, qx, qy, qz, qw) in space, in metres and radians. Covariances are flat
+and row-major, in the order of the tangent space: (x, y, theta), or (x, y, z, rotation vector). The values do not depend
+on the type of the message that they came from.
 """
 
 from dataclasses import asdict, dataclass
@@ -26,12 +27,12 @@ def _check_choice(cls: type, value: str, choices: tuple[str, ...]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """Absolute pose in the odometry frame; only the motion between two of them is ever used.
+    """Absolute pose in the odometry frame; only the motion between two poses is used.
 
     Attributes
     ----------
-    twist_covariance : 9 (36) numbers, (m/s, rad/s) in the base frame, or None where unknown
-    source : which odometry it is, where there are several; their priority is in the configuration
+    twist_covariance : 9 numbers (36 in space), (m/s, rad/s) in the base frame, or None if unknown
+    source : the name of the odometry, if there are several; the configuration has their priority
     """
 
     stamp_ns: int
@@ -42,17 +43,17 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A landmark, seen by a sensor of the robot.
+    """One observation of a landmark by a sensor of the robot.
 
     Attributes
     ----------
-    id : its identity; empty where the sensor does not know it
-    kind : what was measured
-    measured : by ``kind``: of ``position`` and ``pose``, the point or pose in the base frame; else in the sensor's:
-        of ``range_bearing`` (range, bearing) or (range, azimuth, elevation), of ``bearing`` the same without the range,
-        of ``range`` one number
-    covariance : of ``measured``: of a position in the axes of the base frame, of a pose in its tangent space
-    T_base_sensor : where the sensor is, for the kinds that are measured in its frame; None: at the base
+    id : its identity; empty if the sensor does not know it
+    kind : what was measured, one of ``SIGHTING_KINDS``
+    measured : depends on ``kind``. ``position``, ``pose``: the point or pose in the base frame. ``range_bearing``:
+        (range, bearing) or (range, azimuth, elevation) in the sensor frame. ``bearing``: the same without the range.
+        ``range``: one number
+    covariance : of ``measured``; of a position in the axes of the base frame, of a pose in its tangent space
+    T_base_sensor : pose of the sensor, for kinds that are measured in the sensor frame; None: at the base
 
     Raises
     ------
@@ -72,7 +73,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """All landmarks of one message, at the stamp they were seen."""
+    """All observations of one message, at their common stamp."""
 
     stamp_ns: int
     topic: str
@@ -81,16 +82,16 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """An absolute measurement in the map frame: a receiver's position, a compass, a pose from elsewhere.
+    """An absolute measurement in the map frame: a GNSS position, a compass heading, a pose from another system.
 
     Attributes
     ----------
-    measured : by ``kind``: of ``pose``, T_map_base; of ``position``, the coordinates of ``point`` in map; of
-        ``heading``, one angle; of ``attitude``, the quaternion (x, y, z, w) of R_map_base, in space only
-    covariance : of ``measured``: of a position in the axes of map, where a variance of 1e6 m^2 or more says that an
-        axis is not known; of a pose or attitude in its tangent space
-    point : of ``position``, the antenna in the base frame; empty: its origin
-    datum : of a position on earth, latitude [deg], longitude [deg] and height [m] of the map's origin
+    measured : depends on ``kind``. ``pose``: T_map_base. ``position``: the coordinates of ``point`` in map.
+        ``heading``: one angle. ``attitude``: the quaternion (x, y, z, w) of R_map_base, in space only
+    covariance : of ``measured``. Of a position in the axes of map; a variance of 1e6 m^2 or more means that the axis is
+        unknown. Of a pose or attitude in its tangent space
+    point : for ``position``, the antenna in the base frame; empty: the origin of the base
+    datum : for a position on earth, latitude [deg], longitude [deg] and height [m] of the map's origin
 
     Raises
     ------
@@ -112,12 +113,12 @@ class Fix:
 
 @dataclass(frozen=True, slots=True)
 class Closure:
-    """A loop closure: where the robot at one stamp was, seen from where it was at an earlier one.
+    """A loop closure: the pose of the robot at one stamp, relative to its pose at another stamp.
 
     Attributes
     ----------
-    from_stamp_ns : the earlier (or later) stamp
-    T_from_base : the base at ``stamp_ns`` in the base at ``from_stamp_ns``
+    from_stamp_ns : the other stamp, earlier or later
+    T_from_base : pose of the base at ``stamp_ns`` in the frame of the base at ``from_stamp_ns``
     covariance : of that pose in its tangent space
     """
 
@@ -130,7 +131,7 @@ class Closure:
 
 @dataclass(frozen=True, slots=True)
 class InitialPose:
-    """A pose that somebody gives; it holds from the next odometry on.
+    """A pose given by a user or another system; it is used from the next odometry on.
 
     Attributes
     ----------
@@ -147,12 +148,13 @@ class Control:
 
     Attributes
     ----------
-    event : ``flush`` processes the measurements that wait for their turn; ``end`` also drops those that no odometry
-        reached; ``optimize`` solves now; ``clear_closures`` removes all loop closures; ``time_jump`` begins a segment
-        whose stamps may be older; ``set`` changes parameters; ``remove`` removes an edge or a landmark; ``memory``
-        begins or ends a shortage of memory; ``restart`` goes back to the last good estimate after a fault outside
-    values : names and values; of ``set``, the parameters; of ``remove``, ``edge`` and its id or ``landmark`` and its
-        name; of ``memory``, ``is_short``; else none
+    event : ``flush`` processes the measurements that are held for sorting by stamp; ``end`` also drops those that no
+        odometry reached; ``optimize`` solves everything; ``clear_closures`` removes all loop closures; ``time_jump``
+        begins a segment whose stamps may be older; ``set`` changes parameters; ``remove`` removes an edge or landmark;
+        ``memory`` begins or ends a shortage of memory; ``restart`` goes back to the last good estimate
+        after an outside fault
+    values : names and values. ``set``: parameters. ``remove``: ``edge`` and its id, or ``landmark`` and its name.
+        ``memory``: ``is_short``. Others: none
 
     Raises
     ------

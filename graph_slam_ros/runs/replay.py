@@ -30,14 +30,14 @@ _OPTIONS = {"odometry": "--odom", "landmarks": "--landmarks"}
 _OPTIONAL = default_input("detections")  # a recording need not have what nobody asked for
 
 END = Control("end"), Control("optimize")
-"""A recording ends: what waits is released, and the whole is solved."""
+"""The events at the end of a recording: held measurements are processed, and everything is solved."""
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The topics of a recording that are used, by the name of the input, ``tf_static`` and ``tf`` included."""
+    """The topics of a recording that are used, by name of the input, with ``tf_static`` and ``tf``."""
 
     topics: Mapping[str, str]
 
@@ -52,7 +52,7 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class EarlierRun:
-    """A run that ended where time jumped back (``time.on_jump`` is reset), and its numbers."""
+    """A run that ended when time jumped back (``time.on_jump`` is reset), and its summary."""
 
     folder: Path
     summary: dict[str, Any]
@@ -60,11 +60,11 @@ class EarlierRun:
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """The outcome of a replay: the pipeline at its end, numbers, what could not be read, and what to beware of.
+    """The result of a replay: the pipeline at its end, the summary, what could not be read, and warnings.
 
     Attributes
     ----------
-    earlier : the runs before the last, which ``time.on_jump: reset`` has ended
+    earlier : the runs before the last, which were ended by ``time.on_jump: reset``
     """
 
     slam: GraphSlam
@@ -226,14 +226,21 @@ def replay(
     force: bool = False,
     progress: Progress = lambda items, total: items,
 ) -> Replayed:
-    """Run a recording, or a run's own ingest sequence, and save a run folder.
+    """Run a recording, or the journal of a run, and save a run folder.
 
     Parameters
     ----------
-    source : a bag, or a run folder: then exactly its events are repeated, nothing is added
-    config : default: the run's own, that of the map, or the defaults
-    map_folder : the run whose map is gone on in: where the robot is in it shows when it recognises something
-    force : a run in ``out`` may be replaced
+    source : a bag, or a run folder; a run is repeated with exactly its events
+    out : the run folder to write
+    config : default: the configuration of the run, or of the map, or ``Config()``
+    odometry, landmarks : topics, instead of the configured ones
+    map_folder : a run whose map is loaded first; the robot's pose in it is unknown until a landmark is recognised
+    force : replace a run in ``out``
+    progress : wraps the sequence of measurements, for a progress bar; its second argument is their number, or 0
+
+    Returns
+    -------
+    The pipeline at its end, with the summary.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A run's folder as a Python program reads it: paths with stamps, landmarks with names, edges, tables for pandas."""
+"""Read a run folder in Python: paths with stamps, landmarks with names, edges, tables for pandas."""
 
 import json
 from dataclasses import dataclass, fields
@@ -47,12 +47,12 @@ class LandmarkTable:
 
 @dataclass(frozen=True)
 class SavedRun:
-    """A run's folder; each file is read when it is first asked for.
+    """The results in a run folder; each file is read when it is first needed.
 
     Attributes
     ----------
-    folder : where it is
-    summary : what ``run.json`` says: numbers, counters, losses
+    folder : path of the folder
+    summary : the content of ``run.json``: numbers, counters, losses
     """
 
     folder: Path
@@ -64,7 +64,7 @@ class SavedRun:
 
     @cached_property
     def config(self) -> Config:
-        """The parameters it was made with."""
+        """The parameters of the run."""
         return run_config(self.folder)
 
     def trajectory(self) -> Trajectory:
@@ -72,7 +72,7 @@ class SavedRun:
         return self._trajectory
 
     def odometry(self) -> Trajectory:
-        """Return what odometry alone says at the keyframes, ``T_odom_base``."""
+        """Poses of odometry alone at the keyframes, ``T_odom_base``."""
         return read_tum(self.folder / "path_odometry.tum")
 
     @cached_property
@@ -94,12 +94,12 @@ class SavedRun:
 
     @cached_property
     def edges(self) -> list[Entry]:
-        """The ledger: each edge, what was measured, and what is believed of it."""
+        """The ledger: each edge, its measurement and its verdict."""
         return read_ledger(self.folder)
 
     @property
     def warnings(self) -> list[str]:
-        """Files that are not of the same save."""
+        """Warnings about files that are not from the same save."""
         return changed_since(self.folder)
 
     def trajectory_frame(self) -> Any:

@@ -57,7 +57,7 @@ class GraphSlam(MapView):
 
     Attributes
     ----------
-    counters : all that is refused, repaired or used
+    counters : counts of what was refused, repaired and used
     settings : parameters that were changed on the way
     processed : measurements and control events that were handed over
     """
@@ -179,14 +179,14 @@ class GraphSlam(MapView):
                 self._add_sighting(m.topic, name, sighting, where)
 
     def _add_sighting(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
-        """Add a sighting of a landmark; the first of a surveyed landmark tells where the map lies."""
+        """Add a sighting of a landmark; the first of a surveyed landmark locates the map."""
         found = self._landmarks.map.survey_of(name, s, where)
         if found is not None and self._anchor.align_to_landmark(*found, len(self.keyframes) - 1):
             self._note_moved(topic)
         self._landmarks.map.add(topic, name, s, where)
 
     def _add_fix(self, m: Fix, where: PoseAtStamp) -> None:
-        """Add a fix; the first of its kind tells where the map lies."""
+        """Add a fix; the first of its kind locates the map."""
         pose_of, compose = self._solution.pose, self.space.group.compose
         if self._anchor.align_to_fix(m, compose(pose_of(where.vertex), where.T_keyframe_base), len(self.keyframes) - 1):
             self._note_moved(m.topic)
@@ -285,7 +285,7 @@ class GraphSlam(MapView):
         self._solution.guard.note_good()
 
     def _restore(self, start: MapSnapshot) -> None:
-        """Solve a map anew, and be nowhere in it yet."""
+        """Solve a loaded map; the robot's pose in it is still unknown."""
         frontend, localizes = self._frontend, self.config.map.localize
         if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")

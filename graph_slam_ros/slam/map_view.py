@@ -1,4 +1,4 @@
-"""The reading side of the pipeline: path, landmarks, covariances, statistics and health. Reading changes nothing."""
+"""The read-only part of the pipeline: path, landmarks, covariances, statistics and health."""
 
 from collections.abc import Sequence, Set
 
@@ -62,17 +62,17 @@ class MapView:
 
     @property
     def segments(self) -> list[int]:
-        """Indices of the keyframes at which odometry began, or began anew."""
+        """The indices of the keyframes at which a segment begins: odometry started there, or jumped."""
         return self._frontend.path.segments
 
     @property
     def drives(self) -> list[int]:
-        """The first keyframe of each drive, by its index; the last drive is the present one."""
+        """The index of the first keyframe of each drive; the last drive is the present one."""
         return self._frontend.path.drives
 
     @property
     def sighting_poses(self) -> StampedPoses[SightingPose]:
-        """The poses at the stamps of the sightings, each by a keyframe."""
+        """The poses at the stamps of the sightings, each relative to a keyframe."""
         return self._frontend.sighting_poses
 
     def trajectory(self) -> Array:
@@ -82,7 +82,7 @@ class MapView:
     def sighting_trajectory(self) -> Array:
         """Estimated poses ``T_map_base`` at the stamps of the sightings, (n, 3) or (n, 7).
 
-        What odometry was wrong by from one keyframe to the next is spread evenly over the time between.
+        The correction of odometry between two keyframes is spread evenly over the time between them.
         """
         poses, odometry, group = self.trajectory(), self.keyframes.poses, self.space.group
         found, stamps_ns = self._at_sightings(poses), self.keyframes.stamps_ns
@@ -96,7 +96,7 @@ class MapView:
         return found
 
     def sighting_odometry(self) -> Array:
-        """Return what odometry alone says, ``T_odom_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""
+        """Return the poses of odometry alone, ``T_odom_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""
         return self._at_sightings(self.keyframes.poses)
 
     def _at_sightings(self, keyframe_poses: Array) -> Array:
@@ -105,7 +105,7 @@ class MapView:
 
     @property
     def T_map_odom(self) -> Numbers:
-        """The correction: odometry's drift at the newest keyframe."""
+        """The transform ``map -> odom``: it corrects odometry's drift at the newest keyframe."""
         return self._solution.T_map_odom(self.keyframes[-1]) if self.keyframes else self.space.identity
 
     @property
@@ -115,24 +115,24 @@ class MapView:
 
     @property
     def odometry_source(self) -> str:
-        """The odometry in use, by the name of its input; empty before the first."""
+        """The name of the odometry input in use; empty before the first odometry."""
         return self._frontend.source
 
     @property
     def odometry_sources(self) -> Set[str]:
-        """Sources of odometry that have been used."""
+        """The names of the odometry inputs that have been used."""
         return self._frontend.odometry.sources
 
     # -- landmarks -------------------------------------------------------------------------------------------------
 
     @property
     def landmarks(self) -> dict[str, Landmark]:
-        """Landmarks of the graph, by identity; but for tentative ones."""
+        """The landmarks of the graph, by identity, without tentative ones."""
         return {name: mark for name, mark in self._landmarks.map.known.items() if not mark.is_tentative}
 
     @property
     def waiting(self) -> dict[str, str]:
-        """Return why each landmark waits that was seen but is not among ``landmarks`` yet, by identity."""
+        """The landmarks that were seen but are not in ``landmarks`` yet: identity and reason."""
         tentative = {
             name: f"seen {mark.sightings} times, without an identity: not believed yet"
             for name, mark in self._landmarks.map.known.items()
@@ -151,7 +151,7 @@ class MapView:
         return self.backend.noise.history
 
     def noise_scale(self) -> list[NoiseScale]:
-        """The noise by the residuals: a factor of the configured sigmas for each class, input and part.
+        """Estimate the noise from the residuals: a factor of the configured sigmas for each class, input and part.
 
         Raises
         ------
@@ -162,11 +162,11 @@ class MapView:
 
     @property
     def range_offsets(self) -> dict[str, int]:
-        """The vertex of the offset of all ranges of an input, by input."""
+        """The vertex of the offset that all ranges of an input share, by input."""
         return self._landmarks.map.offsets
 
     def touched_landmarks(self, first: int) -> dict[str, Landmark | None]:
-        """The landmarks that changed after the first so many changes, tentative ones included; None: removed."""
+        """The landmarks that changed after the ``first`` changes, tentative ones included; None: removed."""
         return {name: self._landmarks.map.known.get(name) for name in self._landmarks.map.touched[first:]}
 
     @property
@@ -180,21 +180,21 @@ class MapView:
     def pose_covariance(self) -> Array:
         """Covariance (3, 3) or (6, 6) of the newest keyframe's pose in its tangent space.
 
-        The marginal of the last solve, lengthened by the odometry since.
+        It is the marginal of the last solve, propagated with the odometry since then.
         """
         return self._frontend.covariance.copy()
 
     def landmark_covariances(self) -> list[Array]:
-        """Marginal of each landmark, in the map's axes, or of a pose in its tangent space; NaN where unknown."""
+        """Marginal of each landmark: of a point in the map's axes, of a pose in its tangent space; NaN if unknown."""
         return self._marginals([landmark.vertex for landmark in self.landmarks.values()])
 
     def keyframe_covariances(self) -> Array:
-        """Marginal of every keyframe in its tangent space, (n, 3, 3) or (n, 6, 6); NaN where unknown."""
+        """Marginal of every keyframe in its tangent space, (n, 3, 3) or (n, 6, 6); NaN if unknown."""
         dof = self.space.dof
         return np.array(self._marginals(self.keyframes.ids.tolist())).reshape(-1, dof, dof)
 
     def _marginals(self, vertices: list[int]) -> list[Array]:
-        """All since the last solve are unknown until the next, and all are where that failed."""
+        """Vertices added since the last solve are unknown until the next; if the last solve failed, all are."""
         out = [np.full((dof, dof), np.nan) for dof in (self.graph.kind_of(vertex).dof for vertex in vertices)]
         solved = self._solution.vertices if self.is_solved else 0
         known = [k for k, vertex in enumerate(vertices) if vertex < solved]
@@ -221,7 +221,7 @@ class MapView:
 
     @property
     def is_solved(self) -> bool:
-        """Return whether the last solve succeeded and the solver has all edges since: covariances exist."""
+        """Return whether the last solve succeeded and no edge is pending, so that covariances exist."""
         return self._solution.vertices > 0 and self.solver.is_current
 
     @property
@@ -241,37 +241,37 @@ class MapView:
 
     @property
     def frozen(self) -> int:
-        """The number of first vertices that are of a frozen map: they stay where they are."""
+        """The number of vertices of a frozen map; they come first, and are held."""
         return self.backend.frozen
 
     @property
     def frozen_edges(self) -> int:
-        """Verdicts on so many edges, the first, are of that map: they stay."""
+        """The number of edges of that map; they come first, and their verdicts do not change."""
         return self.backend.frozen_edges
 
     @property
     def held(self) -> tuple[int, int]:
-        """The number of vertices and edges that stay as they are while ``map.localize`` is true; zeros otherwise."""
+        """The numbers of vertices and edges that are held while ``map.localize`` is true; zeros otherwise."""
         return self.backend.held
 
     @property
     def datum(self) -> tuple[float, ...]:
-        """The latitude, longitude and height at which the map begins, by the first fix; empty: no fix has them."""
+        """Latitude, longitude [deg] and height [m] of the map's origin, from the first fix; empty: no fix had them."""
         return self._frontend.datum.datum
 
     # -- health ----------------------------------------------------------------------------------------------------
 
     @property
     def failing(self) -> str:
-        """Return why the last solve failed; empty where it did not."""
+        """The reason why the last solve failed; empty if it succeeded."""
         return self._solution.guard.failing
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
-        """Alarms: when the landmarks said that the robot was elsewhere than odometry, in order; the last may go on."""
+        """The displacement alarms in order: the landmarks contradicted odometry. The last one may still be active."""
         return tuple(self._kidnaps.alarms)
 
     @property
     def displaced(self) -> Alarm | None:
-        """The alarm that goes on: the landmarks say that the robot is elsewhere."""
+        """The active displacement alarm, or None."""
         return self._kidnaps.now
