@@ -40,7 +40,7 @@ class Recording:
 
     def __init__(self, bag, wrong, times):
         self._bag, self._wrong, self._times = bag, wrong, times
-        self.topics = bag.topics
+        self.topics, self.warnings = bag.topics, []
 
     def messages(self, topics):
         heard = 0
