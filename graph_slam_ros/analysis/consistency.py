@@ -18,6 +18,7 @@ from graph_slam_ros.typing import Array
 
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BAND = (0.025, 0.975)
+_ESTIMATED = "robust.noise_scale=estimated"
 _WORTH_SAYING = 0.2  # log of a factor of a sigma
 
 
@@ -172,9 +173,9 @@ def noise_advice(noise: Sequence[NoiseScale], *, is_applied: bool) -> str:
     is_applied : whether the run used the factors already
     """
     wrong = [one for one in noise if not one.reason and abs(np.log(one.factor)) > _WORTH_SAYING]
-    if is_applied or not wrong:
+    if not wrong:
         return ""
-    return "replay with --set robust.noise_scale=estimated to use these factors"
+    return "the run used these factors" if is_applied else f"replay with --set {_ESTIMATED} to use these factors"
 
 
 def _in_six(covariance: Array) -> Array:

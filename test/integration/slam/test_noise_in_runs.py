@@ -37,6 +37,7 @@ def test_the_scale_is_said_always_and_applied_where_it_is_asked_for(drive):
         (position,) = [one for one in scores.consistency.noise if one.key == ("landmarks", "detections", "position")]
         assert position.factor < 0.75
         assert ("--set robust.noise_scale=estimated" in str(scores)) is is_advised
+        assert ("the run used these factors" in str(scores)) is not is_advised
     errors = [
         evaluate(folder / name, folder / "bag.mcap").estimate.position_m["rmse"] for name in ("configured", "estimated")
     ]
