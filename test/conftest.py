@@ -18,6 +18,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 KINDS = "unit", "integration", "process"
 """The folders of test/, each with the folders of the package in it."""
+LONGEST = {"test_stopping.py", "test_recorded.py", "test_journal.py", "test_live_inputs.py", "test_stack_time.py"}
 TRIES = re.compile(r"\b(often|times)\(")
 """What it has that tries more in ``make soak``."""
 _running = []
@@ -39,6 +40,11 @@ def pytest_ignore_collect(collection_path, config):  # type: ignore[no-untyped-d
     """For unit tests alone the others are not even imported: ROS, with which half of them begin, takes a second."""
     is_other = collection_path.match("test_*.py") and kind(collection_path) != "unit"
     return True if is_other and config.option.markexpr == "unit" else None
+
+
+def pytest_collection_modifyitems(items) -> None:  # type: ignore[no-untyped-def]
+    """Begin with the longest: where they came last, one process would work while the others wait for it."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
 
 
 def pytest_itemcollected(item) -> None:  # type: ignore[no-untyped-def]
