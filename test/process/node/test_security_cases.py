@@ -5,8 +5,6 @@ The package alone is held to the list of what is banned: benchmarks keep pickles
 
 import ast
 import importlib.util
-import os
-import random
 import re
 import subprocess
 import sys
@@ -310,24 +308,23 @@ def running():
     rclpy = pytest.importorskip("rclpy")
     for package in ("vision_msgs", "tf2_msgs"):
         pytest.importorskip(package)
+    from live_nodes import ENVIRONMENT, own_domain
     from rclpy.context import Context
 
-    domain = random.randint(1, 100)
-    environment = dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST", ROS_DOMAIN_ID=str(domain))
     words = ("-p", "output.folder:=''", "-p", "use_sim_time:=true")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "graph_slam_ros.node.node", "--ros-args", *words], env=environment
-    )
-    context = Context()
-    context.init(args=[], domain_id=domain)
-    node = rclpy.create_node("auditor", context=context)
-    try:
-        yield node
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
-        process.terminate()
-        process.wait(timeout=PATIENCE_S)
+    command = [sys.executable, "-m", "graph_slam_ros.node.node", "--ros-args", *words]
+    with own_domain() as domain:
+        process = subprocess.Popen(command, env=ENVIRONMENT | {"ROS_DOMAIN_ID": domain})
+        context = Context()
+        context.init(args=[], domain_id=int(domain))
+        node = rclpy.create_node("auditor", context=context)
+        try:
+            yield node
+        finally:
+            node.destroy_node()
+            context.try_shutdown()
+            process.terminate()
+            process.wait(timeout=PATIENCE_S)
 
 
 def until_steady(node, want):
