@@ -320,7 +320,7 @@ def _earlier_name(folder: Path) -> re.Pattern[str]:
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
-    """Whatever is called as an earlier run is."""
+    """The folders with a name of an earlier run, by its number."""
     named = _earlier_name(folder)
     there = folder.parent.iterdir() if folder.parent.is_dir() else ()
     return {int(match[1]): run for run in there if (match := named.fullmatch(run.name))}

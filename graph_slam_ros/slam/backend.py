@@ -28,11 +28,11 @@ _UPDATES = 6  # until what was let in fits, before everything is solved for it
 
 
 class Backend:
-    """Whoever adds to ``graph`` has it solved here, keyframe by keyframe.
+    """Solves what is added to ``graph``, keyframe by keyframe, and keeps the verdicts on its edges.
 
     Parameters
     ----------
-    beside : begins the work of a second look; what it returns waits for the result
+    executor : begins the work of a second look; the function that it returns waits for the result
     start : whose graph and ledger to go on with
 
     Attributes

@@ -91,7 +91,7 @@ class MapView:
         a = self.sighting_poses.ids[~ends]
         motion = group.between(tuple(odometry[a].T), tuple(odometry[a + 1].T))
         wrong = group.local(tuple(poses[a + 1].T), group.compose(tuple(poses[a].T), motion))
-        part = np.minimum(since_ns[~ends] / (stamps_ns[a + 1] - stamps_ns[a]), 1.0)
+        part = np.minimum(since_ns[~ends] / np.maximum(stamps_ns[a + 1] - stamps_ns[a], 1), 1.0)
         found[~ends] = np.stack(group.retract(tuple(found[~ends].T), tuple(part * d for d in wrong)), axis=-1)
         return found
 
