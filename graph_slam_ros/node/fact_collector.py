@@ -7,6 +7,7 @@ from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.ingest import Ingest
 from graph_slam_ros.node.preparation import Preparation
 from graph_slam_ros.node.publishers import Publishers
+from graph_slam_ros.node.publishing_clock import PublishingClock
 from graph_slam_ros.node.recent import RecentInputs
 from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.subscriptions import Subscriptions
@@ -31,9 +32,10 @@ class FactCollector:
         worker: Worker,
         ingest: Ingest,
         publishers: Publishers,
+        clock: PublishingClock,
     ) -> None:
         self._node, self._counters, self._session = node, counters, session
-        self._worker, self._ingest, self._publishers = worker, ingest, publishers
+        self._worker, self._ingest, self._publishers, self._clock = worker, ingest, publishers, clock
         self._recent = RecentInputs()
         self._before = 0, 0, 0  # overflows, failures and restarts until the last time
 
@@ -53,13 +55,13 @@ class FactCollector:
         """
         session, node, worker, gate = self._session, self._node, self._worker, self._ingest.gate
         if not worker.waiting and node.now_ns:
-            worker.offer(node.guarded(session.evaluate))
+            worker.offer(session.evaluate)
         pipeline = Counters()
         pipeline.update(session.slam.counters)
         counters = Counters()
         counters.update(self._counters)
         counters.update(pipeline)
-        counted, processed = counters.as_dict(), self._ingest.processed
+        counted, processed = counters.as_dict(), self._clock.processed
         recent = self._recent.observe(time.monotonic(), processed, self._counters.as_dict(), pipeline.as_dict())
         overflows = sum(of.get("overflow", 0) for of in counted.values())
         failures, restarts = session.failures, self._counters["node", "worker_restarted"]

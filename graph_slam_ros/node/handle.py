@@ -47,6 +47,9 @@ class NodeHandle(Protocol):
     def guarded(self, callback: Callback) -> Callback:
         """Return a callback that raises nothing: what the given one raises is counted and logged."""
 
+    def report_fault(self, error: Exception) -> None:
+        """Count and log what a job raised."""
+
     def acknowledge(self, count: int) -> None:
         """Publish the number of messages received."""
 

@@ -1,7 +1,8 @@
 """The way of measurements from the callbacks to the worker: future stamps, jumps of time, memory, the gate."""
 
-from collections import Counter
-from collections.abc import Callable, Sequence
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from functools import partial
 from typing import Any
@@ -17,7 +18,6 @@ from graph_slam_ros.messages.from_msg import Decoder, MessageConverter, twist_of
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.message_class import message_class
-from graph_slam_ros.node.future_stamps import FutureStamps
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.memory import is_short
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
@@ -27,15 +27,17 @@ from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import Config, Control, Counters, Odometry
 from graph_slam_ros.slam.edits import removal
-from graph_slam_ros.slam.frontend.ingest_gate import IngestGate, Passage, input_of, size_of
+from graph_slam_ros.slam.frontend.ingest_gate import IngestGate, Passage
 
 OnJump = Callable[[Passage, str, str], None]
+
+_PATIENCE_S = 1.0  # for the clock to reach a stamp
 
 
 class Ingest:
     """Hands measurements to the worker in the order they came, or refuses and counts them.
 
-    All but ``_process`` is in the main thread.
+    All of it is in the main thread.
 
     Parameters
     ----------
@@ -48,7 +50,6 @@ class Ingest:
     converter : makes measurements of messages
     gate : decides what a jump of time, a pause and a full queue mean
     extrapolator : the pose by the newest odometry
-    processed : things that were handed to the pipeline, by input
     memory_is_short : whether the process has more memory than it should
     """
 
@@ -70,7 +71,6 @@ class Ingest:
         self.converter.on_fault = node.get_logger().error
         self.gate = IngestGate(config.time.jump_back_s, counters, lambda: node.now_ns)
         self.extrapolator = PoseExtrapolator(config)
-        self.processed: Counter[str] = Counter()
         self.memory_is_short = False
         self._future_stamps = FutureStamps(config.time.future_s, self._stamp_clock_ns, partial(self.refuse, "future"))
         self._publishes_odometry = False
@@ -142,7 +142,10 @@ class Ingest:
             self._on_jump(passage, "stamps", "odometry has gone back in time and stays there")
         if passage.measured:
             self._session.accept(passage.measured)
-            self._worker.offer(self._node.guarded(partial(self._process, passage.measured)))
+            self._worker.offer(
+                partial(self._session.process, passage.measured),
+                partial(self._clock.after_message, self._session, passage.measured),
+            )
         else:
             self._clock.refused += 1
 
@@ -156,15 +159,6 @@ class Ingest:
             if isinstance(m, Closure):
                 self._counters.count(m.topic, "memory")
         return [m for m in measured if not isinstance(m, Closure)]
-
-    def _process(self, measured: Sequence[Measured]) -> None:
-        """Process a message that was accepted, in the worker's thread."""
-        try:
-            self._session.process(measured)
-        finally:
-            for m in measured:
-                self.processed[input_of(m)] += size_of(m)
-            self._clock.after_message(self._session)
 
     # -- odometry in the map -----------------------------------------------------------------------------------------
 
@@ -228,6 +222,67 @@ class Ingest:
             return
         passage = self.gate.begin_anew(self._node.config.time.on_jump)
         self._on_jump(passage, "clock", f"jumped by {jump.delta.nanoseconds * 1e-9:.3f} s")
+
+
+class FutureStamps:
+    """Holds messages that are dated ahead of the clock, which may be late itself; refuses those that stay ahead.
+
+    Parameters
+    ----------
+    most_s : how far ahead is not ahead; 0: everything passes
+    now_ns : the clock; 0 where there is none, then everything passes
+    refuse : is handed a message that has waited too long
+    """
+
+    def __init__(self, most_s: float, now_ns: Callable[[], int], refuse: Callable[[Sequence[Measured]], None]) -> None:
+        self._most_ns, self._now_ns, self._refuse = round(most_s * 1e9), now_ns, refuse
+        self._until_ns = 0  # what is older passes without a look at the clock
+        self._held: deque[tuple[float, Sequence[Measured]]] = deque()
+
+    def pass_on(self, messages: Sequence[Measured]) -> Iterable[Sequence[Measured]]:
+        """The measurements of messages that are due now: of this one and of those that were held."""
+        if not self._held and (not self._most_ns or not self.is_ahead(messages)):
+            return (messages,)
+        self._held.append((time.monotonic(), messages))
+        return self.due()
+
+    def due(self) -> list[Sequence[Measured]]:
+        """The held measurements that are due now; those held for too long are refused."""
+        out = []
+        while self._held:
+            since_s, messages = self._held[0]
+            if not self.is_ahead(messages):
+                out.append(messages)
+            elif time.monotonic() - since_s < _PATIENCE_S:
+                break
+            else:
+                self._refuse(messages)
+            self._held.popleft()
+        return out
+
+    def is_ahead(self, messages: Sequence[Measured]) -> bool:
+        """Return whether one of the messages is too far ahead of the clock."""
+        newest_ns = max((m.stamp_ns for m in messages), default=0)
+        if newest_ns <= self._until_ns:
+            return False
+        now_ns = self._now_ns()
+        self._until_ns = now_ns + self._most_ns if now_ns else 0
+        return bool(now_ns) and newest_ns > self._until_ns
+
+    def drain(self) -> list[Sequence[Measured]]:
+        """Hold nothing any more: refuse measurements ahead of the clock, and return the others."""
+        out: list[Sequence[Measured]] = []
+        for _, messages in self._held:
+            if self.is_ahead(messages):
+                self._refuse(messages)
+            else:
+                out.append(messages)
+        self._held.clear()
+        return out
+
+    def forget_time(self) -> None:
+        """The clock begins anew."""
+        self._until_ns = 0
 
 
 def _installed(config: Config) -> dict[str, Decoder]:

@@ -255,16 +255,20 @@ class GraphSlamNode(LifecycleNode):
             try:
                 callback(*arguments)
             except Exception as error:
-                self._faults.append(time.monotonic())
-                if self._run is not None:
-                    self._run.counters.count("node", type(error).__name__)
-                key = f"{type(error).__name__}: {error}"
-                if key not in self._logged and len(self._logged) < 1000:
-                    self._logged.add(key)
-                    self.get_logger().error("".join(traceback.format_exception(error)))
-                self.get_logger().error(key, throttle_duration_sec=5.0)
+                self.report_fault(error)
 
         return guarded
+
+    def report_fault(self, error: Exception) -> None:
+        """Count an exception of a callback or a job, and log its traceback once."""
+        self._faults.append(time.monotonic())
+        if self._run is not None:
+            self._run.counters.count("node", type(error).__name__)
+        key = f"{type(error).__name__}: {error}"
+        if key not in self._logged and len(self._logged) < 1000:
+            self._logged.add(key)
+            self.get_logger().error("".join(traceback.format_exception(error)))
+        self.get_logger().error(key, throttle_duration_sec=5.0)
 
     def _tick(self) -> None:
         if self._run is not None:

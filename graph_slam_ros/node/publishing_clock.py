@@ -1,7 +1,10 @@
 """The schedule of results: each topic in its period, and never so often that the pipeline falls behind."""
 
 import time
+from collections import Counter
+from collections.abc import Sequence
 
+from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.node import events
 from graph_slam_ros.node.handle import NodeHandle
 from graph_slam_ros.node.publishers import Publishers
@@ -9,6 +12,7 @@ from graph_slam_ros.node.session import Session
 from graph_slam_ros.node.throttle import Throttle
 from graph_slam_ros.node.worker import Worker
 from graph_slam_ros.slam import GraphSlam, Update
+from graph_slam_ros.slam.frontend.ingest_gate import input_of, size_of
 
 ACKNOWLEDGE = 32  # messages
 _MOST_UNPUBLISHED_S, _AGAIN_S = 4.0, 5.0
@@ -23,12 +27,14 @@ class PublishingClock:
 
     Attributes
     ----------
-    refused, processed : messages that went no further, by the main thread, and that the worker has done
+    refused : messages that went no further
+    processed : measurements that the worker has processed, by input
     """
 
     def __init__(self, node: NodeHandle, publishers: Publishers, worker: Worker) -> None:
         self._node, self._publishers, self._worker = node, publishers, worker
-        self.refused = self.processed = 0
+        self.refused = self._done = 0
+        self.processed: Counter[str] = Counter()
         self._acknowledged = -1
         self._has_player = False
         self._is_overdue, self._published_s = False, time.monotonic()  # results, where the worker always has messages
@@ -42,24 +48,26 @@ class PublishingClock:
         self._acknowledge()
         is_due = self._publishers.are_due(self._node.config)
         if is_due and self._worker.waiting < ACKNOWLEDGE:
-            self._worker.offer(self._node.guarded(lambda: self.publish_due(session.slam)))
+            self._worker.offer(lambda: self.publish_due(session.slam))
         elif is_due and time.monotonic() - self._published_s > _MOST_UNPUBLISHED_S:
             self._is_overdue = True
 
     def _acknowledge(self) -> None:
-        count = self.refused + self.processed
+        count = self.refused + self._done
         if count != self._acknowledged:
             self._acknowledged = count
             self._node.acknowledge(count)
 
     # -- in the worker's thread --------------------------------------------------------------------------------------
 
-    def after_message(self, session: Session) -> None:
-        """Publish what is overdue, and acknowledge: another message was processed."""
-        self.processed += 1
+    def after_message(self, session: Session, measured: Sequence[Measured]) -> None:
+        """Count what was processed of another message, publish what is overdue, and acknowledge."""
+        self._done += 1
+        for m in measured:
+            self.processed[input_of(m)] += size_of(m)
         if self._is_overdue:
             self.publish_due(session.slam)
-        if self._has_player and (not self._worker.waiting or self.processed % ACKNOWLEDGE == 0):
+        if self._has_player and (not self._worker.waiting or self._done % ACKNOWLEDGE == 0):
             self._acknowledge()
 
     def on_update(self, slam: GraphSlam, update: Update, *, is_located: bool) -> None:

@@ -55,7 +55,7 @@ class Runtime:
             undo.callback(self._session.abandon)
             self._publishers = Publishers(node, config)
             undo.callback(self._publishers.close)
-            self._worker = Worker(config.inputs.queue, self._on_exit_of_a_job)
+            self._worker = Worker(config.inputs.queue, node.report_fault, self._on_exit_of_a_job)
             undo.callback(self._worker.stop, 0.0)
             self._clock = PublishingClock(node, self._publishers, self._worker)
             self._ingest = Ingest(
@@ -63,7 +63,10 @@ class Runtime:
                 *(self._publishers, self._clock, self._begin_anew),
             )
             undo.pop_all()
-        self._facts = FactCollector(node, self.counters, self._session, self._worker, self._ingest, self._publishers)
+        self._facts = FactCollector(
+            *(node, self.counters, self._session, self._worker),
+            *(self._ingest, self._publishers, self._clock),
+        )
         self._preparation = Preparation(node.get_logger(), config.world.dimensions)
         self._completion = Completion(self._session.incomplete, node.get_logger())
         self._subscriptions: Subscriptions | None = None

@@ -7,9 +7,12 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from functools import partial
 from typing import Any
+
+Job = Callable[[], Any]
 
 URGENT_S = 2.0  # for queued jobs when the node is stopped
 _POLL_S = 0.05
@@ -20,30 +23,33 @@ class Worker:
 
     Parameters
     ----------
-    most : jobs that may wait; ``offer`` refuses more, ``call`` never does
+    most : queued jobs up to which ``offer`` accepts another; ``call`` always does
+    on_fault : called in the thread with what an offered job has raised; the next job follows
     on_exit : called in the thread after a job that would have ended it, as ``SystemExit`` does; the next job follows
     """
 
-    def __init__(self, most: int, on_exit: Callable[[], None] = lambda: None) -> None:
-        self._most, self._on_exit = most, on_exit
-        self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any] | None, float] | None] = queue.SimpleQueue()
+    def __init__(
+        self, most: int, on_fault: Callable[[Exception], None], on_exit: Callable[[], None] = lambda: None
+    ) -> None:
+        self._most, self._on_fault, self._on_exit = most, on_fault, on_exit
+        self._jobs: queue.SimpleQueue[tuple[Sequence[Job], Future[Any] | None, float] | None] = queue.SimpleQueue()
         self._since: float | None = None
         self._begun: float | None = None
         self._is_left = False
         self._thread = threading.Thread(target=self._run, name="graph_slam_worker", daemon=True)
         self._thread.start()
 
-    def offer(self, job: Callable[[], None]) -> bool:
-        """Queue a job that raises nothing; False where the queue is full."""
+    def offer(self, *jobs: Job) -> bool:
+        """Queue jobs that follow one another, whatever the first raises; False where the queue is full."""
         if not self.has_room:
             return False
-        self._jobs.put((job, None, time.monotonic()))
+        self._jobs.put((jobs, None, time.monotonic()))
         return True
 
-    def call(self, job: Callable[[], Any]) -> "Future[Any]":
+    def call(self, job: Job) -> "Future[Any]":
         """Queue a job; the future has its result or exception."""
         future: Future[Any] = Future()
-        self._jobs.put((job, future, time.monotonic()))
+        self._jobs.put(([job], future, time.monotonic()))
         return future
 
     @property
@@ -96,14 +102,21 @@ class Worker:
 
     def _run(self) -> None:
         while (item := self._jobs.get()) is not None and not self._is_left:
-            job, future, self._since = item
+            jobs, future, self._since = item
             self._begun = time.monotonic()
-            if not isinstance(_failure(job, future), Exception | None):
-                _failure(self._on_exit, None)
+            for job in jobs:
+                self._do(job, future)
             self._since = self._begun = None
 
+    def _do(self, job: Job, future: "Future[Any] | None") -> None:
+        error = _failure(job, future)
+        if not isinstance(error, Exception | None):
+            _failure(self._on_exit, None)
+        elif error is not None and future is None:
+            _failure(partial(self._on_fault, error), None)
 
-def _failure(job: Callable[[], Any], future: "Future[Any] | None") -> BaseException | None:
+
+def _failure(job: Job, future: "Future[Any] | None") -> BaseException | None:
     """Run a job; what it raises does not end the thread, and goes to its future if it has one."""
     try:
         result = job()

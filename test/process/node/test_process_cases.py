@@ -223,7 +223,7 @@ def test_P23_what_would_end_the_solvers_thread_does_not_and_it_goes_on_with_the_
 
 def test_P23_who_waits_for_a_job_that_would_have_ended_its_thread_is_told():
     done = []
-    worker = Worker(10, lambda: done.append("first"))
+    worker = Worker(10, print, lambda: done.append("first"))
 
     def ends():
         raise SystemExit

@@ -13,7 +13,7 @@ from messages import STAMP_NS
 from graph_slam_ros.lie import so3
 from graph_slam_ros.node import diagnostics
 from graph_slam_ros.node.diagnostics import Facts, InputFacts, judge, statuses
-from graph_slam_ros.node.future_stamps import FutureStamps
+from graph_slam_ros.node.ingest import FutureStamps
 from graph_slam_ros.node.map_to_odom import MapToOdom
 from graph_slam_ros.node.pose_extrapolator import PoseExtrapolator
 from graph_slam_ros.node.recent import Recent, RecentInputs
@@ -175,26 +175,29 @@ def test_where_no_clock_runs_or_nobody_asks_nothing_is_ahead():
 
 
 def test_P10_a_worker_does_everything_in_order_refuses_what_is_too_much_and_survives_what_fails():
-    worker, gate, done = Worker(3), threading.Event(), []
+    faults = []
+    worker, gate, done = Worker(4, faults.append), threading.Event(), []
     first = worker.call(gate.wait)
     deadline = time.monotonic() + 10.0
     while worker.waiting and time.monotonic() < deadline:
         time.sleep(0.001)
-    taken = [worker.offer(lambda k=k: done.append(k)) for k in range(5)]
+    taken = [worker.offer(lambda: [] + 1, lambda: done.append("then"))]
+    taken += [worker.offer(lambda k=k: done.append(k)) for k in range(5)]
     failed, after = worker.call(lambda: 1 / 0), worker.call(lambda: done.append("last"))
-    assert taken == [True, True, True, False, False]
-    assert (worker.waiting, worker.is_alive) == (5, True)
+    assert taken == [True, True, True, True, False, False]
+    assert (worker.waiting, worker.is_alive) == (6, True)
     gate.set()
     assert first.result(10.0)
     assert isinstance(failed.exception(10.0), ZeroDivisionError)
     after.result(10.0)
-    assert done == [0, 1, 2, "last"]
+    assert done == ["then", 0, 1, 2, "last"]
+    assert [type(fault) for fault in faults] == [TypeError], "of an offered job; who called has it in the future"
     assert worker.stop(10.0)
     assert not worker.is_alive
 
 
 def test_a_worker_that_is_stopped_tells_when_what_waits_cannot_be_done_in_time_and_begins_no_more():
-    worker, gate, done = Worker(10), threading.Event(), []
+    worker, gate, done = Worker(10, print), threading.Event(), []
     worker.offer(lambda: gate.wait(10.0) and None)
     worker.offer(lambda: done.append(1))
     assert not worker.stop(0.01)
