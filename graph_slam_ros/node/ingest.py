@@ -231,11 +231,13 @@ class FutureStamps:
     ----------
     most_s : how far ahead is not ahead; 0: everything passes
     now_ns : the clock; 0 where there is none, then everything passes
-    refuse : is handed a message that has waited too long
+    on_refused : called with each message that has waited too long
     """
 
-    def __init__(self, most_s: float, now_ns: Callable[[], int], refuse: Callable[[Sequence[Measured]], None]) -> None:
-        self._most_ns, self._now_ns, self._refuse = round(most_s * 1e9), now_ns, refuse
+    def __init__(
+        self, most_s: float, now_ns: Callable[[], int], on_refused: Callable[[Sequence[Measured]], None]
+    ) -> None:
+        self._most_ns, self._now_ns, self._on_refused = round(most_s * 1e9), now_ns, on_refused
         self._until_ns = 0  # what is older passes without a look at the clock
         self._held: deque[tuple[float, Sequence[Measured]]] = deque()
 
@@ -256,7 +258,7 @@ class FutureStamps:
             elif time.monotonic() - since_s < _PATIENCE_S:
                 break
             else:
-                self._refuse(messages)
+                self._on_refused(messages)
             self._held.popleft()
         return out
 
@@ -274,7 +276,7 @@ class FutureStamps:
         out: list[Sequence[Measured]] = []
         for _, messages in self._held:
             if self.is_ahead(messages):
-                self._refuse(messages)
+                self._on_refused(messages)
             else:
                 out.append(messages)
         self._held.clear()
