@@ -2,7 +2,7 @@
 
 Exit codes: 0 done, 1 internal error, 2 refused (one line names the culprit), 3 done but something was lost, 130
 interrupted (Ctrl-C); of ``optimize --certify`` also 4 not certified, 5 the certificate does not apply; of ``diff`` 4
-they differ.
+they differ; of ``check`` 4 something above a note was found.
 """
 
 import os

@@ -22,6 +22,7 @@ _GAP = "..."
 DONE, FAULT, REFUSED, LOSSES, INTERRUPTED = 0, 1, 2, 3, 130
 NOT_CERTIFIED, NOT_APPLICABLE = 4, 5  # of optimize --certify
 DIFFERENT = 4  # of diff
+FOUND = 4  # of check
 
 
 def escaped(text: str) -> str:

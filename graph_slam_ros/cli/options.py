@@ -72,6 +72,19 @@ def info(sub: CommandParser) -> None:
     sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording")
 
 
+def check(sub: CommandParser) -> None:
+    """Add the options of ``check``."""
+    sub.codes = f"{CODES} 4: something above a note was found."
+    sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording")
+    sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: as info chooses)")
+    sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: as info chooses)")
+    sub.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="set one parameter, before what info chooses"
+    )
+    sub.add_argument("--quick", action="store_true", help="leave out what needs a replay and a fit")
+    sub.add_argument("--json", action="store_true", help="print all of it as one line of JSON")
+
+
 def optimize(sub: CommandParser) -> None:
     """Add the options of ``optimize``."""
     sub.codes = f"{CODES} With --certify: 4 not certified, 5 the certificate does not apply."

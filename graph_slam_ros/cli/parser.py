@@ -41,6 +41,13 @@ COMMANDS = {
         "show topics, types, rates, frames and span of a recording, and how to replay it",
         "drive.mcap",
     ),
+    "check": Command(
+        _later("check"),
+        options.check,
+        "find what is wrong with a recording, by how much, and the setting that mends it",
+        "drive.mcap",
+        "drive.mcap --set detections.offset_s=-0.096",
+    ),
     "replay": Command(
         recordings.replay,
         options.replay,

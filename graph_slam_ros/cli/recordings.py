@@ -91,7 +91,8 @@ def info(args: argparse.Namespace) -> int:
         return console.DONE
     bag = open_bag(args.bag)
     lines, fits = describe(bag, args.bag)
-    console.show(*lines)
+    checked = f"what is wrong with it, and what mends it: {console.command('check', args.bag)}"
+    console.show(*lines[:-1], checked, lines[-1])  # the command to paste is the last line
     return console.report_losses(bag.losses, bag.warnings) or (console.DONE if fits else console.LOSSES)
 
 

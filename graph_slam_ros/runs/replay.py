@@ -8,13 +8,14 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.check.columns import Collector
 from graph_slam_ros.config.inputs import InputConfig, default_input
 from graph_slam_ros.measurements.reasons import warnings as mendable
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageConverter
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.survey import with_survey
-from graph_slam_ros.recordings.bag import Bag, BagError, open_bag
+from graph_slam_ros.recordings.bag import Bag, BagError, BagMessage, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.runs.folder import RunError, check_room, is_run, keep_earlier, missing, recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
@@ -155,6 +156,7 @@ class RecordedRuns:
     Parameters
     ----------
     datum : as of ``measurements``
+    columns : collects what the checks of a recording look into
 
     Attributes
     ----------
@@ -167,14 +169,23 @@ class RecordedRuns:
     """
 
     def __init__(
-        self, bag: Bag, inputs: Inputs, config: Config, counters: Counters, datum: tuple[float, ...] = ()
+        self,
+        bag: Bag,
+        inputs: Inputs,
+        config: Config,
+        counters: Counters,
+        datum: tuple[float, ...] = (),
+        columns: Collector | None = None,
     ) -> None:
-        self._bag, self._inputs, self._counters = bag, inputs, counters
+        self._bag, self._inputs, self._counters, self._columns = bag, inputs, counters, columns
         self._on_jump = config.time.on_jump
         self._gate = IngestGate(config.time.jump_back_s, counters)
         self.counted: list[Counters] = []
         used = [bag.topics[topic] for topic in inputs.topics.values()]
-        self._converter = MessageConverter(config, counters, {topic.type: recorded_decoder(topic) for topic in used})
+        decoders = {topic.type: recorded_decoder(topic) for topic in used}
+        if columns is not None:
+            decoders = {type_name: columns.decoder(decode) for type_name, decode in decoders.items()}
+        self._converter = MessageConverter(config, counters, decoders)
         self._converter.on_fault = bag.warnings.append
         for name in counters.received.keys() - inputs.topics.keys():
             del counters.received[name]  # nobody asked for it
@@ -186,11 +197,17 @@ class RecordedRuns:
         bag, by_topic = self._bag, self._inputs.by_topic()
         if TF_STATIC in self._inputs.topics:
             for message in bag.messages({self._inputs.topics[TF_STATIC]}):
-                self._converter.convert(TF_STATIC, message.cdr)
+                self._collect(message, [TF_STATIC], self._converter.convert(TF_STATIC, message.cdr))
         for message in bag.messages(set(by_topic)):
             names = by_topic[message.topic]
-            yield from self._passed([m for name in names for m in self._converter.convert(name, message.cdr)], names)
+            measured = [m for name in names for m in self._converter.convert(name, message.cdr)]
+            self._collect(message, names, measured)
+            yield from self._passed(measured, names)
         yield from self._passed(self._converter.finish(), ())
+
+    def _collect(self, message: BagMessage, names: Sequence[str], measured: list[Measured]) -> None:
+        if self._columns is not None:
+            self._columns.add(message.topic, names, message.log_ns, measured)
 
     def _passed(self, measured: list[Measured], names: Sequence[str]) -> Iterator[tuple[int, list[Measured | Control]]]:
         passage = self._gate.admit(measured, self._on_jump)

@@ -51,6 +51,7 @@ class Suggestion:
     Attributes
     ----------
     settings : parameters that differ from their defaults, by dotted name
+    topics, names : of odom and detections; of all inputs
     notes : sentences: what was chosen and why, and what is assumed
     unused : why a topic that could be an input is not offered, by its name
     trouble : why there is no command; empty where there is one
@@ -61,8 +62,8 @@ class Suggestion:
         self.settings: dict[str, Any] = {}
         self.notes: list[str] = []
         self.unused: dict[str, str] = {}
-        self._topics: dict[str, str] = {}  # of odom and detections
-        self._names: list[str] = []
+        self.topics: dict[str, str] = {}  # of odom and detections
+        self.names: list[str] = []
         self._base, self._odom = "base_link", "odom"
         self._lag_s: float | None = None
         self.trouble = self._of_a_result() or self._choose_odometry()
@@ -77,7 +78,7 @@ class Suggestion:
         path = str(self._path)
         words = ["graph_slam", "replay", f"./{path}" if path.startswith("-") else path]
         for option, name in (("--odom", "odom"), ("--landmarks", "detections")):
-            words += [option, self._topics[name]] if name in self._topics else []
+            words += [option, self.topics[name]] if name in self.topics else []
         for key, value in self.settings.items():
             words += ["--set", _assignment(key, value)]
         return shlex.join([*words, "--out", str(suggested_out(self._path))])
@@ -86,7 +87,7 @@ class Suggestion:
         """Return why the command would be; empty where it is not."""
         try:
             config = Config.from_mapping(self.settings)
-            choose_inputs(bag, config, self._topics.get("odom"), self._topics.get("detections"))
+            choose_inputs(bag, config, self.topics.get("odom"), self.topics.get("detections"))
         except GraphSlamError as error:
             return str(error)
         return ""
@@ -132,7 +133,7 @@ class Suggestion:
                 self.unused[one.topic.name] = "another odometry"
         if len(found) > 1:
             self.notes.append(f"{len(found)} odometries: {best.topic.name} is chosen; --odom takes another")
-        self._topics["odom"], self._lag_s = best.topic.name, best.typical_lag_s
+        self.topics["odom"], self._lag_s = best.topic.name, best.typical_lag_s
         self._frames(best.frame, best.child)
         if best.off_plane > _OFF_PLANE * best.read:
             self.settings["world.dimensions"] = 3
@@ -162,7 +163,7 @@ class Suggestion:
         return ""
 
     def _frames(self, parent: str, child: str) -> None:
-        self._names.append("odom")
+        self.names.append("odom")
         if not parent:
             self.settings["odom.frame"] = self._odom
         elif parent != self._odom:
@@ -205,7 +206,7 @@ class Suggestion:
             if number := self._tag_number(one):
                 self._add("tag", one, {"use": "landmarks", "id": number})
         prefixes = {found[1] for found in map(_TAG.fullmatch, self._recording.moving) if found}
-        if not any(name.startswith("tags") for name in self._names):
+        if not any(name.startswith("tags") for name in self.names):
             for prefix in sorted(prefixes):
                 chosen = {"type": TRANSFORMS, "topic": TF_TOPIC, "use": "landmarks", "frame_prefix": prefix}
                 frame = next(p for c, p in self._recording.moving.items() if c.startswith(prefix))
@@ -273,7 +274,7 @@ class Suggestion:
     # -- fixes ---------------------------------------------------------------------------------------------------
 
     def _choose_fixes(self) -> None:
-        has_landmarks = len(self._names) > 1
+        has_landmarks = len(self.names) > 1
         receivers = sorted(self._of_type(GNSS), key=lambda one: -one.usable)
         for one in receivers[1:]:
             self.unused[one.topic.name] = "another receiver"
@@ -285,7 +286,7 @@ class Suggestion:
             self._mount(one.topic.name, one.frame)  # says what is assumed; the input itself assumes and counts it
             if not one.has_noise:
                 self.notes.append(f"{one.topic.name} has no covariance: 2 m is assumed")
-        self._choose_imu(self._of_type(IMU), is_needed=len(self._names) == 1)
+        self._choose_imu(self._of_type(IMU), is_needed=len(self.names) == 1)
         for one in self._of_type(POSE, POSE_WITH_COVARIANCE):
             name = one.topic.name
             if self._tag_number(one):
@@ -294,7 +295,7 @@ class Suggestion:
                 self.unused[name] = "the output of a localiser, or a goal: no measurement"
             elif one.frame == self._odom:
                 self.unused[name] = "in the frame of the odometry: it says the same"
-            elif one.topic.type == POSE or has_landmarks or len(self._names) > 1:
+            elif one.topic.type == POSE or has_landmarks or len(self.names) > 1:
                 self.unused[name] = (
                     "a pose may be an estimate or the truth; as a fix: type, topic, frame=map in a section"
                 )
@@ -308,7 +309,7 @@ class Suggestion:
             if one.usable < 0.5 * one.read:
                 self.unused[one.topic.name] = "it has no orientation (an IMU with a filter has)"
             elif not is_needed:
-                names = " ".join([*self._names, "imu"])
+                names = " ".join([*self.names, "imu"])
                 mount = "" if self._recording.is_linked(one.frame, self._base) else " --set 'imu.mount=0 0 0 0 0 0'"
                 self.unused[one.topic.name] = (
                     "its heading may drift, and there is better. With it: "
@@ -337,13 +338,13 @@ class Suggestion:
             self.notes.append(f"{topic} has another clock than odometry: {offset_s:.3f} s are added to its stamps")
         name = self._free(name)
         if name == "detections":
-            self._topics[name] = topic
+            self.topics[name] = topic
         else:
             settings = {"type": one.topic.type, "topic": topic} | settings
         self._set(name, settings)
 
     def _set(self, name: str, chosen: dict[str, Any]) -> None:
-        self._names.append(name)
+        self.names.append(name)
         self.settings |= {f"{name}.{key}": value for key, value in chosen.items()}
 
     def _mount(self, topic: str, frame: str) -> dict[str, str]:
@@ -358,14 +359,14 @@ class Suggestion:
         return {"mount": mount}
 
     def _free(self, name: str) -> str:
-        number = 1 + sum(re.fullmatch(rf"{name}(_\d+)?", other) is not None for other in self._names)
+        number = 1 + sum(re.fullmatch(rf"{name}(_\d+)?", other) is not None for other in self.names)
         return name if number == 1 else f"{name}_{number}"
 
     def _finish(self) -> None:
-        names = " ".join(self._names)
+        names = " ".join(self.names)
         if names != Config().inputs.names:
             self.settings = {"inputs.names": names} | self.settings
-        if self._names == ["odom"]:
+        if self.names == ["odom"]:
             self.notes.append("nothing corrects this odometry: the result will be odometry alone (exit code 3)")
         self._not_read()
 
@@ -381,7 +382,7 @@ class Suggestion:
             more = f" and {len(found) - _MOST_LISTED} more" if len(found) > _MOST_LISTED else ""
             note = f"no input reads {', '.join(found[:_MOST_LISTED])}{more}: their types are none of docs/inputs.md"
             own = "; landmarks in a type of your own: a plugin (docs/inputs.md), or publish them as Detection3DArray"
-            self.notes.append(note + own * (self._names == ["odom"]))
+            self.notes.append(note + own * (self.names == ["odom"]))
 
 
 def _assignment(key: str, value: Any) -> str:

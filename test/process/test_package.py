@@ -48,9 +48,11 @@ WITHIN = {
     "messages/inputs": {"plugins", "lie", "graph", "formats", "measurements", "config"},
     "messages": {"lie", "graph", "formats", "measurements", "config", "slam", "messages/inputs"},
     "recordings": {"lie", "formats", "messages", "messages/inputs"},
+    "check": {"lie", "graph", "formats", "measurements", "config", "slam", "messages", "messages/inputs"},
     "runs": {
         *("lie", "graph", "solver", "warmup", "formats", "measurements", "config"),
         *("slam", "slam/frontend", "slam/landmarks", "slam/robust", "messages", "messages/inputs", "recordings"),
+        "check",
     },
     "maps": {
         *("lie", "graph", "formats", "slam", "slam/landmarks", "slam/robust"),
@@ -67,7 +69,7 @@ WITHIN = {
     },
     "cli": {
         *("progress", "warmup", "graph", "solver", "optimization", "certificate", "formats", "config"),
-        *("slam", "messages/inputs", "recordings", "runs", "maps", "analysis", "simulation", "node"),
+        *("slam", "messages/inputs", "recordings", "check", "runs", "maps", "analysis", "simulation", "node"),
     },
     "__init__.py": {
         *("graph", "solver", "optimization", "certificate", "formats", "measurements", "config", "slam", "runs"),
@@ -99,6 +101,7 @@ NEVER = {
     "certificate": NOT_BELOW_MESSAGES | {"matplotlib"},
     "messages": {"matplotlib"},
     "recordings": {"matplotlib"},
+    "check": NOT_BELOW_MESSAGES | {"datetime", "os", "pathlib", "matplotlib"},
     "runs": {"matplotlib"},
     "simulation": {"matplotlib"},
     "node": {"matplotlib"},

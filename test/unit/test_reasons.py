@@ -54,6 +54,8 @@ def test_every_counted_reason_has_a_row_and_every_row_is_counted():
     found: dict[str, set[str]] = {}
     for file in PACKAGE.rglob("*.py"):
         text = file.read_text()
+        if file.parent.name == "check":  # its findings are not counted
+            continue
         if file.name != "reasons.py" and re.search("[Cc]ounters|MessageError|def admit", text):
             for reason in counted(ast.parse(text)):
                 found.setdefault(reason, set()).add(file.name)

@@ -381,7 +381,7 @@ def test_an_imu_is_offered_where_nothing_else_is(info, capsys, covariance):
     _, lines, words = info(ODOMETRY, SEEN, ("/imu/data", IMU, compass()), name="b.mcap")
     assert not any("imu" in word for word in words)
     assert any(line.startswith("not used: /imu/data: its heading may drift") for line in lines)
-    offered = shlex.split(" ".join(lines).split("With it: ")[1].split(" graph_slam replay")[0])
+    offered = shlex.split(" ".join(lines).split("With it: ")[1].split(" what is wrong")[0])
     assert run([*words[:-2], *offered, "--out", "b_imu"], capsys)[0]["inputs"]["imu"]["believed"] > 0
     _, lines, _ = info(ODOMETRY, ("/imu/raw", IMU, compass(-1.0)), name="c.mcap")
     assert any(line.startswith("not used: /imu/raw: it has no orientation") for line in lines)

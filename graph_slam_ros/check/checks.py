@@ -1,0 +1,47 @@
+"""All checks of a recording's columns, in the order in which a finding can make the later ones meaningless."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.finding import Finding, in_order
+from graph_slam_ros.check.frames import check_frames
+from graph_slam_ros.check.odometry import check_odometry
+from graph_slam_ros.check.pairs import check_pairs
+from graph_slam_ros.check.refusals import check_refusals, check_unnamed
+from graph_slam_ros.check.times import check_times
+
+Check = Callable[[Columns], Iterator[Finding]]
+
+CHECKS: tuple[Check, ...] = (
+    check_refusals,
+    check_frames,
+    check_times,
+    check_odometry,
+    check_unnamed,
+    check_pairs,
+)
+"""They need no fit: milliseconds for each minute of a recording."""
+
+
+def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Finding]:
+    """Findings of all checks, the most severe first; one that makes others meaningless ends the list.
+
+    It fails for no columns, whatever numbers are in them.
+    """
+    found: list[Finding] = []
+    with np.errstate(all="ignore"):
+        for check in checks:
+            found += check(c)
+            if any(one.ends for one in found):
+                break
+        else:
+            found += _nothing_corrects(c)
+    return in_order(found)
+
+
+def _nothing_corrects(c: Columns) -> Iterator[Finding]:
+    if not any(topic.use != "odometry" and len(topic.stamp_ns) for topic in c.topics.values()):
+        text = "no landmark, fix or closure: the result would be odometry alone"
+        yield Finding("no_landmarks", "note", 0, 1, "topics", text, c.odometry.topic)

@@ -1,0 +1,352 @@
+"""A recording as columns of numbers: what the checks look into, collected in one pass over its messages.
+
+A ``Collector`` is fed with each message as decoded and with what the converters make of it, the same ones as in a
+replay. ``Columns`` is what it has collected; checks are functions of it alone.
+"""
+
+from array import array
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.lie import se3
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import Control, Measured, Odometry, Sighting, Sightings
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC
+from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.messages.inputs.transforms import Transforms, pose
+from graph_slam_ros.typing import Array, Index
+
+MOST = 200_000
+"""Messages of each topic that are collected; a replay looks into no more."""
+
+_TWIST = (0, 7, 14, 21, 28, 35)
+Decoder = Callable[[bytes], Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopicColumns:
+    """The messages of one topic.
+
+    Attributes
+    ----------
+    use : of its first input: odometry, landmarks, fix, closure; empty of transforms
+    log_ns, stamp_ns : (n,) when recorded, and the stamp of the header with the input's ``offset_s``
+    frames : how many messages name each frame
+    """
+
+    name: str
+    type: str
+    inputs: tuple[str, ...]
+    use: str
+    log_ns: Index
+    stamp_ns: Index
+    frames: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryColumns:
+    """The odometry that is used, as its messages have it.
+
+    Attributes
+    ----------
+    poses : (n, 7) of ``child`` in ``frame``
+    twist, variances : (n, 6) of the message; NaN where its type has none
+    """
+
+    input: str
+    topic: str
+    frame: str
+    child: str
+    stamp_ns: Index
+    poses: Array
+    twist: Array
+    variances: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SightingColumns:
+    """The sightings of one input, as a replay uses them.
+
+    Attributes
+    ----------
+    stamp_ns, message : (k,) stamp, and number of the message
+    names, name : identities, and (k,) the number of each sighting's; the empty one is of those without
+    points : (k, 3) in the base frame; NaN of a range or bearing alone
+    sigmas : (k,) of the position, in metres
+    frame, T_base_frame : the frame of the first message, and where it is on the robot
+    """
+
+    input: str
+    topic: str
+    stamp_ns: Index
+    message: Index
+    names: tuple[str, ...]
+    name: Index
+    points: Array
+    sigmas: Array
+    frame: str
+    T_base_frame: se3.Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link:
+    """A transform from a parent to a child frame, from /tf_static (``fixed``) or /tf.
+
+    Attributes
+    ----------
+    change : by how much a fixed one differs from the first, at most [m, rad]
+    """
+
+    parent: str
+    child: str
+    fixed: bool
+    count: int = 1
+    change: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """The whole recording.
+
+    Attributes
+    ----------
+    assumed : parameters that were chosen for the recording, and that nobody has set
+    path_ns, path : (m,) and (m, 7) T_odom_base, as a replay uses odometry
+    tf_ns, tf_path : (m,) and (m, 7) the transform from odometry's frame to its child on /tf
+    """
+
+    config: Config
+    topics: Mapping[str, TopicColumns]
+    odometry: OdometryColumns
+    path_ns: Index
+    path: Array
+    sightings: tuple[SightingColumns, ...]
+    links: tuple[Link, ...]
+    tf_ns: Index
+    tf_path: Array
+    counters: Counters
+    assumed: Mapping[str, Any] = field(default_factory=dict)
+
+
+class _Topic:
+    def __init__(self, name: str, type_name: str, inputs: tuple[str, ...], use: str, offset_ns: int) -> None:
+        self.name, self.type, self.inputs, self.use, self.offset_ns = name, type_name, inputs, use, offset_ns
+        self.log_ns, self.stamp_ns = array("q"), array("q")
+        self.frames: dict[str, int] = {}
+
+    def add(self, log_ns: int, message: Any) -> None:
+        header = getattr(message, "header", None)
+        if header is None or len(self.log_ns) >= MOST:
+            return
+        stamp_ns = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+        self.log_ns.append(log_ns)
+        self.stamp_ns.append(stamp_ns + self.offset_ns if stamp_ns else 0)
+        frame = header.frame_id
+        self.frames[frame] = self.frames.get(frame, 0) + 1
+
+    def columns(self) -> TopicColumns:
+        return TopicColumns(
+            self.name, self.type, self.inputs, self.use, _index(self.log_ns), _index(self.stamp_ns), self.frames
+        )
+
+
+class _Sightings:
+    def __init__(self, name: str, topic: str) -> None:
+        self.input, self.topic = name, topic
+        self.frame, self.T_base_frame = "", se3.IDENTITY
+        self.stamp_ns, self.message, self.name = array("q"), array("q"), array("q")
+        self.points, self.sigmas = array("d"), array("d")
+        self.names: dict[str, int] = {}
+        self._messages = 0
+
+    def add(self, m: Sightings) -> None:
+        if len(self.stamp_ns) >= MOST:
+            return
+        self._messages += 1
+        for one in m.sightings:
+            point, sigma = located(one)
+            self.stamp_ns.append(m.stamp_ns)
+            self.message.append(self._messages)
+            self.name.append(self.names.setdefault(one.id, len(self.names)))
+            self.points.extend(point)
+            self.sigmas.append(sigma)
+
+    def columns(self) -> SightingColumns:
+        numbers = (_index(self.stamp_ns), _index(self.message), tuple(self.names), _index(self.name))
+        points = np.array(self.points).reshape(-1, 3)
+        return SightingColumns(
+            self.input, self.topic, *numbers, points, np.array(self.sigmas), self.frame, self.T_base_frame
+        )
+
+
+def located(one: Sighting) -> tuple[tuple[float, float, float], float]:
+    """The point of a sighting in the base frame, NaN where it has none, and the standard deviation of it."""
+    m, c = one.measured, one.covariance
+    size = round(len(c) ** 0.5)
+    if one.kind in ("position", "pose"):
+        n = len(m) if one.kind == "position" else 2 if len(m) == 3 else 3
+        sigma = (sum(c[i * (size + 1)] for i in range(n)) / n) ** 0.5
+        return (m[0], m[1], m[2] if n == 3 else 0.0), sigma
+    if one.kind != "range_bearing":
+        return (np.nan, np.nan, np.nan), c[0] ** 0.5
+    elevation = m[2] if len(m) == 3 else 0.0
+    level = m[0] * np.cos(elevation)
+    seen = (level * np.cos(m[1]), level * np.sin(m[1]), m[0] * np.sin(elevation))
+    at = one.T_base_sensor
+    if at is not None:
+        T = tuple(at) if len(at) == 7 else tuple(se3.in_space(np.array([at]))[0])
+        seen = se3.act(T, seen)
+    sigma = ((c[0] + m[0] ** 2 * sum(c[i * (size + 1)] for i in range(1, size))) / size) ** 0.5
+    return (float(seen[0]), float(seen[1]), float(seen[2])), float(sigma)
+
+
+class Collector:
+    """Collects the columns of a recording while its messages are converted.
+
+    Parameters
+    ----------
+    topics : of each input by its name, with ``tf_static`` and ``tf``
+    assumed : parameters that were chosen for the recording
+    """
+
+    def __init__(self, config: Config, topics: Mapping[str, str], assumed: Mapping[str, Any] | None = None) -> None:
+        self._config, self._assumed = config, dict(assumed or {})
+        used = {name: use for name, use in uses(config).items() if name in topics}
+        by_name = {one.name: one for one in config.sources}
+        self._main = next((name for name, use in used.items() if use == "odometry"), "")
+        self._topics: dict[str, _Topic] = {}
+        for topic in dict.fromkeys(topics[name] for name in used):
+            names = tuple(name for name in used if topics[name] == topic)
+            first = by_name[names[0]]
+            self._topics[topic] = _Topic(topic, first.type, names, used[names[0]], round(first.offset_s * 1e9))
+        self._sightings = {name: _Sightings(name, topics[name]) for name, use in used.items() if use == "landmarks"}
+        self._frame_of = {name: by_name[name].frame for name in used}
+        self._odometry_topic = topics.get(self._main, "")
+        self._frame, self._child = "", ""
+        self._odometry_ns, self._numbers = array("q"), array("d")
+        self._path_ns, self._path = array("q"), array("d")
+        self._tf_ns, self._tf_path = array("q"), array("d")
+        self._links: dict[tuple[str, str, bool], Link] = {}
+        self._first: dict[tuple[str, str], se3.Pose] = {}
+        self._transforms = Transforms()
+        self._last: Any = None
+
+    def decoder(self, decode: Decoder) -> Decoder:
+        """The same decoder, of which the message is remembered until it is collected."""
+
+        def decoded(cdr: bytes) -> Any:
+            self._last = decode(cdr)
+            return self._last
+
+        return decoded
+
+    def add(self, topic: str, names: Iterable[str], log_ns: int, measured: Iterable[Measured | Control]) -> None:
+        """Collect a message: the one that was decoded last, of these inputs, and what became of it."""
+        message, self._last = self._last, None
+        if message is not None:
+            self._add_message(topic, names, log_ns, message)
+        for m in measured:
+            if isinstance(m, Odometry):
+                if m.source.partition("#")[0] == self._main and len(self._path_ns) < MOST:
+                    self._path_ns.append(m.stamp_ns)
+                    self._path.extend(m.T_odom_base)
+            elif isinstance(m, Sightings) and m.topic in self._sightings:
+                self._sightings[m.topic].add(m)
+
+    def _add_message(self, topic: str, names: Iterable[str], log_ns: int, message: Any) -> None:
+        if topic in self._topics:
+            self._topics[topic].add(log_ns, message)
+        if topic == self._odometry_topic and hasattr(message, "twist"):
+            self._add_odometry(message)
+        for name in names:
+            if name in (TF, TF_STATIC):
+                self._add_transforms(message, fixed=name == TF_STATIC)
+            elif name in self._sightings and not self._sightings[name].frame:
+                self._place(self._sightings[name], message)
+
+    def _add_odometry(self, m: Any) -> None:
+        if len(self._odometry_ns) >= MOST:
+            return
+        if not self._frame:
+            self._frame, self._child = m.header.frame_id.lstrip("/"), m.child_frame_id.lstrip("/")
+        self._odometry_ns.append(self._topics[self._odometry_topic].stamp_ns[-1])
+        p, q, v, w = m.pose.pose.position, m.pose.pose.orientation, m.twist.twist.linear, m.twist.twist.angular
+        self._numbers.extend((p.x, p.y, p.z, q.x, q.y, q.z, q.w, v.x, v.y, v.z, w.x, w.y, w.z))
+        c = m.twist.covariance
+        self._numbers.extend([c[k] for k in _TWIST])
+
+    def _add_transforms(self, message: Any, *, fixed: bool) -> None:
+        for t in message.transforms:
+            parent, child = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
+            r = t.transform.rotation
+            at = pose(t.transform.translation, (r.x, r.y, r.z, r.w))
+            link, change = self._links.get((parent, child, fixed)), 0.0
+            if fixed:
+                first = self._first.setdefault((parent, child), at)
+                change = max(abs(a - b) for a, b in zip(first, at, strict=True))
+                self._transforms.add(parent, child, at)
+            elif child == self._child and parent == self._frame and len(self._tf_ns) < MOST:
+                self._tf_ns.append(t.header.stamp.sec * 1_000_000_000 + t.header.stamp.nanosec)
+                self._tf_path.extend(at)
+            if link is None or change > link.change or not fixed:
+                count = 1 if link is None else link.count + 1
+                self._links[parent, child, fixed] = Link(parent, child, fixed, count, change)
+
+    def _place(self, found: _Sightings, message: Any) -> None:
+        """Find the place of an input's sensor on the robot, by its first message that names a frame."""
+        own = self._frame_of[found.input] or _frame(message)
+        if not own:
+            return
+        found.frame = own
+        mounted = next(one for one in self._config.sources if one.name == found.input).numbers("mount", 6)
+        known = self._transforms.lookup(self._config.frames.base, own)
+        if known is None and mounted:
+            known = se3.from_xyz_rpy(mounted)
+        found.T_base_frame = se3.IDENTITY if known is None else known
+
+    def columns(self, counters: Counters) -> Columns:
+        """Everything that was collected, and what the converters have counted."""
+        return Columns(
+            self._config,
+            {name: one.columns() for name, one in self._topics.items()},
+            self._odometry(),
+            _index(self._path_ns),
+            self._poses(self._path),
+            tuple(one.columns() for one in self._sightings.values()),
+            tuple(self._links.values()),
+            _index(self._tf_ns),
+            np.array(self._tf_path).reshape(-1, 7),
+            counters,
+            self._assumed,
+        )
+
+    def _poses(self, numbers: "array[float]") -> Array:
+        poses = np.array(numbers).reshape(-1, self._config.space.pose.size)
+        return poses if poses.shape[1] == 7 else se3.in_space(poses).reshape(-1, 7)
+
+    def _odometry(self) -> OdometryColumns:
+        names = (self._main, self._odometry_topic)
+        if len(self._odometry_ns):
+            rows = np.array(self._numbers).reshape(-1, 19)
+            return OdometryColumns(
+                *names, self._frame, self._child, _index(self._odometry_ns), rows[:, :7], rows[:, 7:13], rows[:, 13:]
+            )
+        frames, poses = self._config.frames, self._poses(self._path)
+        unknown = np.full((len(poses), 6), np.nan)
+        return OdometryColumns(*names, frames.odom, frames.base, _index(self._path_ns), poses, unknown, unknown)
+
+
+def _frame(message: Any) -> str:
+    """The frame that a message names first."""
+    several = getattr(message, "transforms", None) or getattr(message, "markers", None) or []
+    headers = [getattr(message, "header", None), *(getattr(one, "header", None) for one in several[:1])]
+    names = (one.frame_id.lstrip("/") for one in headers if one is not None)
+    return next(filter(None, names), "")
+
+
+def _index(numbers: "array[int]") -> Index:
+    return np.array(numbers, dtype=np.int64)

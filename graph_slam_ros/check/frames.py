@@ -1,0 +1,120 @@
+"""Frames of a recording: what is linked to the robot, and by how many."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.finding import Finding, Severity, Where, assignment
+
+_FIXED = ("map", "world", "earth", "utm")
+_AT_BASE = "0 0 0 0 0 0"
+_UNKNOWN = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
+_SAME = 1e-6
+_DIFFER_M, _FEW = 0.05, 10
+
+
+def check_frames(c: Columns) -> Iterator[Finding]:
+    """The tree of transforms, and where odometry and each sensor are in it."""
+    yield from _parents(c)
+    for link in c.links:
+        if link.fixed and link.change > _SAME:
+            text = f"the static transform {link.parent} -> {link.child} differs by {link.change:.3g} from the first"
+            yield Finding(
+                "static_changes", "warning", link.change, _SAME, "m, rad", text, "/tf_static", count=link.count
+            )
+    if c.odometry.frame in _FIXED:
+        text = f"{c.odometry.topic} is given in frame {c.odometry.frame}: somebody's estimate, not odometry"
+        yield Finding("odometry_in_map", "warning", 1, 0, "topics", text, c.odometry.topic)
+    unlinked = set()
+    for s in c.sightings:
+        found = list(_of_sensor(c, s))
+        unlinked |= {one.topic for one in found}
+        yield from found
+    yield from _unlinked(c, unlinked)
+    yield from _tf(c)
+
+
+def _parents(c: Columns) -> Iterator[Finding]:
+    """Frames that more than one frame is a parent of."""
+    parents: dict[str, dict[str, None]] = {}
+    for link in c.links:
+        parents.setdefault(link.child, {})[link.parent] = None
+    used = {s.frame for s in c.sightings} | {c.config.frames.base, c.odometry.child}
+    for frame in tuple(used):
+        while frame in parents and (above := next(iter(parents[frame]))) not in used:
+            used.add(above)
+            frame = above
+    for child, several in parents.items():
+        if len(several) > 1:
+            severity: Severity = "error" if child in used else "note"
+            text = f"frame {child} has {len(several)} parents ({', '.join(list(several)[:4])}): two nodes publish it"
+            yield Finding("two_parents", severity, len(several), 1, "parents", text, "/tf")
+
+
+def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
+    topic = c.topics.get(s.topic)
+    if topic is None:
+        return
+    key = f"{s.input}.mount"
+    first_ns = int(topic.stamp_ns[0]) if len(topic.stamp_ns) else 0
+    where: Where = {"topic": s.topic, "first_ns": first_ns, "count": len(topic.stamp_ns)}
+    fixed = [frame for frame in topic.frames if frame.lstrip("/") in (*_FIXED, c.odometry.frame) and frame]
+    if fixed:
+        is_linked = any(link.child == c.odometry.child and link.parent == fixed[0].lstrip("/") for link in c.links)
+        text = f"{s.topic} is given in {fixed[0]}, a frame that does not move with the robot"
+        severity: Severity = "note" if is_linked else "error"
+        yield Finding("fixed_frame", severity, topic.frames[fixed[0]], 0, "messages", text, **where)
+    elif key in c.assumed:
+        named = next(filter(None, topic.frames), "") or "its sensor"
+        text = (
+            f"{s.topic}: no transform has the pose of {named} on {c.config.frames.base}: {c.assumed[key]!r} is assumed"
+        )
+        yield Finding(
+            "frame_unlinked", "error", 1, 0, "frames", text, settings=(assignment(key, c.assumed[key]),), **where
+        )
+
+
+def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
+    """Messages that were refused since nothing links their frame, and odometry whose child frame is assumed."""
+    for source, counts in c.counters.as_dict().items():
+        topic = next((t for t in c.topics.values() if source in t.inputs), None)
+        times = sum(counts.get(reason, 0) for reason in _UNKNOWN)
+        if topic is None or not times or topic.name in known:
+            continue
+        names = ", ".join(list(topic.frames)[:4])
+        key, value = f"{source}.mount", _AT_BASE
+        if "odom_frame_unknown" in counts:
+            key, value = "frames.odom", next(iter(topic.frames), "odom")
+        severity: Severity = "error" if times > 0.5 * max(c.counters.received[source], 1) else "warning"
+        text = f"{topic.name}: {times} are refused: nothing links frame {names} to {c.config.frames.base}"
+        first_ns = int(topic.stamp_ns[0]) if len(topic.stamp_ns) else 0
+        setting = assignment(key, value)
+        yield Finding("frame_unlinked", severity, times, 0, "messages", text, topic.name, first_ns, times, (setting,))
+    key = f"{c.odometry.input}.mount"
+    if key in c.assumed:
+        named = c.odometry.child or "its child frame, which is empty,"
+        text = f"{c.odometry.topic}: no transform links {named} to {c.config.frames.base}: one place is assumed"
+        setting = assignment(key, c.assumed[key])
+        yield Finding("frame_unlinked", "warning", 1, 0, "frames", text, c.odometry.topic, settings=(setting,))
+
+
+def _tf(c: Columns) -> Iterator[Finding]:
+    """Odometry's topic against the same transform on /tf."""
+    o = c.odometry
+    usable = np.isfinite(o.poses[:, :3]).all(axis=1) & (o.stamp_ns != 0)
+    if len(c.tf_ns) < _FEW or usable.sum() < _FEW:
+        return
+    stamp_ns, order = np.unique(o.stamp_ns[usable], return_index=True)
+    at = o.poses[usable][order]
+    inside = (c.tf_ns >= stamp_ns[0]) & (c.tf_ns <= stamp_ns[-1])
+    if inside.sum() < _FEW:
+        return
+    seconds, t = (stamp_ns - stamp_ns[0]) * 1e-9, (c.tf_ns[inside] - stamp_ns[0]) * 1e-9
+    apart = np.stack([np.interp(t, seconds, at[:, k]) for k in range(3)], axis=1) - c.tf_path[inside, :3]
+    median_m = float(np.median(np.linalg.norm(apart, axis=1)))
+    if median_m > _DIFFER_M:
+        text = f"/tf {o.frame} -> {o.child} and {o.topic} differ by {median_m:.2f} m in the median: two odometries"
+        yield Finding(
+            "tf_differs", "warning", median_m, _DIFFER_M, "m", text, "/tf", int(c.tf_ns[0]), int(inside.sum())
+        )

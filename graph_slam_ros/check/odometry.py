@@ -1,0 +1,234 @@
+"""Odometry by itself: does it move, jump, leave the plane, and agree with its twist."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns, OdometryColumns
+from graph_slam_ros.check.finding import Finding, Where
+from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.typing import Array, Index, Mask
+
+LEAST = 10
+"""Messages of odometry below which nothing is known of it."""
+
+_FASTEST_M_S = 40.0
+_STEP_M, _STEP_RAD, _TIMES = 0.1, 0.1, 5.0
+_CORRECTED = 3
+_AT_ZERO, _AWAY_M = 1e-9, 0.5
+_STILL_M, _STILL_RAD = 0.5, 1.0
+_WINDOW_S, _LONGEST_S = 1.0, 3.0
+_SCALE, _EXPLAINED, _UNEXPLAINED = 0.1, 0.5, 0.7
+_LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02
+_TINY, _USELESS, _UNUSED_M_S, _SLOWEST_M_S, _TINY_RAD_S = 1e-3, 3.0, 500.0, 0.05, 1e-4
+_OFF_PLANE, _LEVEL_M = 0.05, 0.5
+_UNITS = {
+    -1.0: "mirrored",
+    57.29578: "radians for degrees",
+    1.0 / 57.29578: "degrees for radians",
+    1000.0: "metres for thousands",
+    1e-3: "millimetres for metres",
+}
+_DENSITY = ("odometry.noise=density",)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Steps:
+    """The motion from one usable message to the next.
+
+    Attributes
+    ----------
+    index : (n + 1,) of the messages
+    dt : (n,) seconds, positive
+    moved, turned : (n, 3) in the frame of the earlier pose, metres and radians
+    is_short : (n,) whether no gap is between them
+    fastest_m_s, fastest_rad_s : the 99 % quantiles of the speeds of those
+    """
+
+    index: Index
+    dt: Array
+    moved: Array
+    turned: Array
+    is_short: Mask
+    fastest_m_s: float
+    fastest_rad_s: float
+
+    @property
+    def jumps(self) -> Mask:
+        """(n,) Steps that are far longer than the others."""
+        dt = np.maximum(self.dt, float(np.median(self.dt)))
+        far = np.linalg.norm(self.moved, axis=1) > _STEP_M + _TIMES * self.fastest_m_s * dt
+        return far | (np.linalg.norm(self.turned, axis=1) > _STEP_RAD + _TIMES * self.fastest_rad_s * dt)
+
+
+def steps_of(o: OdometryColumns) -> Steps | None:
+    """The steps of odometry in order of stamp; None where there are too few."""
+    norm = np.linalg.norm(o.poses[:, 3:], axis=1)
+    usable = np.isfinite(o.poses).all(axis=1) & (np.abs(o.poses[:, :3]).max(axis=1, initial=0.0) < 1e9)
+    usable &= (o.stamp_ns != 0) & (np.abs(norm - 1.0) < 0.1)
+    stamp_ns, first = np.unique(o.stamp_ns[usable], return_index=True)
+    if len(stamp_ns) < LEAST:
+        return None
+    index = np.flatnonzero(usable)[first]
+    poses = o.poses[index]
+    poses = np.concatenate([poses[:, :3], poses[:, 3:] / norm[index, None]], axis=1)
+    motion = se3.between(tuple(poses[:-1].T), tuple(poses[1:].T))
+    moved = np.stack(motion[:3], axis=1)
+    turned = np.stack(so3.log(tuple(motion[3:])), axis=1)
+    dt = np.diff(stamp_ns) * 1e-9
+    is_short = dt < max(1.0, 5.0 * float(np.median(dt)))
+    rate = np.maximum(dt, float(np.median(dt)))
+    speeds = np.stack([np.linalg.norm(moved, axis=1) / rate, np.linalg.norm(turned, axis=1) / rate])
+    fastest = np.percentile(speeds[:, is_short], 99.0, axis=1)
+    return Steps(index, dt, moved, turned, is_short, float(fastest[0]), float(fastest[1]))
+
+
+def check_odometry(c: Columns) -> Iterator[Finding]:
+    """The odometry that is used, by its own messages alone."""
+    o, steps = c.odometry, steps_of(c.odometry)
+    if steps is None:
+        text = f"{o.topic or 'odometry'}: {len(np.unique(o.stamp_ns))} messages that can be used, {LEAST} are needed"
+        yield Finding("no_odometry", "error", len(o.stamp_ns), LEAST, "messages", text, o.topic, count=len(o.stamp_ns))
+        return
+    where: Where = {"topic": o.topic, "first_ns": int(o.stamp_ns[steps.index[0]]), "count": len(steps.index)}
+    if steps.fastest_m_s > min(_FASTEST_M_S, c.config.odometry.max_speed_m_s):
+        text = f"{o.topic}: {steps.fastest_m_s:.0f} m/s: millimetres for metres?"
+        yield Finding("units", "error", steps.fastest_m_s, _FASTEST_M_S, "m/s", text, **where)
+        return
+    jumps = steps.jumps
+    yield from _jumps(o, steps, jumps)
+    smooth = steps.is_short & ~jumps
+    total_m = float(np.linalg.norm(steps.moved[smooth], axis=1).sum())
+    total_rad = float(np.linalg.norm(steps.turned[smooth], axis=1).sum())
+    if total_m < _STILL_M and total_rad < _STILL_RAD:
+        span_s = float(steps.dt.sum())
+        text = f"{o.topic}: {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {span_s:.0f} s: it does not move"
+        yield Finding("static", "warning", total_m, _STILL_M, "m", text, **where)
+        return
+    yield from _plane(c, o)
+    if np.isfinite(o.twist[steps.index]).all() and o.twist[steps.index].any() and c.config.odometry.noise != "density":
+        yield from _twist(o, steps, jumps, where)
+    if c.config.odometry.noise != "density" and np.isfinite(o.twist).any():
+        yield from _covariance(o, steps, where)
+
+
+def _jumps(o: OdometryColumns, steps: Steps, jumps: Mask) -> Iterator[Finding]:
+    poses = o.poses[steps.index]
+    at_zero = (np.abs(poses[1:, :6]) < _AT_ZERO).all(axis=1) & (np.linalg.norm(poses[:-1, :3], axis=1) > _AWAY_M)
+    for code, is_there in (("odometry_reset", at_zero), ("odometry_jumps", jumps & ~at_zero)):
+        count = int(is_there.sum())
+        if not count:
+            continue
+        most_m = float(np.linalg.norm(steps.moved[is_there], axis=1).max())
+        most_deg = float(np.degrees(np.linalg.norm(steps.turned[is_there], axis=1).max()))
+        first_ns = int(o.stamp_ns[steps.index[1:][is_there][0]])
+        by = f"by up to {most_m:.2f} m and {most_deg:.0f} degrees in one step"
+        text = f"{o.topic} jumps {count} times, {by}"
+        if code == "odometry_reset":
+            text = f"{o.topic} begins anew at zero {count} times: its driver was restarted"
+        elif count >= _CORRECTED:
+            code, text = "corrected", f"{o.topic} jumps {count} times, {by}: a localiser corrects it?"
+        yield Finding(code, "warning", count, 0, "times", text, o.topic, first_ns, count)
+
+
+def _plane(c: Columns, o: OdometryColumns) -> Iterator[Finding]:
+    if c.config.world.dimensions == 3 or not len(o.poses):
+        return
+    out = c.counters.as_dict().get(o.input, {}).get("out_of_plane", 0)
+    share = out / len(o.poses)
+    if share > _OFF_PLANE:
+        text = f"{o.topic}: {share:.0%} of the poses are more than {_LEVEL_M} m off the first's plane, or tilted"
+        settings = ("world.dimensions=3",)
+        yield Finding("not_planar", "warning", share, _OFF_PLANE, "part", text, o.topic, 0, out, settings)
+
+
+def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Iterator[Finding]:
+    """The twist against the pose, over windows of a second: it may hold until or since its message."""
+    width = max(1, round(_WINDOW_S / float(np.median(steps.dt))))
+    starts = np.arange(0, len(steps.dt) - width + 1, max(1, width // 2))
+    clock = np.concatenate([[0.0], np.cumsum(steps.dt)])
+    starts = starts[clock[starts + width] - clock[starts] < _LONGEST_S]
+    if not len(starts):
+        return
+
+    def sums(rows: Array) -> Array:
+        total = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(jumps[:, None], 0.0, rows), axis=0)])
+        return np.asarray(total[starts + width] - total[starts])
+
+    moved, turned = sums(steps.moved), sums(steps.turned)
+    twist = o.twist[steps.index]
+    fits = []
+    for rows in (twist[:-1], twist[1:]):
+        driven, rotated = (sums(part * steps.dt[:, None]) for part in (rows[:, :3], rows[:, 3:]))
+        fits.append((ratio(driven, moved), ratio(rotated, turned)))
+    speed, rate = min(fits, key=lambda pair: pair[0][1] + pair[1][1])
+    if _in_odom(o, steps, jumps, sums, moved, twist[1:]):
+        text = f"{o.topic}: the twist is along the axes of {o.frame}, not of {o.child} (nav_msgs/Odometry)"
+        yield Finding("twist_frame", "warning", 1.0, _FITS, "times", text, settings=_DENSITY, **where)
+        return
+    for what, (factor, left), total in (
+        ("speed", speed, np.abs(moved).sum()),
+        ("turn rate", rate, np.abs(turned).sum()),
+    ):
+        if total < 1.0 or not np.isfinite(factor):
+            continue
+        if abs(factor - 1.0) > _SCALE and left < _EXPLAINED:
+            unit = next((why for k, why in _UNITS.items() if abs(factor / k - 1.0) < _SCALE), "another scale")
+            text = f"{o.topic}: the pose moves {factor:.3g} times what the twist's {what} says ({unit})"
+            yield Finding("twist_scale", "warning", factor, _SCALE, "times", text, settings=_DENSITY, **where)
+        elif left > _UNEXPLAINED and total > 5.0:
+            text = f"{o.topic}: the twist's {what} leaves {left:.0%} of the pose's motion unexplained"
+            yield Finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, settings=_DENSITY, **where)
+
+
+def _in_odom(
+    o: OdometryColumns, steps: Steps, jumps: Mask, sums: Callable[[Array], Array], moved: Array, twist: Array
+) -> bool:
+    """Return whether the linear twist fits the motion along the axes of the odometry frame far better."""
+    turns = o.poses[steps.index[:-1], 3:]
+    along = np.stack(so3.act(tuple(turns.T), tuple(steps.moved.T)), axis=1)
+    driven = sums(twist[:, :3] * steps.dt[:, None])
+    if np.abs(driven[:, 1]).sum() < _LATERAL * np.abs(driven[:, 0]).sum():
+        return False
+    fixed = float(np.median(np.linalg.norm(sums(along) - driven, axis=1)))
+    body = float(np.median(np.linalg.norm(moved - driven, axis=1)))
+    return body > _WORSE_M and fixed < _FITS * body
+
+
+def ratio(x: Array, y: Array) -> tuple[float, float]:
+    """Robust factor from x to y (both (n, 3)), and the part of y that it leaves unexplained."""
+    size = np.linalg.norm(y, axis=1)
+    if np.abs(x).sum() < 1e-9 or not size.any():
+        return np.nan, 1.0
+    weight, factor = np.ones(len(x)), 1.0
+    for _ in range(15):
+        factor = float((weight[:, None] * x * y).sum() / max(float((weight[:, None] * x * x).sum()), 1e-15))
+        error = np.linalg.norm(y - factor * x, axis=1)
+        scale = 1.48 * float(np.median(error)) + 1e-6 + 0.01 * float(np.median(size))
+        weight = 1.0 / (1.0 + (error / (3.0 * scale)) ** 2)
+    large = size >= np.median(size)
+    return factor, float(np.median(error[large]) / (np.median(size[large]) + 1e-9))
+
+
+def _covariance(o: OdometryColumns, steps: Steps, where: Where) -> Iterator[Finding]:
+    """The variances of the twist against what the robot does."""
+    used = o.variances[:, [0, 1, 5]]
+    bad = ~np.isfinite(used).all(axis=1) | (used < 0.0).any(axis=1)
+    if bad.any():
+        text = f"{o.topic}: {int(bad.sum())} messages have a variance of the twist that is negative or no number"
+        yield Finding("covariance_negative", "warning", int(bad.sum()), 0, "messages", text, settings=_DENSITY, **where)
+        return
+    if not used.any():
+        text = f"{o.topic}: the twist has no covariance: the configured densities are used"
+        yield Finding("covariance_zero", "note", 0.0, 0.0, "m/s", text, **where)
+        return
+    sigmas, speed = np.sqrt(np.median(used, axis=0)), max(steps.fastest_m_s, _SLOWEST_M_S)
+    if _USELESS * speed < sigmas[0] < _UNUSED_M_S:
+        text = f"{o.topic}: the twist's sigma is {sigmas[0]:.2g} m/s, the robot's speed at most {speed:.2g} m/s"
+        yield Finding(
+            "covariance_useless", "warning", sigmas[0] / speed, _USELESS, "times", text, settings=_DENSITY, **where
+        )
+    elif 0.0 < sigmas[0] < _TINY * speed or 0.0 < sigmas[2] < _TINY_RAD_S:
+        text = f"{o.topic}: the twist's sigmas are {sigmas[0]:.1g} m/s and {sigmas[2]:.1g} rad/s: no wheels are so good"
+        yield Finding("covariance_tiny", "warning", sigmas[0] / speed, _TINY, "times", text, settings=_DENSITY, **where)

@@ -1,0 +1,265 @@
+"""Sightings against odometry, without a fit: the same landmark a few seconds later, which drift does not matter to."""
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.finding import Finding, Where, assignment
+from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.typing import Array, Index, Mask
+
+_LATER_S, _SOONEST_S, _MOVED, _MOST_PAIRS, _LEAST_PAIRS = 6.0, 0.3, 0.15, 4000, 30
+_TURNED_RAD, _LEAST_TURNED = 0.25, 25
+_FAR_M = 200.0
+_HALF, _NOISES, _NEARLY = 0.5, 2.0, 1.2
+_UNRELATED, _UNRELATED_NOISES, _UNRELATED_PAIRS = 0.6, 4.0, 100
+_TWICE, _FEW = 0.002, 30
+_ONCE, _SELDOM = 0.5, 3
+_AGAIN_S, _AGAIN_M, _SPAN = 10.0, 3.0, 0.25
+_SILENT, _TYPICAL_M = 0.5, 0.05
+_QUARTER = 0.5**0.5
+_CORRECTED = "_corrected"
+
+# Where a sensor would be turned on the robot, if its positions are in other axes: R_frame_true.
+TURNS: Mapping[str, so3.Quaternion] = {
+    "turned by 90 degrees": (0.0, 0.0, _QUARTER, _QUARTER),
+    "turned by -90 degrees": (0.0, 0.0, -_QUARTER, _QUARTER),
+    "turned by 180 degrees": (0.0, 0.0, 1.0, 0.0),
+    "those of an optical frame (z ahead, x to the right)": (-0.5, 0.5, -0.5, 0.5),
+}
+EXCHANGED, MIRRORED = "x and y exchanged", "y to the right"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Two sightings of one landmark each, with the motion of odometry between them.
+
+    Attributes
+    ----------
+    a, b : (n,) numbers of the earlier and later sighting
+    motion : (n, 7) of the base from the earlier to the later
+    """
+
+    a: Index
+    b: Index
+    motion: Array
+
+    def residuals(self, points: Array, motion: Array | None = None) -> Array:
+        """(n,) How far apart both sightings put the landmark, given (k, 3) the points of all in the base frame."""
+        by = self.motion if motion is None else motion
+        return np.linalg.norm(np.stack(se3.act(tuple(by.T), tuple(points[self.b].T)), axis=1) - points[self.a], axis=1)
+
+    @property
+    def turned(self) -> Array:
+        """(n,) The rotation between both [rad]."""
+        return np.linalg.norm(np.stack(so3.log(tuple(self.motion[:, 3:].T)), axis=1), axis=1)
+
+
+def path_of(c: Columns) -> tuple[Index, Array]:
+    """Odometry as a replay uses it, in order of stamp, one pose for each."""
+    usable = np.isfinite(c.path).all(axis=1) & (np.abs(c.path).max(axis=1, initial=0.0) < 1e9)
+    stamp_ns, first = np.unique(c.path_ns[usable], return_index=True)
+    return stamp_ns, c.path[usable][first]
+
+
+def poses_at(stamp_ns: Index, path_ns: Index, path: Array) -> Array:
+    """Poses (n, 7) at stamps within the path, interpolated."""
+    after = np.clip(np.searchsorted(path_ns, stamp_ns), 1, len(path_ns) - 1)
+    before = after - 1
+    part = np.clip((stamp_ns - path_ns[before]) / (path_ns[after] - path_ns[before]), 0.0, 1.0)
+    return np.stack(se3.interpolate(tuple(path[before].T), tuple(path[after].T), part), axis=1)
+
+
+def usable(s: SightingColumns, path_ns: Index) -> Mask:
+    """Sightings (k,) with an identity and a point, within the time of odometry."""
+    inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
+    is_named = np.array([bool(name) for name in s.names], dtype=bool)[s.name]
+    return np.asarray(inside & is_named & (np.abs(s.points) < 1e9).all(axis=1))
+
+
+def pairs_of(s: SightingColumns, path_ns: Index, path: Array) -> Pairs:
+    """Pairs of sightings between which the robot moved, at most 6 s apart."""
+    use = np.flatnonzero(usable(s, path_ns))
+    order = use[np.argsort(s.stamp_ns[use], kind="stable")]
+    seconds = ((s.stamp_ns - path_ns[0]) * 1e-9).tolist()
+    names, found = s.name.tolist(), []
+    recent: dict[int, deque[int]] = {}
+    for k in order.tolist():
+        held = recent.setdefault(names[k], deque())
+        while held and seconds[k] - seconds[held[0]] > _LATER_S:
+            held.popleft()
+        if held and seconds[k] - seconds[held[0]] > _SOONEST_S:
+            found.append((held[0], k))
+        held.append(k)
+    a, b = np.array(found, dtype=np.int64).reshape(-1, 2).T
+    at = [poses_at(s.stamp_ns[k], path_ns, path) for k in (a, b)]
+    motion = np.stack(np.broadcast_arrays(*se3.between(tuple(at[0].T), tuple(at[1].T))), axis=1)
+    out = Pairs(a, b, motion)
+    moved = (np.linalg.norm(motion[:, :3], axis=1) > _MOVED) | (out.turned > _MOVED)
+    chosen = np.flatnonzero(moved)
+    if len(chosen) > _MOST_PAIRS:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_PAIRS).astype(np.int64)]
+    return Pairs(a[chosen], b[chosen], motion[chosen])
+
+
+def check_pairs(c: Columns) -> Iterator[Finding]:
+    """Each input of landmarks against odometry: units, axes, mirrors, identities, and what is seen again."""
+    path_ns, path = path_of(c)
+    if len(path_ns) < 2:
+        return
+    for s in c.sightings:
+        if not len(s.stamp_ns):
+            continue
+        found = list(_contradictions(c, s, path_ns, path))
+        yield from found
+        yield from _identities(c, s)
+        if not any(one.ends for one in found):
+            yield from _coverage(s, path_ns, path)
+
+
+def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Finding]:
+    use = usable(s, path_ns)
+    where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": int(use.sum())}
+    if not use.any():
+        return
+    distance_m = np.linalg.norm(s.points, axis=1)
+    far_m = float(np.median(distance_m[use]))
+    if far_m > _FAR_M:
+        text = f"{s.topic}: landmarks are {far_m:.0f} m away in the median: millimetres for metres?"
+        yield Finding("units", "error", far_m, _FAR_M, "m", text, **where)
+        return
+    pairs = pairs_of(s, path_ns, path)
+    if len(pairs.a) < _LEAST_PAIRS:
+        text = f"{s.topic}: only {len(pairs.a)} times is a landmark seen again within {_LATER_S:.0f} s of motion"
+        yield Finding("no_parallax", "note", len(pairs.a), _LEAST_PAIRS, "pairs", text, **where)
+        return
+    where["count"] = len(pairs.a)
+    noise_m = 1.5 * (float(np.median(s.sigmas[pairs.a])) * 2.0**0.5 + _TYPICAL_M)
+    found = _mirrored(c, s, pairs, noise_m, where) or _axes(s, pairs, noise_m, where)
+    if found is not None:
+        yield found
+        return
+    residual_m = float(np.median(pairs.residuals(s.points)))
+    lever_m = np.linalg.norm(pairs.motion[:, :3], axis=1) + pairs.turned * np.minimum(distance_m[pairs.a], 1e3)
+    share = residual_m / float(np.median(lever_m))
+    if share > _UNRELATED and residual_m > _UNRELATED_NOISES * noise_m and len(pairs.a) > _UNRELATED_PAIRS:
+        text = f"{s.topic}: {share:.0%} of the motion between two sightings of a landmark is not odometry's"
+        yield Finding("unrelated", "error", share, _UNRELATED, "part", text, **where)
+
+
+def _hypotheses(s: SightingColumns) -> dict[str, Array]:
+    """Points (k, 3) in the base frame, if those of the sensor are in other axes."""
+    base_frame = tuple(s.T_base_frame)
+    seen = np.stack(se3.act(se3.inverse(base_frame), tuple(s.points.T)), axis=1)
+
+    def placed(points: Array) -> Array:
+        return np.stack(se3.act(base_frame, tuple(points.T)), axis=1)
+
+    turned = {what: placed(np.stack(so3.act(q, tuple(seen.T)), axis=1)) for what, q in TURNS.items()}
+    return turned | {EXCHANGED: placed(seen[:, [1, 0, 2]]), MIRRORED: placed(seen * [1.0, -1.0, 1.0])}
+
+
+def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float, where: Where) -> Finding | None:
+    """A mirror shows only where the robot turns."""
+    at = pairs.turned > _TURNED_RAD
+    if at.sum() < _LEAST_TURNED:
+        return None
+    turning = Pairs(pairs.a[at], pairs.b[at], pairs.motion[at])
+    now_m = float(np.median(turning.residuals(s.points)))
+    others = {what: float(np.median(turning.residuals(points))) for what, points in _hypotheses(s).items()}
+    mirror_m = others.pop(MIRRORED)
+    if c.config.world.dimensions == 2:
+        back = turning.motion * [1.0, -1.0, 1.0, 1.0, 1.0, -1.0, 1.0]  # odometry that turns the other way
+        mirror_m = min(mirror_m, float(np.median(turning.residuals(s.points, back))))
+    if mirror_m < _HALF * now_m and now_m > _NOISES * noise_m and mirror_m < _NEARLY * min(others.values()):
+        text = (
+            f"{s.topic}: where the robot turns, a landmark seen twice is {now_m:.2f} m apart, {mirror_m:.2f} m if y or "
+            f"bearings count to the right, or {c.odometry.topic} turns the other way"
+        )
+        return Finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / _HALF, "times", text, **where)
+    return None
+
+
+def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, where: Where) -> Finding | None:
+    now_m = float(np.median(pairs.residuals(s.points)))
+    others = {what: float(np.median(pairs.residuals(points))) for what, points in _hypotheses(s).items()}
+    del others[MIRRORED]
+    what = min(others, key=lambda one: others[one])
+    if others[what] >= _HALF * now_m or now_m <= _NOISES * noise_m:
+        return None
+    text = f"{s.topic}: a landmark seen twice is {now_m:.2f} m apart, {others[what]:.2f} m if its axes are {what}"
+    settings = () if what == EXCHANGED else turned_mount(s, (0.0, 0.0, 0.0, *TURNS[what]))
+    value = now_m / max(others[what], 1e-9)
+    return Finding("axes", "error", value, 1.0 / _HALF, "times", text, settings=settings, **where)
+
+
+def turned_mount(s: SightingColumns, T_frame_true: se3.Pose) -> tuple[str, ...]:
+    """Settings that place an input's sensor elsewhere than its frame is, by a frame of its own name."""
+    T = se3.compose(tuple(s.T_base_frame), T_frame_true)
+    numbers = " ".join(f"{0.0 if abs(x) < 5e-7 else x:.6g}" for x in (*T[:3], *_rpy(tuple(T[3:]))))
+    name = s.frame if s.frame.endswith(_CORRECTED) else f"{s.frame or 'sensor'}{_CORRECTED}"
+    return assignment(f"{s.input}.frame", name), assignment(f"{s.input}.mount", numbers)
+
+
+def _rpy(q: so3.Quaternion) -> tuple[float, float, float]:
+    """Roll, pitch and yaw about fixed axes, as ``se3.from_xyz_rpy`` takes them."""
+    R = so3.matrix(q)
+    pitch = float(np.arcsin(np.clip(-R[2, 0], -1.0, 1.0)))
+    if abs(R[2, 0]) > 1.0 - 1e-9:  # only the sum of the others is determined
+        return 0.0, pitch, float(np.arctan2(-R[0, 1], R[1, 1]))
+    return float(np.arctan2(R[2, 1], R[2, 2])), pitch, float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def _identities(c: Columns, s: SightingColumns) -> Iterator[Finding]:
+    counts = c.counters.as_dict().get(s.input, {})
+    twice = counts.get("id_merged", 0) + counts.get("id_conflict", 0)
+    share = twice / (len(s.stamp_ns) + twice)
+    if share > _TWICE:
+        text = f"{s.topic}: {share:.1%} of the sightings have an identity that their message has twice"
+        yield Finding("id_twice", "warning", share, _TWICE, "part", text, s.topic, int(s.stamp_ns[0]), twice)
+
+
+def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Finding]:
+    where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(s.stamp_ns)}
+    span_s = float(path_ns[-1] - path_ns[0]) * 1e-9
+    inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
+    if inside.sum() < _FEW:
+        text = f"{s.topic}: {int(inside.sum())} sightings in {span_s:.0f} s"
+        yield Finding("few_sightings", "note", int(inside.sum()), _FEW, "sightings", text, **where)
+    ends = np.concatenate([[path_ns[0]], np.sort(s.stamp_ns[inside]), [path_ns[-1]]])
+    silent_s = float(np.diff(ends).max()) * 1e-9
+    if silent_s > _SILENT * span_s:
+        text = f"{s.topic}: nothing is seen for {silent_s:.0f} of {span_s:.0f} s"
+        yield Finding("silent", "warning", silent_s, _SILENT * span_s, "s", text, **where)
+    is_named = np.array([bool(name) for name in s.names], dtype=bool)[s.name]
+    chosen = np.flatnonzero(is_named & inside)
+    if not len(chosen):
+        return
+    times = np.bincount(s.name[chosen])
+    seldom = float((times[times > 0] < _SELDOM).mean())
+    if seldom > _ONCE:
+        text = f"{s.topic}: {seldom:.0%} of {int((times > 0).sum())} identities are seen less than {_SELDOM} times"
+        yield Finding("seen_once", "warning", seldom, _ONCE, "part", text, **where)
+    driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))])
+    seconds = (path_ns - path_ns[0]) * 1e-9
+    reach_m = _reach(s, chosen, path_ns[0], seconds, driven)
+    if reach_m < _SPAN * driven[-1] and driven[-1] > _AGAIN_M:
+        text = f"{s.topic}: no landmark is seen over more than {reach_m:.1f} of {driven[-1]:.0f} m, or again later"
+        yield Finding("no_closure", "warning", reach_m, _SPAN * float(driven[-1]), "m", text, **where)
+
+
+def _reach(s: SightingColumns, chosen: Index, first_ns: int, seconds: Array, driven: Array) -> float:
+    """The longest way over which one landmark is seen, infinite where one is seen again after a pause."""
+    t = (s.stamp_ns[chosen] - first_ns) * 1e-9
+    at_m = np.interp(t, seconds, driven)
+    order = np.lexsort((t, s.name[chosen]))
+    name, t, at_m = s.name[chosen][order], t[order], at_m[order]
+    same = name[1:] == name[:-1]
+    if (same & (np.diff(t) > _AGAIN_S) & (np.diff(at_m) > _AGAIN_M)).any():
+        return float(np.inf)
+    begins = np.concatenate([[True], ~same])
+    ends = np.concatenate([~same, [True]])
+    return float((at_m[ends] - at_m[begins]).max())

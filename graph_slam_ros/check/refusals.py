@@ -1,0 +1,55 @@
+"""Refusals of the converters: each counter is a finding under its own name."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.finding import Finding, Severity, Where
+from graph_slam_ros.measurements.reasons import Effect, explain, remedy
+
+_MOST = 0.5
+_USUAL = {  # of single messages: detectors err, and a recording begins and ends somewhere
+    *("no_id", "late", "before_odometry", "after_odometry", "overhead", "beyond_max_distance", "no_fix", "no_result"),
+    *("other_publisher", "future", "far_in_time", "id_conflict", "poor_tag", "duplicate_stamp", "undecodable"),
+}
+_USUAL_SHARE = 0.05
+ELSEWHERE = {  # those that a check of its own explains better
+    *("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown", "no_id", "id_merged"),
+}
+
+
+def check_refusals(c: Columns) -> Iterator[Finding]:
+    """Every refusal that a replay would count; of few, where a few are usual, a note."""
+    items = {s.input: len(s.stamp_ns) for s in c.sightings}
+    for source, counts in c.counters.as_dict().items():
+        topic = next((t for t in c.topics.values() if source in t.inputs), None)
+        for reason, times in counts.items():
+            row = explain(reason)
+            if row.effect is not Effect.REFUSED or reason in ELSEWHERE:
+                continue
+            received = max(c.counters.received[source], items.get(source, 0) + times, times)
+            share = times / received
+            limit = _USUAL_SHARE if reason in _USUAL else 0.0
+            severity: Severity = "error" if share > _MOST else "warning" if share > limit else "note"
+            mend = remedy(source, reason)
+            text = f"{source}: {times} of {received} are refused: {row.meaning}{'; ' if mend else ''}{mend}"
+            first_ns = int(topic.stamp_ns[0]) if topic is not None and len(topic.stamp_ns) else 0
+            name = source if topic is None else topic.name
+            yield Finding(reason, severity, share, limit, "part", text, name, first_ns, times)
+
+
+def check_unnamed(c: Columns) -> Iterator[Finding]:
+    """Landmarks without identities, where identities are asked for."""
+    if c.config.landmarks.association != "id":
+        return
+    for s in c.sightings:
+        if not len(s.name) or "" not in s.names:
+            continue
+        unnamed = s.name == s.names.index("")
+        share = float(np.mean(unnamed))
+        severity: Severity = "error" if share > _MOST else "warning" if share > _USUAL_SHARE else "note"
+        text = f"{s.topic}: {share:.1%} of the sightings have no identity, and are not used"
+        at: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[unnamed][0]), "count": int(unnamed.sum())}
+        settings = ("landmarks.association=joint",)
+        yield Finding("no_id", severity, share, _USUAL_SHARE, "part", text, settings=settings, **at)

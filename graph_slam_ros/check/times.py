@@ -1,0 +1,183 @@
+"""Times of a recording: clocks, order, gaps."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns, TopicColumns
+from graph_slam_ros.check.finding import Finding, Severity, Where, assignment
+from graph_slam_ros.typing import Array, Index
+
+_FEW = 3
+_CLOCKS_DIFFER_S, _EARLY_S, _DAY_S = 10.0, 0.15, 86400.0
+_WINDOWS, _APART, _LEAST_S, _LEAST_MESSAGES = 20, 5, 30.0, 200
+_DRIFT, _DRIFTED_S, _SCATTERS = 1e-4, 0.02, 4.0
+_DUPLICATES, _OUT_OF_ORDER = 0.01, 0.001
+_LONG_S, _VERY_LONG_S, _PERIODS, _MOVED_M, _TURNED = 1.0, 2.0, 10.0, 0.05, 0.05
+_SLOW_HZ, _BETWEEN_S = 5.0, 0.02
+_JITTER, _FAST_HZ = 1.5, 200.0
+_OUTSIDE, _MARGIN_NS = 0.2, 500_000_000
+
+
+def check_times(c: Columns) -> Iterator[Finding]:
+    """Clocks of inputs against the recorder's and each other, and the order of the stamps of each."""
+    for key, value in c.assumed.items():
+        if key.endswith(".offset_s"):
+            name = key.removesuffix(".offset_s")
+            text = f"{name}: its clock is {-float(value):.3f} s from that of odometry: the difference was assumed"
+            of = next((t.name for t in c.topics.values() if name in t.inputs), "")
+            yield Finding(
+                "clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, of, settings=(assignment(key, value),)
+            )
+    stamped = {name: topic for name, topic in c.topics.items() if np.count_nonzero(topic.stamp_ns) >= _FEW}
+    yield from _clocks(c, stamped)
+    for topic in stamped.values():
+        yield from _order(c, topic)
+    yield from _rate(c)
+    yield from _overlap(c)
+
+
+def _lags(topic: TopicColumns) -> tuple[Array, Index, Index]:
+    """Recorded less stamped [s], and both, of the messages that have a stamp."""
+    is_stamped = topic.stamp_ns != 0
+    log_ns, stamp_ns = topic.log_ns[is_stamped], topic.stamp_ns[is_stamped]
+    return (log_ns - stamp_ns) * 1e-9, log_ns, stamp_ns
+
+
+def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
+    of_odometry = topics.get(c.odometry.topic)
+    if of_odometry is None:
+        return
+    typical_s = float(np.median(_lags(of_odometry)[0]))
+    for topic in topics.values():
+        lag_s, log_ns, stamp_ns = _lags(topic)
+        apart_s = float(np.median(lag_s)) - typical_s
+        where: Where = {"topic": topic.name, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
+        if abs(apart_s) > _CLOCKS_DIFFER_S:
+            settings = (_offset(c, topic, apart_s),) if abs(apart_s) < 3600.0 else ()
+            text = f"{topic.name}: its stamps are {-apart_s:.1f} s from those of {c.odometry.topic}: another clock"
+            yield Finding("clock_domains", "error", -apart_s, _CLOCKS_DIFFER_S, "s", text, settings=settings, **where)
+        elif apart_s < -_EARLY_S:
+            text = (
+                f"{topic.name}: recorded {-apart_s * 1e3:.0f} ms earlier than stamped, compared with "
+                f"{c.odometry.topic}: its clock is ahead"
+            )
+            setting = _offset(c, topic, apart_s)
+            yield Finding("latency", "warning", -apart_s, _EARLY_S, "s", text, settings=(setting,), **where)
+        if topic.use in ("odometry", "landmarks") and abs(typical_s) < _DAY_S:  # else simulated time, or played again
+            yield from _drift(topic, lag_s, log_ns, stamp_ns)
+
+
+def _offset(c: Columns, topic: TopicColumns, offset_s: float) -> str:
+    name = topic.inputs[0]
+    before_s = next(one.offset_s for one in c.config.sources if one.name == name)
+    return assignment(f"{name}.offset_s", round(before_s + offset_s, 3))
+
+
+def _drift(topic: TopicColumns, lag_s: Array, log_ns: Index, stamp_ns: Index) -> Iterator[Finding]:
+    """Theil-Sen slope of the shortest lags of windows: what delays a message only adds to its lag."""
+    span_s = float(log_ns[-1] - log_ns[0]) * 1e-9
+    if len(log_ns) < _LEAST_MESSAGES or span_s < _LEAST_S:
+        return
+    least_s = np.array([one.min() for one in np.array_split(lag_s, _WINDOWS)])
+    at_s = np.array([(one - log_ns[0]).mean() for one in np.array_split(log_ns, _WINDOWS)]) * 1e-9
+    later, earlier = np.tril_indices(_WINDOWS, -_APART)
+    between_s = at_s[later] - at_s[earlier]
+    if not (between_s > 0.0).any():
+        return
+    slopes = (least_s[later] - least_s[earlier])[between_s > 0.0] / between_s[between_s > 0.0]
+    slope = float(np.median(slopes))
+    scatter_s = float(np.median(np.abs(least_s - np.median(least_s) - slope * (at_s - np.median(at_s)))))
+    drifted_s = abs(slope) * span_s
+    if abs(slope) > _DRIFT and drifted_s > max(_DRIFTED_S, _SCATTERS * scatter_s) and drifted_s < _CLOCKS_DIFFER_S:
+        text = (
+            f"{topic.name}: its clock runs {-slope * 1e6:+.0f} ppm against the recorder's "
+            f"({-slope * span_s * 1e3:+.0f} ms in {span_s:.0f} s)"
+        )
+        where: Where = {"topic": topic.name, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
+        yield Finding("clock_drift", "warning", -slope * 1e6, _DRIFT * 1e6, "ppm", text, **where)
+
+
+def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
+    stamp_ns = topic.stamp_ns[topic.stamp_ns != 0]
+    step_s = np.diff(stamp_ns) * 1e-9
+    repeated, back = step_s == 0.0, step_s < 0.0
+    where: Where = {"topic": topic.name}
+    share = float(repeated.mean())
+    if topic.use == "odometry" and share > _DUPLICATES:
+        text = f"{topic.name}: {share:.1%} of the messages repeat the stamp before: published or recorded twice"
+        at, count = int(stamp_ns[1:][repeated][0]), int(repeated.sum())
+        yield Finding("duplicates", "warning", share, _DUPLICATES, "part", text, first_ns=at, count=count, **where)
+    if not back.any():
+        return
+    most_s, at, count = -float(step_s.min()), int(stamp_ns[1:][back][0]), int(back.sum())
+    more: Where = {"first_ns": at, "count": count, **where}
+    window_s = c.config.ordering.window_s if topic.use == "odometry" else c.config.ordering.late_s
+    if most_s > max(c.config.time.jump_back_s, 1.0) and most_s > window_s:
+        text = f"{topic.name}: stamps step back by up to {most_s:.2f} s: the clock was set, or two drives were joined"
+        yield Finding("time_jump", "error", most_s, 1.0, "s", text, **more)
+    elif topic.use == "odometry" and most_s > window_s and count > _OUT_OF_ORDER * len(step_s):
+        text = f"{topic.name}: {count} messages are older than the one before, by up to {most_s * 1e3:.0f} ms"
+        setting = assignment("ordering.window_s", round(1.2 * most_s + 0.005, 3))
+        yield Finding("out_of_order", "warning", most_s, window_s, "s", text, settings=(setting,), **more)
+
+
+def _rate(c: Columns) -> Iterator[Finding]:
+    o = c.odometry
+    stamp_ns, order = np.unique(o.stamp_ns[o.stamp_ns != 0], return_index=True)
+    if len(stamp_ns) < _FEW:
+        return
+    poses = o.poses[o.stamp_ns != 0][order]
+    step_s = np.diff(stamp_ns) * 1e-9
+    median_s = float(np.median(step_s))
+    where: Where = {"topic": o.topic, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
+    most_s = max(_PERIODS * median_s, _LONG_S)
+    long = np.flatnonzero(step_s > most_s)
+    if len(long):
+        moved = np.linalg.norm(np.diff(poses[:, :3], axis=0)[long], axis=1) > _MOVED_M
+        turned = np.linalg.norm(np.diff(poses[:, 3:], axis=0)[long], axis=1) > _TURNED
+        worst_s = float(step_s[long].max())
+        is_bad = bool((step_s[long][moved | turned] > max(_PERIODS * median_s, _VERY_LONG_S)).any())
+        text = (
+            f"{o.topic}: silent {len(long)} times for more than {most_s:.1f} s, at most {worst_s:.1f} s, at "
+            f"{1.0 / median_s:.0f} Hz else{'; the robot moved meanwhile' if is_bad else ''}"
+        )
+        at: Where = {"topic": o.topic, "first_ns": int(stamp_ns[long[0]]), "count": len(long)}
+        yield Finding("gap", "warning" if is_bad else "note", worst_s, most_s, "s", text, **at)
+    if 1.0 / median_s < _SLOW_HZ:
+        between = _between(c, stamp_ns)
+        text = f"{o.topic}: {1.0 / median_s:.1f} Hz: the pose at a sighting is interpolated over {median_s:.2f} s"
+        severity: Severity = "warning" if between > 0.5 else "note"
+        yield Finding("slow_odometry", severity, 1.0 / median_s, _SLOW_HZ, "Hz", text, **where)
+    spread = float(np.subtract(*np.percentile(step_s, [90.0, 10.0]))) / median_s
+    if spread > _JITTER and 1.0 / median_s < _FAST_HZ:
+        text = f"{o.topic}: the times between stamps vary by {spread:.1f} times their median: stamped on arrival?"
+        yield Finding("jitter", "note", spread, _JITTER, "times", text, **where)
+
+
+def _between(c: Columns, odometry_ns: Index) -> float:
+    """The part of the sightings that are far from any stamp of odometry."""
+    stamps_ns = np.concatenate([s.stamp_ns for s in c.sightings]) if c.sightings else np.empty(0, dtype=np.int64)
+    if not len(stamps_ns):
+        return 0.0
+    after = np.clip(np.searchsorted(odometry_ns, stamps_ns), 1, len(odometry_ns) - 1)
+    away_ns = np.minimum(np.abs(stamps_ns - odometry_ns[after - 1]), np.abs(stamps_ns - odometry_ns[after]))
+    return float((away_ns > _BETWEEN_S * 1e9).mean())
+
+
+def _overlap(c: Columns) -> Iterator[Finding]:
+    if not len(c.path_ns):
+        return
+    first_ns, last_ns = int(c.path_ns.min()), int(c.path_ns.max())
+    for s in c.sightings:
+        if len(s.stamp_ns):
+            outside = (s.stamp_ns < first_ns - _MARGIN_NS) | (s.stamp_ns > last_ns + _MARGIN_NS)
+            share = float(outside.mean())
+            if share > _OUTSIDE:
+                ends = [(int(t) - first_ns) * 1e-9 for t in (s.stamp_ns.min(), s.stamp_ns.max())]
+                text = (
+                    f"{s.topic}: {share:.0%} of the sightings are stamped outside the time of odometry ({ends[0]:.1f} "
+                    f"to {ends[1]:.1f} s, odometry 0 to {(last_ns - first_ns) * 1e-9:.1f} s)"
+                )
+                at: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[outside][0]), "count": int(outside.sum())}
+                yield Finding("no_overlap", "error", share, _OUTSIDE, "part", text, **at)

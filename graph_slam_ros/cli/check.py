@@ -1,0 +1,55 @@
+"""The command ``check``: what is wrong with a recording."""
+
+import argparse
+import json
+import shlex
+import textwrap
+from collections.abc import Iterator
+
+from graph_slam_ros.check.finding import Finding
+from graph_slam_ros.cli import console
+from graph_slam_ros.errors import GraphSlamError
+
+_WIDTH = 100
+
+
+def check(args: argparse.Namespace) -> int:
+    """Check a recording; returns 4 where something above a note was found."""
+    from graph_slam_ros.formats.parameters import parse_setting
+    from graph_slam_ros.runs.check import check as checked
+    from graph_slam_ros.runs.folder import is_run
+
+    if is_run(args.bag):
+        raise GraphSlamError(f"{args.bag}: a run folder; check its recording, or graph_slam explain {args.bag}")
+    settings = dict(parse_setting(text) for text in args.set)
+    topics = {"odometry": args.odom, "landmarks": args.landmarks}
+    done = checked(args.bag, settings, **topics, quick=args.quick, progress=console.progress("check"))
+    if args.json:
+        console.show(
+            json.dumps(
+                {"findings": [one.as_dict() for one in done.findings], "command": done.command, "losses": done.losses}
+            )
+        )
+    else:
+        for one in done.findings:
+            console.show(*lines(one))
+        counts = {s: sum(one.severity == s for one in done.findings) for s in ("error", "warning", "note")}
+        console.show(", ".join(f"{n} {s}{'' if n == 1 else 's'}" for s, n in counts.items()))
+        console.then(done.command or console.command("info", args.bag))
+    console.report_losses(done.losses, done.warnings)
+    return console.DONE if done.is_clean else console.FOUND
+
+
+def lines(one: Finding) -> Iterator[str]:
+    """A finding as a person reads it: what, its value and limit, and what mends it."""
+    first = f"[{one.severity}] {one.code}: {one.text}"
+    yield from textwrap.wrap(" ".join(first.splitlines()), _WIDTH, subsequent_indent="    ", break_on_hyphens=False)
+    limit = f"    {one.value:.4g} {one.unit}, limit {one.limit:.4g}"
+    yield limit + (f"; {one.count} in {one.topic}" if one.topic and one.count else "")
+    if one.settings:
+        yield "    mend: " + " ".join(f"--set {shlex.quote(text)}" for text in one.settings)
+    else:
+        from graph_slam_ros.check.finding import KINDS
+
+        if one.code in KINDS and KINDS[one.code].mend:
+            yield f"    mend: {KINDS[one.code].mend.replace('INPUT', 'the input')}"

@@ -1,0 +1,140 @@
+"""A recording is checked: its inputs are chosen, it is read once, and all findings are collected."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros.check.checks import check_columns
+from graph_slam_ros.check.columns import Collector
+from graph_slam_ros.check.finding import Finding, Severity, in_order
+from graph_slam_ros.measurements.types import Measured
+from graph_slam_ros.messages.inputs import known_types
+from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
+from graph_slam_ros.recordings.bag import Bag, open_bag
+from graph_slam_ros.recordings.contents import Recording, TopicContents, recording_of
+from graph_slam_ros.runs.replay import RecordedRuns, choose_inputs
+from graph_slam_ros.runs.suggestion import CLOUD, DETECTIONS, ODOMETRY, Suggestion
+from graph_slam_ros.slam import Config, Control, Counters
+
+_LANDMARKS = (DETECTIONS, CLOUD, *LANDMARK_TYPES)
+_MAPS = ("map", "world", "earth", "utm")
+Measurements = list[Measured | Control]
+Progress = Callable[[Iterable[Any], int], Iterable[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """The outcome of a check.
+
+    Attributes
+    ----------
+    findings : the most severe first
+    command : the replay that was checked; empty where there is none
+    losses, warnings : what could not be read
+    """
+
+    findings: list[Finding]
+    command: str
+    losses: list[str]
+    warnings: list[str]
+
+    @property
+    def is_clean(self) -> bool:
+        """Return whether nothing is above a note."""
+        return all(one.severity == "note" for one in self.findings)
+
+
+def check(
+    path: Path | str,
+    settings: Mapping[str, Any] | None = None,
+    *,
+    odometry: str | None = None,
+    landmarks: str | None = None,
+    quick: bool = False,
+    progress: Progress = lambda items, total: items,
+) -> Checked:
+    """Check a recording as a replay with the settings of ``graph_slam info`` would use it.
+
+    Parameters
+    ----------
+    settings : parameters by dotted name, which come before those that ``info`` chooses
+    odometry, landmarks : topics, instead of those that ``info`` chooses
+    quick : leave out what needs a replay and a fit
+    progress : wraps the sequence of messages
+
+    Raises
+    ------
+    GraphSlamError
+        The recording, a topic or a parameter cannot be used.
+    """
+    path, settings = Path(path), dict(settings or {})
+    bag = open_bag(path)
+    recording = recording_of(bag)
+    suggestion = _suggestion(bag, recording, path, odometry, landmarks)
+    found = list(_unused(recording, suggestion, has_landmarks=landmarks is not None))
+    if suggestion.trouble and odometry is None and not settings:
+        text = f"not ready for replay: {suggestion.trouble}"
+        found.append(Finding("no_odometry", "error", 0, 1, "topics", text))
+        return Checked(in_order(found), "", bag.losses, bag.warnings)
+    assumed = {} if suggestion.trouble else {k: v for k, v in suggestion.settings.items() if k not in settings}
+    if "inputs.names" in settings:
+        assumed = {}
+    config = Config.from_mapping(assumed | settings)
+    chosen = {} if suggestion.trouble else suggestion.topics
+    inputs = choose_inputs(
+        bag, config, odometry or _topic(chosen, "odom", config), landmarks or _topic(chosen, "detections", config)
+    )
+    collector, counters = Collector(config, inputs.topics, assumed), Counters()
+    runs = RecordedRuns(bag, inputs, config, counters, columns=collector)
+    total = sum(bag.topics[topic].count for topic in inputs.by_topic())
+    measured: list[tuple[int, Measurements]] = []
+    for number, some in progress(runs, total):
+        if some and not quick:
+            measured.append((number, some))
+    columns = collector.columns(counters)
+    found += _damage(bag)
+    found += check_columns(columns)
+    command = suggestion.command() if not suggestion.trouble else ""
+    return Checked(in_order(found), command, bag.losses, bag.warnings)
+
+
+def _topic(chosen: Mapping[str, str], name: str, config: Config) -> str | None:
+    return chosen.get(name) if any(one.name == name and one.use != "none" for one in config.sources) else None
+
+
+def _suggestion(bag: Bag, recording: Recording, path: Path, odometry: str | None, landmarks: str | None) -> Suggestion:
+    """The choice of ``info``, if the topics that a person has named were the only ones of their kinds."""
+    topics = dict(recording.topics)
+    if odometry in topics:
+        topics = {n: one for n, one in topics.items() if n == odometry or one.topic.type != topics[odometry].topic.type}
+    if landmarks in topics:
+        topics = {n: one for n, one in topics.items() if n == landmarks or one.topic.type not in _LANDMARKS}
+    return Suggestion(bag, replace(recording, topics=topics), path)
+
+
+def _unused(recording: Recording, suggestion: Suggestion, *, has_landmarks: bool) -> Iterator[Finding]:
+    """Topics that are meant for landmarks or odometry, and that cannot be used."""
+    has_landmarks = has_landmarks or any(name not in ("odom", "gps", "imu", "pose") for name in suggestion.names)
+    for name, why in suggestion.unused.items():
+        one = recording.topics[name]
+        is_landmark = one.topic.type in _LANDMARKS and one.topic.type in known_types()
+        if one.topic.type == ODOMETRY and one.frame in _MAPS:
+            text = f"{name} is {why}"
+            severity: Severity = "note" if "odom" in suggestion.topics else "error"
+            yield Finding("odometry_in_map", severity, 1, 0, "topics", text, name, count=one.topic.count)
+        elif (is_landmark or one.topic.type == ODOMETRY) and _is_defect(one, why):
+            code = "zero_stamp" if one.is_zero else "clock_domains" if "another clock" in why else "input_unused"
+            text = f"{name} is not used: {why}"
+            severity = "note" if has_landmarks and is_landmark else "error"
+            yield Finding(code, severity, 1, 0, "topics", text, name, count=one.topic.count)
+
+
+def _is_defect(one: TopicContents, why: str) -> bool:
+    """Return whether a topic is not used since something is wrong with it, not since there is a better one."""
+    return bool(one.trouble) or one.is_zero or "another clock" in why
+
+
+def _damage(bag: Bag) -> Iterator[Finding]:
+    for loss in dict.fromkeys(bag.losses):
+        yield Finding("damaged", "error", 1, 0, "parts", loss)

@@ -1,0 +1,113 @@
+"""``graph_slam check`` on whole recordings: what a person sees, and the mistakes that people make."""
+
+import json
+
+import pytest
+from recordings import TOPICS, read, short_drive, to_ros1, write_mcap
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.messages.from_msg import decoder
+from graph_slam_ros.messages.to_msg import encode
+from graph_slam_ros.recordings.bag import BagWriter, open_bag
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    return short_drive(tmp_path_factory.mktemp("check") / "drive.mcap")
+
+
+@pytest.fixture
+def check(capsys):
+    """(exit code, findings by code, lines on standard error)."""
+
+    def checked(*words):
+        code = main(["check", *map(str, words), "--json"])
+        out, err = capsys.readouterr()
+        findings = json.loads(out)["findings"] if out else []
+        return code, {one["code"]: one for one in findings}, err.splitlines()
+
+    return checked
+
+
+def copy(source, target, change=lambda topic, message: message):
+    """Write a recording again, with each message changed; None leaves it out."""
+    bag = open_bag(source)
+    decoders = {name: decoder(topic.type) for name, topic in bag.topics.items()}
+    with BagWriter(target) as out:
+        for m in bag.messages(set(bag.topics)):
+            changed = change(m.topic, decoders[m.topic](m.cdr))
+            if changed is not None:
+                out.write(m.topic, bag.topics[m.topic].type, m.log_ns, encode(changed))
+    return target
+
+
+def test_a_clean_recording_has_no_finding_and_the_command_is_that_of_info(drive, capsys):
+    assert main(["check", str(drive)]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert main(["info", str(drive)]) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[-2].endswith(f"graph_slam check {drive}")
+    assert out[-1] == f"next: {shown[-1]}"
+    assert not [line for line in out if line.startswith(("[error]", "[warning]"))]
+
+
+def test_a_refused_message_is_a_finding_with_the_name_of_its_counter(drive, check, tmp_path):
+    def change(topic, m):
+        if topic == "/odom" and m.header.stamp.nanosec % 3 == 0:
+            m.pose.pose.position.x = float("nan")
+        return m
+
+    code, found, _ = check(copy(drive, tmp_path / "a.mcap", change))
+    assert code == 4
+    assert found["nonfinite"]["severity"] in ("warning", "error")
+    assert found["nonfinite"]["evidence"]["topic"] == "/odom"
+
+
+def test_a_frame_that_nothing_links_is_an_error_until_its_mount_is_set(drive, check, tmp_path):
+    def change(topic, m):
+        if topic == "/landmarks":
+            m.header.frame_id = "camera_link"
+            for one in m.detections:
+                one.header.frame_id = "camera_link"
+        return m
+
+    bag = copy(drive, tmp_path / "a.mcap", change)
+    code, found, _ = check(bag)
+    assert (code, found["frame_unlinked"]["severity"]) == (4, "error")
+    code, found, _ = check(bag, *(w for text in found["frame_unlinked"]["settings"] for w in ("--set", text)))
+    assert (code, found) == (0, {})
+
+
+def test_the_mistakes_of_a_user_are_one_line_or_a_finding(drive, check, tmp_path, capsys):
+    messages, _ = read(drive)
+    code, _, err = check(drive, "--odom", "/wheel")
+    assert code == 2
+    assert "no topic /wheel" in err[0]
+    assert "/odom (nav_msgs/msg/Odometry)" in err[0]
+    code, _, err = check(drive, "--set", "detections.offset=3")
+    assert (code, len(err)) == (2, 1)
+    assert "did you mean 'detections.offset_s'" in err[0]
+    alone = write_mcap(tmp_path / "alone.mcap", [m for m in messages if m.topic == "/odom"])
+    code, found, _ = check(alone)
+    assert (code, found["no_landmarks"]["severity"]) == (0, "note")
+    code, found, _ = check(write_mcap(tmp_path / "seen.mcap", [m for m in messages if m.topic == "/landmarks"]))
+    assert (code, found["no_odometry"]["severity"]) == (4, "error")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    assert check(folder)[0] == 2
+    to_ros1(folder / "drive.bag", messages)
+    assert check(folder) == (0, {}, [])
+    assert check(tmp_path / "nothing.mcap")[0] == 2
+    empty = write_mcap(tmp_path / "empty.mcap", [], types=TOPICS)
+    code, found, _ = check(empty)
+    assert (code, found["no_odometry"]["severity"]) == (4, "error")
+
+
+def test_a_damaged_recording_is_checked_as_far_as_it_goes(drive, check, tmp_path):
+    cut = tmp_path / "cut.mcap"
+    data = write_mcap(cut, read(drive)[0], chunk_size=4096).read_bytes()
+    cut.write_bytes(data[: len(data) * 2 // 3])
+    code, found, err = check(cut)
+    assert code == 4
+    assert found["damaged"]["severity"] == "error"
+    assert "lost: cut.mcap" in err[0]

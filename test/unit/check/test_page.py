@@ -1,0 +1,46 @@
+"""docs/check.md has a row for each finding; ``PYTHONPATH=test python test/unit/check/test_page.py`` writes them."""
+
+import re
+
+from places import ROOT
+
+from graph_slam_ros.check.finding import KINDS
+from graph_slam_ros.measurements.reasons import REASONS
+
+PAGE = ROOT / "docs/check.md"
+HEAD = "| finding | what was measured | what mends it |\n|---|---|---|\n"
+
+
+def table():
+    """A row for each finding; those that end the list are marked."""
+    ends = " (ends the list)"
+    rows = (f"| `{name}`{ends if row.ends else ''} | {row.meaning} | {row.mend} |" for name, row in KINDS.items())
+    return HEAD + "\n".join(rows) + "\n"
+
+
+def written(text):
+    """The page with the table as it should be."""
+    return re.sub(re.escape(HEAD) + r"(\|.*\n)*", lambda _: table(), text)
+
+
+def test_every_finding_is_on_the_page():
+    text = PAGE.read_text()
+    assert text == written(text), "PYTHONPATH=test python test/unit/check/test_page.py writes the table"
+
+
+def test_every_code_in_the_sources_has_a_row():
+    sources = "\n".join(path.read_text() for path in (ROOT / "graph_slam_ros").rglob("*.py"))
+    codes = set(re.findall(r'Finding\(\s*"(\w+)"', sources))
+    assert len(codes) > 25
+    assert codes <= KINDS.keys() | REASONS.keys()
+
+
+def test_every_row_can_be_found():
+    sources = "\n".join(
+        path.read_text() for path in (ROOT / "graph_slam_ros").rglob("*.py") if path.name != "finding.py"
+    )
+    assert [name for name in KINDS if f'"{name}"' not in sources] == []
+
+
+if __name__ == "__main__":
+    PAGE.write_text(written(PAGE.read_text()))
