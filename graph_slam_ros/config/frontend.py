@@ -1,7 +1,7 @@
 """Parameters of the front end: odometry, keyframes, the order of messages."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from graph_slam_ros.config.parameter import setting
 
@@ -12,9 +12,10 @@ class OdometryConfig:
 
     noise: str = setting(
         "twist",
-        "noise of odometry: twist: from each message's twist covariance, or the densities where it "
-        "has none; density: always the densities",
-        choices=("twist", "density"),
+        "noise of odometry: twist: from each message's twist covariance; where it has none as motion, or by the "
+        "densities where one of them is set; density: always the densities; motion: it grows with what was turned and "
+        "driven (turn_per_rad, turn_per_m, turn_per_s, way_per_m, way_per_s)",
+        choices=("twist", "density", "motion"),
     )
     translation_density: float = setting(
         0.02, "random walk of the odometry position along x of the base", "m/sqrt(s)", low=1e-6, high=10.0
@@ -37,6 +38,30 @@ class OdometryConfig:
     rotation_density: float = setting(0.05, "random walk of the odometry heading", "rad/sqrt(s)", low=1e-6, high=10.0)
     tilt_density: float = setting(
         0.02, "random walk of odometry roll and pitch; used in space only", "rad/sqrt(s)", low=1e-6, high=10.0
+    )
+    turn_per_rad: float = setting(
+        0.02, "odometry.noise: motion: variance of the heading for each radian turned", "rad^2/rad", low=0.0, high=10.0
+    )
+    turn_per_m: float = setting(
+        0.002, "odometry.noise: motion: variance of the heading for each metre driven", "rad^2/m", low=0.0, high=10.0
+    )
+    turn_per_s: float = setting(
+        2e-4,
+        "odometry.noise: motion: variance of the heading for each second of motion",
+        "rad^2/s",
+        low=1e-12,
+        high=10.0,
+    )
+    way_per_m: float = setting(
+        2e-3,
+        "odometry.noise: motion: variance of the position along x for each metre driven; other axes are to it as the "
+        "densities are",
+        "m^2/m",
+        low=0.0,
+        high=10.0,
+    )
+    way_per_s: float = setting(
+        1e-4, "odometry.noise: motion: variance of the way for each second of motion", "m^2/s", low=1e-12, high=10.0
     )
     twist_correlation_s: float = setting(
         0.25,
@@ -83,6 +108,11 @@ class OdometryConfig:
     jump_sigma_rad: float = setting(
         3.0, "standard deviation of the rotation across a jump of odometry", "rad", low=1e-3
     )
+
+    @property
+    def has_densities(self) -> bool:
+        """Return whether a density is other than its default."""
+        return any(getattr(self, one.name) != one.default for one in fields(self) if one.name.endswith("_density"))
 
 
 @dataclass(frozen=True, slots=True)

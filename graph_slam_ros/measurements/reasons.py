@@ -128,7 +128,7 @@ REASONS: dict[str, Reason] = {
     "noise_unknown": Reason(_REFUSED, "neither the message nor the parameters have its noise", _SIGMAS),
     "covariance_unknown": Reason(_REPAIRED, "the covariance is zero: the configured noise is used"),
     "covariance_of_some_axes_unknown": Reason(
-        _REPAIRED, "the twist's covariance lacks some axes: the configured densities are used"
+        _REPAIRED, "the twist's covariance lacks some axes: the configured noise is used"
     ),
     "covariance_clamped": Reason(_REPAIRED, "a variance above 1e6 m^2 or 1e3 rad^2 was lowered to that"),
     "covariance_floored": Reason(_REPAIRED, "a variance that is nearly zero was raised"),

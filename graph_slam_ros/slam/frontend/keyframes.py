@@ -124,5 +124,5 @@ class KeyframeList:
         T_a_b = self._space.identity if k + 1 in self.segments else group.between(a.T_odom_base, b.T_odom_base)
         fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
         moved = group.interpolate(self._space.identity, T_a_b, fraction)
-        noise = self._noise.of((stamp_ns - a.stamp_ns) * 1e-9, None)
+        noise = self._noise.of(moved, (stamp_ns - a.stamp_ns) * 1e-9, None)
         return PoseAtStamp(k, a.vertex, stamp_ns, moved, group.noise_during(moved, noise))

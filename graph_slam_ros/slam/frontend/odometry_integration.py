@@ -1,5 +1,6 @@
 """Odometry since a keyframe: relative motion and its covariance."""
 
+import math
 from bisect import bisect_right
 from dataclasses import dataclass
 
@@ -26,21 +27,28 @@ class OdometrySample:
 
 
 class OdometryNoise:
-    """Noise of a motion from its duration.
+    """Noise of a motion from its duration, or from its size.
 
     A step of dt seconds adds density^2 dt. From a twist covariance C a step adds C dt max(dt, tau), since errors of
-    velocity last for about tau. A robot that stands gathers none.
+    velocity last for about tau. With ``odometry.noise: motion`` variances grow with what was turned and driven, step
+    by step. A robot that stands gathers none.
     """
 
-    __slots__ = ("_config", "_density", "_flat", "_space", "_square")
+    __slots__ = ("_by_motion", "_by_twist", "_config", "_density", "_flat", "_heading", "_space", "_square", "_way")
 
     def __init__(self, config: OdometryConfig, space: Geometry) -> None:
         self._config, self._space = config, space
         c = config
+        self._by_twist = c.noise == "twist"
+        self._by_motion = c.noise == "motion" or (self._by_twist and not c.has_densities)
         sigmas = [c.translation_density, c.lateral_density, c.rotation_density]
         if space.dimensions == 3:
             sigmas[2:] = [c.vertical_density, c.tilt_density, c.tilt_density, c.rotation_density]
         self._density = np.diag(np.square(sigmas))
+        n = space.dimensions
+        # other directions are to the first, and to heading, as the densities are
+        self._way = np.diag([(one / c.translation_density) ** 2 for one in sigmas[:n]] + [0.0] * (len(sigmas) - n))
+        self._heading = np.diag([0.0] * n + [(one / c.rotation_density) ** 2 for one in sigmas[n:]])
         self._flat: Numbers = ()
         self._square: Array = self._density
 
@@ -58,11 +66,19 @@ class OdometryNoise:
         c, n = self._config, self._space.dimensions
         return bool(sum(x * x for x in moved[:n]) < c.still_m**2 and self._space.angle(moved) < c.still_rad)
 
-    def of(self, dt: float, twist_covariance: Numbers | None) -> Array:
-        """Covariance (dof, dof) of the velocities' integral over dt seconds."""
-        if self._config.noise == "twist" and twist_covariance is not None:
+    def of(self, step: Numbers, dt: float, twist_covariance: Numbers | None) -> Array:
+        """Covariance (dof, dof) of the velocities' integral over a step in dt seconds of motion."""
+        if self._by_twist and twist_covariance is not None:
             return self._twist(twist_covariance) * (dt * max(dt, self._config.twist_correlation_s))
-        return self._density * dt
+        return self._motion(step, dt) if self._by_motion else self._density * dt
+
+    def _motion(self, step: Numbers, dt: float) -> Array:
+        if dt == 0.0:
+            return np.zeros_like(self._density)
+        c = self._config
+        way, turned = math.hypot(*step[: self._space.dimensions]), self._space.angle(step)
+        heading = c.turn_per_rad * turned + c.turn_per_m * way + c.turn_per_s * dt
+        return self._way * (c.way_per_m * way + c.way_per_s * dt) + self._heading * heading
 
     def _twist(self, flat: Numbers) -> Array:
         if flat is not self._flat:  # drivers repeat the same covariance
@@ -193,7 +209,7 @@ class IntegratedOdometry:
         stands: bool,
     ) -> OdometrySample:
         moving_ns = (stamp_ns - a.stamp_ns) * (not stands)
-        noise = self._noise.of(moving_ns * 1e-9, twist_covariance)
+        noise = self._noise.of(T_a_b, moving_ns * 1e-9, twist_covariance)
         covariance = self._space.group.propagate_during(a.covariance, T_a_b, noise)
         return OdometrySample(stamp_ns, to, covariance, twist_covariance, stands)
 

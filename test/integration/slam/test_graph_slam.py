@@ -268,12 +268,36 @@ def test_the_noise_of_a_step_is_what_random_steps_have(noise):
     assert (got / scale) == pytest.approx(expected / scale, abs=0.04)  # 20,000 samples: 1 % each, 4 sigma
 
 
-def test_a_twist_covariance_that_a_message_lacks_is_replaced_by_the_densities():
-    with_twist = slam(odometry={"noise": "twist"})
-    densities = slam(odometry={"noise": "density"})
-    for p in (with_twist, densities):
+def motion_noise(turned, way, seconds):
+    """By the default parameters, about (x, y, heading) of a step; a sixteenth of the way's goes across."""
+    along = 2e-3 * way + 1e-4 * seconds
+    return np.diag([along, along / 16.0, 0.02 * turned + 2e-3 * way + 2e-4 * seconds])
+
+
+def test_noise_by_motion_grows_with_all_that_was_turned_and_driven_not_with_where_it_led():
+    there_and_back = [(0.1, 0.0, 0.2), (0.0, 0.0, 0.0), (0.1, 0.0, 0.2), (0.2, 0.1, 0.4), (0.3, 0.2, 0.4)]
+    p = slam(odometry={"noise": "motion"}, keyframes={"min_distance_m": 0.36, "min_angle_rad": 3.0})
+    run(p, odometry(0, (0, 0, 0)), *(odometry(0.1 * (k + 1), pose) for k, pose in enumerate(there_and_back)))
+    assert len(p.keyframes) == 2
+    steps = [se2.between(a, b) for a, b in itertools.pairwise([(0.0, 0.0, 0.0), *there_and_back])]
+    noise = [motion_noise(abs(step[2]), math.hypot(*step[:2]), 0.1) for step in steps]
+    expected, got = monte_carlo(steps, noise), covariance_of(p, RELATIVE_POSE)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert (got / scale) == pytest.approx(expected / scale, abs=0.04)  # 20,000 samples: 1 % each, 4 sigma
+
+
+@pytest.mark.parametrize(
+    "odometry, is_same",
+    [
+        ({"noise": "twist"}, {"noise": "motion"}),
+        ({"noise": "twist", "rotation_density": 0.1}, {"noise": "density", "rotation_density": 0.1}),
+    ],
+)
+def test_a_twist_covariance_that_a_message_lacks_is_that_of_motion_unless_a_density_is_set(odometry, is_same):
+    with_twist, other = slam(odometry=odometry), slam(odometry=is_same)
+    for p in (with_twist, other):
         run(p, *straight(1))
-    assert covariance_of(with_twist, RELATIVE_POSE) == pytest.approx(covariance_of(densities, RELATIVE_POSE))
+    assert covariance_of(with_twist, RELATIVE_POSE) == pytest.approx(covariance_of(other, RELATIVE_POSE), rel=1e-12)
 
 
 def test_density_is_used_where_it_is_asked_for_whatever_the_messages_say():

@@ -165,7 +165,7 @@ def test_params_tells_default_unit_bounds_meaning_and_when_it_may_change(capsys)
     assert meaning == "    a keyframe is added after the robot moved this far"
     only = told(capsys, "params", "odometry.*")[1].splitlines()[:-1:2]
     assert [line.split(" = ")[0] for line in only] == [p.name for p in parameters() if p.name.startswith("odometry.")]
-    assert "one of twist, density; read at the start" in only[0]
+    assert "one of twist, density, motion; read at the start" in only[0]
     assert "keyframes.min_distance_m" in told(capsys, "params", "the robot moved this FAR")[1]
 
 
