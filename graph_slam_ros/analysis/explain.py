@@ -34,8 +34,15 @@ _WHY = {
     Reason.QUARANTINED: "quarantined",
     Reason.DISPLACED: "displaced",
     Reason.REVOKED: "revoked",
+    Reason.FAILED: "plugin failed",
 }
-_KIND = {"closures": "a loop closure", "landmarks": "a sighting", "fixes": "a fix", "odometry": "odometry"}
+_KIND = {
+    "closures": "a loop closure",
+    "landmarks": "a sighting",
+    "fixes": "a fix",
+    "odometry": "odometry",
+    "custom": "an edge of a plugin",
+}
 _SHOWN = 5
 _WIDTH = 110
 _SAME = 0.99
@@ -150,7 +157,7 @@ def explain_edge(run: SavedGraph, which: str) -> Iterator[str]:
 
 def _landmark(run: SavedGraph, name: str) -> Iterator[str]:
     entries = run.entries
-    seen = [e for e in entries if e.landmark == name]
+    seen = [e for e in entries if name in run.landmarks_of(e)]
     if not seen:
         names = sorted({e.landmark for e in entries} - {""})
         there = ", ".join(names[:20]) + (", ..." if len(names) > 20 else "")
@@ -167,16 +174,19 @@ def _landmark(run: SavedGraph, name: str) -> Iterator[str]:
 def _edge(run: SavedGraph, edge: int) -> Iterator[str]:
     e = run.edge(edge)
     history = [change for change in run.changes if change.edge == edge]
-    kind, of, by = _KIND.get(e.label, e.label), e.landmark and f" of {e.landmark}", e.source and f" by {e.source}"
-    yield f"edge {edge}: {kind}{of}{by}: {_state(e.verdict, e.reason)}"
+    of, by = " and ".join(run.landmarks_of(e)), e.source and f" by {e.source}"
+    kind = _KIND.get(e.label, e.label) + (f" ({e.tag})" if measurement_text.is_custom(e) else "")
+    yield f"edge {edge}: {kind}{of and f' of {of}'}{by}: {_state(e.verdict, e.reason)}"
     yield from _line("stamp", f"{e.stamp_ns / 1e9:.3f} s, of the newest keyframe that it is attached to")
     yield from _line("judged", f"first at keyframe {e.keyframe}")
     yield from _line("between", " and ".join(_vertex(run, e, v) for v in e.vertices))
     yield from _line("measured", measurement_text.with_units(e, measurement_text.measured(e)))
     yield from _line("sigmas", measurement_text.with_units(e, measurement_text.sigmas(e)))
-    yield from _line(
-        "expected", f"{measurement_text.with_units(e, measurement_text.expected(e))}, when it was judged first"
-    )
+    if measurement_text.is_custom(e):
+        yield from _line("residual", f"{measurement_text.with_units(e, e.residual)}, when it was judged first")
+    else:
+        expected = measurement_text.with_units(e, measurement_text.expected(e))
+        yield from _line("expected", f"{expected}, when it was judged first")
     yield from _line("decided", _decided(e, history, run.config))
     if not e.verdict:
         return
@@ -214,6 +224,8 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
             return "not by how it fits: it was cleared, or association took it from its landmark"
         case Reason.QUARANTINED:
             return "not by how it fits: solves failed with it, again and again, and succeeded without"
+        case Reason.FAILED:
+            return "not by how it fits: the plugin of its edge type failed at it; the log of the run names the error"
         case Reason.DISPLACED:
             return (
                 f"{e.statistic:.0f} sightings more agreed on another pose of the robot than on this motion: it was"
@@ -267,4 +279,5 @@ def _line(what: str, text: str) -> Iterator[str]:
 def _vertex(run: SavedGraph, e: Entry, vertex: int) -> str:
     if run.keyframe(vertex) is not None:
         return f"keyframe {run.keyframe(vertex)}"
-    return f"landmark {e.landmark}" if e.landmark else f"vertex {run.ids[vertex]}"
+    name = run.landmark_of(vertex)
+    return f"landmark {name}" if name else f"vertex {run.ids[vertex]}"

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from graph_slam_ros.edge_tags import EDGE_TAGS
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.runs.ledger_file import Entry
 
@@ -33,6 +34,8 @@ _NAMES = {
 
 def with_units(entry: Entry, numbers: Sequence[float]) -> str:
     """One number for each that the edge measures, with their names; angles in degrees."""
+    if is_custom(entry):
+        return ", ".join(f"{number:.4g}" for number in numbers)
     names = _NAMES.get(entry.tag) or (_XY if len(numbers) == 2 else _XYZ)
     words = []
     for name, number in zip(names, numbers, strict=True):
@@ -41,9 +44,19 @@ def with_units(entry: Entry, numbers: Sequence[float]) -> str:
     return ", ".join(words)
 
 
+def is_custom(entry: Entry) -> bool:
+    """Return whether its edge type is a plugin's: nobody knows what its numbers are."""
+    return entry.tag not in EDGE_TAGS
+
+
 def measured(entry: Entry) -> tuple[float, ...]:
-    """Return what was measured, as many numbers as the residual has; rotations in space as vectors."""
+    """Return what was measured, as many numbers as the residual has; rotations in space as vectors.
+
+    All numbers of an edge type of a plugin.
+    """
     z = entry.measured
+    if is_custom(entry):
+        return z
     if entry.tag == "EDGE_ATTITUDE_SE3":
         return _floats(so3.log(z))
     if entry.dof == 6:

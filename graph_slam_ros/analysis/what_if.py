@@ -82,6 +82,7 @@ class SavedGraph:
         self.changes = slam.ledger.history
         self.ids, _ = numbered(slam)
         self.keyframes: list[int] = slam.keyframes.ids.tolist()
+        self._names = {mark.vertex: name for name, mark in slam.landmarks.items()}
         self._numbers = {vertex: k for k, vertex in enumerate(self.keyframes)}
 
     @cached_property
@@ -91,6 +92,14 @@ class SavedGraph:
     def keyframe(self, vertex: int) -> int | None:
         """The number of the keyframe of a vertex; None if it is not a keyframe."""
         return self._numbers.get(vertex)
+
+    def landmark_of(self, vertex: int) -> str:
+        """The name of the landmark of a vertex; empty if it is not a landmark."""
+        return self._names.get(vertex, "")
+
+    def landmarks_of(self, entry: Entry) -> list[str]:
+        """The names of the landmarks that an edge is of."""
+        return [name for name in map(self.landmark_of, entry.vertices) if name]
 
     def edge(self, edge: int) -> Entry:
         """The ledger entry of an edge. Raises GraphSlamError for an unknown id."""

@@ -155,7 +155,7 @@ class Config:
         landmarks, robust = self.landmarks, self.robust
         others = narrow_then_wide(robust.loss, robust.loss_scale)
         out: dict[LossKey, Sequence[Loss]] = {"landmarks": landmark_stages(landmarks.loss, landmarks.loss_scale)}
-        out |= dict.fromkeys(("fixes", "closures", "initialpose"), others)
+        out |= dict.fromkeys(("fixes", "closures", "initialpose", "custom"), others)
         for one in self.sources:
             if one.loss == "auto" and not one.loss_scale:
                 continue
@@ -163,7 +163,7 @@ class Config:
             out["landmarks", one.name] = landmark_stages(name, one.loss_scale or landmarks.loss_scale)
             name = robust.loss if one.loss == "auto" else one.loss
             stages = narrow_then_wide(name, one.loss_scale or robust.loss_scale)
-            out |= {("fixes", one.name): stages, ("closures", one.name): stages}
+            out |= {(label, one.name): stages for label in ("fixes", "closures", "custom")}
         return out
 
     def solver_settings(self) -> Settings:

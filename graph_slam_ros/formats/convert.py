@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from graph_slam_ros.edge_tags import VERTEX_TAGS, tag_of
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.dialects import LANDMARK_IDS_FROM, Text, from_g2o_words
-from graph_slam_ros.formats.edge_tags import tag_of
 from graph_slam_ros.formats.g2o_writer import graph_lines, weightless, write_text
-from graph_slam_ros.formats.graph_file import VERTEX_TAGS, G2oFile, Values
+from graph_slam_ros.formats.graph_file import G2oFile, Values
 from graph_slam_ros.formats.strict import ending
 from graph_slam_ros.formats.tum import NS, tum_text
 from graph_slam_ros.graph import R2, SE2, SE3, Graph, VertexKind

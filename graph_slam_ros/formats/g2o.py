@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
+from graph_slam_ros.edge_tags import EDGE_TAGS, OFFSET, VERTEX_TAGS, edge_of, measured_sizes, plugin_tags
 from graph_slam_ros.errors import FormatError, NoiseError
 from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, in_g2o_words, may_be_roots
-from graph_slam_ros.formats.edge_tags import edge_of, plugin_tags
-from graph_slam_ros.formats.graph_file import AT_OFFSET, EDGE_TAGS, HALVED, OFFSET, VERTEX_TAGS, G2oFile, moved
+from graph_slam_ros.formats.graph_file import AT_OFFSET, HALVED, G2oFile, moved
 from graph_slam_ros.formats.strict import expect, integer, lines, numbers
 from graph_slam_ros.graph import (
     ATTITUDE_PRIOR_3D,
@@ -126,12 +126,13 @@ class _Reader:
         edge = edge_of(tag)
         slots, m, from_offset = len(edge.accepts), edge.residual_size, tag in AT_OFFSET
         others, size = slots + from_offset + m * (m + 1) // 2, edge.measured_size
-        if len(words) - 1 == others + size - len(edge.tail):
-            size -= len(edge.tail)
+        if len(words) - 1 - others in measured_sizes(tag):
+            size = len(words) - 1 - others
         expect(words, others + size)
         vertices = tuple(integer(word) for word in words[1 : 1 + slots])
         values = numbers(words[1 + slots + from_offset :])
-        measured = edge.whole(_with_unit_quaternion(values[:size], _quaternion_at(edge))).tolist()
+        measured = _with_unit_quaternion(values[:size], _quaternion_at(edge))
+        measured += edge.tail[size - edge.measured_size + len(edge.tail) :]
         offset = integer(words[1 + slots]) if from_offset else None
         return _Edge(line, vertices, measured, values[size:], self.label, offset)
 

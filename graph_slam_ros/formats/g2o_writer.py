@@ -7,14 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from graph_slam_ros.edge_tags import OFFSET, VERTEX_TAGS, tag_of
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import write_whole
-from graph_slam_ros.formats.edge_tags import tag_of
 from graph_slam_ros.formats.graph_file import (
     AT_OFFSET,
     HALVED,
-    OFFSET,
-    VERTEX_TAGS,
     G2oFile,
     Values,
     moved,

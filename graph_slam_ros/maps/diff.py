@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on, positions
 from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.slam import GraphSlam
@@ -233,13 +233,12 @@ def _edges(one: GraphSlam, two: GraphSlam) -> tuple[Counts, list[Judged]]:
 
 def _by_meaning(slam: GraphSlam) -> dict[Any, list[int]]:
     names = _names(slam)
-    tags = {edge_type: tag for tag, edge_type in EDGE_TAGS.items()}
     out: dict[Any, list[int]] = defaultdict(list)
     for edge in range(slam.graph.edge_count):
         one = slam.graph.edge(edge)
         ends = tuple(names.get(vertex) for vertex in one.vertices)
         measured = tuple(round(x, _DIGITS) + 0.0 for x in one.measured.tolist())
-        out[tags[one.type], one.label, ends, measured].append(edge)
+        out[tag_of(one.type), one.label, ends, measured].append(edge)
     return out
 
 

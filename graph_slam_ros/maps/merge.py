@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.maps.alignment import Alignment, align, positions
 from graph_slam_ros.maps.diff import refuse_other_space, shared_landmarks
@@ -191,8 +191,7 @@ class _Second:
         begun = space.group.compose(self._T, tuple(self._two.trajectory()[0].tolist()))
         measured = [float(x) for x in space.group.between(last, begun)]
         root = Gaussian.from_sigmas(*space.sigmas(config.jump_sigma_m, config.jump_sigma_rad)).sqrt_information
-        tag = next(tag for tag, edge_type in EDGE_TAGS.items() if edge_type is space.relative_pose)
-        return [tag, ends, measured, np.ravel(root).tolist(), "odometry", ""]
+        return [tag_of(space.relative_pose), ends, measured, np.ravel(root).tolist(), "odometry", ""]
 
     def _landmarks(self, landmarks: Mapping[str, Any]) -> dict[str, Any]:
         out: dict[str, Any] = {}

@@ -3,6 +3,7 @@
 from graph_slam_ros.measurements.types import (
     Closure,
     Control,
+    CustomEdge,
     Fix,
     InitialPose,
     Measured,
@@ -15,6 +16,7 @@ from graph_slam_ros.measurements.types import (
 __all__ = [
     "Closure",
     "Control",
+    "CustomEdge",
     "Fix",
     "InitialPose",
     "Measured",

@@ -105,7 +105,7 @@ REASONS: dict[str, Reason] = {
     "undecodable": Reason(_REFUSED, "the bytes are not a message of this type", "INPUT.type, or record it again"),
     "plugin_failed": Reason(
         _REFUSED,
-        "the plugin that reads this type failed at a message, or gave what is no measurement",
+        "the plugin of this type failed at a message, gave what is no measurement, or failed at an edge of its own",
         "correct or uninstall the package; the log of the node, or the end of replay, names it with its first error",
     ),
     "nonfinite": Reason(_REFUSED, "a number is NaN or infinite", "correct the driver"),
@@ -206,6 +206,15 @@ REASONS: dict[str, Reason] = {
     "merged": Reason(_NOTED, "two unnamed landmarks turned out to be one"),
     "parted": Reason(_NOTED, "two landmarks that had been merged turned out to be two"),
     "given_up": Reason(_NOTED, "a new unnamed landmark was not seen again in landmarks.give_up_s"),
+    # -- edges of plugins
+    "landmark_unknown": Reason(
+        _REFUSED,
+        "a custom edge names a landmark that is not in the map, or was surveyed while nothing says where the map lies",
+        "an input of landmarks that sees it; or landmarks.surveyed with anchor.pose",
+    ),
+    "landmark_of_other_kind": Reason(
+        _REFUSED, "a custom edge is of a point and its landmark is a pose, or the other way round", "correct the plugin"
+    ),
     # -- fixes
     "no_fix": Reason(_REFUSED, "the receiver has no fix", "wait for one: a clear view of the sky"),
     "no_position": Reason(_REFUSED, "latitude and longitude are zero", "wait for a fix"),
@@ -231,14 +240,16 @@ REASONS: dict[str, Reason] = {
     ),
     "no_altitude": Reason(_REPAIRED, "the fix has no altitude: it counts in the horizontal only"),
     "no_orientation": Reason(_REFUSED, "the IMU says that it has no orientation", "an IMU with a filter, or no input"),
-    "not_in_this_space": Reason(_REFUSED, "such a fix does not exist in this many dimensions", "world.dimensions"),
+    "not_in_this_space": Reason(
+        _REFUSED, "such a fix or edge does not exist in this many dimensions", "world.dimensions"
+    ),
     # -- closures
     "id_not_a_stamp": Reason(_REFUSED, "a closure's id is not the earlier stamp in nanoseconds", "see docs/node.md"),
     "closure_with_itself": Reason(_REFUSED, "a closure's two stamps are the same", "correct the publisher"),
     "no_result": Reason(_REFUSED, "a closure has no result with a pose", "correct the publisher"),
-    "within_one_keyframe": Reason(_REFUSED, "a closure links two moments of one keyframe: it says nothing new"),
+    "within_one_keyframe": Reason(_REFUSED, "a closure or edge links two moments of one keyframe: it says nothing new"),
     "from_where_there_was_no_odometry": Reason(
-        _REFUSED, "a closure's earlier stamp is outside the odometry", "stamps by the robot's clock"
+        _REFUSED, "the earlier stamp of a closure or edge is outside the odometry", "stamps by the robot's clock"
     ),
     # -- the map
     "not_in_map": Reason(

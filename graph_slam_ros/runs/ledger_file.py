@@ -16,8 +16,8 @@ from typing import Any, NewType, TypeVar, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.errors import FormatError
-from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.edge_tags import map_edge_of, tag_of
+from graph_slam_ros.errors import ConfigError, FormatError
 from graph_slam_ros.formats.strict import integer, lines, numbers, stamp
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam import GraphSlam
@@ -114,9 +114,10 @@ def read_ledger(folder: Path) -> list[Entry]:
 
 def _fault(entry: Entry) -> str:
     """Return what of an edge does not go together."""
-    edge = EDGE_TAGS.get(entry.tag)
-    if edge is None:
-        return f"tag {shortened(entry.tag)} is none of a graph"
+    try:
+        edge = map_edge_of(entry.tag)
+    except ConfigError as error:
+        return f"tag {shortened(entry.tag)} is none of a graph: {error}"
     m = edge.residual_size
     sizes = {
         "vertices": (len(entry.vertices), len(edge.accepts)),
@@ -136,7 +137,6 @@ def _fault(entry: Entry) -> str:
 def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
     """Each edge that was judged or taken for granted; ``ids`` are the numbers that its vertices are to have."""
     graph, ledger = slam.graph, slam.ledger
-    tags = {edge: tag for tag, edge in EDGE_TAGS.items()}
     names = {mark.vertex: name for name, mark in slam.landmarks.items()}
     chi2, _ = slam.solver.chi2_of(np.arange(len(ledger)))
     settings = slam.solver.settings
@@ -152,7 +152,7 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
         yield Entry(
             edge,
             label,
-            tags[one.type],
+            tag_of(one.type),
             one.source,
             next((names[v] for v in vertices if v in names), ""),
             tuple(ids[v] for v in vertices),

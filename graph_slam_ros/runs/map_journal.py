@@ -34,8 +34,8 @@ from typing import Any
 
 import numpy as np
 
+from graph_slam_ros.edge_tags import map_edge_of, tag_of
 from graph_slam_ros.errors import FormatError, GraphSlamError
-from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3
 from graph_slam_ros.measurements.types import Sighting
@@ -50,7 +50,6 @@ from graph_slam_ros.slam.snapshot import MapSnapshot
 
 GROWTH = "graph_slam_ros.Map"
 VERSION = 1
-_TAGS = {edge_type: tag for tag, edge_type in EDGE_TAGS.items()}
 _KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}
 _MORE = 1.1  # an estimate is written when there are so many times the keyframes: in total it stays linear
 _JUMP_M = 0.5  # or when a solve moved the newest that far, and there are a hundredth more
@@ -252,7 +251,7 @@ def _vertex(graph: Graph, vertex: int) -> list[Any]:
 def _edge(graph: Graph, edge: int) -> list[Any]:
     one = graph.edge(edge)
     measured, root = one.measured.tolist(), one.sqrt_information.ravel().tolist()
-    return [_TAGS[one.type], list(one.vertices), measured, root, one.label, one.source]
+    return [tag_of(one.type), list(one.vertices), measured, root, one.label, one.source]
 
 
 def _judgement(ledger: Ledger, edge: int) -> list[Any]:
@@ -318,9 +317,9 @@ def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     state.values = np.concatenate((state.values, graph.initial.values[len(state.values) :]))
     for (tag, label, source), several in groupby(record.get("edges", ()), key=lambda edge: (edge[0], *edge[4:])):
         _, vertices, measured, roots, *_ = zip(*several, strict=True)
-        size = EDGE_TAGS[tag].residual_size
-        noise = Gaussian(np.array(roots, dtype=float).reshape(-1, size, size))
-        graph.add_edges(EDGE_TAGS[tag], vertices, measured, noise, label, source)
+        edge = map_edge_of(tag)
+        noise = Gaussian(np.array(roots, dtype=float).reshape(-1, edge.residual_size, edge.residual_size))
+        graph.add_edges(edge, vertices, measured, noise, label, source)
     _judge(ledger, record.get("judged", ()))
     for edge, keyframe, verdict, reason, statistic, threshold in record.get("changes", ()):
         ledger.note(edge, keyframe, *_verdict(verdict, reason), float(statistic), float(threshold))

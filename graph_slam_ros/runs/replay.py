@@ -325,7 +325,8 @@ def _recorded(
 
 
 def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
-    return [*map(str, slam.alarms), *doubts(summary), *mendable(summary["counters"])]
+    faults = [f"{source}: {fault}" for source, fault in slam.counters.faults.items()]
+    return [*faults, *map(str, slam.alarms), *doubts(summary), *mendable(summary["counters"])]
 
 
 def _kept(out: Path) -> Path:

@@ -10,9 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o_writer import graph_lines
-from graph_slam_ros.formats.graph_file import EDGE_TAGS, G2oFile
+from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.simulation.bag import ODOMETRY_TOPIC, recorded_names
@@ -117,20 +118,20 @@ def faulty_graph(file: G2oFile, truth: Array, faults: Sequence[Fault], seed: int
     draft = parts.draft()
     put_faults(draft, faults, seed)
     out, edges = parts.graph_of(draft)
+    tags = {tag_of(edge) for edge in out.graph.tables}
     text = graph_lines(out, values_of(out.graph, out.graph.initial.values))
-    lines = [number for number, line in enumerate(text, start=1) if line.split()[0] in EDGE_TAGS]
+    lines = [number for number, line in enumerate(text, start=1) if line.split()[0] in tags]
     labels = np.empty(out.graph.edge_count, dtype=np.int64)
     for table in out.graph.tables.values():
         labels[table.id.values] = table.label.values
     line_of = dict(zip(np.lexsort((np.arange(len(labels)), labels)).tolist(), lines, strict=True))
-    tag_of = {edge: tag for tag, edge in EDGE_TAGS.items()}
     rows = []
     for key, wrong in draft.wrong.items():
         if key in edges:
             edge = out.graph.edge(edges[key])
             first, second = (out.ids[v] for v in edge.vertices[:2])
             true: int | str = int(wrong.true_id) if wrong.true_id else ""
-            rows.append(WrongLine(line_of[edges[key]], tag_of[edge.type], first, second, wrong.fault, true))
+            rows.append(WrongLine(line_of[edges[key]], tag_of(edge.type), first, second, wrong.fault, true))
     return out, sorted(rows, key=lambda row: row.line)
 
 

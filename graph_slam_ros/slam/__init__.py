@@ -2,7 +2,16 @@
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import Closure, Control, Fix, Measurement, Odometry, Sighting, Sightings
+from graph_slam_ros.measurements.types import (
+    Closure,
+    Control,
+    CustomEdge,
+    Fix,
+    Measurement,
+    Odometry,
+    Sighting,
+    Sightings,
+)
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.graph_slam import GraphSlam
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark
@@ -13,6 +22,7 @@ __all__ = [
     "Config",
     "Control",
     "Counters",
+    "CustomEdge",
     "Fix",
     "GraphSlam",
     "Keyframe",

@@ -52,6 +52,12 @@ class Anchor:
                 covariance = self._space.in_parent_axes(at, tangent)
                 self._edge, self._vertex, self._sigmas = edge, vertex, np.sqrt(np.diag(covariance))
 
+    @property
+    def is_located(self) -> bool:
+        """Return whether the map lies in the frame of surveys and fixes: by its start, or by one of them."""
+        is_given = self._config.start_pose is not None or self._config.anchor.sigma_m > 0.0
+        return is_given or bool((self._sigmas[: self._space.dimensions] > _TIGHT).all())
+
     def align_to_fix(self, m: Fix, T_map_base: Numbers, keyframe: int) -> bool:
         """Loosen the prior for a fix, if that says more than was known; returns whether the map has moved.
 

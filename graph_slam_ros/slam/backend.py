@@ -9,6 +9,7 @@ from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.graph import Gaussian, Loss
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.plugin_edges import failed_edges
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
@@ -313,7 +314,8 @@ class Backend:
     def _guarded(self, search: Work) -> Outcome | None:
         """The outcome of a search; None where it failed, which changes nothing."""
         try:
-            return search()
+            with failed_edges():  # of another estimate: nothing is withdrawn for it
+                return search()
         except Exception as error:
             self._counters.count("second_look", type(error).__name__)
             return None

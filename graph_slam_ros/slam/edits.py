@@ -74,7 +74,7 @@ class Edits:
         if edge < backend.ledger.final:
             return self._refuse("held_in_map")
         vertex = landmark_of(backend.graph, edge)
-        if vertex is not None and self._edges_of(vertex) == [edge]:
+        if vertex is not None and self._determining(vertex) == [edge]:
             return self.remove_landmark(self._name_of(vertex), keyframe)
         backend.withdraw([edge], keyframe)
         self._counters.count(SOURCE, "removed")
@@ -107,6 +107,10 @@ class Edits:
         found = [table.at(np.flatnonzero((table.vertices.values == vertex).any(axis=1))).ids for table in tables]
         edges = sorted(int(edge) for ids in found for edge in ids)
         return [edge for edge in edges if not self._backend.ledger.is_withdrawn(edge)]
+
+    def _determining(self, vertex: int) -> list[int]:
+        """The edges of a landmark without those that do not determine where it is."""
+        return [edge for edge in self._edges_of(vertex) if self._backend.graph.label_of(edge) != "custom"]
 
     def _refuse(self, reason: str) -> bool:
         self._counters.count(SOURCE, reason)

@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from graph_slam_ros.errors import DivergedError, message_of
+from graph_slam_ros.graph import GROUPS
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.robust.gating import CANDIDATES, landmark_of
@@ -154,13 +155,20 @@ class FailureGuard:
         new = new[new >= self._good_edges]
         found: dict[tuple[bool, int], _Suspect] = {}
         for edge in new[self._graph.has_label(new, CANDIDATES)].tolist():
-            landmark = landmark_of(self._graph, edge)
+            landmark = landmark_of(self._graph, edge) or self._new_landmark_of(edge)
             if landmark is None or landmark < self._good_vertices:
                 found[False, edge] = _Suspect((edge,))
             else:
                 before = found.get((True, landmark), _Suspect(()))
                 found[True, landmark] = _Suspect((*before.edges, edge), landmark)
         return list(found.values())
+
+    def _new_landmark_of(self, edge: int) -> int | None:
+        """A landmark that a custom edge has and the last good estimate has not."""
+        one = self._graph.edge(edge)
+        new = [vertex for vertex in one.vertices if vertex >= self._good_vertices]
+        landmarks = [vertex for vertex in new if self._graph.kind_of(vertex) not in GROUPS]
+        return landmarks[0] if one.label == "custom" and landmarks else None
 
     def _to_blame(self, suspects: list[_Suspect]) -> list[_Suspect]:
         """The suspects that are out and that cannot come back, half by half; the others are in again."""
@@ -193,6 +201,7 @@ class FailureGuard:
         for one in suspects:
             for edge in one.edges:
                 self._solver.set_weight(edge, 0.0)
+        for one in suspects:
             if one.landmark is not None:
                 self._solver.remove(one.landmark)
 

@@ -15,6 +15,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import (
     Closure,
     Control,
+    CustomEdge,
     Event,
     Fix,
     InitialPose,
@@ -24,8 +25,10 @@ from graph_slam_ros.measurements.types import (
     Sighting,
     Sightings,
 )
+from graph_slam_ros.plugin_edges import failed_edges
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.custom_edges import CustomEdges
 from graph_slam_ros.slam.edits import Edits
 from graph_slam_ros.slam.failure_guard import FailureGuard
 from graph_slam_ros.slam.faults import Faults
@@ -85,13 +88,12 @@ class GraphSlam(MapView):
         self.settings: dict[str, Value] = {}
         self.processed, self._sink = 0, sink
         self._anchor = Anchor(config, backend)
+        self._custom = CustomEdges(config, backend, frontend, landmarks.map, self._anchor, counters)
         self._edits = Edits(backend, landmarks.map, counters)
         self._faults = Faults(counters)
         if start is not None and start.keyframes:
             self._restore(start)
         self._updates = UpdateLog(self)
-
-    # -- the door ------------------------------------------------------------------------------------------------
 
     def process(self, measurement: Measurement) -> Update:
         """Process one measurement or control event; returns what it changed.
@@ -123,8 +125,6 @@ class GraphSlam(MapView):
                 else:
                     self._on_observation(m)
 
-    # -- odometry becomes keyframes ------------------------------------------------------------------------------
-
     def _on_odometry(self, m: Odometry) -> None:
         for step in self._frontend.odometry.steps(m):
             with self._faults:
@@ -154,21 +154,21 @@ class GraphSlam(MapView):
             with self._faults:
                 self._on_observation(m)
 
-    # -- observations become edges -------------------------------------------------------------------------------
-
     def _on_observation(self, m: Observation) -> None:
         """Pass an observation through the gates, and add what it measured from the keyframe before it."""
         admitted = self._frontend.gates.admit(m) if self._frontend.pending.is_reached(m) else None
         if admitted is None:
             return
-        where = self._frontend.where(admitted)
         match admitted:
             case Sightings():
-                self._add_sightings(admitted, where)
+                self._add_sightings(admitted, self._frontend.where(admitted))
             case Fix():
-                self._add_fix(admitted, where)
+                self._add_fix(admitted, self._frontend.where(admitted))
             case Closure():
-                self._frontend.add_closure(admitted, where)
+                self._frontend.add_closure(admitted, self._frontend.where(admitted))
+            case CustomEdge():
+                self._solution.resting += self._frontend.path.rests
+                self._custom.add(admitted)
         self._solve_if_due()
 
     def _add_sightings(self, m: Sightings, where: PoseAtStamp) -> None:
@@ -196,8 +196,6 @@ class GraphSlam(MapView):
         self.counters.count(topic, "map_moved")
         self._solution.guard.note_moved()
 
-    # -- gate, detect a kidnap, solve ----------------------------------------------------------------------------
-
     def _solve_if_due(self) -> None:
         if self._solution.is_due(len(self.keyframes), self.config.solve.every_keyframes):
             self._solve()
@@ -206,8 +204,11 @@ class GraphSlam(MapView):
         """Solve for what is new, or everything; where that fails the last estimate stays, and it is counted."""
         if self.keyframes:
             count = len(self.keyframes)
-            solved = self._solution.solve(lambda: self._solved(count - 1, everything), self.keyframes[-1], count)
+            with failed_edges() as failed:
+                solved = self._solution.solve(lambda: self._solved(count - 1, everything), self.keyframes[-1], count)
             self._frontend.covariance = solved.covariance if solved else self._frontend.covariance
+            if self._custom.withdraw(failed.values(), count - 1):
+                self._solve(everything)
 
     def _solved(self, keyframe: int, everything: Settings | None) -> Solved:
         self.backend.hand_over()
@@ -228,8 +229,6 @@ class GraphSlam(MapView):
 
     def _withdraw(self, edges: Sequence[int]) -> None:
         self.backend.withdraw(edges, len(self.keyframes) - 1)
-
-    # -- control events ------------------------------------------------------------------------------------------
 
     def _on_event(self, event: Event, values: dict[str, Value]) -> None:
         order, pending = self._frontend.order, self._frontend.pending

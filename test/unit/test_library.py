@@ -12,8 +12,8 @@ import graph_slam_ros
 from graph_slam_ros import Config, Control, Graph, GraphSlam, load_run, optimize
 from graph_slam_ros import graph as edge_module
 from graph_slam_ros.config.config import parameters
+from graph_slam_ros.edge_tags import EDGE_TAGS
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.graph_file import EDGE_TAGS
 from graph_slam_ros.graph import EdgeType
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Update

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar
 
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import Closure, Fix, Observation
+from graph_slam_ros.measurements.types import Closure, CustomEdge, Fix, Observation
 from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector
 
@@ -79,7 +79,7 @@ class DatumGate:
 
 
 class ClosureStart:
-    """Refuses a loop closure whose earlier stamp lies before or after all odometry."""
+    """Refuses a loop closure or a custom edge of which another stamp lies before or after all odometry."""
 
     reason = "from_where_there_was_no_odometry"
 
@@ -87,7 +87,7 @@ class ClosureStart:
         self._path, self._odometry = path, odometry
 
     def admit(self, m: Observation) -> Observation | None:
-        """The observation, unless it is such a closure."""
-        if isinstance(m, Closure) and not self._path.oldest_ns <= m.from_stamp_ns <= (self._odometry.newest_ns or 0):
-            return None
-        return m
+        """The observation, unless it is such a one."""
+        stamps_ns = (m.from_stamp_ns,) if isinstance(m, Closure) else m.stamps_ns if isinstance(m, CustomEdge) else ()
+        newest_ns = self._odometry.newest_ns or 0
+        return m if all(self._path.oldest_ns <= stamp_ns <= newest_ns for stamp_ns in stamps_ns) else None

@@ -9,7 +9,7 @@ from graph_slam_ros.graph import EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.typing import Array, Index
 
-CLASSES = ("odometry", "landmarks", "fixes", "closures")
+CLASSES = ("odometry", "landmarks", "fixes", "closures", "custom")
 FIRST_DUE = 50  # keyframes
 LEAST_CHANGE = 0.02  # of a sigma: less changes nothing
 
@@ -29,6 +29,8 @@ def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
     n, m = len(measured), edge.residual_size
     axes = np.broadcast_to(np.eye(m), (n, m, m))
     name = edge.name.removesuffix(" 3D")
+    if label == "custom":  # nobody knows what its numbers are
+        return {"all": axes}
     if name in ("landmark position", "tag position"):
         return _sight_parts(measured[:, :m])
     if name == "range and bearing":

@@ -21,7 +21,7 @@ from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason, Verdict
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
-CANDIDATES = ("landmarks", "fixes", "closures", "initialpose")
+CANDIDATES = ("landmarks", "fixes", "closures", "initialpose", "custom")
 _TYPICAL = 30  # residuals tell what all are like
 _SLACK = 10.0  # times the residuals that are typical of a class its gate may be, where they are small
 _TIGHTEST = 0.1  # part of a gate that is left
@@ -78,7 +78,8 @@ class OutlierGate:
     def _is_of_known(self, edge: int) -> bool:
         """Return whether it is of a landmark that the last solve had: without it that is as determined as it was."""
         landmark = landmark_of(self._graph, edge)
-        return landmark is not None and landmark < self._vertices
+        is_custom = self._graph.label_of(edge) == "custom"  # nothing needs it
+        return is_custom or (landmark is not None and landmark < self._vertices)
 
     def admit_compatible(self, pending: Sequence[int], keyframe: int) -> list[int]:
         """Compare with all that is known: the likeliest first, then the others with that; who is let in."""

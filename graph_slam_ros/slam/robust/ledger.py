@@ -33,9 +33,10 @@ class Reason(IntEnum):
     QUARANTINED = 5  # nothing could be solved with it
     DISPLACED = 6  # odometry, where the landmarks showed that the robot was moved without its noticing
     REVOKED = 7  # what stood in its place, after later sightings showed that it was not
+    FAILED = 8  # the plugin of its edge type failed at it
 
 
-FINAL = (Reason.WITHDRAWN, Reason.QUARANTINED, Reason.DISPLACED, Reason.REVOKED)  # it is out for good
+FINAL = (Reason.WITHDRAWN, Reason.QUARANTINED, Reason.DISPLACED, Reason.REVOKED, Reason.FAILED)  # it is out for good
 INSIDE = (Verdict.ACCEPTED, Verdict.DOWN_WEIGHTED)
 _ACCEPTED, _DOWN_WEIGHTED = _INSIDE = tuple(map(int, INSIDE))  # comparing with members of an enumeration is slow
 

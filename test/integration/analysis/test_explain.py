@@ -14,7 +14,7 @@ from graph_slam_ros import cli
 from graph_slam_ros.analysis import measurement_text
 from graph_slam_ros.analysis.explain import explain_edge
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.formats.graph_file import EDGE_TAGS
+from graph_slam_ros.edge_tags import EDGE_TAGS
 from graph_slam_ros.runs.folder import GRAPH
 from graph_slam_ros.runs.ledger_file import CHANGES, LEDGER, Entry, read_ledger
 from graph_slam_ros.runs.replay import replay

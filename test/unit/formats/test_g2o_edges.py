@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from graph_slam_ros.edge_tags import EDGE_TAGS
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.formats.g2o_writer import write_g2o
-from graph_slam_ros.formats.graph_file import EDGE_TAGS, G2oFile
+from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import (
     ATTITUDE_PRIOR_3D,
     LANDMARK_POSITION_3D,

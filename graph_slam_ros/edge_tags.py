@@ -1,0 +1,179 @@
+"""Tags of edge types: the names by which files and maps call them. Built-in types are here, others are plugins'.
+
+This is the only table of them. A plugin's edge type is an entry point of the group ``graph_slam_ros.edges``.
+"""
+
+import re
+from typing import Any
+
+from graph_slam_ros.errors import ConfigError, FormatError
+from graph_slam_ros.graph import (
+    ATTITUDE_PRIOR_3D,
+    BEARING,
+    BEARING_3D,
+    COORDINATE_PRIOR,
+    COORDINATE_PRIOR_3D,
+    HEADING_PRIOR,
+    HEADING_PRIOR_3D,
+    INVERSE_RELATIVE_POSE,
+    LANDMARK_POSITION,
+    LANDMARK_POSITION_3D,
+    POINT_PRIOR,
+    POSE_PRIOR,
+    POSE_PRIOR_3D,
+    POSITION_PRIOR,
+    POSITION_PRIOR_3D,
+    R1,
+    R2,
+    R3,
+    RANGE,
+    RANGE_3D,
+    RANGE_BEARING,
+    RANGE_BEARING_3D,
+    RANGE_WITH_OFFSET,
+    RANGE_WITH_OFFSET_3D,
+    RELATIVE_POSE,
+    RELATIVE_POSE_3D,
+    SE2,
+    SE3,
+    TAG_POSITION,
+    TAG_POSITION_3D,
+    EdgeType,
+    VertexKind,
+)
+from graph_slam_ros.plugin_edges import fault_of, isolated, measured_at_stamps, named
+from graph_slam_ros.plugins import EDGES, load, names
+
+VERTEX_TAGS: dict[str, VertexKind] = {
+    "VERTEX_SE2": SE2,
+    "VERTEX_XY": R2,
+    "VERTEX_SE3:QUAT": SE3,
+    "VERTEX_TRACKXYZ": R3,
+    "VERTEX_OFFSET": R1,  # ours
+}
+EDGE_TAGS: dict[str, EdgeType] = {
+    "EDGE_SE2": RELATIVE_POSE,
+    "EDGE_SE2_XY": LANDMARK_POSITION,
+    "EDGE_PRIOR_SE2": POSE_PRIOR,
+    "EDGE_PRIOR_SE2_XY": POSITION_PRIOR,
+    "EDGE_PRIOR_XY": POINT_PRIOR[R2],
+    "EDGE_BEARING_SE2_XY": BEARING,
+    "EDGE_SE3:QUAT": RELATIVE_POSE_3D,
+    "EDGE_SE3_PRIOR": POSE_PRIOR_3D,
+    "EDGE_SE3_TRACKXYZ": LANDMARK_POSITION_3D,
+    "EDGE_POINTXYZ_PRIOR": POINT_PRIOR[R3],
+    # ours; of a landmark that is a pose, only the POSITION was seen
+    "EDGE_SE2_POSITION": TAG_POSITION,
+    "EDGE_SE3_POSITION": TAG_POSITION_3D,
+    "EDGE_RANGE_SE2_XY": RANGE,
+    "EDGE_RANGE_BEARING_SE2_XY": RANGE_BEARING,
+    "EDGE_RANGE_OFFSET_SE2_XY": RANGE_WITH_OFFSET,
+    "EDGE_PRIOR_OFFSET": POINT_PRIOR[R1],
+    "EDGE_COORDINATE_SE2": COORDINATE_PRIOR,
+    "EDGE_HEADING_SE2": HEADING_PRIOR,
+    "EDGE_RANGE_SE3_XYZ": RANGE_3D,
+    "EDGE_BEARING_SE3_XYZ": BEARING_3D,
+    "EDGE_RANGE_BEARING_SE3_XYZ": RANGE_BEARING_3D,
+    "EDGE_RANGE_OFFSET_SE3_XYZ": RANGE_WITH_OFFSET_3D,
+    "EDGE_POSITION_SE3": POSITION_PRIOR_3D,
+    "EDGE_COORDINATE_SE3": COORDINATE_PRIOR_3D,
+    "EDGE_ATTITUDE_SE3": ATTITUDE_PRIOR_3D,
+    "EDGE_HEADING_SE3": HEADING_PRIOR_3D,
+}
+OFFSET = "PARAMS_SE3OFFSET"
+_BUILT_IN = {edge: tag for tag, edge in EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
+_RESERVED = frozenset({*EDGE_TAGS, *VERTEX_TAGS, OFFSET, "FIX"})
+_loaded: dict[str, tuple[EdgeType, EdgeType, EdgeType]] = {}  # of plugins: as given, for files, and for maps
+_tags: dict[EdgeType, str] = {}
+
+
+def plugin_tags() -> frozenset[str]:
+    """Return the tags that installed plugins have, usable or not, less those that are built in."""
+    return frozenset(names(EDGES)) - _RESERVED
+
+
+def edge_of(tag: str) -> EdgeType:
+    """Return the edge type of a tag that is built in or of a plugin; what a plugin's raises names it.
+
+    Raises
+    ------
+    ConfigError
+        The plugin cannot be used, or there is none.
+    """
+    return EDGE_TAGS[tag] if tag in EDGE_TAGS else _plugin(tag)[1]
+
+
+def map_edge_of(tag: str) -> EdgeType:
+    """Return the edge type of a tag as maps have it: an edge at which a plugin fails counts for nothing.
+
+    Those edges are in ``plugin_edges.failed_edges``. Raises ConfigError as ``edge_of``.
+    """
+    return EDGE_TAGS[tag] if tag in EDGE_TAGS else _plugin(tag)[2]
+
+
+def plugin_edge(tag: str) -> EdgeType:
+    """Return the edge type that a plugin has under a tag, as its author wrote it. Raises ConfigError as ``edge_of``."""
+    return _plugin(tag)[0]
+
+
+def tag_of(edge: EdgeType) -> str:
+    """Return the tag of an edge type.
+
+    Raises
+    ------
+    FormatError
+        It is not built in, and no plugin has it; those that cannot be used are named.
+    """
+    faults = []
+    if edge not in _BUILT_IN and edge not in _tags:
+        for tag in sorted(plugin_tags()):
+            try:
+                edge_of(tag)
+            except ConfigError as error:
+                faults.append(str(error))
+    found = _BUILT_IN.get(edge) or _tags.get(edge)
+    if found is None:
+        raise FormatError("; ".join([f"g2o has no tag for an edge {edge.name}", *faults]))
+    return found
+
+
+def measured_sizes(tag: str) -> tuple[int, ...]:
+    """Return how many numbers a measurement may have in a file: all, or without those that have defaults."""
+    edge = edge_of(tag)
+    of_plugin = () if tag in EDGE_TAGS else (_plugin(tag)[0].measured_size,)  # without the motion from a keyframe
+    return edge.measured_size, edge.measured_size - len(edge.tail), *of_plugin
+
+
+def described() -> list[str]:
+    """Return a line for each edge type that an installed plugin has, and why it cannot be used where that is so."""
+    lines = []
+    for tag, distribution in sorted(names(EDGES).items()):
+        try:
+            lines.append(f"{tag}: {edge_of(tag).name!r}, an edge type of {distribution}")
+        except ConfigError as error:
+            lines.append(str(error))
+        if tag in _RESERVED:
+            lines[-1] = f"{tag}: the plugin of {distribution} is not used: the tag is built in"
+    return lines
+
+
+def _plugin(tag: str) -> tuple[EdgeType, EdgeType, EdgeType]:
+    if tag not in _loaded:
+        found = None if tag in _RESERVED else load(EDGES, tag, _wrong)
+        if found is None:
+            remedy = f"install the package that has the entry point {tag} of the group {EDGES}"
+            raise ConfigError(f"{tag}: no plugin has an edge of this tag: {remedy}")
+        if not re.fullmatch(r"[A-Za-z_][\w:.+-]*", tag, re.ASCII):
+            raise ConfigError(f"{tag!r}: {found[1]}: a tag is one word of letters, digits and _:.+-")
+        edge = measured_at_stamps(found[0])
+        _loaded[tag] = found[0], named(edge, found[1]), isolated(edge, tag, found[1])
+        _tags.update(dict.fromkeys(_loaded[tag], tag))
+    return _loaded[tag]
+
+
+def _wrong(there: Any) -> str:
+    if not isinstance(there, EdgeType):
+        return f"it is a {type(there).__name__}, not an EdgeType"
+    kinds = {kind for kinds in there.accepts for kind in kinds}
+    unknown = ", ".join(sorted(kind.name for kind in kinds - set(VERTEX_TAGS.values())))
+    return f"g2o has no tag for its vertices {unknown}" if unknown else fault_of(there)

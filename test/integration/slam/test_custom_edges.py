@@ -1,0 +1,344 @@
+"""Edges of a plugin in the running pipeline: the example of the page, its run folder, and plugins that fail."""
+
+import re
+import sys
+
+import numpy as np
+import pytest
+from differences import (
+    BEACONS,
+    EDGES,
+    ENTRIES,
+    EXAMPLE,
+    SETTINGS,
+    STEPS,
+    TAG,
+    TYPE,
+    WRONG,
+    example_installer,
+    recording,
+    truths,
+)
+
+from graph_slam_ros import CustomEdge, GraphSlam, Odometry, Sighting, Sightings, edge_tags, load_run
+from graph_slam_ros.cli import main
+from graph_slam_ros.edge_tags import map_edge_of, tag_of
+from graph_slam_ros.errors import ConfigError, GraphSlamError
+from graph_slam_ros.lie import se2
+from graph_slam_ros.messages.inputs import converters, plugins
+from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.slam import Config, Control
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
+
+SHORT, MEDIUM = 25, 65  # steps
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    with example_installer(tmp_path, monkeypatch) as installed:
+        yield installed
+
+
+def replayed(folder, steps=STEPS, **settings):
+    return replay(recording(folder / "a.mcap", steps=steps), folder / "run", Config.from_mapping(SETTINGS | settings))
+
+
+def test_the_example_of_the_page_corrects_odometry_and_its_outliers_are_rejected(install, tmp_path):
+    assert ENTRIES.count(" = ") == 2
+    install()
+    done = replayed(tmp_path)
+    slam = done.slam
+    truth, said = (np.array(poses) for poses in zip(*truths(), strict=True))
+    at = ((slam.keyframes.stamps_ns - slam.keyframes.stamps_ns[0]) / 1e8).round().astype(int)
+    keyframes = np.isclose((slam.keyframes.stamps_ns - slam.keyframes.stamps_ns[0]) % 10**8, 0)
+    off = np.linalg.norm(slam.trajectory()[keyframes, :2] - truth[at[keyframes], :2], axis=1)
+    assert np.linalg.norm(said[:, :2] - truth[:, :2], axis=1).max() > 0.8
+    assert off.max() < 0.12
+    assert set(slam.landmarks) == set(BEACONS)
+    edges = slam.graph.edges_of("custom")
+    assert len(edges) == done.summary["inputs"]["tdoa"]["used"] == STEPS - 1  # the last is after all odometry
+    assert {tag_of(slam.graph.edge(int(edge)).type) for edge in edges} == {TAG}
+    rejected = [int(e) for e in edges if not slam.ledger.is_inside(int(e))]
+    wrong = [int(edges[k]) for k in WRONG]
+    assert set(wrong) <= set(rejected)
+    assert len(rejected) <= len(wrong) + 3
+    moved = [slam.graph.edge(int(edge)).measured[1:] for edge in edges]
+    assert sum(map(np.any, moved)) > 50, "most are measured between keyframes"
+
+
+def test_every_command_reads_the_run_and_a_repetition_has_the_same_bytes(install, tmp_path, capsys):
+    install()
+    replayed(tmp_path, MEDIUM)
+    run, again = str(tmp_path / "run"), str(tmp_path / "again")
+    assert main(["replay", run, "--out", again]) == 0
+    names = ("graph.g2o", "path.tum", "landmarks.csv", "ledger.csv", "map.mcap")
+    for name in names:
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+    assert main(["recover", run, "--out", str(tmp_path / "recovered")]) == 0
+    capsys.readouterr()
+    assert main(["diff", run, str(tmp_path / "recovered")]) == 0
+    assert "no difference" in capsys.readouterr().out
+    entries = load_run(run).edges
+    (wrong, *_) = [e for e in entries if e.label == "custom" and not e.is_in]
+    assert main(["explain", run, str(wrong.edge)]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert re.search(rf"edge {wrong.edge}: an edge of a plugin \({TAG}\) of (\w+) and (?!\1)\w+ by tdoa: ", text)
+    assert "what if it were in with its full weight" in text
+    assert main(["explain", run, "east"]) == 0
+    assert f"landmark east: {1 + MEDIUM // 2} edges" in capsys.readouterr().out
+    assert main(["solve", run, "--without", str(wrong.edge - 1)]) == 0
+    assert main(["optimize", f"{run}/graph.g2o", "--out", str(tmp_path / "solved.g2o")]) == 0
+    assert "unknown" not in capsys.readouterr().err
+    lines = (tmp_path / "run" / "graph.g2o").read_text().splitlines()
+    assert sum(line.startswith(TAG) for line in lines) == sum(e.is_in for e in entries if e.label == "custom")
+    assert main(["export", run, "--to", "g2o", "--out", str(tmp_path / "exported.g2o")]) == 0
+
+
+def test_a_map_of_such_edges_is_gone_on_in_and_solves_to_the_same(install, tmp_path):
+    install()
+    first = replayed(tmp_path, MEDIUM).slam
+    config = Config.from_mapping(SETTINGS)
+    second = replay(tmp_path / "a.mcap", tmp_path / "second", config, map_folder=tmp_path / "run").slam
+    assert len(second.graph.edges_of("custom")) == 2 * len(first.graph.edges_of("custom"))
+    poses = second.trajectory()[: len(first.keyframes)]
+    assert np.abs(poses - first.trajectory())[:, :2].max() < 0.1
+
+
+@pytest.mark.parametrize("command", ["explain RUN", "recover RUN --out OUT", "replay RUN --out OUT", "diff RUN RUN"])
+def test_without_the_plugin_a_map_or_journal_is_refused_in_one_line_that_names_it(
+    command, install, tmp_path, monkeypatch, capsys
+):
+    site = install()
+    replayed(tmp_path, SHORT)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path != str(site)])
+    monkeypatch.setattr(plugins, "_loaded", {})
+    monkeypatch.setattr(edge_tags, "_loaded", {})
+    monkeypatch.setattr(edge_tags, "_tags", {})
+    capsys.readouterr()
+    words = command.replace("RUN", str(tmp_path / "run")).replace("OUT", str(tmp_path / "out")).split()
+    assert main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{TAG}: no plugin has an edge of this tag: install the package that has the entry point {TAG}" in line
+    assert "graph_slam_ros.edges" in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ((' edges=("EDGE_TDOA",)', ""), "it has a converter of edges without the tags of these"),
+        (("DEFINITION, edges", "DEFINITION, edges=['EDGE_TDOA']) # "), "its edges are not a tuple of tags"),
+        (('EDGE_TDOA",))', 'EDGE_SE2",))'), "EDGE_SE2: a built-in edge type: choose another tag"),
+        (('EDGE_TDOA",))', 'EDGE_TOA",))'), "EDGE_TOA: no plugin has an edge of this tag"),
+        (
+            ("tdoa = edge", "tdoa = 3 or edge"),
+            f"{TAG}: plugin my_tdoa:tdoa of my-tdoa 1.0: it is a int, not an EdgeType",
+        ),
+        (
+            ("1, 1, difference_of_ranges)", "1, 1, difference_of_ranges, lambda v, z: np.ones((1, 7)))"),
+            f"{TAG}: plugin my_tdoa:tdoa of my-tdoa 1.0: Jacobian[0, ",
+        ),
+    ],
+)
+def test_a_mistake_in_a_plugin_is_refused_at_the_start_in_one_line(change, line, install):
+    assert change[0] in EXAMPLE
+    install(EXAMPLE.replace(*change))
+    with pytest.raises(ConfigError) as refused:
+        converters(TYPE)
+    assert line in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_of_two_plugins_with_one_tag_neither_is_used(install):
+    install()
+    install(module="my_other", edges=EDGES.replace("my_tdoa", "my_other"))
+    with pytest.raises(ConfigError, match=f"{TAG}: plugins of my-other 1.0 and my-tdoa 1.0 have it: uninstall one"):
+        map_edge_of(TAG)
+
+
+@pytest.mark.parametrize(
+    ("change", "line", "count"),
+    [
+        (
+            ("(message.difference,)", "(message.difference, 0.0)"),
+            f"FormatError: {TAG}: measured has 2 numbers, not 1",
+            SHORT,
+        ),
+        (("(message.difference,)", "(float('nan'),)"), rf"FormatError: {TAG}: measured \[nan\] is not finite", SHORT),
+        (("source.sigma_m() ** 2,", "0.0,"), f"FormatError: {TAG}: covariance 0 is not positive definite", SHORT),
+        (("source.sigma_m() ** 2,", "1.0, 0.0,"), f"FormatError: {TAG}: covariance has 2 numbers, not 1", SHORT),
+        (("message.one, message.other)", "message.one)"), f"FormatError: {TAG}: 2 ends, not 3", SHORT),
+        (("message.one, message", "stamp_ns, message"), rf"FormatError: {TAG}: the stamp \d+ where a vertex R2", SHORT),
+        (
+            ("pose, one, other = values", "1 / 0"),
+            "edge 'difference of ranges', plugin .*ZeroDivisionError: ",
+            SHORT - 1,
+        ),
+        (("    return [np", "    return [np.nan * np"), "edge 'difference of ranges', plugin .*not finite", SHORT - 1),
+        (("    return [np", "    return [0.0, np"), "edge 'difference of ranges', plugin .*ValueError: ", SHORT - 1),
+    ],
+)
+def test_what_a_plugin_fails_at_is_counted_and_named_once_and_the_run_goes_on(change, line, count, install, tmp_path):
+    assert change[0] in EXAMPLE
+    install(EXAMPLE.replace(*change))
+    done = replayed(tmp_path, SHORT)
+    assert done.summary["counters"]["tdoa"]["plugin_failed"] == count
+    assert not len(done.slam.graph.edges_of("custom"))
+    assert len(done.slam.keyframes) >= 5
+    (said,) = [text for text in done.warnings if "plugin my_tdoa" in text]
+    assert re.match(f"tdoa: (plugin my_tdoa:DIFFERENCES of my-tdoa 1.0: )?{line}", said)
+    assert "\n" not in said
+
+
+TURN = """from graph_slam_ros.graph import R2, SE2, edge_from_residual
+from graph_slam_ros.lie import se2
+
+calls = []
+
+
+def turned(values, measured):
+    return [se2.wrap(values[1][2] - values[0][2] - measured[0])]
+
+
+def ahead(values, measured):
+    if measured[1] == 1.0:
+        calls.append(1)
+        if len(calls) > 60:
+            raise OverflowError("too often")
+    return [se2.act(se2.inverse(tuple(values[0])), tuple(values[1]))[0] - measured[0]]
+
+
+turn = edge_from_residual("turn", ((SE2,), (SE2,)), 1, 1, turned)
+ahead = edge_from_residual("ahead", ((SE2,), (R2,)), 2, 1, ahead)
+"""
+POINTS = "[graph_slam_ros.edges]\nEDGE_TURN = my_turn:turn\nEDGE_AHEAD = my_turn:ahead\n"
+SPARSE = {"keyframes.min_distance_m": 0.45, "keyframes.min_angle_rad": 1.0}
+POST, STEP = (4.0, 1.5), 100_000_000
+
+
+@pytest.fixture
+def drive(install):
+    """A function that drives a circle with odometry that turns too far, and hands over what a function yields."""
+    install(TURN, edges=POINTS, module="my_turn")
+
+    def driven(made, steps=120, **settings):
+        slam = GraphSlam(Config.from_mapping(settings))
+        truth = said = se2.IDENTITY
+        for k in range(steps):
+            slam.process(Odometry(k * STEP + STEP, said))
+            for m in made(k, k * STEP + STEP, truth):
+                slam.process(m)
+            truth, said = se2.compose(truth, (0.1, 0.0, 0.03)), se2.compose(said, (0.1, 0.0, 0.034))
+        slam.process(Control("end"))
+        slam.process(Control("optimize"))
+        return slam, truth
+
+    return driven
+
+
+def turn(stamp_ns, before_ns, angle, sigma=1e-3):
+    return CustomEdge(stamp_ns, "wheels", "EDGE_TURN", (before_ns, stamp_ns), (angle,), (sigma**2,))
+
+
+def ahead(stamp_ns, truth, name="post", fails=0.0, wrong=0.0):
+    far = se2.act(se2.inverse(truth), POST)[0] + wrong
+    return CustomEdge(stamp_ns, "mast", "EDGE_AHEAD", (stamp_ns, name), (far, fails), (1e-4,))
+
+
+def seen(stamp_ns, truth):
+    return Sightings(
+        stamp_ns, "tags", (Sighting("post", "position", se2.act(se2.inverse(truth), POST), (0.04, 0, 0, 0.04)),)
+    )
+
+
+def heading_error(slam):
+    """The error [rad] of the last keyframe's heading."""
+    return abs(se2.wrap(slam.trajectory()[-1, 2] - 0.03 * (slam.keyframes[-1].stamp_ns / STEP - 1)))
+
+
+def test_an_edge_of_two_poses_corrects_the_motion_between_them(drive):
+    def wheels(k, stamp_ns, truth):
+        if k and k % 7 == 0:
+            yield turn(stamp_ns, stamp_ns - 7 * STEP, 0.21, 0.05)
+
+    slam, _ = drive(wheels, **SPARSE)
+    alone, _ = drive(lambda *_: (), **SPARSE)
+    off, off_alone = (heading_error(one) for one in (slam, alone))
+    assert off < 0.8 * off_alone
+    assert slam.counters.used["wheels"] == 17
+
+
+def test_an_edge_that_cannot_be_used_is_counted_with_the_reason(drive):
+    def odd(k, stamp_ns, truth):
+        if k == 62:
+            yield turn(stamp_ns, stamp_ns - 1, 0.0, 1.0)
+            yield turn(stamp_ns, 1, 0.0)
+            yield ahead(stamp_ns, truth, "nobody")
+
+    slam, _ = drive(odd, **SPARSE)
+    counted = slam.counters.as_dict()
+    assert counted["wheels"] == {"within_one_keyframe": 1, "from_where_there_was_no_odometry": 1}
+    assert counted["mast"] == {"landmark_unknown": 1}
+    in_space = GraphSlam(Config.from_mapping({"world.dimensions": 3}))
+    for k in range(5):
+        in_space.process(Odometry(k * STEP + STEP, (0.2 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)))
+    in_space.process(turn(4 * STEP, STEP, 0.0))
+    in_space.process(Control("flush"))
+    assert in_space.counters.as_dict()["wheels"] == {"not_in_this_space": 1}
+
+
+def test_a_program_is_told_what_is_wrong_with_an_edge_and_one_that_cannot_be_is_never_made(drive):
+    slam, _ = drive(lambda *_: (), 5)
+    edges = slam.graph.edge_count
+    for wrong, line in (
+        (CustomEdge(STEP, "a", "EDGE_TURN", (STEP, STEP + 0), (0.0,), (1.0,)), "one of its ends is there twice"),
+        (CustomEdge(STEP, "a", "EDGE_NONE", (STEP,), (0.0,), (1.0,)), "no plugin has an edge of this tag"),
+        (CustomEdge(STEP, "a", "EDGE_SE2", (STEP,), (0.0,), (1.0,)), "a built-in edge type"),
+    ):
+        with pytest.raises(GraphSlamError, match=line):
+            slam.process(wrong)
+            slam.process(Control("flush"))
+    for ends in ((), (0,), (True, 2), (2.0,), (2 * STEP,)):
+        with pytest.raises(GraphSlamError, match="CustomEdge: "):
+            CustomEdge(STEP, "a", "EDGE_TURN", ends, (0.0,), (1.0,))
+    assert slam.graph.edge_count == edges
+
+
+def test_an_edge_at_which_its_plugin_fails_during_a_solve_is_withdrawn_and_all_else_stays(drive):
+    def mast(k, stamp_ns, truth):
+        yield seen(stamp_ns, truth)
+        if k % 5 == 4:
+            yield ahead(stamp_ns, truth, fails=float(k == 24))
+
+    slam, _ = drive(mast)
+    edges = slam.graph.edges_of("custom").tolist()
+    (failed,) = [edge for edge in edges if not slam.ledger.is_inside(edge)]
+    assert Reason(int(slam.ledger.reason.values[failed])) is Reason.FAILED
+    assert slam.ledger.verdict_of(failed) is Verdict.REJECTED
+    assert slam.graph.edge(failed).weight == 0.0
+    assert slam.graph.edge(failed).measured[1] == 1.0
+    assert slam.counters.as_dict()["mast"] == {"plugin_failed": 1}
+    assert slam.counters.used["mast"] == len(edges) - 1
+    assert slam.counters.faults["mast"].endswith("OverflowError: too often")
+    assert slam.is_solved
+    assert not slam.failing
+
+
+def test_a_landmark_is_removed_with_its_custom_edges_and_with_the_last_that_determines_it(drive):
+    def mast(k, stamp_ns, truth):
+        if k in (20, 40):
+            yield seen(stamp_ns, truth)
+        if k > 40 and k % 5 == 0:
+            yield ahead(stamp_ns, truth)
+
+    slam, _ = drive(mast)
+    first, second = slam.graph.edges_of("landmarks").tolist()
+    custom = slam.graph.edges_of("custom").tolist()
+    slam.process(Control("remove", (("edge", custom[0]),)))
+    slam.process(Control("remove", (("edge", first),)))
+    assert slam.is_solved
+    assert list(slam.landmarks) == ["post"]
+    slam.process(Control("remove", (("edge", second),)))
+    assert slam.is_solved
+    assert not slam.landmarks
+    assert all(slam.ledger.is_withdrawn(edge) for edge in custom)
