@@ -65,6 +65,12 @@ class SavedGraph:
     ----------
     losses : a line is added for each part of the run that could not be read
 
+    Attributes
+    ----------
+    keyframes, stamps_ns, segments : vertices and stamps of the keyframes; the keyframes at which odometry begins
+    landmarks : vertex of each landmark that an accepted edge is about, by its name
+    held : vertices of a frozen map
+
     Raises
     ------
     GraphSlamError
@@ -76,17 +82,22 @@ class SavedGraph:
         if not slam.is_solved:
             raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
         self.folder, self.space, self.config = folder, slam.space, slam.config
-        self.graph, self._held = slam.graph.copy(), slam.solver.held
+        self.graph, self.held = slam.graph.copy(), slam.solver.held
         self.graph.initial.values[:] = slam.solver.values
         self.entries = list(ledger_entries(slam, range(self.graph.vertex_count)))
         self.changes = slam.ledger.history
         self.ids, _ = numbered(slam)
         self.keyframes: list[int] = slam.keyframes.ids.tolist()
         self._names = {mark.vertex: name for name, mark in slam.landmarks.items()}
+        self.stamps_ns: list[int] = slam.keyframes.stamps_ns.tolist()
+        self.segments = list(slam.segments)
+        joined = {vertex for entry in self.entries if entry.is_in for vertex in entry.vertices}
+        self.landmarks = {name: mark.vertex for name, mark in slam.landmarks.items() if mark.vertex in joined}
         self._numbers = {vertex: k for k, vertex in enumerate(self.keyframes)}
 
     @cached_property
-    def _was(self) -> Solver:
+    def solver(self) -> Solver:
+        """The solution of the run: all its accepted edges."""
         return self.solve()
 
     def keyframe(self, vertex: int) -> int | None:
@@ -137,21 +148,21 @@ class SavedGraph:
         solver = Solver(graph, settings)
         vertices = np.unique([*self.keyframes, *(v for e in edges for v in graph.edge(e).vertices)])
         solver.add(vertices, edges)
-        for vertex in np.intersect1d(vertices, self._held).tolist():
+        for vertex in np.intersect1d(vertices, self.held).tolist():
             solver.hold(vertex)
         solver.optimize()
         return solver
 
     def moved(self, solver: Solver) -> MovedVertex:
         """Compare a solution with that of the run."""
-        a, b = self._was.estimate(self.keyframes), solver.estimate(self.keyframes)
+        a, b = self.solver.estimate(self.keyframes), solver.estimate(self.keyframes)
         distance = np.linalg.norm(b[:, : self.space.dimensions] - a[:, : self.space.dimensions], axis=1)
         turned = self.space.angle(self.space.group.between(tuple(a[-1]), tuple(b[-1])))
         inside = np.array([e.edge for e in self.entries if e.is_in], dtype=np.int64)
-        before, after = self._was.chi2_of(inside)[0], solver.chi2_of(inside)[0]
+        before, after = self.solver.chi2_of(inside)[0], solver.chi2_of(inside)[0]
         worse = [k for k in np.argsort(before - after, kind="stable").tolist() if after[k] > before[k]]
         return MovedVertex(
-            self._was.evaluate(),
+            self.solver.evaluate(),
             solver.evaluate(),
             (float(distance[-1]), float(turned)),
             (self.keyframes[int(distance.argmax())], float(distance.max())),
@@ -178,7 +189,7 @@ class SavedGraph:
         With A and r its whitened Jacobian and residual at the optimum and Sigma the joint covariance of its vertices, a
         Gauss-Newton step without it is ``Sigma A' (I - A Sigma A')^-1 r``, by the matrix inversion lemma.
         """
-        solver, graph, last = self._was, self.graph, self.keyframes[-1]
+        solver, graph, last = self.solver, self.graph, self.keyframes[-1]
         one = graph.edge(edge)
         ends, root = one.vertices, one.sqrt_information
         residual, jacobian = linearized(graph, solver.values, one.type, ends, one.measured)

@@ -310,6 +310,26 @@ def influence(sub: CommandParser) -> None:
     )
 
 
+def advise(sub: CommandParser) -> None:
+    """Add the options of ``advise``."""
+    _add_run(sub)
+    sub.add_argument(
+        "--count",
+        type=values.count,
+        default=1,
+        metavar="N",
+        help="additions of each kind that are listed for each weakest direction (default: 1)",
+    )
+    sub.add_argument(
+        "--survey-sigma",
+        type=values.positive,
+        default=0.02,
+        metavar="M",
+        help="sigma of each coordinate of a surveyed landmark [m] (default: 0.02)",
+    )
+    sub.add_argument("--json", action="store_true", help="print all of it as one line of JSON")
+
+
 def demo(sub: CommandParser) -> None:
     """Add the options of ``demo``."""
     sub.add_argument(

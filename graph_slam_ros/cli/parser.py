@@ -118,6 +118,13 @@ COMMANDS = {
         "list the edges of a run that its last pose depends on most",
         "drive_run --count 5",
     ),
+    "advise": Command(
+        _later("advise"),
+        options.advise,
+        "find the weakest directions of a run's map, and what to measure to make them better known",
+        "drive_run",
+        "drive_run --json",
+    ),
     "optimize": Command(
         graphs.optimize,
         options.optimize,

@@ -16,6 +16,7 @@ from graph_slam_ros.node.recent import WINDOW_S, Recent
 
 _LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them
 _TF_BEHIND_S = 1.0
+_UNSEEN_M = 10.0
 _LONGEST = 80  # of a frame's name
 _UNLINKED = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
 
@@ -59,6 +60,7 @@ class Facts:
     Attributes
     ----------
     lifecycle : ``unconfigured``, ``inactive``, ``active`` or ``finalized``
+    weakest : the weakest direction of the newest pose, by quantity, with its sigma
     loads : the run whose map is being loaded; empty where none is
     faults : exceptions of callbacks in the last ten seconds
     busy_s : for how long the solver has been at what it does
@@ -75,6 +77,7 @@ class Facts:
     lifecycle: str
     inputs: tuple[InputFacts, ...] = ()
     estimate: Estimate | None = None
+    weakest: Mapping[str, str] = field(default_factory=dict)
     waits_for_clock: bool = False
     is_paused: bool = False
     loads: str = ""
@@ -256,7 +259,16 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
         yield Status(level, f"{node}: input {one.name}", one.mismatch or f"{one.received} received", node, values)
     if facts.estimate:
         values = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}
+        yield Status(OK, f"{node}: weak directions", _weakness(facts, facts.estimate), node, facts.weakest)
         yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes", node, values)
+
+
+def _weakness(facts: Facts, estimate: Estimate) -> str:
+    """The weakest direction of the newest pose, and the way without a landmark where that is long."""
+    weakest, unseen_m = ", ".join(facts.weakest.values()), estimate.unseen.length_m
+    uses_landmarks = any(one.use == "landmarks" for one in facts.inputs)
+    unseen = f"no landmark seen for {unseen_m:.0f} m" if uses_landmarks and unseen_m >= _UNSEEN_M else ""
+    return "; ".join(filter(None, (weakest, unseen)))
 
 
 def _graph(e: Estimate) -> dict[str, str]:
@@ -271,5 +283,6 @@ def _graph(e: Estimate) -> dict[str, str]:
         "slowest update [ms]": f"{1e3 * e.slowest_solve_s:.2f}",
         "last correction [m]": f"{e.correction.distance_m:.4f}",
         "last correction [rad]": f"{e.correction.angle_rad:.4f}",
+        "driven since a landmark was seen [m]": f"{e.unseen.length_m:.1f}",
         "newest keyframe [ns]": str(e.stamp_ns),
     }

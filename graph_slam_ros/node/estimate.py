@@ -3,9 +3,41 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.solution import Correction
+from graph_slam_ros.slam.weak_direction import position_covariance, weakest_position, weakest_turn
 from graph_slam_ros.typing import Numbers
+
+
+@dataclass(frozen=True, slots=True)
+class UnseenWay:
+    """The way driven since a landmark was seen last.
+
+    Attributes
+    ----------
+    keyframes, changes : keyframes, and changes of landmarks, that are counted already
+    length_m : by odometry, from keyframe to keyframe
+    direction : of the last keyframe from the one before, in odometry's frame
+    """
+
+    keyframes: int
+    changes: int
+    length_m: float = 0.0
+    direction: Numbers = ()
+
+    def goes_on(self, slam: GraphSlam) -> "UnseenWay":
+        """Return the way after an update."""
+        count, changes = len(slam.keyframes), slam.landmark_changes
+        positions = slam.keyframes.poses[max(self.keyframes - 1, 0) : count, : slam.space.dimensions]
+        steps = np.diff(positions, axis=0)
+        length_m, direction = self.length_m, self.direction
+        if len(steps) and slam.segments[-1] < self.keyframes:  # a jump of odometry is no way
+            length_m += float(np.linalg.norm(steps, axis=1).sum())
+            direction = tuple(steps[-1].tolist())
+        return UnseenWay(count, changes, length_m if changes == self.changes else 0.0, direction)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,6 +50,7 @@ class Estimate:
     T_odom_keyframe, covariance, stamp_ns : odometry's pose, tangent covariance and stamp of the newest keyframe
     source : the odometry in use
     is_confirmed : whether the robot knows where it is in a map that was loaded
+    unseen : the way since a landmark was seen
     fit : chi2 per degree of freedom; NaN before it was looked at
     rivals : loop closures of other explanations that could not be ruled out
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
@@ -39,6 +72,7 @@ class Estimate:
     solve_s: float
     slowest_solve_s: float
     fit: float
+    unseen: UnseenWay
     rivals: int
     displaced: str = ""
     is_resumed: bool = False
@@ -47,6 +81,17 @@ class Estimate:
     def is_located(self) -> bool:
         """Return whether pose and ``map -> odom`` may be published."""
         return self.is_confirmed or self.is_resumed
+
+    def weakest(self, space: Geometry) -> dict[str, str]:
+        """The weakest direction of the newest keyframe, of its position and of its orientation, in words."""
+        pose = space.group.compose(self.T_map_odom, self.T_odom_keyframe)
+        path = space.turn(self.T_map_odom) @ np.array(self.unseen.direction) if self.unseen.direction else None
+        position = weakest_position(position_covariance(space, pose, self.covariance), path)
+        turn = weakest_turn(space, pose, self.covariance)
+        return {
+            "position": f"{position.sigma:.3f} m {position.words}",
+            "orientation": f"{np.degrees(turn.sigma):.2f} deg {turn.words}",
+        }
 
     @classmethod
     def of(
@@ -59,6 +104,7 @@ class Estimate:
         solve_s: float,
         slowest_solve_s: float,
         fit: float,
+        unseen: UnseenWay,
     ) -> "Estimate":
         """Return the estimate of a pipeline that has keyframes; the rest is as of the attributes."""
         newest = slam.keyframes[-1]
@@ -78,6 +124,7 @@ class Estimate:
             solve_s=solve_s,
             slowest_solve_s=slowest_solve_s,
             fit=fit,
+            unseen=unseen,
             rivals=sum(len(rival.only_here) for rival in slam.backend.rivals),
             displaced=str(slam.displaced or ""),
             is_resumed=is_resumed,

@@ -71,6 +71,7 @@ class FactCollector:
             lifecycle,
             subscriptions.facts(node.now_ns, counted, recent) if subscriptions is not None else (),
             session.estimate,
+            weakest=session.estimate.weakest(node.config.space) if session.estimate is not None else {},
             waits_for_clock=node.get_parameter("use_sim_time").value and not node.now_ns,
             is_paused=gate.is_paused,
             loads=session.loads,

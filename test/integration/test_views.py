@@ -74,8 +74,9 @@ def test_every_topic_of_foxglove_is_the_nodes_or_of_a_runs_recording(tmp_path):
 
 def test_what_foxglove_plots_is_among_the_nodes_diagnostics():
     diagnostics = pytest.importorskip("graph_slam_ros.node.diagnostics")
+    unseen = pytest.importorskip("graph_slam_ros.node.estimate").UnseenWay(0, 0)
     given = {field.name: 0 for field in dataclasses.fields(diagnostics.Estimate)}
-    estimate = diagnostics.Estimate(**given | {"correction": Correction()})
+    estimate = diagnostics.Estimate(**given | {"correction": Correction(), "unseen": unseen})
     facts = diagnostics.Facts("active", estimate=estimate)
     told = {
         status.name: set(status.values)

@@ -88,6 +88,7 @@ NEEDS = {  # what each command reads of a run
     ("explain", "RUN", "3"): OF_MAP,
     ("solve", "RUN", "--without", "3"): OF_MAP,
     ("influence", "RUN", "--count", "1"): OF_MAP,
+    ("advise", "RUN"): OF_MAP,
     ("evaluate", "RUN", "--truth", "BAG"): SCORED,
     ("plot", "RUN"): SCORED,
     ("replay", "RUN", "--out", "OUT"): ("run.json", "config.yaml", "ingest.mcap"),

@@ -245,6 +245,7 @@ READERS = {  # and the files of the run that they need
     ("explain", "RUN"): ("run.json", "config.yaml", "map.mcap"),
     ("solve", "RUN", "--without", "3"): ("config.yaml", "map.mcap"),
     ("influence", "RUN", "--count", "1"): ("map.mcap",),
+    ("advise", "RUN"): ("map.mcap",),
     ("evaluate", "RUN", "--truth", "BAG"): ("run.json", "config.yaml", "path.tum", "covariances.csv", *SCORED),
     ("plot", "RUN"): ("run.json", "config.yaml", "path.tum", "covariances.csv", *SCORED),
     ("replay", "RUN", "--out", "OUT"): ("config.yaml", "ingest.mcap"),

@@ -215,6 +215,7 @@ def test_each_command_ends_with_a_line_of_what_to_do_next(bag, run, tmp_path, ca
         ("explain", run, "3"),
         ("solve", run, "--loss", "none"),
         ("influence", run, "--count", "1"),
+        ("advise", run),
         ("params", "odometry"),
     ):
         code, out, _ = told(capsys, *words)

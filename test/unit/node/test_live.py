@@ -171,6 +171,41 @@ def test_where_no_clock_runs_or_nobody_asks_nothing_is_ahead():
         assert list(ahead.pass_on(seen(10**18))) == [seen(10**18)]
 
 
+# -- weak directions ---------------------------------------------------------------------------------------------------
+
+
+def test_the_weakest_direction_of_the_newest_pose_and_the_way_without_a_landmark_are_among_the_diagnostics():
+    """A robot drives east, sees a tag until 3 m, and then none for 20 m; a jump of its odometry is no way."""
+    settings = {"ordering.window_s": 0.0, "output.folder": ""}
+    session = Session(Config.from_mapping(settings), Counters(), lambda slam, update: None, lambda *_: None)
+
+    def status(inputs):
+        estimate = session.estimate
+        facts = Facts("active", inputs, estimate, estimate.weakest(session.config.space))
+        return next(
+            one for one in statuses(facts, judge(facts, Config()), "node") if one.name == "node: weak directions"
+        )
+
+    for k in range(240):
+        stamp, x = STAMP_NS + k * NS // 10, 0.1 * k + (50.0 if k > 200 else 0.0)
+        session.ingest([Odometry(stamp, (x, 0.0, 0.0), None, "odom")])
+        if k <= 30:
+            tag = Sighting("a", "position", (5.0 - x, 1.0), (1e-4, 0.0, 0.0, 1e-4))
+            session.ingest([Sightings(stamp, "tags", (tag,))])
+        if k == 30:
+            assert session.estimate.unseen.length_m == pytest.approx(0.0, abs=0.5)
+            assert "no landmark" not in status((tags(),)).message
+    assert session.slam.segments[-1] > 0
+    assert session.estimate.unseen.length_m == pytest.approx(20.7, abs=0.7)
+    seen = status((odom(), tags()))
+    assert seen.message.endswith(f"deg heading; no landmark seen for {session.estimate.unseen.length_m:.0f} m")
+    assert "no landmark" not in status((odom(),)).message, "none is used"
+    covariance = session.slam.pose_covariance
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+    assert seen.values["position"].startswith(f"{sigma:.3f} m ")
+    assert seen.values["orientation"] == f"{math.degrees(covariance[2, 2] ** 0.5):.2f} deg heading"
+
+
 # -- the worker --------------------------------------------------------------------------------------------------------
 
 

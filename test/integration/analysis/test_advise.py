@@ -1,0 +1,198 @@
+"""``advise``: the sigma that it predicts is the one that comes out, and what it says of a run is so."""
+
+import json
+
+import numpy as np
+import pytest
+from advised import SimulatedRun
+from reliability import tell, times
+
+from graph_slam_ros import cli
+from graph_slam_ros.analysis.advice import KINDS, Advisor
+from graph_slam_ros.analysis.weakness import Weakness
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.runs.recorder import RunRecorder
+from graph_slam_ros.runs.restore import freeze
+from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+
+S = 1_000_000_000
+NOISY = {"sigma_speed_m_s": 0.2, "sigma_turn_rad_s": 0.2}
+WORLDS = [
+    ("manhattan", {"poses": 40, "blocks": 2} | NOISY),
+    ("warehouse", {"aisles": 2, "aisle_m": 5.0}),
+    ("flight", {"laps": 1, "length_m": 12.0, "width_m": 12.0}),
+]
+MORE = [
+    ("manhattan", {"poses": 60, "blocks": 3, "sensor": "range_bearing"} | NOISY),
+    ("manhattan", {"poses": 60, "blocks": 3, "sensor": "bearing"}),
+    ("manhattan", {"poses": 60, "blocks": 3, "sensor": "range"}),
+    ("warehouse", {"aisles": 3, "sensor": "range_bearing"}),
+    ("flight", {"laps": 2, "sensor": "bearing"}),
+    ("flight", {"laps": 1, "sensor": "position", "beacons": 10}),
+]
+
+
+@pytest.fixture
+def told(capsys):
+    def command(*words):
+        code = cli.main([*map(str, words)])
+        return code, *capsys.readouterr()
+
+    return command
+
+
+def test_the_predicted_sigma_is_within_a_fifth_of_what_comes_out_in_95_of_100(tmp_path):
+    """The measurement is made truly, with its noise, and everything is solved again."""
+    ratios, kinds = [], set()
+    for seed in range(times(1, 6)):
+        for k, (world, options) in enumerate(times(WORLDS, WORLDS + MORE)):
+            simulated = SimulatedRun(tmp_path / f"{seed}_{k}", world, seed, **options)
+            for kind, _, _, predicted, real in simulated.comparisons(np.random.default_rng(seed), 2):
+                ratios.append(predicted / real)
+                kinds.add(kind)
+    off = np.maximum(ratios, 1.0 / np.array(ratios)) - 1.0
+    tell("advise", predictions=len(off), within=int((off < 0.2).sum()), worst={"off by": round(float(off.max()), 3)})
+    assert kinds == set(KINDS)
+    assert len(off) > 20
+    assert (off < 0.2).mean() >= 0.95
+
+
+# -- a corridor --------------------------------------------------------------------------------------------------------
+
+
+def corridor(folder, landmarks=True, length_m=60.0, settings=None):
+    """A robot drives east; landmarks stand at the beginning and at the end, none for 40 m between."""
+    config = Config.from_mapping(settings or {})
+    recorder = RunRecorder(folder, config)
+    slam = GraphSlam(config, sink=recorder.sink)
+    spots = {"start": (4.0, 2.0), "near": (8.0, -2.0), "late": (52.0, 2.0), "end": (58.0, -2.0)}
+    for k in range(int(10 * length_m) + 1):
+        x = 0.1 * k
+        slam.process(Odometry((100 + k) * S // 10, (x, 0.0, 0.0), source="odom"))
+        if landmarks and k % 5 == 0:
+            seen = [
+                Sighting(name, "position", (spot[0] - x, spot[1]), (0.01, 0.0, 0.0, 0.01))
+                for name, spot in spots.items()
+                if np.hypot(spot[0] - x, spot[1]) < 5.0 and spot[0] > x
+            ]
+            if seen:
+                slam.process(Sightings((100 + k) * S // 10, "tags", tuple(seen)))
+    slam.process(Control("end"))
+    recorder.record(slam, slam.process(Control("optimize")))
+    recorder.save(slam, {"ended": True})
+    recorder.close()
+    return slam
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("corridor") / "run"
+    corridor(folder)
+    return folder
+
+
+def test_a_way_without_landmarks_is_named_with_its_length_and_stamps(straight, told):
+    weakness = Weakness(SavedGraph(straight, []))
+    unseen = weakness.longest_unseen()
+    assert 38.0 < unseen.length_m < 42.0
+    assert unseen.begins_m == pytest.approx(7.5, abs=1.0)
+    assert unseen.begins_ns == pytest.approx(10 * S + unseen.begins_m * S, abs=S)
+    code, out, err = told("advise", straight)
+    assert (code, err) == (0, "")
+    (line,) = [one for one in out.splitlines() if one.startswith("  no landmark seen for")]
+    assert f"no landmark seen for {unseen.length_m:.1f} m (keyframes {unseen.first} to {unseen.last}, " in line
+    assert "the anchor at the first keyframe" in out
+    assert out.splitlines()[-1].startswith("next: ")
+
+
+def test_the_weakest_is_where_the_odometry_has_drifted_most_and_across_the_path(straight):
+    """Nothing is seen twice: it is the last keyframe, whose way across grows with the error of the heading."""
+    run = SavedGraph(straight, [])
+    position, heading, landmark = Weakness(run).weakest()
+    assert position.keyframe == len(run.keyframes) - 1
+    assert position.direction.words == "across the path"
+    assert heading.direction.sigma == pytest.approx(
+        float(np.sqrt(run.solver.marginal([heading.vertex])[0][2, 2])), rel=1e-9
+    )
+    assert landmark.about == "landmark end"
+    assert heading.usual < heading.direction.sigma
+
+
+def test_a_survey_of_what_is_weakest_helps_it_most_and_leaves_what_was_surveyed(straight, told):
+    code, out, _ = told("advise", straight, "--json", "--survey-sigma", "0.05", "--count", "3")
+    assert code == 0
+    told_of = json.loads(out)
+    landmark = next(one for one in told_of["weakest"] if one["what"] == "landmark")
+    assert landmark["advice"][0]["kind"] == "survey"
+    assert landmark["advice"][0]["about"].startswith("survey landmark end")
+    assert landmark["advice"][0]["predicted"] == pytest.approx(0.05, rel=0.01)
+    for one in told_of["weakest"]:
+        predicted = [advice["predicted"] for advice in one["advice"]]
+        assert predicted == sorted(predicted)
+        assert all(sigma < one["sigma"] for sigma in predicted)
+        assert all(advice["path_m"] <= advice["path_now_m"] for advice in one["advice"])
+
+
+def test_a_prediction_to_first_order_is_that_of_the_information_matrix(straight):
+    """By the inverse of all of it, with and without a new tag's sightings."""
+    run = SavedGraph(straight, [])
+    advisor = Advisor(Weakness(run))
+    solver, dofs = run.solver, {v: run.graph.kind_of(v).dof for v in range(run.graph.vertex_count)}
+    first = dict(zip(dofs, np.cumsum([0, *dofs.values()]), strict=False))
+    information = solver.information_matrix()
+    for kind in ("survey", "sighting", "new tag"):
+        addition = next(iter(advisor.additions([kind])))
+        a, columns = advisor.rows(addition)
+        place = {int(c): first[v] + k for v, of in advisor._columns.items() for k, c in enumerate(of)}
+        wide = np.zeros((len(a), len(information)))
+        wide[:, [place[int(c)] for c in columns]] = a
+        covariance = np.linalg.inv(information + wide.T @ wide)
+        for one, sigma in zip(advisor.weakest, advisor.predict(addition)[0], strict=True):
+            at = slice(first[one.vertex], first[one.vertex] + dofs[one.vertex])
+            assert sigma == pytest.approx(
+                float(np.sqrt(one.functional @ covariance[at, at] @ one.functional)), rel=1e-4
+            )
+
+
+# -- what may be wrong -------------------------------------------------------------------------------------------------
+
+
+def test_a_run_without_landmarks_says_so(tmp_path, told):
+    corridor(tmp_path / "run", landmarks=False, length_m=5.0)
+    code, out, err = told("advise", tmp_path / "run")
+    assert (code, err) == (0, "")
+    assert "0 landmarks" in out
+    assert "nothing that was tried helps by 2 % or more: the run has no landmark" in out
+    assert "no landmark seen; sigma up to" in out
+
+
+def test_a_run_of_one_keyframe_has_a_weakest_pose_and_no_stretch(tmp_path, told):
+    corridor(tmp_path / "run", landmarks=False, length_m=0.0)
+    code, out, err = told("advise", tmp_path / "run")
+    assert (code, err) == (0, "")
+    assert "1 keyframes, 0 landmarks" in out
+    assert "weak stretches: none" in out
+
+
+def test_a_frozen_map_alone_is_refused_for_nothing_of_it_is_estimated(straight, tmp_path, told):
+    freeze(straight, tmp_path / "site")
+    code, out, err = told("advise", tmp_path / "site")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "all keyframes are of a frozen map" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["NONE"], "not a run: no config.yaml in it"),
+        (["RUN", "--survey-sigma", "0"], "0 is not a positive number"),
+        (["RUN", "--survey-sigma", "1e-200"], "is not positive definite"),
+        (["RUN", "--count", "0"], "0 is not a positive integer"),
+    ],
+)
+def test_what_cannot_be_advised_on_is_refused_in_one_line(straight, tmp_path, told, words, why):
+    words = [{"NONE": tmp_path, "RUN": straight}.get(word, word) for word in words]
+    with pytest.raises(SystemExit) if "0" in words else pytest.MonkeyPatch.context():
+        code, out, err = told("advise", *words)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert why in err
