@@ -10,8 +10,10 @@ from graph_slam_ros.graph import Gaussian, Loss
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.plugin_edges import failed_edges
-from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.calibration.rows import TrialProblem
+from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
+from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise
 from graph_slam_ros.slam.robust.background import Background, Executor, Work, run_when_asked
@@ -210,6 +212,16 @@ class Backend:
     def _first_free_edge(self) -> int:
         """The first edge that is not of a frozen or held map."""
         return max(self.frozen_edges, self.held[1])
+
+    def trial_problem(
+        self, space: Geometry, path: KeyframeList, origins: SightingEdges, settings: Settings | None = None
+    ) -> TrialProblem:
+        """A copy of the present problem for a trial fit: sightings that are out are in, under their loss."""
+        graph, solver, out = self.graph.copy(), self.solver, self.ledger.outside
+        graph.set_weights(out[graph.has_label(out, ("landmarks",))], 1.0)
+        keyframes = path.keyframes.ids.copy(), path.keyframes.stamps_ns.copy(), tuple(path.segments)
+        problem = solver.vertices, solver.held, solver.values, settings or solver.settings
+        return TrialProblem(space, graph, *problem, origins.copy(), *keyframes, self._first_free_edge)
 
     def move(self, T_new_old: Numbers, space: Geometry) -> None:
         """Move everything rigidly, what a second look works on besides: that is dropped."""

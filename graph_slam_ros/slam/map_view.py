@@ -1,6 +1,6 @@
 """The read-only part of the pipeline: path, landmarks, covariances, statistics and health."""
 
-from collections.abc import Sequence, Set
+from collections.abc import Collection, Sequence, Set
 
 import numpy as np
 
@@ -8,6 +8,10 @@ from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.calibration.choice import parameters_of
+from graph_slam_ros.slam.calibration.decision import Finding, decide
+from graph_slam_ros.slam.calibration.fit import TrialFit, fit
+from graph_slam_ros.slam.calibration.parameters import DEFAULT_GROUPS
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
@@ -159,6 +163,28 @@ class MapView:
             As for ``Solver.joint_marginal``.
         """
         return self.backend.noise_scale(self.keyframes)
+
+    def trial_fit(self, groups: Collection[str] = DEFAULT_GROUPS) -> tuple[TrialFit, list[Finding]]:
+        """Fit the calibration of odometry and sensors with the map, on a copy: nothing is changed.
+
+        Parameters
+        ----------
+        groups : of ``slam.calibration.parameters.GROUPS``
+
+        Returns
+        -------
+        The fit: ``parameters``, ``values`` (corrections, 0 is what is configured), ``sigmas``, ``correlation``. And the
+        finding of each: ``verdict``, ``text``, ``is_determined``. Both are empty where no edge depends on any.
+
+        Raises
+        ------
+        SingularError
+            The edges do not determine the estimate.
+        """
+        problem = self.backend.trial_problem(self.space, self._frontend.path, self._landmarks.map.origins)
+        wanted = parameters_of(problem, groups)
+        found = fit(problem, {one: one.quantity.prior for one in wanted})
+        return found, decide(found, len(self.landmarks))
 
     @property
     def range_offsets(self) -> dict[str, int]:

@@ -43,9 +43,10 @@ WITHIN = {
     "slam/frontend": {"lie", "graph", "measurements", "config"},
     "slam/landmarks": {"lie", "graph", "solver", "measurements", "config", "slam/frontend"},
     "slam/robust": {"lie", "graph", "solver", "measurements", "config", "slam/frontend", "slam/landmarks"},
+    "slam/calibration": {"lie", "graph", "solver", "slam/frontend"},
     "slam": {
         *("plugin_edges", "edge_tags", "lie", "graph", "solver", "measurements", "config"),
-        *("slam/frontend", "slam/landmarks", "slam/robust"),
+        *("slam/frontend", "slam/landmarks", "slam/robust", "slam/calibration"),
     },
     "messages/inputs": {"plugins", "edge_tags", "lie", "graph", "formats", "measurements", "config"},
     "messages": {"lie", "graph", "formats", "measurements", "config", "slam", "messages/inputs"},
@@ -146,6 +147,7 @@ COLUMNS = {
 }
 BULK = {  # the stored numbers of many vertices, or the noise of many edges, at once
     *("slam/frontend/noise_factors.py", "slam/noise_scale.py"),
+    *("slam/calibration/fit.py", "slam/calibration/model.py", "slam/calibration/rows.py"),
     *("slam/backend.py", "slam/robust/pairwise_consistency.py"),
     *("runs/map_journal.py", "analysis/what_if.py", "simulation/pose_graph.py"),
 }

@@ -15,6 +15,7 @@ from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.motion_compensation import KeyframeMeasurement, PoseAtStamp
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
+from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.landmarks import triangulation
 from graph_slam_ros.slam.landmarks.triangulation import PartialObservation, PositionHypothesis
 from graph_slam_ros.solver import Solver
@@ -77,6 +78,7 @@ class Landmarks:
     undetermined : those that are not determined yet
     offsets : by input, the vertex of what all its ranges have in common
     touched : the name of a landmark of the graph for each change of it, in order
+    origins : when each edge of a sighting was measured, and where from
     begins_new : whether what is not known begins a landmark; not so while the map is held
     """
 
@@ -102,6 +104,7 @@ class Landmarks:
                 self._noise_of_pose(name, known)
         self.offsets: dict[str, int] = {}
         self.touched: list[str] = []
+        self.origins = SightingEdges(self._space)
 
     def add(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
         """Add a sighting of a landmark with this identity."""
@@ -211,6 +214,7 @@ class Landmarks:
         distance_m = float(np.linalg.norm(compensated.measured[:metres]))
         noise = edge_noise(self._counters, topic, self._blurred(s, compensated), metres, distance_m)
         edge = self._edges.add_edge(edge_type, vertices, compensated.measured, noise, LABEL, topic)
+        self.origins.append(edge, s, where)
         if not s.id:
             landmark.seen.append(LandmarkEdge(edge, topic, s, where))
             landmark.stamps.add(where.stamp_ns)

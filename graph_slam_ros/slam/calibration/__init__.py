@@ -1,0 +1,1 @@
+"""Calibration: what drivers and rulers got slightly wrong, estimated with the map."""

@@ -1,0 +1,115 @@
+"""The decision on a fitted parameter: four questions, and a sentence where the answer is no.
+
+1. Is it determined? Its sigma must be below a limit.
+2. Is it worth it? It must be off by four sigmas, and by more than anybody would notice.
+3. Is it reproducible? Fitted on either half of the drive, it must lower the cost of the other.
+4. Is it this parameter, not another? Its correlation with any other must be below 0.95, and it must lie within three
+   sigmas of its prior.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from graph_slam_ros.slam.calibration.fit import TrialFit
+from graph_slam_ros.slam.calibration.parameters import Parameter
+
+SIGMAS = 4.0
+MOST_CORRELATED = 0.95
+PRIOR_SIGMAS = 3.0
+MOST_LOST = 0.2
+LEAST_LANDMARKS = 3
+
+Verdict = Literal["admitted", "nothing_to_correct", "not_determined", "not_reproducible", "not_separable", "refused"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of a trial fit for one parameter, judged.
+
+    Attributes
+    ----------
+    value, sigma : of the correction
+    verdict : whether it is let in, and else why not
+    text : the verdict with its reason, for a person
+    """
+
+    parameter: Parameter
+    value: float
+    sigma: float
+    verdict: Verdict
+    text: str
+
+    @property
+    def is_determined(self) -> bool:
+        """Return whether the drive tells the parameter."""
+        return self.verdict in ("admitted", "nothing_to_correct")
+
+
+def decide(found: TrialFit, landmarks: int) -> list[Finding]:
+    """Answer the four questions for each parameter of a trial fit.
+
+    Parameters
+    ----------
+    landmarks : how many were seen
+    """
+    return [_finding(found, k, _void(found, landmarks)) for k in range(len(found.parameters))]
+
+
+def refusal(parameter: Parameter, why: str) -> Finding:
+    """A parameter that is not fitted, with the reason."""
+    return Finding(parameter, 0.0, float("inf"), "refused", f"{parameter}: refused: {why}")
+
+
+def amount(parameter: Parameter, value: float, digits: int = 2) -> str:
+    """A number of a parameter in its unit."""
+    quantity = parameter.quantity
+    return f"{value * quantity.shown:.{digits}g}{' ' * bool(quantity.unit)}{quantity.unit}"
+
+
+def _void(found: TrialFit, landmarks: int) -> str:
+    """Return why nothing of a fit is believed; empty where it may be."""
+    if landmarks < LEAST_LANDMARKS:
+        return f"{landmarks} landmarks were seen, it needs {LEAST_LANDMARKS}"
+    if found.lost > MOST_LOST:
+        return f"{found.lost:.0%} of the sightings do not fit, more than {MOST_LOST:.0%}: check their ids and noise"
+    return ""
+
+
+def _finding(found: TrialFit, k: int, void: str) -> Finding:
+    parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
+    verdict, why = _verdict(found, k, void)
+    return Finding(parameter, value, sigma, verdict, f"{parameter}: {why}")
+
+
+def _verdict(found: TrialFit, k: int, void: str) -> tuple[Verdict, str]:
+    parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
+    quantity, (correlation, other) = parameter.quantity, found.worst_correlation(k)
+    shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
+    if void:
+        return "refused", f"not used ({shown}): {void}"
+    if sigma >= quantity.determined_below:
+        needs = f"sigma {amount(parameter, sigma)}, needs {amount(parameter, quantity.determined_below)}"
+        return "not_determined", f"not determined ({needs}): {quantity.manoeuvre}"
+    if abs(value) < max(SIGMAS * sigma, quantity.least):
+        return "nothing_to_correct", f"nothing to correct ({shown})"
+    if correlation > MOST_CORRELATED:
+        return "not_separable", f"not told from {other} (correlation {correlation:.2f}): {quantity.manoeuvre}"
+    if abs(value) > PRIOR_SIGMAS * found.priors[k]:
+        limit = amount(parameter, PRIOR_SIGMAS * float(found.priors[k]))
+        return "refused", f"not used ({shown}): beyond {limit}, a wrong configuration is more likely"
+    halves = float(found.first[k]), float(found.second[k])
+    if not _agree(*halves):
+        first, second = (amount(parameter, half, 3) for half in halves)
+        return "not_reproducible", f"not used ({shown}): {first} in one half of the drive, {second} in the other"
+    return "admitted", shown
+
+
+def _agree(first: float, second: float) -> bool:
+    """Return whether each half's estimate lowers the cost of the other, a parabola around its own."""
+    return 0.0 < first / second < 2.0 and 0.0 < second / first < 2.0 if first and second else False
+
+
+def admitted(findings: Sequence[Finding]) -> list[Parameter]:
+    """The parameters that are let in."""
+    return [one.parameter for one in findings if one.verdict == "admitted"]

@@ -1,0 +1,201 @@
+"""The trial fit: all unknowns of a graph and the parameters together, by bordered least squares on a copy.
+
+The parameters are no vertices: with H of the graph's own unknowns and B of these with the parameters, their information
+is the Schur complement ``C - B' H^-1 B``, dense and small. So the solver, its kernels and a graph in which nothing is
+admitted stay as they are. A value is taken over by correcting what edges have measured.
+
+The rows of the parameters' columns less what the other unknowns explain of them, ``P - J H^-1 B``, give the rest: the
+information of any part of the drive, and scores whose sums by landmark and by stretches of time are the sandwich
+covariance (White, "Maximum likelihood estimation of misspecified models", 1982): errors that are alike count once.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse.linalg import SuperLU, splu
+
+from graph_slam_ros.errors import SingularError
+from graph_slam_ros.graph import Graph, VertexKind
+from graph_slam_ros.slam.calibration.model import Values
+from graph_slam_ros.slam.calibration.parameters import Parameter
+from graph_slam_ros.slam.calibration.rows import Linearization, Rows, TrialProblem
+from graph_slam_ros.typing import Array, Index
+
+_ITERATIONS, _CAUTIOUS = 12, 2  # of all, and of the first with the first stage of the losses
+_STILL = 0.02  # of a sigma of each parameter
+_STRIDE_M, _STRIDE_RAD, _STRIDE = 1.0, 0.3, 0.2  # the largest step of a pose, an angle, a parameter
+_BLOCK_S = 30.0  # errors within are taken for alike
+_LOST = 0.1  # of its weight: a sighting with less is not believed
+
+
+@dataclass(frozen=True, slots=True)
+class TrialFit:
+    """The outcome of a trial fit of some parameters.
+
+    Attributes
+    ----------
+    parameters : (p,)
+    values : (p,) corrections; 0 is what is configured
+    priors : (p,) their sigmas, around 0
+    covariance : (p, p) by curvature
+    robust_covariance : (p, p) where errors by one landmark, or within half a minute, are taken for alike
+    first, second : estimates (p,) from the halves of the drive that tell as much of each parameter
+    lost : part of the sightings that have less than a tenth of their weight
+    path : stored numbers of all vertices
+    """
+
+    parameters: tuple[Parameter, ...]
+    values: Array
+    priors: Array
+    covariance: Array
+    robust_covariance: Array
+    first: Array
+    second: Array
+    lost: float
+    path: Array
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations (p,): the larger one of curvature's and of the sandwich's."""
+        plain, robust = np.diag(self.covariance), np.diag(self.robust_covariance)
+        return np.asarray(np.sqrt(np.maximum(np.maximum(plain, robust), 0.0)))
+
+    @property
+    def correlation(self) -> Array:
+        """Correlations (p, p) by curvature."""
+        sigmas = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        return np.asarray(self.covariance / np.outer(sigmas, sigmas))
+
+    def value(self, parameter: Parameter) -> float:
+        """The correction of one parameter; 0 where it was not fitted."""
+        return float(self.values[self.parameters.index(parameter)]) if parameter in self.parameters else 0.0
+
+    def worst_correlation(self, k: int) -> tuple[float, Parameter | None]:
+        """The largest correlation of a parameter with another, and that other."""
+        row = np.abs(self.correlation[k])
+        row[k] = 0.0
+        other = int(row.argmax())
+        return float(row[other]), self.parameters[other] if row[other] > 0.0 else None
+
+
+def fit(problem: TrialProblem, priors: Mapping[Parameter, float], start: Values | None = None) -> TrialFit:
+    """Fit parameters together with all unknowns of a graph; begin at its estimate.
+
+    Parameters
+    ----------
+    priors : sigma of each parameter
+    start : corrections to begin with
+
+    Raises
+    ------
+    SingularError
+        The edges do not determine the estimate.
+    """
+    return _Fit(problem, priors).run(start or {})
+
+
+class _Fit:
+    def __init__(self, problem: TrialProblem, priors: Mapping[Parameter, float]) -> None:
+        self._p, self._parameters = problem, tuple(priors)
+        self._priors = np.array(list(priors.values()))
+        self._free = np.setdiff1d(problem.vertices, problem.held)
+        self._linear = Linearization(problem, self._parameters, self._free)
+
+    def run(self, start: Values) -> TrialFit:
+        """Iterate until the parameters stand still."""
+        x, theta = self._p.values.copy(), np.array([start.get(p, 0.0) for p in self._parameters])
+        stages = self._p.settings.stages()
+        for k in range(_ITERATIONS):
+            rows = self._linear.rows(x, theta, stages[0 if k < _CAUTIOUS else -1])
+            factor, border = _factor(rows)
+            information = self._information(rows.columns - rows.jacobian @ border)
+            pull = rows.jacobian.T @ rows.residual
+            gradient = rows.columns.T @ rows.residual - border.T @ pull + theta / self._priors**2
+            step = -np.linalg.solve(information, gradient)
+            move = -factor.solve(pull) - border @ step
+            part = self._stride(move, step)
+            x, theta = self._moved(x, part * move), theta + part * step
+            sigmas = np.sqrt(np.diag(np.linalg.inv(information)))
+            if k >= _CAUTIOUS and part == 1.0 and (np.abs(step) < _STILL * sigmas).all():
+                break
+        return self._outcome(x, theta, self._linear.rows(x, theta, stages[-1]))
+
+    def _information(self, rest: Array) -> Array:
+        """Return the information on the parameters, all else marginalised, with their priors."""
+        return np.asarray(rest.T @ rest + np.diag(self._priors**-2.0))
+
+    def _stride(self, move: Array, step: Array) -> float:
+        """The part of a step that is not too long for the linearisation."""
+        graph, lengths = self._p.graph, self._p.space.dimensions
+        largest = float(np.abs(step).max(initial=0.0)) / _STRIDE
+        for kind, _, steps in self._steps(graph, move):
+            turned = steps[:, lengths:] if kind is self._p.space.pose else steps[:, :0]
+            largest = max(largest, float(np.abs(turned).max(initial=0.0)) / _STRIDE_RAD)
+            largest = max(largest, float(np.abs(steps[:, :lengths]).max(initial=0.0)) / _STRIDE_M)
+        return min(1.0, 1.0 / largest) if largest > 0.0 else 1.0
+
+    def _moved(self, x: Array, move: Array) -> Array:
+        out, graph = x.copy(), self._p.graph
+        for kind, vertices, steps in self._steps(graph, move):
+            at = graph.offset.values[vertices][:, None] + np.arange(kind.size)
+            out[at] = kind.retract(x[at], steps)
+        return out
+
+    def _steps(self, graph: Graph, move: Array) -> "Iterator[tuple[VertexKind, Index, Array]]":
+        """The unknowns of each kind, and their steps (n, dof)."""
+        for code, kind in enumerate(graph.kinds):
+            vertices = self._free[graph.kind.values[self._free] == code]
+            yield kind, vertices, move[self._linear.column[vertices][:, None] + np.arange(kind.dof)]
+
+    # -- what it says ----------------------------------------------------------------------------------------------
+
+    def _outcome(self, x: Array, theta: Array, rows: Rows) -> TrialFit:
+        _, border = _factor(rows)
+        rest = rows.columns - rows.jacobian @ border
+        covariance = np.asarray(np.linalg.inv(self._information(rest)))
+        scores = rest * rows.residual[:, None]
+        robust = np.asarray(covariance @ self._meat(scores, rows) @ covariance)
+        first, second = self._halves(rest, scores, theta, rows.stamp_ns)
+        sightings = rows.landmark >= 0
+        lost = float(np.mean(rows.weight[sightings] < _LOST)) if sightings.any() else 0.0
+        return TrialFit(self._parameters, theta, self._priors, covariance, robust, first, second, lost, x)
+
+    def _meat(self, scores: Array, rows: Rows) -> Array:
+        """The larger one, by its trace, of the scatter of scores by landmark and by half a minute."""
+        block = ((rows.stamp_ns - self._p.stamps_ns.min()) * 1e-9 // _BLOCK_S).astype(np.int64)
+        block -= block.min()
+        by_landmark = np.where(rows.landmark >= 0, rows.landmark, int(rows.landmark.max()) + 1 + block)
+        both = [_scatter(scores, clusters) for clusters in (block, by_landmark)]
+        scale = np.linalg.norm(scores, axis=0) + 1e-300
+        return max(both, key=lambda meat: float(np.sum(np.diag(meat) / scale**2)))
+
+    def _halves(self, rest: Array, scores: Array, theta: Array, stamps_ns: Index) -> tuple[Array, Array]:
+        """Each parameter's estimates from the halves of the drive, split where half of what tells it has come."""
+        order = np.argsort(stamps_ns, kind="stable")
+        out = np.zeros((2, len(theta)))
+        for k in range(len(theta)):
+            known = np.cumsum(rest[order, k] ** 2)
+            cut = int(np.searchsorted(known, 0.5 * known[-1])) + 1
+            for half, some in enumerate((order[:cut], order[cut:])):
+                pull = scores[some].sum(axis=0) + self._priors**-2.0 * theta
+                out[half, k] = (theta - np.linalg.solve(self._information(rest[some]), pull))[k]
+        return out[0], out[1]
+
+
+def _factor(rows: Rows) -> tuple[SuperLU, Array]:
+    """H in factors, and ``H^-1 B``."""
+    h = (rows.jacobian.T @ rows.jacobian).tocsc()
+    try:
+        factor = splu(h, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError as error:
+        raise SingularError(f"trial fit: {error}") from None
+    return factor, factor.solve(np.asarray(rows.jacobian.T @ rows.columns))
+
+
+def _scatter(scores: Array, clusters: Index) -> Array:
+    _, at = np.unique(clusters, return_inverse=True)
+    sums = np.zeros((int(at.max()) + 1, scores.shape[1]))
+    np.add.at(sums, at, scores)
+    count = len(sums)
+    return np.asarray(sums.T @ sums * (count / max(count - 1, 1)))

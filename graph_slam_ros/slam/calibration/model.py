@@ -1,0 +1,216 @@
+"""The measurements of a graph as they would be with other parameters.
+
+An edge of odometry between two keyframes is ``Exp(S Log z)``, with the factors in S: over its few centimetres the
+motion is taken for one of constant velocity. A sighting is brought to the stamp plus the clock's correction along the
+estimated path, never by single twists: their noise would be taken for signal; and its sensor is turned about its own
+origin and moved, in the axes of the base. A range becomes ``factor * range + offset``.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.lie import so3
+from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter
+from graph_slam_ros.slam.calibration.path import EstimatedPath
+from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
+from graph_slam_ros.typing import Array, Index, Numbers
+
+Values = Mapping[Parameter, float]
+_POINTS = ("landmark position", "tag position")
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryEdges:
+    """Edges of odometry in one table.
+
+    Attributes
+    ----------
+    measured : (n, size)
+    seconds : (n,) that each lasts
+    """
+
+    table: EdgeTable
+    rows: Index
+    source: str
+    measured: Array
+    seconds: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """Edges of sightings in one table, of one input.
+
+    Attributes
+    ----------
+    seen : (n, p) what was measured, from the base at the stamp instead of from the keyframe
+    roots : (n, m, m) square roots of its information, in the axes of the base there
+    stamps_ns : (n,); T_keyframe_base : (n, size) there; sensor : (n, dimensions) position on the base
+    """
+
+    table: EdgeTable
+    rows: Index
+    source: str
+    seen: Array
+    roots: Array
+    stamps_ns: Index
+    T_keyframe_base: Array
+    sensor: Array
+
+    @property
+    def kind(self) -> str:
+        """The name of the edge type, without the number of dimensions."""
+        return self.table.type.name.removesuffix(" 3D")
+
+
+class MeasurementModel:
+    """The measurements of a graph as functions of corrections, by parameter; one that is missing is 0.
+
+    Parameters
+    ----------
+    origins : of the sightings
+    stamp_of : (vertices,) nanoseconds of each pose
+    edges : whose measurements may be corrected
+    """
+
+    def __init__(self, space: Geometry, graph: Graph, origins: SightingEdges, stamp_of: Index, edges: range) -> None:
+        self._space = space
+        self.odometry: list[OdometryEdges] = []
+        self.sightings: list[Sightings] = []
+        for table in graph.tables.values():
+            for label, source, rows in _rows(graph, table, edges):
+                ends = table.vertices.values[rows]
+                if label == "odometry":
+                    seconds = (stamp_of[ends[:, 1]] - stamp_of[ends[:, 0]]) * 1e-9
+                    measured = table.measured.values[rows].copy()
+                    self.odometry.append(OdometryEdges(table, rows, source, measured, seconds))
+                else:
+                    self.sightings.append(self._sightings(table, rows, source, origins, stamp_of[ends[:, 0]]))
+
+    def _sightings(
+        self, table: EdgeTable, rows: Index, source: str, origins: SightingEdges, stamps_ns: Index
+    ) -> Sightings:
+        """Sightings whose origin is unknown, of an older map, are taken for those of their keyframe."""
+        z, places, n = table.measured.values[rows].copy(), origins.places(table.id.values[rows]), self._space.dimensions
+        known, roots = places >= 0, table.sqrt_information.values[rows].copy()
+        poses = np.tile(np.array(self._space.identity), (len(rows), 1))
+        sensor, stamps = np.zeros((len(rows), n)), stamps_ns.copy()
+        stamps[known], poses[known] = origins.stamp_ns[places[known]], origins.T_keyframe_base[places[known]]
+        sensor[known] = origins.sensor[places[known]]
+        found = Sightings(table, rows, source, z, roots, stamps, poses, sensor)
+        found.seen[:] = self.from_pose(found, z, self._space.group.inverse(tuple(poses.T)))
+        if found.kind in _POINTS:
+            roots[:] = roots @ self._turns(tuple(poses.T))
+        if found.kind not in (*_POINTS, "relative pose"):
+            tail = z.shape[1] - self._space.pose.size
+            found.sensor[:] = found.seen[:, tail : tail + n]
+        return found
+
+    def corrected_odometry(self, edges: OdometryEdges, values: Values) -> Array:
+        """Measurements (n, size) of odometry with other factors."""
+        out = self.scaled(tuple(edges.measured.T), values)
+        bias = _of(values, edges.source, ("turn_bias",)).get("turn_bias", 0.0)
+        if bias:
+            group = self._space.group
+            tangent = list(group.log(out))
+            tangent[-1] = tangent[-1] + bias * edges.seconds
+            out = group.exp(tuple(tangent))
+        return np.stack(out, axis=-1)
+
+    def scaled(self, pose: Numbers, values: Values) -> Numbers:
+        """A motion by odometry with other factors."""
+        named, n = _of(values, None, OF_ODOMETRY), self._space.dimensions
+        factors = [1.0 + named.get("distance", 0.0)] * n
+        factors += [1.0 + named.get("turn", 0.0)] * (self._space.dof - n)
+        group = self._space.group
+        out: Numbers = group.exp(tuple(f * x for f, x in zip(factors, group.log(pose), strict=True)))
+        return out
+
+    def base(self, edges: Sightings, values: Values, path: EstimatedPath) -> Array:
+        """Poses (n, size) of the base from the keyframes, at the corrected stamps."""
+        group, clock = self._space.group, clock_of(values, edges.source)
+        out = self.scaled(tuple(edges.T_keyframe_base.T), values)
+        if clock:
+            known = path.knows(edges.stamps_ns, abs(clock))
+            moved = np.stack(group.compose(out, path.motion(edges.stamps_ns, clock)), axis=-1)
+            return np.where(known[:, None], moved, np.stack(out, axis=-1))
+        return np.stack(out, axis=-1)
+
+    def seen(self, edges: Sightings, values: Values) -> Array:
+        """Measurements (n, p) from the base at the stamp, by a sensor that is elsewhere."""
+        named, z, n = _of(values, edges.source), edges.seen.copy(), self._space.dimensions
+        turn, shift = self._mount(named)
+        sensor = tuple(edges.sensor.T)
+        if edges.kind in _POINTS:
+            around = tuple(z[:, k] - sensor[k] for k in range(n))
+            turned = self._space.group.act(turn, around)
+            z[:, :n] = np.stack([turned[k] + sensor[k] + shift[k] for k in range(n)], axis=-1)
+            return z
+        tail = z.shape[1] - self._space.pose.size
+        pose = z[:, tail:].T
+        around = (*(pose[k] - sensor[k] for k in range(n)), *pose[n:])
+        turned = self._space.group.compose(turn, around)
+        z[:, tail:] = np.stack((*(turned[k] + sensor[k] + shift[k] for k in range(n)), *turned[n:]), axis=-1)
+        if edges.kind.startswith("range"):
+            z[:, 0] = (1.0 + named.get("range_factor", 0.0)) * z[:, 0] + named.get("range_offset", 0.0)
+        return z
+
+    def roots(self, edges: Sightings, values: Values, T_a_b: Numbers | None = None) -> Array:
+        """Square roots (n, m, m) of their information by a sensor that is turned, in the axes of the base or of a."""
+        if edges.kind not in _POINTS:
+            return edges.roots
+        turn, _ = self._mount(_of(values, edges.source))
+        out = edges.roots @ self._turns(tuple(np.atleast_1d(x) for x in turn)).swapaxes(1, 2)
+        return out if T_a_b is None else out @ self._turns(T_a_b).swapaxes(1, 2)
+
+    def _turns(self, poses: Any) -> Array:
+        """Rotation matrices (n, d, d) of poses that are arrays."""
+        n = self._space.dimensions
+        rotation = (*(0.0 * x for x in poses[:n]), *poses[n:])
+        columns = [np.stack(self._space.group.act(rotation, tuple(axis)), axis=-1) for axis in np.eye(n)]
+        return np.stack(columns, axis=-1)
+
+    def _mount(self, named: Mapping[str, float]) -> tuple[Numbers, Array]:
+        """The rotation of a sensor, as a pose, and its shift."""
+        shift = np.array([named.get(axis, 0.0) for axis in "xyz"])
+        if self._space.dimensions == 2:
+            return (0.0, 0.0, named.get("yaw", 0.0)), shift
+        turned = so3.exp((named.get("roll", 0.0), named.get("pitch", 0.0), named.get("yaw", 0.0)))
+        return (0.0, 0.0, 0.0, *turned), shift
+
+    def from_pose(self, edges: Sightings, z: Array, T_a_b: Numbers) -> Array:
+        """Measurements (n, p) that were seen from b as they are from a; the poses are arrays."""
+        out, n, group = z.copy(), self._space.dimensions, self._space.group
+        if edges.kind in _POINTS:
+            out[:, :n] = np.stack(group.act(T_a_b, tuple(z[:, :n].T)), axis=-1)
+        else:
+            tail = z.shape[1] - self._space.pose.size
+            out[:, tail:] = np.stack(group.compose(T_a_b, tuple(z[:, tail:].T)), axis=-1)
+        return out
+
+
+def clock_of(values: Values, source: str) -> float:
+    """The correction of an input's clock [s]."""
+    return _of(values, source).get("clock", 0.0)
+
+
+def _of(values: Values, source: str | None, names: tuple[str, ...] = ()) -> dict[str, float]:
+    """Corrections of an input, or of some names whatever the input, by name."""
+    chosen = (p for p in values if (source is None or p.source == source) and (not names or p.name in names))
+    return {p.name: values[p] for p in chosen}
+
+
+def _rows(graph: Graph, table: EdgeTable, edges: range) -> "list[tuple[str, str, Index]]":
+    """Class, input and rows of the edges of a table that parameters may concern."""
+    ids, out = table.id.values, []
+    here = (ids >= edges.start) & (ids < edges.stop)
+    for label in {"odometry", "landmarks"} & set(graph.labels):
+        of_label = here & (table.label.values == graph.labels.index(label))
+        for origin in np.unique(table.source.values[of_label]).tolist():
+            out.append((label, graph.sources[origin], np.flatnonzero(of_label & (table.source.values == origin))))
+    return sorted(out, key=lambda one: one[:2])

@@ -1,0 +1,101 @@
+"""The trial fit: derivatives against differences, and what was wrong is found with an honest sigma."""
+
+import numpy as np
+import pytest
+from imperfect import Faults, driven, imperfect_drive
+
+from graph_slam_ros.graph import LANDMARK_POSITION
+from graph_slam_ros.slam.calibration.choice import parameters_of
+from graph_slam_ros.slam.calibration.fit import fit
+from graph_slam_ros.slam.calibration.parameters import GROUPS, Parameter
+from graph_slam_ros.slam.calibration.rows import Linearization
+
+FAULTS = Faults(distance=0.95, turn=1.05, clock_s=0.12, yaw=0.08)
+TRUTH = {"distance": -0.05, "turn": 0.05, "clock": 0.12, "yaw": 0.08}
+
+
+def trial_problem(slam):
+    return slam.backend.trial_problem(slam.space, slam._frontend.path, slam._landmarks.map.origins)
+
+
+@pytest.fixture(scope="module", params=["range_bearing", "position"])
+def wrong(request):
+    return driven(imperfect_drive(FAULTS, kind=request.param, seconds=60.0))
+
+
+def test_columns_of_the_parameters_are_the_derivatives_of_the_residuals(wrong):
+    problem = trial_problem(wrong)
+    groups = [one for one in GROUPS if one != "clock"]
+    if LANDMARK_POSITION in wrong.graph.tables:
+        groups.remove("yaw")  # it turns the noise of positions, too: weights, which have no derivative here
+    parameters = tuple(parameters_of(problem, groups))
+    linear = Linearization(problem, parameters, problem.vertices)
+    theta = np.full(len(parameters), 0.02)
+    rows = linear.rows(problem.values, theta, {})
+    for k, parameter in enumerate(parameters):
+        sides = []
+        for side in (1e-3, -1e-3):
+            there = theta.copy()
+            there[k] += side
+            sides.append(linear.rows(problem.values, there, {}).residual)
+        difference = (sides[0] - sides[1]) / 2e-3
+        scale = np.abs(difference).max()
+        assert scale > 0.0, parameter
+        np.testing.assert_allclose(rows.columns[:, k], difference, atol=3e-3 * scale, err_msg=str(parameter))
+
+
+def test_unknowns_between_two_keyframes_have_their_derivatives(wrong):
+    """Sightings late by more than the time between keyframes are seen from between others than their own."""
+    problem = trial_problem(wrong)
+    parameters = (Parameter("detections", "clock"),)
+    linear = Linearization(problem, parameters, problem.vertices)
+    theta = np.array([0.3])
+    x = problem.values
+    jacobian = linear.rows(x, theta, {}).jacobian.toarray()
+    graph, keyframe = problem.graph, int(problem.keyframes[40])
+    at = int(graph.offset.values[keyframe])
+    for d in range(3):
+        sides = []
+        for side in (1e-5, -1e-5):
+            moved = x.copy()
+            step = np.zeros((1, 3))
+            step[0, d] = side
+            moved[at : at + 3] = problem.space.pose.retract(x[at : at + 3][None], step)[0]
+            sides.append(linear.rows(moved, theta, {}).residual)
+        difference = (sides[0] - sides[1]) / 2e-5
+        column = jacobian[:, linear.column[keyframe] + d]
+        assert np.count_nonzero(np.abs(column) > 1e-3) > 6
+        np.testing.assert_allclose(column, difference, atol=0.03 * np.abs(difference).max())
+
+
+def test_a_fit_finds_what_was_wrong(wrong):
+    found, findings = wrong.trial_fit()
+    by_name = {one.parameter.name: one for one in findings}
+    for name, truth in TRUTH.items():
+        one = by_name[name]
+        assert one.verdict == "admitted", one.text
+        assert abs(one.value - truth) < 5.0 * one.sigma + 0.003, one.text
+        assert one.sigma < one.parameter.quantity.determined_below / 3.0
+    assert np.abs(found.correlation - np.eye(4)).max() < 0.95
+
+
+def test_where_nothing_is_wrong_nothing_is_found():
+    _, findings = driven(imperfect_drive(Faults(), seconds=60.0)).trial_fit()
+    assert {one.parameter.name: one.verdict for one in findings} == dict.fromkeys(TRUTH, "nothing_to_correct")
+
+
+def test_the_fit_changes_nothing(wrong):
+    before, measured = wrong.solver.values, [t.measured.values.copy() for t in wrong.graph.tables.values()]
+    wrong.trial_fit(GROUPS)
+    assert (wrong.solver.values == before).all()
+    for table, old in zip(wrong.graph.tables.values(), measured, strict=True):
+        assert (table.measured.values == old).all()
+
+
+def test_range_factor_and_offset_are_found_where_distance_is_held():
+    slam = driven(imperfect_drive(Faults(range_factor=0.93, range_offset=0.2), seconds=60.0))
+    problem = trial_problem(slam)
+    wanted = parameters_of(problem, ["range_factor", "range_offset"])
+    found = fit(problem, {one: one.quantity.prior for one in wanted})
+    for parameter, truth in zip(wanted, (0.2, -0.07), strict=True):
+        assert abs(found.value(parameter) - truth) < 5.0 * found.sigmas[wanted.index(parameter)] + 0.005, parameter
