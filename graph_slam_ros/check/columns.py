@@ -163,12 +163,14 @@ class _Sightings:
         self.names: dict[str, int] = {}
         self._messages = 0
 
-    def add(self, m: Sightings) -> None:
+    def add(self, m: Sightings, heights: Mapping[str, float]) -> None:
         if len(self.stamp_ns) >= MOST:
             return
         self._messages += 1
         for one in m.sightings:
             point, sigma = located(one)
+            if one.id in heights:
+                point = point[0], point[1], heights[one.id]
             self.stamp_ns.append(m.stamp_ns)
             self.message.append(self._messages)
             self.name.append(self.names.setdefault(one.id, len(self.names)))
@@ -247,6 +249,7 @@ class Collector:
     def add(self, topic: str, names: Iterable[str], log_ns: int, measured: Iterable[Measured | Control]) -> None:
         """Collect a message: the one that was decoded last, of these inputs, and what became of it."""
         message, self._last = self._last, None
+        heights: dict[str, float] = {}
         if message is not None:
             self._add_message(topic, names, log_ns, message)
         for m in measured:
@@ -255,7 +258,9 @@ class Collector:
                     self._path_ns.append(m.stamp_ns)
                     self._path.extend(m.T_odom_base)
             elif isinstance(m, Sightings) and m.topic in self._sightings:
-                self._sightings[m.topic].add(m)
+                if message is not None and self._config.world.dimensions == 2:
+                    heights = heights or _heights(message, self._sightings[m.topic].T_base_frame)
+                self._sightings[m.topic].add(m, heights)
 
     def _add_message(self, topic: str, names: Iterable[str], log_ns: int, message: Any) -> None:
         if topic in self._topics:
@@ -338,6 +343,16 @@ class Collector:
         frames, poses = self._config.frames, self._poses(self._path)
         unknown = np.full((len(poses), 6), np.nan)
         return OdometryColumns(*names, frames.odom, frames.base, _index(self._path_ns), poses, unknown, unknown)
+
+
+def _heights(message: Any, T_base_frame: se3.Pose) -> dict[str, float]:
+    """The heights of detections above the base, by id, which the plane does not have."""
+    out = {}
+    for one in getattr(message, "detections", ()):
+        if getattr(one, "results", ()) and hasattr(one.results[0], "pose"):
+            p = one.results[0].pose.pose.position
+            out[one.id] = float(se3.act(T_base_frame, (p.x, p.y, p.z))[2])
+    return out
 
 
 def _frame(message: Any) -> str:

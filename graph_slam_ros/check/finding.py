@@ -74,7 +74,7 @@ KINDS: dict[str, Kind] = {
         "a frame has two parents, so transforms through it are arbitrary", "one publisher of each frame"
     ),
     "static_changes": Kind("a static transform is published twice and differs", "one publisher of each frame"),
-    "fixed_frame": Kind(
+    "seen_in_fixed_frame": Kind(
         "sightings are given in a frame that does not move with the robot", "publish them in the sensor's frame"
     ),
     "tf_differs": Kind(

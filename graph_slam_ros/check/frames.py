@@ -64,7 +64,7 @@ def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
         is_linked = any(link.child == c.odometry.child and link.parent == fixed[0].lstrip("/") for link in c.links)
         text = f"{s.topic} is given in {fixed[0]}, a frame that does not move with the robot"
         severity: Severity = "note" if is_linked else "error"
-        yield Finding("fixed_frame", severity, topic.frames[fixed[0]], 0, "messages", text, **where)
+        yield Finding("seen_in_fixed_frame", severity, topic.frames[fixed[0]], 0, "messages", text, **where)
     elif key in c.assumed:
         named = next(filter(None, topic.frames), "") or "its sensor"
         text = (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns, OdometryColumns
-from graph_slam_ros.check.finding import Finding, Where
+from graph_slam_ros.check.finding import Finding, Severity, Where
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.typing import Array, Index, Mask
 
@@ -217,7 +217,8 @@ def _covariance(o: OdometryColumns, steps: Steps, where: Where) -> Iterator[Find
     bad = ~np.isfinite(used).all(axis=1) | (used < 0.0).any(axis=1)
     if bad.any():
         text = f"{o.topic}: {int(bad.sum())} messages have a variance of the twist that is negative or no number"
-        yield Finding("covariance_negative", "warning", int(bad.sum()), 0, "messages", text, settings=_DENSITY, **where)
+        severity: Severity = "error" if bad.mean() > 0.5 else "warning"  # such messages are refused
+        yield Finding("covariance_negative", severity, int(bad.sum()), 0, "messages", text, settings=_DENSITY, **where)
         return
     if not used.any():
         text = f"{o.topic}: the twist has no covariance: the configured densities are used"

@@ -41,16 +41,19 @@ class Pairs:
     ----------
     a, b : (n,) numbers of the earlier and later sighting
     motion : (n, 7) of the base from the earlier to the later
+    dimensions : 2 where heights do not count
     """
 
     a: Index
     b: Index
     motion: Array
+    dimensions: int = 3
 
     def residuals(self, points: Array, motion: Array | None = None) -> Array:
         """(n,) How far apart both sightings put the landmark, given (k, 3) the points of all in the base frame."""
         by = self.motion if motion is None else motion
-        return np.linalg.norm(np.stack(se3.act(tuple(by.T), tuple(points[self.b].T)), axis=1) - points[self.a], axis=1)
+        apart = np.stack(se3.act(tuple(by.T), tuple(points[self.b].T)), axis=1) - points[self.a]
+        return np.linalg.norm(apart[:, : self.dimensions], axis=1)
 
     @property
     def turned(self) -> Array:
@@ -80,7 +83,7 @@ def usable(s: SightingColumns, path_ns: Index) -> Mask:
     return np.asarray(inside & is_named & (np.abs(s.points) < 1e9).all(axis=1))
 
 
-def pairs_of(s: SightingColumns, path_ns: Index, path: Array) -> Pairs:
+def pairs_of(s: SightingColumns, path_ns: Index, path: Array, dimensions: int) -> Pairs:
     """Pairs of sightings between which the robot moved, at most 6 s apart."""
     use = np.flatnonzero(usable(s, path_ns))
     order = use[np.argsort(s.stamp_ns[use], kind="stable")]
@@ -102,7 +105,7 @@ def pairs_of(s: SightingColumns, path_ns: Index, path: Array) -> Pairs:
     chosen = np.flatnonzero(moved)
     if len(chosen) > _MOST_PAIRS:
         chosen = chosen[np.linspace(0, len(chosen) - 1, _MOST_PAIRS).astype(np.int64)]
-    return Pairs(a[chosen], b[chosen], motion[chosen])
+    return Pairs(a[chosen], b[chosen], motion[chosen], dimensions)
 
 
 def check_pairs(c: Columns) -> Iterator[Finding]:
@@ -131,7 +134,7 @@ def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array)
         text = f"{s.topic}: landmarks are {far_m:.0f} m away in the median: millimetres for metres?"
         yield Finding("units", "error", far_m, _FAR_M, "m", text, **where)
         return
-    pairs = pairs_of(s, path_ns, path)
+    pairs = pairs_of(s, path_ns, path, c.config.world.dimensions)
     if len(pairs.a) < _LEAST_PAIRS:
         text = f"{s.topic}: only {len(pairs.a)} times is a landmark seen again within {_LATER_S:.0f} s of motion"
         yield Finding("no_parallax", "note", len(pairs.a), _LEAST_PAIRS, "pairs", text, **where)
@@ -167,7 +170,7 @@ def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float, wher
     at = pairs.turned > _TURNED_RAD
     if at.sum() < _LEAST_TURNED:
         return None
-    turning = Pairs(pairs.a[at], pairs.b[at], pairs.motion[at])
+    turning = Pairs(pairs.a[at], pairs.b[at], pairs.motion[at], pairs.dimensions)
     now_m = float(np.median(turning.residuals(s.points)))
     others = {what: float(np.median(turning.residuals(points))) for what, points in _hypotheses(s).items()}
     mirror_m = others.pop(MIRRORED)

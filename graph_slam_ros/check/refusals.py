@@ -17,6 +17,7 @@ _USUAL_SHARE = 0.05
 ELSEWHERE = {  # those that a check of its own explains better
     *("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown", "no_id", "id_merged"),
 }
+_OF_TWIST = ("covariance_not_positive_definite", "nonfinite_covariance")
 
 
 def check_refusals(c: Columns) -> Iterator[Finding]:
@@ -26,7 +27,8 @@ def check_refusals(c: Columns) -> Iterator[Finding]:
         topic = next((t for t in c.topics.values() if source in t.inputs), None)
         for reason, times in counts.items():
             row = explain(reason)
-            if row.effect is not Effect.REFUSED or reason in ELSEWHERE:
+            is_of_twist = source == c.odometry.input and reason in _OF_TWIST
+            if row.effect is not Effect.REFUSED or reason in ELSEWHERE or is_of_twist:
                 continue
             received = max(c.counters.received[source], items.get(source, 0) + times, times)
             share = times / received

@@ -8,7 +8,7 @@ from graph_slam_ros.check.columns import Columns, TopicColumns
 from graph_slam_ros.check.finding import Finding, Severity, Where, assignment
 from graph_slam_ros.typing import Array, Index
 
-_FEW = 3
+_FEW, _BACK_NS = 3, 1_000_000_000
 _CLOCKS_DIFFER_S, _EARLY_S, _DAY_S = 10.0, 0.15, 86400.0
 _WINDOWS, _APART, _LEAST_S, _LEAST_MESSAGES = 20, 5, 30.0, 200
 _DRIFT, _DRIFTED_S, _SCATTERS = 1e-4, 0.02, 4.0
@@ -46,7 +46,7 @@ def _lags(topic: TopicColumns) -> tuple[Array, Index, Index]:
 
 def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
     of_odometry = topics.get(c.odometry.topic)
-    if of_odometry is None:
+    if of_odometry is None or any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -_BACK_NS).any() for t in topics.values()):
         return
     typical_s = float(np.median(_lags(of_odometry)[0]))
     for topic in topics.values():

@@ -155,8 +155,12 @@ def convert(sub: CommandParser) -> None:
 
 def simulate(sub: CommandParser) -> None:
     """Add the options of ``simulate``."""
-    sub.more = _world_options
-    sub.add_argument("scenario", metavar="SCENARIO", help="name of a world, city (a graph), or the file of a graph")
+    from graph_slam_ros.cli.simulate import options_of_worlds
+
+    sub.more = options_of_worlds
+    sub.add_argument(
+        "scenario", metavar="SCENARIO", help="name of a world, city (a graph), or the file of a graph or recording"
+    )
     sub.add_argument(
         "--out",
         type=Path,
@@ -185,31 +189,6 @@ def simulate(sub: CommandParser) -> None:
         metavar="KIND[:KEY=VALUE,...]",
         help="fault to add, listed below; several are added in order",
     )
-
-
-def _world_options() -> str:
-    """Every option of the worlds and every kind of fault, with defaults."""
-    from graph_slam_ros.simulation import WORLDS, Instruments
-    from graph_slam_ros.simulation.faults import KINDS
-    from graph_slam_ros.simulation.options import options_of
-
-    def option_lines(cls: type) -> list[str]:
-        lines = []
-        for o in options_of(cls):
-            choices = f": {', '.join(o.choices)}" if o.choices else ""
-            default = str(o.default).lower() if isinstance(o.default, bool) else o.default
-            lines.append(f"    {o.name}={default}{f' [{o.unit}]' if o.unit else ''}  {o.meaning}{choices}")
-        return lines
-
-    lines = ["options of the worlds, for --set:"]
-    for name, world in WORLDS.items():
-        lines += [f"  {name}: {world.about}", *option_lines(world.options)]
-    lines += ["  every world: with a satellite receiver and an IMU", *option_lines(Instruments)]
-    lines += ["", "faults for --fault with their options; OUT.faults.csv lists what is wrong:"]
-    for name, kind in KINDS.items():
-        lines += [f"  {name}: {kind.about}", *option_lines(kind.options)]
-    lines += ["", "example: graph_slam simulate warehouse --out world.mcap --set gnss=5 --set imu=100"]
-    return "\n".join(lines)
 
 
 def evaluate(sub: CommandParser) -> None:

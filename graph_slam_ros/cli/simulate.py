@@ -23,6 +23,10 @@ def simulate(args: argparse.Namespace) -> int:
 
     faults = [Fault.parsed(text) for text in args.fault]
     as_graph = ending(args.out) == ".g2o"
+    if as_graph and (wrong := [fault.kind for fault in faults if fault.is_of_messages]):
+        raise GraphSlamError(f"{wrong[0]}: a graph has no messages: --out FILE.mcap")
+    if args.scenario not in (*WORLDS, CITY) and _is_recording(Path(args.scenario)) and not as_graph:
+        return _spoil_recording(args, faults)
     of_file = args.scenario not in (*WORLDS, CITY) and Path(args.scenario).is_file()
     if (of_file or args.scenario == CITY) and not as_graph:
         raise GraphSlamError(f"{args.out}: {args.scenario} is a graph: --out FILE.g2o")
@@ -47,10 +51,41 @@ def _write_bag(args: argparse.Namespace, faults: "list[Fault]") -> None:
 
     recording, wrong = faulty_recording(_recorded(args), faults, args.seed)
     write_bag(recording, args.out)
+    if any(fault.is_of_messages for fault in faults):
+        _spoil_messages(args.out, args.out, faults, args.seed)
     console.show(f"wrote {args.out}")
     if faults:
         write_table(_companion(args.out, ".faults.csv"), WrongMessage, wrong)
         console.show(f"wrote {_companion(args.out, '.faults.csv')}: {len(wrong)} measurements are wrong")
+
+
+def _is_recording(path: Path) -> bool:
+    return path.is_dir() or (path.is_file() and path.suffix in (".mcap", ".db3", ".bag"))
+
+
+def _spoil_recording(args: argparse.Namespace, faults: "list[Fault]") -> int:
+    """A recording of the user's, with faults in its messages."""
+    for what, given in (("--set", args.set), ("--closures", args.closures), ("--poses", args.poses)):
+        if given:
+            raise GraphSlamError(f"{args.scenario}: no use for {what}: it is no world")
+    for fault in faults:
+        if not fault.is_of_messages:
+            raise GraphSlamError(f"{fault.kind}: needs the truth of a world, which {args.scenario} is not")
+    if not faults:
+        raise GraphSlamError(f"{args.scenario}: no --fault, so nothing to do")
+    console.check_file(args.out, force=args.force, source=Path(args.scenario))
+    _spoil_messages(Path(args.scenario), args.out, faults, args.seed)
+    console.show(f"wrote {args.out}")
+    console.then(console.command("check", args.out))
+    return console.DONE
+
+
+def _spoil_messages(source: Path, out: Path, faults: "list[Fault]", seed: int) -> None:
+    from graph_slam_ros.simulation import Drive, spoil_messages
+
+    drive = Drive(source)
+    spoil_messages(drive, faults, seed)
+    drive.write(out)
 
 
 def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
@@ -132,3 +167,32 @@ def _companion(out: Path, ending: str) -> Path:
     """``world.mcap`` and ``world.g2o.gz`` have a ``world.faults.csv``."""
     whole = out.with_suffix("") if out.suffix.lower() == ".gz" else out
     return whole.with_suffix(ending)
+
+
+def options_of_worlds() -> str:
+    """Every option of the worlds and every kind of fault, with defaults."""
+    from graph_slam_ros.simulation import WORLDS, Instruments
+    from graph_slam_ros.simulation.faults import KINDS
+    from graph_slam_ros.simulation.message_faults import MESSAGE_KINDS
+    from graph_slam_ros.simulation.options import options_of
+
+    def option_lines(cls: type) -> list[str]:
+        lines = []
+        for o in options_of(cls):
+            choices = f": {', '.join(o.choices)}" if o.choices else ""
+            default = str(o.default).lower() if isinstance(o.default, bool) else o.default
+            lines.append(f"    {o.name}={default}{f' [{o.unit}]' if o.unit else ''}  {o.meaning}{choices}")
+        return lines
+
+    lines = ["options of the worlds, for --set:"]
+    for name, world in WORLDS.items():
+        lines += [f"  {name}: {world.about}", *option_lines(world.options)]
+    lines += ["  every world: with a satellite receiver and an IMU", *option_lines(Instruments)]
+    lines += ["", "faults for --fault with their options; OUT.faults.csv lists what is wrong:"]
+    for name, kind in KINDS.items():
+        lines += [f"  {name}: {kind.about}", *option_lines(kind.options)]
+    lines += ["", "faults of drivers, clocks and frames, in a world or in a recording of yours:"]
+    for name, of_messages in MESSAGE_KINDS.items():
+        lines += [f"  {name}: {of_messages.about}", *option_lines(of_messages.options)]
+    lines += ["", "example: graph_slam simulate warehouse --out world.mcap --set gnss=5 --set imu=100"]
+    return "\n".join(lines)

@@ -12,7 +12,8 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.simulation import flight, manhattan, pythonrobotics, warehouse
 from graph_slam_ros.simulation.bag import write_bag
 from graph_slam_ros.simulation.draft import WrongLine, WrongMessage, write_table
-from graph_slam_ros.simulation.faults import KINDS, Fault
+from graph_slam_ros.simulation.drive import Drive
+from graph_slam_ros.simulation.faults import KINDS, Fault, spoil_messages
 from graph_slam_ros.simulation.faulty import faulty_graph, faulty_recording
 from graph_slam_ros.simulation.instruments import Instruments, with_instruments
 from graph_slam_ros.simulation.options import Option, fill, options_of
@@ -64,6 +65,7 @@ __all__ = [
     "KINDS",
     "WORLDS",
     "CityGraph",
+    "Drive",
     "Fault",
     "Instruments",
     "Option",
@@ -78,6 +80,7 @@ __all__ = [
     "measurements",
     "options_of",
     "simulate",
+    "spoil_messages",
     "with_closures",
     "write_bag",
     "write_graph",

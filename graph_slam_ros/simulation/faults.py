@@ -14,7 +14,9 @@ from numpy.random import PCG64, Generator, SeedSequence
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.simulation.draft import Draft
+from graph_slam_ros.simulation.drive import Drive
 from graph_slam_ros.simulation.false_closures import GROUP, POLICIES, Closures, count_for, false_closures
+from graph_slam_ros.simulation.message_faults import MESSAGE_KINDS
 from graph_slam_ros.simulation.options import fill, option
 from graph_slam_ros.typing import Array
 
@@ -289,9 +291,15 @@ class Fault:
         GraphSlamError
             Unknown kind or option (those that exist are named), wrong type, or a value out of bounds.
         """
-        if kind not in KINDS:
-            raise GraphSlamError(f"no fault {kind!r}; there are {', '.join(KINDS)}")
-        return cls(kind, fill(kind, KINDS[kind].options, options))
+        known: dict[str, Any] = {**KINDS, **MESSAGE_KINDS}
+        if kind not in known:
+            raise GraphSlamError(f"no fault {kind!r}; there are {', '.join(known)}")
+        return cls(kind, fill(kind, known[kind].options, options))
+
+    @property
+    def is_of_messages(self) -> bool:
+        """Return whether it is put into messages, and not into a world."""
+        return self.kind in MESSAGE_KINDS
 
     @classmethod
     def parsed(cls, text: str) -> "Fault":
@@ -307,7 +315,18 @@ class Fault:
 
 
 def put_faults(draft: Draft, faults: Sequence[Fault], seed: int) -> None:
-    """Put faults into a draft, one after the other."""
+    """Put faults into a draft, one after the other; those of messages are left to ``spoil_messages``."""
     for k, fault in enumerate(faults):
-        own = SeedSequence(seed, spawn_key=(_STREAMS, k))
-        KINDS[fault.kind].put(draft, fault.options, Generator(PCG64(own)))
+        if not fault.is_of_messages:
+            KINDS[fault.kind].put(draft, fault.options, _stream(seed, k))
+
+
+def spoil_messages(drive: Drive, faults: Sequence[Fault], seed: int) -> None:
+    """Put the faults of messages into a drive, one after the other."""
+    for k, fault in enumerate(faults):
+        if fault.is_of_messages:
+            MESSAGE_KINDS[fault.kind].put(drive, fault.options, _stream(seed, k))
+
+
+def _stream(seed: int, number: int) -> Generator:
+    return Generator(PCG64(SeedSequence(seed, spawn_key=(_STREAMS, number))))

@@ -1,0 +1,87 @@
+"""Faults that are planted into a recording are found under their names; ``planted_faults.py`` has all of them."""
+
+import pytest
+from planted_faults import FAULTS, planted
+from recordings import short_drive
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.formats.parameters import parse_setting
+from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.runs.check import check
+from graph_slam_ros.simulation import Drive, Fault, simulate, spoil_messages, write_bag
+from graph_slam_ros.simulation.message_faults import MESSAGE_KINDS
+
+SELECTED = (
+    "landmark clock +400 ms",
+    "landmarks by uptime",
+    "clock set back by 30 s",
+    "odometry out of order by 0.2 s",
+    "turn rate mirrored",
+    "twist in degrees",
+    "odometry in millimetres",
+    "optical frame called base_link",
+    "mount turned 180 degrees",
+    "sensor frame without TF",
+    "sensor frame with two parents",
+    "twist sigma 1e-6",
+    "identities of tracks",
+    "odometry stands",
+    "NaN in odometry",
+)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    file = tmp_path_factory.mktemp("planted") / "drive.mcap"
+    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=4.0, laps=1), file)
+    return file
+
+
+def test_a_drive_without_a_fault_has_no_finding(drive):
+    assert check(drive, quick=True).findings == []
+
+
+@pytest.mark.parametrize("name", SELECTED)
+def test_a_planted_fault_is_found_and_its_settings_mend_it(drive, tmp_path, name):
+    codes = FAULTS[name][1].split()
+    bag = planted(drive, tmp_path / "faulty.mcap", name)
+    found = [one for one in check(bag, quick=True).findings if one.code in codes]
+    assert found
+    for one in found:
+        if one.settings:
+            mended = check(bag, dict(parse_setting(text) for text in one.settings), quick=True).findings
+            assert one.code not in {other.code for other in mended}
+
+
+def test_faults_can_be_put_into_a_recording_of_a_user_but_not_those_that_need_the_truth(drive, tmp_path, capsys):
+    out = tmp_path / "bad.mcap"
+    assert main(["simulate", str(drive), "--out", str(out), "--fault", "wrong_units:factor=1000.0"]) == 0
+    assert main(["check", str(out), "--quick"]) == 4
+    assert "[error] units" in capsys.readouterr().out
+    for words, why in (
+        (["--fault", "slip"], "needs the truth of a world"),
+        ([], "no --fault"),
+        (["--fault", "gap", "--poses", "5"], "no use for --poses"),
+    ):
+        assert main(["simulate", str(drive), "--out", str(tmp_path / "b.mcap"), *words]) == 2
+        assert why in capsys.readouterr().err
+    assert main(["simulate", str(drive), "--out", str(drive), "--fault", "gap", "--force"]) == 2
+    assert main(["simulate", "city", "--out", str(tmp_path / "c.g2o"), "--fault", "gap"]) == 2
+    assert "a graph has no messages" in capsys.readouterr().err
+
+
+def contents(file):
+    bag = open_bag(file)
+    found = [(m.topic, m.cdr) for m in bag.messages(set(bag.topics))]
+    assert bag.losses == []
+    return found
+
+
+def test_every_kind_changes_a_recording_and_leaves_it_readable(tmp_path):
+    drive, out = short_drive(tmp_path / "drive.mcap"), tmp_path / "out.mcap"
+    before = contents(drive)
+    for kind in MESSAGE_KINDS:
+        changed = Drive(drive)
+        spoil_messages(changed, [Fault.named(kind)], seed=1)
+        changed.write(out)
+        assert (contents(out) != before) == (kind != "wrong_twist")  # whose defaults change nothing

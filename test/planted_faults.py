@@ -1,0 +1,233 @@
+"""Faults planted into recordings, and how many of them ``graph_slam check`` finds under their names.
+
+``PYTHONPATH=test python test/planted_faults.py [--quick] [--seconds N] BAG ...`` prints a table for each recording;
+without a recording, of two simulated ones. A recording needs /ground_truth, by which landmarks are moved.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.lie import se3
+from graph_slam_ros.messages.from_msg import decoder
+from graph_slam_ros.runs.check import check
+from graph_slam_ros.simulation import Drive, Fault, simulate, spoil_messages, write_bag
+from graph_slam_ros.simulation.drive import Sightings
+from graph_slam_ros.simulation.odometry_faults import _moved
+
+TRUTH = "/ground_truth"
+
+
+class Places:
+    """Where landmarks are, and how the robot points, by the truth of a recording."""
+
+    def __init__(self, drive):
+        decode = decoder("geometry_msgs/msg/PoseStamped")
+        truth = [decode(m.content) for m in drive.messages if m.topic == TRUTH]
+        self.stamps = np.array([m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in truth])
+        at = np.array([(p.position.x, p.position.y, p.orientation.z, p.orientation.w) for p in (m.pose for m in truth)])
+        self.x, self.y = at[:, 0], at[:, 1]
+        self.heading = np.unwrap(2.0 * np.arctan2(at[:, 2], at[:, 3]))
+        found = {}
+        middle = np.median([m.stamp_ns for m in drive.landmarks])
+        for m in drive.landmarks:
+            seen, (x, y, heading) = Sightings(m), self.pose(m.stamp_ns)
+            c, s = np.cos(heading), np.sin(heading)
+            for name, p in zip(seen.ids, seen.points, strict=True):
+                if name:
+                    at = x + c * p[0] - s * p[1], y + s * p[0] + c * p[1]
+                    found.setdefault(name, []).append((m.stamp_ns > middle, *at))
+        self.middle = middle
+        self.at = {name: np.median([one[1:] for one in rows], axis=0) for name, rows in found.items()}
+        self.times = {name: len(rows) for name, rows in found.items()}
+        self.on_both = {n: min(sum(r[0] for r in rows), sum(not r[0] for r in rows)) for n, rows in found.items()}
+
+    def pose(self, stamp_ns):
+        return (np.interp(stamp_ns, self.stamps, row) for row in (self.x, self.y, self.heading))
+
+    def two(self, times):
+        """The landmark that is seen most often, and the next that is far from it."""
+        order = sorted(times, key=lambda name: -times[name])
+        first = order[0]
+        far = [n for n in order[1:] if np.linalg.norm(self.at[n] - self.at[first]) > 1.5]
+        if not far or times[far[0]] < 12:
+            raise GraphSlamError("no two landmarks are seen often enough")
+        return first, far[0]
+
+
+def reused(drive):
+    first, second = (places := Places(drive)).two(places.times)
+    for m in drive.landmarks:
+        seen = Sightings(m)
+        if not {first, second} <= set(seen.ids):  # both at once would be a conflict, which is refused
+            seen.ids = [first if name == second else name for name in seen.ids]
+            seen.store()
+
+
+def exchanged(drive):
+    first, second = (places := Places(drive)).two(places.on_both)
+    other = {first: second, second: first}
+    for m in drive.landmarks:
+        if m.stamp_ns > places.middle:
+            seen = Sightings(m)
+            seen.ids = [other.get(name, name) for name in seen.ids]
+            seen.store()
+
+
+def displaced(drive):
+    first, _ = (places := Places(drive)).two(places.on_both)
+    for m in drive.landmarks:
+        seen = Sightings(m)
+        if m.stamp_ns > places.middle and first in seen.ids:
+            *_, heading = places.pose(m.stamp_ns)
+            c, s = np.cos(heading), np.sin(heading)
+            k = seen.ids.index(first)
+            seen.points[k, :2] += np.array([[c, s], [-s, c]]) @ [1.6, 1.2]
+            seen.store()
+
+
+def jumped(drive):
+    poses = drive.poses
+    at = len(poses) // 2
+    drive.poses = _moved(poses, at, se3.compose(tuple(poses[at].tolist()), (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)))
+
+
+def of(*texts):
+    faults = [Fault.parsed(text) for text in texts]
+    return lambda drive: spoil_messages(drive, faults, 1)
+
+
+FAULTS = {
+    "landmark clock +100 ms": (of("clock_offset:seconds=0.1"), "clock_offset"),
+    "landmark clock -100 ms": (of("clock_offset:seconds=-0.1"), "clock_offset"),
+    "landmark clock +400 ms": (of("clock_offset:seconds=0.4"), "clock_offset latency"),
+    "landmark clock drifts 500 ppm": (of("clock_drift:ppm=500"), "clock_drift"),
+    "landmarks by uptime": (of("uptime"), "clock_domains no_overlap"),
+    "zero stamps": (of("zero_stamps"), "zero_stamp"),
+    "odometry recorded twice": (of("recorded_twice"), "duplicates"),
+    "odometry out of order by 0.2 s": (of("out_of_order"), "out_of_order"),
+    "clock set back by 30 s": (of("clock_set_back"), "time_jump"),
+    "5 s of odometry lost": (of("gap"), "gap"),
+    "odometry at 2 Hz": (of("slow_odometry"), "slow_odometry"),
+    "stamped on arrival, 60 ms": (of("jitter"), "jitter"),
+    "odometry scaled 1.05": (of("wrong_scale:distance=1.05"), "odometry_scale"),
+    "odometry scaled 0.9": (of("wrong_scale:distance=0.9"), "odometry_scale"),
+    "track width 8 % wrong": (of("wrong_scale:distance=1.0,turn=1.08"), "turn_scale"),
+    "turn rate mirrored": (of("wrong_scale:distance=1.0,turn=-1.0"), "mirrored"),
+    "twist mirrored, pose right": (of("wrong_twist:angular=-1.0"), "twist_scale"),
+    "twist in degrees": (of("wrong_twist:angular=57.29578"), "twist_scale"),
+    "odometry in millimetres": (of("wrong_scale:distance=1000.0"), "units"),
+    "twist in the odom frame": (of("wrong_twist:axes=odom"), "twist_frame"),
+    "mount turned 5 degrees": (of("wrong_mount:yaw_deg=5.0"), "mount_yaw"),
+    "mount turned -10 degrees": (of("wrong_mount:yaw_deg=-10.0"), "mount_yaw"),
+    "mount turned 180 degrees": (of("wrong_axes:how=backwards"), "axes"),
+    "bearings mirrored": (of("wrong_axes:how=mirrored"), "mirrored"),
+    "x and y exchanged": (of("wrong_axes:how=exchanged"), "axes mirrored"),
+    "optical frame called base_link": (of("wrong_axes:how=optical"), "axes"),
+    "landmarks in millimetres": (of("wrong_units"), "units"),
+    "sensor frame without TF": (of("wrong_frames"), "frame_unlinked"),
+    "sensor frame with two parents": (of("two_parents"), "two_parents"),
+    "sightings given in odom": (of("wrong_frames:landmarks=odom"), "seen_in_fixed_frame"),
+    "twist sigma 1e-6": (of("twist_variance:variance=1e-12"), "covariance_tiny"),
+    "twist variance 1000": (of("twist_variance:variance=1000.0"), "covariance_useless"),
+    "negative variance": (of("twist_variance:variance=-1.0"), "covariance_negative"),
+    "noise 8 times its covariance": (of("noisy"), "over_confident"),
+    "two landmarks share an identity": (reused, "id_reused"),
+    "two identities exchanged half-way": (exchanged, "ids_exchanged"),
+    "a landmark moved by 2 m": (displaced, "landmark_moved"),
+    "identities of tracks": (of("track_ids"), "seen_once"),
+    "identities at random": (of("random_ids"), "unrelated ids_unsure outliers"),
+    "30 % of ids wrong": (of("random_ids:rate=0.3"), "outliers ids_unsure"),
+    "odometry stands": (of("standing"), "static"),
+    "odometry jumps 1 m": (jumped, "odometry_jumps"),
+    "odometry restarted": (of("restarted"), "odometry_reset"),
+    "odometry corrected every 20 s": (of("corrected"), "corrected"),
+    "odometry in frame map": (of("wrong_frames:odometry=map,landmarks=kept"), "odometry_in_map"),
+    "all ids new each 15 s": (of("new_ids"), "no_closure"),
+    "nothing seen after a quarter": (of("blind"), "silent"),
+    "NaN in odometry": (of("not_a_number"), "nonfinite"),
+}
+"""By name: what is planted, and the codes of which one is to be found."""
+
+
+def planted(bag, target, name):
+    """A recording with a fault in it."""
+    drive = Drive(bag)
+    FAULTS[name][0](drive)
+    drive.write(target)
+    return target
+
+
+def cut(bag, target, seconds):
+    """The beginning of a recording."""
+    drive = Drive(bag)
+    end_ns = drive.messages[0].log_ns + round(seconds * 1e9)
+    drive.messages = [m for m in drive.messages if m.log_ns <= end_ns]
+    drive.write(target)
+    return target
+
+
+def table(bag, names, *, quick=False):
+    """Rows of what was found in a recording with each fault, and the number that was not."""
+    before = {one.code: one for one in check(bag, quick=quick).findings}
+    print(
+        f"## {bag.name}\n\nwithout a fault: {', '.join(f'{f.severity} {c}' for c, f in before.items()) or 'nothing'}\n"
+    )
+    print("| planted | found as | value | other errors and warnings | CPU [s] |\n|---|---|---|---|---|", flush=True)
+    missed = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            codes = FAULTS[name][1].split()
+            try:
+                file = planted(bag, Path(folder) / "faulty.mcap", name)
+            except GraphSlamError as error:
+                print(f"| {name} | not possible: {error} | | | |", flush=True)
+                continue
+            start_s = time.process_time()
+            found = check(file, quick=quick).findings
+            took_s = time.process_time() - start_s
+            hits = [one for one in found if one.code in codes]
+            others = {f.code for f in found if f.severity != "note"} - set(codes) - before.keys()
+            values = ", ".join(f"{one.value:.4g} {one.unit}" for one in hits)
+            if not hits:
+                missed.append(name)
+            named = ", ".join(one.code for one in hits) or "**missed**"
+            print(f"| {name} | {named} | {values} | {', '.join(sorted(others))} | {took_s:.1f} |", flush=True)
+    print(
+        f"\n{len(names) - len(missed)} of {len(names)} found{'; missed: ' if missed else ''}{', '.join(missed)}\n",
+        flush=True,
+    )
+    return missed
+
+
+def worlds(folder):
+    """Two simulated recordings: tags, and ranges with bearings."""
+    for name, world, options in (
+        ("tags", "warehouse", {"aisles": 2, "laps": 2}),
+        ("range_bearing", "warehouse", {"aisles": 3, "laps": 2, "sensor": "range_bearing"}),
+    ):
+        file = Path(folder) / f"{name}.mcap"
+        write_bag(simulate(world, 3, **options), file)
+        yield file
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("bags", nargs="*", type=Path, metavar="BAG")
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--seconds", type=float, default=300.0, metavar="N", help="of the beginning of each recording")
+    parser.add_argument("--only", action="append", metavar="NAME")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        bags = [cut(bag, Path(folder) / bag.name, args.seconds) for bag in args.bags] or list(worlds(folder))
+        missed = [table(bag, args.only or FAULTS, quick=args.quick) for bag in bags]
+    return 1 if any(missed) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
