@@ -151,10 +151,12 @@ class Additions:
 
     def _learn(self) -> None:
         of_key: dict[_Key, list[Entry]] = {}
+        space = self._space
+        types = {*space.sightings.values(), space.tag_position, space.range_with_offset}
         for entry in self._run.entries:
             is_known = entry.is_in and entry.landmark in self._run.landmarks
-            if is_known and self._run.keyframe(entry.vertices[0]) is not None:
-                key = entry.source, self._run.graph.edge(entry.edge).type
+            key = entry.source, self._run.graph.edge(entry.edge).type
+            if is_known and key[1] in types and self._run.keyframe(entry.vertices[0]) is not None:
                 of_key.setdefault(key, []).append(entry)
                 self._of_landmark.setdefault(entry.landmark, Counter())[key] += 1
                 self._seen.add((entry.vertices[0], entry.landmark))
@@ -296,4 +298,4 @@ def _columns(poses: Sequence[Numbers]) -> tuple[Array, ...]:
 
 
 def _place(position: Sequence[float]) -> str:
-    return "(" + ", ".join(f"{x:.1f}" for x in position) + ")"
+    return "(" + ", ".join(f"{round(x, 1) + 0.0:.1f}" for x in position) + ")"  # without -0.0

@@ -206,10 +206,14 @@ class Weakness:
             yield from sorted(long, key=lambda one: -one.sigma)[:_SHOWN]
 
     def longest_unseen(self) -> Stretch | None:
-        """The longest part of the path without an accepted sighting; None where the run has no landmark."""
+        """The longest part of the path without an accepted sighting; None where the run has no landmark.
+
+        The path of a frozen map does not count.
+        """
         if not any(self.seen):
             return None
-        unseen = [(max(a - 1, 0), min(b, len(self.seen) - 1)) for a, b in _runs(np.array([not s for s in self.seen]))]
+        is_unseen = np.array([not names for names in self.seen]) & ~np.isin(self.run.keyframes, self.run.held)
+        unseen = [(max(a - 1, 0), min(b, len(is_unseen) - 1)) for a, b in _runs(is_unseen)]
         longest = max(unseen, key=lambda one: self._length(*one), default=None)
         if longest is None or self._length(*longest) < _LEAST_M:
             return None

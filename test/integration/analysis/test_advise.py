@@ -12,7 +12,7 @@ from graph_slam_ros.analysis.advice import KINDS, Advisor
 from graph_slam_ros.analysis.weakness import Weakness
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.runs.recorder import RunRecorder
-from graph_slam_ros.runs.restore import freeze
+from graph_slam_ros.runs.restore import freeze, map_of
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 
 S = 1_000_000_000
@@ -60,11 +60,11 @@ def test_the_predicted_sigma_is_within_a_fifth_of_what_comes_out_in_95_of_100(tm
 # -- a corridor --------------------------------------------------------------------------------------------------------
 
 
-def corridor(folder, landmarks=True, length_m=60.0, settings=None):
+def corridor(folder, landmarks=True, length_m=60.0, start=None):
     """A robot drives east; landmarks stand at the beginning and at the end, none for 40 m between."""
-    config = Config.from_mapping(settings or {})
-    recorder = RunRecorder(folder, config)
-    slam = GraphSlam(config, sink=recorder.sink)
+    config = Config.from_mapping({"map.localize": start is not None})
+    recorder = RunRecorder(folder, config, start=start)
+    slam = GraphSlam(config, sink=recorder.sink, start=start)
     spots = {"start": (4.0, 2.0), "near": (8.0, -2.0), "late": (52.0, 2.0), "end": (58.0, -2.0)}
     for k in range(int(10 * length_m) + 1):
         x = 0.1 * k
@@ -179,6 +179,21 @@ def test_a_frozen_map_alone_is_refused_for_nothing_of_it_is_estimated(straight, 
     code, out, err = told("advise", tmp_path / "site")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "all keyframes are of a frozen map" in err
+
+
+def test_of_a_drive_in_a_frozen_map_the_drive_is_advised_on(straight, tmp_path, told):
+    freeze(straight, tmp_path / "site")
+    corridor(tmp_path / "run", start=map_of(tmp_path / "site", []))
+    run = SavedGraph(tmp_path / "run", [])
+    weakest = [*Weakness(run).weakest()]
+    assert [one.what for one in weakest] == ["position", "heading"], "the landmarks are held"
+    assert all(one.vertex not in run.held for one in weakest)
+    assert len(run.held) > 0
+    code, out, err = told("advise", tmp_path / "run")
+    assert (code, err) == (0, "")
+    assert "a frozen map" in out.splitlines()[0]
+    assert "survey landmark" not in out
+    assert Weakness(run).longest_unseen().first >= len(SavedGraph(straight, []).keyframes)
 
 
 @pytest.mark.parametrize(
