@@ -8,6 +8,7 @@ from advised import SimulatedRun
 from reliability import tell, times
 
 from graph_slam_ros import cli
+from graph_slam_ros.analysis.additions import CLOSURE, NEW, stored_values
 from graph_slam_ros.analysis.advice import KINDS, Advisor
 from graph_slam_ros.analysis.weakness import Weakness
 from graph_slam_ros.analysis.what_if import SavedGraph
@@ -133,25 +134,32 @@ def test_a_survey_of_what_is_weakest_helps_it_most_and_leaves_what_was_surveyed(
         assert all(advice["path_m"] <= advice["path_now_m"] for advice in one["advice"])
 
 
-def test_a_prediction_to_first_order_is_that_of_the_information_matrix(straight):
-    """By the inverse of all of it, with and without a new tag's sightings."""
+def test_a_prediction_is_that_of_the_whole_inverse(straight):
+    """Each kind's best, a new tag with its vertex among the others."""
     run = SavedGraph(straight, [])
-    advisor = Advisor(Weakness(run))
-    solver, dofs = run.solver, {v: run.graph.kind_of(v).dof for v in range(run.graph.vertex_count)}
-    first = dict(zip(dofs, np.cumsum([0, *dofs.values()]), strict=False))
-    information = solver.information_matrix()
-    for kind in ("survey", "sighting", "new tag"):
-        addition = next(iter(advisor.additions([kind])))
-        a, columns = advisor.rows(addition)
-        place = {int(c): first[v] + k for v, of in advisor._columns.items() for k, c in enumerate(of)}
-        wide = np.zeros((len(a), len(information)))
-        wide[:, [place[int(c)] for c in columns]] = a
-        covariance = np.linalg.inv(information + wide.T @ wide)
-        for one, sigma in zip(advisor.weakest, advisor.predict(addition)[0], strict=True):
+    advisor, graph = Advisor(Weakness(run)), run.graph
+    dofs = [graph.kind_of(v).dof for v in range(graph.vertex_count)]
+    first, before = np.cumsum([0, *dofs]), run.solver.information_matrix()
+    for kind in KINDS:
+        addition = min(advisor.additions([kind]), key=lambda one: advisor.predict(one)[0].sum(), default=None)
+        if addition is None:
+            assert kind == CLOSURE, "it drives straight on"
+            continue
+        information = np.zeros((len(before) + len(addition.value),) * 2)
+        information[: len(before), : len(before)] = before
+        for edge in addition.edges:
+            x, at = stored_values(graph, run.solver.values, edge, addition.value)
+            a = edge.share**0.5 * edge.noise.sqrt_information @ edge.type.linearize(x, at, edge.measured[None])[1][0]
+            begins = [len(before) if v == NEW else int(first[v]) for v in edge.vertices]
+            columns = [b + k for b, dof in zip(begins, edge.type.dofs, strict=True) for k in range(dof)]
+            information[np.ix_(columns, columns)] += a.T @ a
+        covariance = np.linalg.inv(information)
+        predicted, _ = advisor.predict(addition)
+        assert predicted[0] < advisor.weakest[0].direction.sigma
+        for one, sigma in zip(advisor.weakest, predicted, strict=True):
             at = slice(first[one.vertex], first[one.vertex] + dofs[one.vertex])
-            assert sigma == pytest.approx(
-                float(np.sqrt(one.functional @ covariance[at, at] @ one.functional)), rel=1e-4
-            )
+            real = float(np.sqrt(one.functional @ covariance[at, at] @ one.functional))
+            assert sigma == pytest.approx(real, rel=1e-6), kind
 
 
 # -- what may be wrong -------------------------------------------------------------------------------------------------
