@@ -21,7 +21,7 @@ def use(package, messages, request, tmp_path_factory, monkeypatch):
     if reason := generate_interfaces.obstacle([package]):
         pytest.skip(reason)
     cache = getattr(request.config, "cache", None)
-    name = f"{package}_{sysconfig.get_python_version()}"
+    name = "_".join([package, *messages, sysconfig.get_python_version()])
     built = Path(cache.mkdir(name)) if cache else tmp_path_factory.mktemp(name)
     if not (done := built / "built").exists():
         monkeypatch.setitem(generate_interfaces.INTERFACES, package, messages)

@@ -1,19 +1,24 @@
-"""An input whose type a plugin reads, in a live graph where its message package is installed."""
+"""Inputs whose types plugins read, in a live graph where their message package is installed."""
 
 import os
 import re
 import subprocess
 
+import beacons
 import built_packages
+import differences
 import pytest
-from beacons import BEACONS, DEFINITION, TYPE, recording
 from executables import executable
 from installed import installer
 from live_nodes import ENVIRONMENT, own_domain
 from places import ROOT
 
 (EXAMPLE,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/inputs.md").read_text(), re.DOTALL)
-SETTINGS = ("inputs.names=odom radio", f"radio.type={TYPE}", "radio.topic=/radio", "radio.sigma_m=0.05")
+LANDMARKS = ("inputs.names=odom radio", f"radio.type={beacons.TYPE}", "radio.topic=/radio", "radio.sigma_m=0.05")
+EDGES = (
+    *("inputs.names=odom tdoa", f"tdoa.type={differences.TYPE}", "tdoa.topic=/tdoa", "tdoa.sigma_m=0.03"),
+    *("anchor.pose=0 0 0", "anchor.sigma_m=0.1", "anchor.sigma_rad=0.05"),
+)
 
 
 @pytest.fixture(autouse=True)
@@ -23,23 +28,38 @@ def domain(monkeypatch):
         yield
 
 
-def test_the_example_of_the_page_reads_in_the_node_what_it_reads_in_a_replay(
-    request, tmp_path, tmp_path_factory, monkeypatch
-):
-    built_packages.use("my_msgs", {"Beacons": DEFINITION}, request, tmp_path_factory, monkeypatch)
-    bag, settings = recording(tmp_path / "a.mcap"), [word for one in SETTINGS for word in ("--set", one)]
-    with installer(tmp_path, monkeypatch) as install:
-        site = install(
-            EXAMPLE, group="graph_slam_ros.inputs", name=TYPE.replace("/", "."), module="my_beacons", at="BEACONS"
-        )
-        monkeypatch.setitem(
-            ENVIRONMENT, "PYTHONPATH", os.pathsep.join(filter(None, (str(site), ENVIRONMENT.get("PYTHONPATH"))))
-        )
-        for name, options in (("live", ["--ros"]), ("offline", [])):
-            words = [executable("graph_slam"), "replay", bag, *options, *settings, "--out", tmp_path / name]
+@pytest.fixture
+def replays(request, tmp_path, tmp_path_factory, monkeypatch):
+    """A function that replays a recording in a node and without, where a package of plugins is installed."""
+    messages = {"Beacons": beacons.DEFINITION, "RangeDifference": differences.DEFINITION}
+    built_packages.use("my_msgs", messages, request, tmp_path_factory, monkeypatch)
+
+    def replayed(bag, site, *settings):
+        path = os.pathsep.join(filter(None, (str(site), ENVIRONMENT.get("PYTHONPATH"))))
+        monkeypatch.setitem(ENVIRONMENT, "PYTHONPATH", path)
+        options = [word for one in settings for word in ("--set", one)]
+        for name, ros in (("live", ["--ros"]), ("offline", [])):
+            words = [executable("graph_slam"), "replay", bag, *ros, *options, "--out", tmp_path / name]
             done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
             assert done.returncode == 0, done.stderr
-    for name in ("graph.g2o", "path.tum", "landmarks.csv"):
-        assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "offline" / name).read_bytes()
-    found = (tmp_path / "live" / "landmarks.csv").read_text()
-    assert all(name in found for name in BEACONS)
+        for name in ("graph.g2o", "path.tum", "landmarks.csv"):
+            assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "offline" / name).read_bytes()
+        return tmp_path / "live"
+
+    return replayed
+
+
+def test_the_example_of_the_page_reads_in_the_node_what_it_reads_in_a_replay(replays, tmp_path, monkeypatch):
+    with installer(tmp_path, monkeypatch) as install:
+        name = beacons.TYPE.replace("/", ".")
+        site = install(EXAMPLE, group="graph_slam_ros.inputs", name=name, module="my_beacons", at="BEACONS")
+        run = replays(beacons.recording(tmp_path / "a.mcap"), site, *LANDMARKS)
+    assert all(name in (run / "landmarks.csv").read_text() for name in beacons.BEACONS)
+
+
+def test_edges_of_a_plugin_are_in_the_map_of_the_node_as_in_that_of_a_replay(replays, tmp_path, monkeypatch):
+    (tmp_path / "survey.csv").write_text(differences.SURVEY)
+    with differences.example_installer(tmp_path, monkeypatch) as install:
+        bag = differences.recording(tmp_path / "a.mcap", steps=60)
+        run = replays(bag, install(), *EDGES, f"landmarks.surveyed_file={tmp_path / 'survey.csv'}")
+    assert (run / "graph.g2o").read_text().count(differences.TAG) > 50
