@@ -46,8 +46,8 @@ def example_installer(folder, monkeypatch):
     monkeypatch.setattr(plugins, "_loaded", {})
     with installer(folder, monkeypatch) as install:
 
-        def installed(text=EXAMPLE, edges=EDGES, module=MODULE):
-            return install(text, group=GROUP, name=NAME, module=module, at=AT, more=edges)
+        def installed(text=EXAMPLE, edges=EDGES, module=MODULE, name=NAME):
+            return install(text, group=GROUP, name=name, module=module, at=AT, more=edges)
 
         yield installed
 

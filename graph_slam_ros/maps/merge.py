@@ -26,6 +26,7 @@ from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
 _ABSOLUTE = ("fixes", "surveyed")  # told in the axes of map, whoever tells them
+_SAME = 1e-6  # of chi2
 _ONCE = ("surveyed", "range_offset")  # what both sessions were told is told once
 
 
@@ -98,10 +99,26 @@ def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:
             raise GraphSlamError(f"landmark {name} has an identity in one of {a} and {b}, and none in the other")
         if one.graph.kind_of(other.vertex) is not two.graph.kind_of(mark.vertex):
             raise GraphSlamError(f"landmark {name} is a point in one of {a} and {b}, and a pose in the other")
-    for label in _ABSOLUTE:
-        if len(two.graph.edges_of(label)) and not any(len(one.graph.edges_of(other)) for other in _ABSOLUTE):
+    for label in _absolute(two):
+        if not _absolute(one):
             raise GraphSlamError(f"{b} has {label}, which say where its map is, and {a} has none: merge {b} {a}")
     return shared_landmarks(one, two)
+
+
+def _absolute(slam: GraphSlam) -> list[str]:
+    """The classes of edges that say where the map lies; of custom edges those whose chi2 changes if all is moved."""
+    space, values, here = slam.space, slam.solver.values, slam.solver.evaluate().classes.get("custom")
+    found = [label for label in _ABSOLUTE if len(slam.graph.edges_of(label))]
+    if here is None:
+        return found
+    T_new_old = space.group.exp(tuple(1.0 + 0.3 * k for k in range(space.dof)))
+    for vertex in range(slam.graph.vertex_count):
+        one = slam.graph.vertex(vertex)
+        move = {space.pose: space.group.compose, space.point: space.group.act}.get(one.kind)
+        if move is not None:
+            values[one.stored] = move(T_new_old, tuple(values[one.stored].tolist()))
+    there = slam.solver.evaluate(at=values).classes["custom"]
+    return [*found, *["custom"] * (abs(there.chi2 - here.chi2) > _SAME * max(1.0, here.chi2))]
 
 
 def _aligned(one: GraphSlam, two: GraphSlam, shared: list[str]) -> Alignment:

@@ -2,6 +2,7 @@
 
 import re
 import sys
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -25,8 +26,10 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.edge_tags import map_edge_of, tag_of
 from graph_slam_ros.errors import ConfigError, GraphSlamError
 from graph_slam_ros.lie import se2
+from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.messages.inputs import converters, plugins
 from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.runs.restore import record_run
 from graph_slam_ros.slam import Config, Control
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 
@@ -208,6 +211,7 @@ def ahead(values, measured):
     return [se2.act(se2.inverse(tuple(values[0])), tuple(values[1]))[0] - measured[0]]
 
 
+wall = edge_from_residual("wall", ((SE2,),), 1, 1, lambda values, measured: [values[0][1] - measured[0]])
 turn = edge_from_residual("turn", ((SE2,), (SE2,)), 1, 1, turned)
 ahead = edge_from_residual("ahead", ((SE2,), (R2,)), 2, 1, ahead)
 """
@@ -342,3 +346,101 @@ def test_a_landmark_is_removed_with_its_custom_edges_and_with_the_last_that_dete
     assert slam.is_solved
     assert not slam.landmarks
     assert all(slam.ledger.is_withdrawn(edge) for edge in custom)
+
+
+def test_the_noise_of_the_motion_since_the_keyframe_is_added(drive):
+    """Compared with differences of the residual over the motion."""
+
+    def wheels(k, stamp_ns, truth):
+        yield from [seen(stamp_ns, truth)] if k == 3 else []
+        yield from [turn(stamp_ns, stamp_ns - 3 * STEP, 0.102, 0.02)] if k == 17 else []
+        later = se2.compose(truth, (0.025, 0.0, 0.0075))
+        yield from [ahead(stamp_ns + STEP // 4, later)] if k == 17 else []
+
+    slam, _ = drive(wheels, 20, **{"keyframes.min_distance_m": 0.45, "keyframes.shared_noise": 1e9})
+    cases = {"EDGE_TURN": (4e-4, 1, (15 * STEP, 18 * STEP)), "EDGE_AHEAD": (1e-4, 2, (18 * STEP + STEP // 4,))}
+    for edge in map(slam.graph.edge, slam.graph.edges_of("custom").tolist()):
+        own, size, stamps = cases.pop(tag_of(edge.type))
+        z, due = edge.measured, own
+        for k, stamp_ns in enumerate(stamps):
+            where, here = slam._frontend.path.where(stamp_ns), slice(size + 3 * k, size + 3 * k + 3)
+            assert z[here] == pytest.approx(where.T_keyframe_base)
+            j = [(_at(slam, edge, z, here, d) - _at(slam, edge, z, here, -d)) / 2e-5 for d in 1e-5 * np.eye(3)]
+            due += np.array(j) @ where.covariance @ np.array(j)
+        assert due > 1.4 * own
+        assert 1.0 / edge.sqrt_information[0, 0] ** 2 == pytest.approx(due, rel=0.1)  # the estimate has moved since
+    assert not cases
+
+
+def _at(slam, edge, z, here, d):
+    moved = z.copy()
+    moved[here] = se2.compose(tuple(z[here]), se2.exp(tuple(d)))
+    at = np.array([[slam.graph.vertex(v).stored.start for v in edge.vertices]])
+    return edge.type.linearize(slam.solver.values, at, moved[None])[0][0, 0]
+
+
+def test_two_maps_are_merged_unless_only_the_second_has_edges_that_say_where_it_lies(install, tmp_path):
+    install(TURN, edges=POINTS + "EDGE_WALL = my_turn:wall\n", module="my_turn")
+
+    def run(name, later_ns, *extra):
+        measured = [Odometry(later_ns + k * STEP, (0.1 * k, 0.0, 0.0)) for k in range(1, 40)]
+        for k in range(1, 40, 2):
+            pose = (0.1 * k, 0.0, 0.0)
+            for landmark, at in (("post", POST), ("rock", (1.0, -2.0)), ("tree", (2.0, 3.0))):
+                there = se2.act(se2.inverse(pose), at)
+                one = Sighting(landmark, "position", there, (0.01, 0, 0, 0.01))
+                measured.append(Sightings(later_ns + k * STEP, "tags", (one,)))
+            measured.append(ahead(later_ns + k * STEP, pose))
+        measured += [
+            CustomEdge(later_ns + 9 * STEP, "wall", "EDGE_WALL", (later_ns + 9 * STEP,), (0.0,), (0.01,))
+        ] * len(extra)
+        record_run(tmp_path / name, Config(), [*measured, Control("end"), Control("optimize")], [])
+        return tmp_path / name
+
+    a, b = run("a", 0), run("b", 10**12)
+    merged = merge(a, b, tmp_path / "ab")
+    assert merged.summary["edges"] == sum(load_run(one).summary["edges"] for one in (a, b))
+    wall = run("wall", 2 * 10**12, "wall")
+    assert merge(wall, a, tmp_path / "wall_a").shared == 3
+    with pytest.raises(GraphSlamError, match=r"wall has custom, which say where its map is, and .* has none: merge "):
+        merge(a, wall, tmp_path / "a_wall")
+
+
+def test_info_lists_edge_types_of_plugins_usable_or_not(install, tmp_path, capsys):
+    install()
+    install(
+        "wrong = 3",
+        edges="[graph_slam_ros.edges]\nEDGE_WRONG = my_wrong:wrong\nEDGE_SE2 = my_wrong:wrong\n",
+        module="my_wrong",
+        name="my_msgs.msg.Wrong",
+    )
+    assert main(["info", str(recording(tmp_path / "a.mcap", steps=5))]) == 0
+    out = capsys.readouterr().out
+    assert f"plugin: {TYPE}: read by my-tdoa 1.0 as edges\n" in out
+    assert f"plugin: {TAG}: 'difference of ranges', an edge type of my-tdoa 1.0\n" in out
+    assert "plugin: EDGE_WRONG: plugin my_wrong:wrong of my-wrong 1.0: it is a int, not an EdgeType\n" in out
+    assert "plugin: EDGE_SE2: the plugin of my-wrong 1.0 is not used: the tag is built in\n" in out
+
+
+def test_a_resting_robot_thins_edges_and_a_survey_without_a_place_of_the_map_begins_no_landmark(install):
+    install()
+    settings = {name: value for name, value in SETTINGS.items() if not name.startswith("anchor")}
+    slam, anchored = (GraphSlam(Config.from_mapping(one)) for one in (settings, SETTINGS))
+    for k in range(1, 60):
+        at_ns = k * STEP
+        for one in (slam, anchored):
+            one.process(Odometry(at_ns, (0.0, 0.0, 0.0)))
+            for ends in ((at_ns, "north", "south"), (at_ns, "south", "east")):
+                one.process(CustomEdge(at_ns, "tdoa", TAG, ends, (0.0,), (25.0,)))
+    for one in (slam, anchored):
+        one.process(Control("end"))
+        one.process(Control("optimize"))
+    refused, thinned = slam.counters["tdoa", "landmark_unknown"], anchored.counters["tdoa", "thinned"]
+    assert not slam.landmarks
+    assert refused + slam.counters["tdoa", "thinned"] == 118
+    assert set(anchored.landmarks) == {"north", "south", "east"}
+    assert anchored.counters.used["tdoa"] + thinned == 118
+    assert thinned > 70
+    ends = Counter(anchored.graph.edge(int(edge)).vertices[1:] for edge in anchored.graph.edges_of("custom"))
+    assert len(ends) == 2
+    assert len(set(ends.values())) == 1, "both edges of a message, or none"
