@@ -24,11 +24,13 @@ def advise(args: argparse.Namespace) -> int:
     run = SavedGraph(args.run_folder, losses)
     weakness = Weakness(run)
     advisor = Advisor(weakness, args.survey_sigma)
-    found = [_best(some, args.count) for some in advisor.advise()]
+    everything = advisor.advise()
+    found = [_best(some, args.count) for some in everything]
+    of_path = min((one for some in everything for one in some), key=lambda one: one.path_m, default=None)
     if args.json:
-        console.show(json.dumps(_as_dict(weakness, advisor, found)))
+        console.show(json.dumps(_as_dict(weakness, advisor, found, of_path)))
     else:
-        console.show(*_weak_text(weakness, advisor), *_advice_text(advisor, found))
+        console.show(*_weak_text(weakness, advisor), *_advice_text(advisor, found, of_path))
         console.then(_next(args, found))
     return console.report_losses(losses)
 
@@ -88,16 +90,21 @@ def _sigma(what: str, sigma: float) -> str:
     return f"{np.degrees(sigma):.2f} deg" if what == "heading" else f"{sigma:.3f} m"
 
 
-def _advice_text(advisor: "Advisor", found: "list[list[Advice]]") -> Iterator[str]:
+def _advice_text(advisor: "Advisor", found: "list[list[Advice]]", of_path: "Advice | None") -> Iterator[str]:
     yield "what would help most, each alone: the sigma that it leaves, and the position error on the path (rms)"
     for one, some in zip(advisor.weakest, found, strict=True):
         what = "heading" if one.what == "heading" else f"position, {one.direction.words},"
         yield f"  {what} of {one.about}: {_sigma(one.what, one.direction.sigma)} now"
         for advice in some:
-            path = f"path {advice.path_now_m:.3f} -> {advice.path_m:.3f} m"
-            yield f"    {_sigma(one.what, advice.predicted):>10s}   {path}   {advice.addition.about}"
+            yield f"    {_sigma(one.what, advice.predicted):>10s}   {_path(advice)}   {advice.addition.about}"
         if not some:
             yield f"    nothing that was tried helps by 2 % or more: {advisor.why_nothing()}"
+    if of_path:
+        yield f"  of these, most for the whole path: {of_path.addition.about}, {_path(of_path)}"
+
+
+def _path(one: "Advice") -> str:
+    return f"path {one.path_now_m:.3f} -> {one.path_m:.3f} m"
 
 
 def _next(args: argparse.Namespace, found: "list[list[Advice]]") -> str:
@@ -109,7 +116,9 @@ def _next(args: argparse.Namespace, found: "list[list[Advice]]") -> str:
 # -- JSON --------------------------------------------------------------------------------------------------------------
 
 
-def _as_dict(weakness: "Weakness", advisor: "Advisor", found: "list[list[Advice]]") -> dict[str, Any]:
+def _as_dict(
+    weakness: "Weakness", advisor: "Advisor", found: "list[list[Advice]]", of_path: "Advice | None"
+) -> dict[str, Any]:
     stretches, unseen = [*weakness.stretches()], weakness.longest_unseen()
     return {
         "keyframes": len(weakness.run.keyframes),
@@ -126,21 +135,18 @@ def _as_dict(weakness: "Weakness", advisor: "Advisor", found: "list[list[Advice]
                 "axis": one.direction.axis.tolist(),
                 "sigma": one.direction.sigma,
                 "usual": one.usual,
-                "advice": [
-                    {
-                        "kind": advice.addition.kind,
-                        "about": advice.addition.about,
-                        "predicted": advice.predicted,
-                        "path_now_m": advice.path_now_m,
-                        "path_m": advice.path_m,
-                    }
-                    for advice in some
-                ],
+                "advice": [_advice_as_dict(advice) | {"predicted": advice.predicted} for advice in some],
             }
             for one, some in zip(advisor.weakest, found, strict=True)
         ],
+        "best_for_path": _advice_as_dict(of_path) if of_path else None,
         "stretches": [_stretch_as_dict(one) for one in (*stretches, *([unseen] if unseen else []))],
     }
+
+
+def _advice_as_dict(one: "Advice") -> dict[str, Any]:
+    kind, about = one.addition.kind, one.addition.about
+    return {"kind": kind, "about": about, "path_now_m": one.path_now_m, "path_m": one.path_m}
 
 
 def _stretch_as_dict(one: "Stretch") -> dict[str, Any]:

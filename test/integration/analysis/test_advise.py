@@ -127,6 +127,8 @@ def test_a_survey_of_what_is_weakest_helps_it_most_and_leaves_what_was_surveyed(
     assert landmark["advice"][0]["kind"] == "survey"
     assert landmark["advice"][0]["about"].startswith("survey landmark end")
     assert landmark["advice"][0]["predicted"] == pytest.approx(0.05, rel=0.01)
+    best = told_of["best_for_path"]
+    assert best["path_m"] <= min(advice["path_m"] for one in told_of["weakest"] for advice in one["advice"])
     for one in told_of["weakest"]:
         predicted = [advice["predicted"] for advice in one["advice"]]
         assert predicted == sorted(predicted)
