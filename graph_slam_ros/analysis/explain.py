@@ -4,7 +4,7 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from scipy.special import gammainc
 
@@ -162,44 +162,75 @@ def _landmark(run: SavedGraph, name: str) -> Iterator[str]:
         names = sorted({e.landmark for e in entries} - {""})
         there = ", ".join(names[:20]) + (", ..." if len(names) > 20 else "")
         raise GraphSlamError(f"{name}: neither the id of an edge nor a landmark; there are {there or 'no landmarks'}")
+    yield from landmark_lines(run.folder, name, seen)
+
+
+def landmark_lines(folder: Path, name: str, seen: Sequence[Entry]) -> Iterator[str]:
+    """Explain a landmark by its edges: how many there are of each verdict, and the worst of them."""
     yield f"landmark {name}: {len(seen)} edges, from keyframe {seen[0].keyframe} to {seen[-1].keyframe}"
     yield from _table(seen)
     out = [e for e in seen if not e.is_in]
     yield from _worst(out)
     yield from _least(e for e in seen if e.is_in)
     if out:
-        yield f"graph_slam explain {run.folder} {out[0].edge} prints all about the first"
+        yield f"graph_slam explain {folder} {out[0].edge} prints all about the first"
 
 
 def _edge(run: SavedGraph, edge: int) -> Iterator[str]:
     e = run.edge(edge)
     history = [change for change in run.changes if change.edge == edge]
-    of, by = " and ".join(run.landmarks_of(e)), e.source and f" by {e.source}"
-    kind = _KIND.get(e.label, e.label) + (f" ({e.tag})" if measurement_text.is_custom(e) else "")
-    yield f"edge {edge}: {kind}{of and f' of {of}'}{by}: {_state(e.verdict, e.reason)}"
-    yield from _line("stamp", f"{e.stamp_ns / 1e9:.3f} s, of the newest keyframe that it is attached to")
-    yield from _line("judged", f"first at keyframe {e.keyframe}")
-    yield from _line("between", " and ".join(_vertex(run, e, v) for v in e.vertices))
-    yield from _line("measured", measurement_text.with_units(e, measurement_text.measured(e)))
-    yield from _line("sigmas", measurement_text.with_units(e, measurement_text.sigmas(e)))
-    if measurement_text.is_custom(e):
-        yield from _line("residual", f"{measurement_text.with_units(e, e.residual)}, when it was judged first")
-    else:
-        expected = measurement_text.with_units(e, measurement_text.expected(e))
-        yield from _line("expected", f"{expected}, when it was judged first")
-    yield from _line("decided", _decided(e, history, run.config))
+    yield title(e, " and ".join(run.landmarks_of(e)))
+    for what, text in statements(e, [_vertex(run, e, v) for v in e.vertices], Numbers.of(e), history, run.config):
+        yield from _line(what, text)
     if not e.verdict:
         return
-    yield from _line("now", f"chi2 {e.chi2:.4g} by its own noise; {100.0 * e.weight:.3g} % of its weight counts")
-    for c in history:
-        text = (
-            f"at keyframe {c.keyframe}: {_state(c.verdict, c.reason)}, chi2 {c.statistic:.4g} against {c.threshold:.4g}"
-        )
-        yield from _line("changed", text)
     if e.reason not in FINAL:
         yield from _what_if(run, e)
     if not e.is_in:
-        yield from _line("to change", _remedy(e))
+        yield from _line("to change", remedy(e))
+
+
+class Numbers(NamedTuple):
+    """The numbers of a measurement that are explained; ``expected`` is the residual of an edge type of a plugin."""
+
+    measured: Sequence[float]
+    sigmas: Sequence[float]
+    expected: Sequence[float]
+
+    @classmethod
+    def of(cls, e: Entry) -> "Numbers":
+        """The numbers of one edge."""
+        expected = e.residual if measurement_text.is_custom(e) else measurement_text.expected(e)
+        return cls(measurement_text.measured(e), measurement_text.sigmas(e), expected)
+
+
+def title(e: Entry, of: str) -> str:
+    """An edge's title: its kind, the landmarks that it is ``of``, and the verdict on it."""
+    kind = _KIND.get(e.label, e.label) + (f" ({e.tag})" if measurement_text.is_custom(e) else "")
+    by = e.source and f" by {e.source}"
+    return f"edge {e.edge}: {kind}{of and f' of {of}'}{by}: {_state(e.verdict, e.reason)}"
+
+
+def statements(
+    e: Entry, ends: Sequence[str], numbers: Numbers, history: Sequence[VerdictChange], config: Config
+) -> Iterator[tuple[str, str]]:
+    """Sentences on an edge, each with its name: what was measured, what was decided, and how it fits now."""
+    yield "stamp", f"{e.stamp_s:.3f} s, of the newest keyframe that it is attached to"
+    yield "judged", f"first at keyframe {e.keyframe}"
+    yield "between", " and ".join(ends)
+    yield "measured", measurement_text.with_units(e, numbers.measured)
+    yield "sigmas", measurement_text.with_units(e, numbers.sigmas)
+    last = "residual" if measurement_text.is_custom(e) else "expected"
+    yield last, f"{measurement_text.with_units(e, numbers.expected)}, when it was judged first"
+    yield "decided", _decided(e, history, config)
+    if e.verdict:
+        yield "now", f"chi2 {e.chi2:.4g} by its own noise; {e.percent:.3g} % of its weight counts"
+        yield from (("changed", change_text(c)) for c in history)
+
+
+def change_text(c: VerdictChange) -> str:
+    """One change of a verdict."""
+    return f"at keyframe {c.keyframe}: {_state(c.verdict, c.reason)}, chi2 {c.statistic:.4g} against {c.threshold:.4g}"
 
 
 def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
@@ -253,13 +284,13 @@ def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
             yield from _line("against", f"{other}, whose chi2 would go from {before:.3g} to {after:.3g}")
 
 
-def _remedy(e: Entry) -> str:
+def remedy(e: Entry) -> str:
+    """The remedy for an edge that is out."""
     if e.reason in FINAL:
         return f"nothing: what was {_WHY[e.reason]} stays out; replay the run with another configuration"
-    factor = (e.statistic / e.threshold) ** 0.5
     return (
         "it comes back by itself once the map agrees with it. If you know that it is true, a stated noise is too small,"
-        f" its own or that of the edges against it: with all sigmas {factor:.3g} times as large it would pass"
+        f" its own or that of the edges against it: with all sigmas {e.sigma_factor:.3g} times as large it would pass"
         " (robust.noise_factor). robust.decide=false holds nothing back"
     )
 

@@ -1,13 +1,16 @@
 """The numbers of a measurement as text: their names and units, and what was expected instead."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graph_slam_ros.edge_tags import EDGE_TAGS
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.runs.ledger_file import Entry
 
+_DEGREES = 180.0 / math.pi
 _XY, _XYZ = ("x m", "y m"), ("x m", "y m", "z m")
 _POSE, _POSE_3D = (*_XY, "heading rad"), (*_XYZ, "turn x rad", "turn y rad", "turn z rad")
 _NAMES = {
@@ -32,15 +35,22 @@ _NAMES = {
 }
 
 
+def units(tag: str, count: int) -> list[tuple[str, str]]:
+    """Name and unit (m or rad) of each number that an edge measures."""
+    return [(what, unit) for what, unit in (name.rsplit(" ", 1) for name in _named(tag, count))]
+
+
+def _named(tag: str, count: int) -> Sequence[str]:
+    return _NAMES.get(tag) or (_XY if count == 2 else _XYZ)
+
+
 def with_units(entry: Entry, numbers: Sequence[float]) -> str:
     """One number for each that the edge measures, with their names; angles in degrees."""
     if is_custom(entry):
         return ", ".join(f"{number:.4g}" for number in numbers)
-    names = _NAMES.get(entry.tag) or (_XY if len(numbers) == 2 else _XYZ)
     words = []
-    for name, number in zip(names, numbers, strict=True):
-        what, unit = name.rsplit(" ", 1)
-        words.append(f"{what} {np.degrees(number):.2f} deg" if unit == "rad" else f"{what} {number:.3f} {unit}")
+    for (what, unit), number in zip(units(entry.tag, len(numbers)), numbers, strict=True):
+        words.append(f"{what} {number * _DEGREES:.2f} deg" if unit == "rad" else f"{what} {number:.3f} {unit}")
     return ", ".join(words)
 
 
@@ -58,9 +68,9 @@ def measured(entry: Entry) -> tuple[float, ...]:
     if is_custom(entry):
         return z
     if entry.tag == "EDGE_ATTITUDE_SE3":
-        return _floats(so3.log(z))
+        return tuple(so3.log(z))
     if entry.dof == 6:
-        return _floats((*z[:3], *so3.log(z[3:])))
+        return (*z[:3], *so3.log(z[3:]))
     if entry.tag.startswith("EDGE_COORDINATE"):  # behind its direction, before the place on the robot
         return z[len(z) // 2 : len(z) // 2 + 1]
     return z[: entry.dof]
@@ -71,19 +81,21 @@ def expected(entry: Entry) -> tuple[float, ...]:
     z, r = entry.measured, entry.residual
     if entry.tag in ("EDGE_SE2", "EDGE_PRIOR_SE2"):
         x, y, heading = se2.compose(z, r)
-        return _floats((x, y, se2.wrap(heading)))
+        return (x, y, se2.wrap(heading))
     if entry.tag == "EDGE_ATTITUDE_SE3":
-        return _floats(so3.log(so3.compose(z, so3.exp(r))))
+        return tuple(so3.log(so3.compose(z, so3.exp(r))))
     if entry.dof == 6:
         pose = se3.compose(z, (*r[:3], *so3.exp(r[3:])))
-        return _floats((*pose[:3], *so3.log(pose[3:])))
+        return (*pose[:3], *so3.log(pose[3:]))
     return tuple(a + b for a, b in zip(measured(entry), r, strict=True))
 
 
 def sigmas(entry: Entry) -> tuple[float, ...]:
     """Standard deviation of each of these numbers."""
-    return _floats(np.sqrt(np.diag(np.linalg.inv(entry.information_matrix))).tolist())
+    deviations: list[float] = sigmas_of(entry.information_matrix).tolist()
+    return tuple(deviations)
 
 
-def _floats(numbers: Sequence[float]) -> tuple[float, ...]:
-    return tuple(float(x) for x in numbers)
+def sigmas_of(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard deviations (..., m) of information matrices (..., m, m)."""
+    return np.sqrt(np.diagonal(np.linalg.inv(information), axis1=-2, axis2=-1))

@@ -10,15 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from graph_slam_ros.analysis.influence import InfluenceModel
 from graph_slam_ros.errors import GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.graph import Gaussian, Graph, Loss
-from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.runs.folder import RunError
 from graph_slam_ros.runs.ledger_file import Entry, ledger_entries
 from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.runs.tables import numbered
 from graph_slam_ros.solver import Report, Solver
-from graph_slam_ros.solver.linearization import linearized
 from graph_slam_ros.typing import Array
 
 _ACCEPTED = "believed"  # the class of what is let in: it has no loss
@@ -100,6 +99,11 @@ class SavedGraph:
         """The solution of the run: all its accepted edges."""
         return self.solve()
 
+    @cached_property
+    def influence_model(self) -> InfluenceModel:
+        """The influence of each edge, to first order."""
+        return InfluenceModel(self.graph, self.solver, self.keyframes[-1])
+
     def keyframe(self, vertex: int) -> int | None:
         """The number of the keyframe of a vertex; None if it is not a keyframe."""
         return self._numbers.get(vertex)
@@ -171,11 +175,12 @@ class SavedGraph:
 
     def influences(self, count: int) -> list[Influence]:
         """The judged edges without which the last keyframe would move most, ranked to first order."""
-        judged = [e for e in self.entries if e.is_in and e.verdict]
-        first = np.array([np.linalg.norm(self.first_order(e.edge)[: self.space.dimensions]) for e in judged])
+        judged = [e.edge for e in self.entries if e.is_in and e.verdict]
+        step = self.influence_model.without(judged).step
+        first = np.linalg.norm(step[:, : self.space.dimensions], axis=1)
         out = []
         for k in np.argsort(-first, kind="stable")[:count].tolist():
-            edge = judged[k].edge
+            edge = judged[k]
             try:
                 exact_m = self.moved(self.solve([edge])).final[0]
             except (GaugeError, SingularError):
@@ -184,27 +189,8 @@ class SavedGraph:
         return sorted(out, key=lambda one: -one.exact_m)
 
     def first_order(self, edge: int) -> Array:
-        """The step (dof,) of the last keyframe, in its tangent space, if an edge is removed.
-
-        With A and r its whitened Jacobian and residual at the optimum and Sigma the joint covariance of its vertices, a
-        Gauss-Newton step without it is ``Sigma A' (I - A Sigma A')^-1 r``, by the matrix inversion lemma.
-        """
-        solver, graph, last = self.solver, self.graph, self.keyframes[-1]
-        one = graph.edge(edge)
-        ends, root = one.vertices, one.sqrt_information
-        residual, jacobian = linearized(graph, solver.values, one.type, ends, one.measured)
-        loss = solver.settings.last_loss(one.label, one.source)
-        white = root @ residual
-        share = weight_and_cost(loss.kind, loss.scale, float(white @ white))[0] ** 0.5
-        white, a = share * white, share * root @ jacobian
-        among = [*ends, *([] if last in ends else [last])]
-        joint = solver.joint_marginal(among)
-        first = np.cumsum([0, *(graph.kind_of(v).dof for v in among)])
-        of_last = slice(first[k := among.index(last)], first[k + 1])
-        of_ends = slice(0, int(first[len(ends)]))
-        left = np.eye(len(white)) - a @ joint[of_ends, of_ends] @ a.T
-        step: Array = joint[of_last, of_ends] @ a.T @ np.linalg.lstsq(left, white, rcond=1e-9)[0]
-        return step
+        """The step (dof,) of the last keyframe, in its tangent space, if an edge is removed."""
+        return self.influence_model.without([self.edge(edge).edge]).step[0]
 
 
 def _accepted(graph: Graph, entry: Entry) -> int:

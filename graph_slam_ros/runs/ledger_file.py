@@ -84,6 +84,21 @@ class Entry:
         return f"{self.label} {self.landmark}".strip()
 
     @property
+    def stamp_s(self) -> float:
+        """The stamp [s]."""
+        return self.stamp_ns / 1e9
+
+    @property
+    def percent(self) -> float:
+        """The weight [%]."""
+        return 100.0 * self.weight
+
+    @property
+    def sigma_factor(self) -> float:
+        """The factor of all sigmas with which it would just have passed."""
+        return float((self.statistic / self.threshold) ** 0.5)
+
+    @property
     def information_matrix(self) -> NDArray[np.float64]:
         """The whole of it, (dof, dof)."""
         upper = np.zeros((self.dof, self.dof))

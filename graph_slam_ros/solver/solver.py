@@ -15,6 +15,7 @@ from graph_slam_ros.solver.clique_tree.numeric import keep
 from graph_slam_ros.solver.clique_tree.pools import compact
 from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, NOTHING
 from graph_slam_ros.solver.covariance import joint, marginals
+from graph_slam_ros.solver.edge_covariance import EdgeCovariances
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.linearization import (
     Losses,
@@ -195,6 +196,11 @@ class Solver(Problem):
             with self._tree_remade_after_error():
                 out[np.ix_(at, at)] = joint(self._tree, wanted[free])
         return out
+
+    def edge_covariances(self) -> EdgeCovariances:
+        """Covariances of the vertices of all edges, as ``joint_marginal`` has them, for many edges at once."""
+        self._with_covariance(self.vertices)
+        return EdgeCovariances(self._tree, np.flatnonzero(self._inside & ~self._held))
 
     def information_matrix(self) -> Array:
         """H as a dense matrix, vertices in order of id, with pending edges: for tests and small examples.
