@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from graph_slam_ros.config.calibrate import CalibrateConfig
 from graph_slam_ros.config.frontend import KeyframesConfig, OdometryConfig, OrderingConfig
 from graph_slam_ros.config.inputs import DEFAULT_INPUTS, InputConfig, default_input
 from graph_slam_ros.config.landmarks import LandmarksConfig
@@ -58,6 +59,7 @@ class Config:
     anchor: AnchorConfig = AnchorConfig()
     map: MapConfig = MapConfig()
     ordering: OrderingConfig = OrderingConfig()
+    calibrate: CalibrateConfig = CalibrateConfig()
     solve: SolveConfig = SolveConfig()
     robust: RobustConfig = RobustConfig()
     initialpose: InitialPoseConfig = InitialPoseConfig()
@@ -79,6 +81,12 @@ class Config:
 
     def __post_init__(self) -> None:
         _ = self.start_pose, self.load_pose, self.survey  # what they are made of is refused here, not later
+        words = self.calibrate.groups.split()
+        if "range_factor" in words and {"factors", "on"} & set(words) and not self.survey:
+            raise ConfigError(
+                "calibrate.groups: factors and range_factor are one scale: leave one out, or survey landmarks "
+                "(landmarks.surveyed)"
+            )
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> "Config":

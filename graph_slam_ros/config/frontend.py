@@ -93,6 +93,15 @@ class OdometryConfig:
         low=0.0,
         high=math.pi,
     )
+    distance_factor: float = setting(
+        1.0, "factor by which the motion of odometry is multiplied", "times", low=0.01, high=100.0
+    )
+    turn_factor: float = setting(
+        1.0, "factor by which the turns of odometry are multiplied", "times", low=0.01, high=100.0
+    )
+    turn_bias_rad_s: float = setting(
+        0.0, "turn rate added to odometry while the robot moves", "rad/s", low=-10.0, high=10.0
+    )
     timeout_s: float = setting(
         0.5,
         "an odometry input without messages for this long, in stamp time, is replaced by the next of inputs.names",

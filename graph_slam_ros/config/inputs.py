@@ -70,6 +70,20 @@ class InputConfig:
         low=-3600.0,
         high=3600.0,
     )
+    mount_correction: str = setting(
+        "",
+        "correction of the sensor's pose on the robot, by TF or mount: x y z roll pitch yaw, a shift and a turn about "
+        "the sensor's origin in the axes of the base; graph_slam calibrate prints it; empty: none",
+        "m, rad",
+    )
+    range_factor: float = setting(
+        1.0,
+        "factor by which ranges of the input are multiplied, before range_offset_m is added",
+        "times",
+        low=0.1,
+        high=10.0,
+    )
+    range_offset_m: float = setting(0.0, "length added to ranges of the input", "m", low=-1000.0, high=1000.0)
     max_distance_m: float = setting(
         0.0,
         "landmarks and closures farther away than this are refused; 0: ten times the distance seen so"
@@ -126,6 +140,7 @@ class InputConfig:
 
     def __post_init__(self) -> None:
         self.numbers("mount", 6)
+        self.numbers("mount_correction", 6)
         limits = ("latitude", 90.0, "deg"), ("longitude", 360.0, "deg"), ("altitude", HIGHEST_M, "m")
         for (name, most, unit), number in zip(limits, self.numbers("datum", 3), strict=False):
             if abs(number) > most:

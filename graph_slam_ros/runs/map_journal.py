@@ -18,6 +18,8 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 * ``noise``: factors of the configured sigmas that the edges have from now on, ``[class, input, part, factor]`` each;
   ``rescaled``: changes of edges of earlier records, in order: first edge, the first that is not among them, and by how
   much the sigmas of each group were multiplied, as in ``noise``;
+* ``calibration``: corrections with those configured, ``[input, name, value]`` each; ``recalibrated``: edges of
+  earlier records as they are by these: edge type, rows of its table, numbers measured, square roots of the information;
 * ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are; ``held``: the
   same while ``map.localize`` is true, zeros when it ends.
 
@@ -41,9 +43,10 @@ from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.runs.journal import MAP, parts_of, read_records
 from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.calibration.recalibration import Recalibration, Totals, read_totals, totals_record
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
-from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
+from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling, factors_record, read_factors
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark, LandmarkEdge
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict, VerdictChange
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -70,6 +73,8 @@ class MapGrowth:
         self._keyframes = self._segments = self._sightings = self._landmarks = self._offsets = 0
         self._frozen = self._drives = self._rescaled = 0
         self._noise: dict[Key, float] = {}
+        self._calibration: Totals = {}
+        self._recalibrated = 0
         self._held = (0, 0)
         self._datum: tuple[float, ...] = ()
         self._settings: dict[str, Any] = {}
@@ -114,11 +119,15 @@ class MapGrowth:
         if a.held != self._held:
             out["held"] = self._held = a.held
         if a.noise_factors != self._noise:
-            out["noise"] = _factors(a.noise_factors)
+            out["noise"] = factors_record(a.noise_factors)
             self._noise = dict(a.noise_factors)
         changes = a.noise_changes[self._rescaled :] if first_edge else ()
-        out["rescaled"] = [[one.first, one.last, _factors(one.changed)] for one in changes]
+        out["rescaled"] = [[one.first, one.last, factors_record(one.changed)] for one in changes]
         self._rescaled = len(a.noise_changes)
+        if a.calibration != self._calibration:
+            out["calibration"], self._calibration = totals_record(a.calibration), dict(a.calibration)
+        out["recalibrated"] = [one.as_record() for one in a.recalibrations[self._recalibrated :] if first_edge]
+        self._recalibrated = len(a.recalibrations)
         if a.datum != self._datum:
             out["datum"] = self._datum = a.datum
         if keyframes:
@@ -309,9 +318,12 @@ def _apply_verdicts(state: MapSnapshot) -> None:
 def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     graph, ledger = state.graph, state.ledger
     for first, last, changed in record.get("rescaled", ()):
-        Rescaling(first, last, _by_group(changed)).apply(graph)
+        Rescaling(first, last, read_factors(changed)).apply(graph)
+    for one in record.get("recalibrated", ()):
+        Recalibration.from_record(one).apply(graph)
+    state.calibration |= read_totals(record.get("calibration", ()))
     if "noise" in record:
-        state.noise_factors = _by_group(record["noise"])
+        state.noise_factors = read_factors(record["noise"])
     for name, several in groupby(record.get("vertices", ()), key=lambda vertex: vertex[0]):
         graph.add_vertices(_KINDS[name], [values for _, values in several])
     state.values = np.concatenate((state.values, graph.initial.values[len(state.values) :]))
@@ -341,17 +353,6 @@ def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
         state.frozen, edges = record["frozen"]
         ledger.finish(edges)
     state.held = tuple(record.get("held", state.held))
-
-
-def _factors(factors: Mapping[Key, float]) -> list[list[Any]]:
-    return [[*key, factor] for key, factor in factors.items()]
-
-
-def _by_group(factors: Sequence[Any]) -> dict[Key, float]:
-    out = {(str(label), str(source), str(part)): float(factor) for label, source, part, factor in factors}
-    if not all(math.isfinite(factor) and factor > 0.0 for factor in out.values()):
-        raise ValueError(f"a factor of the noise is not above 0: {factors}")
-    return out
 
 
 def _count(value: Any) -> int | None:

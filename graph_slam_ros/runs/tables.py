@@ -49,27 +49,31 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
     for some in (earlier or Counters(), slam.counters):
         counters.update(some)
     last = slam.report or (slam.solver.evaluate() if slam.is_solved else None)
-    return {
-        "version": __version__,
-        "keyframes": len(slam.keyframes),
-        "landmarks": len(slam.landmarks),
-        "waiting": slam.waiting,
-        "segments": len(slam.segments),
-        "drives": _drives(slam),
-        "sightings": sum(landmark.sightings for landmark in slam.landmarks.values()),
-        "edges": slam.graph.edge_count,
-        "solves": slam.solves,
-        "chi2": last.chi2_final if last else 0.0,
-        "cost": last.cost_final if last else 0.0,
-        "ended": True,
-        "converged": last.converged if last else True,
-        "stop": last.stop if last else "nothing_to_do",
-        "failing": slam.failing,
-        "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
-        "rivals": [asdict(rival) for rival in slam.backend.rivals],
-        "displacements": [asdict(alarm) for alarm in slam.alarms],
-        "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
-    } | account(slam, counters)
+    return (
+        {
+            "version": __version__,
+            "keyframes": len(slam.keyframes),
+            "landmarks": len(slam.landmarks),
+            "waiting": slam.waiting,
+            "segments": len(slam.segments),
+            "drives": _drives(slam),
+            "sightings": sum(landmark.sightings for landmark in slam.landmarks.values()),
+            "edges": slam.graph.edge_count,
+            "solves": slam.solves,
+            "chi2": last.chi2_final if last else 0.0,
+            "cost": last.cost_final if last else 0.0,
+            "ended": True,
+            "converged": last.converged if last else True,
+            "stop": last.stop if last else "nothing_to_do",
+            "failing": slam.failing,
+            "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
+            "rivals": [asdict(rival) for rival in slam.backend.rivals],
+            "displacements": [asdict(alarm) for alarm in slam.alarms],
+            "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
+        }
+        | ({"calibration": report} if (report := slam.calibration_report) else {})
+        | account(slam, counters)
+    )
 
 
 def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:

@@ -223,6 +223,10 @@ class Backend:
         problem = solver.vertices, solver.held, solver.values, settings or solver.settings
         return TrialProblem(space, graph, *problem, origins.copy(), *keyframes, self._first_free_edge)
 
+    def cancel_search(self) -> None:
+        """Drop a second look under way: all was reviewed."""
+        self._background.cancel(self.ledger.outside_count)
+
     def move(self, T_new_old: Numbers, space: Geometry) -> None:
         """Move everything rigidly, what a second look works on besides: that is dropped."""
         values, graph = self.solver.values, self.graph

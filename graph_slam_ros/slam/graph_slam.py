@@ -28,6 +28,7 @@ from graph_slam_ros.measurements.types import (
 from graph_slam_ros.plugin_edges import failed_edges
 from graph_slam_ros.slam.anchor import Anchor
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.calibrator import Calibrator
 from graph_slam_ros.slam.custom_edges import CustomEdges
 from graph_slam_ros.slam.edits import Edits
 from graph_slam_ros.slam.failure_guard import FailureGuard
@@ -86,11 +87,10 @@ class GraphSlam(MapView):
         kidnaps = KidnapDetector(config.space, config.odometry, backend, counters, frontend.path.segments)
         super().__init__(config, backend, frontend, landmarks, kidnaps, solution)
         self.settings: dict[str, Value] = {}
-        self.processed, self._sink = 0, sink
-        self._anchor = Anchor(config, backend)
+        self.processed, self._sink, self._faults = 0, sink, Faults(counters)
+        self._anchor, self._edits = Anchor(config, backend), Edits(backend, landmarks.map, counters)
         self._custom = CustomEdges(config, backend, frontend, landmarks.map, self._anchor, counters)
-        self._edits = Edits(backend, landmarks.map, counters)
-        self._faults = Faults(counters)
+        self._calibrator = Calibrator(config, backend, frontend, landmarks.map, counters, executor, start)
         if start is not None and start.keyframes:
             self._restore(start)
         self._updates = UpdateLog(self)
@@ -123,10 +123,10 @@ class GraphSlam(MapView):
                 if isinstance(m, Odometry):
                     self._on_odometry(m)
                 else:
-                    self._on_observation(m)
+                    self._on_observation(self._frontend.corrections.observation(m))
 
     def _on_odometry(self, m: Odometry) -> None:
-        for step in self._frontend.odometry.steps(m):
+        for step in self._frontend.steps(m):
             with self._faults:
                 self._on_step(step)
 
@@ -222,6 +222,7 @@ class GraphSlam(MapView):
         else:
             report = self.backend.optimize(keyframe, everything)
         report = self.backend.scale_noise(self.keyframes, everything) or report
+        report = self._calibrator.after_solve(keyframe, everything) or report
         (covariance,) = self.solver.marginal([self.keyframes[keyframe].vertex])
         if not np.isfinite(covariance).all():
             raise DivergedError("the covariance is not finite")

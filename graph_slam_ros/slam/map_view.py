@@ -1,6 +1,7 @@
 """The read-only part of the pipeline: path, landmarks, covariances, statistics and health."""
 
 from collections.abc import Collection, Sequence, Set
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from graph_slam_ros.slam.calibration.choice import parameters_of
 from graph_slam_ros.slam.calibration.decision import Finding, decide
 from graph_slam_ros.slam.calibration.fit import TrialFit, fit
 from graph_slam_ros.slam.calibration.parameters import DEFAULT_GROUPS
+from graph_slam_ros.slam.calibration.recalibration import Recalibration
+from graph_slam_ros.slam.calibrator import Calibrator
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
@@ -47,6 +50,8 @@ class MapView:
         self.config, self.backend = config, backend
         self._frontend, self._landmarks = frontend, landmarks
         self._kidnaps, self._solution = kidnaps, solution
+
+    _calibrator: Calibrator
 
     def __repr__(self) -> str:
         counts = f"{len(self.keyframes)} keyframes, {len(self.landmarks)} landmarks, {self.graph.edge_count} edges"
@@ -94,6 +99,7 @@ class MapView:
         ends = np.isin(self.sighting_poses.ids + 1, [*self.segments, len(self.keyframes)])
         a = self.sighting_poses.ids[~ends]
         motion = group.between(tuple(odometry[a].T), tuple(odometry[a + 1].T))
+        motion = self._frontend.corrections.motion(motion)
         wrong = group.local(tuple(poses[a + 1].T), group.compose(tuple(poses[a].T), motion))
         part = np.minimum(since_ns[~ends] / np.maximum(stamps_ns[a + 1] - stamps_ns[a], 1), 1.0)
         found[~ends] = np.stack(group.retract(tuple(found[~ends].T), tuple(part * d for d in wrong)), axis=-1)
@@ -185,6 +191,21 @@ class MapView:
         wanted = parameters_of(problem, groups)
         found = fit(problem, {one: one.quantity.prior for one in wanted})
         return found, decide(found, len(self.landmarks))
+
+    @property
+    def calibration_report(self) -> dict[str, Any]:
+        """The number of trial fits, what is known of each parameter, and settings that have it."""
+        return self._calibrator.summary()
+
+    @property
+    def calibration(self) -> dict[tuple[str, str], float]:
+        """The corrections that were found, with those that were configured, by input and name."""
+        return self._frontend.corrections.totals()
+
+    @property
+    def recalibrations(self) -> Sequence[Recalibration]:
+        """The corrections of measurements that were in the graph, in order."""
+        return self._calibrator.history
 
     @property
     def range_offsets(self) -> dict[str, int]:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.graph import Graph
+from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark
@@ -28,6 +29,7 @@ class MapSnapshot:
     used_ns : stamp of the last odometry that was used by then; None before the first
     source : the input of that odometry
     noise_factors : of the configured sigmas, that the edges have, as ``NoiseScales.factors``
+    calibration : corrections that were found, with those that were configured, by input and name
     continues_with : the odometry whose next message belongs to the same drive; empty where a new drive begins
     """
 
@@ -49,9 +51,15 @@ class MapSnapshot:
     source: str = ""
     continues_with: str = ""
     noise_factors: dict[Key, float] = field(default_factory=dict)
+    calibration: dict[tuple[str, str], float] = field(default_factory=dict)
 
     @property
     def noise_changes(self) -> tuple[Rescaling, ...]:
+        """None: the edges are as they were read."""
+        return ()
+
+    @property
+    def recalibrations(self) -> tuple[Recalibration, ...]:
         """None: the edges are as they were read."""
         return ()
 

@@ -54,7 +54,8 @@ WITHIN = {
     "check": {"lie", "graph", "formats", "measurements", "config", "slam", "messages", "messages/inputs"},
     "runs": {
         *("edge_tags", "lie", "graph", "solver", "warmup", "formats", "measurements", "config"),
-        *("slam", "slam/frontend", "slam/landmarks", "slam/robust", "messages", "messages/inputs", "recordings"),
+        *("slam", "slam/calibration", "slam/frontend", "slam/landmarks", "slam/robust"),
+        *("messages", "messages/inputs", "recordings"),
         "check",
     },
     "maps": {
@@ -147,7 +148,8 @@ COLUMNS = {
 }
 BULK = {  # the stored numbers of many vertices, or the noise of many edges, at once
     *("slam/frontend/noise_factors.py", "slam/noise_scale.py"),
-    *("slam/calibration/fit.py", "slam/calibration/model.py", "slam/calibration/rows.py"),
+    *("slam/calibrator.py", "slam/calibration/fit.py"),
+    *("slam/calibration/model.py", "slam/calibration/rows.py"),
     *("slam/backend.py", "slam/robust/pairwise_consistency.py"),
     *("runs/map_journal.py", "analysis/what_if.py", "analysis/influence.py", "simulation/pose_graph.py"),
 }
@@ -230,7 +232,7 @@ def test_a_folder_imports_only_the_libraries_it_is_built_on(name):
         assert not [top for top in tops if re.fullmatch(r"\w+_(msgs|srvs|interfaces)", top)]
 
 
-MOST_LINES, MOST_OF_A_FUNCTION, MOST_ATTRIBUTES = 400, 60, 15
+MOST_LINES, MOST_OF_A_FUNCTION, MOST_ATTRIBUTES = 400, 60, 16
 
 
 @pytest.mark.parametrize("name", FILES)

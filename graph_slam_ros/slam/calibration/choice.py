@@ -8,18 +8,33 @@ from graph_slam_ros.slam.calibration.rows import TrialProblem
 _LEAST_KEYFRAMES = 3
 
 
-def parameters_of(problem: TrialProblem, groups: Collection[str]) -> list[Parameter]:
-    """The parameters of some groups that the edges of a graph depend on."""
+def parameters_of(problem: TrialProblem, groups: Collection[str], *, chooses: bool = False) -> list[Parameter]:
+    """The parameters of some groups that the edges of a graph depend on.
+
+    Parameters
+    ----------
+    chooses : where all inputs of landmarks have ranges alone, these have an offset and a factor, as radios do, and
+        odometry keeps its scale: one of the two must
+    """
     if len(problem.keyframes) < _LEAST_KEYFRAMES:
         return []
-    model = problem.model()
+    model, excluded = problem.model(), set[str]()
     odometries = sorted({edges.source for edges in model.odometry})
     kinds: dict[str, set[str]] = {}
     for edges in model.sightings:
         kinds.setdefault(edges.source, set()).add(edges.kind)
+    if chooses and kinds and all(only_ranges(some) for some in kinds.values()):
+        groups = {*groups, "range_factor", "range_offset"}
+        excluded.add("distance")
+    if any("offset" in kind for some in kinds.values() for kind in some):
+        excluded.add("range_offset")  # it is an unknown of the graph
     found = []
     for name, quantity in QUANTITIES.items():
-        if quantity.group not in groups or (problem.space.dimensions == 2 and name in ("roll", "pitch", "z")):
+        if (
+            quantity.group not in groups
+            or name in excluded
+            or (problem.space.dimensions == 2 and name in ("roll", "pitch", "z"))
+        ):
             continue
         if name in OF_ODOMETRY:
             found += [Parameter(odometries[0], name)] if len(odometries) == 1 else []

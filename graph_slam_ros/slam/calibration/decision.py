@@ -7,7 +7,7 @@
    sigmas of its prior.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
@@ -46,19 +46,16 @@ class Finding:
         return self.verdict in ("admitted", "nothing_to_correct")
 
 
-def decide(found: TrialFit, landmarks: int) -> list[Finding]:
+def decide(found: TrialFit, landmarks: int, corrected: Collection[Parameter] = ()) -> list[Finding]:
     """Answer the four questions for each parameter of a trial fit.
 
     Parameters
     ----------
     landmarks : how many were seen
+    corrected : parameters that were let in before: what is left of them is followed from one sigma on
     """
-    return [_finding(found, k, _void(found, landmarks)) for k in range(len(found.parameters))]
-
-
-def refusal(parameter: Parameter, why: str) -> Finding:
-    """A parameter that is not fitted, with the reason."""
-    return Finding(parameter, 0.0, float("inf"), "refused", f"{parameter}: refused: {why}")
+    void = _void(found, landmarks)
+    return [_finding(found, k, void, one in corrected) for k, one in enumerate(found.parameters)]
 
 
 def amount(parameter: Parameter, value: float, digits: int = 2) -> str:
@@ -76,13 +73,13 @@ def _void(found: TrialFit, landmarks: int) -> str:
     return ""
 
 
-def _finding(found: TrialFit, k: int, void: str) -> Finding:
+def _finding(found: TrialFit, k: int, void: str, is_corrected: bool) -> Finding:
     parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
-    verdict, why = _verdict(found, k, void)
+    verdict, why = _verdict(found, k, void, is_corrected)
     return Finding(parameter, value, sigma, verdict, f"{parameter}: {why}")
 
 
-def _verdict(found: TrialFit, k: int, void: str) -> tuple[Verdict, str]:
+def _verdict(found: TrialFit, k: int, void: str, is_corrected: bool) -> tuple[Verdict, str]:
     parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
     quantity, (correlation, other) = parameter.quantity, found.worst_correlation(k)
     shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
@@ -91,15 +88,16 @@ def _verdict(found: TrialFit, k: int, void: str) -> tuple[Verdict, str]:
     if sigma >= quantity.determined_below:
         needs = f"sigma {amount(parameter, sigma)}, needs {amount(parameter, quantity.determined_below)}"
         return "not_determined", f"not determined ({needs}): {quantity.manoeuvre}"
-    if abs(value) < max(SIGMAS * sigma, quantity.least):
+    least = sigma if is_corrected else max(SIGMAS * sigma, quantity.least)
+    if abs(value) < least:
         return "nothing_to_correct", f"nothing to correct ({shown})"
     if correlation > MOST_CORRELATED:
         return "not_separable", f"not told from {other} (correlation {correlation:.2f}): {quantity.manoeuvre}"
     if abs(value) > PRIOR_SIGMAS * found.priors[k]:
-        limit = amount(parameter, PRIOR_SIGMAS * float(found.priors[k]))
-        return "refused", f"not used ({shown}): beyond {limit}, a wrong configuration is more likely"
+        most = amount(parameter, PRIOR_SIGMAS * float(found.priors[k]))
+        return "refused", f"not used ({shown}): beyond {most}, a wrong configuration is more likely"
     halves = float(found.first[k]), float(found.second[k])
-    if not _agree(*halves):
+    if not is_corrected and not _agree(*halves):
         first, second = (amount(parameter, half, 3) for half in halves)
         return "not_reproducible", f"not used ({shown}): {first} in one half of the drive, {second} in the other"
     return "admitted", shown
@@ -108,8 +106,3 @@ def _verdict(found: TrialFit, k: int, void: str) -> tuple[Verdict, str]:
 def _agree(first: float, second: float) -> bool:
     """Return whether each half's estimate lowers the cost of the other, a parabola around its own."""
     return 0.0 < first / second < 2.0 and 0.0 < second / first < 2.0 if first and second else False
-
-
-def admitted(findings: Sequence[Finding]) -> list[Parameter]:
-    """The parameters that are let in."""
-    return [one.parameter for one in findings if one.verdict == "admitted"]

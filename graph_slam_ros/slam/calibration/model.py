@@ -141,6 +141,12 @@ class MeasurementModel:
             return np.where(known[:, None], moved, np.stack(out, axis=-1))
         return np.stack(out, axis=-1)
 
+    def stamps(self, edges: Sightings, values: Values, path: EstimatedPath) -> Index:
+        """Corrected stamps (n,)."""
+        clock = clock_of(values, edges.source)
+        known = path.knows(edges.stamps_ns, abs(clock))
+        return edges.stamps_ns + np.where(known, round(clock * 1e9), 0)
+
     def seen(self, edges: Sightings, values: Values) -> Array:
         """Measurements (n, p) from the base at the stamp, by a sensor that is elsewhere."""
         named, z, n = _of(values, edges.source), edges.seen.copy(), self._space.dimensions

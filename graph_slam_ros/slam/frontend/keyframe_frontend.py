@@ -1,7 +1,7 @@
 """The front end: odometry becomes keyframes, each a vertex that odometry joins to the one before."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import edge_noise
 from graph_slam_ros.measurements.types import Closure, CustomEdge, InitialPose, Observation, Odometry, Sightings
 from graph_slam_ros.slam.frontend import motion_compensation
+from graph_slam_ros.slam.frontend.corrections import Corrections
 from graph_slam_ros.slam.frontend.gates import ClosureStart, DatumGate, GateChain
 from graph_slam_ros.slam.frontend.ingest_gate import size_of
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList, SightingPose
@@ -48,6 +49,7 @@ class KeyframeFrontend:
     pending : observations that odometry has not reached
     gates : what an observation passes before it is used
     edges : adds fixes, loop closures and poses that are given
+    corrections : of odometry and sightings
     covariance : (dof, dof) of the newest keyframe's pose, by the last solve and the odometry since
     initial_pose : the pose that is given for the next odometry
     held_covariance : (dof, dof) of the newest pose when the map was held, for the next odometry
@@ -80,6 +82,8 @@ class KeyframeFrontend:
         )
         self.edges = PoseEdges(self._space, edges, counters)
         self.covariance = np.zeros((self._space.dof, self._space.dof))
+        self.corrections = Corrections(config)
+        self._T_odom_base = self._space.identity  # of the last step of odometry, as its messages have it
         self.initial_pose: InitialPose | None = None
         self.held_covariance: Array | None = None
         self.custom_noise_dominates: Callable[[CustomEdge, PoseAtStamp, float], bool] = lambda m, where, most: False
@@ -122,6 +126,14 @@ class KeyframeFrontend:
     def accepts(self, m: Odometry | Observation) -> bool:
         """Return whether a measurement may be used when its turn comes; else it is counted."""
         return self.order.accepts(m) and (isinstance(m, Odometry) or self._arrivals.admit(m) is not None)
+
+    def steps(self, m: Odometry) -> Iterator[Step]:
+        """Yield the steps that a message of odometry leads to, corrected."""
+        before_ns = self.odometry.newest_ns
+        for step in self.odometry.steps(m):
+            seconds = 0.0 if before_ns is None else (step.stamp_ns - before_ns) * 1e-9
+            before_ns, self._T_odom_base = step.stamp_ns, step.T_odom_base
+            yield self.corrections.step(step, seconds)
 
     # -- the motion since the last keyframe ------------------------------------------------------------------------
 
@@ -265,9 +277,12 @@ class KeyframeFrontend:
     def _keyframe_at(self, where: PoseAtStamp, motion: IntegratedOdometry) -> PoseAtStamp:
         """A keyframe at a stamp within the last step of odometry, which is cut in two."""
         group, size, keyframes = self._space.group, self._space.dof, self.path.keyframes
-        T_odom_base = group.compose(keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
         stood = motion.now.stands
         rest = motion.cut(where.stamp_ns)
+        T_odom_base = group.compose(keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
+        if self.corrections.found or self.corrections.are_configured:  # odometry's own frame has no part in them
+            left = self.corrections.uncorrected(rest.T_last_base) if rest is not None else self._space.identity
+            T_odom_base = tuple(map(float, group.compose(self._T_odom_base, group.inverse(left))))
         self._append(
             Step(where.stamp_ns, self._space.identity, T_odom_base), motion.now.T_keyframe_base, where.covariance
         )

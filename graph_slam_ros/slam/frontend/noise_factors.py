@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -152,3 +153,16 @@ def groups(graph: Graph, edges: range) -> Iterator[tuple[EdgeTable, Index, str, 
             for origin in np.unique(table.source.values[of_label]).tolist():
                 rows = np.flatnonzero(of_label & (table.source.values == origin))
                 yield table, rows, label, graph.sources[origin]
+
+
+def factors_record(factors: Mapping[Key, float]) -> list[list[Any]]:
+    """Plain lists of factors by group, for JSON."""
+    return [[*key, factor] for key, factor in factors.items()]
+
+
+def read_factors(factors: Sequence[Any]) -> dict[Key, float]:
+    """Inverse of ``factors_record``. Raises ValueError where a factor is not above 0."""
+    out = {(str(label), str(source), str(part)): float(factor) for label, source, part, factor in factors}
+    if not all(np.isfinite(factor) and factor > 0.0 for factor in out.values()):
+        raise ValueError(f"a factor of the noise is not above 0: {factors}")
+    return out

@@ -57,6 +57,10 @@ class SightingEdges:
         where = (self._pose, T_keyframe_base, 1), (self._sensor, sensor, 1)
         Column.extend((self._edge, edge, 1), (self._stamp_ns, stamp_ns, 1), *where)
 
+    def move(self, rows: Index, stamp_ns: Index, T_keyframe_base: Array) -> None:
+        """Correct some rows."""
+        self.stamp_ns[rows], self.T_keyframe_base[rows] = stamp_ns, T_keyframe_base
+
     def copy(self) -> "SightingEdges":
         """Another with the same rows."""
         return deepcopy(self, {id(self._space): self._space})

@@ -7,13 +7,14 @@ done, in a thread or at the end, changes nothing.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.slam.robust.hypotheses import CancelToken, FrozenGraph, Outcome, search_alternatives
 
 _MORE = 1.5  # times as many out as at the last look: looks become rarer as their cost grows
 
-Work = Callable[[], Outcome | None]
+Work = Callable[[], Any]
 Executor = Callable[[Work], Work]
 """Begins work and returns what waits for its result."""
 

@@ -1,0 +1,76 @@
+"""Corrections of measurements that are in the graph."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.typing import Array, Index
+
+
+@dataclass(frozen=True, slots=True)
+class Recalibration:
+    """A correction of measurements that were in the graph.
+
+    Attributes
+    ----------
+    table : the name of the edge type
+    rows : (n,) rows of its table
+    measured, roots : (n, p), (n, m, m) what they are from now on
+    """
+
+    table: str
+    rows: Index
+    measured: Array
+    roots: Array
+
+    def only_changed(self, graph: Graph) -> "Recalibration | None":
+        """The rows that are not as they are in a graph; None where there is none."""
+        z, roots = self._columns(graph)
+        same = (z[self.rows] == self.measured).all(axis=1) & (roots[self.rows] == self.roots).all(axis=(1, 2))
+        if same.all():
+            return None
+        return Recalibration(self.table, self.rows[~same], self.measured[~same], self.roots[~same])
+
+    def _columns(self, graph: Graph) -> tuple[Array, Array]:
+        table = next(one for one in graph.tables.values() if one.type.name == self.table)
+        return table.measured.values, table.sqrt_information.values
+
+    def apply(self, graph: Graph) -> "Recalibration":
+        """Correct them; returns what undoes it."""
+        z, roots = self._columns(graph)
+        before = replace(self, measured=z[self.rows].copy(), roots=roots[self.rows].copy())
+        z[self.rows], roots[self.rows] = self.measured, self.roots
+        return before
+
+    def as_record(self) -> list[Any]:
+        """Plain lists of it, for JSON."""
+        return [self.table, self.rows.tolist(), self.measured.tolist(), self.roots.tolist()]
+
+    @classmethod
+    def from_record(cls, record: Sequence[Any]) -> "Recalibration":
+        """Inverse of ``as_record``. Raises ValueError where its numbers are not finite, or too few."""
+        table, *numbers = record
+        rows, measured, roots = (np.array(one, dtype=float) for one in numbers)
+        if not (len(rows) == len(measured) == len(roots) and np.isfinite(measured).all() and np.isfinite(roots).all()):
+            raise ValueError(f"corrections of {table!r}: not finite, or of different numbers")
+        return cls(str(table), rows.astype(np.int64), measured, roots)
+
+
+Totals = dict[tuple[str, str], float]
+
+
+def totals_record(totals: Totals) -> list[list[Any]]:
+    """Plain lists of corrected values by input and name."""
+    return [[*key, value] for key, value in totals.items()]
+
+
+def read_totals(record: Sequence[Any]) -> Totals:
+    """Inverse of ``totals_record``. Raises ValueError where a value is not finite."""
+    totals = {(str(source), str(name)): float(value) for source, name, value in record}
+    if not all(map(math.isfinite, totals.values())):
+        raise ValueError(f"a calibration is not finite: {record}")
+    return totals

@@ -1,0 +1,219 @@
+"""Calibration on the way: trial fits at fixed keyframes, and what they find taken over by correcting measurements.
+
+A trial begins at keyframes 50, 100, 200 and so on, and when everything is solved. It works on a copy, in the background
+where there is one, and its outcome is due a fixed number of keyframes later: a replay decides as the live run did.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.calibration.choice import parameters_of
+from graph_slam_ros.slam.calibration.decision import Finding, decide
+from graph_slam_ros.slam.calibration.fit import TrialFit, fit
+from graph_slam_ros.slam.calibration.model import Values
+from graph_slam_ros.slam.calibration.parameters import Parameter
+from graph_slam_ros.slam.calibration.recalibration import Recalibration
+from graph_slam_ros.slam.calibration.rows import TrialProblem
+from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
+from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
+from graph_slam_ros.slam.robust.background import Executor
+from graph_slam_ros.slam.snapshot import MapSnapshot
+from graph_slam_ros.solver import Report, Settings
+from graph_slam_ros.typing import Array, Index
+
+FIRST_DUE = 50  # keyframes
+_ROUNDS = 3  # when everything is solved
+_STEADY = 3  # trials in a row that move nothing by a sigma end it
+_DIGITS = 12  # of a corrected measurement: the last ones of a sine depend on the machine
+
+Trial = Callable[[], "TrialFit | None"]
+
+
+class Calibrator:
+    """Decides when parameters are fitted, and takes over what is found.
+
+    Attributes
+    ----------
+    findings : of the last trial, by parameter, with the whole correction so far
+    history : all corrections of measurements that were there, in order
+    trials : how many there were
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        backend: Backend,
+        frontend: KeyframeFrontend,
+        landmarks: Landmarks,
+        counters: Counters,
+        executor: Executor,
+        start: MapSnapshot | None = None,
+    ) -> None:
+        self._config, self._backend, self._frontend = config, backend, frontend
+        self._landmarks, self._counters, self._executor = landmarks, counters, executor
+        self.findings: dict[Parameter, Finding] = {}
+        self.history: list[Recalibration] = []
+        self.trials = 0
+        self._admitted: set[Parameter] = set()
+        self._due, self._steady = FIRST_DUE, 0
+        self._job: Trial | None = None
+        self._apply_at = 0  # the keyframe
+        self._first_edge = backend.graph.edge_count  # those of a loaded map are of another drive
+        if start is not None:
+            frontend.corrections.restore(start.calibration)
+            self._admitted = {Parameter(*key) for key in start.calibration}
+
+    def after_solve(self, keyframe: int, everything: Settings | None) -> Report | None:
+        """Begin a trial where it is due, and take over the outcome of one; returns the report of a solve."""
+        if not self._config.calibrate.is_on or self._backend.holds_back:
+            return None
+        if everything is not None:
+            return self._at_the_end(keyframe, everything)
+        if self._job is not None and keyframe >= self._apply_at:
+            job, self._job = self._job, None
+            self._adopt(self._guarded(job), keyframe, None)
+        if keyframe + 1 >= self._due and self._job is None:
+            while keyframe + 1 >= self._due:
+                self._due *= 2
+            if self._steady < _STEADY and not self._backend.spares_memory:
+                self._job = self._executor(self._trial(self._backend.solver.settings))
+                self._apply_at = keyframe + self._config.robust.apply_after_keyframes
+        return None
+
+    def _at_the_end(self, keyframe: int, everything: Settings) -> Report | None:
+        self._job, report = None, None
+        for _ in range(_ROUNDS):
+            found = self._adopt(self._guarded(self._trial(everything)), keyframe, everything)
+            if found is None:
+                break
+            report = found
+        return report
+
+    def _trial(self, settings: Settings) -> Trial:
+        problem, calibrate = self._problem(settings), self._config.calibrate
+
+        def run() -> TrialFit | None:
+            wanted = parameters_of(problem, calibrate.asked, chooses=calibrate.chooses)
+            return fit(problem, {one: calibrate.prior(one.name) for one in wanted}) if wanted else None
+
+        return run
+
+    def _guarded(self, job: Trial) -> TrialFit | None:
+        try:
+            return job()
+        except Exception as error:
+            self._counters.count("calibration", type(error).__name__)
+            return None
+
+    # -- taking over -------------------------------------------------------------------------------------------------
+
+    def _adopt(self, found: TrialFit | None, keyframe: int, everything: Settings | None) -> Report | None:
+        """Take over what a trial has found; None where that is nothing."""
+        if found is None:
+            return None
+        self.trials += 1
+        findings = decide(found, self._count_landmarks(), self._admitted)
+        values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
+        self._steady = 0 if values else self._steady + bool(self._admitted)
+        report = self._correct(values, keyframe, everything) if values else None
+        if report is not None:
+            self._admitted |= values.keys()
+        for one in findings:
+            self.findings[one.parameter] = one
+        return report
+
+    def _count_landmarks(self) -> int:
+        return sum(not mark.is_tentative for mark in self._landmarks.known.values())
+
+    def _correct(self, values: Values, keyframe: int, everything: Settings | None) -> Report | None:
+        """Correct all measurements, those that come included, and solve; what fails is undone."""
+        backend, corrections = self._backend, self._frontend.corrections
+        before, start = dict(corrections.found), backend.solver.values
+        changes, origins = self._changes(values)
+        undo = [change.apply(backend.graph) for change in changes]
+        try:
+            for parameter, value in values.items():
+                _add(corrections.found, (parameter.source, parameter.name), value)
+            backend.solver.rebuild()
+            report = backend.solver.optimize(everything)
+            if backend.decisions.reclassify(keyframe):
+                report = backend.solver.optimize(everything)
+        except Exception as error:
+            self._counters.count("calibration", type(error).__name__)
+            corrections.found = before
+            for change in undo:
+                change.apply(backend.graph)
+            backend.solver.start_at(start)
+            backend.solver.rebuild()
+            return None
+        for row, stamp_ns, pose in origins:
+            self._landmarks.origins.move(row, stamp_ns, pose)
+        self.history += changes
+        backend.cancel_search()
+        return report
+
+    def _changes(self, values: Values) -> "tuple[list[Recalibration], list[tuple[Index, Index, Array]]]":
+        """Return what all edges will have measured, and the origins of sightings by then."""
+        problem = self._problem()
+        model, path = problem.model(), problem.path(problem.values)
+        changes, origins = [], []
+        for odometry in model.odometry:
+            roots = odometry.table.sqrt_information.values[odometry.rows]
+            z = model.corrected_odometry(odometry, values)
+            changes.append(Recalibration(odometry.table.type.name, odometry.rows, _exact(z), roots.copy()))
+        for seen in model.sightings:
+            base = model.base(seen, values, path)
+            T_keyframe_base = tuple(base.T)
+            z = model.from_pose(seen, model.seen(seen, values), T_keyframe_base)
+            roots = model.roots(seen, values, T_keyframe_base)
+            changes.append(Recalibration(seen.table.type.name, seen.rows, _exact(z), _exact(roots)))
+            stamps = model.stamps(seen, values, path)
+            places = self._landmarks.origins.places(seen.table.id.values[seen.rows])
+            known = places >= 0
+            origins.append((places[known], stamps[known], _exact(base[known])))
+        return [one for change in changes if (one := change.only_changed(self._backend.graph)) is not None], origins
+
+    def _problem(self, settings: Settings | None = None) -> TrialProblem:
+        path, origins = self._frontend.path, self._landmarks.origins
+        problem = self._backend.trial_problem(self._config.space, path, origins, settings)
+        return replace(problem, first_edge=max(problem.first_edge, self._first_edge))
+
+    # -- what it says ------------------------------------------------------------------------------------------------
+
+    def summary(self) -> dict[str, Any]:
+        """Return what was found, for a person and for programs; empty where nothing is calibrated."""
+        if not self._config.calibrate.is_on and not self._frontend.corrections.found:
+            return {}
+        corrections = self._frontend.corrections
+        parameters = []
+        for one in self.findings.values():
+            key = one.parameter.source, one.parameter.name
+            of_one = asdict(one) | {"source": key[0], "name": key[1], "correction": corrections.found.get(key, 0.0)}
+            of_one["total"] = corrections.total(key)
+            del of_one["parameter"]
+            parameters.append({name: value for name, value in of_one.items() if value != float("inf")})
+        return {"trials": self.trials, "parameters": parameters, "settings": corrections.lines()}
+
+
+def _add(found: dict[tuple[str, str], float], key: tuple[str, str], value: float) -> None:
+    """Add a correction to those before: factors multiply."""
+    before = found.get(key, 0.0)
+    is_factor = key[1] in ("distance", "turn", "range_factor")
+    if key[1] == "range_factor" and (key[0], "range_offset") in found:
+        found[key[0], "range_offset"] *= 1.0 + value
+    found[key] = (1.0 + before) * (1.0 + value) - 1.0 if is_factor else before + value
+
+
+def _rounded(value: float) -> float:
+    """A value with six digits: the last ones of a sine depend on where in memory an array is."""
+    return float(f"{value:.6g}")
+
+
+def _exact(numbers: Array) -> Array:
+    return np.round(numbers, _DIGITS)

@@ -1,0 +1,170 @@
+"""Corrections of odometry and sightings: those that are configured, and those that calibration has found on the way.
+
+``inputs.offset_s`` is applied where messages are read; a clock's correction that is found is added to it here.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.config.inputs import InputConfig
+from graph_slam_ros.lie import so3
+from graph_slam_ros.measurements.types import Observation, Sighting, Sightings
+from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.typing import Array, Numbers
+
+Key = tuple[str, str]
+"""Input, and the name of what is corrected."""
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+_ODOMETRY = {"distance": "distance_factor", "turn": "turn_factor", "turn_bias": "turn_bias_rad_s"}
+
+
+class Corrections:
+    """The corrections in force.
+
+    Attributes
+    ----------
+    found : what was found besides the configuration: factors less 1, seconds, radians, metres
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config, self._space = config, config.space
+        self._inputs = {one.name: one for one in config.sources}
+        self.found: dict[Key, float] = {}
+
+    def configured(self, key: Key) -> float:
+        """The configured value of what is corrected."""
+        source, name = key
+        if name in _ODOMETRY:
+            return float(getattr(self._config.odometry, _ODOMETRY[name]))
+        settings = self._inputs.get(source, InputConfig(source))
+        if name in AXES:
+            return (settings.numbers("mount_correction", 6) or (0.0,) * 6)[AXES.index(name)]
+        return float(
+            {"clock": settings.offset_s, "range_factor": settings.range_factor}.get(name, settings.range_offset_m)
+        )
+
+    def total(self, key: Key, found: float | None = None) -> float:
+        """The value that the configuration would have with what was found."""
+        found = self.found.get(key, 0.0) if found is None else found
+        is_factor = key[1] in ("distance", "turn", "range_factor")
+        if key[1] == "range_offset":  # ranges are scaled by what was found, too, after the configured offset
+            return self.configured(key) * (1.0 + self.found.get((key[0], "range_factor"), 0.0)) + found
+        return self.configured(key) * (1.0 + found) if is_factor else self.configured(key) + found
+
+    def restore(self, totals: Mapping[Key, float]) -> None:
+        """Go on with the values of another run, whatever of them is configured now."""
+        for key, total in totals.items():
+            is_factor = key[1] in ("distance", "turn", "range_factor")
+            self.found[key] = total / self.configured(key) - 1.0 if is_factor else total - self.configured(key)
+
+    def totals(self) -> dict[Key, float]:
+        """The values of all that was found, as ``restore`` takes them."""
+        return {key: self.total(key) for key in self.found}
+
+    def lines(self) -> dict[str, float | str]:
+        """Parameters of a configuration that has what was found."""
+        out: dict[str, float | str] = {}
+        for source, name in self.found:
+            total = self.total((source, name))
+            if name in _ODOMETRY:
+                out[f"odometry.{_ODOMETRY[name]}"] = float(f"{total:.6g}")
+            elif name in AXES:
+                numbers = (self.total((source, axis)) for axis in AXES)
+                out[f"{source}.mount_correction"] = " ".join(f"{number:.6g}" for number in numbers)
+            else:
+                key = {"clock": "offset_s", "range_offset": "range_offset_m"}.get(name, name)
+                out[f"{source}.{key}"] = float(f"{total:.6g}")
+        return out
+
+    # -- odometry ----------------------------------------------------------------------------------------------------
+
+    def step(self, step: Step, seconds: float) -> Step:
+        """A step of odometry that lasts some seconds, corrected; where it leads to in its own frame stays."""
+        motion = self.motion(step.T_last_base, seconds)
+        return step if motion is step.T_last_base else replace(step, T_last_base=motion)
+
+    def motion(self, motion: Numbers, seconds: float = 0.0) -> Numbers:
+        """A motion by odometry, corrected; its numbers may be arrays."""
+        distance, turn, bias = (self._of_odometry(name) for name in _ODOMETRY)
+        if (distance, turn, bias) == (1.0, 1.0, 0.0):
+            return motion
+        group, n = self._space.group, self._space.dimensions
+        tangent = group.log(motion)
+        moves = bias != 0.0 and any(np.any(x) for x in tangent)
+        scaled = [x * (distance if k < n else turn) for k, x in enumerate(tangent)]
+        scaled[-1] = scaled[-1] + moves * bias * seconds
+        out = group.exp(tuple(scaled))
+        return out if isinstance(out[0], np.ndarray) else tuple(map(float, out))
+
+    @property
+    def are_configured(self) -> bool:
+        """Return whether the configuration corrects odometry."""
+        c = self._config.odometry
+        return (c.distance_factor, c.turn_factor, c.turn_bias_rad_s) != (1.0, 1.0, 0.0)
+
+    def uncorrected(self, motion: Numbers) -> Numbers:
+        """A corrected motion as odometry has it, but for its bias."""
+        group, n = self._space.group, self._space.dimensions
+        distance, turn = self._of_odometry("distance"), self._of_odometry("turn")
+        tangent = group.log(motion)
+        out: Numbers = group.exp(tuple(x / (distance if k < n else turn) for k, x in enumerate(tangent)))
+        return out
+
+    def _of_odometry(self, name: str) -> float:
+        found = next((value for (_, other), value in self.found.items() if other == name), 0.0)
+        value = float(getattr(self._config.odometry, _ODOMETRY[name]))
+        return value + found if name == "turn_bias" else value * (1.0 + found)
+
+    # -- sightings ---------------------------------------------------------------------------------------------------
+
+    def observation(self, m: Observation) -> Observation:
+        """An observation, corrected."""
+        if not isinstance(m, Sightings):
+            return m
+        shift_ns = round(self.found.get((m.topic, "clock"), 0.0) * 1e9)
+        mount = [self.total((m.topic, axis)) for axis in AXES]
+        scale = self.total((m.topic, "range_factor"))
+        offset = self.total((m.topic, "range_offset"))
+        if not shift_ns and not any(mount) and (scale, offset) == (1.0, 0.0):
+            return m
+        turned = self._turn(mount)
+        sightings = tuple(self._sighting(s, mount, turned, scale, offset) for s in m.sightings)
+        return replace(m, stamp_ns=m.stamp_ns + shift_ns, sightings=sightings)
+
+    def _turn(self, mount: list[float]) -> Numbers:
+        if self._space.dimensions == 2:
+            return 0.0, 0.0, mount[5]
+        return (0.0, 0.0, 0.0, *map(float, so3.exp((mount[3], mount[4], mount[5]))))
+
+    def _sighting(self, s: Sighting, mount: list[float], turn: Numbers, scale: float, offset: float) -> Sighting:
+        space, n = self._space, self._space.dimensions
+        T_base_sensor = s.T_base_sensor or space.identity
+        if s.kind in ("position", "pose"):
+            moved = self._moved((*s.measured[:n], *(s.measured[n:] or space.identity[n:])), T_base_sensor, mount, turn)
+            own = s.measured[:n] if s.kind == "position" else s.measured
+            covariance = s.covariance
+            if s.kind == "position":
+                rotation = space.turn(turn)
+                covariance = tuple((rotation @ _square(covariance) @ rotation.T).ravel().tolist())
+            return replace(s, measured=tuple(map(float, moved[: len(own)])), covariance=covariance)
+        at = self._moved(T_base_sensor, T_base_sensor, mount, turn)
+        measured = s.measured
+        if s.kind in ("range", "range_bearing"):
+            measured = (scale * measured[0] + offset, *measured[1:])
+        return replace(s, measured=measured, T_base_sensor=tuple(map(float, at)))
+
+    def _moved(self, pose: Numbers, T_base_sensor: Numbers, mount: list[float], turn: Numbers) -> Numbers:
+        """A pose in the base frame after its sensor was turned about its origin, and moved."""
+        n = self._space.dimensions
+        around = (*(pose[k] - T_base_sensor[k] for k in range(n)), *pose[n:])
+        turned = self._space.group.compose(turn, around)
+        return (*(turned[k] + T_base_sensor[k] + mount[k] for k in range(n)), *turned[n:])
+
+
+def _square(flat: Numbers) -> Array:
+    size = math.isqrt(len(flat))
+    return np.array(flat).reshape(size, size)

@@ -1,0 +1,118 @@
+"""Calibration on the way: what was wrong is corrected, and where nothing is, nothing changes."""
+
+import numpy as np
+import pytest
+from imperfect import Faults, driven, imperfect_drive
+
+from graph_slam_ros import Config
+from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.runs.map_journal import state_of
+from graph_slam_ros.slam import GraphSlam
+
+ON = {"calibrate.groups": "on"}
+FAULTS = Faults(distance=0.95, turn=1.05, clock_s=0.12, yaw=0.08)
+
+
+@pytest.fixture(scope="module")
+def wrong():
+    return imperfect_drive(FAULTS, seconds=70.0)
+
+
+@pytest.fixture(scope="module")
+def calibrated(wrong):
+    return driven(wrong, ON)
+
+
+def true_landmarks(slam, truth_of):
+    return np.array([slam.solver.estimate([slam.landmarks[name].vertex])[0] for name in truth_of])
+
+
+def spread_error(slam, reference):
+    """RMSE of distances between landmarks against those of another map."""
+    names = sorted(slam.landmarks.keys() & reference.landmarks.keys())
+    a, b = (np.array([one.solver.estimate([one.landmarks[n].vertex])[0] for n in names]) for one in (slam, reference))
+    first, second = np.triu_indices(len(names), 1)
+    far = [np.linalg.norm(x[first] - x[second], axis=1) for x in (a, b)]
+    return float(np.sqrt(np.mean((far[0] - far[1]) ** 2)))
+
+
+def test_what_is_wrong_is_corrected_on_the_way(wrong, calibrated):
+    lines = calibrated.calibration_report["settings"]
+    assert lines["odometry.distance_factor"] == pytest.approx(0.95, abs=0.01)
+    assert lines["odometry.turn_factor"] == pytest.approx(1.05, abs=0.015)
+    assert lines["detections.offset_s"] == pytest.approx(0.12, abs=0.02)
+    yaw = float(lines["detections.mount_correction"].split()[5])
+    assert yaw == pytest.approx(0.08, abs=0.006)
+    perfect = driven(imperfect_drive(Faults(), seconds=70.0))
+    assert spread_error(calibrated, perfect) < 0.3 * spread_error(driven(wrong), perfect)
+
+
+def test_the_lines_applied_leave_nothing_to_correct(wrong, calibrated):
+    again = driven(_earlier(wrong, calibrated), {**ON, **_without_clock(calibrated)})
+    found = {p["name"]: p["correction"] for p in again.calibration_report["parameters"]}
+    assert found == dict.fromkeys(found, 0.0), found
+
+
+def _without_clock(slam):
+    return {k: v for k, v in slam.calibration_report["settings"].items() if not k.endswith("offset_s")}
+
+
+def _earlier(measurements, slam):
+    """``offset_s`` is applied where messages are read."""
+    from dataclasses import replace
+
+    shift_ns = round(slam.calibration_report["settings"]["detections.offset_s"] * 1e9)
+    out = [replace(m, stamp_ns=m.stamp_ns + shift_ns) if hasattr(m, "sightings") else m for m in measurements]
+    return sorted(out, key=lambda m: m.stamp_ns)
+
+
+def test_where_nothing_is_wrong_the_graph_is_the_same_to_the_last_bit():
+    measurements = imperfect_drive(Faults(), seconds=40.0)
+    off, on = driven(measurements), driven(measurements, ON)
+    assert on.calibration_report["trials"] >= 2
+    assert not on.calibration_report["settings"]
+    assert (off.solver.values == on.solver.values).all()
+
+
+def test_odometry_in_its_own_frame_is_not_corrected(wrong, calibrated):
+    """Whoever publishes odom -> base publishes it uncorrected: map -> odom has to fit that."""
+    odometry = {m.stamp_ns: m.T_odom_base for m in wrong if not hasattr(m, "sightings")}
+    keyframes = [k for k in calibrated.keyframes if k.stamp_ns in odometry]
+    assert len(keyframes) > 20
+    for one in keyframes[-20:]:
+        np.testing.assert_allclose(one.T_odom_base[:2], odometry[one.stamp_ns][:2], atol=2e-3)
+
+
+def test_a_map_that_is_loaded_goes_on_with_its_calibration(calibrated):
+    state = state_of(calibrated)
+    again = GraphSlam(Config.from_mapping(ON), start=state)
+    assert again.calibration == pytest.approx(calibrated.calibration)
+    configured = {"odometry.distance_factor": calibrated.calibration_report["settings"]["odometry.distance_factor"]}
+    told = GraphSlam(Config.from_mapping(configured), start=state_of(calibrated))
+    assert told._frontend.corrections.found["odometry", "distance"] == pytest.approx(0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("groups", "why"),
+    [
+        ("factors range_factor", "one scale"),
+        ("on range_factor", "one scale"),
+        ("on off", "off and on"),
+        ("wheels", "'wheels' is not on, off or one of factors"),
+    ],
+)
+def test_what_cannot_be_told_apart_is_refused_by_configuration(groups, why):
+    with pytest.raises(ConfigError, match=why):
+        Config.from_mapping({"calibrate.groups": groups})
+
+
+def test_mount_and_range_offset_need_a_ruler():
+    both = {"calibrate.groups": "mount range_offset", "calibrate.mount_sigma_m": 0.5}
+    with pytest.raises(ConfigError, match="measure the mount"):
+        Config.from_mapping(both)
+    assert Config.from_mapping(both | {"calibrate.mount_sigma_m": 0.05})
+
+
+def test_factors_and_range_factor_are_allowed_where_landmarks_are_surveyed():
+    survey = {"landmarks.surveyed": "id,x,y,sigma\na,0,0,0.01\nb,5,0,0.01"}
+    assert Config.from_mapping({"calibrate.groups": "factors range_factor", **survey})
