@@ -50,7 +50,7 @@ setup(
     author_email="maintainers@graph-slam-ros.example",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed"]},
+    package_data={NAME: ["py.typed", "report/page.*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -74,10 +74,12 @@ setup(
     extras_require={
         # Tests compare our scores with its. GPL-3.0: never a requirement of the Apache-2.0 package itself.
         "evaluate": ["evo>=1.31.1"],
+        "report": ["plotly>=7.1.0"],  # its JavaScript; of Python nothing is imported
         "jazzy": [f"{line} ; {WHERE_JAZZY_HAS_WHEELS}" for line in JAZZY],
         "test": [
             "hypothesis>=6.82",
             "mypy>=1.8",
+            "playwright>=1.65.2",  # with an installed Chromium, for the report
             "pytest>=7.4",
             "pytest-xdist>=3.5",
             "ruff>=0.6",

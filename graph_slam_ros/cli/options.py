@@ -221,6 +221,16 @@ def plot(sub: CommandParser) -> None:
     _add_force(sub)
 
 
+def report(sub: CommandParser) -> None:
+    """Add the options of ``report``."""
+    _add_run(sub)
+    sub.add_argument("--out", type=Path, metavar="FILE.html", help="file of the report (default: RUN.html)")
+    _add_truth(sub, required=False)
+    sub.add_argument("--compare", type=Path, metavar="RUN2", help="another run: draw its path and list what differs")
+    sub.add_argument("--plan", type=Path, metavar="MAP.yaml", help="floor plan to draw below: a map.yaml of Nav2")
+    _add_force(sub)
+
+
 def _add_truth(sub: CommandParser, *, required: bool) -> None:
     sub.add_argument("--truth", required=required, metavar="BAG|FILE.tum", help="the truth: a recording, or a TUM file")
     sub.add_argument(

@@ -99,6 +99,13 @@ COMMANDS = {
         "drive_run --truth drive.mcap:/ground_truth --out drive.png",
         "drive_run --animate drive.gif",
     ),
+    "report": Command(
+        _later("report"),
+        options.report,
+        "write one HTML file on a run: map, edges with their reasons, charts and tables",
+        "drive_run",
+        "drive_run --truth drive.mcap:/ground_truth --out drive.html",
+    ),
     "explain": Command(
         audit.explain,
         options.explain,

@@ -66,6 +66,10 @@ WITHIN = {
         *("edge_tags", "lie", "graph", "solver", "formats", "measurements", "slam", "slam/landmarks", "slam/robust"),
         *("messages/inputs", "recordings", "runs", "maps"),
     },
+    "report": {
+        *("graph", "lie", "formats", "measurements", "config", "slam", "slam/landmarks", "slam/robust"),
+        *("recordings", "runs", "maps", "analysis"),
+    },
     "simulation": {"edge_tags", "lie", "graph", "formats", "slam", "messages", "messages/inputs", "recordings"},
     "node": {
         *("graph", "warmup", "formats", "measurements", "config", "slam", "slam/frontend", "slam/robust"),
@@ -73,7 +77,7 @@ WITHIN = {
     },
     "cli": {
         *("progress", "warmup", "graph", "solver", "optimization", "certificate", "formats", "config"),
-        *("slam", "messages/inputs", "recordings", "check", "runs", "maps", "analysis", "simulation", "node"),
+        *("slam", "messages/inputs", "recordings", "check", "runs", "maps", "analysis", "report", "simulation", "node"),
     },
     "__init__.py": {
         *("graph", "solver", "optimization", "certificate", "formats", "measurements", "config", "slam", "runs"),

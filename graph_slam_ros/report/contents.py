@@ -1,0 +1,256 @@
+"""The contents of a report: read from its folder, one part after another, each missing only where its files are."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.special import gammainc
+
+from graph_slam_ros.analysis.evaluation import Scores, dimensions_of, evaluate, input_topics
+from graph_slam_ros.analysis.explain import landmark_lines
+from graph_slam_ros.analysis.trajectories import Truth, read_truth
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.report import drive, verdict
+from graph_slam_ros.report.packing import Packing, shown
+from graph_slam_ros.report.places import floor_plan, paths
+from graph_slam_ros.report.sentences import effects, sentences
+from graph_slam_ros.runs.folder import RunError, changed_since, is_run, run_config, summary_of
+from graph_slam_ros.slam.robust.ledger import Reason, Verdict
+
+_BINS, _SHOWN = 60, 25
+_MM, _NOTHING = 1e-3, 1e-9
+
+
+@dataclass
+class Contents:
+    """The contents, as JSON with packed columns.
+
+    Attributes
+    ----------
+    losses : parts that could not be read; beware : what may mislead
+    """
+
+    run: Path
+    packing: Packing = field(default_factory=Packing)
+    data: dict[str, Any] = field(default_factory=dict)
+    losses: list[str] = field(default_factory=list)
+    beware: list[str] = field(default_factory=list)
+
+    def attempt(self, part: Callable[[], Any]) -> Any:
+        """Make one part; None, and a loss, where its files are damaged."""
+        try:
+            return part()
+        except (GraphSlamError, LookupError, TypeError, ValueError, AttributeError, OSError) as error:
+            self.losses.append(str(error) or type(error).__name__)
+            return None
+
+
+def contents(
+    run: Path,
+    truth: str | None = None,
+    other: Path | None = None,
+    plan: Path | None = None,
+    topic: str = "",
+    *,
+    align: bool = True,
+) -> Contents:
+    """Read a run.
+
+    Parameters
+    ----------
+    truth, topic : as ``evaluate`` takes them
+    other : another run, whose path is drawn and whose map is compared
+    plan : a ``map.yaml`` of Nav2
+
+    Raises
+    ------
+    GraphSlamError
+        The folder is not a run; or the truth, the other run or the floor plan, which were asked for, cannot be read.
+    """
+    if not is_run(run):
+        raise RunError(f"{run}: not a run's folder")
+    out = Contents(run)
+    summary = out.attempt(lambda: summary_of(run)) or {}
+    known = read_truth(truth, topic, out.attempt(lambda: input_topics(run)) or set()) if truth else None
+    saved = out.attempt(lambda: SavedGraph(run, out.losses))
+    out.beware += out.attempt(lambda: changed_since(run)) or []
+    scores = evaluate(run, known, align=align) if known and saved else None
+    out.data["dimensions"] = out.attempt(lambda: dimensions_of(run)) or 2
+    out.data["map"] = out.attempt(lambda: paths(out.packing, run, known, other, align=align)) if saved else None
+    out.data["plan"] = floor_plan(plan) if plan else None
+    if saved:
+        out.data["edges"] = _edges(out, saved)
+        out.data["charts"] = _charts(out, saved)
+        out.data["drive"] = out.attempt(lambda: _drive(out, saved))
+    _tables(out, summary, saved, scores, known)
+    out.data["compared"] = _compared(run, other, out) if other else None
+    out.losses = list(dict.fromkeys(out.losses))
+    out.data["sentences"] = out.attempt(lambda: verdict.verdict(run, summary, saved, scores, out.losses))
+    out.data["losses"], out.data["beware"] = [[shown(one) for one in some] for some in (out.losses, out.beware)]
+    return out
+
+
+def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
+    """The columns of the ledger, and the sentences on each edge."""
+    pack, entries, found = out.packing, saved.entries, effects(saved)
+    texts = sentences(saved, found)
+    keyframes = {vertex: k for k, vertex in enumerate(saved.keyframes)}
+    names = list(dict.fromkeys(e.landmark for e in entries))
+    places = {name: len(saved.keyframes) + k for k, name in enumerate(name for name in names if name)}
+
+    def coded(values: list[str]) -> dict[str, Any]:
+        several = list(dict.fromkeys(values))
+        code = {value: k for k, value in enumerate(several)}
+        return {"names": several, "of": pack.column([code[value] for value in values], "i4")}
+
+    def end(slot: int) -> list[int]:
+        def place(e: Any) -> int:
+            if slot >= len(e.vertices):
+                return -1
+            return keyframes.get(e.vertices[slot], places.get(e.landmark, -1))
+
+        return [place(e) for e in entries]
+
+    def numbers(name: str) -> Any:
+        return np.array([getattr(e, name) for e in entries], dtype=float)
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.sqrt(numbers("statistic") / numbers("threshold"))
+    columns = {name: pack.column(_finite(numbers(name))) for name in ("statistic", "threshold", "chi2")}
+    columns |= {"sigma_factor": pack.column(_finite(factor)), "percent": pack.column(100.0 * numbers("weight"))}
+    columns |= {name: pack.column(_finite(getattr(found, name))) for name in ("last_m", "end_m", "cost")}
+    columns["stamp_s"] = pack.column(numbers("stamp_s"), "f8")
+    columns |= {name: pack.column(numbers(name), "i4") for name in ("keyframe", "dof")}
+    for name, values in texts.numbers.items():
+        columns[name] = pack.fixed(values, _step(values))
+    for slot in range(max((len(e.vertices) for e in entries), default=0)):
+        ends = [e.vertices[slot] if slot < len(e.vertices) else None for e in entries]
+        shown_as = [-1 if vertex is None else keyframes.get(vertex, saved.ids[vertex]) for vertex in ends]
+        columns[f"end{slot}"] = pack.column(shown_as, "i4")
+    return {
+        "count": len(entries),
+        "columns": columns,
+        "group": pack.column(texts.group, "i4"),
+        "groups": texts.groups,
+        "changes": {str(edge): lines for edge, lines in texts.changes.items()},
+        "places": [pack.column(end(slot), "i4") for slot in range(2)],
+        "label": coded([e.label for e in entries]),
+        "source": coded([shown(e.source) for e in entries]),
+        "landmark": coded([shown(e.landmark) for e in entries]),
+        "verdict": pack.column([int(e.verdict) for e in entries], "u1"),
+        "reason": pack.column([int(e.reason) for e in entries], "u1"),
+        "verdicts": [one.name.lower().replace("_", " ") for one in Verdict],
+        "reasons": ["" if one is Reason.NONE else one.name.lower().replace("_", " ") for one in Reason],
+        "landmark_lines": pack.texts(_landmark_texts(saved, [name for name in names if name])),
+        "landmark_names": pack.texts([shown(name) for name in names if name]),
+    }
+
+
+def _step(values: Any) -> float:
+    """The step of a column of measured numbers: what is shown of it is no finer."""
+    largest = float(np.nanmax(np.abs(values)))
+    return _MM if largest < 1e6 else largest * 1e-9
+
+
+def _finite(values: Any) -> Any:
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _landmark_texts(saved: SavedGraph, names: list[str]) -> list[str]:
+    """The lines of ``explain`` on each landmark."""
+    seen: dict[str, list[Any]] = {name: [] for name in names}
+    for e in saved.entries:
+        if e.landmark:
+            seen[e.landmark].append(e)
+    return ["\n".join(map(shown, landmark_lines(saved.folder, name, several))) for name, several in seen.items()]
+
+
+def _charts(out: Contents, saved: SavedGraph) -> dict[str, Any]:
+    """Histograms: verdicts over the drive, and chi2 of each class against what it should be."""
+    judged = [e for e in saved.entries if e.verdict]
+    count = max(1, len(saved.keyframes))
+    edges = np.linspace(0, count, min(_BINS, count) + 1)
+    over = {}
+    for one in Verdict:
+        if one:
+            at = [e.keyframe for e in judged if e.verdict is one]
+            over[one.name.lower().replace("_", " ")] = np.histogram(at, edges)[0].tolist()
+    later = [c.keyframe for c in saved.changes]
+    inside = sorted((e for e in judged if e.is_in), key=lambda e: -e.chi2 / e.dof)[:_SHOWN]
+    outside = sorted((e for e in judged if not e.is_in), key=lambda e: -e.statistic / e.threshold)[:_SHOWN]
+    return {
+        "bins": edges.tolist(),
+        "verdicts": over,
+        "changes": np.histogram(later, edges)[0].tolist(),
+        "chi2": list(_chi2_histograms(saved)),
+        "worst": [e.edge for e in inside],
+        "farthest": [e.edge for e in outside],
+    }
+
+
+def _chi2_histograms(saved: SavedGraph) -> Iterator[dict[str, Any]]:
+    """Chi2 of the accepted edges of each class, and how many the chi2 distribution has in each bin."""
+    inside = [e for e in saved.entries if e.is_in]
+    for label, dof in dict.fromkeys((e.label, e.dof) for e in inside):
+        values = np.array([e.chi2 for e in inside if (e.label, e.dof) == (label, dof)])
+        if len(values) < 2 or not values.max() > _NOTHING:
+            continue
+        bins = np.linspace(0.0, 4.0 * dof + 8.0, 41)
+        found = np.histogram(np.minimum(values, bins[-1] - _NOTHING), bins)[0]
+        should = len(values) * np.diff(gammainc(0.5 * dof, 0.5 * bins))
+        should[-1] = len(values) - should[:-1].sum()
+        name = f"chi2 of {label}, {dof} degree{'s' * (dof > 1)} of freedom; the last bin has all above"
+        yield {"name": name, "bins": bins.tolist(), "found": found.tolist(), "should": should.tolist()}
+
+
+def _drive(out: Contents, saved: SavedGraph) -> dict[str, Any]:
+    """The frames of the time slider, and the jumps of map -> odom."""
+    from graph_slam_ros.runs.trajectory import read_tum
+
+    frames = drive.frames(out.run, out.losses)
+    odometry = read_tum(out.run / "path_odometry.tum")
+    found = drive.corrections(out.run, odometry.stamps_s, odometry.poses, out.losses)
+    changed: dict[int, list[int]] = {}
+    for change in saved.changes:
+        changed.setdefault(change.keyframe, []).append(change.edge)
+    several = drive.jumps(found, saved.entries, changed)
+    return {
+        "frames": [
+            {
+                "keyframes": one.keyframes,
+                "points": [out.packing.fixed(column, _MM, is_path=True) for column in one.points.T],
+            }
+            for one in frames
+        ],
+        "corrections": [out.packing.column(found[0], "i4"), out.packing.fixed(found[1], 1e-4)],
+        "jumps": [[one.keyframe, one.distance_m, one.angle_rad * 180.0 / np.pi, one.edges] for one in several],
+    }
+
+
+def _tables(out: Contents, summary: dict[str, Any], saved: Any, scores: Scores | None, known: Truth | None) -> None:
+    """The tables below the map."""
+    config = out.attempt(lambda: run_config(out.run))
+    out.data["tables"] = {
+        "inputs": out.attempt(lambda: verdict.inputs(summary)) or [],
+        "configuration": out.attempt(lambda: verdict.configuration(config)) if config else [],
+        "versions": out.attempt(lambda: verdict.versions(out.run, summary)) or [],
+        "timing": out.attempt(lambda: verdict.timing(summary)) or [],
+        "noise": out.attempt(lambda: verdict.noise(summary)) or [],
+        "classes": out.attempt(lambda: list(verdict.classes(summary))) or [],
+    }
+    out.data["waiting"] = [[shown(str(n)), shown(str(why))] for n, why in dict(summary.get("waiting") or {}).items()]
+    out.data["chi2_per_dof"] = out.attempt(lambda: verdict.chi2_per_dof(saved)) if saved else None
+    out.data["scores"] = str(scores).splitlines() if scores else None
+    if scores:
+        out.beware += scores.warnings
+        out.losses += scores.losses
+
+
+def _compared(run: Path, other: Path, out: Contents) -> dict[str, Any]:
+    from graph_slam_ros.maps.diff import diff
+
+    lines = [shown(line) for line in diff(run, other, out.losses).lines()]
+    return {"with": shown(other.resolve().name), "lines": lines}

@@ -1,0 +1,157 @@
+"""The drive as it went on: what the estimate was at some moments, and where it jumped."""
+
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.records import Channel, Message
+
+from graph_slam_ros.formats.cdr import CdrReader
+from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, SE3
+from graph_slam_ros.lie import se3
+from graph_slam_ros.recordings.mcap_records import records
+from graph_slam_ros.runs.journal import MAP, parts_of, read_records
+from graph_slam_ros.runs.ledger_file import Entry
+from graph_slam_ros.typing import Array
+
+MOST_FRAMES, MOST_POINTS, MOST_JUMPS = 80, 500, 15
+_KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}
+_RUN = "run"
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The estimate at one moment.
+
+    Attributes
+    ----------
+    keyframes : how many there were
+    points : (m, 3) their positions in map as they were known then, or some of them
+    """
+
+    keyframes: int
+    points: Array
+
+
+def frames(run: Path, losses: list[str]) -> list[Frame]:
+    """The estimates of a map's journal, some of them where there are many; each with a part of its keyframes."""
+    found, reader = list[Frame](), _Values()
+    for record in read_records(run, MAP, losses):
+        if record.get("type") == "growth":
+            reader.grow(record)
+        elif record.get("type") == "estimate" and reader.keyframes:
+            found.append(Frame(len(reader.keyframes), reader.at(record["values"])))
+    some = np.unique(np.linspace(0, len(found) - 1, min(len(found), MOST_FRAMES)).astype(int))
+    return [found[k] for k in some.tolist()]
+
+
+class _Values:
+    """Values of a map by keyframe."""
+
+    def __init__(self) -> None:
+        self._first: list[int] = []
+        self._total = 0
+        self.keyframes: list[int] = []
+        self._is_flat = True
+
+    def grow(self, record: dict[str, Any]) -> None:
+        for name, _ in record.get("vertices", ()):
+            self._first.append(self._total)
+            self._total += _KINDS[name].size
+            self._is_flat = self._is_flat and name != SE3.name
+        self.keyframes += [vertex for vertex, *_ in record.get("keyframes", ())]
+
+    def at(self, values: Sequence[float]) -> Array:
+        some = np.unique(np.linspace(0, len(self.keyframes) - 1, min(len(self.keyframes), MOST_POINTS)).astype(int))
+        first = np.array([self._first[self.keyframes[k]] for k in some.tolist()])
+        flat = np.asarray(values, dtype=float)
+        first = first[first + (2 if self._is_flat else 3) <= len(flat)]
+        out = np.zeros((len(first), 3))
+        for axis in range(2 if self._is_flat else 3):
+            out[:, axis] = flat[first + axis]
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Jump:
+    """A moment at which ``map -> odom`` changed.
+
+    Attributes
+    ----------
+    distance_m, angle_rad : how far the robot was moved in map
+    edges : the measurements judged then that pulled most
+    """
+
+    keyframe: int
+    distance_m: float
+    angle_rad: float
+    edges: list[int]
+
+
+def corrections(run: Path, stamps_s: Array, odometry: Array, losses: list[str]) -> tuple[Array, Array, Array]:
+    """Changes of ``map -> odom`` from keyframe to keyframe, as it was published.
+
+    Parameters
+    ----------
+    stamps_s, odometry : (n,), (n, 7) of the keyframes, ``T_odom_base``
+
+    Returns
+    -------
+    keyframes (m,), distances (m,) [m] by which the robot was moved at each, angles (m,) [rad]
+    """
+    published = list(_published(run, losses))
+    if len(published) < 2:
+        return np.zeros(0, dtype=int), np.zeros(0), np.zeros(0)
+    stamps, poses = np.array([at for at, _ in published]) * 1e-9, np.array([pose for _, pose in published])
+    at = np.clip(np.searchsorted(stamps_s, stamps - 1e-4), 0, len(stamps_s) - 1)
+    fits = np.abs(stamps_s[at] - stamps) < 1e-3
+    at, poses = at[fits], poses[fits]
+    odom = tuple(odometry[at].T)
+    T_map_odom = se3.compose(tuple(poses.T), se3.inverse(odom))
+    before = tuple(number[:-1] for number in T_map_odom)
+    foretold = se3.compose(before, tuple(number[1:] for number in odom))
+    moved = np.stack(se3.between(foretold, tuple(poses[1:].T)), axis=1)
+    angles = 2.0 * np.arctan2(np.linalg.norm(moved[:, 3:6], axis=1), np.abs(moved[:, 6]))
+    keyframes: Any = at[1:]
+    return keyframes, np.linalg.norm(moved[:, :3], axis=1), angles
+
+
+def jumps(found: tuple[Array, Array, Array], entries: Sequence[Entry], changed: dict[int, list[int]]) -> list[Jump]:
+    """The largest corrections, each with the measurements that came or were judged otherwise at that keyframe.
+
+    Parameters
+    ----------
+    changed : by keyframe, the edges whose verdict changed there
+    """
+    keyframes, distances, angles = found
+    came: dict[int, list[Entry]] = {}
+    for e in entries:
+        if e.verdict and e.is_in:
+            came.setdefault(e.keyframe, []).append(e)
+    out = []
+    for k in np.argsort(-distances, kind="stable")[:MOST_JUMPS].tolist():
+        if distances[k] <= 1e-3:
+            break
+        at = int(keyframes[k])
+        pulled = sorted(came.get(at, ()), key=lambda e: -e.statistic)[:4]
+        edges = list(dict.fromkeys([*changed.get(at, ())[:4], *(e.edge for e in pulled)]))
+        out.append(Jump(at, float(distances[k]), float(angles[k]), edges))
+    return out
+
+
+def _published(run: Path, losses: list[str]) -> Iterator[tuple[int, tuple[float, ...]]]:
+    """Stamp and pose of each message of ``/pose``."""
+    for file in parts_of(run, _RUN):
+        of_pose = -1
+        for record in records(file, losses, follow=False):
+            if isinstance(record, Channel) and record.topic == "/pose":
+                of_pose = record.id
+            elif isinstance(record, Message) and record.channel_id == of_pose:
+                with suppress(struct.error):  # shorter than a pose: as if it had not come
+                    reader = CdrReader(record.data)
+                    stamp_ns, _ = reader.stamp_ns(), reader.text()
+                    yield stamp_ns, reader.numbers("d", 7)

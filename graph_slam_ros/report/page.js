@@ -1,0 +1,588 @@
+"use strict";
+// The page of `graph_slam report`. Names come from files and messages: they are shown with textContent, and escaped for
+// plotly, which knows some HTML.
+const UNKNOWN = -(2 ** 31), SIZES = {f4: 4, f8: 8, i4: 4, u1: 1};
+const ARRAYS = {f4: Float32Array, f8: Float64Array, i4: Int32Array, u1: Uint8Array};
+const data = JSON.parse(document.getElementById("data").textContent);
+const byId = (id) => document.getElementById(id);
+const unpacked = new Map();
+let bytes = null;
+
+// -- columns ---------------------------------------------------------------------------------------------------------
+
+async function readColumns() {
+  const text = atob(byId("columns").textContent.trim());
+  const packed = new Uint8Array(text.length);
+  for (let k = 0; k < text.length; k++) packed[k] = text.charCodeAt(k);
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  bytes = new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+function column(one) {
+  if (!unpacked.has(one)) unpacked.set(one, unpack(one));
+  return unpacked.get(one);
+}
+
+function unpack(one) {
+  const part = bytes.subarray(one.at, one.at + one.bytes);
+  if (one.packed === "s") return one.count ? new TextDecoder().decode(part).split("\0") : [];
+  const size = SIZES[one.packed], n = one.count, whole = new Uint8Array(n * size);
+  for (let b = 0; b < size; b++) for (let k = 0, at = b * n; k < n; k++, at++) whole[k * size + b] = part[at];
+  const values = new ARRAYS[one.packed](whole.buffer);
+  if (one.step === 1) return values;
+  const out = new Float64Array(n);
+  for (let k = 0, sum = 0; k < n; k++) {
+    sum = one.sum ? sum + values[k] : values[k];
+    out[k] = !one.sum && values[k] === UNKNOWN ? NaN : sum * one.step;
+  }
+  return out;
+}
+
+// -- sentences -------------------------------------------------------------------------------------------------------
+
+function general(value, digits) {
+  if (value === 0) return "0";
+  const [mantissa, power] = value.toExponential(digits - 1).split("e");
+  const exponent = Number(power), short = (text) => (text.includes(".") ? text.replace(/\.?0+$/, "") : text);
+  if (exponent >= -4 && exponent < digits) return short(value.toFixed(digits - 1 - exponent));
+  return `${short(mantissa)}e${exponent < 0 ? "-" : "+"}${String(Math.abs(exponent)).padStart(2, "0")}`;
+}
+
+function formatted(value, spec) {
+  if (typeof value === "string" || !spec) return String(value);
+  if (!Number.isFinite(value)) return Number.isNaN(value) ? "nan" : value > 0 ? "inf" : "-inf";
+  const [, plus, digits, kind] = spec.match(/^(\+?)\.(\d+)([fg])$/);
+  const text = kind === "f" ? value.toFixed(Number(digits)) : general(value, Number(digits));
+  return plus && value >= 0 ? `+${text}` : text;
+}
+
+const named = (coded, k) => coded.names[column(coded.of)[k]];
+
+function valueOf(name, k) {
+  const e = data.edges;
+  if (name === "edge") return k;
+  if (name === "landmark" || name === "source") return named(e[name], k);
+  return column(e.columns[name])[k];
+}
+
+const filled = (text, k) => text.replace(/\{(\w+)(?::([^}]*))?\}/g, (_, name, spec) => formatted(valueOf(name, k), spec));
+
+function explained(k) {
+  const group = data.edges.groups[column(data.edges.group)[k]], lines = [];
+  for (const [what, text] of group.lines) {
+    if (text === "{changes}") for (const one of data.edges.changes[k] || []) lines.push([what, one]);
+    else lines.push([what, filled(text, k)]);
+  }
+  return {title: filled(group.title, k), lines};
+}
+
+// -- small things ----------------------------------------------------------------------------------------------------
+
+function element(tag, text, attributes = {}) {
+  const out = document.createElement(tag);
+  if (text !== undefined && text !== null) out.textContent = text;
+  for (const [name, value] of Object.entries(attributes)) out.setAttribute(name, value);
+  return out;
+}
+
+const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+const short = (text) => (text.length > 40 ? `${text.slice(0, 37)}...` : text);
+const number = (value) => (value === null || value === undefined ? "-" : Number.isInteger(value) ? String(value) : general(value, 4));
+
+function table(id, head, rows) {
+  const place = byId(id);
+  if (!rows || !rows.length) return place.append(element("p", "nothing", {class: "quiet"}));
+  const out = element("table"), isNumber = head.map((_, c) => rows.some((row) => typeof row[c] === "number"));
+  const top = out.createTHead().insertRow();
+  head.forEach((name, c) => top.append(element("th", name, {scope: "col", ...(isNumber[c] ? {class: "number"} : {})})));
+  const body = out.createTBody();
+  for (const row of rows) {
+    const line = body.insertRow();
+    row.forEach((value, c) => {
+      const cell = line.insertCell();
+      if (value instanceof Node) return cell.append(value);
+      if (isNumber[c]) cell.className = "number";
+      cell.append(element("bdi", isNumber[c] ? number(value) : value));
+    });
+  }
+  place.append(out);
+}
+
+function edgeLinks(edges) {
+  const out = element("span");
+  edges.forEach((k, at) => out.append(at ? ", " : "", linkTo("edge", k, String(k))));
+  return out;
+}
+
+function linkTo(kind, which, text) {
+  const out = element("a", undefined, {href: `#${kind}=${encodeURIComponent(which)}`});
+  out.append(element("bdi", text));
+  return out;
+}
+
+// -- colours ---------------------------------------------------------------------------------------------------------
+
+const dark = matchMedia("(prefers-color-scheme: dark)");
+function colours() {
+  const d = dark.matches;
+  return {
+    odometry: d ? "#e6e8eb" : "#1a1a1a", estimate: d ? "#ff6b6b" : "#d62728", truth: d ? "#6cb2ff" : "#1f6fd6",
+    landmarks: "#e08a00", other: d ? "#c9a2ff" : "#7b3fb3", then: d ? "#ffd24d" : "#9a6700", mark: d ? "#7ee787" : "#116329",
+    ink: d ? "#e6e8eb" : "#1f2328", grid: d ? "#30363d" : "#e6e8eb", paper: d ? "#16191d" : "#ffffff",
+    "not evaluated": "#9aa0a6", accepted: d ? "#8b9bab" : "#7a8794", "down weighted": "#56b4e9", pending: "#cc79a7",
+    rejected: d ? "#ff9e64" : "#c04000",
+  };
+}
+
+function layout(more) {
+  const c = colours(), axis = {gridcolor: c.grid, zerolinecolor: c.grid, linecolor: c.grid};
+  return {
+    paper_bgcolor: c.paper, plot_bgcolor: c.paper, font: {color: c.ink, size: 12}, margin: {l: 55, r: 10, t: 10, b: 40},
+    legend: {orientation: "h", y: 1.02, yanchor: "bottom"}, xaxis: axis, yaxis: axis, ...more(axis),
+  };
+}
+const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["toImage", "sendDataToCloud"]};
+
+// -- the map ---------------------------------------------------------------------------------------------------------
+
+const map = {inSpace: false, points: null, spans: new Map()};
+
+function points() {
+  if (map.points) return map.points;
+  const estimate = data.map.paths.estimate.map(column), marks = landmarkPlaces(), n = data.map.keyframes;
+  map.points = [0, 1, 2].map((axis) => {
+    const out = new Float64Array(n + marks[axis].length);
+    out.set(estimate[axis]);
+    out.set(marks[axis], n);
+    return out;
+  });
+  return map.points;
+}
+
+function landmarkPlaces() {  // in the order in which edges name them
+  const names = column(data.map.landmarks.names), at = new Map(names.map((name, k) => [name, k]));
+  const places = data.map.landmarks.points.map(column), of = column(data.edges.landmark_names);
+  return places.map((axis) => Float64Array.from(of, (name) => (at.has(name) ? axis[at.get(name)] : NaN)));
+}
+
+function thinned(axes, every) {
+  if (every <= 1) return axes;
+  return axes.map((axis) => axis.filter((_, k) => k % every === 0 || k === axis.length - 1));
+}
+
+function trace(name, axes, colour, more) {
+  const [x, y, z] = axes, kind = map.inSpace ? {type: "scatter3d", z} : {type: "scattergl"};
+  return {name, x, y, mode: "lines", line: {color: colour, width: 1.5}, hoverinfo: "skip", ...kind, ...more};
+}
+
+function edgeTraces() {
+  const e = data.edges, all = points(), [from, to] = e.places.map(column), groups = new Map();
+  const label = column(e.label.of), verdict = column(e.verdict);
+  for (let k = 0; k < e.count; k++) {
+    if (from[k] < 0 || to[k] < 0 || e.label.names[label[k]] === "odometry") continue;
+    const key = `${e.label.names[label[k]]}, ${e.verdicts[verdict[k]]}`;
+    if (!groups.has(key)) groups.set(key, []);
+    groups.get(key).push(k);
+  }
+  const out = [];
+  for (const [key, edges] of groups) {
+    const name = key.split(", ")[1], isIn = name === "accepted" || name === "not evaluated", isSighting = key.startsWith("landmarks");
+    const every = Math.max(1, Math.ceil(edges.length / 20000)), some = edges.filter((_, k) => k % every === 0);
+    if (every > 1) map.notes.push(`one of ${every} edges of "${key}" is drawn (the ledger has all)`);
+    const axes = [0, 1, 2].map((axis) => {
+      const line = new Float64Array(3 * some.length);
+      some.forEach((k, at) => { line[3 * at] = all[axis][from[k]]; line[3 * at + 1] = all[axis][to[k]]; line[3 * at + 2] = NaN; });
+      return line;
+    });
+    const middle = axes.map((line) => Float64Array.from(some, (_, at) => (line[3 * at] + line[3 * at + 1]) / 2));
+    const colour = isIn && isSighting ? colours().landmarks : isIn ? "#2e7d32" : colours()[name];
+    out.push(trace(plain(key), axes, colour, {opacity: isIn && isSighting ? 0.25 : 0.8, legendgroup: key}));
+    out.push(trace("", middle, colour, {
+      mode: "markers", marker: {color: colour, size: isIn ? 4 : 7, symbol: "diamond", opacity: isIn ? 0.35 : 0.9}, showlegend: false,
+      legendgroup: key, customdata: some, meta: "edge", hovertemplate: `edge %{customdata}: ${plain(key)}<extra></extra>`, hoverinfo: "all",
+    }));
+  }
+  return out;
+}
+
+function traces() {
+  const c = colours(), paths = data.map.paths, every = data.map.every, out = edgeTraces();
+  const names = {odometry: "dead reckoning", truth: "truth", other: "compared run", estimate: "estimate"};
+  for (const name of ["odometry", "truth", "other", "estimate"]) {
+    if (!paths[name]) continue;
+    const step = name === "truth" ? 1 : every, axes = thinned(paths[name].map(column), step);
+    const isPath = name === "estimate", of = isPath ? thinned([Float64Array.from({length: data.map.keyframes}, (_, k) => k)], step)[0] : null;
+    out.push(trace(names[name], axes, c[name], isPath ? {
+      mode: "lines+markers", marker: {size: 3, color: c[name]}, meta: "keyframe", customdata: of,
+      hovertemplate: "keyframe %{customdata}<extra></extra>", hoverinfo: "all", line: {color: c[name], width: 2},
+    } : {line: {color: c[name], width: name === "truth" ? 3 : 1.2}}));
+  }
+  const marks = data.map.landmarks, labels = column(marks.names);
+  if (labels.length) {
+    const axes = marks.points.map(column), text = labels.map((name) => plain(short(name)));
+    if (!map.inSpace) out.push(trace("2 sigma", [...marks.ellipses.map(column), []], c.landmarks, {line: {color: c.landmarks, width: 1}}));
+    out.push(trace("landmarks", axes, c.landmarks, {
+      mode: labels.length > 400 ? "markers" : "markers+text", text, textposition: "top center", textfont: {size: 10, color: c.ink}, meta: "landmark",
+      marker: {symbol: map.inSpace ? "diamond" : "star", size: map.inSpace ? 4 : 11, color: c.landmarks}, customdata: labels,
+      hovertemplate: "landmark %{text}<extra></extra>", hoverinfo: "all",
+    }));
+  }
+  out.push(trace("as known then", [[], [], []], c.then, {line: {color: c.then, width: 3}, visible: true, showlegend: false, meta: "then"}));
+  out.push(trace("chosen", [[], [], []], c.mark, {mode: "lines+markers", line: {color: c.mark, width: 5}, marker: {color: c.mark, size: 11}, showlegend: false, meta: "chosen"}));
+  return out;
+}
+
+async function drawMap() {
+  map.notes = [];
+  if (data.map.every > 1) map.notes.push(`one of ${data.map.every} keyframes is drawn`);
+  const several = traces(), image = data.plan && {
+    source: data.plan.url, xref: "x", yref: "y", x: data.plan.x, y: data.plan.y, sizex: data.plan.width, sizey: data.plan.height,
+    xanchor: "left", yanchor: "bottom", sizing: "stretch", layer: "below", opacity: 0.6,
+  };
+  const c = colours(), scene = {aspectmode: "data", bgcolor: c.paper};
+  for (const axis of ["xaxis", "yaxis", "zaxis"]) scene[axis] = {title: {text: `${axis[0]} [m]`}, gridcolor: c.grid, color: c.ink};
+  const flat = layout((axis) => ({
+    xaxis: {...axis, title: {text: "x [m]"}}, yaxis: {...axis, title: {text: "y [m]"}, scaleanchor: "x", scaleratio: 1},
+    dragmode: "pan", hovermode: "closest", images: image ? [image] : [], uirevision: "map",
+  }));
+  const shape = map.inSpace ? {...layout(() => ({})), scene, uirevision: "space"} : flat;
+  Plotly.purge("map");
+  await Plotly.newPlot("map", several, shape, {...CONFIG, scrollZoom: true});
+  byId("map").on("plotly_click", ({points: [one]}) => {
+    const kind = one.data.meta;
+    if (kind === "edge" || kind === "keyframe" || kind === "landmark") go(kind, one.customdata);
+  });
+  byId("map-note").textContent = map.notes.join("; ");
+  if (map.chosen) mark(...map.chosen);
+}
+
+function restyle(meta, axes) {
+  const at = byId("map").data.findIndex((one) => one.meta === meta), [x, y, z] = axes;
+  return Plotly.restyle("map", {x: [x], y: [y], ...(map.inSpace ? {z: [z]} : {})}, [at]);
+}
+
+function placesOf(kind, which) {
+  const all = points(), n = data.map.keyframes;
+  if (kind === "keyframe") return [Number(which)];
+  if (kind === "landmark") return [n + column(data.edges.landmark_names).indexOf(which)];
+  return data.edges.places.map((one) => column(one)[which]).filter((at) => at >= 0 && Number.isFinite(all[0][at]));
+}
+
+function mark(kind, which, move = false) {
+  map.chosen = [kind, which];
+  const at = placesOf(kind, which), all = points(), axes = all.map((axis) => at.map((k) => axis[k]));
+  restyle("chosen", axes);
+  if (move && !map.inSpace && at.length) {
+    const width = Math.max(...axes[0]) - Math.min(...axes[0]), height = Math.max(...axes[1]) - Math.min(...axes[1]);
+    const x = (Math.max(...axes[0]) + Math.min(...axes[0])) / 2, y = (Math.max(...axes[1]) + Math.min(...axes[1])) / 2, r = 5 + Math.max(width, height);
+    Plotly.relayout("map", {"xaxis.range": [x - r, x + r], "yaxis.range": [y - r, y + r]});
+  }
+}
+
+// -- time ------------------------------------------------------------------------------------------------------------
+
+function setTime() {
+  const frames = data.drive.frames, at = Number(byId("time").value), now = at >= frames.length;
+  const stamps = column(data.map.stamps), frame = frames[at];
+  if (now) {
+    byId("when").textContent = "now: the estimate after all of it";
+    return restyle("then", [[], [], []]);
+  }
+  const last = Math.min(frame.keyframes, stamps.length) - 1;
+  byId("when").textContent = `as known at keyframe ${last}, ${(stamps[last] - stamps[0]).toFixed(1)} s after the start`;
+  return restyle("then", frame.points.map(column));
+}
+
+// -- why -------------------------------------------------------------------------------------------------------------
+
+function go(kind, which) {
+  const hash = `#${kind}=${encodeURIComponent(which)}`;
+  if (location.hash === hash) show(kind, which);
+  else location.hash = hash;
+}
+
+function fromHash(move) {
+  const found = location.hash.match(/^#(edge|keyframe|landmark)=(.*)$/);
+  if (!found || !data.edges) return;
+  let which = found[2];
+  try { which = decodeURIComponent(which); } catch { /* as it is */ }
+  if (found[1] !== "landmark") {
+    if (!/^\d+$/.test(which)) return;
+    which = Number(which);
+  }
+  show(found[1], which, move);
+}
+
+function show(kind, which, move = false) {
+  const body = byId("why-body");
+  body.replaceChildren();
+  byId("why-hint").hidden = true;
+  const known = {edge: data.edges.count, keyframe: data.map ? data.map.keyframes : 0};
+  const isThere = kind === "landmark" ? column(data.edges.landmark_names).includes(which) : which < known[kind];
+  if (!isThere) return body.append(element("p", `there is no ${kind} ${short(String(which))}`));
+  ({edge: showEdge, keyframe: showKeyframe, landmark: showLandmark})[kind](which, body);
+  if (data.map) mark(kind, which, move);
+  if (kind === "edge") choose(which);
+}
+
+function showEdge(k, body) {
+  const {title, lines} = explained(k), list = element("dl");
+  body.append(element("h3", title));
+  for (const [what, text] of lines) list.append(element("dt", what), element("dd", text));
+  body.append(list);
+  const also = element("p");
+  for (const at of data.edges.places.map((one) => column(one)[k])) {
+    if (at < 0) continue;
+    if (also.childNodes.length) also.append(", ");
+    const isKeyframe = at < data.map.keyframes, name = isKeyframe ? at : column(data.edges.landmark_names)[at - data.map.keyframes];
+    also.append(linkTo(isKeyframe ? "keyframe" : "landmark", name, `${isKeyframe ? "keyframe" : "landmark"} ${short(String(name))}`));
+  }
+  body.append(also);
+}
+
+function edgesAt(place) {
+  const [from, to] = data.edges.places.map(column), out = [];
+  for (let k = 0; k < data.edges.count; k++) if (from[k] === place || to[k] === place) out.push(k);
+  return out;
+}
+
+function edgeList(edges, body) {
+  const list = element("ul"), e = data.edges;
+  for (const k of edges.slice(0, 200)) {
+    const item = element("li"), about = named(e.landmark, k);
+    item.append(linkTo("edge", k, `edge ${k}`), ` ${named(e.label, k)} ${short(about)}: ${verdictOf(k)}`);
+    list.append(item);
+  }
+  body.append(list);
+  if (edges.length > 200) body.append(element("p", `and ${edges.length - 200} more: filter the ledger`));
+}
+
+function showKeyframe(k, body) {
+  const stamp = column(data.map.stamps)[k], [x, y, z] = data.map.paths.estimate.map((axis) => column(axis)[k]), edges = edgesAt(k);
+  const where = `x ${x.toFixed(3)} m, y ${y.toFixed(3)} m${data.dimensions === 3 ? `, z ${z.toFixed(3)} m` : ""}`;
+  body.append(element("h3", `keyframe ${k}: ${edges.length} edges`), element("p", `${stamp.toFixed(3)} s, at ${where}`));
+  edgeList(edges, body);
+}
+
+function showLandmark(name, body) {
+  const at = column(data.edges.landmark_names).indexOf(name), text = column(data.edges.landmark_lines)[at];
+  const [first, ...rest] = text.split("\n");
+  body.append(element("h3", first), element("pre", rest.join("\n")));
+  edgeList(edgesAt(data.map.keyframes + at), body);
+}
+
+// -- the ledger ------------------------------------------------------------------------------------------------------
+
+const HEIGHT = 24;
+const verdictOf = (k) => {
+  const e = data.edges, reason = e.reasons[column(e.reason)[k]];
+  return e.verdicts[column(e.verdict)[k]] + (reason ? `: ${reason}` : "");
+};
+const values = (name) => (k) => column(data.edges.columns[name])[k];
+const FIELDS = [
+  ["edge", (k) => k], ["class", (k) => named(data.edges.label, k)], ["about", (k) => named(data.edges.landmark, k)],
+  ["input", (k) => named(data.edges.source, k)], ["keyframe", values("keyframe")],
+  ["verdict", (k) => data.edges.verdicts[column(data.edges.verdict)[k]]], ["reason", (k) => data.edges.reasons[column(data.edges.reason)[k]]],
+  ["chi2", values("chi2")], ["dof", values("dof")], ["judged", values("statistic")], ["limit", values("threshold")],
+  ["weight %", values("percent")], ["last pose m", values("last_m")], ["its own m", values("end_m")],
+];
+const ledger = {order: null, sort: 0, up: true, chosen: -1};
+
+function startLedger() {
+  FIELDS.forEach(([name], at) => {
+    const button = element("button", name, {type: "button", role: "columnheader", "aria-sort": "none"});
+    button.addEventListener("click", () => sortBy(at));
+    byId("head").append(button);
+  });
+  byId("filter").addEventListener("input", arrange);
+  byId("rows").addEventListener("scroll", () => requestAnimationFrame(drawRows));
+  byId("rows").addEventListener("keydown", (event) => {
+    const step = {ArrowDown: 1, ArrowUp: -1, PageDown: 20, PageUp: -20}[event.key];
+    if (!step || !ledger.order.length) return;
+    event.preventDefault();
+    const at = ledger.order.indexOf(ledger.chosen);
+    go("edge", ledger.order[Math.min(ledger.order.length - 1, Math.max(0, at + step))]);
+  });
+  arrange();
+}
+
+function sortBy(at) {
+  ledger.up = ledger.sort === at ? !ledger.up : true;
+  ledger.sort = at;
+  arrange();
+}
+
+function arrange() {
+  const words = byId("filter").value.toLowerCase().split(/\s+/).filter(Boolean), e = data.edges, kept = [];
+  const lower = (names) => names.map((name) => name.toLowerCase());
+  const parts = [e.label, e.landmark, e.source].map((one) => [lower(one.names), column(one.of)]);
+  parts.push([lower(e.verdicts), column(e.verdict)], [lower(e.reasons), column(e.reason)]);
+  const hits = words.map((word) => parts.map(([names, codes]) => [names.map((name) => name.includes(word)), codes]));
+  for (let k = 0; k < e.count; k++) {
+    if (hits.every((of, w) => String(k) === words[w] || of.some(([has, codes]) => has[codes[k]]))) kept.push(k);
+  }
+  const of = FIELDS[ledger.sort][1], way = ledger.up ? 1 : -1, keys = new Map(kept.map((k) => [k, of(k)]));
+  const isMissing = (value) => Number.isNaN(value);
+  kept.sort((a, b) => {
+    const [p, q] = [keys.get(a), keys.get(b)];
+    if (isMissing(p) || isMissing(q)) return isMissing(p) - isMissing(q) || a - b;
+    return p < q ? -way : p > q ? way : a - b;
+  });
+  ledger.order = kept;
+  [...byId("head").children].forEach((one, at) => one.setAttribute("aria-sort", at !== ledger.sort ? "none" : ledger.up ? "ascending" : "descending"));
+  byId("count").textContent = `${kept.length} of ${e.count} edges`;
+  byId("space").style.height = `${kept.length * HEIGHT}px`;
+  byId("rows").setAttribute("aria-rowcount", kept.length);
+  drawRows();
+}
+
+function drawRows() {
+  const rows = byId("rows"), first = Math.max(0, Math.floor(rows.scrollTop / HEIGHT) - 5);
+  const last = Math.min(ledger.order.length, first + Math.ceil(rows.clientHeight / HEIGHT) + 10);
+  const drawn = [];
+  for (let at = first; at < last; at++) {
+    const k = ledger.order[at], row = element("div", undefined, {class: "row", role: "row", "aria-rowindex": at + 1, "data-edge": k, "aria-selected": k === ledger.chosen});
+    row.style.top = `${(at + 1) * HEIGHT}px`;
+    for (const [, of] of FIELDS) {
+      const value = of(k), cell = element("span", undefined, {role: "gridcell"});
+      cell.append(element("bdi", typeof value === "number" ? (Number.isNaN(value) ? "-" : number(value)) : value));
+      row.append(cell);
+    }
+    row.addEventListener("click", () => go("edge", k));
+    drawn.push(row);
+  }
+  byId("space").replaceChildren(...drawn);
+}
+
+function choose(k) {
+  ledger.chosen = k;
+  const at = ledger.order.indexOf(k), rows = byId("rows");
+  if (at >= 0 && (at * HEIGHT < rows.scrollTop || (at + 2) * HEIGHT > rows.scrollTop + rows.clientHeight)) {
+    rows.scrollTop = Math.max(0, (at - 4) * HEIGHT);
+  }
+  drawRows();
+}
+
+// -- charts ----------------------------------------------------------------------------------------------------------
+
+const CHARTS = {
+  "chart-verdicts": (id) => {
+    const bins = data.charts.bins, middle = bins.slice(1).map((b, k) => (b + bins[k]) / 2), c = colours();
+    const bars = Object.entries(data.charts.verdicts).filter(([, of]) => of.some(Boolean)).map(([name, y]) => ({type: "bar", name: plain(name), x: middle, y, marker: {color: c[name]}}));
+    const changes = {type: "scatter", mode: "lines", name: "verdicts that changed", x: middle, y: data.charts.changes, line: {color: c.ink, width: 1}};
+    return Plotly.newPlot(id, [...bars, changes], layout((axis) => ({barmode: "stack", bargap: 0, xaxis: {...axis, title: {text: "keyframe"}}, yaxis: {...axis, title: {text: "edges"}}})), CONFIG);
+  },
+  "chart-jumps": (id) => {
+    const [x, y] = data.drive.corrections.map(column);
+    return Plotly.newPlot(id, [{type: "scattergl", mode: "lines", x, y, line: {color: colours().estimate, width: 1}}],
+      layout((axis) => ({xaxis: {...axis, title: {text: "keyframe"}}, yaxis: {...axis, title: {text: "the robot is moved by [m]"}}})), CONFIG);
+  },
+  "chart-nees": (id) => {
+    const [x, y] = data.nees.values.map(column), c = colours(), line = (name, value) => ({type: "scatter", mode: "lines", name, x: [0, data.map.keyframes], y: [value, value], line: {color: c.truth, width: 1, dash: "dot"}});
+    return Plotly.newPlot(id, [{type: "scattergl", mode: "markers", name: "NEES of poses", x, y, marker: {size: 3, color: c.estimate}}, line("95 % band", data.nees.band[0]), line("", data.nees.band[1])],
+      layout((axis) => ({xaxis: {...axis, title: {text: "keyframe"}}, yaxis: {...axis, type: "log", title: {text: "NEES"}}})), CONFIG);
+  },
+};
+
+function histogram(id, one) {
+  const x = one.bins.slice(1).map((b, k) => (b + one.bins[k]) / 2), c = colours();
+  return Plotly.newPlot(id, [
+    {type: "bar", name: "chi2 of edges", x, y: one.found, marker: {color: c.accepted}},
+    {type: "scatter", mode: "lines", name: "chi2 distribution", x, y: one.should, line: {color: c.estimate, width: 2}},
+  ], layout((axis) => ({bargap: 0, xaxis: {...axis, title: {text: plain(one.name)}}, yaxis: {...axis, title: {text: "edges"}}})), CONFIG);
+}
+
+const undrawn = new Map();
+function drawWhenSeen(id, draw) {
+  undrawn.set(id, draw);
+  seen.observe(byId(id));
+}
+const seen = new IntersectionObserver((entries) => entries.forEach((one) => one.isIntersecting && drawNow(one.target.id)), {rootMargin: "100px"});
+function drawNow(id) {
+  const draw = undrawn.get(id);
+  if (!draw) return;
+  undrawn.delete(id);
+  seen.unobserve(byId(id));
+  draw(id);
+}
+
+function startCharts() {
+  if (data.charts) drawWhenSeen("chart-verdicts", CHARTS["chart-verdicts"]);
+  if (data.drive && data.drive.corrections[0].count) {
+    drawWhenSeen("chart-jumps", CHARTS["chart-jumps"]);
+  } else byId("chart-jumps").replaceWith(element("p", "the run folder has no poses as they were published", {class: "quiet"}));
+  if (data.drive) table("jumps", ["keyframe", "moved m", "turned deg", "edges judged there"], data.drive.jumps.map(([k, m, deg, edges]) => [linkTo("keyframe", k, String(k)), m, deg, edgeLinks(edges)]));
+  if (data.nees) { byId("chart-nees").hidden = false; drawWhenSeen("chart-nees", CHARTS["chart-nees"]); }
+  (data.charts ? data.charts.chi2 : []).forEach((one, at) => {
+    byId("chi2-plots").append(element("div", undefined, {id: `chi2-${at}`, class: "plot"}));
+    drawWhenSeen(`chi2-${at}`, (id) => histogram(id, one));
+  });
+}
+
+// -- the page --------------------------------------------------------------------------------------------------------
+
+function writeText() {
+  byId("title").textContent = document.title;
+  for (const one of data.sentences || []) byId("verdict").append(element("p", one));
+  const notes = [...data.losses.map((one) => `lost: ${one}`), ...data.beware.map((one) => `beware: ${one}`)];
+  notes.forEach((one) => byId("notes").append(element("li", one)));
+  byId("notes").hidden = !notes.length;
+  const t = data.tables;
+  table("inputs", ["input", "use", "received", "used", "believed", "refused", "why", "remedy"], t.inputs);
+  table("configuration", ["parameter", "value", "default", "meaning"], t.configuration);
+  table("versions", ["what", "mark"], t.versions);
+  table("timing", ["what", "value"], t.timing);
+  table("classes", ["class", "edges", "numbers", "chi2", "chi2 per number"], t.classes);
+  table("noise", ["class, input, part", "degrees of freedom", "chi2 per degree", "alike", "sigmas should be"], t.noise);
+  if (data.waiting.length) table("waiting", ["landmark that waits", "why"], data.waiting);
+  byId("chi2-dof").textContent = data.chi2_per_dof === null ? "" : `chi2 per degree of freedom of the whole: ${general(data.chi2_per_dof, 3)}`;
+  if (data.scores) { byId("scores-section").hidden = false; byId("scores").textContent = data.scores.join("\n"); }
+  if (data.compared) {
+    byId("compared-section").hidden = false;
+    byId("compared-title").textContent = `Compared with ${data.compared.with}`;
+    byId("compared").textContent = data.compared.lines.join("\n");
+  }
+}
+
+function writeEdges() {
+  const rows = (edges, judged) => edges.map((k) => [linkTo("edge", k, String(k)), named(data.edges.label, k), named(data.edges.landmark, k), values("keyframe")(k),
+    values(judged ? "statistic" : "chi2")(k), judged ? values("threshold")(k) : values("dof")(k), verdictOf(k)]);
+  table("worst", ["edge", "class", "about", "keyframe", "chi2", "dof", "verdict"], rows(data.charts.worst, false));
+  table("farthest", ["edge", "class", "about", "keyframe", "chi2", "limit", "verdict"], rows(data.charts.farthest, true));
+}
+
+async function start() {
+  writeText();
+  await readColumns();
+  if (data.edges) { writeEdges(); startLedger(); }
+  if (data.map && data.edges) {
+    map.inSpace = data.dimensions === 3;
+    await drawMap();
+    const frames = data.drive ? data.drive.frames : [];
+    byId("time").max = frames.length;
+    byId("time").value = frames.length;
+    byId("time").disabled = !frames.length;
+    if (frames.length) setTime();
+    byId("time").addEventListener("input", setTime);
+    byId("view").setAttribute("aria-pressed", map.inSpace);
+    byId("view").addEventListener("click", async () => {
+      map.inSpace = !map.inSpace;
+      byId("view").setAttribute("aria-pressed", map.inSpace);
+      await drawMap();
+      if (frames.length) setTime();
+    });
+    dark.addEventListener("change", drawMap);
+  } else byId("map-section").hidden = true;
+  if (!data.edges) byId("ledger").hidden = true;
+  startCharts();
+  addEventListener("hashchange", () => fromHash(true));
+  addEventListener("beforeprint", () => [...undrawn.keys()].forEach(drawNow));
+  fromHash(true);
+  document.body.dataset.ready = "yes";
+}
+
+start().catch((error) => {
+  byId("notes").hidden = false;
+  byId("notes").append(element("li", `the page could not be drawn: ${error.message}`));
+  console.error(error);
+});

@@ -1,0 +1,202 @@
+"""The verdict on a run in three sentences, and its tables."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros import __version__
+from graph_slam_ros.analysis.explain import explain_run
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.config.config import Config, flatten, parameters
+from graph_slam_ros.measurements.reasons import Effect, explain, remedy
+from graph_slam_ros.report.packing import shown
+from graph_slam_ros.runs import outcome
+
+Row = list[Any]
+_FINE = 0.5, 2.0  # chi2 per degree of freedom
+
+
+def verdict(
+    run: Path, summary: Mapping[str, Any], saved: SavedGraph | None, scores: Any, losses: Sequence[str]
+) -> list[str]:
+    """Three sentences: whether the map can be used, what was not believed, and what to do next.
+
+    Parameters
+    ----------
+    saved : the graph; None if it cannot be read
+    scores : of the evaluation, None without truth
+    """
+    short = [*outcome.shortcomings(summary)] if _is_complete(summary) else []
+    doubts = [*outcome.doubts(summary)] if _is_complete(summary) else []
+    gates = [line for line in explain_run(saved) if line.startswith("warning: ")] if saved else []
+    first = _state(summary, saved, scores, short, losses)
+    last = _next(run, (short, doubts, gates), losses, has_truth=scores is not None)
+    return [first, _judged(saved), last]
+
+
+def _is_complete(summary: Mapping[str, Any]) -> bool:
+    return {"counters", "inputs", "keyframes", "landmarks", "sightings", "waiting"} <= set(summary)
+
+
+def _state(
+    summary: Mapping[str, Any], saved: SavedGraph | None, scores: Any, short: Sequence[str], losses: Sequence[str]
+) -> str:
+    if saved is None:
+        return f"There is no map to show: {losses[0] if losses else 'the run holds no keyframe'}."
+    size = f"{len(saved.keyframes)} keyframes and {summary.get('landmarks', 0)} landmarks"
+    fit = _fit(saved)
+    error = ""
+    if scores is not None:
+        error = f", {scores.estimate.position_m['rmse']:.3f} m from the truth (RMSE)"
+        if scores.odometry is not None:
+            error += f", dead reckoning {scores.odometry.position_m['rmse']:.3f} m"
+    if short:
+        return f"Do not rely on this map yet ({size}{error}): {short[0]}."
+    if not summary.get("converged", True):
+        return f"Do not rely on this map yet ({size}{error}): the last solve did not converge."
+    return f"The map can be used as far as the run itself can say: {size}{error}{fit}."
+
+
+def _fit(saved: SavedGraph) -> str:
+    ratio = chi2_per_dof(saved)
+    if ratio is None:
+        return ""
+    if _FINE[0] <= ratio <= _FINE[1]:
+        return f"; residuals are as large as the stated noise (chi2 per degree of freedom {ratio:.2f})"
+    which = "larger" if ratio > 1.0 else "smaller"
+    return f"; residuals are {which} than the stated noise (chi2 per degree of freedom {ratio:.2f})"
+
+
+def chi2_per_dof(saved: SavedGraph) -> float | None:
+    """Chi2 by the residuals that are not used up by unknowns; None without any."""
+    dof = saved.solver.degrees_of_freedom
+    return saved.solver.evaluate().chi2_final / dof if dof > 0 else None
+
+
+def _judged(saved: SavedGraph | None) -> str:
+    judged = [e for e in saved.entries if e.verdict] if saved else []
+    if not judged:
+        return "No measurement was judged: there is nothing but odometry."
+    out = [e for e in judged if not e.is_in]
+    weak = sum(e.verdict.name == "DOWN_WEIGHTED" for e in judged)
+    low = f"; {weak} more have little weight" if weak else ""
+    if not out:
+        return f"All {len(judged)} measurements that were judged are in the map{low}."
+    counted = Counter((e.source or e.label, e.reason.name.lower().replace("_", " ")) for e in out)
+    (name, why), most = counted.most_common(1)[0]
+    return (
+        f"{len(out)} of {len(judged)} measurements that were judged are not in the map{low};"
+        f" most of them, {most}, are of {shown(name)} ({why})."
+    )
+
+
+def _next(
+    run: Path,
+    several: Iterable[Sequence[str]],
+    losses: Sequence[str],
+    *,
+    has_truth: bool,
+) -> str:
+    """The first of several kinds of sentences that has any."""
+    if losses:
+        again = f"graph_slam recover {run.name} --out DIR writes its results anew"
+        return f"First get the run whole: {losses[0]} ({again})."
+    first = next((some[0] for some in several if some), "")
+    if first:
+        return f"Next: {first.removeprefix('warning: ')}."
+    if has_truth:
+        return "Nothing calls for a change."
+    truth = f"graph_slam report {run.name} --truth TRUTH"
+    return f"Nothing calls for a change; whether the map is true only a truth can say: {truth}."
+
+
+# -- tables ------------------------------------------------------------------------------------------------------------
+
+
+def inputs(summary: Mapping[str, Any]) -> list[Row]:
+    """A row for each input: received, used, believed, refused; and one for each reason, with its remedy."""
+    rows: list[Row] = []
+    of_inputs = summary.get("inputs", {})
+    counters = summary.get("counters", {})
+    for name in dict.fromkeys([*of_inputs, *counters]):
+        of = of_inputs.get(name, {})
+        counts = counters.get(name, {})
+        refused = sum(times for reason, times in counts.items() if explain(reason).effect is Effect.REFUSED)
+        numbers = [of.get(column) for column in ("received", "used", "believed")]
+        rows.append([shown(name), of.get("use", ""), *numbers, refused, "", ""])
+        for reason, times in sorted(counts.items(), key=lambda one: -one[1]):
+            row = explain(reason)
+            why = f"{reason}: {row.meaning}"
+            rows.append(["", row.effect.value, None, None, None, times, why, remedy(name, reason)])
+    return rows
+
+
+def configuration(config: Config) -> list[Row]:
+    """The parameters that differ from their defaults: name, value, default, meaning."""
+    names = config.inputs.names.split()
+    known = {p.name: p for p in parameters(names)}
+    rows = []
+    for name, value in flatten(config.as_mapping()):
+        p = known.get(name)
+        if p is None or value != p.default:
+            default, meaning = (shown(str(p.default)), p.meaning) if p else ("", "")
+            rows.append([shown(name), shown(str(value)), default, meaning])
+    return rows
+
+
+def versions(run: Path, summary: Mapping[str, Any]) -> list[Row]:
+    """Versions, and what tells the files of the run from others."""
+    recording = str(summary.get("recording") or "a live run, or not known")
+    rows = [
+        ["report made by", f"graph_slam_ros {__version__}"],
+        ["run written by", f"graph_slam_ros {summary.get('version', '?')}"],
+        ["run folder", shown(run.resolve().name)],
+        ["recording", shown(recording)],
+    ]
+    for kind in ("recorded", "files"):
+        of = summary.get(kind)
+        if isinstance(of, dict):
+            rows += [[shown(str(name)), shown(str(mark))] for name, mark in sorted(of.items())]
+    return rows
+
+
+def timing(summary: Mapping[str, Any]) -> list[Row]:
+    """Time and backlog of the run, as its summary has them; its folder holds nothing of memory."""
+    rows: list[Row] = []
+    if "time_s" in summary:
+        rows.append(["time", f"{summary['time_s']:.1f} s"])
+    if "cpu_s" in summary:
+        rows.append(["CPU time", f"{summary['cpu_s']:.1f} s"])
+    span_s, solves = summary.get("span_s"), summary.get("solves")
+    if span_s:
+        rows.append(["span of the drive", f"{span_s:.1f} s"])
+        if "cpu_s" in summary:
+            rows.append(["CPU time per second of the drive", f"{summary['cpu_s'] / span_s:.3f} s"])
+    if solves:
+        rows.append(["solves", str(solves)])
+        if "cpu_s" in summary:
+            rows.append(["CPU time per solve, with all else", f"{1e3 * summary['cpu_s'] / solves:.2f} ms"])
+    if summary.get("unprocessed"):
+        rows.append(["backlog at the end", f"{summary['unprocessed']} measurements accepted and not processed"])
+    elif "unprocessed" in summary:
+        rows.append(["backlog at the end", "none"])
+    rows.append(["memory", "not in a run folder: /diagnostics of the node has it"])
+    return rows
+
+
+def noise(summary: Mapping[str, Any]) -> list[Row]:
+    """Chi2 per degree of freedom and the factor that sigmas should have, by class, input and part."""
+    rows = []
+    for one in summary.get("noise", ()):
+        name = " ".join(filter(None, (one["label"], one["source"], one["part"])))
+        should = one["reason"] if one["reason"] else f"{one['factor']:.3g} times as large"
+        rows.append([shown(name), one["dof"], one["per_dof"], one["design_effect"], should])
+    return rows
+
+
+def classes(summary: Mapping[str, Any]) -> Iterator[Row]:
+    """Edges, numbers and chi2 of each class."""
+    for name, of in summary.get("classes", {}).items():
+        residuals = of.get("residuals", 0)
+        yield [shown(name), of["edges"], residuals, of["chi2"], of["chi2"] / residuals if residuals else None]

@@ -1,0 +1,179 @@
+"""The contents of a report: the sentences are those of ``explain``, the columns come back as they were."""
+
+import base64
+import json
+import shutil
+import zlib
+
+import numpy as np
+import pytest
+from faulty import faulty_run
+
+from graph_slam_ros import cli
+from graph_slam_ros.analysis.explain import Numbers, remedy, statements, title
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.report import page
+from graph_slam_ros.report.contents import contents
+from graph_slam_ros.report.packing import UNKNOWN, Packing, json_for_script, shown
+from graph_slam_ros.report.sentences import effects, sentences
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return faulty_run(tmp_path_factory.mktemp("faulty"))[1]
+
+
+@pytest.fixture(scope="module")
+def saved(run):
+    return SavedGraph(run, [])
+
+
+@pytest.fixture(scope="module")
+def made(run):
+    return contents(run)
+
+
+def unpacked(packing, one):
+    """A column as the page reads it."""
+    block = zlib.decompress(base64.b64decode(packing.block()))
+    part = block[one["at"] : one["at"] + one["bytes"]]
+    if one["packed"] == "s":
+        return part.decode().split("\0") if one["count"] else []
+    dtype = np.dtype({"f4": "<f4", "f8": "<f8", "i4": "<i4", "u1": "u1"}[one["packed"]])
+    values = np.frombuffer(part, np.uint8).reshape(dtype.itemsize, -1).T.copy().view(dtype).ravel()
+    if one["step"] == 1.0:
+        return values
+    values = np.cumsum(values, dtype=float) if one.get("sum") else np.where(values == UNKNOWN, np.nan, values)
+    return values * one["step"]
+
+
+def test_columns_come_back():
+    packing = Packing()
+    path = np.cumsum(np.random.default_rng(1).normal(size=100))
+    gaps = np.where(path > 0.0, path, np.nan)
+    columns = [packing.fixed(path, 1e-3, is_path=True), packing.fixed(gaps, 1e-3), packing.column([1, 2, 250], "u1")]
+    columns += [packing.column([], "f4"), packing.column([1.7e9 + 1e-6], "f8"), packing.texts(["a", "", "ä<"])]
+    first, second, *others, texts = (unpacked(packing, one) for one in columns)
+    assert first == pytest.approx(path, abs=5.1e-4)
+    assert second == pytest.approx(gaps, abs=5.1e-4, nan_ok=True)
+    assert [one.tolist() for one in others] == [[1, 2, 250], [], [1.7e9 + 1e-6]]
+    assert texts == ["a", "", "ä<"]
+
+
+def test_nothing_in_the_data_ends_its_script():
+    hostile = "</script><!--<script>&\u2028\u202e"
+    text = json_for_script({hostile: [hostile]})
+    assert not set(text) & set("<>&\u2028\u202e")
+    assert json.loads(text) == {hostile: [hostile]}
+    assert shown("a\u202eb\x00") == "a\\u202eb\\x00"
+    assert len(shown("x" * 10_000)) == 200
+
+
+def test_each_edge_has_the_sentences_of_explain(saved):
+    """All of them, with their numbers; only the what-if is not solved, and says so."""
+    found = effects(saved)
+    made = sentences(saved, found)
+    assert len(made.groups) < 60
+    for e in saved.entries:
+        history = [change for change in saved.changes if change.edge == e.edge]
+        keyframe = saved.keyframe
+        ends = [f"keyframe {keyframe(v)}" if keyframe(v) is not None else f"landmark {e.landmark}" for v in e.vertices]
+        expected = [*statements(e, ends, Numbers.of(e), history, saved.config)]
+        expected += [("to change", remedy(e))] if not e.is_in else []
+        values = {name: of[e.edge] for name, of in made.numbers.items()}
+        values |= {f"end{slot}": keyframe(vertex) for slot, vertex in enumerate(e.vertices)}
+        names = ("edge", "landmark", "source", "keyframe", "stamp_s", "statistic", "threshold", "chi2", "percent")
+        values |= {name: getattr(e, name) for name in (*names, "sigma_factor")}
+        values |= {name: getattr(found, name)[e.edge] for name in ("last_m", "end_m", "cost")}
+        group = made.groups[made.group[e.edge]]
+        lines = [(what, text) for what, text in group["lines"] if what != "what if"]
+        at = next((k for k, (_, text) in enumerate(lines) if text == "{changes}"), None)
+        if at is not None:
+            lines[at : at + 1] = [("changed", text) for text in made.changes[e.edge]]
+        assert group["title"].format(**values) == title(e, e.landmark)
+        assert [(what, text.format(**values)) for what, text in lines] == expected
+        assert ("what if" in dict(group["lines"])) == bool(e.verdict)
+
+
+def test_the_effect_of_an_edge_is_that_of_the_influence_model(saved):
+    found = effects(saved)
+    inside = [e.edge for e in saved.entries if e.is_in and e.verdict][::9]
+    for edge in inside:
+        assert found.last_m[edge] == pytest.approx(np.linalg.norm(saved.first_order(edge)[:2]))
+    assert np.isnan([found.last_m[e.edge] for e in saved.entries if not e.verdict]).all()
+
+
+def test_the_columns_of_the_ledger_are_those_of_the_run(saved, made):
+    edges = made.data["edges"]
+    for name in ("chi2", "statistic", "threshold", "keyframe", "stamp_s", "percent"):
+        expected = [getattr(e, name) for e in saved.entries]
+        assert unpacked(made.packing, edges["columns"][name]) == pytest.approx(expected, rel=1e-6)
+    verdicts = [edges["verdicts"][k] for k in unpacked(made.packing, edges["verdict"])]
+    assert verdicts == [e.verdict.name.lower().replace("_", " ") for e in saved.entries]
+    names = [edges["landmark"]["names"][k] for k in unpacked(made.packing, edges["landmark"]["of"])]
+    assert names == [e.landmark for e in saved.entries]
+
+
+def test_the_sentences_on_top_say_what_is_out_and_what_to_do(made, run):
+    state, judged, after = made.data["sentences"]
+    out = [e for e in SavedGraph(run, []).entries if not e.is_in]
+    assert "keyframes" in state
+    assert judged.startswith(f"{len(out)} of ")
+    assert after.startswith("Next: ")
+
+
+def test_jumps_name_measurements_judged_there(made, saved):
+    drive = made.data["drive"]
+    assert drive["frames"]
+    distances = [jump[1] for jump in drive["jumps"]]
+    assert distances == sorted(distances, reverse=True)
+    assert distances[0] > 0.05
+    keyframe, _, _, edges = drive["jumps"][0]
+    assert edges
+    changed = {c.edge for c in saved.changes if c.keyframe == keyframe}
+    assert all(saved.edge(edge).keyframe == keyframe or edge in changed for edge in edges)
+
+
+def test_frames_are_the_estimate_as_it_was_known_then(made, run):
+    """The last is near the end's, the first has fewer keyframes; none has one that came later."""
+    frames = made.data["drive"]["frames"]
+    counts = [frame["keyframes"] for frame in frames]
+    assert counts == sorted(counts)
+    assert counts[0] < 0.2 * counts[-1]
+    path = np.loadtxt(run / "path.tum")
+    last = np.stack([unpacked(made.packing, column) for column in frames[-1]["points"]], axis=1)
+    assert np.linalg.norm(last[0, :2] - path[0, 1:3]) < 0.1
+
+
+def test_a_damaged_run_shows_what_can_be_read_and_says_what_cannot(run, tmp_path, capsys):
+    broken = shutil.copytree(run, tmp_path / "broken")
+    (broken / "landmarks.csv").write_text("nonsense\n1\n")
+    (broken / "map.mcap").write_bytes((broken / "map.mcap").read_bytes()[:-2000])
+    code = cli.main(["report", str(broken), "--out", str(tmp_path / "broken.html")])
+    out, err = capsys.readouterr()
+    assert code == 3
+    assert "lost: " in err
+    assert "First get the run whole" in out
+
+
+def test_what_cannot_be_a_report_is_refused(run, tmp_path, capsys):
+    html = tmp_path / "a.html"
+    for words, why in (
+        ((tmp_path,), "not a run"),
+        ((run, "--out", tmp_path / "a.txt"), "a report is a .html file"),
+        ((run, "--out", html, "--topic", "/x"), "no use for --topic"),
+        ((run, "--out", html, "--truth", tmp_path / "none"), "none"),
+        ((run, "--out", html, "--plan", run / "config.yaml"), "not a map.yaml"),
+    ):
+        code = cli.main(["report", *map(str, words)])
+        out, err = capsys.readouterr()
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert why in err
+    assert not html.exists()
+
+
+def test_without_plotly_the_command_that_installs_it_is_named(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(page.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(GraphSlamError, match=r"pip install 'graph_slam_ros\[report\]'"):
+        page.plotly()
