@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from graph_slam_ros.check.columns import Columns
-from graph_slam_ros.check.finding import Finding, in_order
+from graph_slam_ros.check.finding import Finding, in_order, worst
 from graph_slam_ros.check.frames import check_frames
 from graph_slam_ros.check.odometry import check_odometry
 from graph_slam_ros.check.pairs import check_pairs
@@ -24,6 +24,11 @@ CHECKS: tuple[Check, ...] = (
 )
 """They need no fit: milliseconds for each minute of a recording."""
 
+OF_A_REPLAY: tuple[Check, ...] = (check_frames, check_times, check_odometry, check_pairs)
+"""Those that a replay does by itself; its own table has the refusals."""
+
+_IN_OUTCOME = ("not_planar", "no_landmarks")
+
 
 def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Finding]:
     """Findings of all checks, the most severe first; one that makes others meaningless ends the list.
@@ -39,6 +44,11 @@ def check_columns(c: Columns, checks: tuple[Check, ...] = CHECKS) -> list[Findin
         else:
             found += _nothing_corrects(c)
     return in_order(found)
+
+
+def worst_of_replay(c: Columns) -> Finding | None:
+    """The worst error or warning beyond what the end of a replay says anyway; None where there is none."""
+    return worst([one for one in check_columns(c, OF_A_REPLAY) if one.code not in _IN_OUTCOME])
 
 
 def _nothing_corrects(c: Columns) -> Iterator[Finding]:

@@ -109,6 +109,23 @@ KINDS: dict[str, Kind] = {
         "landmarks are not seen again after the robot has moved, so neither mount nor clock can be checked",
         _SEE + "past landmarks, and turn in their sight",
     ),
+    # -- a replay in memory, and a fit that begins at its estimate
+    "clock_offset": Kind("sightings fit odometry better at other stamps", f"INPUT.offset_s; {_ONE_CLOCK}"),
+    "mount_yaw": Kind("the sensor is turned on the robot", "correct its transform; INPUT.frame with INPUT.mount"),
+    "odometry_scale": Kind(
+        "the robot drives more or less than odometry says", "wheel radius; odometry.distance_factor"
+    ),
+    "turn_scale": Kind("the robot turns more or less than odometry says", "track width; odometry.turn_factor"),
+    "not_observable": Kind("the drive does not tell a clock, mount or scale", "the manoeuvre that the text names"),
+    "over_confident": Kind("residuals of an input are larger than its noise says", "robust.noise_scale=estimated"),
+    "odometry_over_confident": Kind("odometry is worse than its noise says", "robust.noise_scale=estimated"),
+    "id_reused": Kind("an identity is of two places in turn", "one id for each landmark"),
+    "ids_unsure": Kind("many identities are of more than one place", "the detector; landmarks.association=joint"),
+    "ids_exchanged": Kind("two identities exchange their places", "one id for each landmark"),
+    "landmark_moved": Kind("a landmark stands elsewhere from some time on", "landmarks that nobody moves"),
+    "map_breaks": Kind("many landmarks stand elsewhere from some time on", "was the robot carried?"),
+    "outliers": Kind("many sightings are far from where their landmark is", "the detector; landmarks.loss"),
+    "fit_unsure": Kind("odometry and sightings cannot be brought together", "other findings first"),
     "silent": Kind("nothing is seen for most of the drive", _SEE + "past landmarks all the way"),
 }
 """What ``check`` finds, beyond counters."""

@@ -15,6 +15,7 @@ _LATER_S, _SOONEST_S, _MOVED, _MOST_PAIRS, _LEAST_PAIRS = 6.0, 0.3, 0.15, 4000, 
 _TURNED_RAD, _LEAST_TURNED = 0.25, 25
 _FAR_M = 200.0
 _HALF, _NOISES, _NEARLY = 0.5, 2.0, 1.2
+_RELATED, _QUARTILE, _OF_RAYLEIGH, _WORSE = 0.7, 0.25, 0.7585, 3.0
 _UNRELATED, _UNRELATED_NOISES, _UNRELATED_PAIRS = 0.6, 4.0, 100
 _TWICE, _FEW = 0.002, 30
 _ONCE, _SELDOM = 0.5, 3
@@ -149,8 +150,34 @@ def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array)
     lever_m = np.linalg.norm(pairs.motion[:, :3], axis=1) + pairs.turned * np.minimum(distance_m[pairs.a], 1e3)
     share = residual_m / float(np.median(lever_m))
     if share > _UNRELATED and residual_m > _UNRELATED_NOISES * noise_m and len(pairs.a) > _UNRELATED_PAIRS:
+        if residual_m < _RELATED * _of_others(s, pairs, use):
+            yield from noisier(s, pairs)
+            return
         text = f"{s.topic}: {share:.0%} of the motion between two sightings of a landmark is not odometry's"
         yield Finding("unrelated", "error", share, _UNRELATED, "part", text, **where)
+
+
+def _of_others(s: SightingColumns, pairs: Pairs, use: Mask) -> float:
+    """The median distance between two landmarks, whatever their identities: what chance would give."""
+    chosen = np.flatnonzero(use)
+    shifted = Pairs(pairs.a, np.roll(chosen, len(chosen) // 2)[np.searchsorted(chosen, pairs.b)], pairs.motion)
+    return float(np.median(Pairs(shifted.a, shifted.b, shifted.motion, pairs.dimensions).residuals(s.points)))
+
+
+def noisier(s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
+    """Sightings that are far worse than their noise says, by the smaller residuals of pairs, which no outlier has."""
+    sigmas = np.hypot(s.sigmas[pairs.a], _TYPICAL_M) * 2.0**0.5
+    residuals = pairs.residuals(s.points)
+    factor = float(np.quantile(residuals / sigmas, _QUARTILE)) / _OF_RAYLEIGH
+    if factor > _WORSE:
+        sigma_m = float(np.quantile(residuals, _QUARTILE)) / _OF_RAYLEIGH / 2.0**0.5
+        sigma_rad = sigma_m / max(float(np.median(np.linalg.norm(s.points[pairs.a], axis=1))), sigma_m)
+        numbers = (("sigma_m", round(sigma_m, 3)), ("sigma_rad", round(sigma_rad, 4)))
+        settings = ("noise=sigmas", *(f"{key}={number}" for key, number in numbers))
+        text = f"{s.topic}: the same landmark seen twice is {factor:.1f} times as far apart as its noise says"
+        where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(pairs.a)}
+        settings = tuple(f"{s.input}.{setting}" for setting in settings)
+        yield Finding("over_confident", "warning", factor, _WORSE, "times", text, settings=settings, **where)
 
 
 def _hypotheses(s: SightingColumns) -> dict[str, Array]:

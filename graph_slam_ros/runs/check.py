@@ -5,9 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from graph_slam_ros.check.checks import check_columns
-from graph_slam_ros.check.columns import Collector
+from graph_slam_ros.check.columns import Collector, Columns
 from graph_slam_ros.check.finding import Finding, Severity, in_order
+from graph_slam_ros.check.trial import check_trial, replayed
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.inputs import known_types
 from graph_slam_ros.messages.inputs.landmark_types import LANDMARK_TYPES
@@ -16,6 +20,7 @@ from graph_slam_ros.recordings.contents import Recording, TopicContents, recordi
 from graph_slam_ros.runs.replay import RecordedRuns, choose_inputs
 from graph_slam_ros.runs.suggestion import CLOUD, DETECTIONS, ODOMETRY, Suggestion
 from graph_slam_ros.slam import Config, Control, Counters
+from graph_slam_ros.warmup import warmup
 
 _LANDMARKS = (DETECTIONS, CLOUD, *LANDMARK_TYPES)
 _MAPS = ("map", "world", "earth", "utm")
@@ -95,8 +100,20 @@ def check(
     columns = collector.columns(counters)
     found += _damage(bag)
     found += check_columns(columns)
+    if not quick and not any(one.ends for one in found):
+        found += _trial(columns, [some for number, some in measured if number == 0])
     command = suggestion.command() if not suggestion.trouble else ""
     return Checked(in_order(found), command, bag.losses, bag.warnings)
+
+
+def _trial(columns: Columns, measured: list[Measurements]) -> list[Finding]:
+    """Findings of a replay in memory; none where the pipeline fails at such measurements, which is its to say."""
+    warmup(dimensions=columns.config.world.dimensions)
+    try:
+        with np.errstate(all="ignore"):
+            return list(check_trial(columns, replayed(columns.config, (m for some in measured for m in some))))
+    except GraphSlamError as error:
+        return [Finding("fit_unsure", "warning", 1, 0, "replays", f"a replay fails: {error}")]
 
 
 def _topic(chosen: Mapping[str, str], name: str, config: Config) -> str | None:

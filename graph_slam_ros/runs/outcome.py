@@ -3,6 +3,7 @@
 Both are made from ``run.json``, so they are the same for a live run, a replay and a recovered run.
 """
 
+import shlex
 import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -92,6 +93,7 @@ def table(summary: Summary) -> list[str]:
 def shortcomings(summary: Summary) -> Iterator[str]:
     """Return why the result is less than what was asked for, a sentence each; nothing where it is not."""
     inputs: Mapping[str, Any] = summary.get("inputs", {})
+    yield from checked(summary, "error")
     if summary.get("failing"):
         yield f"the last solve failed ({summary['failing']}), and the estimate is the one before it: {_EXTREME}"
     if stopped := sum(reasons.get("stopped", 0) for reasons in summary["counters"].values()):
@@ -130,6 +132,14 @@ def doubts(summary: Summary) -> Iterator[str]:
         if _MOSTLY <= accepted < 1.0 - _DOUBTED:
             part, hint = 100.0 * (1.0 - accepted), _CONTRADICT.format(name)
             yield f"{name}: {part:.0f} % of {counts['used']} are not believed: {hint}"
+
+
+def checked(summary: Summary, severity: str) -> Iterator[str]:
+    """Return the worst finding of the recording, if it is so severe; ``graph_slam check`` lists all."""
+    found = summary.get("check")
+    if found is not None and found["severity"] == severity:
+        mend = " ".join(f"--set {shlex.quote(text)}" for text in found["settings"])
+        yield f"{found['code']}: {found['text']}{'; ' if mend else ''}{mend} (graph_slam check BAG lists all)"
 
 
 def _unused(summary: Summary, name: str, received: int | None) -> str:

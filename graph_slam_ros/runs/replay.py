@@ -8,6 +8,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.check.checks import worst_of_replay
 from graph_slam_ros.check.columns import Collector
 from graph_slam_ros.config.inputs import InputConfig, default_input
 from graph_slam_ros.measurements.reasons import warnings as mendable
@@ -20,7 +21,7 @@ from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.runs.folder import RunError, check_room, is_run, keep_earlier, missing, recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.runs.outcome import doubts
+from graph_slam_ros.runs.outcome import checked, doubts
 from graph_slam_ros.runs.restore import Stopwatch, config_of, map_of, record_run, stopwatch
 from graph_slam_ros.slam import Config, Control, Counters, GraphSlam, Measurement
 from graph_slam_ros.slam.frontend.ingest_gate import IngestGate
@@ -304,7 +305,8 @@ def _recorded(
     config = with_survey(config or Config())
     bag = open_bag(source)
     inputs = choose_inputs(bag, config, *topics)
-    runs = RecordedRuns(bag, inputs, config, Counters(), state.datum if state is not None else ())
+    columns, counters = Collector(config, inputs.topics), Counters()
+    runs = RecordedRuns(bag, inputs, config, counters, state.datum if state is not None else (), columns)
     total = sum(bag.topics[topic].count for topic in inputs.by_topic()) + 3
     bag.losses += losses
     warmup(dimensions=config.world.dimensions)
@@ -317,16 +319,27 @@ def _recorded(
             state, took = None, stopwatch()
         refused = Counters()
         measured, name = _measured(run, runs, number, refused), source.resolve().name
-        slam, summary = record_run(
-            out, config, measured, bag.losses, state, border=refused, took=took, recording=name, force=force
-        )
+        options: dict[str, Any] = {"recording": name, "took": took, "more": lambda: _checked(columns, counters)}
+        slam, summary = record_run(out, config, measured, bag.losses, state, border=refused, force=force, **options)
         warnings += _warnings(slam, summary)
     return Replayed(slam, summary, summary["losses"], [*bag.warnings, *warnings], tuple(earlier))
 
 
+def _checked(columns: Collector, counters: Counters) -> dict[str, Any]:
+    """The worst finding of the recording so far, of the checks that need no fit."""
+    found = worst_of_replay(columns.columns(counters))
+    return {} if found is None else {"check": found.as_dict()}
+
+
 def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
     faults = [f"{source}: {fault}" for source, fault in slam.counters.faults.items()]
-    return [*faults, *map(str, slam.alarms), *doubts(summary), *mendable(summary["counters"])]
+    return [
+        *faults,
+        *map(str, slam.alarms),
+        *doubts(summary),
+        *checked(summary, "warning"),
+        *mendable(summary["counters"]),
+    ]
 
 
 def _kept(out: Path) -> Path:

@@ -124,6 +124,7 @@ def record_run(
     earlier: Counters | None = None,
     took: Stopwatch | None = None,
     recording: str = "",
+    more: Callable[[], Summary] = dict,
     force: bool = False,
 ) -> tuple[GraphSlam, Summary]:
     """Run the pipeline over measurements and save it all; returns the pipeline and the summary.
@@ -136,6 +137,7 @@ def record_run(
     earlier : counters of the run whose results these are, up to ``start``
     took : the time since whatever is told as its beginning
     recording : the name of the file or folder that the measurements are from
+    more : returns what else is in the summary, when all is processed
     force : a run in the folder may be replaced
 
     Raises
@@ -152,7 +154,7 @@ def record_run(
             recorder.record(slam, slam.process(measurement))
         slam.counters.update(border or Counters())
         summary = summarize(slam, earlier) | took() | {"losses": list(dict.fromkeys(losses))}
-        summary |= {"recording": recording} if recording else {}
+        summary |= ({"recording": recording} if recording else {}) | more()
         recorder.save(slam, summary)
     except KeyboardInterrupt:
         if recorder is not None:

@@ -51,7 +51,9 @@ WITHIN = {
     "messages/inputs": {"plugins", "edge_tags", "lie", "graph", "formats", "measurements", "config"},
     "messages": {"lie", "graph", "formats", "measurements", "config", "slam", "messages/inputs"},
     "recordings": {"lie", "formats", "messages", "messages/inputs"},
-    "check": {"lie", "graph", "formats", "measurements", "config", "slam", "messages", "messages/inputs"},
+    "check": {
+        *("lie", "formats", "measurements", "config", "slam", "slam/calibration", "messages", "messages/inputs"),
+    },
     "runs": {
         *("edge_tags", "lie", "graph", "solver", "warmup", "formats", "measurements", "config"),
         *("slam", "slam/calibration", "slam/frontend", "slam/landmarks", "slam/robust"),

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
 from graph_slam_ros.errors import SingularError
@@ -186,6 +187,7 @@ class _Fit:
 def _factor(rows: Rows) -> tuple[SuperLU, Array]:
     """H in factors, and ``H^-1 B``."""
     h = (rows.jacobian.T @ rows.jacobian).tocsc()
+    h += sparse.diags((h.diagonal() == 0.0).astype(float), format="csc")  # an unknown that has lost all its edges stays
     try:
         factor = splu(h, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     except RuntimeError as error:

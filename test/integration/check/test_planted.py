@@ -85,3 +85,37 @@ def test_every_kind_changes_a_recording_and_leaves_it_readable(tmp_path):
         spoil_messages(changed, [Fault.named(kind)], seed=1)
         changed.write(out)
         assert (contents(out) != before) == (kind != "wrong_twist")  # whose defaults change nothing
+
+
+@pytest.fixture(scope="module")
+def laps(tmp_path_factory):
+    file = tmp_path_factory.mktemp("planted") / "laps.mcap"
+    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2), file)
+    return file
+
+
+@pytest.mark.parametrize(
+    "name, code, value, within",
+    [
+        ("landmark clock +100 ms", "clock_offset", -0.1, 0.02),
+        ("mount turned 5 degrees", "mount_yaw", 0.0873, 0.01),
+        ("two landmarks share an identity", "id_reused", None, None),
+        ("noise 8 times its covariance", "over_confident", None, None),
+    ],
+)
+def test_the_fit_finds_what_needs_an_estimate_and_its_settings_mend_it(laps, tmp_path, name, code, value, within):
+    bag = planted(laps, tmp_path / "faulty.mcap", name)
+    found = {one.code: one for one in check(bag).findings}
+    assert code in found
+    if value is not None:
+        assert found[code].value == pytest.approx(value, abs=within)
+    if found[code].settings:
+        mended = check(bag, dict(parse_setting(text) for text in found[code].settings)).findings
+        assert code not in {one.code for one in mended}
+
+
+def test_a_replay_ends_with_the_worst_finding_and_only_its_summary_differs(drive, tmp_path, capsys):
+    bag = planted(drive, tmp_path / "faulty.mcap", "turn rate mirrored")
+    assert main(["replay", str(bag), "--out", str(tmp_path / "run")]) == 3
+    assert "mirrored: /landmarks" in capsys.readouterr().err
+    assert '"code": "mirrored"' in (tmp_path / "run" / "run.json").read_text()

@@ -1,0 +1,142 @@
+"""Identities that are of two places, and landmarks that move: each sighting put into the map by an estimate."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph_slam_ros.check.columns import SightingColumns
+from graph_slam_ros.check.finding import Finding
+from graph_slam_ros.check.pairs import usable
+from graph_slam_ros.lie import se3
+from graph_slam_ros.typing import Array, Index, Mask
+
+_LEAST, _IN_EACH, _PART = 12, 5, 0.05
+_APART_M, _SIGMAS, _WIDTHS = 0.5, 8.0, 6.0
+_ROUNDS, _QUANTILE, _FIRST = 10, 95.0, 6
+_IN_TURN, _EXCHANGED, _MOST_MOVED = 0.9, 0.4, 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwoPlaces:
+    """An identity whose sightings are at two places, with nothing between them.
+
+    Attributes
+    ----------
+    first, second : (3,) in map; ``first`` is the earlier, or the one of most sightings
+    share : part of the sightings at the second
+    since_ns : when it moved; None where both places are seen in turn
+    first_ns : of its sightings at the second place, the first
+    """
+
+    name: str
+    first: Array
+    second: Array
+    share: float
+    count: int
+    since_ns: int | None
+    first_ns: int
+
+    @property
+    def apart_m(self) -> float:
+        """The distance between both."""
+        return float(np.linalg.norm(self.second - self.first))
+
+
+def points_in_map(s: SightingColumns, poses: Array) -> Array:
+    """(k, 3) Where each sighting puts its landmark, by the poses (k, 7) of the base at their stamps."""
+    return np.stack(se3.act(tuple(poses.T), tuple(s.points.T)), axis=1)
+
+
+def check_identities(s: SightingColumns, points: Array, path_ns: Index, dimensions: int) -> Iterator[Finding]:
+    """Identities that are of two places, by turns or one after the other."""
+    points = points[:, :dimensions]
+    use = usable(s, path_ns) & np.isfinite(points).all(axis=1)
+    found = []
+    for number, name in enumerate(s.names):
+        chosen = np.flatnonzero(use & (s.name == number))
+        if len(chosen) >= _LEAST and (two := _two_places(name, chosen, s, points)) is not None:
+            found.append(two)
+    seen = sum(bool(name) for name in s.names)
+    yield from _moved(s, [one for one in found if one.since_ns is not None])
+    yield from _reused(s, [one for one in found if one.since_ns is None], seen)
+
+
+def _two_places(name: str, chosen: Index, s: SightingColumns, points: Array) -> TwoPlaces | None:
+    chosen = chosen[np.argsort(s.stamp_ns[chosen], kind="stable")]
+    at, sigma_m = points[chosen], float(np.median(s.sigmas[chosen]))
+    near = _parted(at)
+    if near.all() or not near.any():
+        return None
+    a, b = np.median(at[near], axis=0), np.median(at[~near], axis=0)
+    widths = [float(np.median(np.linalg.norm(at[part] - centre, axis=1))) for part, centre in ((near, a), (~near, b))]
+    apart_m, fewest = float(np.linalg.norm(b - a)), int(min(near.sum(), (~near).sum()))
+    if fewest < max(_IN_EACH, _PART * len(at)):
+        return None
+    if not apart_m >= max(_APART_M, _SIGMAS * sigma_m, _WIDTHS * sum(widths)):
+        return None
+    before = np.cumsum(near)[:-1] / np.arange(1, len(at))
+    after = (near.sum() - np.cumsum(near)[:-1]) / np.arange(len(at) - 1, 0, -1)
+    cut = int(np.argmax(np.abs(before - after)))
+    in_turn = abs(before[cut] - after[cut]) <= _IN_TURN or min(cut + 1, len(at) - cut - 1) < _IN_EACH
+    first_is_near = near.mean() > 0.5 if in_turn else before[cut] > 0.5
+    first, second = (a, b) if first_is_near else (b, a)
+    at_second = ~near if first_is_near else near
+    stamps_ns = s.stamp_ns[chosen]
+    since_ns = None if in_turn else int(stamps_ns[cut + 1])
+    return TwoPlaces(name, first, second, float(at_second.mean()), len(at), since_ns, int(stamps_ns[at_second][0]))
+
+
+def _parted(at: Array) -> Mask:
+    """Two medians: from the first sightings, and from the farthest of them but for outliers."""
+    a = np.median(at[: max(4, len(at) // _FIRST)], axis=0)
+    away = np.linalg.norm(at - a, axis=1)
+    b = at[np.argmax(np.where(away <= np.percentile(away, _QUANTILE), away, -1.0))]
+    near = np.ones(len(at), dtype=bool)
+    for _ in range(_ROUNDS):
+        near = np.asarray(np.linalg.norm(at - a, axis=1) <= np.linalg.norm(at - b, axis=1))
+        if near.all() or not near.any():
+            break
+        a, b = np.median(at[near], axis=0), np.median(at[~near], axis=0)
+    return near
+
+
+def _moved(s: SightingColumns, moved: list[TwoPlaces]) -> Iterator[Finding]:
+    """Landmarks that stand elsewhere from some time on; two that change places have exchanged their identities."""
+    exchanged = set()
+    for k, one in enumerate(moved):
+        for other in moved[k + 1 :]:
+            ends = np.linalg.norm(one.second - other.first), np.linalg.norm(other.second - one.first)
+            if max(ends) < _EXCHANGED * one.apart_m:
+                exchanged |= {one.name, other.name}
+                text = (
+                    f"{s.topic}: landmarks {one.name} and {other.name} exchange their places, {one.apart_m:.1f} m apart"
+                )
+                yield Finding(
+                    "ids_exchanged", "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count
+                )
+    rest = [one for one in moved if one.name not in exchanged]
+    if len(rest) > _MOST_MOVED:
+        text = (
+            f"{s.topic}: {len(rest)} landmarks stand elsewhere from some time on: the robot was carried, or it slipped"
+        )
+        first_ns = min(one.first_ns for one in rest)
+        yield Finding("map_breaks", "note", len(rest), _MOST_MOVED, "landmarks", text, s.topic, first_ns, len(rest))
+        return
+    for one in rest:
+        text = f"{s.topic}: landmark {one.name} stands {one.apart_m:.1f} m elsewhere from some time on"
+        yield Finding("landmark_moved", "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count)
+
+
+def _reused(s: SightingColumns, reused: list[TwoPlaces], seen: int) -> Iterator[Finding]:
+    if len(reused) > _MOST_MOVED:
+        text = f"{s.topic}: {len(reused)} of {seen} identities are of more than one place"
+        first_ns = min(one.first_ns for one in reused)
+        yield Finding("ids_unsure", "warning", len(reused), _MOST_MOVED, "identities", text, s.topic, first_ns)
+        return
+    for one in reused:
+        text = (
+            f"{s.topic}: identity {one.name} is of two places {one.apart_m:.1f} m apart "
+            f"({one.share:.0%} of its sightings at the second)"
+        )
+        yield Finding("id_reused", "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count)

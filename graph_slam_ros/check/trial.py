@@ -1,0 +1,180 @@
+"""The trial: a replay in memory, and a fit of clock, mount and scales that begins at its estimate."""
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.finding import Finding, Where, assignment
+from graph_slam_ros.check.identities import check_identities, points_in_map
+from graph_slam_ros.check.pairs import noisier, pairs_of, path_of, poses_at, turned_mount
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.measurements.types import Control, Measurement, Odometry
+from graph_slam_ros.slam import Config, GraphSlam
+from graph_slam_ros.slam.calibration.decision import Finding as Fitted
+from graph_slam_ros.typing import Array, Index, Mask
+
+_THIN_NS = 80_000_000
+_COARSE = {"solve.every_keyframes": 20, "keyframes.min_interval_s": 0.3}
+_SIGMAS = 4.0  # each the larger one of curvature's and of the sandwich's
+_ABSURD, _BACKWARDS, _LATE_S = 0.5, 0.35, 0.2
+_DEGREE = np.pi / 180.0
+# By parameter: code, unit, limit, and from which sigma on it is not observable.
+_LIMITS = {
+    "clock": ("clock_offset", "s", 0.03, 0.05),
+    "yaw": ("mount_yaw", "rad", 2.0 * _DEGREE, 3.0 * _DEGREE),
+    "distance": ("odometry_scale", "part", 0.03, 0.05),
+    "turn": ("turn_scale", "part", 0.03, 0.05),
+}
+_OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
+_OUTLIERS, _LOST, _NEAR_M = 0.12, 0.25, 0.5
+
+
+def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
+    """The pipeline after all measurements, with odometry thinned and fewer solves: the estimate a fit begins at."""
+    slam = GraphSlam(config.changed(_COARSE))
+    last_ns = 0
+    for m in measured:
+        if isinstance(m, Odometry):
+            if 0 <= m.stamp_ns - last_ns < _THIN_NS:
+                continue
+            last_ns = m.stamp_ns
+        slam.process(m)
+    slam.process(Control("end"))
+    slam.process(Control("optimize"))
+    return slam
+
+
+def poses_in_map(slam: GraphSlam, stamp_ns: Index, path_ns: Index, path: Array) -> Array:
+    """Estimated poses (k, 7) at stamps; the correction between two keyframes is spread over the time between them."""
+    keyframes, estimate = slam.keyframes, se3.in_space(slam.trajectory()).reshape(-1, 7)
+    own, at_ns = se3.in_space(keyframes.poses).reshape(-1, 7), keyframes.stamps_ns
+    order = np.argsort(at_ns, kind="stable")
+    at_ns = at_ns[order]
+    driven = poses_at(stamp_ns, path_ns, path)
+    after = np.clip(np.searchsorted(at_ns, stamp_ns), 1, len(at_ns) - 1)
+    ends = []
+    for k in (order[after - 1], order[after]):
+        since = se3.between(tuple(own[k].T), tuple(driven.T))
+        ends.append(se3.compose(tuple(estimate[k].T), since))
+    span = np.maximum(at_ns[after] - at_ns[after - 1], 1)
+    part = np.clip((stamp_ns - at_ns[after - 1]) / span, 0.0, 1.0)
+    return np.stack(se3.interpolate(ends[0], ends[1], part), axis=1)
+
+
+def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
+    """Findings of the replay and of the fit: clock, mount, scales, noise, identities, outliers."""
+    path_ns, path = path_of(c)
+    if len(slam.keyframes) < 3 or len(path_ns) < 2 or not slam.landmarks:
+        return
+    try:
+        fit, fitted = slam.trial_fit()
+        scales = slam.noise_scale()
+    except GraphSlamError as error:
+        text = f"the trial fit failed: {error}"
+        yield Finding("fit_unsure", "note", 1, 0, "fits", text)
+        return
+    turned = [one for one in fitted if one.parameter.name == "distance" and abs(one.value - 0.1) > _ABSURD]
+    if turned:
+        yield _absurd(c, 1.0 + turned[0].value)
+        return
+    found = list(_places(c, slam, path_ns, path))
+    if fit.lost > _LOST:
+        found += [one for s in c.sightings for one in noisier(s, pairs_of(s, path_ns, path, c.config.world.dimensions))]
+        if not found:
+            text = f"{fit.lost:.0%} of the sightings fit nothing: nothing is said of clock, mount and scale"
+            yield Finding("fit_unsure", "warning", fit.lost, _LOST, "part", text)
+        yield from found
+        return
+    offsets = [finding for one in fitted for finding in _fitted(c, one)]
+    yield from offsets
+    if not any(one.code == "clock_offset" and abs(one.value) > _LATE_S for one in offsets):
+        yield from found  # else it is the clock that puts landmarks elsewhere
+    for scale in scales:
+        limit = _ODOMETRY_OVER_CONFIDENT if scale.label == "odometry" else _OVER_CONFIDENT
+        factor = float(np.sqrt(scale.per_dof))
+        if factor > limit and scale.dof > _LEAST_DOF and not scale.reason:
+            yield _over_confident(c, scale.source, scale.label, scale.part, factor, limit)
+
+
+def _absurd(c: Columns, factor: float) -> Finding:
+    """Odometry that a map would need in other units, or the wrong way round."""
+    s = next(s for s in c.sightings if len(s.stamp_ns))
+    where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(s.stamp_ns)}
+    text = f"the robot would have to drive {factor:.2f} m where {c.odometry.topic} says 1 m"
+    if abs(factor + 1.0) < _BACKWARDS:
+        settings = turned_mount(s, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0))
+        text = f"{s.topic}: {text}: the sensor looks backwards?"
+        return Finding("axes", "error", factor, -1.0, "times", text, settings=settings, **where)
+    return Finding("unrelated", "error", factor, 1.0 + _ABSURD, "times", f"{s.topic}: {text}", **where)
+
+
+def _over_confident(c: Columns, source: str, label: str, part: str, factor: float, limit: float) -> Finding:
+    code = "odometry_over_confident" if label == "odometry" else "over_confident"
+    topic = next((t.name for t in c.topics.values() if source in t.inputs), source)
+    what = " ".join(filter(None, (label, part)))
+    text = f"{topic}: residuals ({what}) are {factor:.1f} times as large as its noise says"
+    settings = ("robust.noise_scale=estimated",)
+    return Finding(code, "warning", factor, limit, "times", text, topic, settings=settings)
+
+
+def _fitted(c: Columns, one: Fitted) -> Iterator[Finding]:
+    """A parameter that is far off by its limit and by five sigmas, or that the drive does not tell."""
+    if one.parameter.name not in _LIMITS:
+        return
+    code, unit, limit, unknown = _LIMITS[one.parameter.name]
+    topic = next((t for t in c.topics.values() if one.parameter.source in t.inputs), None)
+    if topic is None:
+        return
+    where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[0]), "count": len(topic.stamp_ns)}
+    if one.sigma > unknown:
+        yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **where)
+    elif abs(one.value) > max(limit, _SIGMAS * one.sigma) and one.verdict == "admitted":
+        text, settings = _mended(c, one)
+        yield Finding(code, "warning", one.value, limit, unit, f"{topic.name}: {text}", settings=settings, **where)
+
+
+def _mended(c: Columns, one: Fitted) -> tuple[str, tuple[str, ...]]:
+    """Return a sentence on what is off, and the settings that mend it."""
+    source, value, sigma = one.parameter.source, one.value, one.sigma
+    if one.parameter.name == "clock":
+        before_s = next(s.offset_s for s in c.config.sources if s.name == source)
+        when = "later" if value > 0.0 else "earlier"
+        text = f"fits odometry best {abs(value) * 1e3:.0f} ms {when} than stamped (sigma {sigma * 1e3:.0f} ms)"
+        return text, (assignment(f"{source}.offset_s", round(before_s + value, 3)),)
+    if one.parameter.name == "yaw":
+        degrees = (value / _DEGREE, sigma / _DEGREE)
+        text = f"its sensor is turned by {degrees[0]:.1f} degrees on the robot (sigma {degrees[1]:.1f})"
+        s = next(s for s in c.sightings if s.input == source)
+        return text, turned_mount(s, (0.0, 0.0, 0.0, *so3.exp((0.0, 0.0, value))))
+    what = "drives" if one.parameter.name == "distance" else "turns"
+    text = f"the robot {what} {1.0 + value:.3f} times what odometry says (sigma {sigma:.3f})"
+    return text, ()
+
+
+def _places(c: Columns, slam: GraphSlam, path_ns: Index, path: Array) -> Iterator[Finding]:
+    """Identities by where the estimate puts them, and sightings that are far from their landmark."""
+    for s in c.sightings:
+        inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
+        if not inside.any():
+            continue
+        poses = poses_in_map(slam, np.clip(s.stamp_ns, path_ns[0], path_ns[-1]), path_ns, path)
+        points = points_in_map(s, poses)
+        yield from check_identities(s, points, path_ns, c.config.world.dimensions)
+        yield from _outliers(c, s, points, inside)
+
+
+def _outliers(c: Columns, s: SightingColumns, points: Array, inside: Mask) -> Iterator[Finding]:
+    """Sightings that are far from the median of their identity, by their noise and by that of the others."""
+    n, far, used = c.config.world.dimensions, 0, 0
+    for number, name in enumerate(s.names):
+        chosen = np.flatnonzero((s.name == number) & inside & np.isfinite(points).all(axis=1))
+        if not name or len(chosen) < 5:
+            continue
+        away = np.linalg.norm(points[chosen, :n] - np.median(points[chosen, :n], axis=0), axis=1)
+        limit = np.maximum(_NEAR_M, _SIGMAS * np.maximum(s.sigmas[chosen], 1.48 * np.median(away)))
+        far, used = far + int((away > limit).sum()), used + len(chosen)
+    if used and far > _OUTLIERS * used:
+        text = f"{s.topic}: {far / used:.0%} of the sightings are far from where their landmark is"
+        yield Finding("outliers", "warning", far / used, _OUTLIERS, "part", text, s.topic, int(s.stamp_ns[0]), far)
