@@ -19,11 +19,11 @@ from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.ledger import FINAL, Reason, Verdict, VerdictChange
 
 _STATE = {
-    Verdict.NOT_EVALUATED: "taken for granted",
+    Verdict.NOT_EVALUATED: "not judged",
     Verdict.ACCEPTED: "accepted",
     Verdict.DOWN_WEIGHTED: "down-weighted",
     Verdict.PENDING: "held back",
-    Verdict.REJECTED: "taken out",
+    Verdict.REJECTED: "rejected",
 }
 _WHY = {
     Reason.NONE: "",
@@ -63,7 +63,7 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
     """
     entries = run.entries
     judged = [entry for entry in entries if entry.verdict]
-    yield f"{len(entries)} edges, {len(judged)} of them judged; {len(entries) - len(judged)} are taken for granted"
+    yield f"{len(entries)} edges, {len(judged)} of them judged; others are odometry and priors"
     if judged:
         yield from _table(judged)
     yield from _worst(e for e in judged if not e.is_in and e.reason not in FINAL)
@@ -86,7 +86,7 @@ def _worst(entries: Iterable[Entry]) -> Iterator[str]:
     """The worst rejected edges: those whose statistic is farthest above its threshold."""
     worst = sorted(entries, key=lambda e: -e.statistic / e.threshold)[:_SHOWN]
     if worst:
-        yield "farthest off, of what is out:"
+        yield "rejected or held back; the farthest above its threshold first:"
     yield from (_row(e, f"chi2 {e.statistic:10.4g} against {e.threshold:6.4g}") for e in worst)
 
 
@@ -94,7 +94,7 @@ def _least(entries: Iterable[Entry]) -> Iterator[str]:
     """The accepted edges that fit worst now."""
     least = sorted(entries, key=lambda e: -e.chi2 / e.dof)[:_SHOWN]
     if least:
-        yield "fits least, of what is in:"
+        yield "accepted; the largest chi2 first:"
     yield from (_row(e, f"chi2 {e.chi2:10.4g} of {e.dof} number{'s' * (e.dof > 1)}") for e in least)
 
 
@@ -105,7 +105,7 @@ def _row(e: Entry, numbers: str) -> str:
 def _gates(entries: Sequence[Entry], changes: Sequence[VerdictChange], config: Config) -> Iterator[str]:
     """Warn of gates that reject nothing: every statistic is far below them, more than correct noise explains."""
     if not config.robust.decide:
-        yield "warning: robust.decide is false: nothing was held back or taken out, whatever it said"
+        yield "warning: robust.decide is false: no measurement is ever held back or rejected"
         return
     gate = {e.edge: quantile(config.robust.gate, e.dof) for e in entries}
     seen = {e.edge: e.statistic for e in entries}
@@ -243,28 +243,28 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
     numbers = f"chi2 {e.statistic:.4g} with {e.dof} degree{'s' * (e.dof > 1)} of freedom"
     allowed = f"up to {e.threshold:.4g} would have passed ({chance})"
     if not e.verdict:
-        return "nothing: odometry and the anchor are not judged"
+        return "nothing: odometry and priors are not judged"
     match e.reason:
         case Reason.UNLIKELY:
-            return f"accepting it would have cost {numbers}, with all that must move for it; {allowed}"
+            return f"accepting it would have raised the cost by {numbers}, after all else had moved for it; {allowed}"
         case Reason.DOES_NOT_FIT:
-            return f"with everything solved it was off by {numbers}; {allowed}"
+            return f"after a solve with it, it had {numbers}; {allowed}"
         case Reason.OUTVOTED:
-            return f"in the cheapest explanation of everything it is off by {numbers}; {allowed}"
+            return f"in the solution of least cost of the whole graph it has {numbers}; {allowed}"
         case Reason.WITHDRAWN:
-            return "not by how it fits: it was cleared, or association took it from its landmark"
+            return "not by its chi2: a user cleared or removed it, or association gave it to another landmark"
         case Reason.QUARANTINED:
-            return "not by how it fits: solves failed with it, again and again, and succeeded without"
+            return "not by its chi2: several solves in a row failed with it, and succeeded without it"
         case Reason.FAILED:
-            return "not by how it fits: the plugin of its edge type failed at it; the log of the run names the error"
+            return "not by its chi2: the plugin of its edge type failed at it; the log of the run has the error"
         case Reason.DISPLACED:
             return (
                 f"{e.statistic:.0f} sightings more agreed on another pose of the robot than on this motion: it was"
                 " carried, or its wheels slipped; an edge with very large noise replaces it"
             )
     if e.verdict is Verdict.DOWN_WEIGHTED:
-        return f"it stays in, but its loss leaves it little: {numbers}, above {e.threshold:.4g} ({chance})"
-    return f"{'it came in later' if history else 'it fits as it came'}: {numbers}; {allowed}"
+        return f"it is accepted, but its loss leaves it little weight: {numbers}, above {e.threshold:.4g} ({chance})"
+    return f"{'it was accepted later' if history else 'it was accepted at once'}: {numbers}; {allowed}"
 
 
 def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
@@ -287,11 +287,11 @@ def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
 def remedy(e: Entry) -> str:
     """The remedy for an edge that is out."""
     if e.reason in FINAL:
-        return f"nothing: what was {_WHY[e.reason]} stays out; replay the run with another configuration"
+        return f"nothing in this run: {_WHY[e.reason]} is final; replay the run with another configuration"
     return (
-        "it comes back by itself once the map agrees with it. If you know that it is true, a stated noise is too small,"
-        f" its own or that of the edges against it: with all sigmas {e.sigma_factor:.3g} times as large it would pass"
-        " (robust.noise_factor). robust.decide=false holds nothing back"
+        "it is accepted by itself as soon as the map agrees with it. If you know that it is true, a stated noise is too"
+        f" small, its own or that of the edges against it: with all sigmas {e.sigma_factor:.3g} times as large it would"
+        " pass (robust.noise_factor). With robust.decide=false nothing is held back"
     )
 
 

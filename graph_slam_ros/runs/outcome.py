@@ -35,7 +35,7 @@ def text(summary: Summary) -> list[str]:
         f"keyframes  {summary['keyframes']:8d}   over {summary['span_s']:.1f} s",
         f"landmarks  {summary['landmarks']:8d}   from {summary['sightings']} sightings",
         f"edges      {summary['edges']:8d}",
-        f"chi2       {summary['chi2']:12.3f}   after {summary['solves']} solves",
+        f"chi2       {summary['chi2']:12.3f}   {_solves(summary)}",
     ]
     if "time_s" in summary:
         cpu = f", {summary['cpu_s']:.1f} s of CPU time" if "cpu_s" in summary else ""
@@ -54,6 +54,14 @@ def text(summary: Summary) -> list[str]:
         for line in _counted_lines(source, reason, times)
     ]
     return [*lines, *undetermined, *others, *table(summary)]
+
+
+def _solves(summary: Summary) -> str:
+    """The number of solves; a map that is only read is solved once, before the run counts."""
+    count = summary["solves"]
+    if count:
+        return f"after {count} solve{'s' * (count > 1)}"
+    return "no solve succeeded" if summary["failing"] else "of the map as it was read, solved once"
 
 
 def _counted_lines(source: str, reason: str, times: int) -> Iterator[str]:

@@ -92,10 +92,11 @@ def test_each_verdict_is_explained_in_its_words(run):
     saved = SavedGraph(run, [])
     entry = next(e for e in saved.entries if (e.label, e.verdict) == ("closures", Verdict.ACCEPTED))
     for verdict, reason, words in (
-        (Verdict.REJECTED, Reason.DOES_NOT_FIT, "with everything solved it was off by"),
-        (Verdict.REJECTED, Reason.OUTVOTED, "in the cheapest explanation of everything"),
-        (Verdict.REJECTED, Reason.WITHDRAWN, "what was withdrawn stays out"),
-        (Verdict.DOWN_WEIGHTED, Reason.NONE, "it stays in, but its loss leaves it little"),
+        (Verdict.REJECTED, Reason.DOES_NOT_FIT, "after a solve with it, it had chi2"),
+        (Verdict.REJECTED, Reason.OUTVOTED, "in the solution of least cost of the whole graph it has chi2"),
+        (Verdict.REJECTED, Reason.WITHDRAWN, "withdrawn is final"),
+        (Verdict.REJECTED, Reason.FAILED, "the plugin of its edge type failed at it"),
+        (Verdict.DOWN_WEIGHTED, Reason.NONE, "it is accepted, but its loss leaves it little weight"),
     ):
         saved.entries[entry.edge] = dataclasses.replace(entry, verdict=verdict, reason=reason)
         assert words in " ".join(" ".join(explain_edge(saved, str(entry.edge))).split())

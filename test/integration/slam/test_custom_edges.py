@@ -77,8 +77,9 @@ def test_every_command_reads_the_run_and_a_repetition_has_the_same_bytes(install
     names = ("graph.g2o", "path.tum", "landmarks.csv", "ledger.csv", "map.mcap")
     for name in names:
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
-    assert main(["recover", run, "--out", str(tmp_path / "recovered")]) == 0
     capsys.readouterr()
+    assert main(["recover", run, "--out", str(tmp_path / "recovered")]) == 0
+    assert "of the map as it was read, solved once" in capsys.readouterr().out
     assert main(["diff", run, str(tmp_path / "recovered")]) == 0
     assert "no difference" in capsys.readouterr().out
     entries = load_run(run).edges
@@ -118,6 +119,8 @@ def test_without_the_plugin_a_map_or_journal_is_refused_in_one_line_that_names_i
     monkeypatch.setattr(edge_tags, "_loaded", {})
     monkeypatch.setattr(edge_tags, "_tags", {})
     capsys.readouterr()
+    with pytest.raises(GraphSlamError, match=f"ledger.csv:[0-9]+: tag '{TAG}' is none of a graph: {TAG}: no plugin"):
+        _ = load_run(tmp_path / "run").edges
     words = command.replace("RUN", str(tmp_path / "run")).replace("OUT", str(tmp_path / "out")).split()
     assert main(words) == 2
     (line,) = capsys.readouterr().err.splitlines()

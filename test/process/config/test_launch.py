@@ -88,25 +88,28 @@ def install(prefix, name, script):
 @contextlib.contextmanager
 def launched(prefix, *words):
     """The process of a launch, and a function that gives what it has said."""
+    from live_nodes import own_domain  # which needs ROS
+
     paths = filter(None, [str(prefix), os.environ.get("AMENT_PREFIX_PATH")])
-    environment = dict(
-        os.environ,
-        AMENT_PREFIX_PATH=os.pathsep.join(paths),
-        ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST",
-        ROS_DOMAIN_ID=str(random.randint(1, 100)),
-        ROS_LOG_DIR=str(prefix / "log"),
-    )
-    command = [sys.executable, "-c", LAUNCH, str(FILE), *words]
-    told = prefix / f"said_{random.randrange(10**9)}"
-    with told.open("w") as said:
-        options = {"stdout": said, "stderr": subprocess.STDOUT, "start_new_session": True}
-        process = subprocess.Popen(command, env=environment, **options)
-    try:
-        yield process, told.read_text
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+    with own_domain() as domain:
+        environment = dict(
+            os.environ,
+            AMENT_PREFIX_PATH=os.pathsep.join(paths),
+            ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST",
+            ROS_DOMAIN_ID=domain,
+            ROS_LOG_DIR=str(prefix / "log"),
+        )
+        command = [sys.executable, "-c", LAUNCH, str(FILE), *words]
+        told = prefix / f"said_{random.randrange(10**9)}"
+        with told.open("w") as said:
+            options = {"stdout": said, "stderr": subprocess.STDOUT, "start_new_session": True}
+            process = subprocess.Popen(command, env=environment, **options)
+        try:
+            yield process, told.read_text
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
 
 
 def started(prefix, *words):
