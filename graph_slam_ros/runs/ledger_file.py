@@ -107,7 +107,7 @@ class Entry:
 
 
 def ledger_text(slam: GraphSlam, ids: list[int]) -> str:
-    """All edges that were judged or taken for granted; ``ids`` are the numbers of the vertices in the file."""
+    """All edges that the solver has; ``ids`` are the numbers of the vertices in the file."""
     return _text(Entry, ledger_entries(slam, ids))
 
 
@@ -150,7 +150,7 @@ def _fault(entry: Entry) -> str:
 
 
 def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
-    """Each edge that was judged or taken for granted; ``ids`` are the numbers that its vertices are to have."""
+    """Each edge that the solver has; ``ids`` are the numbers that its vertices are to have."""
     graph, ledger = slam.graph, slam.ledger
     names = {mark.vertex: name for name, mark in slam.landmarks.items()}
     chi2, _ = slam.solver.chi2_of(np.arange(len(ledger)))
