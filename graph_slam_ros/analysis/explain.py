@@ -72,6 +72,24 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
     yield from _rivals(run.folder)
 
 
+def explain_calibration(folder: Path) -> Iterator[str]:
+    """Say what calibration has found of each parameter, and how to determine what it has not.
+
+    Raises
+    ------
+    GraphSlamError
+        The run did not calibrate.
+    """
+    report = summary_of(folder).get("calibration")
+    if not report:
+        raise GraphSlamError(f"{folder}: it did not calibrate; graph_slam replay with --set calibrate.groups=auto does")
+    yield f"{report['trials']} trial fits; what is left after the corrections:"
+    for one in report["parameters"]:
+        yield from textwrap.wrap(one["text"], _WIDTH, initial_indent="  ", subsequent_indent="    ")
+    for name, value in report["settings"].items():
+        yield f"corrected: {name}={value}"
+
+
 def _table(entries: Sequence[Entry]) -> Iterator[str]:
     counts = Counter((e.label, _state(e.verdict, e.reason)) for e in entries)
     labels, states = dict.fromkeys(e.label for e in entries), sorted({state for _, state in counts})

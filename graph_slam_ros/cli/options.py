@@ -72,7 +72,7 @@ def info(sub: CommandParser) -> None:
     sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording")
 
 
-def check(sub: CommandParser) -> None:
+def check(sub: CommandParser, *, of_check: bool = True) -> None:
     """Add the options of ``check``."""
     sub.codes = f"{CODES} 4: something above a note was found."
     sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording")
@@ -81,8 +81,18 @@ def check(sub: CommandParser) -> None:
     sub.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="set one parameter, before what info chooses"
     )
-    sub.add_argument("--quick", action="store_true", help="leave out what needs a replay and a fit")
+    if of_check:
+        sub.add_argument("--quick", action="store_true", help="leave out what needs a replay and a fit")
     sub.add_argument("--json", action="store_true", help="print all of it as one line of JSON")
+
+
+def calibrate(sub: CommandParser) -> None:
+    """Add the options of ``calibrate``."""
+    check(sub, of_check=False)
+    sub.codes = f"{CODES} 4: something is to be corrected."
+    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file")
+    sub.add_argument("--out", type=Path, metavar="FILE", help="write the settings as a parameter file, too")
+    sub.add_argument("--force", action="store_true", help="replace an existing file")
 
 
 def optimize(sub: CommandParser) -> None:

@@ -48,6 +48,13 @@ COMMANDS = {
         "drive.mcap",
         "drive.mcap --set detections.offset_s=-0.096",
     ),
+    "calibrate": Command(
+        _later("calibrate"),
+        options.calibrate,
+        "estimate odometry's scale, clocks and mounts from a recording, and print the settings",
+        "drive.mcap",
+        "drive.mcap --set calibrate.groups='factors clock'",
+    ),
     "replay": Command(
         recordings.replay,
         options.replay,

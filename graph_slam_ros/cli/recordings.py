@@ -21,7 +21,7 @@ def replay(args: argparse.Namespace) -> int:
     from graph_slam_ros.runs.replay import replay as replayed
 
     _refuse_idle_options(args, is_run(args.bag))
-    config = _config(args)
+    config = config_of(args)
     if args.ros:
         return _replay_live(args, config)
     if args.out is None:
@@ -45,11 +45,12 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
     if not console.has_ros():
         raise GraphSlamError("--ros needs ROS 2 (no rclpy here); without --ros the same replay runs without it")
     bag, code = open_bag(args.bag), console.DONE
-    from graph_slam_ros.node.player import config_of, own_node, play
+    from graph_slam_ros.node.player import config_of as live_config
+    from graph_slam_ros.node.player import own_node, play
     from graph_slam_ros.runs.folder import SUMMARY, check_room
 
     node_name = args.node or "/graph_slam"
-    config = config_of(node_name) if args.out is None else config
+    config = live_config(node_name) if args.out is None else config
     inputs = choose_inputs(bag, config, args.odom, args.landmarks)
     options: dict[str, Any] = {"config": config, "rate": args.rate, "progress": console.progress("play")}
     if args.out is None:
@@ -207,14 +208,14 @@ def _refuse_idle_options(args: argparse.Namespace, of_run: bool) -> None:
             raise GraphSlamError(f"replay: no use for {what}")
 
 
-def _config(args: argparse.Namespace) -> "Config":
+def config_of(args: argparse.Namespace) -> "Config":
     """Defaults, then the run's own or the given file, then single settings."""
     from graph_slam_ros.config.config import flatten
     from graph_slam_ros.formats.parameters import parse_setting, read_parameters
     from graph_slam_ros.runs.folder import is_run
     from graph_slam_ros.slam import Config
 
-    run = args.map or (args.bag if is_run(args.bag) else None)
+    run = getattr(args, "map", None) or (args.bag if is_run(args.bag) else None)
     if run is not None and not is_run(run):
         raise GraphSlamError(f"--map: {run} is not a run folder")
     file = args.config or (run / "config.yaml" if run is not None else None)

@@ -15,8 +15,8 @@ class CalibrateConfig:
     """Calibration of odometry and sensors, estimated with the map."""
 
     groups: str = setting(
-        "off",
-        "what is estimated and corrected: off, on (factors of odometry, clock and yaw of sensors; of an input with "
+        "none",
+        "what is estimated and corrected: none, auto (factors of odometry, clock and yaw of sensors; of an input with "
         "ranges alone their offset and factor, while odometry keeps its scale), or a list of factors, clock, yaw, "
         "mount, range_offset, range_factor, turn_bias",
     )
@@ -31,12 +31,12 @@ class CalibrateConfig:
     turn_bias_sigma: float = setting(0.05, "prior of odometry's constant turn rate error", "rad/s", low=1e-5, high=1.0)
 
     def __post_init__(self) -> None:
-        unknown = [word for word in self.groups.split() if word not in (*GROUPS, "on", "off")]
+        unknown = [word for word in self.groups.split() if word not in (*GROUPS, "auto", "none")]
         if unknown:
-            raise ConfigError(f"calibrate.groups: {unknown[0]!r} is not on, off or one of {', '.join(GROUPS)}")
+            raise ConfigError(f"calibrate.groups: {unknown[0]!r} is not auto, none or one of {', '.join(GROUPS)}")
         words = self.groups.split()
-        if "off" in words and len(words) > 1:
-            raise ConfigError(f"calibrate.groups: {self.groups!r} is off and on")
+        if "none" in words and len(words) > 1:
+            raise ConfigError(f"calibrate.groups: {self.groups!r} is none and some")
         asked = self.asked
         if "mount" in asked and "range_offset" in asked and self.mount_sigma_m > _RULER_M:
             raise ConfigError(
@@ -48,7 +48,7 @@ class CalibrateConfig:
     def asked(self) -> tuple[str, ...]:
         """Names of the groups that are estimated."""
         words = self.groups.split()
-        wanted = {*words, *(DEFAULT_GROUPS if "on" in words else ())}
+        wanted = {*words, *(DEFAULT_GROUPS if "auto" in words else ())}
         return tuple(group for group in GROUPS if group in wanted)
 
     @property
@@ -59,7 +59,7 @@ class CalibrateConfig:
     @property
     def chooses(self) -> bool:
         """Return whether groups follow what the inputs measure, beyond those that are named."""
-        return "on" in self.groups.split()
+        return "auto" in self.groups.split()
 
     def prior(self, name: str) -> float:
         """Sigma of the prior of a quantity, by its name."""

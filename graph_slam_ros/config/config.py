@@ -82,7 +82,7 @@ class Config:
     def __post_init__(self) -> None:
         _ = self.start_pose, self.load_pose, self.survey  # what they are made of is refused here, not later
         words = self.calibrate.groups.split()
-        if "range_factor" in words and {"factors", "on"} & set(words) and not self.survey:
+        if "range_factor" in words and {"factors", "auto"} & set(words) and not self.survey:
             raise ConfigError(
                 "calibrate.groups: factors and range_factor are one scale: leave one out, or survey landmarks "
                 "(landmarks.surveyed)"

@@ -33,6 +33,9 @@ def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
         )
     for change in update.changes[:_EDGES]:
         yield _verdict(slam, change)
+    for found in update.calibrated:
+        value, sigma, source = f"{found.value:.6g}", f"{found.sigma:.3g}", found.parameter.source
+        yield happened("calibration", f"corrected {found.text}", value=value, sigma=sigma, source=source)
     for alarm in update.alarms:
         yield _alarm(alarm)
     if update.solved and update.correction.distance_m + update.correction.angle_rad > 0.0:

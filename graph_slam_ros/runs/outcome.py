@@ -53,7 +53,20 @@ def text(summary: Summary) -> list[str]:
         if source not in inputs or explain(reason).effect is not Effect.REFUSED
         for line in _counted_lines(source, reason, times)
     ]
-    return [*lines, *undetermined, *others, *table(summary)]
+    return [*lines, *undetermined, *others, *calibration(summary), *table(summary)]
+
+
+def calibration(summary: Summary) -> Iterator[str]:
+    """Yield what calibration has corrected, with the settings that have it, and what it could not determine."""
+    report = summary.get("calibration")
+    if not report:
+        return
+    settings = report["settings"]
+    lines = " ".join(f"--set {shlex.quote(f'{name}={value}')}" for name, value in settings.items())
+    yield from _wrapped(f"calibrated {lines or 'nothing: no correction was needed and determined'}", 11)
+    for one in report["parameters"]:
+        if one["verdict"] not in ("admitted", "nothing_to_correct"):
+            yield from _wrapped(f"calibrated {one['text']}", 11)
 
 
 def _solves(summary: Summary) -> str:

@@ -41,6 +41,7 @@ class Calibrator:
     Attributes
     ----------
     findings : of the last trial, by parameter, with the whole correction so far
+    corrected : findings that were used, in order
     history : all corrections of measurements that were there, in order
     trials : how many there were
     """
@@ -59,6 +60,7 @@ class Calibrator:
         self._landmarks, self._counters, self._executor = landmarks, counters, executor
         self.findings: dict[Parameter, Finding] = {}
         self.history: list[Recalibration] = []
+        self.corrected: list[Finding] = []
         self.trials = 0
         self._admitted: set[Parameter] = set()
         self._due, self._steady = FIRST_DUE, 0
@@ -124,6 +126,7 @@ class Calibrator:
         report = self._correct(values, keyframe, everything) if values else None
         if report is not None:
             self._admitted |= values.keys()
+            self.corrected += [one for one in findings if one.parameter in values]
         for one in findings:
             self.findings[one.parameter] = one
         return report

@@ -203,6 +203,11 @@ class MapView:
         return self._frontend.corrections.totals()
 
     @property
+    def corrected(self) -> Sequence[Finding]:
+        """The findings that calibration has taken over, in order."""
+        return self._calibrator.corrected
+
+    @property
     def recalibrations(self) -> Sequence[Recalibration]:
         """The corrections of measurements that were in the graph, in order."""
         return self._calibrator.history

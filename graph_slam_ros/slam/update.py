@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from graph_slam_ros.slam.calibration.decision import Finding
 from graph_slam_ros.slam.kidnap_detector import Alarm
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.robust.ledger import VerdictChange
@@ -23,6 +24,7 @@ class Update:
     report : of a solve of everything
     correction : of the last solve
     changes : of verdicts, since the last update that told any
+    calibrated : corrections by calibration
     alarms : that began, were decided or ended since then: the landmarks say that the robot is elsewhere
     """
 
@@ -33,6 +35,7 @@ class Update:
     correction: Correction = _NO_CORRECTION
     changes: tuple[VerdictChange, ...] = ()
     alarms: tuple[Alarm, ...] = ()
+    calibrated: tuple[Finding, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.keyframes) or self.solved
@@ -58,7 +61,7 @@ class UpdateLog:
         self._keyframes = self._edges = self._solves = 0
         self._report: Report | None = None
         self._changes = len(view.ledger.history)  # of verdicts, that updates have reported
-        self._alarms = view.alarms
+        self._alarms, self._corrections = view.alarms, len(view.corrected)
 
     def begin(self) -> None:
         """The next update begins here."""
@@ -83,7 +86,12 @@ class UpdateLog:
             view.correction if solved else _NO_CORRECTION,
             changes,
             tuple(one for one in self._alarms if _state(one) not in known),
+            self._new_corrections(),
         )
+
+    def _new_corrections(self) -> tuple[Finding, ...]:
+        first, self._corrections = self._corrections, len(self._view.corrected)
+        return tuple(self._view.corrected[first:])
 
 
 def _state(alarm: Alarm) -> tuple[int, int | None, int | None, str]:

@@ -9,7 +9,7 @@ from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.runs.map_journal import state_of
 from graph_slam_ros.slam import GraphSlam
 
-ON = {"calibrate.groups": "on"}
+ON = {"calibrate.groups": "auto"}
 FAULTS = Faults(distance=0.95, turn=1.05, clock_s=0.12, yaw=0.08)
 
 
@@ -96,9 +96,9 @@ def test_a_map_that_is_loaded_goes_on_with_its_calibration(calibrated):
     ("groups", "why"),
     [
         ("factors range_factor", "one scale"),
-        ("on range_factor", "one scale"),
-        ("on off", "off and on"),
-        ("wheels", "'wheels' is not on, off or one of factors"),
+        ("auto range_factor", "one scale"),
+        ("auto none", "none and some"),
+        ("wheels", "'wheels' is not auto, none or one of factors"),
     ],
 )
 def test_what_cannot_be_told_apart_is_refused_by_configuration(groups, why):

@@ -1,0 +1,84 @@
+"""A recording is calibrated: replayed in memory, again with what was found, until nothing is left to correct."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.messages.survey import with_survey
+from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.runs.replay import END, RecordedRuns, choose_inputs
+from graph_slam_ros.slam import Config, Counters, GraphSlam
+from graph_slam_ros.warmup import warmup
+
+_ROUNDS = 4  # replays; a large clock needs two or three
+
+Progress = Callable[[Iterable[Any], int], Iterable[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """The outcome of a calibration.
+
+    Attributes
+    ----------
+    settings : parameters to be set, by dotted name
+    parameters : of the last replay, as ``calibration`` in ``run.json``
+    rounds : replays
+    is_complete : whether the last replay found nothing more
+    losses, warnings : what could not be read
+    """
+
+    settings: dict[str, float | str]
+    parameters: list[dict[str, Any]]
+    rounds: int
+    is_complete: bool
+    losses: list[str]
+    warnings: list[str]
+
+
+def calibrate(
+    path: Path | str,
+    config: Config | None = None,
+    *,
+    odometry: str | None = None,
+    landmarks: str | None = None,
+    progress: Progress = lambda items, total: items,
+) -> Calibrated:
+    """Estimate what is wrong with odometry's scale, clocks and mounts; nothing is written.
+
+    Parameters
+    ----------
+    config : whose ``calibrate.groups`` are estimated; ``auto`` where it names none
+    odometry, landmarks : topics, instead of the configured ones
+    progress : wraps the sequence of messages
+
+    Raises
+    ------
+    GraphSlamError
+        The recording or an input cannot be used, or has no keyframe.
+    """
+    path, config = Path(path), with_survey(config or Config())
+    if not config.calibrate.is_on:
+        config = config.changed({"calibrate.groups": "auto"})
+    bag, found = open_bag(path), dict[str, float | str]()
+    inputs = choose_inputs(bag, config, odometry, landmarks)
+    warmup(dimensions=config.world.dimensions)
+    total = sum(bag.topics[topic].count for topic in inputs.by_topic())
+    report: Mapping[str, Any] = {"settings": {"": 0.0}}
+    rounds = 0
+    while report["settings"] and rounds < _ROUNDS:
+        rounds, now = rounds + 1, config.changed(found)
+        slam = GraphSlam(now)
+        for _, some in progress(RecordedRuns(bag, inputs, now, Counters()), total):
+            for one in some:
+                slam.process(one)
+        for event in END:
+            slam.process(event)
+        if not slam.keyframes:
+            raise GraphSlamError(f"{path}: no odometry of it could be used: graph_slam info {path}")
+        report = slam.calibration_report
+        found |= report["settings"]
+    losses, warnings = list(dict.fromkeys(bag.losses)), list(dict.fromkeys(bag.warnings))
+    return Calibrated(found, report["parameters"], rounds, not report["settings"], losses, warnings)

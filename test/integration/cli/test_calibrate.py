@@ -1,0 +1,26 @@
+"""The command ``calibrate``: settings that are wrong come back right, and applied they leave nothing to correct."""
+
+import json
+
+import pytest
+from places import ROOT
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.formats.parameters import read_parameters
+
+DEMO = str(ROOT / "data" / "demo.mcap")
+WRONG = ("--set", "detections.mount_correction=0 0 0 0 0 0.1", "--set", "odometry.distance_factor=1.08")
+
+
+def test_wrong_settings_of_a_recording_come_back_right(tmp_path, capsys):
+    file = tmp_path / "found.yaml"
+    assert main(["calibrate", DEMO, *WRONG, "--json", "--out", str(file)]) == 4
+    found = json.loads(capsys.readouterr().out)
+    assert found["settings"]["odometry.distance_factor"] == pytest.approx(1.0, abs=0.01)
+    assert float(found["settings"]["detections.mount_correction"].split()[5]) == pytest.approx(0.0, abs=0.01)
+    assert {one["verdict"] for one in found["parameters"]} == {"nothing_to_correct"}, "applied, they leave nothing"
+    assert found["rounds"] > 1
+    written = read_parameters(file)
+    assert written["odometry"]["distance_factor"] == found["settings"]["odometry.distance_factor"]
+    assert main(["calibrate", DEMO, "--out", str(file)]) != 0, "a file of somebody's is not replaced"
+    assert read_parameters(file) == written
