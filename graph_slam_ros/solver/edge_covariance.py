@@ -83,9 +83,9 @@ class EdgeCovariances:
             self._factors[c] = rows, inverse, gain
             keys.append(c * len(self._dof) + members)
             places.append(np.cumsum(self._dof[members]) - self._dof[members])
-        key = np.concatenate(keys) if keys else np.zeros(0, dtype=np.int64)
-        order = np.argsort(key)
-        self._keys, self._places = key[order], (np.concatenate(places) if places else key)[order]
+        if keys:
+            order = np.argsort(key := np.concatenate(keys))
+            self._keys, self._places = key[order], np.concatenate(places)[order]
 
     def _of(self, c: int) -> Array:
         wide = int(self._full[c])
@@ -96,19 +96,19 @@ class EdgeCovariances:
 
         All edges have the same kinds of vertices, and are in the problem.
         """
+        dofs = self._tree.vertex[ends[0], DOF].tolist() if len(ends) else []
+        if not self._order or not dofs:  # all are held
+            return np.zeros((len(ends), sum(dofs), sum(dofs)))
         clique = self._clique[ends]
         depth = np.where(clique == NOTHING, NOTHING, self._depth[clique])
         lowest = clique[np.arange(len(ends)), depth.argmax(axis=1)]
-        dofs = self._tree.vertex[ends[0], DOF].tolist() if len(ends) else []
-        place, slots = np.searchsorted(self._keys, lowest[:, None] * len(self._dof) + ends), []
-        place = self._places[np.minimum(place, len(self._places) - 1)] if len(self._places) else place
-        for slot, dof in enumerate(dofs):
-            slots.append(place[:, slot, None] + np.arange(dof))
-        at = np.concatenate(slots, axis=1) if slots else np.zeros((0, 0), dtype=np.int64)
-        held = np.repeat(clique == NOTHING, dofs, axis=1) if slots else np.zeros((0, 0), dtype=bool)
-        flat = self._start[lowest][:, None, None] + at[:, :, None] * self._full[lowest][:, None, None] + at[:, None, :]
+        place = np.searchsorted(self._keys, lowest[:, None] * len(self._dof) + ends)
+        place = self._places[np.minimum(place, len(self._places) - 1)]
+        at = np.concatenate([place[:, slot, None] + np.arange(dof) for slot, dof in enumerate(dofs)], axis=1)
+        held = np.repeat(clique == NOTHING, dofs, axis=1)
         hidden = held[:, :, None] | held[:, None, :]
-        out: Array = np.where(hidden, 0.0, self._pool[np.where(hidden, 0, flat)]) if len(self._pool) else 0.0 * flat
+        flat = self._start[lowest][:, None, None] + at[:, :, None] * self._full[lowest][:, None, None] + at[:, None, :]
+        out: Array = np.where(hidden, 0.0, self._pool[np.where(hidden, 0, flat)])
         return out
 
     def with_vertex(self, vertex: int, ends: Index) -> Array:

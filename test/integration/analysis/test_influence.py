@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from faulty import faulty_run
 
+from graph_slam_ros.analysis.influence import InfluenceModel
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 
@@ -77,6 +78,21 @@ def test_covariances_of_all_edges_at_once_are_those_of_each(saved):
             if last not in e.vertices:
                 joint = solver.joint_marginal([last, *e.vertices])
                 assert of_last[k] == pytest.approx(joint[:3, 3:], rel=1e-6, abs=1e-12)
+
+
+def test_in_a_map_that_is_held_an_edge_moves_nothing(saved):
+    solver = saved.solve()
+    for vertex in solver.vertices.tolist():
+        solver.hold(vertex)
+    judged = [e.edge for e in saved.entries if e.is_in and e.verdict]
+    found = InfluenceModel(saved.graph, solver, saved.keyframes[-1]).without(judged)
+    assert not found.step.any()
+    assert not found.end_m.any()
+    solver = saved.solve()
+    solver.hold(saved.keyframes[0])
+    known, edge = solver.edge_covariances(), saved.entries[1]
+    assert saved.keyframes[0] in edge.vertices
+    assert known.among(np.array([edge.vertices]))[0] == pytest.approx(solver.joint_marginal(edge.vertices), abs=1e-12)
 
 
 def test_an_unknown_edge_is_refused(saved):

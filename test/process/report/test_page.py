@@ -1,0 +1,228 @@
+"""The page of a report in a real browser: it opens offline, asks for nothing, and says what the run says."""
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from faulty import faulty_run
+
+from graph_slam_ros import cli
+from graph_slam_ros.analysis.explain import Numbers, explain_edge, statements, title
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.runs.ledger_file import read_ledger
+from graph_slam_ros.runs.recorder import RunRecorder
+from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+
+CHROMIUM = Path("/usr/bin/chromium")
+SOFTWARE = ["--use-gl=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+HOSTILE = [
+    "<script>document.title='broken'</script>",
+    "\"'><img src=x onerror=\"document.title='broken'\">",
+    "<a href='http://example.org'>a</a> {edge} %{x} </script>",
+    "\u202eright to left\u200b",
+    "x" * 10_000,
+]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="the page is tested with playwright")
+    if not CHROMIUM.exists():
+        pytest.skip(f"the page is tested with {CHROMIUM}: apt install chromium")
+    with playwright.sync_playwright() as one:
+        browser = one.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(browser):
+    """A function that opens a file offline, and checks at the end that it asked for nothing and that nothing failed."""
+    contexts, wrong = [], []
+
+    def go(file, place="", **options):
+        context = browser.new_context(offline=True, viewport={"width": 1400, "height": 900}, **options)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("request", lambda r: wrong.append(r.url) if r.url.split("#")[0] != file.as_uri() else None)
+        page.goto(file.as_uri() + place)
+        page.wait_for_selector("body[data-ready=yes]")
+        return page
+
+    yield go
+    for context in contexts:
+        context.close()
+    assert wrong == []
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("faulty")
+    run = faulty_run(folder)[1]
+    truth = folder / "drive.mcap"
+    assert cli.main(["report", str(run), "--truth", str(truth), "--out", str(folder / "run.html")]) == 0
+    return SimpleNamespace(run=run, html=folder / "run.html", saved=SavedGraph(run, []))
+
+
+def drive(folder, names, seconds=0, dimensions=2):
+    """A run of a short drive that sees landmarks with these names, and closes a loop on none."""
+    config = Config.from_mapping({"world.dimensions": dimensions})
+    recorder = RunRecorder(folder, config)
+    slam = GraphSlam(config, sink=recorder.sink)
+    for k in range(20):
+        stamp = (1 + seconds) * 1_000_000_000 + k * 200_000_000
+        pose = (0.3 * k, 0.0, 0.0) if dimensions == 2 else (0.3 * k, 0.0, 0.1 * k, 0.0, 0.0, 0.0, 1.0)
+        recorder.record(slam, slam.process(Odometry(stamp, pose)))
+        at = [(2.0 * n - 0.3 * k, 1.0 + n, 0.5)[:dimensions] for n in range(len(names))]
+        noise = tuple((0.01 * np.eye(dimensions)).ravel())
+        seen = tuple(Sighting(name, "position", where, noise) for name, where in zip(names, at, strict=True))
+        recorder.record(slam, slam.process(Sightings(stamp, "seen", seen)))
+    for control in ("end", "optimize"):
+        recorder.record(slam, slam.process(Control(control)))
+    recorder.save(slam)
+    recorder.close()
+    return folder
+
+
+def reported(run, out, *words):
+    code = cli.main(["report", str(run), "--out", str(out), *map(str, words)])
+    return code, out
+
+
+def why(page):
+    return " ".join(page.inner_text("#why-body").split())
+
+
+def test_a_page_says_why_as_explain_does(opened, faulty):
+    """By its address, by a row of the ledger, and by a click on the map."""
+    false = next(e for e in read_ledger(faulty.run) if e.label == "closures" and not e.is_in)
+    page = opened(faulty.html, f"#edge={false.edge}")
+    told = " ".join(" ".join(explain_edge(faulty.saved, str(false.edge))).split())
+    before = told[: told.index(" what if ")]
+    assert why(page).startswith(before)
+    assert f"graph_slam solve run --with {false.edge}" in why(page)
+    page.fill("#filter", f"{false.edge + 1}")
+    page.click(f".row[data-edge='{false.edge + 1}']")
+    other = faulty.saved.edge(false.edge + 1)
+    assert title(other, other.landmark) in why(page)
+    edge = next(e for e in read_ledger(faulty.run) if e.label == "landmarks")
+    page.evaluate("which => go('edge', which)", edge.edge)  # as the map's click does
+    ends = ["", ""]
+    texts = dict(statements(edge, ends, Numbers.of(edge), (), faulty.saved.config))
+    page.wait_for_function(
+        "text => document.getElementById('why-body').innerText.includes(text)", arg=texts["measured"]
+    )
+    page.evaluate("() => byId('map').emit('plotly_click', {points: [{data: {meta: 'keyframe'}, customdata: 5}]})")
+    page.wait_for_function("() => document.getElementById('why-body').innerText.startsWith('keyframe 5:')")
+    assert page.evaluate("location.hash") == "#keyframe=5"
+
+
+def test_each_sentence_of_the_page_is_explains(opened, faulty):
+    """Of every edge: numbers may differ by one in their last digit, as they are packed."""
+    page = opened(faulty.html)
+    shown = page.evaluate("() => Array.from({length: data.edges.count}, (_, k) => explained(k))")
+    number = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]\d+)?")
+    for e, found in zip(faulty.saved.entries, shown, strict=True):
+        history = [change for change in faulty.saved.changes if change.edge == e.edge]
+        keyframe = faulty.saved.keyframe
+        ends = [f"keyframe {keyframe(v)}" if keyframe(v) is not None else f"landmark {e.landmark}" for v in e.vertices]
+        expected = [*statements(e, ends, Numbers.of(e), history, faulty.saved.config)]
+        lines = [tuple(line) for line in found["lines"] if line[0] not in ("what if", "to change")]
+        assert found["title"] == title(e, e.landmark)
+        assert [what for what, _ in lines] == [what for what, _ in expected]
+        for (_, text), (_, other) in zip(lines, expected, strict=True):
+            assert number.sub("#", text) == number.sub("#", other)
+            a, b = (np.array(number.findall(one), dtype=float) for one in (text, other))
+            assert a == pytest.approx(b, rel=1.1e-3, abs=1.1e-2)
+
+
+def test_the_slider_shows_the_estimate_as_it_was_known_then(opened, faulty):
+    page = opened(faulty.html)
+    assert page.inner_text("#when").startswith("now")
+    then = "() => byId('map').data.find(one => one.meta === 'then').x.length"
+    assert page.evaluate(then) == 0
+    page.evaluate("() => { byId('time').value = 1; byId('time').dispatchEvent(new Event('input')); }")
+    assert re.match(r"as known at keyframe \d+, [\d.]+ s after the start", page.inner_text("#when"))
+    page.wait_for_function(f"({then})() > 1")
+    page.focus("#time")
+    page.keyboard.press("End")
+    assert page.inner_text("#when").startswith("now")
+
+
+def test_the_ledger_filters_sorts_and_is_walked_with_arrow_keys(opened, faulty):
+    page = opened(faulty.html)
+    entries = read_ledger(faulty.run)
+    assert page.inner_text("#count") == f"{len(entries)} of {len(entries)} edges"
+    page.fill("#filter", "closures pending")
+    pending = [e.edge for e in entries if e.label == "closures" and e.verdict.name == "PENDING"]
+    assert page.inner_text("#count") == f"{len(pending)} of {len(entries)} edges"
+    page.click("#head button:has-text('judged')")
+    statistic = [e.statistic for e in entries]
+    rows = page.evaluate("() => [...document.querySelectorAll('.row')].map(row => Number(row.dataset.edge))")
+    assert rows == sorted(pending, key=lambda edge: statistic[edge])[: len(rows)]
+    page.focus("#rows")
+    page.keyboard.press("ArrowDown")
+    page.wait_for_function("edge => location.hash === `#edge=${edge}`", arg=rows[0])
+    page.keyboard.press("ArrowDown")
+    page.wait_for_function("edge => location.hash === `#edge=${edge}`", arg=rows[1])
+
+
+def test_space_charts_and_print_draw_without_a_fault(opened, faulty):
+    page = opened(faulty.html, color_scheme="dark")
+    page.click("#view")
+    page.wait_for_function("() => byId('map').data.some(one => one.type === 'scatter3d')")
+    page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
+    page.wait_for_function("() => [...document.querySelectorAll('#charts .plot')].every(one => one.data)")
+    assert page.evaluate("() => byId('chi2-plots').children.length") > 1
+    assert "RMSE" in page.inner_text("#verdict")
+    assert page.evaluate("() => getComputedStyle(document.body).backgroundColor") == "rgb(22, 25, 29)"
+
+
+def test_hostile_names_are_shown_as_text(opened, tmp_path, capsys):
+    run = drive(tmp_path / "<b>&'run", HOSTILE)
+    code, html = reported(run, tmp_path / "hostile.html")
+    assert code == 0
+    page = opened(html, "#edge=25")
+    assert page.title() == "<b>&'run: report"
+    assert page.locator("#verdict b, #why-body img, #why-body script, #space img, .plot a[href*=example]").count() == 0
+    names = page.evaluate("() => column(data.edges.landmark_names)")
+    assert names[:3] == HOSTILE[:3]
+    assert names[3] == "\\u202eright to left\\u200b"
+    assert len(names[4]) == 200
+    for name in names:
+        page.evaluate("name => go('landmark', name)", name)
+        page.wait_for_function(
+            "name => why_text().startsWith(`landmark ${name.slice(0, 100)}`)".replace(
+                "why_text()", "byId('why-body').innerText"
+            ),
+            arg=name,
+        )
+    assert page.title() == "<b>&'run: report"
+
+
+def test_a_run_in_space_a_merged_and_frozen_one_and_an_empty_one_open(opened, tmp_path, capsys):
+    space = drive(tmp_path / "space", ["a", "b", "c"], dimensions=3)
+    code, html = reported(space, tmp_path / "space.html")
+    page = opened(html, "#landmark=b")
+    assert (code, page.evaluate("() => byId('map').data[0].type")) == (0, "scatter3d")
+    assert why(page).startswith("landmark b: 20 edges")
+    one, two = (drive(tmp_path / name, ["a", "b", "c", name], at) for name, at in (("one", 0), ("two", 100)))
+    both, site = tmp_path / "both", tmp_path / "site"
+    assert cli.main(["merge", str(one), str(two), "--out", str(both)]) == 0
+    assert cli.main(["freeze", str(both), "--out", str(site)]) == 0
+    code, html = reported(site, tmp_path / "site.html", "--compare", one)
+    page = opened(html, "#keyframe=30")
+    assert code == 0
+    assert why(page).startswith("keyframe 30: ")
+    assert "Compared with one" in page.inner_text("#compared-section")
+    recorder = RunRecorder(tmp_path / "empty", Config())
+    recorder.close()
+    code, html = reported(tmp_path / "empty", tmp_path / "empty.html")
+    page = opened(html)
+    assert code == 3
+    assert page.inner_text("#verdict").startswith("There is no map to show")
+    assert not page.is_visible("#map")
