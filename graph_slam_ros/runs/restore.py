@@ -101,7 +101,9 @@ def restored(folder: Path, losses: list[str], counters: Counters | None = None) 
     state = map_of(folder, losses, counters)
     losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
     config = config_of(folder, state).changed({"map.localize": False})  # what is asked of a map is asked of all of it
-    return GraphSlam(config, start=state)
+    slam = GraphSlam(config, start=state)
+    losses += [f"{folder}: {source}: {fault}" for source, fault in slam.counters.faults.items()]
+    return slam
 
 
 def restored_and_solved(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:

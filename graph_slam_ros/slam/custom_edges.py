@@ -85,7 +85,7 @@ class CustomEdges:
         for edge, fault in found.items():
             source = self._backend.graph.source_of(edge)
             self._count_fault(source, fault)
-            self._counters.used[source] -= 1
+            self._counters.used[source] = max(0, self._counters.used[source] - 1)  # those of a loaded map are not in it
         if found:
             self._backend.withdraw(list(found), keyframe, Reason.FAILED)
         return bool(found)

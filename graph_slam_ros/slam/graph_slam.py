@@ -5,7 +5,7 @@ their gates, landmarks are associated, both become edges; these are gated, a kid
 state is a function of the configuration and the sequence of accepted measurements, nothing else.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -78,7 +78,7 @@ class GraphSlam(MapView):
         backend = Backend(config.robust, config.solver_settings(), executor, start, counters)
         landmarks = LandmarkFrontend(
             *(config, backend.noise, backend.solver, counters),
-            withdraw=self._withdraw,
+            withdraw=lambda edges: backend.withdraw(edges, len(self.keyframes) - 1),
             hand_over=backend.hand_over,
             trusts_sightings=lambda: backend.trusts_sightings,
         )
@@ -92,7 +92,10 @@ class GraphSlam(MapView):
         self._custom = CustomEdges(config, backend, frontend, landmarks.map, self._anchor, counters)
         self._calibrator = Calibrator(config, backend, frontend, landmarks.map, counters, executor, start)
         if start is not None and start.keyframes:
-            self._restore(start)
+            with failed_edges() as failed:
+                self._restore(start)
+            if self._custom.withdraw(failed.values(), len(self.keyframes) - 1):
+                self._solve(self.config.solver_settings())
         self._updates = UpdateLog(self)
 
     def process(self, measurement: Measurement) -> Update:
@@ -227,9 +230,6 @@ class GraphSlam(MapView):
         if not np.isfinite(covariance).all():
             raise DivergedError("the covariance is not finite")
         return Solved(fits, report, covariance)
-
-    def _withdraw(self, edges: Sequence[int]) -> None:
-        self.backend.withdraw(edges, len(self.keyframes) - 1)
 
     def _on_event(self, event: Event, values: dict[str, Value]) -> None:
         order, pending = self._frontend.order, self._frontend.pending

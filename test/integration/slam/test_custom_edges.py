@@ -447,3 +447,50 @@ def test_a_resting_robot_thins_edges_and_a_survey_without_a_place_of_the_map_beg
     ends = Counter(anchored.graph.edge(int(edge)).vertices[1:] for edge in anchored.graph.edges_of("custom"))
     assert len(ends) == 2
     assert len(set(ends.values())) == 1, "both edges of a message, or none"
+
+
+def test_edges_of_a_map_at_which_another_version_of_the_plugin_fails_are_withdrawn_and_named(
+    install, tmp_path, monkeypatch, capsys
+):
+    site = install()
+    replayed(tmp_path, SHORT)
+    (site / "my_tdoa.py").write_text(EXAMPLE.replace("pose, one, other = values", "raise RuntimeError('gone')"))
+    monkeypatch.delitem(sys.modules, "my_tdoa")
+    monkeypatch.setattr(edge_tags, "_loaded", {})
+    monkeypatch.setattr(edge_tags, "_tags", {})
+    capsys.readouterr()
+    main(["explain", str(tmp_path / "run")])
+    said = capsys.readouterr()
+    (line,) = [text for text in said.err.splitlines() if "plugin my_tdoa" in text]
+    assert line.endswith("tdoa: edge 'difference of ranges', plugin my_tdoa:tdoa of my-tdoa 1.0: RuntimeError: gone")
+    assert re.search(rf"rejected: plugin failed\n  custom +{SHORT - 1}\n", said.out)
+    again = replay(tmp_path / "a.mcap", tmp_path / "b", Config.from_mapping(SETTINGS), map_folder=tmp_path / "run")
+    assert again.summary["counters"]["tdoa"]["plugin_failed"] == 2 * (SHORT - 1)
+    assert again.slam.is_solved
+
+
+def test_a_barometer_in_space_corrects_the_height(install):
+    """Odometry climbs where the robot does not; the sensor is 0.2 m above the base."""
+    install(
+        "from graph_slam_ros.graph import SE3, edge_from_residual\nfrom graph_slam_ros.lie import se3\n\n\n"
+        "def height(values, measured):\n"
+        "    return [se3.act(tuple(values[0]), (0.0, 0.0, 0.2))[2] - measured[0]]\n\n\n"
+        'height = edge_from_residual("height", ((SE3,),), 1, 1, height)\n',
+        edges="[graph_slam_ros.edges]\nEDGE_HEIGHT = my_air:height\n",
+        module="my_air",
+    )
+    off = []
+    for measures in (False, True):
+        slam = GraphSlam(Config.from_mapping({"world.dimensions": 3}))
+        for k in range(60):
+            at_ns = (k + 1) * STEP
+            slam.process(Odometry(at_ns, (0.1 * k, 0.0, 0.01 * k, 0.0, 0.0, 0.0, 1.0)))
+            if measures:
+                later_ns = at_ns + 40_000_000
+                slam.process(CustomEdge(later_ns, "air", "EDGE_HEIGHT", (later_ns,), (0.2,), (0.01,)))
+        slam.process(Control("end"))
+        slam.process(Control("optimize"))
+        off.append(abs(slam.trajectory()[-1, 2]))
+    assert slam.counters.used["air"] == 59  # the last is after all odometry
+    assert off[0] > 0.5
+    assert off[1] < 0.2 * off[0]
