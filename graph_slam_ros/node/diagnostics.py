@@ -260,6 +260,9 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
     if facts.estimate:
         values = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}
         yield Status(OK, f"{node}: weak directions", _weakness(facts, facts.estimate), node, facts.weakest)
+        if calibration := facts.estimate.calibration:
+            corrected = ", ".join(name for name in calibration if name.startswith("corrected "))
+            yield Status(OK, f"{node}: calibration", corrected or "nothing corrected", node, dict(calibration))
         yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes", node, values)
 
 

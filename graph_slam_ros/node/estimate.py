@@ -1,6 +1,7 @@
 """The estimate that the worker's thread leaves for the others."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,7 @@ class Estimate:
     fit : chi2 per degree of freedom; NaN before it was looked at
     rivals : loop closures of other explanations that could not be ruled out
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
+    calibration : settings that calibration has corrected, and a sentence for each parameter that it has fitted
     is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
     """
 
@@ -76,6 +78,7 @@ class Estimate:
     rivals: int
     displaced: str = ""
     is_resumed: bool = False
+    calibration: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def is_located(self) -> bool:
@@ -128,4 +131,10 @@ class Estimate:
             rivals=sum(len(rival.only_here) for rival in slam.backend.rivals),
             displaced=str(slam.displaced or ""),
             is_resumed=is_resumed,
+            calibration=_calibration(slam.calibration_report),
         )
+
+
+def _calibration(report: Mapping[str, Any]) -> dict[str, str]:
+    settings = {f"corrected {name}": str(value) for name, value in report.get("settings", {}).items()}
+    return settings | {f"{one['name']} of {one['source']}": one["text"] for one in report.get("parameters", ())}

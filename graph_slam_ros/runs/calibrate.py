@@ -8,7 +8,9 @@ from typing import Any
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.recordings.bag import open_bag
+from graph_slam_ros.recordings.contents import recording_of
 from graph_slam_ros.runs.replay import END, RecordedRuns, choose_inputs
+from graph_slam_ros.runs.suggestion import Suggestion
 from graph_slam_ros.slam import Config, Counters, GraphSlam
 from graph_slam_ros.warmup import warmup
 
@@ -25,6 +27,7 @@ class Calibrated:
     ----------
     settings : parameters to be set, by dotted name
     parameters : of the last replay, as ``calibration`` in ``run.json``
+    command : the replay with them
     rounds : replays
     is_complete : whether the last replay found nothing more
     losses, warnings : what could not be read
@@ -32,6 +35,7 @@ class Calibrated:
 
     settings: dict[str, float | str]
     parameters: list[dict[str, Any]]
+    command: str
     rounds: int
     is_complete: bool
     losses: list[str]
@@ -40,7 +44,7 @@ class Calibrated:
 
 def calibrate(
     path: Path | str,
-    config: Config | None = None,
+    settings: Mapping[str, Any] | None = None,
     *,
     odometry: str | None = None,
     landmarks: str | None = None,
@@ -50,8 +54,9 @@ def calibrate(
 
     Parameters
     ----------
-    config : whose ``calibrate.groups`` are estimated; ``auto`` where it names none
-    odometry, landmarks : topics, instead of the configured ones
+    settings : parameters by dotted name, which come before those that ``graph_slam info`` chooses; of
+        ``calibrate.groups`` the default is ``auto``
+    odometry, landmarks : topics, instead of those that ``info`` chooses
     progress : wraps the sequence of messages
 
     Raises
@@ -59,10 +64,13 @@ def calibrate(
     GraphSlamError
         The recording or an input cannot be used, or has no keyframe.
     """
-    path, config = Path(path), with_survey(config or Config())
-    if not config.calibrate.is_on:
-        config = config.changed({"calibrate.groups": "auto"})
+    path, given = Path(path), {"calibrate.groups": "auto"} | dict(settings or {})
     bag, found = open_bag(path), dict[str, float | str]()
+    chosen = Suggestion(bag, recording_of(bag), path)
+    if not chosen.trouble and "inputs.names" not in given:
+        given = chosen.settings | given
+        odometry, landmarks = odometry or chosen.topics.get("odom"), landmarks or chosen.topics.get("detections")
+    config = with_survey(Config.from_mapping(given))
     inputs = choose_inputs(bag, config, odometry, landmarks)
     warmup(dimensions=config.world.dimensions)
     total = sum(bag.topics[topic].count for topic in inputs.by_topic())
@@ -81,4 +89,5 @@ def calibrate(
         report = slam.calibration_report
         found |= report["settings"]
     losses, warnings = list(dict.fromkeys(bag.losses)), list(dict.fromkeys(bag.warnings))
-    return Calibrated(found, report["parameters"], rounds, not report["settings"], losses, warnings)
+    command = chosen.command(found | dict(settings or {}) | found)
+    return Calibrated(found, report["parameters"], command, rounds, not report["settings"], losses, warnings)

@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,13 +73,13 @@ class Suggestion:
             self._finish()
             self.trouble = self._refused(bag)
 
-    def command(self) -> str:
-        """The command as it is pasted into a shell."""
+    def command(self, more: Mapping[str, Any] | None = None) -> str:
+        """The command as it is pasted into a shell, with more settings."""
         path = str(self._path)
         words = ["graph_slam", "replay", f"./{path}" if path.startswith("-") else path]
         for option, name in (("--odom", "odom"), ("--landmarks", "detections")):
             words += [option, self.topics[name]] if name in self.topics else []
-        for key, value in self.settings.items():
+        for key, value in (self.settings | dict(more or {})).items():
             words += ["--set", _assignment(key, value)]
         return shlex.join([*words, "--out", str(suggested_out(self._path))])
 

@@ -122,7 +122,8 @@ class Calibrator:
         self.trials += 1
         findings = decide(found, self._count_landmarks(), self._admitted)
         values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
-        self._steady = 0 if values else self._steady + bool(self._admitted)
+        moved = any(one.parameter in values and abs(one.value) > one.sigma for one in findings)
+        self._steady = 0 if moved else self._steady + bool(self._admitted)
         report = self._correct(values, keyframe, everything) if values else None
         if report is not None:
             self._admitted |= values.keys()

@@ -19,6 +19,7 @@ MOST_CORRELATED = 0.95
 PRIOR_SIGMAS = 3.0
 MOST_LOST = 0.2
 LEAST_LANDMARKS = 3
+FOLLOWED = 0.1  # of a sigma: what is left of a correction that is used is followed from there on
 
 Verdict = Literal["admitted", "nothing_to_correct", "not_determined", "not_reproducible", "not_separable", "refused"]
 
@@ -52,7 +53,7 @@ def decide(found: TrialFit, landmarks: int, corrected: Collection[Parameter] = (
     Parameters
     ----------
     landmarks : how many were seen
-    corrected : parameters that were let in before: what is left of them is followed from one sigma on
+    corrected : parameters that were let in before: what is left of them is followed
     """
     void = _void(found, landmarks)
     return [_finding(found, k, void, one in corrected) for k, one in enumerate(found.parameters)]
@@ -88,7 +89,7 @@ def _verdict(found: TrialFit, k: int, void: str, is_corrected: bool) -> tuple[Ve
     if sigma >= quantity.determined_below:
         needs = f"sigma {amount(parameter, sigma)}, needs {amount(parameter, quantity.determined_below)}"
         return "not_determined", f"not determined ({needs}): {quantity.manoeuvre}"
-    least = sigma if is_corrected else max(SIGMAS * sigma, quantity.least)
+    least = FOLLOWED * sigma if is_corrected else max(SIGMAS * sigma, quantity.least)
     if abs(value) < least:
         return "nothing_to_correct", f"nothing to correct ({shown})"
     if correlation > MOST_CORRELATED:

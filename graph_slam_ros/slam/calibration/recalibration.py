@@ -40,8 +40,13 @@ class Recalibration:
         return table.measured.values, table.sqrt_information.values
 
     def apply(self, graph: Graph) -> "Recalibration":
-        """Correct them; returns what undoes it."""
+        """Correct them; returns what undoes it. Rows that a graph does not have are left out."""
+        if not any(edge_type.name == self.table for edge_type in graph.tables):
+            return self
         z, roots = self._columns(graph)
+        if len(self.rows) and self.rows.max() >= len(z):
+            there = self.rows < len(z)
+            return Recalibration(self.table, self.rows[there], self.measured[there], self.roots[there]).apply(graph)
         before = replace(self, measured=z[self.rows].copy(), roots=roots[self.rows].copy())
         z[self.rows], roots[self.rows] = self.measured, self.roots
         return before

@@ -1,13 +1,17 @@
 """Calibration on the way: what was wrong is corrected, and where nothing is, nothing changes."""
 
+import json
+
 import numpy as np
 import pytest
 from imperfect import Faults, driven, imperfect_drive
 
 from graph_slam_ros import Config
 from graph_slam_ros.errors import ConfigError
-from graph_slam_ros.runs.map_journal import state_of
+from graph_slam_ros.runs.map_journal import MapGrowth, extend, state_of
 from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.robust.background import run_when_asked
+from graph_slam_ros.slam.snapshot import MapSnapshot
 
 ON = {"calibrate.groups": "auto"}
 FAULTS = Faults(distance=0.95, turn=1.05, clock_s=0.12, yaw=0.08)
@@ -21,10 +25,6 @@ def wrong():
 @pytest.fixture(scope="module")
 def calibrated(wrong):
     return driven(wrong, ON)
-
-
-def true_landmarks(slam, truth_of):
-    return np.array([slam.solver.estimate([slam.landmarks[name].vertex])[0] for name in truth_of])
 
 
 def spread_error(slam, reference):
@@ -116,3 +116,26 @@ def test_mount_and_range_offset_need_a_ruler():
 def test_factors_and_range_factor_are_allowed_where_landmarks_are_surveyed():
     survey = {"landmarks.surveyed": "id,x,y,sigma\na,0,0,0.01\nb,5,0,0.01"}
     assert Config.from_mapping({"calibrate.groups": "factors range_factor", **survey})
+
+
+def test_trials_in_the_background_and_what_is_recorded_give_the_same_graph(wrong):
+    """A job that is done at once and one that is done when its outcome is due decide alike."""
+
+    def at_once(work):
+        outcome = work()
+        return lambda: outcome
+
+    slams = [GraphSlam(Config.from_mapping(ON), executor=one) for one in (at_once, run_when_asked)]
+    growth, state = MapGrowth(), MapSnapshot()
+    for m in [m for m in wrong if m.stamp_ns < wrong[0].stamp_ns + 40 * 10**9]:
+        for slam in slams:
+            slam.process(m)
+        for record in growth.of(slams[0]):
+            if record["type"] == "growth":
+                extend(state, json.loads(json.dumps(record)))
+    assert slams[0].corrected
+    assert (slams[0].solver.values == slams[1].solver.values).all()
+    assert state.calibration == slams[0].calibration
+    for mine, read in zip(slams[0].graph.tables.values(), state.graph.tables.values(), strict=True):
+        np.testing.assert_array_equal(read.measured.values, mine.measured.values)
+        np.testing.assert_array_equal(read.sqrt_information.values, mine.sqrt_information.values)

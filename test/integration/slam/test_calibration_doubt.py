@@ -1,0 +1,88 @@
+"""Where calibration must not be sure: nothing is corrected, and the sentence names why."""
+
+import numpy as np
+import pytest
+from imperfect import Faults, driven, imperfect_drive
+
+from graph_slam_ros.slam import Odometry, Sightings
+
+ON = {"calibrate.groups": "auto"}
+
+
+def findings(slam):
+    return {one["name"]: one for one in slam.calibration_report["parameters"]}
+
+
+def only(measurements, names):
+    """The same with the sightings of some landmarks."""
+    for m in measurements:
+        seen = tuple(s for s in m.sightings if s.id in names) if isinstance(m, Sightings) else ()
+        if isinstance(m, Odometry):
+            yield m
+        elif seen:
+            yield Sightings(m.stamp_ns, m.topic, seen)
+
+
+def test_with_one_landmark_nothing_is_corrected():
+    slam = driven(list(only(imperfect_drive(Faults(yaw=0.1), seconds=40.0), {"3"})), ON)
+    assert not slam.calibration_report["settings"]
+    assert all("1 landmarks were seen, it needs 3" in one["text"] for one in findings(slam).values())
+
+
+def test_a_drive_without_turns_does_not_determine_the_turn_factor():
+    slam = driven(imperfect_drive(Faults(turn=1.1), seconds=20.0, turns=0.0), ON)
+    assert "odometry.turn_factor" not in slam.calibration_report["settings"]
+    assert findings(slam)["turn"]["verdict"] == "not_determined"
+    assert "figure of eight" in findings(slam)["turn"]["text"]
+
+
+def test_a_standing_robot_corrects_nothing():
+    still = [
+        Odometry(m.stamp_ns, (0.0, 0.0, 0.0)) if isinstance(m, Odometry) else m
+        for m in imperfect_drive(Faults(), seconds=15.0)
+    ]
+    at_once = next(m for m in still if isinstance(m, Sightings))
+    same = [m if isinstance(m, Odometry) else Sightings(m.stamp_ns, m.topic, at_once.sightings) for m in still]
+    slam = driven(same, ON)
+    assert not slam.calibration_report["settings"]
+
+
+def test_a_clock_that_jumps_half_way_is_not_reproducible():
+    half = 35 * 10**9
+    first = imperfect_drive(Faults(), seconds=70.0)
+    middle_ns = first[0].stamp_ns + half
+    jumped = [
+        Sightings(m.stamp_ns - 200_000_000, m.topic, m.sightings)
+        if isinstance(m, Sightings) and m.stamp_ns > middle_ns
+        else m
+        for m in first
+    ]
+    slam = driven(sorted(jumped, key=lambda m: m.stamp_ns), ON)
+    one = findings(slam)["clock"]
+    assert "detections.offset_s" not in slam.calibration_report["settings"], one["text"]
+    assert one["verdict"] in ("not_reproducible", "refused", "not_determined"), one["text"]
+
+
+@pytest.mark.parametrize("wrong", [0.05, 0.2])
+def test_wrong_identities_do_not_make_calibration_worse_than_none(wrong):
+    faults = Faults(distance=0.95, clock_s=0.1, yaw=0.08, wrong_ids=wrong)
+    measurements = imperfect_drive(faults, seconds=50.0)
+    found = driven(measurements, ON)._frontend.corrections.found
+    truth = {"distance": -0.05, "turn": 0.0, "clock": 0.1, "yaw": 0.08}
+    for (_, name), value in found.items():
+        assert abs(value - truth[name]) < 0.5 * abs(truth[name]) + 0.01, (name, value)
+
+
+def test_a_prior_that_contradicts_is_named():
+    measurements = imperfect_drive(Faults(yaw=0.3), seconds=40.0)
+    slam = driven(measurements, ON | {"calibrate.yaw_sigma_rad": 0.05})
+    one = findings(slam)["yaw"]
+    assert one["verdict"] == "refused", one["text"]
+    assert "a wrong configuration is more likely" in one["text"]
+
+
+def test_factors_apart_find_what_is_configured_wrong():
+    """``odometry.distance_factor`` that is wrong is as odometry that is wrong."""
+    slam = driven(imperfect_drive(Faults(), seconds=50.0), ON | {"odometry.distance_factor": 1.06})
+    assert slam.calibration_report["settings"]["odometry.distance_factor"] == pytest.approx(1.0, abs=0.01)
+    assert np.isfinite(slam.solver.values).all()
