@@ -201,7 +201,7 @@ def _draw_errors(axes: Any, found: _Placed) -> None:
 
 
 def _box(found: _Placed, points: Array, axis: int) -> tuple[float, float]:
-    """Return what has to be seen along an axis: estimate and truth, and all else that is not far away from them."""
+    """The interval of an axis: it has the estimate, the truth, and all else that is not far from them."""
     sure = [found.path.poses[:, axis]] + ([found.truth.poses[:, axis]] if found.truth is not None else [])
     low, high = float(np.nanmin(np.concatenate(sure))), float(np.nanmax(np.concatenate(sure)))
     reach = max(high - low, 1.0)
@@ -271,7 +271,7 @@ def draw_graph(
 
 
 def _within(truth: Trajectory, path: Trajectory) -> Trajectory:
-    """The truth during the run: what came before and after would only shrink the picture."""
+    """The truth during the run; the rest would only make the scale smaller."""
     at = (truth.stamps_s >= path.stamps_s[0] - 1.0) & (truth.stamps_s <= path.stamps_s[-1] + 1.0)
     return Trajectory(truth.stamps_s[at], truth.poses[at])
 
@@ -301,7 +301,7 @@ def _draw_edges(axes: Any, points: Array, ends: Index, label: str) -> None:
 
 
 def canvas(size: tuple[float, float], dpi: int = _DPI) -> Any:
-    """A figure of a size in inches, without pyplot, which would keep state and look for a display."""
+    """A figure of a size in inches, without pyplot, which has global state and needs a display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -335,7 +335,7 @@ def dress(axes: Any) -> None:
 
 
 def _legend(axes: Any, *, at: float, side: str) -> None:
-    """Above the axes, where it covers nothing; faint lines are shown in full colour."""
+    """Add a legend above the axes, where it covers nothing; faint lines are shown in full colour."""
     handles, labels = axes.get_legend_handles_labels()
     if not handles:
         return

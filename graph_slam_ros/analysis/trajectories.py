@@ -39,7 +39,7 @@ Row = tuple[int, tuple[float, ...]]  # stamp [ns] and pose (7,)
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The truth.
+    """The true poses and landmarks of a drive.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
     truth : ``BAG``, ``BAG:TOPIC`` or ``FILE.tum``
     topic : of the recording; of a topic of transforms also ``TOPIC:PARENT:CHILD``, the names of two frames.
         Default: ``/ground_truth``, else the only topic that can be the truth
-    not_these : topics that are not chosen by themselves
+    not_these : topics that are not chosen by default
 
     Raises
     ------
