@@ -1,6 +1,7 @@
 """Types of arrays, by one name each in the whole package."""
 
-from typing import TypeAlias
+from collections.abc import Callable
+from typing import Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,3 +11,12 @@ Index: TypeAlias = NDArray[np.int64]
 Mask: TypeAlias = NDArray[np.bool_]
 Numbers: TypeAlias = tuple[float, ...]
 """A point, a pose or a covariance, row by row: what messages and measurements carry."""
+
+Result = TypeVar("Result")
+
+
+class Executor(Protocol):
+    """Begins work and returns what waits for its result."""
+
+    def __call__(self, work: Callable[[], Result], /) -> Callable[[], Result]:
+        """Begin."""

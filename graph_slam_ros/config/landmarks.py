@@ -28,12 +28,12 @@ class LandmarksConfig:
     )
     association: str = setting(
         "id",
-        "data association: none: landmarks are not used; id: by identity; nearest: observations "
-        "without identity one by one; joint: all of a message together",
+        "data association: none: landmarks are not used; id: by identity; joint: observations without identity by "
+        "several hypotheses, which later ones decide; nearest: the same with one hypothesis",
         choices=("none", "id", "nearest", "joint"),
     )
     gate_same: float = setting(
-        0.999,
+        0.9999,
         "an observation without identity may belong to a landmark within this probability of the chi2 test",
         "probability",
         low=0.5,
@@ -41,20 +41,22 @@ class LandmarksConfig:
     )
     gate_other: float = setting(
         0.99999,
-        "an observation outside this probability of every landmark begins a new one; between "
-        "gate_same and this it is discarded",
+        "an observation outside this probability of every landmark is not used",
         "probability",
         low=0.5,
         high=1.0,
     )
     close_m: float = setting(
         0.5,
-        "landmarks closer together than this are not distinguished: an observation of either gets more noise",
+        "objects closer together than this, seen in one message, may be one landmark",
         "m",
         low=0.0,
     )
     unnamed_sigma_m: float = setting(
-        0.1, "position noise added to observations without identity: they may be of a neighbouring object", "m", low=0.0
+        0.14,
+        "position noise added to observations without identity: where on an object, or on which of several, it is seen",
+        "m",
+        low=0.0,
     )
     density_per_m: float = setting(
         0.03,
@@ -64,7 +66,10 @@ class LandmarksConfig:
         low=1e-4,
     )
     ambiguity_chi2: float = setting(
-        6.0, "an association is used only if every alternative fits worse by this much", "chi2", low=0.0
+        6.0,
+        "a stretch of the drive is laid on other landmarks only if every alternative fits worse by this much",
+        "chi2",
+        low=0.0,
     )
     confirm_sightings: int = setting(5, "observations that confirm a new landmark without identity", "sightings", low=1)
     confirm_s: float = setting(
@@ -72,7 +77,7 @@ class LandmarksConfig:
     )
     follow_s: float = setting(
         10.0,
-        "an observation is compared with landmarks observed within this time; older ones are matched later, by merging",
+        "not used any more: observations without identity are compared with all landmarks around",
         "s",
         low=0.0,
     )
@@ -81,7 +86,7 @@ class LandmarksConfig:
     )
     review_every_keyframes: int = setting(
         10,
-        "landmarks without identity are merged, split, confirmed and removed after every so many keyframes",
+        "landmarks without identity are confirmed and removed after every so many keyframes",
         "keyframes",
         low=1,
     )

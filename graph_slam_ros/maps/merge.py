@@ -20,7 +20,7 @@ from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.runs.restore import record_run, restored_and_solved, stopwatch
 from graph_slam_ros.slam import Control, GraphSlam
-from graph_slam_ros.slam.landmarks.anonymous import NAME, last_number
+from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
 from graph_slam_ros.slam.robust.gating import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot

@@ -166,8 +166,8 @@ REASONS: dict[str, Reason] = {
     ),
     "unclear_which": Reason(
         _REFUSED,
-        "a detection without identity may be of several landmarks, or of none",
-        "landmarks.association=joint where it is nearest; else smaller noise, if the sensor is better than stated",
+        "a detection without identity is of no landmark: it fits none, and nothing else was seen there",
+        "landmarks.association=joint where it is nearest; else noise that is as large as the sensor's",
     ),
     "surveyed_orientation_unused": Reason(
         _NOTED,
@@ -202,9 +202,8 @@ REASONS: dict[str, Reason] = {
     "fields_beyond_point": Reason(_REFUSED, "a field of the cloud lies outside its point", "correct the driver"),
     "too_many_points": Reason(_REFUSED, "the cloud has more than 100,000 points", "a scan is no list of landmarks"),
     "cut_off": Reason(_REFUSED, "the cloud has fewer bytes than it says", "correct the driver"),
-    "undecided": Reason(_NOTED, "several unnamed landmarks may be the same ones in too many ways: decided later"),
-    "merged": Reason(_NOTED, "two unnamed landmarks turned out to be one"),
-    "parted": Reason(_NOTED, "two landmarks that had been merged turned out to be two"),
+    "undecided": Reason(_NOTED, "a stretch of the drive may be of several places that look alike: it is left as it is"),
+    "reassigned": Reason(_NOTED, "what was seen without identity turned out to be of another landmark"),
     "given_up": Reason(_NOTED, "a new unnamed landmark was not seen again in landmarks.give_up_s"),
     # -- edges of plugins
     "landmark_unknown": Reason(

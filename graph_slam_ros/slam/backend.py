@@ -16,14 +16,14 @@ from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise
-from graph_slam_ros.slam.robust.background import Background, Executor, Work, run_when_asked
+from graph_slam_ros.slam.robust.background import Background, Work, run_when_asked
 from graph_slam_ros.slam.robust.displacement import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import Alternative, FrozenGraph, Outcome, search_alternatives
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Executor, Numbers
 
 _MAX_PENDING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
 _NOISE_ROUNDS, _NOISE_ROUNDS_ONLINE = 8, 2  # of estimating the scale of the noise and solving with it

@@ -22,10 +22,9 @@ from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibration.rows import TrialProblem
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
-from graph_slam_ros.slam.robust.background import Executor
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings
-from graph_slam_ros.typing import Array, Index
+from graph_slam_ros.typing import Array, Executor, Index
 
 FIRST_DUE = 50  # keyframes
 _ROUNDS = 3  # when everything is solved

@@ -22,7 +22,6 @@ from graph_slam_ros.measurements.types import (
     Measurement,
     Observation,
     Odometry,
-    Sighting,
     Sightings,
 )
 from graph_slam_ros.plugin_edges import failed_edges
@@ -37,6 +36,7 @@ from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.kidnap_detector import KidnapDetector
+from graph_slam_ros.slam.landmarks.assignments import Assigned
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.robust.background import Executor, run_when_asked
@@ -81,6 +81,7 @@ class GraphSlam(MapView):
             withdraw=lambda edges: backend.withdraw(edges, len(self.keyframes) - 1),
             hand_over=backend.hand_over,
             trusts_sightings=lambda: backend.trusts_sightings,
+            executor=executor,
         )
         solution = Solution(config.space, backend, FailureGuard(backend, counters, landmarks.map.forget))
         frontend = KeyframeFrontend(config, backend.noise, counters, solution.pose, start.datum if start else ())
@@ -136,6 +137,7 @@ class GraphSlam(MapView):
     def _on_step(self, step: Step) -> None:
         """Integrate odometry, use the observations that it reaches, and add a keyframe where one is due."""
         frontend = self._frontend
+        self._add_assigned(self._landmarks.travel(step))
         if not self.keyframes:
             frontend.begin(step, self._anchor.begin)
             self._solution.begin(self.keyframes[-1], len(self.keyframes))
@@ -177,19 +179,18 @@ class GraphSlam(MapView):
     def _add_sightings(self, m: Sightings, where: PoseAtStamp) -> None:
         self._solution.resting += self._frontend.path.rests
         self.sighting_poses.append(where.keyframe, m.stamp_ns, where.T_keyframe_base)
-        for name, sighting in self._landmarks.identified(m, where):
-            with self._faults:
-                self._add_sighting(m.topic, name, sighting, where)
+        self._add_assigned(self._landmarks.identified(m, where))
 
-    def _add_sighting(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
-        """Add a sighting of a landmark; the first of a surveyed landmark locates the map."""
-        found = self._landmarks.map.survey_of(name, s, where)
-        if found is not None and self._anchor.align_to_landmark(*found, len(self.keyframes) - 1):
-            self._note_moved(topic)
-        self._landmarks.map.add(topic, name, s, where)
+    def _add_assigned(self, sightings: Iterable[Assigned]) -> None:
+        """Add sightings of landmarks; the first of a surveyed landmark locates the map."""
+        for one in sightings:
+            with self._faults:
+                found = self._landmarks.map.survey_of(one.name, one.sighting, one.where)
+                if found is not None and self._anchor.align_to_landmark(*found, len(self.keyframes) - 1):
+                    self._note_moved(one.topic)
+                self._landmarks.map.add(one.topic, one.name, one.sighting, one.where)
 
     def _add_fix(self, m: Fix, where: PoseAtStamp) -> None:
-        """Add a fix; the first of its kind locates the map."""
         pose_of, compose = self._solution.pose, self.space.group.compose
         if self._anchor.align_to_fix(m, compose(pose_of(where.vertex), where.T_keyframe_base), len(self.keyframes) - 1):
             self._note_moved(m.topic)
@@ -197,6 +198,7 @@ class GraphSlam(MapView):
 
     def _note_moved(self, topic: str) -> None:
         self.counters.count(topic, "map_moved")
+        self._landmarks.anonymous.forget_belief()
         self._solution.guard.note_moved()
 
     def _solve_if_due(self) -> None:
@@ -218,8 +220,8 @@ class GraphSlam(MapView):
         now_ns, report = self._frontend.now_ns, None
         self._kidnaps.add(self.backend.handed_over[1], now_ns)
         fits = self._solution.fits()
+        self._landmarks.review(self.keyframes, everything=everything is not None)
         if everything is None:
-            self._landmarks.review_if_due(len(self.keyframes), self.keyframes[-1].stamp_ns)
             self.backend.update(keyframe)
             self._kidnaps.check(self.keyframes.ids, now_ns)
         else:
@@ -232,16 +234,17 @@ class GraphSlam(MapView):
         return Solved(fits, report, covariance)
 
     def _on_event(self, event: Event, values: dict[str, Value]) -> None:
-        order, pending = self._frontend.order, self._frontend.pending
         match event:
             case "flush":
-                self._use(order.flush())
+                self._use(self._frontend.order.flush())
             case "end" | "time_jump":
-                self._use(order.flush())
-                pending.drop()
+                self._use(self._frontend.order.flush())
+                self._frontend.pending.drop()
+                self._add_assigned(self._landmarks.end_scan())
                 if event == "time_jump":
                     self._frontend.forget_time()
             case "optimize":
+                self._add_assigned(self._landmarks.end_scan())
                 self._solve(self.config.solver_settings())
             case "clear_closures":
                 if self._edits.clear_closures(len(self.keyframes) - 1):
@@ -262,15 +265,12 @@ class GraphSlam(MapView):
         self._solution.vertices = 0
 
     def _set(self, values: dict[str, Value]) -> None:
-        """Change parameters."""
         before, self.config = self.config, self.config.changed(values)
         self._frontend.config = self.config
         self.settings |= values
         self.solver.settings = self.config.solver_settings()
         if self.config.map.localize != before.map.localize:
             self._hold_map(self.config.map.localize)
-
-    # -- a map that is held or loaded ----------------------------------------------------------------------------
 
     def _hold_map(self, is_held: bool) -> None:
         """Begin or end localization: the map of now stays, and the pose's covariance adds to the next odometry edge."""

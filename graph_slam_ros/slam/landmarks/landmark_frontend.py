@@ -5,28 +5,31 @@ from dataclasses import dataclass, replace
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import Sighting, Sightings
+from graph_slam_ros.measurements.types import Sightings
 from graph_slam_ros.slam.frontend.gates import GateChain
+from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.max_distance import off_the_pole
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
+from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
+from graph_slam_ros.slam.landmarks.assignments import Assigned
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark, Landmarks
 from graph_slam_ros.solver import Solver
-
-Named = tuple[str, Sighting]
+from graph_slam_ros.typing import Executor
 
 
 @dataclass(frozen=True, slots=True)
 class NamedSightings:
-    """Sightings of one message, each with the name of its landmark."""
+    """Sightings of an input, each with the name of its landmark."""
 
     topic: str
-    named: tuple[Named, ...]
+    named: tuple[Assigned, ...]
 
     def only(self, known: Mapping[str, Landmark]) -> "NamedSightings | None":
         """The sightings of known landmarks; None where there is none."""
-        named = tuple(one for one in self.named if one[0] in known)
+        named = tuple(one for one in self.named if one.name in known)
         return replace(self, named=named) if named else None
 
 
@@ -70,6 +73,7 @@ class LandmarkFrontend:
     withdraw : takes edges out for good
     hand_over : gives the solver what is new in the graph
     trusts_sightings : whether new landmarks may begin: not so while an alarm cannot be decided
+    executor : begins work in the background
 
     Attributes
     ----------
@@ -87,10 +91,11 @@ class LandmarkFrontend:
         withdraw: Callable[[Sequence[int]], None],
         hand_over: Callable[[], None],
         trusts_sightings: Callable[[], bool],
+        executor: Executor,
     ) -> None:
         self._config, self._space, self._counters = config.landmarks, config.space, counters
         self.map = Landmarks(config, edges, solver, counters, withdraw)
-        self.anonymous = AnonymousLandmarks(config, self.map, solver, counters, hand_over)
+        self.anonymous = AnonymousLandmarks(config, self.map, solver, counters, hand_over, executor)
         self._gates = GateChain[NamedSightings](
             (HeldMapGate(self.map), AlarmGate(self.map, trusts_sightings)), lambda m: len(m.named), counters
         )
@@ -100,27 +105,43 @@ class LandmarkFrontend:
         self.map.restore(landmarks, range_offsets)
         self.anonymous.restore()
 
-    def identified(self, m: Sightings, where: PoseAtStamp) -> Sequence[Named]:
-        """The sightings to be used, each with the landmark it is of; the others are counted."""
-        m = replace(m, sightings=tuple(off_the_pole(self._space, s) for s in m.sightings))
-        named = self._named(m, where)
-        passed = self._gates.admit(NamedSightings(m.topic, tuple(named))) if named else None
-        return passed.named if passed else ()
-
-    def _named(self, m: Sightings, where: PoseAtStamp) -> list[Named]:
+    def identified(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
+        """The sightings to be used now, each with the landmark it is of; the others are counted."""
         how = self._config.association
         if how == "none":
             self._counters.count(m.topic, "not_used", len(m.sightings))
             return []
-        if how == "id":
-            named = [(s.id, s) for s in m.sightings if s.id]
-            if len(named) < len(m.sightings):
-                self._counters.count(m.topic, "no_id", len(m.sightings) - len(named))
-            return named
-        return self.anonymous.identified(m, where)
+        m = replace(m, sightings=tuple(off_the_pole(self._space, s) for s in m.sightings))
+        if how != "id":
+            return self._passed(self.anonymous.identified(m, where))
+        named = [Assigned(m.topic, s.id, s, where) for s in m.sightings if s.id]
+        if len(named) < len(m.sightings):
+            self._counters.count(m.topic, "no_id", len(m.sightings) - len(named))
+        return self._passed(named)
 
-    def review_if_due(self, keyframes: int, stamp_ns: int) -> None:
-        """Review the landmarks without identity now and then; what that changes is part of the next solve."""
-        is_due = keyframes % self._config.review_every_keyframes == 0
-        if self.map.begins_new and self._config.association in ("nearest", "joint") and is_due:
-            self.anonymous.review(stamp_ns)
+    def travel(self, step: Step) -> list[Assigned]:
+        """Go on by a step of odometry; the sightings to be used of what was seen before."""
+        return self._passed(self.anonymous.travel(step)) if self._is_anonymous else []
+
+    def end_scan(self) -> list[Assigned]:
+        """The sightings to be used of what was seen before."""
+        return self._passed(self.anonymous.end_scan())
+
+    @property
+    def _is_anonymous(self) -> bool:
+        return self._config.association in ("nearest", "joint")
+
+    def _passed(self, named: Sequence[Assigned]) -> list[Assigned]:
+        """The sightings that pass the gates, by input."""
+        out: list[Assigned] = []
+        for topic in dict.fromkeys(one.topic for one in named):
+            passed = self._gates.admit(NamedSightings(topic, tuple(one for one in named if one.topic == topic)))
+            out += passed.named if passed else ()
+        return out
+
+    def review(self, keyframes: StampedPoses[Keyframe], *, everything: bool) -> None:
+        """Review the landmarks without identity; what that changes is part of the next solve."""
+        if self._is_anonymous and everything:
+            self.anonymous.explain_all(keyframes)
+        elif self._is_anonymous:
+            self.anonymous.review(keyframes)

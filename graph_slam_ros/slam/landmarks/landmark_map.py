@@ -1,6 +1,6 @@
 """Landmarks: from sightings to vertices and edges, and what still waits to be determined, with the reason."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -264,35 +264,60 @@ class Landmarks:
             self.touched.append(name)
             del self.known[name]
 
-    def merge(self, kept: str, merged: str) -> None:
-        """Give the sightings of one landmark to another."""
-        a, b = self.known[kept], self.known[merged]
-        self.prune(merged)
-        for one in b.seen:
-            self._add_edge(one.topic, a, one.sighting, one.where)
+    def remove_sightings(self, name: str, seen: Set[tuple[int, str, Sighting]]) -> None:
+        """Take sightings from a landmark, each by its stamp, topic and itself; with its last it is gone."""
+        landmark = self.known[name]
+        gone = [one for one in landmark.seen if (one.where.stamp_ns, one.topic, one.sighting) in seen]
+        edges = {one.edge for one in gone}
+        left = [one for one in landmark.seen if one.edge not in edges]
+        if not left and len(gone) == landmark.sightings:
+            self.prune(name)
+            return
+        landmark.seen = left
+        landmark.stamps = {one.where.stamp_ns for one in left}
+        landmark.sightings -= len(gone)
+        if left and landmark.sightings == len(left):
+            landmark.first_seen_ns, landmark.last_seen_ns = min(landmark.stamps), max(landmark.stamps)
+        self._withdraw_sightings(gone)
+        self.touched.append(name)
 
-    def split(self, kept: str, merged: str, moved: Sequence[LandmarkEdge]) -> None:
-        """Take a merger back: these sightings are of a landmark of their own."""
-        a = self.known[kept]
-        gone = {one.edge for one in moved}
-        a.seen = [one for one in a.seen if one.edge not in gone]
-        a.stamps = {one.where.stamp_ns for one in a.seen}
-        a.sightings -= len(moved)
-        self._withdraw_sightings(moved)
-        for one in moved:
-            self.add(one.topic, merged, one.sighting, one.where)
-        self.touched.append(kept)
-        self.confirm(merged)
-
-    def confirm(self, name: str) -> None:
-        """Confirm a tentative landmark."""
-        self.known[name].is_tentative = False
+    def confirm(self, name: str, *, is_sure: bool) -> None:
+        """Believe a landmark, or no longer."""
+        self.known[name].is_tentative = not is_sure
         self.touched.append(name)
 
     def _withdraw_sightings(self, seen: Sequence[LandmarkEdge]) -> None:
         for one in seen:
             self._counters.used[one.topic] -= 1
         self._withdraw([one.edge for one in seen])
+
+    def positions(self, vertices: Sequence[int]) -> Array:
+        """Positions (k, n) of landmarks in map."""
+        n = self._space.dimensions
+        out, at = np.empty((len(vertices), n)), np.array(vertices, dtype=np.int64)
+        is_point = np.array([self.kind_of(v) is self._space.point for v in vertices], dtype=bool)
+        for some in (is_point, ~is_point):
+            if some.any():
+                out[some] = self._solver.estimate(at[some])[:, :n]
+        return out
+
+    def axes(self, landmark: Landmark) -> Array:
+        """The rotation from a landmark's tangent space to the map's axes, of its position."""
+        if self.kind_of(landmark.vertex) is self._space.point:
+            return np.eye(self._space.dimensions)
+        return self._space.turn(tuple(self._solver.estimate([landmark.vertex])[0].tolist()))
+
+    def placed(self, values: Array, places: Mapping[str, Sequence[float]]) -> Array:
+        """Stored numbers of all vertices, with landmarks at these positions."""
+        for name, place in places.items():
+            if name in self.known:
+                begin = self._graph.vertex(self.known[name].vertex).stored.start
+                values[begin : begin + len(place)] = place
+        return values
+
+    def is_held(self, name: str) -> bool:
+        """Return whether a landmark stays where it is."""
+        return self._solver.is_held(self.known[name].vertex)
 
     def kind_of(self, vertex: int) -> VertexKind:
         """Point or pose."""
@@ -307,7 +332,7 @@ class Landmarks:
         candidate = self.undetermined.setdefault(name, UndeterminedLandmark(topic))
         is_elsewhere = not candidate.seen or candidate.seen[-1][0].keyframe != where.keyframe
         candidate.seen.append((where, s))
-        if is_elsewhere:  # another look from where the last was taken determines nothing
+        if is_elsewhere:  # another scan from where the last was taken determines nothing
             self._determine(name, candidate)
         if len(candidate.seen) > _MAX_SIGHTINGS:
             del candidate.seen[1::2]

@@ -7,19 +7,18 @@ done, in a thread or at the end, changes nothing.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.slam.robust.hypotheses import CancelToken, FrozenGraph, Outcome, search_alternatives
+from graph_slam_ros.typing import Executor as Executor
+from graph_slam_ros.typing import Result
 
 _MORE = 1.5  # times as many out as at the last look: looks become rarer as their cost grows
 
-Work = Callable[[], Any]
-Executor = Callable[[Work], Work]
-"""Begins work and returns what waits for its result."""
+Work = Callable[[], Outcome | None]
 
 
-def run_when_asked(work: Work) -> Work:
+def run_when_asked(work: Callable[[], Result], /) -> Callable[[], Result]:
     """Does it when its result is asked for."""
     return work
 

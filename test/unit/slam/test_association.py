@@ -1,142 +1,333 @@
-"""Which landmark is it: one message against landmarks, and landmarks against older ones."""
+"""Which landmark is it: scans and their clusters, the beam of hypotheses, and the moves that take back."""
 
-from itertools import product
+import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from graph_slam_ros.slam.frontend.motion_compensation import KeyframeMeasurement
-from graph_slam_ros.slam.landmarks import association
-from graph_slam_ros.slam.landmarks.association import NEW, UNCLEAR, Candidates, Expected, Gates, likely_pairings
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
+from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.slam.landmarks.association import quantile
+from graph_slam_ros.slam.landmarks.beam import NOTHING, Beam, BeamSettings, Decision, Seed, changes
+from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
+from graph_slam_ros.slam.landmarks.explanation import Costs, Drive, Estimate
+from graph_slam_ros.slam.landmarks.moves import refined
+from graph_slam_ros.slam.landmarks.rotations import rotation, rotation_vector
+from graph_slam_ros.slam.landmarks.scans import (
+    Cluster,
+    DeadReckoning,
+    MotionNoise,
+    Reckoned,
+    Scan,
+    ScanBuilder,
+    Seen,
+    motion_between,
+)
 
-GATES = Gates(same=0.999, other=0.99999, density=0.03**2, margin=6.0, close_m=0.5)
-SIGMA = 0.1
-
-
-def seen(*points, sigma=SIGMA):
-    return [KeyframeMeasurement(tuple(map(float, p)), sigma**2 * np.eye(2)) for p in points]
-
-
-def landmarks(*points, sigma=SIGMA, shared=0.0, followed=None):
-    """Each known to within sigma by itself, and all together shifted by the shared one."""
-    count = len(points)
-    covariance = sigma**2 * np.eye(2 * count) + shared**2 * np.kron(np.ones((count, count)), np.eye(2))
-    is_followed = np.ones(count, dtype=bool) if followed is None else np.array(followed)
-    return Expected(np.array(points, dtype=float), covariance, is_followed)
-
-
-def found(sightings, what, *, jointly=True, gates=GATES):
-    return [m.landmark for m in association.associate(gates, sightings, what, jointly=jointly)]
-
-
-@pytest.mark.parametrize("jointly", [False, True])
-def test_a_sighting_is_of_the_landmark_it_fits_and_of_a_new_one_where_it_fits_none(jointly):
-    what = landmarks((0, 0), (5, 0))
-    assert found(seen((5.1, 0.05), (0.0, 9.0), (-0.1, 0.0)), what, jointly=jointly) == [1, NEW, 0]
-
-
-def test_without_landmarks_all_are_new():
-    assert found(seen((0, 0), (1, 1)), landmarks_of_nothing()) == [NEW, NEW]
+S = 1_000_000_000
+NOISE = MotionNoise(0.02, 0.002, 0.0002, 0.002, 0.0001)
+SPACES = {2: PLANAR, 3: SPATIAL}
+SETTINGS = BeamSettings(quantile(0.9999, 2), 2 * float(np.log(0.03)))
+COSTS = Costs(14.0, 25.0, 6.0)
+WHERE = PoseAtStamp(0, 0, 0, PLANAR.identity, np.zeros((3, 3)))
+SEEN = Seen("seen", Sighting("", "position", (1.0, 0.0), (0.01, 0.0, 0.0, 0.01)), WHERE)
 
 
-def landmarks_of_nothing():
-    return Expected(np.empty((0, 2)), np.empty((0, 0)), np.empty(0, dtype=bool))
+def pose(n, x=0.0, y=0.0, yaw=0.0):
+    return (x, y, yaw) if n == 2 else (x, y, 0.0, 0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
 
 
-@pytest.mark.parametrize("jointly", [False, True])
-def test_between_the_gates_a_sighting_is_of_nothing(jointly):
-    chi2 = 0.5 * (GATES.chi2(2) + GATES.other_chi2(2))
-    away = float(np.sqrt(chi2 * 2.0 * SIGMA**2))
-    assert found(seen((away, 0.0)), landmarks((0, 0)), jointly=jointly) == [UNCLEAR]
+def at(second, n=2, x=0.0, y=0.0, yaw=0.0, **sums):
+    return Reckoned(round(second * S), pose(n, x, y, yaw), **sums)
 
 
-@pytest.mark.parametrize("jointly", [False, True])
-def test_a_landmark_is_seen_once_in_a_message_and_the_pairs_are_the_cheapest_together(jointly):
-    """The first alone would be of landmark 0, which is the only one the second can be."""
-    what = landmarks((0.0, 0.0), (0.45, 0.0))
-    assert found(seen((0.2, 0.0), (-0.3, 0.0)), what, jointly=jointly) == [1, 0]
+def scan(second, where, points, sigma=0.1, sort=""):
+    """What is seen of points (k, n), from the robot, at a place by odometry (x, y, yaw) and the way so far."""
+    x, y, yaw, way = where
+    n = len(points[0]) if len(points) else 2
+    here = at(second, n, x, y, yaw, way=way, turned=abs(yaw), moving_s=second)
+    covariance = sigma**2 * np.eye(n)
+    return Scan(here, WHERE, tuple(Cluster(np.array(p, dtype=float), covariance, (), sort) for p in points))
 
 
-@pytest.mark.parametrize("jointly", [False, True])
-def test_a_vague_landmark_is_not_taken_for_what_is_seen(jointly):
-    """It is within the gate, but that says nothing where the gate holds several others."""
-    away = (6.0, 0.0)
-    assert found(seen(away), landmarks((0, 0), sigma=3.0), jointly=jointly) == [0]
-    assert found(seen(away), landmarks((0, 0), sigma=30.0), jointly=jointly) != [0]
+def seed(n=2, scale_sigma=0.1):
+    dof = SPACES[n].dof
+    covariance = np.diag([1e-4] * dof + [scale_sigma**2] * 2)
+    return Seed(np.zeros(n), np.eye(n), np.zeros(2), np.zeros((0, n)), np.zeros(0, dtype=np.int64), covariance)
 
 
-def test_rivals_close_to_each_other_widen_the_sighting_by_their_spread():
-    (match,) = association.associate(GATES, seen((0.2, 0.0)), landmarks((0.0, 0.0), (0.4, 0.0)), jointly=True)
-    assert match.landmark in (0, 1)
-    assert match.spread == pytest.approx(np.diag([0.5 * 0.4**2, 0.0]))  # either, with even odds
+def motions(scans, n=2):
+    jump = np.zeros((SPACES[n].dof,) * 2)
+    return [motion_between(SPACES[n], NOISE, a.at, b.at, jump) for a, b in itertools.pairwise(scans)]
 
 
-def test_rivals_far_apart_leave_it_unclear():
-    assert found(seen((0.5, 0.0), sigma=0.5), landmarks((0.0, 0.0), (1.0, 0.0))) == [UNCLEAR]
+def explained(scans, settings=SETTINGS, n=2):
+    """The beam after some scans, and what each cluster is by its leader."""
+    beam, first, last = Beam(settings, seed(n)), 0, None
+    for k, one in enumerate(scans):
+        if k:
+            beam.advance(motions(scans[k - 1 : k + 1], n)[0])
+        last = beam.explain(one, first)
+        first += len(one.clusters)
+    return beam, list(changes(None, last).values())
 
 
-def test_a_rival_that_another_sighting_is_of_is_none():
-    what = landmarks((0.0, 0.0), (1.0, 0.0), sigma=0.5)
-    (a, b) = association.associate(GATES, seen((0.45, 0.0), (1.0, 0.0)), what, jointly=True)
-    assert (a.landmark, b.landmark) == (0, 1)
+# -- scans ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_sighting_that_hardly_fits_is_not_pressed_on_a_landmark_where_one_seen_earlier_fits_better():
-    points, followed = ((0.0, 0.0), (0.38, 0.0)), [True, False]
-    assert found(seen((0.36, 0.0)), landmarks(points[0])) == [0]
-    assert found(seen((0.36, 0.0)), landmarks(*points, followed=followed)) == [NEW]
+def glimpse(builder, second, point, topic="seen", turned=0.0, segment=0):
+    builder.add(
+        at(second, turned=turned, segment=segment), np.array(point), 0.01 * np.eye(2), replace(SEEN, topic=topic)
+    )
 
 
-def test_together_a_pair_is_refused_that_passes_alone():
-    """The robot's place is vague, so each may be shifted by 2 m, but not one to the left and one to the right."""
-    what = landmarks((0, 0), (0, 20), sigma=0.05, shared=1.0)
-    apart = seen((1.5, 0.0), (-1.5, 20.0))
-    assert found(apart, what, jointly=False) == [0, 1]
-    together = found(apart, what, jointly=True)
-    assert together != [0, 1] and (0 in together or 1 in together)
-    assert found(seen((1.5, 0.0), (1.5, 20.0)), what, jointly=True) == [0, 1]
+def test_a_look_is_full_after_half_a_second_or_a_turn_or_where_odometry_jumped():
+    builder = ScanBuilder(PLANAR, 0.01 * np.eye(2), 0.5)
+    assert not builder.is_full(at(9.0))
+    glimpse(builder, 1.0, (1.0, 0.0))
+    assert not builder.is_full(at(1.49, turned=0.14))
+    assert builder.is_full(at(1.5))
+    assert builder.is_full(at(1.1, turned=0.15))
+    assert builder.is_full(at(1.1, segment=1))
 
 
-def candidates(residual, covariance, names):
-    """Pairs of the named landmarks; two of one name exclude each other."""
-    excluded = np.array([[a == b for b in names] for a in names])
-    options = [[p for p, name in enumerate(names) if name == k] for k in range(max(names) + 1)]
-    return Candidates(options, residual, covariance, excluded)
+def test_sightings_of_one_thing_are_a_cluster_with_the_covariance_of_one_of_them():
+    builder = ScanBuilder(PLANAR, 0.02 * np.eye(2), 0.5)
+    for k, x in enumerate((5.0, 5.1, 5.2, 8.0)):
+        glimpse(builder, 1.0 + 0.1 * k, (x, 0.0))
+    one, other = builder.close().clusters
+    assert one.point == pytest.approx([5.1, 0.0])
+    assert one.covariance == pytest.approx(0.03 * np.eye(2))
+    assert [len(one.seen), len(other.seen)] == [3, 1]
+    shared = [seen.sighting.covariance[0] for seen in one.seen]
+    assert shared == pytest.approx([0.03] * 3), "together they say as much as one"
+    assert builder.close() is None
 
 
-def drifted(offsets, names, drift=5.0):
-    count = len(offsets)
-    covariance = 0.04 * np.eye(2 * count) + drift**2 * np.kron(np.ones((count, count)), np.eye(2))
-    return candidates(np.array(offsets, dtype=float).ravel(), covariance, names)
+@pytest.mark.parametrize(("apart_m", "topics", "clusters"), [(0.4, 1, 1), (0.6, 1, 2), (0.6, 2, 1)])
+def test_of_one_message_only_what_is_close_is_one(apart_m, topics, clusters):
+    builder = ScanBuilder(PLANAR, 0.05 * np.eye(2), 0.5)
+    glimpse(builder, 1.0, (5.0, 0.0))
+    glimpse(builder, 1.0, (5.0 + apart_m, 0.0), topic="seen" if topics == 1 else "other")
+    assert len(builder.close().clusters) == clusters
 
 
-def test_landmarks_that_all_drifted_alike_are_older_ones_where_one_alone_is_not_clear():
-    alone = likely_pairings(GATES, drifted([(4.0, 3.0), (-6.0, 1.0)], [0, 0]))
-    assert {(0,), (1,)} <= set(alone)
-    three = drifted([(4.0, 3.0), (-6.0, 1.0), (4.1, 2.9), (3.9, 3.1)], [0, 0, 1, 2])
-    assert [sorted(pairs) for pairs in likely_pairings(GATES, three)] == [[0, 2, 3]]
+@pytest.mark.parametrize("n", [2, 3])
+def test_what_is_seen_is_carried_to_the_middle_by_odometry(n):
+    builder = ScanBuilder(SPACES[n], 0.01 * np.eye(n), 0.5)
+    thing = np.array([4.0, 1.0, 0.5][:n])
+    for k in range(3):
+        here = at(1.0 + 0.1 * k, n, x=0.2 * k)
+        seen_at = thing - np.array([0.2 * k, 0.0, 0.0])[:n]
+        builder.add(here, seen_at, 0.01 * np.eye(n), SEEN)
+    (cluster,) = builder.close().clusters
+    assert cluster.point == pytest.approx(thing - np.array([0.2, 0.0, 0.0])[:n])
 
 
-def test_no_pair_is_likely_where_new_ones_cost_less():
-    assert likely_pairings(GATES, drifted([(9.0, 9.0)], [0], drift=100.0))[0] == ()
-    nothing = Candidates([], np.empty(0), np.empty((0, 0)), np.empty((0, 0), dtype=bool))
-    assert likely_pairings(GATES, nothing) == [()]
+def test_dead_reckoning_adds_up_what_was_driven_and_not_what_jumped():
+    reckoning = DeadReckoning(PLANAR, 10.0)
+    reckoning.step(Step(S, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), stands=False)
+    reckoning.step(Step(2 * S, (1.0, 0.0, 0.5), (1.0, 0.0, 0.5)), stands=False)
+    half = reckoning.at(3 * S // 2)
+    assert (half.way, half.turned, half.moving_s) == pytest.approx((0.5, 0.25, 0.5))
+    reckoning.step(Step(3 * S, (9.0, 0.0, 0.0), (9.0, 0.0, 0.0), broken=True), stands=True)
+    end = reckoning.at(3 * S)
+    assert (end.way, end.segment, end.pose) == (1.0, 1, (1.0, 0.0, 0.5))
 
 
-def test_the_likely_pairings_are_those_of_trying_all():
-    rng = np.random.default_rng(3)
-    for _ in range(20):
-        names = [0, 0, 1, 1, 2, 2]
-        root = rng.normal(size=(12, 12)) + np.kron(np.ones((6, 6)), np.eye(2))
-        c = candidates(rng.normal(size=12) * 2.0, root @ root.T + 0.1 * np.eye(12), names)
-        every = {}
-        for choice in product(*([None, *c.options[k]] for k in range(3))):
-            pairs = tuple(p for p in choice if p is not None)
-            statistic, cost = c.cost(pairs) if pairs else (0.0, 0.0)
-            if not pairs or statistic < GATES.chi2(2 * len(pairs)):
-                every[frozenset(pairs)] = cost - len(pairs) * GATES.new
-        likely = {pairs for pairs, cost in every.items() if cost <= min(every.values()) + GATES.margin}
-        told = likely_pairings(GATES, c)
-        assert {frozenset(p) for p in told} == likely
-        costs = [every[frozenset(p)] for p in told]
-        assert costs == sorted(costs)
+# -- the beam ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_cluster_is_the_landmark_it_fits_and_a_new_one_where_it_fits_none(n):
+    settings = BeamSettings(quantile(0.9999, n), n * float(np.log(0.03)))
+    marks = np.array([[4.0, 1.0, 0.5], [4.0, -6.0, 0.2], [-3.0, 2.0, 0.0]])[:, :n]
+    step = np.array([0.5, 0.0, 0.0])[:n]
+    scans = [scan(0.5 * k, (0.5 * k, 0.0, 0.0, 0.5 * k), (marks - k * step)[: 2 + (k > 1)]) for k in range(4)]
+    beam, which = explained(scans, settings, n)
+    assert which == [0, 1, 0, 1, 0, 1, 6, 0, 1, 6]
+    found = {int(k): beam.landmarks[0, slot] for slot, k in enumerate(beam.ids[0]) if k >= 0}
+    assert found[0] == pytest.approx(marks[0], abs=0.05)
+    assert beam.position[0] == pytest.approx(3 * step, abs=0.05)
+
+
+def test_a_cluster_far_out_of_the_gate_is_never_that_landmark():
+    first = scan(0.0, (0, 0, 0, 0), [(4.0, 0.0)])
+    near = explained([first, scan(0.5, (0, 0, 0, 0.0), [(4.3, 0.0)])])[1]
+    far = explained([first, scan(0.5, (0, 0, 0, 0.0), [(5.5, 0.0)])])[1]
+    assert near == [0, 0]
+    assert far == [0, 1]
+
+
+def test_clusters_of_one_look_are_of_different_landmarks():
+    scans = [scan(0.0, (0, 0, 0, 0), [(4.0, 0.0)]), scan(0.5, (0, 0, 0, 0), [(4.0, 0.1), (4.0, -0.1)])]
+    which = explained(scans)[1]
+    assert len(set(which[1:])) == 2
+
+
+def test_what_is_of_another_sort_is_another_landmark():
+    scans = [scan(0.0, (0, 0, 0, 0), [(4.0, 0.0)], sort="tree"), scan(0.5, (0, 0, 0, 0), [(4.0, 0.0)], sort="pole")]
+    assert explained(scans)[1] == [0, 1]
+    assert explained([scans[0], scan(0.5, (0, 0, 0, 0), [(4.0, 0.0)], sort="tree")])[1] == [0, 0]
+
+
+def test_what_comes_later_decides_what_was_seen_before():
+    """Odometry turns by 0.5 rad less than the robot; until a second landmark is seen, the first may be another."""
+    marks = np.array([[5.0, 0.0], [5.0, 2.3], [-4.0, 3.0]])
+    first = [scan(0.5 * k, (0, 0, 0, 0), marks) for k in range(6)]
+    turn = rotation(np.array([-0.45]))  # the robot turned by 0.45 rad, odometry says 0.05
+    here = (0.0, 0.0, 0.05, 0.0)
+    later = [scan(4.0, here, [turn @ marks[0]], sigma=0.3)] + [
+        scan(4.5 + k, here, (turn @ marks.T).T) for k in range(4)
+    ]
+    which = explained([*first, *later])[1]
+    assert which[18:] == [0, *[0, 1, 2] * 4]
+
+
+def test_one_hypothesis_is_the_nearest_and_the_beam_keeps_as_many_as_allowed():
+    scans = [scan(0.5 * k, (0.3 * k, 0, 0, 0.3 * k), [(4.0 - 0.3 * k, 0.5), (4.0 - 0.3 * k, -0.5)]) for k in range(12)]
+    for many in (1, 5):
+        beam, which = explained(scans, replace(SETTINGS, hypotheses=many))
+        assert 1 <= len(beam.log_weight) <= many
+        assert (np.diff(beam.log_weight) <= 0).all()
+        assert which == [0, 1] * 12
+
+
+def test_where_there_is_no_slot_the_landmark_not_seen_for_longest_leaves():
+    scans = [scan(0.5 * k, (0, 0, 0, 0), [(3.0 + 3 * k, 3.0 * k)]) for k in range(12)]
+    beam, which = explained(scans, replace(SETTINGS, slots=8))
+    assert which == list(range(12))
+    assert sorted(beam.ids[0].tolist()) == list(range(4, 12))
+
+
+def test_the_changes_between_two_leaders_are_those_since_they_agreed():
+    root = Decision(None, 0, 0)
+    one, two = Decision(root, 1, 1, 2), Decision(root, 1, 0, 2)
+    assert changes(one, Decision(two, 2, NOTHING, 3)) == {1: 0, 2: NOTHING}
+    assert changes(one, one) == {}
+    assert changes(None, one) == {0: 0, 1: 1}
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_rotations_are_those_of_their_vectors(n):
+    vectors = np.random.default_rng(0).uniform(-1.0, 1.0, (5, 1 if n == 2 else 3))
+    matrices = rotation(vectors)
+    assert rotation_vector(matrices) == pytest.approx(vectors)
+    assert matrices @ matrices.transpose(0, 2, 1) == pytest.approx(np.tile(np.eye(n), (5, 1, 1)))
+
+
+# -- everything at once ----------------------------------------------------------------------------------------------
+
+ROUND = np.array([[6.0, 0.0], [5.0, 6.0], [-6.0, 3.0], [-3.0, -6.0], [7.0, 7.5]])
+
+
+def circle(seed=0, laps=3, scale=1.0, marks=ROUND, per_lap=40):
+    """Scans from a circle of 2 m; odometry is ``scale`` times too short in way."""
+    rng, scans, truth = np.random.default_rng(seed), [], []
+    at_, step = np.zeros(3), 2.0 * np.pi / per_lap
+    odometry = np.zeros(3)
+    for k in range(laps * per_lap):
+        turn = rotation(at_[2:])
+        seen = (marks - at_[:2]) @ turn
+        near = [j for j in range(len(marks)) if np.linalg.norm(seen[j]) < 7.0]
+        points = seen[near] + rng.normal(0.0, 0.1, (len(near), 2))
+        scans.append(scan(0.5 * k, (*odometry, 2.0 * step * k), points, 0.1))
+        object.__setattr__(scans[-1].at, "turned", step * k)
+        truth.append(near)
+        for pose_, way in ((at_, 2.0 * step), (odometry, 2.0 * step / scale)):
+            pose_[:2] += way * np.array([np.cos(pose_[2] + step / 2), np.sin(pose_[2] + step / 2)])
+            pose_[2] += step
+    return scans, np.concatenate(truth)
+
+
+def of_drive(scans, which, n=2):
+    drive = Drive(scans, motions(scans, n), SETTINGS, COSTS)
+    position, turn = drive.along_odometry(np.zeros(n), np.eye(n), np.zeros(2))
+    return drive, drive.staged(Estimate(position, turn, np.empty((0, n)), np.zeros(2), np.array(which)))
+
+
+def test_solving_all_finds_the_landmarks_and_what_odometry_is_short_of():
+    scans, truth = circle(scale=1.08)
+    _, e = of_drive(scans, truth)
+    assert e.landmarks == pytest.approx(ROUND, abs=0.1)
+    assert e.scales[0] == pytest.approx(0.08, abs=0.02)
+
+
+def test_what_was_taken_for_two_is_merged_and_what_was_given_wrongly_is_given_to_another():
+    scans, truth = circle()
+    wrong = truth.copy()
+    wrong[(truth == 1) & (np.arange(len(truth)) > len(truth) // 2)] = len(ROUND)
+    wrong[np.flatnonzero(truth == 0)[::9]] = -1
+    drive, e = of_drive(scans, wrong)
+    e = refined(drive, e)
+    assert len(e.landmarks) == len(ROUND)
+    pairs = {(a, b) for a, b in zip(truth.tolist(), e.which.tolist(), strict=True)}
+    assert len(pairs) == len(ROUND)
+
+
+def two_rooms(marks_of_second):
+    """A drive among marks, and then a stretch with odometry off by a metre among others."""
+    scans, truth = circle(laps=3)
+    last = scans[-1].at
+    moved = []
+    for k, one in enumerate(scans[:30]):
+        here = at(
+            last.stamp_ns / S + 10.0 + 0.5 * k,
+            x=one.at.pose[0] + 1.0,
+            y=one.at.pose[1] + 0.3,
+            yaw=one.at.pose[2],
+            way=last.way + 0.5 * k,
+            turned=last.turned + 0.16 * k,
+            moving_s=last.moving_s + 10.0 + 0.5 * k,
+        )
+        moved.append(replace(one, at=here))
+    own = marks_of_second[truth[: sum(len(one.clusters) for one in moved)]]
+    return [*scans, *moved], np.concatenate([truth, own])
+
+
+def test_a_stretch_that_is_a_twin_is_laid_on_the_map_as_one():
+    scans, which = two_rooms(np.arange(5, 10))
+    drive, e = of_drive(scans, which)
+    assert len(e.landmarks) == 10
+    e, undecided = laid_on_the_map(drive, e)
+    assert (len(e.landmarks), undecided) == (5, 0)
+    assert e.landmarks == pytest.approx(ROUND, abs=0.25)
+
+
+@pytest.mark.parametrize("halls", [1, 2])
+def test_which_of_two_halls_alike_it_is_stays_open(halls):
+    """A round in each hall, then odometry jumps, and what is seen next may be either."""
+    scans, which = [], []
+    once, seen_in_one = circle(laps=2)
+    begin = {"way": 0.0, "turned": 0.0}
+    for hall in range(halls + 1):
+        is_lost = hall == halls
+        for k, one in enumerate(once if not is_lost else once[:40]):
+            x, y, yaw = one.at.pose
+            away = 40.0 * hall if not is_lost else 17.0
+            here = at(
+                100.0 * hall + 0.5 * k,
+                x=x + away,
+                y=y,
+                yaw=yaw,
+                way=begin["way"] + one.at.way,
+                turned=begin["turned"] + one.at.turned,
+                moving_s=100.0 * hall + 0.5 * k,
+                segment=int(is_lost),
+            )
+            scans.append(replace(one, at=here))
+        begin = {"way": scans[-1].at.way + 40.0, "turned": scans[-1].at.turned}
+        count = sum(len(one.clusters) for one in (once if not is_lost else once[:40]))
+        which.append(5 * hall + seen_in_one[:count])
+    jump = np.diag([100.0, 100.0, 9.0])
+    steps = [motion_between(PLANAR, NOISE, a.at, b.at, jump) for a, b in itertools.pairwise(scans)]
+    drive = Drive(scans, steps, SETTINGS, COSTS)
+    position, turn = drive.along_odometry(np.zeros(2), np.eye(2), np.zeros(2))
+    e = drive.staged(Estimate(position, turn, np.empty((0, 2)), np.zeros(2), np.concatenate(which)))
+    assert len(e.landmarks) == 5 * (halls + 1)
+    laid, undecided = laid_on_the_map(drive, e)
+    assert len(laid.landmarks) == (5 if halls == 1 else 15)
+    assert (undecided > 0) == (halls == 2)

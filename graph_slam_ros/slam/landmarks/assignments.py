@@ -1,0 +1,165 @@
+"""The landmark of each cluster in the graph: given at once, and another when that is known better."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph_slam_ros.config.landmarks import LandmarksConfig
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.landmarks.beam import NOTHING
+from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
+from graph_slam_ros.slam.landmarks.moves import LEAST_SCANS
+from graph_slam_ros.slam.landmarks.scans import Cluster, Seen
+
+NOT_IN_MAP = ""  # in place of a name, where the map is held and nothing in it fits
+NAME = "unnamed"
+"""What landmarks are called that have no name; a number follows."""
+_OF_MEDIAN = 0.1  # part of the scans of the median landmark that one is seen in to be believed
+_FROM_MAP = -100  # numbers of landmarks that no cluster of this drive began, downwards
+
+
+@dataclass(frozen=True, slots=True)
+class Assigned:
+    """A sighting, and the name of the landmark it is of."""
+
+    topic: str
+    name: str
+    sighting: Sighting
+    where: PoseAtStamp
+
+
+def last_number(names: Iterable[str]) -> int:
+    """The highest that follows ``NAME``; 0 where there is none."""
+    numbers = (name.removeprefix(NAME) for name in names)
+    return max((int(number) for number in numbers if number.isdecimal()), default=0)
+
+
+class Assignments:
+    """The clusters and their landmarks.
+
+    Parameters
+    ----------
+    hand_over : gives the solver what is new in the graph
+
+    Attributes
+    ----------
+    given : of each cluster the number of its landmark, or ``NOTHING``
+    seen : of each cluster its sightings
+    names : of landmarks by number
+    """
+
+    def __init__(
+        self, config: LandmarksConfig, landmarks: Landmarks, counters: Counters, hand_over: Callable[[], None]
+    ) -> None:
+        self._config, self._landmarks, self._counters, self._hand_over = config, landmarks, counters, hand_over
+        self.given: list[int] = []
+        self.names: dict[int, str] = {}
+        self.seen: list[tuple[Seen, ...]] = []
+        self._scans: Counter[int] = Counter()  # of each landmark
+        self._begun, self._fresh = 0, _FROM_MAP
+        self._final = 0  # clusters whose landmarks stay
+        self._given_up: dict[int, list[int]] = {}  # landmarks that were, with their clusters
+
+    def restore(self) -> bool:
+        """Go on with the landmarks of a map, if there are any; new names are other than theirs."""
+        unnamed = [name for name, mark in self._landmarks.known.items() if mark.is_unnamed]
+        self._begun = last_number(unnamed)
+        self.names = {self.fresh(): name for name in unnamed}
+        return bool(unnamed)
+
+    def fresh(self) -> int:
+        """A number for a landmark that no cluster begins."""
+        self._fresh -= 1
+        return self._fresh
+
+    def finish(self) -> None:
+        """All clusters of now stay with their landmarks."""
+        self._final = len(self.given)
+
+    def append(self, clusters: Sequence[Cluster]) -> int:
+        """Add clusters, of nothing yet; returns the number of the first."""
+        self.seen += [cluster.seen for cluster in clusters]
+        self.given += [NOTHING] * len(clusters)
+        return len(self.given) - len(clusters)
+
+    def begin(self, first: int, landmarks: Mapping[int, int]) -> list[Assigned]:
+        """Give the clusters from one on for the first time; their sightings, each with the name of its landmark."""
+        out = []
+        for cluster in range(first, len(self.given)):
+            landmark = self.given[cluster] = landmarks.get(cluster, NOTHING)
+            self._scans[landmark] += 1
+            for one in self.seen[cluster]:
+                if landmark == NOTHING:
+                    self._counters.count(one.topic, "unclear_which")
+                else:
+                    out.append(Assigned(one.topic, self._name(landmark), one.sighting, one.where))
+        return out
+
+    def give(self, changed: Mapping[int, int]) -> bool:
+        """Give clusters to other landmarks; whether there were any."""
+        changed = {c: k for c, k in changed.items() if c >= self._final and self.given[c] != k}
+        lost: dict[str, set[tuple[int, str, Sighting]]] = {}
+        for cluster in changed:
+            name = self.names.get(self.given[cluster], NOT_IN_MAP)
+            lost.setdefault(name, set()).update((s.where.stamp_ns, s.topic, s.sighting) for s in self.seen[cluster])
+            self._scans[self.given[cluster]] -= 1
+        for name, seen in lost.items():
+            if name in self._landmarks.known:
+                self._landmarks.remove_sightings(name, seen)
+        for cluster, landmark in changed.items():
+            self.given[cluster] = landmark
+            self._scans[landmark] += 1
+            self._add(cluster)
+        if changed:
+            self._counters.count("landmarks", "reassigned", len(changed))
+            self._hand_over()
+        return bool(changed)
+
+    def _add(self, cluster: int) -> None:
+        """The sightings of a cluster to its landmark."""
+        landmark = self.given[cluster]
+        name = self._name(landmark) if landmark != NOTHING else NOT_IN_MAP
+        if name != NOT_IN_MAP:
+            for one in self.seen[cluster]:
+                with suppress(GraphSlamError):  # as when it was new
+                    self._landmarks.add(one.topic, name, one.sighting, one.where)
+
+    def _name(self, landmark: int) -> str:
+        if landmark in self._given_up:  # it is seen again, and with it what was seen before
+            for cluster in self._given_up.pop(landmark):
+                if self.given[cluster] == landmark:
+                    self._add(cluster)
+        return self.names.get(landmark) or self._new_name(landmark)
+
+    def _new_name(self, landmark: int) -> str:
+        if not self._landmarks.begins_new:
+            return NOT_IN_MAP
+        self._begun += 1
+        while f"{NAME}{self._begun}" in self._landmarks.known:
+            self._begun += 1
+        return self.names.setdefault(landmark, f"{NAME}{self._begun}")
+
+    def judge(self, now_ns: int) -> None:
+        """Believe landmarks that were seen often enough; give up those that were not seen again."""
+        c, known = self._config, self._landmarks.known
+        counts = [n for k, n in self._scans.items() if n >= LEAST_SCANS and k != NOTHING]
+        least = _OF_MEDIAN * float(np.median(counts)) if counts else 0.0
+        for number, name in self.names.items():
+            mark = known.get(name)
+            if mark is None or self._landmarks.is_held(name):
+                continue
+            for_long = mark.last_seen_ns - mark.first_seen_ns >= round(c.confirm_s * 1e9)
+            often = number < _FROM_MAP or self._scans[number] >= least
+            is_sure = mark.sightings >= c.confirm_sightings and for_long and often
+            if is_sure == mark.is_tentative:
+                self._landmarks.confirm(name, is_sure=is_sure)
+            if not is_sure and now_ns - mark.last_seen_ns > round(c.give_up_s * 1e9):
+                self._landmarks.prune(name)
+                self._given_up[number] = [cluster for cluster, k in enumerate(self.given) if k == number]
+                self._counters.count("landmarks", "given_up")

@@ -1,0 +1,193 @@
+"""A stretch of the drive, laid on the rest of the map as one constellation.
+
+Where what is seen in a stretch is a twin of what is seen elsewhere, no landmark by itself can be mended. Candidates for
+the motion come from pairs of what is seen in the stretch and pairs of landmarks as far apart; the best few are solved
+completely and compared by what they cost.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate, Ids, compressed
+from graph_slam_ros.slam.landmarks.moves import TRIAL, merged, reassigned, sorts_of, without_few
+from graph_slam_ros.slam.landmarks.rotations import yaw
+from graph_slam_ros.typing import Array
+
+_SHORT_S, _WEAK = 100.0, 0.15  # a landmark that is seen for less, or in so small a part of the median's scans
+_GAP_S, _LONGEST_S = 5.0, 60.0
+_SAME_M, _LEAST_M = 0.6, 0.5
+_TRIES = 4
+_OTHER = 0.1  # part of the clusters by which two candidates differ
+_MOST_COST, _MOST_PRIOR, _NONE = 14.0, 30.0, 60.0
+_TURN_RAD, _MOVE_M = 0.3, 0.6
+_LEAST_CLUSTERS, _LEAST_STRONG = 3, 5
+_MOST_MOVES, _MOST_STRETCHES = 40, 16
+_MOST_LOCAL, _MOST_SCORED = 8, 200
+_APART_M = 0.5  # explanations that have a stretch farther apart are two
+_HOPELESS = 60.0  # that much more than before is never mended by giving clusters to others
+
+Motion = tuple[Array, Array]  # rotation, translation
+
+
+def laid_on_the_map(drive: Drive, e: Estimate) -> tuple[Estimate, int]:
+    """Lay stretches on the map, as long as that costs less; and how many stay as they are, which fit several places."""
+    undecided = 0
+    for _ in range(_MOST_MOVES):
+        undecided = 0
+        for landmark, first, last in stretches(drive, e):
+            better = _laid(drive, e, landmark, first, last)
+            undecided += better is e
+            if better is not None and better is not e:
+                e = merged(drive, better)
+                break
+        else:
+            break
+    return e, undecided
+
+
+def stretches(drive: Drive, e: Estimate) -> list[tuple[int, int, int]]:
+    """Landmarks that were seen in one stretch of time only, or little, and the scans around."""
+    stamps, counts = drive.stamps_s, np.bincount(e.which[e.which >= 0], minlength=len(e.landmarks))
+    out: list[tuple[int, int, int]] = []
+    for landmark in np.argsort(counts, kind="stable").tolist():
+        scans = drive.scan[e.which == landmark]
+        t = stamps[scans]
+        if t[-1] - t[0] >= _SHORT_S and counts[landmark] >= _WEAK * np.median(counts):
+            continue
+        starts = np.r_[0, np.flatnonzero(np.diff(t) > 2 * _GAP_S) + 1]
+        ends = np.r_[starts[1:], len(t)] - 1
+        own = [(int(scans[a]), int(scans[b])) for a, b in zip(starts, ends, strict=True)]
+        out += [(landmark, *one) for one in own]
+        out += [(landmark, *_grown(stamps, *one)) for one in own]
+    return list(dict.fromkeys(out))[:_MOST_STRETCHES]
+
+
+def _grown(stamps: Array, first: int, last: int) -> tuple[int, int]:
+    """A stretch of scans, as long as there is no gap."""
+    while first > 0 and stamps[first] - stamps[first - 1] < _GAP_S and stamps[last] - stamps[first - 1] < _LONGEST_S:
+        first -= 1
+    while (
+        last + 1 < len(stamps)
+        and stamps[last + 1] - stamps[last] < _GAP_S
+        and stamps[last + 1] - stamps[first] < _LONGEST_S
+    ):
+        last += 1
+    return first, last
+
+
+def _laid(drive: Drive, e: Estimate, landmark: int, first: int, last: int) -> Estimate | None:
+    """Lay a stretch on landmarks that were seen before it; None if that does not cost less.
+
+    Returns ``e`` itself where two ways to lay it cost nearly the same.
+    """
+    is_inside = (drive.scan >= first) & (drive.scan <= last)
+    outside = np.bincount(e.which[(e.which >= 0) & ~is_inside], minlength=len(e.landmarks))
+    least = max(_LEAST_STRONG, _WEAK * float(np.median(outside[outside > 0])) if outside.any() else 0.0)
+    was_seen = np.isin(np.arange(len(outside)), e.which[drive.scan < first])
+    strong = np.flatnonzero((outside >= least) & was_seen & (np.arange(len(outside)) != landmark))
+    inside = np.flatnonzero(is_inside)
+    if len(strong) < 2 or len(inside) < _LEAST_CLUSTERS:
+        return None
+    scans, found, done = slice(first, last + 1), list[Estimate](), [e.which[inside]]
+    for which, turn, move in _candidates(drive, e, inside, strong, (first + last) // 2):
+        if any((which != other).mean() < _OTHER for other in done):
+            continue
+        done.append(which)
+        found.append(_solved(drive, e, inside, which, scans, turn, move))
+        if len(found) == _TRIES:
+            break
+    found.sort(key=drive.total)
+    if not found or drive.total(found[0]) >= drive.total(e) - 1e-6:
+        return None
+    others = [one for one in found[1:] if _are_apart(found[0], one, scans) and _are_apart(e, one, scans)]
+    is_unique = all(drive.total(one) >= drive.total(found[0]) + drive.costs.ambiguous for one in others)
+    return found[0] if is_unique else e
+
+
+def _are_apart(a: Estimate, b: Estimate, scans: slice) -> bool:
+    """Return whether two estimates have a stretch elsewhere."""
+    return float(np.linalg.norm(a.position[scans] - b.position[scans], axis=1).max()) > _APART_M
+
+
+def _solved(drive: Drive, e: Estimate, inside: Ids, of_inside: Ids, scans: slice, turn: Array, move: Array) -> Estimate:
+    """Solve with a stretch moved and its clusters given to other landmarks."""
+    which, position, turns = e.which.copy(), e.position.copy(), e.turn.copy()
+    which[inside] = of_inside
+    position[scans], turns[scans] = position[scans] @ turn.T + move, turn @ turns[scans]
+    moved = replace(e, which=without_few(which), position=position, turn=turns)
+    one = drive.solve(compressed(moved), 40, enough=TRIAL)
+    is_hopeless = drive.total(one) > drive.total(e) + _HOPELESS
+    return one if is_hopeless else reassigned(drive, one)[0]
+
+
+def _candidates(drive: Drive, e: Estimate, inside: Ids, strong: Ids, middle: int) -> list[tuple[Ids, Array, Array]]:
+    """Motions of a stretch, the likeliest first, each with the landmarks of its clusters."""
+    at, names, there = drive.seen_at(e, inside), e.which[inside], e.landmarks[strong]
+    ids, counts = np.unique(names[names >= 0], return_counts=True)
+    local = np.array([np.median(at[names == k], axis=0) for k in ids[np.argsort(-counts, kind="stable")]])
+    local = local.reshape(-1, drive.n)
+    centre = e.position[middle]
+    turns, moves = (np.array(one) for one in zip(*_motions(local[:_MOST_LOCAL], there, centre), strict=True))
+    rough = _rough_scores(local, there, turns, moves) + _priors(turns, moves, centre)
+    rough[0] = 0.0  # as it lies
+    likely = np.argsort(rough, kind="stable")[:_MOST_SCORED]
+    priors = _priors(turns[likely], moves[likely], centre)
+    whiten = drive.whiten[inside] @ e.turn[drive.scan[inside]].transpose(0, 2, 1)
+    is_other = drive.sort[inside][:, None] != sorts_of(drive, e)[strong]
+    scored = []
+    for turn, move, prior in zip(turns[likely], moves[likely], priors.tolist(), strict=True):
+        away = (there[None] - (at @ turn.T + move)[:, None]) @ turn  # in the axes before the turn
+        chi2 = np.square(away @ whiten.transpose(0, 2, 1)).sum(axis=-1)
+        chi2[is_other] = np.inf
+        least = chi2.min(axis=1)
+        score = float(np.minimum(least / 4.0, _MOST_COST).sum()) + prior
+        scored.append((score, np.where(least < _NONE, strong[chi2.argmin(axis=1)], UNUSED), turn, move))
+    as_it_lies = scored[int(np.flatnonzero(likely == 0)[0])][0]
+    scored.sort(key=lambda one: one[0])
+    return [one[1:] for one in scored if one[0] < as_it_lies + _MOST_PRIOR]
+
+
+def _rough_scores(local: Array, there: Array, turns: Array, moves: Array) -> Array:
+    """The misfit of a stretch with the landmarks, of each motion."""
+    at = np.einsum("mij,uj->mui", turns, local) + moves[:, None]
+    nearest = np.concatenate([_nearest(there, some) for some in np.array_split(at, max(1, len(at) // 256))])
+    return np.asarray(np.minimum(np.square(nearest / _MOVE_M), _MOST_COST).sum(axis=1))
+
+
+def _nearest(there: Array, at: Array) -> Array:
+    return np.asarray(np.linalg.norm(there - at[:, :, None], axis=-1).min(axis=2))
+
+
+def _priors(turns: Array, moves: Array, centre: Array) -> Array:
+    """The cost of each motion: a turn and a way."""
+    gone = np.square(turns @ centre + moves - centre).sum(axis=1)
+    return np.minimum(
+        np.square(np.arctan2(turns[:, 1, 0], turns[:, 0, 0]) / _TURN_RAD) + gone / _MOVE_M**2, _MOST_PRIOR
+    )
+
+
+def _motions(local: Array, there: Array, centre: Array) -> Iterator[Motion]:
+    """Motions that lay what is seen on landmarks: as it lies, by one of each, by two."""
+    n = len(centre)
+    yield np.eye(n), np.zeros(n)
+    bearing = np.arctan2((there - centre)[:, 1], (there - centre)[:, 0])
+    apart = np.linalg.norm(there[:, None] - there[None], axis=2)
+    for u, one in enumerate(local):
+        from_centre = np.arctan2(*(one - centre)[1::-1])
+        for i, landmark in enumerate(there):
+            turn = yaw(float(bearing[i] - from_centre), n)
+            yield turn, centre - turn @ centre
+            yield np.eye(n), landmark - one
+        for other in local[:u]:
+            d = other - one
+            far = float(np.linalg.norm(d))
+            if far < _LEAST_M:
+                continue
+            close = np.abs(apart - far) <= _SAME_M
+            np.fill_diagonal(close, val=False)
+            for i, h in np.argwhere(close).tolist():
+                between = there[h] - there[i]
+                turn = yaw(float(np.arctan2(between[1], between[0]) - np.arctan2(d[1], d[0])), n)
+                yield turn, 0.5 * (there[i] + there[h]) - turn @ (0.5 * (one + other))

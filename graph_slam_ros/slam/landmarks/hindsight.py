@@ -1,0 +1,199 @@
+"""All scans explained at once, in the background: it begins on a copy, and is taken over at a fixed later keyframe.
+
+Solved in stages from odometry and from the present path, the cheaper one; then what moves take back. Where in between
+the work is done changes nothing.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.landmarks.association import quantile
+from graph_slam_ros.slam.landmarks.beam import NOTHING, BeamSettings, Ids
+from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
+from graph_slam_ros.slam.landmarks.explanation import UNUSED, Costs, Drive, Estimate
+from graph_slam_ros.slam.landmarks.moves import refined, without_few
+from graph_slam_ros.slam.landmarks.rotations import matrices_of, poses_of
+from graph_slam_ros.slam.landmarks.scans import Motion, Scan
+from graph_slam_ros.solver import Solver
+from graph_slam_ros.typing import Array, Executor
+
+_FIRST, _MORE = 100, 2.0  # scans at the first time; then times as many
+_LEAST_LANDMARK = 1.0
+_SCALE_SIGMA = 0.02  # of odometry's scales, once they were found
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenScans:
+    """The input of an explanation, and how all is explained now: copies.
+
+    Attributes
+    ----------
+    poses : (N, 3) or (N, 7) of the scans, by the solver
+    given : (M,) the number of each cluster's landmark
+    leader : (M,) the same, by the beam alone
+    """
+
+    scans: tuple[Scan, ...]
+    motions: tuple[Motion, ...]
+    poses: Array
+    scales: Array
+    given: Ids
+    leader: Ids
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """An explanation of frozen scans; so many stretches fit several places."""
+
+    frozen: FrozenScans
+    estimate: Estimate
+    undecided: int = 0
+
+    def numbers(self, given: Sequence[int], fresh: Callable[[], int]) -> Ids:
+        """A number for each landmark: that of most of its clusters, each once, or a fresh one."""
+        which = self.estimate.which
+        before = np.array(given)[: len(which)]
+        pairs, sizes = np.unique(np.stack([which, before])[:, which >= 0], axis=1, return_counts=True)
+        out, used = np.full(len(self.estimate.landmarks), NOTHING), {NOTHING}
+        for landmark, number in pairs[:, np.argsort(-sizes, kind="stable")].T.tolist():
+            if out[landmark] == NOTHING and number not in used:
+                out[landmark] = number
+                used.add(number)
+        for landmark in np.flatnonzero(out == NOTHING).tolist():
+            out[landmark] = fresh()
+        return out
+
+    def changes(self, given: Sequence[int], numbers: Ids) -> tuple[dict[int, int], dict[int, int]]:
+        """The landmark of each cluster, also of those seen since, that has another now; and of each that is none."""
+        which, before = self.estimate.which, np.array(given)
+        after, frozen = before.copy(), before[: len(which)]
+        of_none = np.where(np.isin(frozen, _indices(frozen)[0]), NOTHING, frozen)
+        after[: len(which)] = np.where(which >= 0, numbers[which], of_none)
+        now, since = after[: len(which)], np.arange(len(before)) >= len(which)
+        gone: dict[int, int] = {}
+        for landmark in np.setdiff1d(frozen, np.append(now, NOTHING)).tolist():
+            names, counts = np.unique(now[frozen == landmark], return_counts=True)
+            gone[landmark] = int(names[counts.argmax()])
+            after[since & (before == landmark)] = gone[landmark]
+        return {c: int(after[c]) for c in np.flatnonzero(after != before).tolist()}, gone
+
+    def carried_to(self, space: Geometry, solver: Solver, keyframes: StampedPoses[Keyframe]) -> Array:
+        """Stored numbers with the keyframes where this explanation has them; what is between scans moves with both."""
+        group, values = space.group, solver.values
+        n, scans = space.dimensions, self.frozen.scans
+        found = tuple(poses_of(space, self.estimate.position, self.estimate.turn).T)
+        correction = np.stack(group.compose(found, group.inverse(tuple(self.frozen.poses.T))), axis=-1)
+        at = np.array([scan.where.keyframe for scan in scans])
+        at, last = np.unique(at[::-1], return_index=True)
+        correction = correction[::-1][last]
+        k = np.arange(len(keyframes))
+        after = np.clip(np.searchsorted(at, k), 0, len(at) - 1)
+        before = np.clip(np.searchsorted(at, k, side="right") - 1, 0, len(at) - 1)
+        stamps = keyframes.stamps_ns
+        part = (stamps - stamps[at[before]]) / np.maximum(stamps[at[after]] - stamps[at[before]], 1)
+        poses = tuple(solver.estimate(keyframes.ids).T)
+        a, b = (group.compose(tuple(correction[side].T), poses) for side in (before, after))
+        way = group.local(a, b)
+        moved = np.stack(group.retract(a, tuple(np.clip(part, 0.0, 1.0) * d for d in way)), axis=-1)
+        begins = np.array([solver.graph.vertex(vertex).stored.start for vertex in keyframes.ids.tolist()])
+        where = begins[:, None] + np.arange(space.pose.size)
+        values[where] = moved if n == 2 else np.hstack([moved[:, :3], _unit(moved[:, 3:])])
+        return values
+
+
+class Hindsight:
+    """Explains all scans at once now and then.
+
+    Attributes
+    ----------
+    is_on : whether it does
+    scales : (2,) of odometry, as last found, and their standard deviation
+    """
+
+    def __init__(self, config: Config, settings: BeamSettings, executor: Executor) -> None:
+        self._space, self._settings, self._executor = config.space, settings, executor
+        c = config.landmarks
+        unused = quantile(c.gate_other, config.space.dimensions)
+        self._costs = Costs(max(-2.0 * settings.log_new, _LEAST_LANDMARK), unused, c.ambiguity_chi2)
+        self._after = config.robust.apply_after_keyframes
+        self._next = _FIRST
+        self._job: tuple[int, Callable[[], Found | None]] | None = None
+        self._last: Ids | None = None
+        self.is_on = True
+        self.scales: tuple[Array, float] = np.zeros(2), settings.scale_sigma
+
+    def is_due(self, scans: int) -> bool:
+        """Return whether so many scans deserve it."""
+        return self.is_on and self._job is None and scans >= self._next
+
+    def start(self, frozen: FrozenScans, keyframes: int) -> None:
+        """Begin with what there is now."""
+        self._next = round(_MORE * len(frozen.scans))
+        work = self._executor(lambda: explained(self._space, frozen, self._settings, self._costs))
+        self._job = keyframes + self._after, work
+
+    def outcome(self, keyframes: int) -> Found | None:
+        """The explanation that is due at a keyframe; waits for it."""
+        if self._job is None or keyframes < self._job[0]:
+            return None
+        (_, work), self._job = self._job, None
+        return self._noted(work())
+
+    def found(self, freeze: Callable[[], FrozenScans]) -> Found | None:
+        """Explain what there is, at once; None where that was done, or finds nothing."""
+        self._job = None
+        if not self.is_on:
+            return None
+        frozen = freeze()
+        if self._last is not None and np.array_equal(self._last, frozen.given):
+            return None
+        return self._noted(explained(self._space, frozen, self._settings, self._costs))
+
+    def note(self, given: Sequence[int]) -> None:
+        """All was explained: each cluster is given to this landmark."""
+        self._last = np.array(given)
+
+    def _noted(self, found: Found | None) -> Found | None:
+        if found is not None:
+            self.scales = found.estimate.scales, _SCALE_SIGMA
+        return found
+
+
+def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, costs: Costs) -> Found | None:
+    """Explain all scans at once, from what the graph has and from what the beam says; None where little was seen."""
+    drive = Drive(frozen.scans, frozen.motions, settings, costs)
+    here = matrices_of(space, frozen.poses)
+    paths = here, drive.along_odometry(here[0][0], here[1][0], frozen.scales)
+    found: list[Found] = []
+    for given in (frozen.given, frozen.leader):
+        numbers, which = _indices(given)
+        if not len(numbers) or (found and np.array_equal(frozen.given, frozen.leader)):
+            continue
+        starts = [Estimate(position, turn, np.empty((0, drive.n)), frozen.scales, which) for position, turn in paths]
+        staged = min((drive.staged(start) for start in starts), key=lambda e: e.cost)
+        found.append(Found(frozen, refined(drive, staged)))
+    if not found:
+        return None
+    best = min(found, key=lambda one: drive.total(one.estimate))
+    estimate, undecided = laid_on_the_map(drive, best.estimate)
+    return replace(best, estimate=estimate, undecided=undecided)
+
+
+def _indices(given: Ids) -> tuple[Ids, Ids]:
+    """Numbers of the landmarks that were seen often enough, and which of them each cluster is."""
+    numbers, indices = np.unique(given, return_inverse=True)
+    which = without_few(np.where(given == NOTHING, UNUSED, indices))
+    used = np.unique(which[which >= 0])
+    index = np.full(len(numbers) + 1, UNUSED)
+    index[used] = np.arange(len(used))
+    return numbers[used], index[which]
+
+
+def _unit(quaternions: Array) -> Array:
+    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)

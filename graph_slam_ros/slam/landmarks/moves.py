@@ -1,0 +1,100 @@
+"""Moves that take association back: two landmarks become one, clusters change hands. Each is kept if it costs less."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate, Ids, compressed
+from graph_slam_ros.typing import Array
+
+LEAST_SCANS = 3  # of a landmark
+_MERGE_M = 3.0
+_APART = 0.02  # of the scans of two landmarks, that show both, if they may be one
+_BOTH_AT_MOST = 3  # scans that showed both, that count
+_BETTER = 4.0  # chi2 by which another landmark fits a cluster better
+_ROUNDS = 6
+TRIAL = 0.1  # a solve that compares ends where an iteration gains less
+
+
+def refined(drive: Drive, e: Estimate) -> Estimate:
+    """Merge and reassign until nothing changes."""
+    for _ in range(_ROUNDS):
+        before = e.cost
+        e = merged(drive, e)
+        e, is_changed = reassigned(drive, e)
+        if e.cost >= before and not is_changed:
+            break
+    return drive.solve(e, 40)
+
+
+def merged(drive: Drive, e: Estimate) -> Estimate:
+    """Merge pairs, the nearest first, where that costs less than the landmark it saves."""
+    tried: set[tuple[tuple[float, ...], tuple[float, ...]]] = set()
+    while True:
+        for key, i, j in _pairs(e.landmarks):
+            if key in tried:
+                continue
+            tried.add(key)
+            one = _merged_pair(drive, e, i, j)
+            if one is not None:
+                e = one
+                break
+        else:
+            return e
+
+
+def _pairs(landmarks: Array) -> list[tuple[tuple[tuple[float, ...], tuple[float, ...]], int, int]]:
+    """Pairs that are close, the nearest first, with their places."""
+    apart = np.linalg.norm(landmarks[:, None] - landmarks[None], axis=2)
+    i, j = np.nonzero(np.tril(apart < _MERGE_M, -1))
+    order = np.argsort(apart[i, j], kind="stable")
+    keys = [tuple(place) for place in np.round(landmarks, 1).tolist()]
+    return [((keys[a], keys[b]), a, b) for a, b in zip(i[order].tolist(), j[order].tolist(), strict=True)]
+
+
+def _merged_pair(drive: Drive, e: Estimate, i: int, j: int) -> Estimate | None:
+    is_i, is_j = e.which == i, e.which == j
+    if (drive.sort[is_i][0], drive.sort[is_j][0]) != (drive.sort[is_j][0], drive.sort[is_i][0]):
+        return None
+    both = len(np.intersect1d(drive.scan[is_i], drive.scan[is_j]))
+    counts = np.count_nonzero(is_i), np.count_nonzero(is_j)
+    if both > max(1.0, _APART * min(counts)):
+        return None
+    landmarks = e.landmarks.copy()
+    landmarks[j] = np.average(e.landmarks[[i, j]], axis=0, weights=counts)
+    one = drive.solve(compressed(replace(e, which=np.where(is_i, j, e.which), landmarks=landmarks)), 12, enough=TRIAL)
+    allowed = drive.costs.landmark * (1 + min(both, _BOTH_AT_MOST))
+    return one if one.cost - e.cost < allowed else None
+
+
+def reassigned(drive: Drive, e: Estimate) -> tuple[Estimate, bool]:
+    """Give each cluster to the landmark that it fits better, one to one in a scan, if the whole costs less."""
+    chi2 = drive.chi2_with(e)
+    chi2[drive.sort[:, None] != sorts_of(drive, e)] = np.inf
+    rows = np.arange(len(chi2))
+    which, best = e.which.copy(), chi2.argmin(axis=1)
+    mine = np.where(which >= 0, chi2[rows, which], drive.costs.unused)
+    for i in np.flatnonzero((chi2.min(axis=1) < mine - _BETTER) & (best != which)).tolist():
+        if not (which[drive.scan == drive.scan[i]] == best[i]).any():
+            which[i] = best[i]
+    which[(which >= 0) & (chi2[rows, which] > 2.0 * drive.costs.unused)] = UNUSED
+    if (which == e.which).all():
+        return e, False
+    one = drive.solve(compressed(replace(e, which=without_few(which))), enough=TRIAL)
+    if one.cost > e.cost + drive.costs.landmark * max(0, len(one.landmarks) - len(e.landmarks)):
+        return e, False
+    return one, True
+
+
+def sorts_of(drive: Drive, e: Estimate) -> Array:
+    """The sort of each landmark (J,)."""
+    out = np.full(len(e.landmarks), "", dtype=drive.sort.dtype)
+    used = e.which >= 0
+    out[e.which[used]] = drive.sort[used]
+    return out
+
+
+def without_few(which: Ids) -> Ids:
+    """Clusters of landmarks that hardly any scan shows are of none."""
+    counts = np.bincount(which[which >= 0], minlength=1)
+    return np.where((which >= 0) & (counts[np.maximum(which, 0)] < LEAST_SCANS), UNUSED, which)

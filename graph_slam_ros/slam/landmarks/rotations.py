@@ -1,0 +1,61 @@
+"""Rotations of many poses at once, in the plane and in space: arrays instead of one pose after another."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.typing import Array, Numbers
+
+
+def rotation(vectors: Array) -> Array:
+    """Rotation matrices (..., n, n) of rotation vectors (..., 1) or (..., 3)."""
+    if vectors.shape[-1] == 3:
+        flat = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+        return np.asarray(flat.reshape(*vectors.shape[:-1], 3, 3))
+    c, s = np.cos(vectors[..., 0]), np.sin(vectors[..., 0])
+    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+
+
+def rotation_vector(matrices: Array) -> Array:
+    """Inverse of ``rotation``."""
+    if matrices.shape[-1] == 3:
+        flat = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec()
+        return np.asarray(flat.reshape(*matrices.shape[:-2], 3))
+    return np.arctan2(matrices[..., 1, 0], matrices[..., 0, 0])[..., None]
+
+
+def yaw(angle: float, n: int) -> Array:
+    """Rotation matrix (n, n) about the vertical."""
+    out = np.eye(n)
+    out[:2, :2] = rotation(np.array([angle]))
+    return out
+
+
+def lever(points: Array) -> Array:
+    """``X`` (..., n, r) of points (..., n): a small rotation ``phi`` moves a point by ``X phi``."""
+    if points.shape[-1] == 2:
+        return np.stack([-points[..., 1], points[..., 0]], axis=-1)[..., None]
+    x, y, z = np.moveaxis(points, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [[zero, z, -y], [-z, zero, x], [y, -x, zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def matrices_of(space: Geometry, poses: Array) -> tuple[Array, Array]:
+    """Positions (k, n) and rotation matrices (k, n, n) of poses (k, 3) or (k, 7)."""
+    n = space.dimensions
+    if n == 2:
+        return poses[:, :2], rotation(poses[:, 2:])
+    return poses[:, :3], np.asarray(Rotation.from_quat(poses[:, 3:]).as_matrix())
+
+
+def poses_of(space: Geometry, positions: Array, turns: Array) -> Array:
+    """Inverse of ``matrices_of``."""
+    if space.dimensions == 2:
+        return np.hstack([positions, rotation_vector(turns)])
+    return np.hstack([positions, Rotation.from_matrix(turns).as_quat()])
+
+
+def turn_of(space: Geometry, pose: Numbers) -> Array:
+    """Rotation vector (1,) or (3,) of a pose."""
+    return rotation_vector(space.turn(pose)[None])[0]

@@ -1,0 +1,280 @@
+"""Scans: what was seen of things without identity within half a second, carried to one instant by odometry.
+
+Sightings of one thing are a cluster. A cluster is the mean of its sightings and has the covariance of one of them: what
+is wrong for half a second is wrong in all of them alike. Clusters of one scan are of different landmarks.
+"""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graph_slam_ros.config.frontend import OdometryConfig
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
+from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.slam.landmarks.association import quantile
+from graph_slam_ros.slam.landmarks.rotations import lever, turn_of
+from graph_slam_ros.typing import Array, Numbers
+
+SCAN_NS, _SCAN_RAD = 500_000_000, 0.15
+_SAME = 0.9973  # probability with which two sightings of one thing fall into one cluster
+
+
+@dataclass(frozen=True, slots=True)
+class MotionNoise:
+    """Variances of odometry by what it drove: they grow with what was turned and driven, hardly with time.
+
+    Attributes
+    ----------
+    turn_per_rad, turn_per_m, turn_per_s : rad^2
+    way_per_m, way_per_s : m^2; a quarter of it sideways
+    """
+
+    turn_per_rad: float
+    turn_per_m: float
+    turn_per_s: float
+    way_per_m: float
+    way_per_s: float
+
+    @classmethod
+    def of(cls, c: OdometryConfig) -> "MotionNoise":
+        """The noise that is configured."""
+        return cls(c.turn_per_rad, c.turn_per_m, c.turn_per_s, c.way_per_m, c.way_per_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Reckoned:
+    """Dead reckoning at a stamp.
+
+    Attributes
+    ----------
+    pose : since odometry began, without its jumps
+    turned, way, moving_s : sums of absolute steps [rad, m, s]
+    segment : how often odometry has jumped
+    """
+
+    stamp_ns: int
+    pose: Numbers
+    turned: float = 0.0
+    way: float = 0.0
+    moving_s: float = 0.0
+    segment: int = 0
+
+
+class DeadReckoning:
+    """Odometry added up, as far back as late sightings may reach."""
+
+    def __init__(self, space: Geometry, remembered_s: float) -> None:
+        self._space, self._remembered_ns = space, round(remembered_s * 1e9)
+        self._samples: list[Reckoned] = []
+
+    def step(self, step: Step, *, stands: bool) -> None:
+        """Go on by one step of odometry."""
+        if not self._samples:
+            self._samples.append(Reckoned(step.stamp_ns, self._space.identity))
+            return
+        a = self._samples[-1]
+        if step.stamp_ns < a.stamp_ns:  # stamps begin anew: none before can be told from them
+            self._samples.clear()
+        if step.broken or not self._samples:
+            b = Reckoned(step.stamp_ns, a.pose, a.turned, a.way, a.moving_s, a.segment + 1)
+        else:
+            group, moved = self._space.group, step.T_last_base
+            pose = self._space.normalized(tuple(map(float, group.compose(a.pose, moved))))
+            turned, way, moving_s = a.turned, a.way, a.moving_s
+            if not stands:
+                turned += self._space.angle(moved)
+                way += float(sum(x * x for x in moved[: self._space.dimensions])) ** 0.5
+                moving_s += (step.stamp_ns - a.stamp_ns) * 1e-9
+            b = Reckoned(step.stamp_ns, pose, turned, way, moving_s, a.segment)
+        self._samples.append(b)
+        if len(self._samples) > 64 and self._samples[32].stamp_ns < step.stamp_ns - self._remembered_ns:
+            del self._samples[:32]
+
+    def since_s(self, stamp_ns: int) -> float:
+        """Seconds from the last step to a stamp."""
+        return (stamp_ns - self._samples[-1].stamp_ns) * 1e-9 if self._samples else 0.0
+
+    def at(self, stamp_ns: int) -> Reckoned:
+        """Dead reckoning at a stamp, interpolated between two odometry messages."""
+        k = bisect_right(self._samples, stamp_ns, key=lambda one: one.stamp_ns) - 1
+        if k < 0:
+            return self._samples[0]
+        a = self._samples[k]
+        if a.stamp_ns == stamp_ns or k + 1 == len(self._samples):
+            return a
+        b = self._samples[k + 1]
+        part = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+        sums = [u + part * (v - u) for u, v in ((a.turned, b.turned), (a.way, b.way), (a.moving_s, b.moving_s))]
+        pose = tuple(map(float, self._space.group.interpolate(a.pose, b.pose, part)))
+        return Reckoned(stamp_ns, pose, sums[0], sums[1], sums[2], a.segment if part < 1.0 else b.segment)
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """The motion between two scans.
+
+    Attributes
+    ----------
+    way : (n,) in the frame of the earlier one
+    turn : (1,) or (3,) rotation vector
+    covariance : (dof, dof), of way and turn
+    moving_s : for so long the robot moved
+    is_broken : whether odometry jumped in between
+    """
+
+    way: Array
+    turn: Array
+    covariance: Array
+    moving_s: float
+    is_broken: bool
+
+
+def motion_between(space: Geometry, noise: MotionNoise, a: Reckoned, b: Reckoned, jump: Array) -> Motion:
+    """The motion from one instant to another.
+
+    Parameters
+    ----------
+    jump : (dof, dof) covariance added where odometry jumped
+    """
+    n, dof = space.dimensions, space.dof
+    moved = tuple(map(float, space.group.between(a.pose, b.pose)))
+    way = np.array(moved[:n])
+    turned, far, moving_s = b.turned - a.turned, b.way - a.way, max(b.moving_s - a.moving_s, 1e-3)
+    own = np.empty(dof)
+    own[n:] = noise.turn_per_rad * turned + noise.turn_per_m * far + noise.turn_per_s * moving_s
+    own[0] = noise.way_per_m * far + noise.way_per_s * moving_s
+    own[1:n] = 0.25 * own[0]
+    j = np.eye(dof)
+    j[:n, n:] = 0.5 * lever(way)
+    covariance = j @ np.diag(own) @ j.T + 1e-9 * np.eye(dof)
+    is_broken = a.segment != b.segment
+    return Motion(way, turn_of(space, moved), covariance + jump if is_broken else covariance, moving_s, is_broken)
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A sighting without identity: its input, and where the robot was."""
+
+    topic: str
+    sighting: Sighting
+    where: PoseAtStamp
+
+    def shared_by(self, count: int) -> "Seen":
+        """The same as one of several that are wrong alike: together they say as much as one."""
+        covariance = tuple(count * c for c in self.sighting.covariance)
+        return replace(self, sighting=replace(self.sighting, covariance=covariance))
+
+
+@dataclass(frozen=True, slots=True)
+class Cluster:
+    """Sightings of one thing: where it is from the scan, with covariance (n, n)."""
+
+    point: Array
+    covariance: Array
+    seen: tuple[Seen, ...]
+    sort: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """Clusters seen at one instant; ``where`` is that of its middle sighting."""
+
+    at: Reckoned
+    where: PoseAtStamp
+    clusters: tuple[Cluster, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Glimpse:
+    at: Reckoned
+    point: Array
+    covariance: Array
+    seen: Seen
+    sort: str
+
+
+class ScanBuilder:
+    """Collects sightings until a scan is full; it is closed by stamps, never by when they come.
+
+    Parameters
+    ----------
+    extent : (n, n) covariance of where on a thing it is seen
+    close_m : things this close to one another are one
+    """
+
+    def __init__(self, space: Geometry, extent: Array, close_m: float) -> None:
+        self._space, self._extent, self._close_m = space, extent, close_m
+        self._glimpses: list[_Glimpse] = []
+
+    @property
+    def began_ns(self) -> int | None:
+        """Stamp of the first sighting; None where nothing was seen."""
+        return self._glimpses[0].at.stamp_ns if self._glimpses else None
+
+    def is_full(self, at: Reckoned) -> bool:
+        """Return whether what is seen at an instant belongs to another scan."""
+        if not self._glimpses:
+            return False
+        first = self._glimpses[0].at
+        is_over = at.stamp_ns - first.stamp_ns >= SCAN_NS or at.turned - first.turned >= _SCAN_RAD
+        return is_over or at.segment != first.segment
+
+    def add(self, at: Reckoned, point: Array, covariance: Array, seen: Seen, sort: str = "") -> None:
+        """Add a sighting of a point (n,) in the base frame, with its covariance (n, n)."""
+        self._glimpses.append(_Glimpse(at, point, covariance, seen, sort))
+
+    def close(self) -> Scan | None:
+        """The scan, and begin another; None where nothing was seen."""
+        glimpses, self._glimpses = sorted(self._glimpses, key=lambda one: one.at.stamp_ns), []
+        if not glimpses:
+            return None
+        middle = glimpses[(len(glimpses) - 1) // 2]
+        carried = [self._carried(one, middle.at) for one in glimpses]
+        groups = _clustered(
+            [point for point, _ in carried], [c + self._extent for _, c in carried], glimpses, self._close_m
+        )
+        clusters = []
+        for members in groups:
+            point = np.mean([carried[k][0] for k in members], axis=0)
+            covariance = np.mean([carried[k][1] for k in members], axis=0) + self._extent
+            seen = tuple(glimpses[k].seen.shared_by(len(members)) for k in members)
+            clusters.append(Cluster(point, covariance, seen, glimpses[members[0]].sort))
+        return Scan(middle.at, middle.seen.where, tuple(clusters))
+
+    def _carried(self, one: _Glimpse, at: Reckoned) -> tuple[Array, Array]:
+        moved = tuple(map(float, self._space.group.between(at.pose, one.at.pose)))
+        turn = self._space.turn(moved)
+        return turn @ one.point + np.array(moved[: self._space.dimensions]), turn @ one.covariance @ turn.T
+
+
+def _clustered(
+    points: Sequence[Array], covariances: Sequence[Array], glimpses: Sequence[_Glimpse], close_m: float
+) -> list[list[int]]:
+    """Indices of the sightings of each thing; those of one message are of one thing only where they are close."""
+    groups: list[list[int]] = []
+    limit = quantile(_SAME, len(points[0]))
+    for k, point in enumerate(points):
+        best, least = None, limit
+        for group in groups:
+            first = group[0]
+            away = point - np.mean([points[i] for i in group], axis=0)
+            is_far = float(np.linalg.norm(away)) > close_m
+            if glimpses[first].sort != glimpses[k].sort or (is_far and _same_message(glimpses, group, k)):
+                continue
+            chi2 = float(away @ np.linalg.solve(covariances[k] + covariances[first], away))
+            if chi2 < least:
+                best, least = group, chi2
+        if best is None:
+            groups.append([k])
+        else:
+            best.append(k)
+    return groups
+
+
+def _same_message(glimpses: Sequence[_Glimpse], group: Sequence[int], k: int) -> bool:
+    one = glimpses[k]
+    return any(glimpses[i].at.stamp_ns == one.at.stamp_ns and glimpses[i].seen.topic == one.seen.topic for i in group)
