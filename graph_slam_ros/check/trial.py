@@ -16,9 +16,9 @@ from graph_slam_ros.slam.calibration.decision import Finding as Fitted
 from graph_slam_ros.typing import Array, Index, Mask
 
 _THIN_NS = 80_000_000
-_COARSE = {"solve.every_keyframes": 20, "keyframes.min_interval_s": 0.3}
+_COARSE = {"solve.every_keyframes": 20}
 _SIGMAS = 4.0  # each the larger one of curvature's and of the sandwich's
-_ABSURD, _BACKWARDS, _LATE_S = 0.5, 0.35, 0.2
+_ABSURD, _BACKWARDS, _LATE_S, _SURE = 0.5, 0.35, 0.2, 0.05
 _DEGREE = np.pi / 180.0
 # By parameter: code, unit, limit, and from which sigma on it is not observable.
 _LIMITS = {
@@ -75,9 +75,9 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         text = f"the trial fit failed: {error}"
         yield Finding("fit_unsure", "note", 1, 0, "fits", text)
         return
-    turned = [one for one in fitted if one.parameter.name == "distance" and abs(one.value - 0.1) > _ABSURD]
-    if turned:
-        yield _absurd(c, 1.0 + turned[0].value)
+    scale = next((one for one in fitted if one.parameter.name == "distance"), None)
+    if scale is not None and _has_points(c) and scale.sigma < _SURE and abs(scale.value - 0.1) > _ABSURD:
+        yield _absurd(c, 1.0 + scale.value)
         return
     found = list(_places(c, slam, path_ns, path))
     if fit.lost > _LOST:
@@ -91,11 +91,16 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     yield from offsets
     if not any(one.code == "clock_offset" and abs(one.value) > _LATE_S for one in offsets):
         yield from found  # else it is the clock that puts landmarks elsewhere
-    for scale in scales:
-        limit = _ODOMETRY_OVER_CONFIDENT if scale.label == "odometry" else _OVER_CONFIDENT
-        factor = float(np.sqrt(scale.per_dof))
-        if factor > limit and scale.dof > _LEAST_DOF and not scale.reason:
-            yield _over_confident(c, scale.source, scale.label, scale.part, factor, limit)
+    for noise in scales:
+        limit = _ODOMETRY_OVER_CONFIDENT if noise.label == "odometry" else _OVER_CONFIDENT
+        factor = float(np.sqrt(noise.per_dof))
+        if factor > limit and noise.dof > _LEAST_DOF and not noise.reason:
+            yield _over_confident(c, noise.source, noise.label, noise.part, factor, limit)
+
+
+def _has_points(c: Columns) -> bool:
+    """Return whether most sightings have a range: bearings alone tell no scale."""
+    return bool(np.isfinite(np.concatenate([s.points[:, 0] for s in c.sightings])).mean() > 0.5)
 
 
 def _absurd(c: Columns, factor: float) -> Finding:
@@ -127,7 +132,7 @@ def _fitted(c: Columns, one: Fitted) -> Iterator[Finding]:
     topic = next((t for t in c.topics.values() if one.parameter.source in t.inputs), None)
     if topic is None:
         return
-    where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[0]), "count": len(topic.stamp_ns)}
+    where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
     if one.sigma > unknown:
         yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **where)
     elif abs(one.value) > max(limit, _SIGMAS * one.sigma) and one.verdict == "admitted":

@@ -15,7 +15,7 @@ from graph_slam_ros.messages.inputs.landmark_types import APRILTAGS
 from graph_slam_ros.recordings.bag import Bag, BagError, Topic
 from graph_slam_ros.recordings.definitions import recorded_decoder
 
-_SAMPLED = 2000  # messages of each topic but odometry
+_SAMPLED, _EVERY = 2000, 8  # the first messages of each topic; of odometry then every so many
 _MOST_NAMES, _LAGS = 1000, 100
 _LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # as for what is counted as out of the plane
 
@@ -44,6 +44,7 @@ class TopicContents:
     first_ns: int = 0
     last_ns: int = 0
     read: int = 0
+    skipped: int = 0
     lag_s: list[float] = field(default_factory=list)
     is_stamped: bool = False
     frame: str = ""
@@ -108,9 +109,12 @@ def recording_of(bag: Bag) -> Recording:
         one = out.topics[message.topic]
         one.first_ns = one.first_ns or message.log_ns
         one.last_ns = message.log_ns
-        is_odometry = one.topic.type == "nav_msgs/msg/Odometry"
-        if message.topic not in decoders or (one.read >= _SAMPLED and not is_odometry):
+        if message.topic not in decoders:
             continue
+        if one.read >= _SAMPLED:
+            one.skipped += 1
+            if one.topic.type != "nav_msgs/msg/Odometry" or one.skipped % _EVERY:
+                continue
         one.read += 1
         try:
             _add(out, one, decoders[message.topic](message.cdr), message.log_ns)
