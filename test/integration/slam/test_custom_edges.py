@@ -25,6 +25,7 @@ from graph_slam_ros import CustomEdge, GraphSlam, Odometry, Sighting, Sightings,
 from graph_slam_ros.cli import main
 from graph_slam_ros.edge_tags import map_edge_of, tag_of
 from graph_slam_ros.errors import ConfigError, GraphSlamError
+from graph_slam_ros.graph import check_edge
 from graph_slam_ros.lie import se2
 from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.messages.inputs import converters, plugins
@@ -494,3 +495,48 @@ def test_a_barometer_in_space_corrects_the_height(install):
     assert slam.counters.used["air"] == 59  # the last is after all odometry
     assert off[0] > 0.5
     assert off[1] < 0.2 * off[0]
+
+
+KERNEL = """import numba
+import numpy as np
+
+from graph_slam_ros.graph import EdgeType
+
+
+@numba.njit
+def linearize(x, at, measured):
+    n = len(at)
+    residual, jacobian = np.empty((n, 1)), np.zeros((n, 1, 7))
+    for e in range(n):
+        residual[e, 0] = -measured[e, 0]
+        c, s = np.cos(x[at[e, 0] + 2]), np.sin(x[at[e, 0] + 2])
+        for slot, sign in ((1, 1.0), (2, -1.0)):
+            dx, dy = x[at[e, slot]] - x[at[e, 0]], x[at[e, slot] + 1] - x[at[e, 0] + 1]
+            far = np.hypot(dx, dy)
+            residual[e, 0] += sign * far
+            jacobian[e, 0, 0] -= sign * (c * dx + s * dy) / far
+            jacobian[e, 0, 1] -= sign * (c * dy - s * dx) / far
+            jacobian[e, 0, 1 + 2 * slot], jacobian[e, 0, 2 + 2 * slot] = sign * dx / far, sign * dy / far
+    return residual, jacobian
+
+
+"""
+
+
+def test_a_compiled_edge_type_is_compiled_at_the_start_once_and_gives_the_same_map(install, tmp_path):
+    made = re.search(r"^tdoa = edge_from_residual.*$", EXAMPLE, re.MULTILINE)[0]
+    compiled = made.replace("edge_from_residual", "EdgeType").replace("difference_of_ranges)", "linearize)")
+    install(KERNEL + EXAMPLE.replace(made, compiled.replace("difference of ranges", "compiled")))
+    converters(TYPE)
+    import my_tdoa
+
+    before = my_tdoa.linearize.signatures
+    assert len(before) == 1
+    fast = replayed(tmp_path, SHORT).slam
+    assert my_tdoa.linearize.signatures == before
+    path = fast.trajectory()
+    assert len(fast.graph.edges_of("custom")) == SHORT - 1
+    assert fast.ledger.outside_count == 0
+    check_edge(map_edge_of(TAG), lambda rng: [*rng.standard_normal(1), *se2.exp(rng.standard_normal(3))])
+    *_, (truth, _) = truths(SHORT)
+    assert np.abs(path[-1, :2] - truth[:2]).max() < 0.15
