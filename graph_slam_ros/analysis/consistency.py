@@ -45,17 +45,15 @@ class Nees:
     @classmethod
     def of(cls, errors: Array, covariances: Array) -> "Nees | None":
         """The NEES of errors (n, d) and covariances (n, d, d), NaN where unknown; None where all are."""
-        known = np.asarray(np.isfinite(errors).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
-        known[known] = np.linalg.eigvalsh(covariances[known])[:, 0] > 0.0  # of what is certain no error has a size
-        n, dof = int(known.sum()), errors.shape[1]
+        values = _single(errors, covariances)
+        values = values[np.isfinite(values)]
+        n, dof = len(values), errors.shape[1]
         if not n:
             return None
-        e = errors[known]
-        values = np.einsum("ni,ni->n", e, np.linalg.solve(covariances[known], e[:, :, None])[:, :, 0])
         low, high = (2.0 * float(gammaincinv(0.5 * n * dof, edge)) / n for edge in _BAND)
         single = [2.0 * float(gammaincinv(0.5 * dof, edge)) for edge in _BAND]
         inside = float(((values >= single[0]) & (values <= single[1])).mean())
-        return cls(float(values.mean()), dof, (low, high), inside, n, len(known) - n)
+        return cls(float(values.mean()), dof, (low, high), inside, n, len(errors) - n)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +132,25 @@ def pose_errors(estimate: Array, truth: Array, covariances: Array) -> tuple[Arra
         inherited = se3.propagate(first, tuple(map(float, step)), np.zeros((6, 6)))
         relative[k] = covariances[k + 1] - (inherited[_PLANAR] if planar else inherited)
     return errors[:, [0, 1, 5]] if planar else errors, relative
+
+
+def nees_of_each(estimate: Array, truth: Array, covariances: Array) -> tuple[Array, tuple[float, float]]:
+    """NEES (n - 1,) of all poses but the first, NaN where unknown, and the band of 95 % of single ones.
+
+    As ``pose_errors``.
+    """
+    errors, relative = pose_errors(estimate, truth, covariances)
+    low, high = (2.0 * float(gammaincinv(0.5 * errors.shape[1], edge)) for edge in _BAND)
+    return _single(errors, relative), (low, high)
+
+
+def _single(errors: Array, covariances: Array) -> Array:
+    """NEES (n,) of errors (n, d) and covariances (n, d, d), NaN where unknown."""
+    known = np.asarray(np.isfinite(errors).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
+    known[known] = np.linalg.eigvalsh(covariances[known])[:, 0] > 0.0  # of what is certain no error has a size
+    out, e = np.full(len(errors), np.nan), errors[known]
+    out[known] = np.einsum("ni,ni->n", e, np.linalg.solve(covariances[known], e[:, :, None])[:, :, 0])
+    return out
 
 
 def landmark_nees(

@@ -82,6 +82,7 @@ class SavedGraph:
             raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
         self.folder, self.space, self.config = folder, slam.space, slam.config
         self.graph, self.held = slam.graph.copy(), slam.solver.held
+        self.restored = slam.solver
         self.graph.initial.values[:] = slam.solver.values
         self.entries = list(ledger_entries(slam, range(self.graph.vertex_count)))
         self.changes = slam.ledger.history
@@ -102,7 +103,7 @@ class SavedGraph:
     @cached_property
     def influence_model(self) -> InfluenceModel:
         """The influence of each edge, to first order."""
-        return InfluenceModel(self.graph, self.solver, self.keyframes[-1])
+        return InfluenceModel(self.graph, self.restored, self.keyframes[-1])
 
     def keyframe(self, vertex: int) -> int | None:
         """The number of the keyframe of a vertex; None if it is not a keyframe."""
@@ -150,12 +151,16 @@ class SavedGraph:
         if loss is not None:
             settings = replace(settings, losses={label: [loss] for label in settings.losses})
         solver = Solver(graph, settings)
-        vertices = np.unique([*self.keyframes, *(v for e in edges for v in graph.edge(e).vertices)])
+        vertices = np.unique([*self.keyframes, *(v for e in edges for v in self._ends(graph, e))])
         solver.add(vertices, edges)
         for vertex in np.intersect1d(vertices, self.held).tolist():
             solver.hold(vertex)
         solver.optimize()
         return solver
+
+    def _ends(self, graph: Graph, edge: int) -> Sequence[int]:
+        """The vertices of an edge of the run, or of one that is let in."""
+        return self.entries[edge].vertices if edge < len(self.entries) else graph.edge(edge).vertices
 
     def moved(self, solver: Solver) -> MovedVertex:
         """Compare a solution with that of the run."""

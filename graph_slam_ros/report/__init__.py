@@ -4,7 +4,7 @@ from pathlib import Path
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
-from graph_slam_ros.report.contents import Contents, contents
+from graph_slam_ros.report.contents import Contents, read_contents
 from graph_slam_ros.report.page import plotly, whole_page
 
 __all__ = ["write_report"]
@@ -20,7 +20,7 @@ def write_report(
     *,
     align: bool = True,
 ) -> Contents:
-    """Write the report on a run; returns what it shows. As ``contents``.
+    """Write the report on a run; returns what it shows. As ``read_contents``.
 
     Raises
     ------
@@ -30,7 +30,7 @@ def write_report(
     if out.suffix != ".html":
         raise GraphSlamError(f"{out}: a report is a .html file")
     script = plotly()
-    made = contents(run, truth, other, plan, topic, align=align)
+    made = read_contents(run, truth, other, plan, topic, align=align)
     try:
         write_whole(out, whole_page(made, script).encode())
     except OSError as error:

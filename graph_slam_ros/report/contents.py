@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 from scipy.special import gammainc
 
-from graph_slam_ros.analysis.evaluation import Scores, dimensions_of, evaluate, input_topics
+from graph_slam_ros.analysis.consistency import nees_of_each
+from graph_slam_ros.analysis.evaluation import Scores, dimensions_of, evaluate, input_topics, scored_drive
 from graph_slam_ros.analysis.explain import landmark_lines
+from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
@@ -17,7 +19,8 @@ from graph_slam_ros.report import drive, verdict
 from graph_slam_ros.report.packing import Packing, shown
 from graph_slam_ros.report.places import floor_plan, paths
 from graph_slam_ros.report.sentences import effects, sentences
-from graph_slam_ros.runs.folder import RunError, changed_since, is_run, run_config, summary_of
+from graph_slam_ros.runs.folder import COVARIANCES, RunError, changed_since, is_run, run_config, summary_of
+from graph_slam_ros.runs.trajectory import read_covariances, read_tum
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 
 _BINS, _SHOWN = 60, 25
@@ -48,7 +51,7 @@ class Contents:
             return None
 
 
-def contents(
+def read_contents(
     run: Path,
     truth: str | None = None,
     other: Path | None = None,
@@ -191,6 +194,19 @@ def _charts(out: Contents, saved: SavedGraph) -> dict[str, Any]:
     }
 
 
+def _nees(out: Contents, known: Truth) -> dict[str, Any]:
+    """NEES of each keyframe that has a truth, and the band of single ones."""
+    run, drive_of = out.run, scored_drive(out.run, known.trajectory)
+    path, covariances = (
+        read_tum(run / "path.tum").at(drive_of.keyframes),
+        read_covariances(run / COVARIANCES)[drive_of.keyframes],
+    )
+    truth = known.trajectory if covariances.shape[1] == 6 else known.trajectory.in_plane()
+    values, band = nees_of_each(path.poses, interpolated(truth, path.stamps_s), covariances)
+    at = np.flatnonzero(np.isfinite(values))
+    return {"values": [out.packing.column(at + 1, "i4"), out.packing.column(values[at])], "band": band}
+
+
 def _chi2_histograms(saved: SavedGraph) -> Iterator[dict[str, Any]]:
     """Chi2 of the accepted edges of each class, and how many the chi2 distribution has in each bin."""
     inside = [e for e in saved.entries if e.is_in]
@@ -208,9 +224,7 @@ def _chi2_histograms(saved: SavedGraph) -> Iterator[dict[str, Any]]:
 
 def _drive(out: Contents, saved: SavedGraph) -> dict[str, Any]:
     """The frames of the time slider, and the jumps of map -> odom."""
-    from graph_slam_ros.runs.trajectory import read_tum
-
-    frames = drive.frames(out.run, out.losses)
+    frames = drive.frames(out.run, saved, out.losses)
     odometry = read_tum(out.run / "path_odometry.tum")
     found = drive.corrections(out.run, odometry.stamps_s, odometry.poses, out.losses)
     changed: dict[int, list[int]] = {}
@@ -244,6 +258,8 @@ def _tables(out: Contents, summary: dict[str, Any], saved: Any, scores: Scores |
     out.data["waiting"] = [[shown(str(n)), shown(str(why))] for n, why in dict(summary.get("waiting") or {}).items()]
     out.data["chi2_per_dof"] = out.attempt(lambda: verdict.chi2_per_dof(saved)) if saved else None
     out.data["scores"] = str(scores).splitlines() if scores else None
+    if scores and known and scores.consistency and scores.consistency.poses:
+        out.data["nees"] = out.attempt(lambda: _nees(out, known))
     if scores:
         out.beware += scores.warnings
         out.losses += scores.losses

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel, Message
 
+from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.formats.cdr import CdrReader
-from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, SE3
 from graph_slam_ros.lie import se3
 from graph_slam_ros.recordings.mcap_records import records
 from graph_slam_ros.runs.journal import MAP, parts_of, read_records
@@ -19,7 +19,6 @@ from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.typing import Array
 
 MOST_FRAMES, MOST_POINTS, MOST_JUMPS = 80, 500, 15
-_KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}
 _RUN = "run"
 
 
@@ -37,43 +36,21 @@ class Frame:
     points: Array
 
 
-def frames(run: Path, losses: list[str]) -> list[Frame]:
+def frames(run: Path, saved: SavedGraph, losses: list[str]) -> list[Frame]:
     """The estimates of a map's journal, some of them where there are many; each with a part of its keyframes."""
-    found, reader = list[Frame](), _Values()
-    for record in read_records(run, MAP, losses):
-        if record.get("type") == "growth":
-            reader.grow(record)
-        elif record.get("type") == "estimate" and reader.keyframes:
-            found.append(Frame(len(reader.keyframes), reader.at(record["values"])))
-    some = np.unique(np.linspace(0, len(found) - 1, min(len(found), MOST_FRAMES)).astype(int))
-    return [found[k] for k in some.tolist()]
-
-
-class _Values:
-    """Values of a map by keyframe."""
-
-    def __init__(self) -> None:
-        self._first: list[int] = []
-        self._total = 0
-        self.keyframes: list[int] = []
-        self._is_flat = True
-
-    def grow(self, record: dict[str, Any]) -> None:
-        for name, _ in record.get("vertices", ()):
-            self._first.append(self._total)
-            self._total += _KINDS[name].size
-            self._is_flat = self._is_flat and name != SE3.name
-        self.keyframes += [vertex for vertex, *_ in record.get("keyframes", ())]
-
-    def at(self, values: Sequence[float]) -> Array:
-        some = np.unique(np.linspace(0, len(self.keyframes) - 1, min(len(self.keyframes), MOST_POINTS)).astype(int))
-        first = np.array([self._first[self.keyframes[k]] for k in some.tolist()])
-        flat = np.asarray(values, dtype=float)
-        first = first[first + (2 if self._is_flat else 3) <= len(flat)]
-        out = np.zeros((len(first), 3))
-        for axis in range(2 if self._is_flat else 3):
-            out[:, axis] = flat[first + axis]
-        return out
+    several = [np.array(record["values"], dtype=float) for record in read_records(run, MAP, losses, "estimate")]
+    some = np.unique(np.linspace(0, len(several) - 1, min(len(several), MOST_FRAMES)).astype(int))
+    width = saved.space.dimensions
+    first = np.array([saved.graph.vertex(vertex).stored.start for vertex in saved.keyframes])
+    found = []
+    for values in (several[k] for k in some.tolist()):
+        count = int(np.searchsorted(first + width, len(values), side="right"))
+        if count:
+            at = first[np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int))]
+            points = np.zeros((len(at), 3))
+            points[:, :width] = values[at[:, None] + np.arange(width)]
+            found.append(Frame(count, points))
+    return found
 
 
 @dataclass(frozen=True, slots=True)

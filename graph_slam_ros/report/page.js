@@ -145,6 +145,7 @@ const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["
 
 // -- the map ---------------------------------------------------------------------------------------------------------
 
+const MOST_SHOWN = 5000, MOST_DRAWN = 20000;  // edges of one class and verdict
 const map = {inSpace: false, points: null, spans: new Map()};
 
 function points() {
@@ -170,9 +171,10 @@ function thinned(axes, every) {
   return axes.map((axis) => axis.filter((_, k) => k % every === 0 || k === axis.length - 1));
 }
 
-function trace(name, axes, colour, more) {
-  const [x, y, z] = axes, kind = map.inSpace ? {type: "scatter3d", z} : {type: "scattergl"};
-  return {name, x, y, mode: "lines", line: {color: colour, width: 1.5}, hoverinfo: "skip", ...kind, ...more};
+function trace(name, axes, colour, more) {  // edges are many: they are drawn by WebGL, all else as SVG, which begins faster
+  const [x, y, z] = axes, kind = map.inSpace ? {type: "scatter3d", z} : {type: more.isMany ? "scattergl" : "scatter"};
+  const {isMany, ...rest} = more;
+  return {name, x, y, mode: "lines", line: {color: colour, width: 1.5}, hoverinfo: "skip", ...kind, ...rest};
 }
 
 function edgeTraces() {
@@ -187,8 +189,10 @@ function edgeTraces() {
   const out = [];
   for (const [key, edges] of groups) {
     const name = key.split(", ")[1], isIn = name === "accepted" || name === "not evaluated", isSighting = key.startsWith("landmarks");
-    const every = Math.max(1, Math.ceil(edges.length / 20000)), some = edges.filter((_, k) => k % every === 0);
+    const every = Math.max(1, Math.ceil(edges.length / MOST_DRAWN)), some = edges.filter((_, k) => k % every === 0);
     if (every > 1) map.notes.push(`one of ${every} edges of "${key}" is drawn (the ledger has all)`);
+    const visible = isIn && edges.length > MOST_SHOWN ? "legendonly" : true;
+    if (visible !== true) map.notes.push(`${edges.length} edges of "${key}" are hidden at first: click that name in the legend`);
     const axes = [0, 1, 2].map((axis) => {
       const line = new Float64Array(3 * some.length);
       some.forEach((k, at) => { line[3 * at] = all[axis][from[k]]; line[3 * at + 1] = all[axis][to[k]]; line[3 * at + 2] = NaN; });
@@ -196,9 +200,9 @@ function edgeTraces() {
     });
     const middle = axes.map((line) => Float64Array.from(some, (_, at) => (line[3 * at] + line[3 * at + 1]) / 2));
     const colour = isIn && isSighting ? colours().landmarks : isIn ? "#2e7d32" : colours()[name];
-    out.push(trace(plain(key), axes, colour, {opacity: isIn && isSighting ? 0.25 : 0.8, legendgroup: key}));
+    out.push(trace(plain(key), axes, colour, {visible, isMany: true, opacity: isIn && isSighting ? 0.25 : 0.8, legendgroup: key}));
     out.push(trace("", middle, colour, {
-      mode: "markers", marker: {color: colour, size: isIn ? 4 : 7, symbol: "diamond", opacity: isIn ? 0.35 : 0.9}, showlegend: false,
+      visible, isMany: true, mode: "markers", marker: {color: colour, size: isIn ? 4 : 7, symbol: "diamond", opacity: isIn ? 0.35 : 0.9}, showlegend: false,
       legendgroup: key, customdata: some, meta: "edge", hovertemplate: `edge %{customdata}: ${plain(key)}<extra></extra>`, hoverinfo: "all",
     }));
   }
@@ -213,7 +217,7 @@ function traces() {
     const step = name === "truth" ? 1 : every, axes = thinned(paths[name].map(column), step);
     const isPath = name === "estimate", of = isPath ? thinned([Float64Array.from({length: data.map.keyframes}, (_, k) => k)], step)[0] : null;
     out.push(trace(names[name], axes, c[name], isPath ? {
-      mode: "lines+markers", marker: {size: 3, color: c[name]}, meta: "keyframe", customdata: of,
+      meta: "keyframe", customdata: of,
       hovertemplate: "keyframe %{customdata}<extra></extra>", hoverinfo: "all", line: {color: c[name], width: 2},
     } : {line: {color: c[name], width: name === "truth" ? 3 : 1.2}}));
   }
@@ -246,6 +250,7 @@ async function drawMap() {
     dragmode: "pan", hovermode: "closest", images: image ? [image] : [], uirevision: "map",
   }));
   const shape = map.inSpace ? {...layout(() => ({})), scene, uirevision: "space"} : flat;
+  map.isThen = false;
   Plotly.purge("map");
   await Plotly.newPlot("map", several, shape, {...CONFIG, scrollZoom: true});
   byId("map").on("plotly_click", ({points: [one]}) => {
@@ -286,8 +291,9 @@ function setTime() {
   const stamps = column(data.map.stamps), frame = frames[at];
   if (now) {
     byId("when").textContent = "now: the estimate after all of it";
-    return restyle("then", [[], [], []]);
+    return map.isThen ? restyle("then", [[], [], []]) : null;
   }
+  map.isThen = true;
   const last = Math.min(frame.keyframes, stamps.length) - 1;
   byId("when").textContent = `as known at keyframe ${last}, ${(stamps[last] - stamps[0]).toFixed(1)} s after the start`;
   return restyle("then", frame.points.map(column));
@@ -421,9 +427,10 @@ function arrange() {
   for (let k = 0; k < e.count; k++) {
     if (hits.every((of, w) => String(k) === words[w] || of.some(([has, codes]) => has[codes[k]]))) kept.push(k);
   }
-  const of = FIELDS[ledger.sort][1], way = ledger.up ? 1 : -1, keys = new Map(kept.map((k) => [k, of(k)]));
+  const of = FIELDS[ledger.sort][1], way = ledger.up ? 1 : -1, isSorted = !ledger.sort && ledger.up;
+  const keys = isSorted ? null : new Map(kept.map((k) => [k, of(k)]));
   const isMissing = (value) => Number.isNaN(value);
-  kept.sort((a, b) => {
+  if (!isSorted) kept.sort((a, b) => {
     const [p, q] = [keys.get(a), keys.get(b)];
     if (isMissing(p) || isMissing(q)) return isMissing(p) - isMissing(q) || a - b;
     return p < q ? -way : p > q ? way : a - b;

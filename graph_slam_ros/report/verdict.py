@@ -30,7 +30,7 @@ def verdict(
     short = [*outcome.shortcomings(summary)] if _is_complete(summary) else []
     doubts = [*outcome.doubts(summary)] if _is_complete(summary) else []
     gates = [line for line in explain_run(saved) if line.startswith("warning: ")] if saved else []
-    first = _state(summary, saved, scores, short, losses)
+    first = _state(summary, saved, scores, short, [*doubts, *gates], losses)
     last = _next(run, (short, doubts, gates), losses, has_truth=scores is not None)
     return [first, _judged(saved), last]
 
@@ -40,7 +40,12 @@ def _is_complete(summary: Mapping[str, Any]) -> bool:
 
 
 def _state(
-    summary: Mapping[str, Any], saved: SavedGraph | None, scores: Any, short: Sequence[str], losses: Sequence[str]
+    summary: Mapping[str, Any],
+    saved: SavedGraph | None,
+    scores: Any,
+    short: Sequence[str],
+    doubts: Sequence[str],
+    losses: Sequence[str],
 ) -> str:
     if saved is None:
         return f"There is no map to show: {losses[0] if losses else 'the run holds no keyframe'}."
@@ -55,6 +60,8 @@ def _state(
         return f"Do not rely on this map yet ({size}{error}): {short[0]}."
     if not summary.get("converged", True):
         return f"Do not rely on this map yet ({size}{error}): the last solve did not converge."
+    if doubts or losses:
+        return f"Use this map with care: {size}{error}{fit}."
     return f"The map can be used as far as the run itself can say: {size}{error}{fit}."
 
 
@@ -70,8 +77,8 @@ def _fit(saved: SavedGraph) -> str:
 
 def chi2_per_dof(saved: SavedGraph) -> float | None:
     """Chi2 by the residuals that are not used up by unknowns; None without any."""
-    dof = saved.solver.degrees_of_freedom
-    return saved.solver.evaluate().chi2_final / dof if dof > 0 else None
+    dof = saved.restored.degrees_of_freedom
+    return saved.restored.evaluate().chi2_final / dof if dof > 0 else None
 
 
 def _judged(saved: SavedGraph | None) -> str:
@@ -104,7 +111,7 @@ def _next(
         return f"First get the run whole: {losses[0]} ({again})."
     first = next((some[0] for some in several if some), "")
     if first:
-        return f"Next: {first.removeprefix('warning: ')}."
+        return f"Next: {first.removeprefix('warning: ')}{'' if first.endswith('.') else '.'}"
     if has_truth:
         return "Nothing calls for a change."
     truth = f"graph_slam report {run.name} --truth TRUTH"

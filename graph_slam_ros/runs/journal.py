@@ -209,10 +209,16 @@ def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[st
     return list(_measurements(waited + rest, losses))
 
 
-def read_records(folder: Path, name: str, losses: list[str]) -> Iterator[dict[str, Any]]:
-    """Records in the order they were written, up to the first that cannot be read; what is lost adds to ``losses``."""
-    for file, _, message in _messages(folder, name, losses):
-        yield _decoded(file, message)
+def read_records(folder: Path, name: str, losses: list[str], kind: str = "") -> Iterator[dict[str, Any]]:
+    """Records in the order they were written, up to the first that cannot be read; what is lost adds to ``losses``.
+
+    Parameters
+    ----------
+    kind : records of this ``type`` alone
+    """
+    for file, of, message in _messages(folder, name, losses):
+        if not kind or of == kind:
+            yield _decoded(file, message)
 
 
 def _decoded(file: str, message: Message) -> Any:

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from functools import cache
 from pathlib import Path
 from reprlib import repr as shortened
 from typing import Any, NewType, TypeVar, get_type_hints
@@ -149,6 +150,12 @@ def _fault(entry: Entry) -> str:
     return next((f"{name}: {n} is too small" for name, low in least.items() if (n := getattr(entry, name)) < low), "")
 
 
+@cache
+def _upper(size: int) -> tuple[Any, Any]:
+    """Indices of an upper triangle."""
+    return np.triu_indices(size)
+
+
 def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
     """Each edge that the solver has; ``ids`` are the numbers that its vertices are to have."""
     graph, ledger = slam.graph, slam.ledger
@@ -174,7 +181,7 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
             keyframe,
             Stamp(int(stamps_ns[max((keyframe_of[v] for v in vertices if v in keyframe_of), default=keyframe)])),
             tuple(one.measured.tolist()),
-            tuple((root.T @ root)[np.triu_indices(len(root))].tolist()),
+            tuple((root.T @ root)[_upper(len(root))].tolist()),
             tuple(ledger.residual(edge).tolist()),
             float(ledger.statistic.values[edge]),
             int(ledger.numbers.values[edge]),

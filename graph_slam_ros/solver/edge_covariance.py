@@ -43,6 +43,7 @@ class EdgeCovariances:
         used = np.unique(self._clique[vertices])
         self._depth = _depths(tree.clique[:, PARENT], used)
         self._order: list[int] = used[np.argsort(self._depth[used], kind="stable")].tolist()
+        self._columns: dict[int, Array] = {}
         self._fill()
 
     def _rows(self, c: int) -> tuple[Index, Index]:
@@ -114,7 +115,9 @@ class EdgeCovariances:
     def with_vertex(self, vertex: int, ends: Index) -> Array:
         """Covariances (n, d, D) of one vertex with the vertices (n, k) of edges; zero for held ones."""
         dofs = self._tree.vertex[ends[0], DOF].tolist() if len(ends) else []
-        column = self._column(vertex)
+        if vertex not in self._columns:
+            self._columns[vertex] = self._column(vertex)
+        column = self._columns[vertex]
         slots = []
         for slot, dof in enumerate(dofs):
             is_free = self._clique[ends[:, slot]] != NOTHING

@@ -1,6 +1,7 @@
 """The contents of a report: the sentences are those of ``explain``, the columns come back as they were."""
 
 import base64
+import io
 import json
 import shutil
 import zlib
@@ -8,13 +9,15 @@ import zlib
 import numpy as np
 import pytest
 from faulty import faulty_run
+from PIL import Image
 
 from graph_slam_ros import cli
+from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.explain import Numbers, remedy, statements, title
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.report import page
-from graph_slam_ros.report.contents import contents
+from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.report.packing import UNKNOWN, Packing, json_for_script, shown
 from graph_slam_ros.report.sentences import effects, sentences
 
@@ -31,7 +34,7 @@ def saved(run):
 
 @pytest.fixture(scope="module")
 def made(run):
-    return contents(run)
+    return read_contents(run)
 
 
 def unpacked(packing, one):
@@ -144,6 +147,30 @@ def test_frames_are_the_estimate_as_it_was_known_then(made, run):
     path = np.loadtxt(run / "path.tum")
     last = np.stack([unpacked(made.packing, column) for column in frames[-1]["points"]], axis=1)
     assert np.linalg.norm(last[0, :2] - path[0, 1:3]) < 0.1
+
+
+def test_nees_is_that_of_evaluate(run):
+    truth = run.parent / "drive.mcap"
+    made = read_contents(run, str(truth))
+    at, values = (unpacked(made.packing, one) for one in made.data["nees"]["values"])
+    expected = evaluate(run, truth).consistency.poses
+    assert (len(values), float(np.mean(values))) == (expected.n, pytest.approx(expected.mean, rel=1e-5))
+    low, high = made.data["nees"]["band"]
+    assert np.mean((values >= low) & (values <= high)) == pytest.approx(expected.inside)
+    assert at.min() >= 1
+    assert made.data["scores"] == str(evaluate(run, truth)).splitlines()
+
+
+def test_a_floor_plan_lies_where_its_file_says(run, tmp_path):
+    Image.new("L", (40, 20), 255).save(tmp_path / "hall.png")
+    (tmp_path / "map.yaml").write_text("image: hall.png\nresolution: 0.5\norigin: [-3.0, 2.0, 0.0]\n")
+    plan = read_contents(run, plan=tmp_path / "map.yaml").data["plan"]
+    assert [plan[name] for name in ("x", "y", "width", "height")] == [-3.0, 2.0, 20.0, 10.0]
+    picture = Image.open(io.BytesIO(base64.b64decode(plan["url"].partition(",")[2])))
+    assert picture.size == (40, 20)
+    (tmp_path / "map.yaml").write_text("image: hall.png\nresolution: 0.5\norigin: [0.0, 0.0, 0.3]\n")
+    with pytest.raises(GraphSlamError, match="is turned"):
+        read_contents(run, plan=tmp_path / "map.yaml")
 
 
 def test_a_damaged_run_shows_what_can_be_read_and_says_what_cannot(run, tmp_path, capsys):
