@@ -53,7 +53,8 @@ class Sighting:
         (range, bearing) or (range, azimuth, elevation) in the sensor frame. ``bearing``: the same without the range.
         ``range``: one number
     covariance : of ``measured``; of a position in the axes of the base frame, of a pose in its tangent space
-    T_base_sensor : pose of the sensor, for kinds that are measured in the sensor frame; None: at the base
+    T_base_sensor : pose of the sensor, for kinds that are measured in the sensor frame; None: at the base. Of a
+        position or pose it is the place about which ``mount_correction`` turns
 
     Raises
     ------

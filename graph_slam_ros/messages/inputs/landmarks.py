@@ -111,15 +111,23 @@ def _sighting(source: InputContext, stamp_ns: int, seen: ObservedLandmark) -> Si
     x, y, z = map(float, se3.act(T_base_frame, p))
     distance_m = math.hypot(x, y, z)
     covariance = SPATIAL.in_parent_axes(T_base_frame, source.pose_covariance(seen.covariance, distance_m))
-    n = source.space.dimensions
+    n, sensor = source.space.dimensions, _sensor(source, T_base_frame)
     if seen.orientation is not None and source.orientation_known(covariance):
         q = so3.compose(se3.rotation(T_base_frame), source.unit(seen.orientation))
         T_base_seen = (x, y, z, *q)
         if source.has_heading(T_base_seen):
             at = source.projected(T_base_seen)
             block = np.reshape(source.checked(source.block(covariance), n, distance_m), (source.space.dof, -1))
-            return Sighting(name, "pose", at, tuple(source.space.in_tangent(at, block).ravel().tolist()))
-    return Sighting(name, "position", (x, y, z)[:n], source.checked(covariance[:n, :n], n, distance_m))
+            return Sighting(name, "pose", at, tuple(source.space.in_tangent(at, block).ravel().tolist()), sensor)
+    return Sighting(name, "position", (x, y, z)[:n], source.checked(covariance[:n, :n], n, distance_m), sensor)
+
+
+def _sensor(source: InputContext, T_base_frame: se3.Pose) -> Numbers | None:
+    """The place of a sensor on the base, where calibration may turn it about its origin; None at the base."""
+    at, n = se3.position(T_base_frame), source.space.dimensions
+    if not (source.config.calibrate.is_on or source.settings.mount_correction) or not any(at[:n]):
+        return None
+    return (*map(float, at[:n]), *source.space.identity[n:])
 
 
 def _identity(source: InputContext, name: str) -> str:
