@@ -28,7 +28,10 @@ def guided(name):
     return [str(ROOT / ".venv-fuzz/bin/python"), str(HERE / "guided_fuzzing.py"), name, "600"]
 
 
-DRIVES = "advise", "consistency", "displacement", "extreme_fixes", "initialization", "nees", "simulation", "unnamed"
+DRIVES = (
+    *("advise", "calibration_consistency", "consistency", "displacement", "extreme_fixes", "initialization"),
+    *("nees", "simulation", "unnamed"),
+)
 PROGRAMMES = {
     "lives": tests("test_life.py"),
     "mutated_bags": tests("test_mutated_recordings.py"),

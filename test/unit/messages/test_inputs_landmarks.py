@@ -64,6 +64,14 @@ def test_a_range_and_a_bearing_are_those_of_a_sensor_that_may_be_turned():
     assert s.T_base_sensor == pytest.approx((1.0, 2.0, 0.0))
 
 
+def test_a_position_has_the_place_of_its_sensor_where_that_may_be_turned():
+    eye = ("base_link", "eye", (1.0, 2.0, 0.5), quaternion(yaw=0.5))
+    sent = cloud(XYZ, (1.5, -2.0, 0.25, 7, 0.1), frame="eye")
+    assert only(heard(scanner(2, eye), "scan", sent)).T_base_sensor is None
+    turned = scanner(2, eye, mount_correction="0 0 0 0 0 0.1")
+    assert only(heard(turned, "scan", sent)).T_base_sensor == pytest.approx((1.0, 2.0, 0.0))
+
+
 def test_in_space_a_bearing_needs_an_elevation_and_stays_in_the_frame_of_its_sensor():
     eye = ("base_link", "eye", (1.0, 2.0, 0.5), quaternion(0.1, 0.2, 0.5))
     layout = [("bearing", "f8"), ("elevation", "f8"), ("id", "u1")]
