@@ -13,9 +13,10 @@ HAS_MRCLAM = CONVERTER.exists() and SET_7.exists()
 WITHOUT_MRCLAM = f"no MR.CLAM set 7 under {DATASETS}"
 
 
-def mrclam(robot, bag):
+def mrclam(robot, bag, *options):
     """Write the recording of a robot of UTIAS MR.CLAM set 7 with the truth; returns its folder."""
-    subprocess.run([sys.executable, CONVERTER, SET_7, str(robot), bag, "--map"], check=True, stdout=subprocess.DEVNULL)
+    written = [sys.executable, CONVERTER, SET_7, str(robot), bag, "--map", *options]
+    subprocess.run(written, check=True, stdout=subprocess.DEVNULL)
     return bag
 
 

@@ -193,7 +193,7 @@ class AnonymousLandmarks:
             self.clusters.finish()
             return
         count = len(keyframes)
-        self._adopt(self._hindsight.outcome(count), keyframes)
+        self._adopt(self._guarded(lambda: self._hindsight.outcome(count)), keyframes)
         if self._hindsight.is_due(len(self._scans)):
             self._hindsight.start(self._frozen(), count)
         if count % self._config.review_every_keyframes == 0:
@@ -202,8 +202,16 @@ class AnonymousLandmarks:
     def explain_all(self, keyframes: StampedPoses[Keyframe]) -> None:
         """Explain all scans at once, now."""
         if self._landmarks.begins_new and self._scans:
-            self._adopt(self._hindsight.found(self._frozen), keyframes)
+            self._adopt(self._guarded(lambda: self._hindsight.found(self._frozen)), keyframes)
             self.clusters.judge(keyframes[-1].stamp_ns)
+
+    def _guarded(self, search: Callable[[], Found | None]) -> Found | None:
+        """The outcome of a search; None where it failed, which changes nothing."""
+        try:
+            return search()
+        except Exception as error:
+            self._counters.count("second_look", type(error).__name__)
+            return None
 
     def _frozen(self) -> FrozenScans:
         self._hand_over()

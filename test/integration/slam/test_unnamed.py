@@ -13,6 +13,7 @@ from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.recording import drive
 from graph_slam_ros.simulation.sensing import RangeBearing
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.landmarks import hindsight
 
 S = 1_000_000_000
 TICK_NS = S // 10
@@ -177,6 +178,20 @@ def test_where_the_leader_changes_sightings_change_hands_and_a_replay_has_the_sa
         again.process(m)
     assert again.solver.values.tobytes() == slam.solver.values.tobytes()
     assert list(again.landmarks) == list(slam.landmarks)
+
+
+def test_where_all_scans_cannot_be_explained_at_once_it_is_counted_and_the_rest_goes_on(monkeypatch):
+    def broken(*_):
+        raise RuntimeError("Factor is exactly singular")
+
+    monkeypatch.setattr(hindsight, "explained", broken)
+    slam = pipeline("joint")
+    standing(slam, lambda t_s: [(8.0, 2.0), (9.0, -3.0)], 12.0)
+    slam.process(Control("end"))
+    slam.process(Control("optimize"))
+    assert slam.counters["second_look", "RuntimeError"] == 1
+    assert slam.is_solved
+    assert len(slam.landmarks) == 2
 
 
 def test_the_graph_is_that_of_the_last_decisions():
