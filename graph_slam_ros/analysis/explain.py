@@ -35,6 +35,7 @@ _WHY = {
     Reason.DISPLACED: "displaced",
     Reason.REVOKED: "revoked",
     Reason.FAILED: "plugin failed",
+    Reason.BY_HAND: "by hand",
 }
 _KIND = {
     "closures": "a loop closure",
@@ -42,6 +43,7 @@ _KIND = {
     "fixes": "a fix",
     "odometry": "odometry",
     "custom": "an edge of a plugin",
+    "by_hand": "an edge that was let in",
 }
 _SHOWN = 5
 _WIDTH = 110
@@ -69,6 +71,7 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
     yield from _worst(e for e in judged if not e.is_in and e.reason not in FINAL)
     yield from _least(e for e in judged if e.is_in)
     yield from _gates(judged, run.changes, run.config)
+    yield from (f"by hand: {one.text}" for one in run.edits)
     yield from _rivals(run.folder)
 
 
@@ -200,12 +203,19 @@ def _edge(run: SavedGraph, edge: int) -> Iterator[str]:
     yield title(e, " and ".join(run.landmarks_of(e)))
     for what, text in statements(e, [_vertex(run, e, v) for v in e.vertices], Numbers.of(e), history, run.config):
         yield from _line(what, text)
+    for text in by_hand(run, edge):
+        yield from _line("by hand", text)
     if not e.verdict:
         return
     if e.reason not in FINAL:
         yield from _what_if(run, e)
     if not e.is_in:
         yield from _line("to change", remedy(e))
+
+
+def by_hand(run: SavedGraph, edge: int) -> list[str]:
+    """Return the edits by hand of an edge: by whom, when and why."""
+    return [one.text for one in run.edits if edge in (*one.edges, *one.added)]
 
 
 class Numbers(NamedTuple):
@@ -275,6 +285,8 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
             return "not by its chi2: several solves in a row failed with it, and succeeded without it"
         case Reason.FAILED:
             return "not by its chi2: the plugin of its edge type failed at it; the log of the run has the error"
+        case Reason.BY_HAND:
+            return "not by its chi2: a user decided it by hand"
         case Reason.DISPLACED:
             return (
                 f"{e.statistic:.0f} sightings more agreed on another pose of the robot than on this motion: it was"

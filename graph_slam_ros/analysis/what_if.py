@@ -67,6 +67,7 @@ class SavedGraph:
     Attributes
     ----------
     keyframes, stamps_ns, segments : vertices and stamps of the keyframes; the keyframes at which odometry begins
+    edits : by hand, in order
     landmarks : vertex of each landmark that an accepted edge is about, by its name
     held : vertices of a frozen map
 
@@ -86,6 +87,7 @@ class SavedGraph:
         self.graph.initial.values[:] = slam.solver.values
         self.entries = list(ledger_entries(slam, range(self.graph.vertex_count)))
         self.changes = slam.ledger.history
+        self.edits = slam.edits
         self.ids, _ = numbered(slam)
         self.keyframes: list[int] = slam.keyframes.ids.tolist()
         self._names = {mark.vertex: name for name, mark in slam.landmarks.items()}

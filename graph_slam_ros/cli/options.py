@@ -34,7 +34,7 @@ def recover(sub: CommandParser) -> None:
 
 def export(sub: CommandParser) -> None:
     """Add the options of ``export``."""
-    _add_run(sub)
+    add_run(sub)
     sub.add_argument(
         "--to",
         choices=("tum", "g2o", "mcap"),
@@ -63,7 +63,7 @@ def merge(sub: CommandParser) -> None:
 
 def freeze(sub: CommandParser) -> None:
     """Add the options of ``freeze``."""
-    _add_run(sub)
+    add_run(sub)
     _add_out(sub)
 
 
@@ -220,7 +220,7 @@ def evaluate(sub: CommandParser) -> None:
 
 def plot(sub: CommandParser) -> None:
     """Add the options of ``plot``."""
-    _add_run(sub)
+    add_run(sub)
     sub.add_argument(
         "--out", type=Path, metavar="PNG", help="file of the picture (default: path.png in the run folder)"
     )
@@ -233,7 +233,7 @@ def plot(sub: CommandParser) -> None:
 
 def report(sub: CommandParser) -> None:
     """Add the options of ``report``."""
-    _add_run(sub)
+    add_run(sub)
     sub.add_argument("--out", type=Path, metavar="FILE.html", help="file of the report (default: RUN.html)")
     _add_truth(sub, required=False)
     sub.add_argument("--compare", type=Path, metavar="RUN2", help="another run: draw its path and list what differs")
@@ -257,7 +257,7 @@ def _add_truth(sub: CommandParser, *, required: bool) -> None:
 
 def explain(sub: CommandParser) -> None:
     """Add the options of ``explain``."""
-    _add_run(sub)
+    add_run(sub)
     sub.add_argument(
         "edge",
         nargs="?",
@@ -269,7 +269,7 @@ def explain(sub: CommandParser) -> None:
 def solve(sub: CommandParser) -> None:
     """Add the options of ``solve``."""
     sub.codes = f"Edges have the ids of explain and of the run's ledger. {CODES}"
-    _add_run(sub)
+    add_run(sub)
     sub.add_argument(
         "--without",
         nargs="+",
@@ -299,7 +299,7 @@ def solve(sub: CommandParser) -> None:
 
 def influence(sub: CommandParser) -> None:
     """Add the options of ``influence``."""
-    _add_run(sub)
+    add_run(sub)
     sub.add_argument(
         "--count",
         type=values.count,
@@ -311,7 +311,7 @@ def influence(sub: CommandParser) -> None:
 
 def advise(sub: CommandParser) -> None:
     """Add the options of ``advise``."""
-    _add_run(sub)
+    add_run(sub)
     sub.add_argument(
         "--count",
         type=values.count,
@@ -360,7 +360,8 @@ def nothing(sub: CommandParser) -> None:
 # -- options that commands share ---------------------------------------------------------------------------------------
 
 
-def _add_run(sub: CommandParser) -> None:
+def add_run(sub: CommandParser) -> None:
+    """Add the run folder."""
     sub.add_argument("run_folder", type=Path, metavar="RUN", help="run folder")
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from importlib import import_module
 
 from graph_slam_ros import __version__
-from graph_slam_ros.cli import audit, graphs, maps, options, recordings, simulate
+from graph_slam_ros.cli import audit, edit, graphs, maps, options, recordings, simulate
 from graph_slam_ros.cli.usage import CommandParser
 
 
@@ -97,6 +97,14 @@ COMMANDS = {
         options.freeze,
         "write a run's map as a frozen one: it stays fixed when it is loaded for localization",
         "drive_run --out site",
+    ),
+    "edit": Command(
+        edit.edit,
+        edit.add_options,
+        "edit a run's map by hand with a plan: take out or let in edges; delete, rename or merge landmarks",
+        "drive_run --new-plan edits.json",
+        "drive_run --plan edits.json --dry-run",
+        "drive_run --plan edits.json --out drive_edited",
     ),
     "plot": Command(
         recordings.plot,

@@ -61,6 +61,7 @@ class Difference:
     T_a_b : where the map of B is in that of A
     keyframes_m : how far keyframes of one stamp are apart, of half of them and at most; none: not a number
     moved : landmarks, the farthest in standard deviations first
+    edits_a, edits_b : edits by hand that only one of them has
     """
 
     keyframes: Counts
@@ -74,6 +75,8 @@ class Difference:
     only_in_b: list[str]
     moved: list[MovedLandmark]
     verdicts: list[Judged]
+    edits_a: list[str]
+    edits_b: list[str]
 
     @property
     def is_same(self) -> bool:
@@ -81,7 +84,7 @@ class Difference:
         counted = (self.keyframes, self.landmarks, self.edges)
         is_there = all(one.a == one.b == one.both for one in counted)
         is_moved = any(one.distance_m > _SAME_M for one in self.moved) or self.keyframes_m[1] > _SAME_M
-        return is_there and not is_moved and not self.verdicts
+        return is_there and not (is_moved or self.verdicts or self.edits_a or self.edits_b)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; what there is not is None."""
@@ -116,6 +119,8 @@ class Difference:
             f"judged     {j.about}: {j.verdict_a} (edge {j.edge_a} of A), {j.verdict_b} (edge {j.edge_b} of B)"
             for j in self.verdicts
         )
+        yield from _shown(f"by hand    only in A: {text}" for text in self.edits_a)
+        yield from _shown(f"by hand    only in B: {text}" for text in self.edits_b)
         yield "no difference" if self.is_same else "they differ"
 
 
@@ -154,6 +159,8 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
         sorted(known[1] - known[0]),
         sorted(moved, key=lambda one: (-one.sigmas, one.landmark)),
         verdicts,
+        [edit.text for edit in one.edits if edit.edit not in [other.edit for other in two.edits]],
+        [edit.text for edit in two.edits if edit.edit not in [other.edit for other in one.edits]],
     )
 
 

@@ -5,7 +5,8 @@ came there.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.maps.alignment import Alignment, align, positions
 from graph_slam_ros.maps.diff import refuse_other_space, shared_landmarks
+from graph_slam_ros.measurements.edits import AppliedEdit
 from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.runs.restore import record_run, restored_and_solved, stopwatch
@@ -178,6 +180,7 @@ class _Second:
                 [number[edge], topic, sighting, first + keyframe, self._vertex[vertex], *rest]
                 for edge, topic, sighting, keyframe, vertex, *rest in growth.get("seen", ())
             ],
+            "edits": [self._edit_record(one, number) for one in self._two.edits],
             "datum": growth.get("datum", self._one.datum),
             "offsets": {name: self._vertex[vertex] for name, vertex in growth.get("offsets", {}).items()},
         }
@@ -199,6 +202,14 @@ class _Second:
         if label == "initialpose":  # it was told in the axes of the second
             measured = [float(x) for x in self._one.space.group.compose(self._T, tuple(measured))]
         return [tag, [self._vertex[vertex] for vertex in vertices], measured, root, label, source]
+
+    def _edit_record(self, one: AppliedEdit, number: Mapping[int, int]) -> list[Any]:
+        """An edit of the second map; a name that the first has is changed."""
+        names = {other.edit.name for other in self._one.edits}
+        free = chain([one.edit.name], (f"{one.edit.name}-{k}" for k in count(2)))
+        name = next(name for name in free if name not in names)
+        edges, added = (tuple(number[e] for e in ids if e in number) for ids in (one.edges, one.added))
+        return AppliedEdit(replace(one.edit, name=name), self._keyframes + one.keyframe, edges, added).record
 
     def _bridge(self) -> list[Any]:
         """A weak edge from the last keyframe of the first map to the first keyframe of the second."""

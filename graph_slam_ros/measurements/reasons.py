@@ -255,6 +255,9 @@ REASONS: dict[str, Reason] = {
         _NOTED, "a landmark that the map does not have, while map.localize is true", "map.localize=false to add it"
     ),
     "removed": Reason(_NOTED, "an edge or a landmark that was removed by hand (~/remove)"),
+    "let_in": Reason(_NOTED, "an edge that a plan of edits let in"),
+    "merged_by_hand": Reason(_NOTED, "a landmark that a plan of edits merged into another"),
+    "renamed": Reason(_NOTED, "a landmark that a plan of edits renamed"),
     "unknown_edge": Reason(
         _NOTED, "~/remove named an edge that is not in the graph", "graph_slam explain RUN lists ids"
     ),

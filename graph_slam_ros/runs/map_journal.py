@@ -21,7 +21,7 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 * ``calibration``: corrections with those configured, ``[input, name, value]`` each; ``recalibrated``: edges of
   earlier records as they are by these: edge type, rows of its table, numbers measured, square roots of the information;
 * ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are; ``held``: the
-  same while ``map.localize`` is true, zeros when it ends.
+  same while ``map.localize`` is true, zeros when it ends; ``edits``: ``AppliedEdit.record`` of each edit by hand.
 
 Now and then an ``estimate`` tells all values, end to end. A run that goes on in another's map has that first, as one
 ``growth`` and one ``estimate``, up to a record ``start``.
@@ -40,6 +40,7 @@ from graph_slam_ros.edge_tags import map_edge_of, tag_of
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3
+from graph_slam_ros.measurements.edits import applied_edit
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.runs.journal import MAP, parts_of, read_records
 from graph_slam_ros.slam import GraphSlam
@@ -71,7 +72,7 @@ class MapGrowth:
     def __init__(self, start: MapSnapshot | None = None) -> None:
         self._vertices = self._edges = self._judged = self._changes = 0
         self._keyframes = self._segments = self._sightings = self._landmarks = self._offsets = 0
-        self._frozen = self._drives = self._rescaled = 0
+        self._edits = self._frozen = self._drives = self._rescaled = 0
         self._noise: dict[Key, float] = {}
         self._calibration: Totals = {}
         self._recalibrated = 0
@@ -128,15 +129,15 @@ class MapGrowth:
             out["calibration"], self._calibration = totals_record(a.calibration), dict(a.calibration)
         out["recalibrated"] = [one.as_record() for one in a.recalibrations[self._recalibrated :] if first_edge]
         self._recalibrated = len(a.recalibrations)
+        out["edits"] = [one.record for one in a.edits[self._edits :]]
         if a.datum != self._datum:
             out["datum"] = self._datum = a.datum
         if keyframes:
             out["stamp_ns"] = keyframes[-1].stamp_ns
         self._vertices, self._edges, self._judged = graph.vertex_count, graph.edge_count, len(a.ledger)
         self._changes, self._keyframes, self._segments = len(a.ledger.history), len(a.keyframes), len(a.segments)
-        self._sightings, self._offsets = len(a.sighting_poses), len(a.range_offsets)
-        self._drives = len(a.drives)
-        self._landmarks, self._frozen = a.landmark_changes, a.frozen
+        self._sightings, self._offsets, self._frozen = len(a.sighting_poses), len(a.range_offsets), a.frozen
+        self._drives, self._edits, self._landmarks = len(a.drives), len(a.edits), a.landmark_changes
         return {name: part for name, part in out.items() if part}
 
 
@@ -343,6 +344,7 @@ def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     state.range_offsets.update(record.get("offsets", {}))
     state.datum = tuple(record.get("datum", state.datum))
     state.settings.update(record.get("settings", {}))
+    state.edits += map(applied_edit, record.get("edits", ()))
     state.processed = _count(record.get("processed"))
     state.used_ns, state.source = record.get("used", (None, ""))
     for name in ("frozen", "held"):
@@ -381,12 +383,13 @@ def _verdict(verdict: str, reason: str) -> tuple[Verdict, Reason]:
 
 
 def _know(state: MapSnapshot, record: Mapping[str, Any]) -> None:
+    renamed: dict[int, Landmark] = {}
     for name, fields in record.get("landmarks", {}).items():
         before = state.landmarks.get(name)
         if before is not None and (fields is None or fields[0] != before.vertex):  # it was given up: another comes last
-            del state.landmarks[name]
-            before = None
+            renamed[before.vertex] = state.landmarks.pop(name)
         if fields is not None:
+            before = state.landmarks.get(name) or renamed.get(fields[0])
             now = state.landmarks[name] = Landmark(name, *fields)
             now.seen = before.seen if before is not None else []
     by_vertex = {mark.vertex: mark for mark in state.landmarks.values()} if record.get("seen") else {}

@@ -49,6 +49,7 @@ class Backend:
     holds_back : whether what does not fit stays out, and verdicts stay as they are, until somebody has decided
     trusts_sightings : whether a new sighting that fits is believed; else it waits until it is compared with all else
     rivals : other explanations of the same measurements that the last second look could not rule out
+    edits : by hand, in order
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class Backend:
         self.handed_over, self.frozen = (0, 0), start.frozen
         self.frozen_edges = start.ledger.final
         self.held = (0, 0)
+        self.edits = list(start.edits)
         self._background = Background(config, executor)
         self.rivals: tuple[Alternative, ...] = ()
         self.spares_memory = self.holds_back = False
@@ -135,11 +137,15 @@ class Backend:
         self.solver.add(range(vertices, self.graph.vertex_count), range(edges, self.graph.edge_count))
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
 
-    def update(self, keyframe: int) -> None:
-        """Take in what is new and believed, then what is believed of the rest."""
+    def gate_new(self, keyframe: int) -> None:
+        """Judge what is new by its own noise; what does not fit waits until it is compared with all else."""
         self.hand_over()
         new = self.decisions.gate_new(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
         self._pending = [*self._pending, *new][-_MAX_PENDING:]
+
+    def update(self, keyframe: int) -> None:
+        """Take in what is new and believed, then what is believed of the rest."""
+        self.gate_new(keyframe)
         if self.holds_back:
             self.solver.update()
             return
@@ -157,9 +163,7 @@ class Backend:
 
     def optimize(self, keyframe: int, settings: Settings) -> Report:
         """Solve everything, and have a second look at all that was decided."""
-        self.hand_over()
-        new = self.decisions.gate_new(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
-        self._pending = [*self._pending, *new][-_MAX_PENDING:]
+        self.gate_new(keyframe)
         report = self.solver.optimize(settings)
         if not self._config.decide or self.holds_back:
             return report

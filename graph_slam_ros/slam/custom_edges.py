@@ -1,6 +1,7 @@
 """Custom edges: measurements whose edge types plugins have, between poses of the robot and landmarks."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -57,6 +58,8 @@ class CustomEdges:
             No plugin has the edge type, or the numbers are not those of it.
         """
         edge, measured = edge_type_of(m)
+        aliases = self._landmarks.aliases
+        m = replace(m, ends=tuple(aliases.get(end, end) if isinstance(end, str) else end for end in m.ends))
         for name in m.landmarks:
             self._begin_surveyed(m, name)
         reason = self._unusable(m, edge)

@@ -12,6 +12,7 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import DivergedError, GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.edits import Value
 from graph_slam_ros.measurements.types import (
     Closure,
     Control,
@@ -44,8 +45,6 @@ from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.slam.solution import Solution, Solved
 from graph_slam_ros.slam.update import Update, UpdateLog
 from graph_slam_ros.solver import Settings
-
-Value = bool | int | float | str
 
 
 class GraphSlam(MapView):
@@ -249,8 +248,8 @@ class GraphSlam(MapView):
             case "clear_closures":
                 if self._edits.clear_closures(len(self.keyframes) - 1):
                     self._solve()
-            case "remove":
-                if self._edits.remove(values, len(self.keyframes) - 1):
+            case "remove" | "edit":
+                if self._edits.change(event, values, len(self.keyframes) - 1):
                     self._solve(self.config.solver_settings())
             case "set":
                 self._set(values)

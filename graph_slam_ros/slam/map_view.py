@@ -8,6 +8,7 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.measurements.edits import AppliedEdit
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.choice import parameters_of
 from graph_slam_ros.slam.calibration.decision import Finding, decide
@@ -305,6 +306,11 @@ class MapView:
     def held(self) -> tuple[int, int]:
         """The numbers of vertices and edges that are held while ``map.localize`` is true; zeros otherwise."""
         return self.backend.held
+
+    @property
+    def edits(self) -> list[AppliedEdit]:
+        """The edits by hand, in order."""
+        return self.backend.edits
 
     @property
     def datum(self) -> tuple[float, ...]:

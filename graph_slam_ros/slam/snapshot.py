@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.graph import Graph
+from graph_slam_ros.measurements.edits import AppliedEdit
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
@@ -30,6 +31,7 @@ class MapSnapshot:
     source : the input of that odometry
     noise_factors : of the configured sigmas, that the edges have, as ``NoiseScales.factors``
     calibration : corrections that were found, with those that were configured, by input and name
+    edits : by hand, in order
     continues_with : the odometry whose next message belongs to the same drive; empty where a new drive begins
     """
 
@@ -51,6 +53,7 @@ class MapSnapshot:
     source: str = ""
     continues_with: str = ""
     noise_factors: dict[Key, float] = field(default_factory=dict)
+    edits: list[AppliedEdit] = field(default_factory=list)
     calibration: dict[tuple[str, str], float] = field(default_factory=dict)
 
     @property

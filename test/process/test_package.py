@@ -61,7 +61,7 @@ WITHIN = {
         "check",
     },
     "maps": {
-        *("edge_tags", "lie", "graph", "formats", "slam", "slam/landmarks", "slam/robust"),
+        *("edge_tags", "lie", "graph", "formats", "measurements", "slam", "slam/landmarks", "slam/robust"),
         *("messages", "recordings", "runs"),
     },
     "analysis": {

@@ -78,6 +78,7 @@ class Landmarks:
     undetermined : those that are not determined yet
     offsets : by input, the vertex of what all its ranges have in common
     touched : the name of a landmark of the graph for each change of it, in order
+    aliases : the landmark that an identity is of, where somebody has merged two
     origins : when each edge of a sighting was measured, and where from
     begins_new : whether what is not known begins a landmark; not so while the map is held
     """
@@ -104,10 +105,12 @@ class Landmarks:
                 self._noise_of_pose(name, known)
         self.offsets: dict[str, int] = {}
         self.touched: list[str] = []
+        self.aliases: dict[str, str] = {}
         self.origins = SightingEdges(self._space)
 
     def add(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
         """Add a sighting of a landmark with this identity."""
+        name = self.aliases.get(name, name)
         landmark = self.known.get(name)
         if landmark is not None:
             self._add_edge(topic, landmark, s, where)
@@ -130,7 +133,7 @@ class Landmarks:
 
         That is a pose where both the survey and the sighting have the orientation, else a position (n,).
         """
-        if name not in self._survey or name in self.known:
+        if name not in self._survey or self.aliases.get(name, name) in self.known:
             return None
         if s.kind == "pose" and self._survey[name].orientation:
             measured = motion_compensation.pose(self._space, s, where).measured

@@ -34,9 +34,12 @@ class Reason(IntEnum):
     DISPLACED = 6  # odometry, where the landmarks showed that the robot was moved without its noticing
     REVOKED = 7  # what stood in its place, after later sightings showed that it was not
     FAILED = 8  # the plugin of its edge type failed at it
+    BY_HAND = 9  # somebody decided so: taken out for good, or in and never judged
 
 
-FINAL = (Reason.WITHDRAWN, Reason.QUARANTINED, Reason.DISPLACED, Reason.REVOKED, Reason.FAILED)  # it is out for good
+FINAL = (  # it is out for good
+    *(Reason.WITHDRAWN, Reason.QUARANTINED, Reason.DISPLACED, Reason.REVOKED, Reason.FAILED, Reason.BY_HAND),
+)
 INSIDE = (Verdict.ACCEPTED, Verdict.DOWN_WEIGHTED)
 _ACCEPTED, _DOWN_WEIGHTED = _INSIDE = tuple(map(int, INSIDE))  # comparing with members of an enumeration is slow
 
@@ -166,7 +169,7 @@ class Ledger:
 
     def is_withdrawn(self, edge: int) -> bool:
         """Return whether an edge was taken out for good."""
-        return edge < len(self) and int(self.reason.values[edge]) in FINAL
+        return edge < len(self) and self.reason.values.item(edge) in FINAL and self.verdict.values.item(edge) != 0
 
     @property
     def inside(self) -> Index:

@@ -1,0 +1,218 @@
+"""A plan of edits by hand, and the run that it makes of another."""
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from reprlib import repr as shortened
+from typing import Any
+
+import numpy as np
+
+from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.formats.durable import write_whole
+from graph_slam_ros.formats.files import opened, read_text
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.edits import AppliedEdit, Edit, edit_of
+from graph_slam_ros.runs.folder import CONFIG, RunError, check_room, discard, is_run, recording_of
+from graph_slam_ros.runs.journal import INGEST, MAP, parts_of
+from graph_slam_ros.runs.map_journal import state_of
+from graph_slam_ros.runs.restore import record_run, restored, stopwatch
+from graph_slam_ros.slam import Control, GraphSlam
+
+FORMAT, VERSION = "graph_slam_ros edits", 1
+_KEYS = ("format", "version", "source", "edits")
+_MOST_BYTES = 2**24
+_MOST_EDITS = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Edits of one run.
+
+    Attributes
+    ----------
+    source : ``source_hash`` of the run that it was made for
+    edits : in the order in which they are applied
+    """
+
+    source: str
+    edits: tuple[Edit, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Edited:
+    """The outcome of a plan.
+
+    Attributes
+    ----------
+    edits : as they were applied
+    chi2 : of the accepted edges, before and after
+    moved : the number of the keyframe that moved farthest, and by how much [m]
+    final_m : by how much the last keyframe moved [m]
+    summary : of the new run; empty where none was written
+    losses : parts of the run that could not be read
+    """
+
+    edits: tuple[AppliedEdit, ...]
+    chi2: tuple[float, float]
+    moved: tuple[int, float]
+    final_m: float
+    summary: dict[str, Any]
+    losses: list[str]
+
+
+# -- plans -------------------------------------------------------------------------------------------------------------
+
+
+def source_hash(folder: Path) -> str:
+    """The hash of a run that a plan names: of its configuration, its journal and its map.
+
+    Raises
+    ------
+    RunError
+        It is no run, or a file of it cannot be read.
+    """
+    if not is_run(folder):
+        raise RunError(f"{folder}: not a run's folder")
+    digest = hashlib.sha256()
+    for file in (folder / CONFIG, *parts_of(folder, INGEST), *parts_of(folder, MAP)):
+        try:
+            with opened(file, follow=False) as stream:
+                content = hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as error:
+            raise RunError(f"{file}: {error.strerror}") from None
+        digest.update(f"{file.name} {content}\n".encode())
+    return f"sha256:{digest.hexdigest()}"
+
+
+def plan_text(plan: Plan) -> str:
+    """A plan as JSON."""
+    content = {"format": FORMAT, "version": VERSION, "source": plan.source, "edits": [e.values for e in plan.edits]}
+    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"
+
+
+def write_empty_plan(folder: Path, file: Path) -> None:
+    """Write a plan without edits for a run, to be filled. Raises GraphSlamError where something is there already."""
+    if os.path.lexists(file):
+        raise GraphSlamError(f"{file}: exists already: choose another name")
+    try:
+        write_whole(file, plan_text(Plan(source_hash(folder), ())).encode())
+    except OSError as error:
+        raise GraphSlamError(f"{file}: {error.strerror}") from None
+
+
+def read_plan(file: Path) -> Plan:
+    """Read a plan.
+
+    Raises
+    ------
+    FormatError
+        It is not a plan; the text names the edit and the key.
+    """
+    try:
+        if file.stat().st_size > _MOST_BYTES:
+            raise FormatError(f"{file}: larger than {_MOST_BYTES} bytes: not read")
+        content = json.loads(read_text(file), object_pairs_hook=_without_repeats, parse_constant=_no_number)
+    except OSError as error:
+        raise FormatError(f"{file}: {error.strerror}") from None
+    except (ValueError, RecursionError, FormatError) as error:
+        raise FormatError(str(error) if str(error).startswith(str(file)) else f"{file}: not JSON: {error}") from None
+    try:
+        return _plan(content)
+    except FormatError as error:
+        raise FormatError(f"{file}: {error}") from None
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    out = dict(pairs)
+    if len(out) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise FormatError(f"key {shortened(next(n for n in names if names.count(n) > 1))} is there twice")
+    return out
+
+
+def _no_number(word: str) -> Any:
+    raise FormatError(f"{word} is not a finite number")
+
+
+def _plan(content: Any) -> Plan:
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise FormatError(f'not a plan of edits: no "format": "{FORMAT}"')
+    for key in content:
+        if key not in _KEYS:
+            raise FormatError(f"{shortened(key)}: unknown key; a plan has {', '.join(_KEYS)}")
+    if type(content.get("version")) is not int or content["version"] != VERSION:
+        raise FormatError(f"version: {shortened(content.get('version'))} is not {VERSION}, which this program reads")
+    source, edits = content.get("source"), content.get("edits")
+    if not isinstance(source, str):
+        raise FormatError(f"source: {shortened(source)} is not the hash of a run")
+    if not isinstance(edits, list) or len(edits) > _MOST_EDITS:
+        raise FormatError(f"edits: {shortened(edits)} is not a list of at most {_MOST_EDITS} edits")
+    read = list[Edit]()
+    for number, values in enumerate(edits, start=1):
+        try:
+            read.append(edit_of(values))
+        except FormatError as error:
+            raise FormatError(f"edit {number}: {error}") from None
+        if read[-1].name in {one.name for one in read[:-1]}:
+            raise FormatError(f"edit {number}: name: {shortened(read[-1].name)} is the name of another edit, too")
+    return Plan(source, tuple(read))
+
+
+# -- what a plan makes of a run ----------------------------------------------------------------------------------------
+
+
+def edit(folder: Path, plan: Plan, out: Path | None) -> Edited:
+    """Apply a plan to the map of a run, solve everything, and write it as another run.
+
+    Parameters
+    ----------
+    out : nothing may be there; None: nothing is written
+
+    Raises
+    ------
+    GraphSlamError
+        The plan is for another run, has no edits, or one cannot be applied; or the map cannot be solved with it.
+        Nothing was written.
+    """
+    took = stopwatch()
+    if out is not None:
+        check_room(out, folder)
+        if os.path.lexists(out):
+            raise RunError(f"{out}: exists already: an edited map is written to a new folder")
+    if (found := source_hash(folder)) != plan.source:
+        raise GraphSlamError(f"the plan is for another run: its source is {plan.source[:80]}, and {folder} is {found}")
+    if not plan.edits:
+        raise GraphSlamError("the plan has no edits")
+    losses: list[str] = []
+    counters = Counters()
+    slam = restored(folder, losses, counters)
+    state, events = state_of(slam), [Control("edit", tuple(one.values.items())) for one in plan.edits]
+    measurements = [*events, Control("optimize")]
+    edited = _applied(slam, measurements, losses)
+    if out is None:
+        return edited
+    options: dict[str, Any] = {"earlier": counters, "took": took, "recording": recording_of(folder)}
+    try:
+        edited.summary.update(record_run(out, slam.config, measurements, losses, state, **options)[1])
+    except Exception:
+        discard(out)
+        raise
+    return edited
+
+
+def _applied(slam: GraphSlam, measurements: list[Control], losses: list[str]) -> Edited:
+    """Apply edits to a map in memory, and compare it with what it was."""
+    known, before, chi2 = len(slam.edits), slam.trajectory(), slam.solver.evaluate().chi2_final
+    for one in measurements:
+        slam.process(one)
+    if not slam.is_solved:
+        raise GraphSlamError(f"the map cannot be solved with these edits: {slam.failing}")
+    n = slam.space.dimensions
+    distances = np.linalg.norm(slam.trajectory()[:, :n] - before[:, :n], axis=1)
+    farthest = int(distances.argmax())
+    after = slam.solver.evaluate().chi2_final
+    moved = farthest, float(distances[farthest])
+    return Edited(tuple(slam.edits[known:]), (chi2, after), moved, float(distances[-1]), {}, losses)
