@@ -111,7 +111,7 @@ KINDS: dict[str, Kind] = {
     ),
     # -- a replay in memory, and a fit that begins at its estimate
     "clock_offset": Kind("sightings fit odometry better at other stamps", f"INPUT.offset_s; {_ONE_CLOCK}"),
-    "mount_yaw": Kind("the sensor is turned on the robot", "correct its transform; INPUT.frame with INPUT.mount"),
+    "mount_yaw": Kind("the sensor is turned on the robot", "correct its transform; INPUT.mount_correction"),
     "odometry_scale": Kind(
         "the robot drives more or less than odometry says", "wheel radius; odometry.distance_factor"
     ),

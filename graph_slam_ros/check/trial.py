@@ -9,7 +9,7 @@ from graph_slam_ros.check.finding import Finding, Where, assignment
 from graph_slam_ros.check.identities import check_identities, points_in_map
 from graph_slam_ros.check.pairs import noisier, pairs_of, path_of, poses_at, turned_mount
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
@@ -79,7 +79,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     if scale is not None and _has_points(c) and scale.sigma < _SURE and abs(scale.value - 0.1) > _ABSURD:
         yield _absurd(c, 1.0 + scale.value)
         return
-    found = list(_places(c, slam, path_ns, path))
+    found = [] if _goes_back(c) else list(_places(c, slam, path_ns, path))
     if fit.lost > _LOST:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(s, path_ns, path, c.config.world.dimensions))]
         if not found:
@@ -96,6 +96,11 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         factor = float(np.sqrt(noise.per_dof))
         if factor > limit and noise.dof > _LEAST_DOF and not noise.reason:
             yield _over_confident(c, noise.source, noise.label, noise.part, factor, limit)
+
+
+def _goes_back(c: Columns) -> bool:
+    """Return whether time jumps back: stamps then do not say where the robot was."""
+    return any((np.diff(t.stamp_ns[t.stamp_ns != 0]) < -1_000_000_000).any() for t in c.topics.values())
 
 
 def _has_points(c: Columns) -> bool:
@@ -151,11 +156,16 @@ def _mended(c: Columns, one: Fitted) -> tuple[str, tuple[str, ...]]:
     if one.parameter.name == "yaw":
         degrees = (value / _DEGREE, sigma / _DEGREE)
         text = f"its sensor is turned by {degrees[0]:.1f} degrees on the robot (sigma {degrees[1]:.1f})"
-        s = next(s for s in c.sightings if s.input == source)
-        return text, turned_mount(s, (0.0, 0.0, 0.0, *so3.exp((0.0, 0.0, value))))
+        before = next(s.numbers("mount_correction", 6) for s in c.config.sources if s.name == source) or (0.0,) * 6
+        numbers = (*before[:5], before[5] + value)
+        return text, (assignment(f"{source}.mount_correction", " ".join(f"{x:.5g}" for x in numbers)),)
+    name = f"{one.parameter.name}_factor"
+    factor = getattr(c.config.odometry, name) * (1.0 + value)
     what = "drives" if one.parameter.name == "distance" else "turns"
     text = f"the robot {what} {1.0 + value:.3f} times what odometry says (sigma {sigma:.3f})"
-    return text, ()
+    if one.parameter.name == "distance":
+        text += ", or ranges are too long or short by that"
+    return text, (assignment(f"odometry.{name}", round(factor, 4)),)
 
 
 def _places(c: Columns, slam: GraphSlam, path_ns: Index, path: Array) -> Iterator[Finding]:

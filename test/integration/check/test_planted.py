@@ -99,6 +99,7 @@ def laps(tmp_path_factory):
     [
         ("landmark clock +100 ms", "clock_offset", -0.1, 0.02),
         ("mount turned 5 degrees", "mount_yaw", 0.0873, 0.01),
+        ("odometry scaled 0.9", "odometry_scale", 0.111, 0.02),
         ("two landmarks share an identity", "id_reused", None, None),
         ("noise 8 times its covariance", "over_confident", None, None),
     ],
