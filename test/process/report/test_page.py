@@ -1,6 +1,7 @@
 """The page of a report in a real browser: it opens offline, asks for nothing, and says what the run says."""
 
 import re
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -37,9 +38,9 @@ def browser():
         browser.close()
 
 
-@pytest.fixture
-def opened(browser):
-    """A function that opens a file offline, and checks at the end that it asked for nothing and that nothing failed."""
+@contextmanager
+def pages(browser):
+    """A function that opens a file offline; at the end no page may have asked for anything, and nothing have failed."""
     contexts, wrong = [], []
 
     def go(file, place="", **options):
@@ -57,6 +58,20 @@ def opened(browser):
     for context in contexts:
         context.close()
     assert wrong == []
+
+
+@pytest.fixture
+def opened(browser):
+    with pages(browser) as go:
+        yield go
+
+
+@pytest.fixture(scope="module")
+def page(browser, faulty):
+    """The page of a drive with false closures, dark, at one of them."""
+    false = next(e for e in read_ledger(faulty.run) if e.label == "closures" and not e.is_in)
+    with pages(browser) as go:
+        yield go(faulty.html, f"#edge={false.edge}", color_scheme="dark")
 
 
 @pytest.fixture(scope="module")
@@ -97,10 +112,9 @@ def why(page):
     return " ".join(page.inner_text("#why-body").split())
 
 
-def test_a_page_says_why_as_explain_does(opened, faulty):
+def test_a_page_says_why_as_explain_does(page, faulty):
     """By its address, by a row of the ledger, and by a click on the map."""
     false = next(e for e in read_ledger(faulty.run) if e.label == "closures" and not e.is_in)
-    page = opened(faulty.html, f"#edge={false.edge}")
     told = " ".join(" ".join(explain_edge(faulty.saved, str(false.edge))).split())
     before = told[: told.index(" what if ")]
     assert why(page).startswith(before)
@@ -121,9 +135,8 @@ def test_a_page_says_why_as_explain_does(opened, faulty):
     assert page.evaluate("location.hash") == "#keyframe=5"
 
 
-def test_each_sentence_of_the_page_is_explains(opened, faulty):
+def test_each_sentence_of_the_page_is_explains(page, faulty):
     """Of every edge: numbers may differ by one in their last digit, as they are packed."""
-    page = opened(faulty.html)
     shown = page.evaluate("() => Array.from({length: data.edges.count}, (_, k) => explained(k))")
     number = re.compile(r"-?\d+(?:\.\d+)?(?:e[-+]\d+)?")
     for e, found in zip(faulty.saved.entries, shown, strict=True):
@@ -140,8 +153,7 @@ def test_each_sentence_of_the_page_is_explains(opened, faulty):
             assert a == pytest.approx(b, rel=1.1e-3, abs=1.1e-2)
 
 
-def test_the_slider_shows_the_estimate_as_it_was_known_then(opened, faulty):
-    page = opened(faulty.html)
+def test_the_slider_shows_the_estimate_as_it_was_known_then(page, faulty):
     assert page.inner_text("#when").startswith("now")
     then = "() => byId('map').data.find(one => one.meta === 'then').x.length"
     assert page.evaluate(then) == 0
@@ -153,9 +165,9 @@ def test_the_slider_shows_the_estimate_as_it_was_known_then(opened, faulty):
     assert page.inner_text("#when").startswith("now")
 
 
-def test_the_ledger_filters_sorts_and_is_walked_with_arrow_keys(opened, faulty):
-    page = opened(faulty.html)
+def test_the_ledger_filters_sorts_and_is_walked_with_arrow_keys(page, faulty):
     entries = read_ledger(faulty.run)
+    page.fill("#filter", "")
     assert page.inner_text("#count") == f"{len(entries)} of {len(entries)} edges"
     page.fill("#filter", "closures pending")
     pending = [e.edge for e in entries if e.label == "closures" and e.verdict.name == "PENDING"]
@@ -171,8 +183,7 @@ def test_the_ledger_filters_sorts_and_is_walked_with_arrow_keys(opened, faulty):
     page.wait_for_function("edge => location.hash === `#edge=${edge}`", arg=rows[1])
 
 
-def test_space_charts_and_print_draw_without_a_fault(opened, faulty):
-    page = opened(faulty.html, color_scheme="dark")
+def test_space_charts_and_print_draw_without_a_fault(page, faulty):
     page.click("#view")
     page.wait_for_function("() => byId('map').data.some(one => one.type === 'scatter3d')")
     page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
