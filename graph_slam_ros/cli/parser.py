@@ -105,6 +105,7 @@ COMMANDS = {
         "drive_run --new-plan edits.json",
         "drive_run --plan edits.json --dry-run",
         "drive_run --plan edits.json --out drive_edited",
+        "drive_edited --undo wrong-aisle --out drive_mended",
     ),
     "plot": Command(
         recordings.plot,

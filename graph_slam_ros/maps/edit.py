@@ -15,9 +15,9 @@ from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.formats.files import opened, read_text
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edits import AppliedEdit, Edit, edit_of
-from graph_slam_ros.runs.folder import CONFIG, RunError, check_room, discard, is_run, recording_of
-from graph_slam_ros.runs.journal import INGEST, MAP, parts_of
-from graph_slam_ros.runs.map_journal import state_of
+from graph_slam_ros.runs.folder import CONFIG, RunError, check_room, discard, is_run, recording_of, run_config
+from graph_slam_ros.runs.journal import INGEST, MAP, parts_of, read_measurements
+from graph_slam_ros.runs.map_journal import read_map, state_of
 from graph_slam_ros.runs.restore import record_run, restored, stopwatch
 from graph_slam_ros.slam import Control, GraphSlam
 
@@ -201,6 +201,39 @@ def edit(folder: Path, plan: Plan, out: Path | None) -> Edited:
         discard(out)
         raise
     return edited
+
+
+def undo(folder: Path, name: str, out: Path) -> dict[str, Any]:
+    """Write the run that a run would be without one of its edits, by its name; returns the summary.
+
+    Raises
+    ------
+    GraphSlamError
+        The run has no such edit, a later one depends on it, or the map cannot be solved. Nothing was written.
+    """
+    took, losses = stopwatch(), list[str]()
+    if os.path.lexists(out):
+        raise RunError(f"{out}: exists already: an edited map is written to a new folder")
+    start, config = read_map(folder, losses, start_only=True), run_config(folder)
+    events = list(read_measurements(folder, losses)) if start is not None else []
+    made = [edit_of(dict(m.values)) for m in events if isinstance(m, Control) and m.event == "edit"]
+    if start is None or name not in [one.name for one in made]:
+        before = start is not None and name in [one.edit.name for one in start.edits]
+        there = f"it has {', '.join(one.name for one in made)}" if made else "it has none of its own"
+        why = "is of the map that it began in: undo it in the run that has it" if before else f"is not in it: {there}"
+        raise GraphSlamError(f"{folder}: edit {shortened(name)} {why}")
+    gone = [one.name for one in made].index(name)
+    for one in made[gone + 1 :]:
+        if int(one.arguments.get("edge", 0)) >= start.graph.edge_count:
+            raise GraphSlamError(f"edit {one.name} is of an edge that an edit has added: undo {one.name} first")
+    rest = [m for m in events if not (isinstance(m, Control) and ("name", name) in m.values)]
+    slam = GraphSlam(config, start=start)
+    for m in rest:
+        slam.process(m)
+    if not slam.is_solved:
+        raise GraphSlamError(f"the map cannot be solved without this edit: {slam.failing}")
+    start = read_map(folder, [], start_only=True)
+    return record_run(out, config, rest, losses, start, took=took, recording=recording_of(folder))[1]
 
 
 def _applied(slam: GraphSlam, measurements: list[Control], losses: list[str]) -> Edited:

@@ -241,3 +241,19 @@ def test_a_dry_run_prints_the_effect_and_writes_nothing(run, edits, edited, tmp_
     assert contents(tmp_path) | contents(run) == before
     chi2 = float(next(line for line in out.splitlines() if line.startswith("chi2")).split()[-1])
     assert chi2 == pytest.approx(json.loads((edited / "run.json").read_text())["chi2"], rel=1e-6)
+
+
+def test_undo_writes_the_run_as_without_that_edit_to_the_same_bytes(run, edits, edited, tmp_path, capsys):
+    for name in ("let_in_edge", "rename_landmark"):
+        before, rest = contents(edited), [one for do, one in edits.items() if do != name]
+        without, undone = tmp_path / f"without_{name}", tmp_path / f"undone_{name}"
+        assert edit(run, planned(run, tmp_path, *rest), "--out", without) == 0
+        assert edit(edited, None, "--undo", name, "--out", undone) == 0
+        assert contents(edited) == before
+        one, two = contents(without), contents(undone)
+        assert {file for file in one if one[file] != two[file]} == {"run.json"}
+    for folder, name, named in ((run, "x", "edit 'x' is not in it"), (edited, "x", "it has remove_edge, let_in_edge")):
+        capsys.readouterr()
+        assert edit(folder, None, "--undo", name, "--out", tmp_path / "none") == 2
+        assert named in capsys.readouterr().err
+        assert not (tmp_path / "none").exists()
