@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
+from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.typing import Array
@@ -97,10 +98,17 @@ class Consistency:
             lines.append(f"{'noise of class, input, part':40s}{head}   configured sigmas should be")
         for one in self.noise:
             name = " ".join(filter(None, (one.label, one.source, one.part)))
-            should = f"not known: {one.reason}" if one.reason else f"{one.factor:.3g} times as large"
+            should = f"not known: {one.reason}" if one.reason else f"{one.factor:.3g} times as large{_growth(one)}"
             lines.append(f"{name:40s}{one.dof:8.0f}{one.per_dof:10.3f}{one.design_effect:8.2f}   {should}")
         lines += [self.advice] if self.advice else []
         return "\n".join(lines)
+
+
+def _growth(one: NoiseScale) -> str:
+    """What is added to a variance of odometry with what was turned and driven."""
+    unit = "rad^2" if one.part == "rotation" else "m^2"
+    added = {"rad": one.per_rad, "m": one.per_m}
+    return "".join(f" + {value:.2g} {unit}/{per}" for per, value in added.items() if value > 0.0)
 
 
 def pose_nees(estimate: Array, truth: Array, covariances: Array) -> tuple[Nees | None, Nees | None]:
@@ -182,17 +190,42 @@ def landmark_errors(
     return (true - positions)[:, :dimensions], relative
 
 
-def noise_advice(noise: Sequence[NoiseScale], *, is_applied: bool) -> str:
+def noise_advice(noise: Sequence[NoiseScale], *, is_applied: bool, odometry: OdometryConfig | None = None) -> str:
     """The advice if residuals contradict the configured sigmas; else empty.
 
     Parameters
     ----------
     is_applied : whether the run used the factors already
+    odometry : parameters of the run; with these, parameters of odometry that say what was found
     """
-    wrong = [one for one in noise if not one.reason and abs(np.log(one.factor)) > _WORTH_SAYING]
+    wrong = [one for one in noise if not one.reason and _is_wrong(one)]
     if not wrong:
         return ""
-    return "the run used these factors" if is_applied else f"replay with --set {_ESTIMATED} to use these factors"
+    out = "the run used these factors" if is_applied else f"replay with --set {_ESTIMATED} to use these factors"
+    line = motion_setting([one for one in wrong if one.label == "odometry"], odometry) if odometry else ""
+    return f"{out}\nodometry for good: {line}" if line else out
+
+
+def _is_wrong(one: NoiseScale) -> bool:
+    return one.per_rad > 0.0 or one.per_m > 0.0 or abs(np.log(one.factor)) > _WORTH_SAYING
+
+
+def motion_setting(noise: Sequence[NoiseScale], config: OdometryConfig) -> str:
+    """Parameters of ``odometry.noise: motion`` that say the estimated noise of odometry; empty where there is none."""
+    if not noise or config.noise == "density":
+        return ""
+    values = dict[str, float]()
+    for one in noise:
+        name = {"rotation": "turn", "position": "way"}[one.part]
+        # a position's is summed over its directions
+        along = 1.0 if name == "turn" else 1.0 + (config.lateral_density / config.translation_density) ** 2
+        found = {"per_rad": one.per_rad / along, "per_m": one.per_m / along, "per_s": one.per_s / along}
+        if config.noise == "motion":
+            found["per_s"] = one.factor**2 * getattr(config, f"{name}_per_s")
+            found["per_m"] += one.factor**2 * getattr(config, f"{name}_per_m")
+            found["per_rad"] += one.factor**2 * getattr(config, f"{name}_per_rad", 0.0)
+        values |= {f"{name}_{per}": value for per, value in found.items() if hasattr(config, f"{name}_{per}")}
+    return "--set odometry.noise=motion " + " ".join(f"--set odometry.{k}={v:.2g}" for k, v in values.items())
 
 
 def _in_six(covariance: Array) -> Array:

@@ -278,7 +278,9 @@ def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
     truth = known.trajectory if covariances.shape[1] == 6 else known.trajectory.in_plane()
     true = interpolated(truth, path.stamps_s)
     is_held, noise = _noise(run)
-    advice = noise_advice(noise, is_applied=run_config(run).robust.noise_scale == "estimated")
+    config = run_config(run)
+    is_applied = config.robust.noise_scale == "estimated"
+    advice = noise_advice(noise, is_applied=is_applied, odometry=config.odometry)
     reason = _why_no_nees(known, drive, path, true, is_held)
     if reason:
         return Consistency(None, None, None, noise, {"poses and landmarks": reason}, advice)

@@ -123,7 +123,9 @@ class MapGrowth:
             out["noise"] = factors_record(a.noise_factors)
             self._noise = dict(a.noise_factors)
         changes = a.noise_changes[self._rescaled :] if first_edge else ()
-        out["rescaled"] = [[one.first, one.last, factors_record(one.changed)] for one in changes]
+        out["rescaled"] = [
+            [one.first, one.last, factors_record(one.before), factors_record(one.after)] for one in changes
+        ]
         self._rescaled = len(a.noise_changes)
         if a.calibration != self._calibration:
             out["calibration"], self._calibration = totals_record(a.calibration), dict(a.calibration)
@@ -318,8 +320,8 @@ def _apply_verdicts(state: MapSnapshot) -> None:
 
 def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     graph, ledger = state.graph, state.ledger
-    for first, last, changed in record.get("rescaled", ()):
-        Rescaling(first, last, read_factors(changed)).apply(graph)
+    for first, last, *factors in record.get("rescaled", ()):
+        Rescaling(first, last, *map(read_factors, factors)).apply(graph)
     for one in record.get("recalibrated", ()):
         Recalibration.from_record(one).apply(graph)
     state.calibration |= read_totals(record.get("calibration", ()))

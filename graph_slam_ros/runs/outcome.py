@@ -163,6 +163,18 @@ def checked(summary: Summary, severity: str) -> Iterator[str]:
         yield f"{found['code']}: {found['text']}{'; ' if mend else ''}{mend} (graph_slam check BAG lists all)"
 
 
+def unscaled(summary: Summary) -> Iterator[str]:
+    """Return why noise that was to be estimated is as configured."""
+    if summary.get("noise_scale") != "estimated":
+        return
+    if why := summary.get("noise_unknown"):
+        yield f"robust.noise_scale=estimated: no noise could be estimated at the end: {why}"
+    unknown = [one for one in summary.get("noise", ()) if one["reason"]]
+    if unknown:
+        groups = "; ".join(f"{one['label']} {one['source']} {one['part']}: {one['reason']}" for one in unknown)
+        yield f"robust.noise_scale=estimated: not estimated at the end: {groups}; a longer drive tells more"
+
+
 def _unused(summary: Summary, name: str, received: int | None) -> str:
     if not received and received is not None:
         return f"{name}: no message came"

@@ -8,11 +8,9 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import AppendedFile, write_whole
 from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.measurements.types import to_record
@@ -31,7 +29,7 @@ from graph_slam_ros.runs.folder import (
 )
 from graph_slam_ros.runs.journal import BEGINS_IN_A_MAP, INGEST, MAP, MEASUREMENT, Parts, close_all, part_name, parts_of
 from graph_slam_ros.runs.map_journal import GROWTH, MapGrowth
-from graph_slam_ros.runs.tables import counted, result_texts, summarize
+from graph_slam_ros.runs.tables import counted, noise_summary, result_texts, summarize
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
@@ -331,10 +329,8 @@ def save_results(
         return _put(folder, name, text)
 
     files = {name: put(name, text) for name, text in result_texts(slam).items()}
-    contents = {"format": MARK} | summarize(slam) | summary | {"format": MARK, "files": files}
-    contents["noise"] = []
-    with contextlib.suppress(GraphSlamError):  # what cannot be said of a singular map must not cost its results
-        contents["noise"] = [asdict(one) for one in slam.noise_scale()] if slam.is_solved else []
+    noise = {} if "noise" in summary else noise_summary(slam)
+    contents = {"format": MARK} | summarize(slam) | summary | noise | {"format": MARK, "files": files}
     put(SUMMARY, json.dumps(contents, indent=2) + "\n")
 
 

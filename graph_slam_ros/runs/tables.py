@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from graph_slam_ros import __version__
+from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.g2o_writer import g2o_text
 from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.formats.tum import tum_text
@@ -41,6 +42,17 @@ def result_texts(slam: GraphSlam) -> dict[str, str]:
         ODOMETRY: tum_text(stamps, slam.sighting_odometry()),
         LANDMARKS: _landmark_table(slam),
     }
+
+
+def noise_summary(slam: GraphSlam) -> dict[str, Any]:
+    """The estimate of the noise, whether it is applied, and why there is none where there is none."""
+    out: dict[str, Any] = {"noise_scale": slam.config.robust.noise_scale, "noise": []}
+    if not slam.is_solved:
+        return out | {"noise_unknown": "nothing is solved"}
+    try:
+        return out | {"noise": [asdict(one) for one in slam.noise_scale()]}
+    except GraphSlamError as error:  # what cannot be said of a singular map must not cost its results
+        return out | {"noise_unknown": str(error)}
 
 
 def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise
+from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise, factors_of
 from graph_slam_ros.slam.robust.background import Background, Work, run_when_asked
 from graph_slam_ros.slam.robust.displacement import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
@@ -102,7 +102,7 @@ class Backend:
         if held[0]:
             self._hold(*held)
         if self._config.noise_scale != "estimated":
-            self.noise.change(dict.fromkeys(self.noise.factors, 1.0), self._first_free_edge)
+            self.noise.change(self.noise.neutral(), self._first_free_edge)
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
         report = self.solver.optimize(self.solver.settings.until_still())  # what is believed was decided before
         self.decisions.recalibrate()
@@ -189,14 +189,14 @@ class Backend:
         for _ in range(_NOISE_ROUNDS if everything else _NOISE_ROUNDS_ONLINE):
             before = dict(self.noise.factors)
             try:
-                found = {one.key: one.factor for one in self.noise_scale(keyframes) if not one.reason}
+                found = factors_of(self.noise_scale(keyframes))
                 if not self.noise.change(found, first_edge):
                     break
                 self.solver.rebuild()
                 report = self.solver.optimize(everything)
             except Exception as error:
                 self._counters.count("noise_scale", type(error).__name__)
-                if self.noise.change(dict.fromkeys(self.noise.factors, 1.0) | before, first_edge):
+                if self.noise.change(self.noise.neutral() | before, first_edge):
                     self.solver.rebuild()
                     report = self.solver.optimize(everything)
                 break

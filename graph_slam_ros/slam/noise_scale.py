@@ -18,7 +18,8 @@ import numpy as np
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
-from graph_slam_ros.slam.frontend.noise_factors import Key, groups, parts_of
+from graph_slam_ros.slam.frontend.noise_factors import PER_M, PER_RAD, Key, groups, grows, parts_of
+from graph_slam_ros.slam.motion_noise import Growth, Motions, fit_growth, growth_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import Losses
 from graph_slam_ros.typing import Array, Index
@@ -26,6 +27,7 @@ from graph_slam_ros.typing import Array, Index
 PASS_ENDS_NS = 2_000_000_000  # a landmark that is not seen for so long is passed again
 LEAST_IN_PASS, LEAST_PASSES = 3, 10
 LEAST_DOF = 200.0  # of a group: below it says too little
+LEAST_DOF_OF_MOTION = 20.0  # of odometry, whose estimate changes the less the less is known
 MOST_OUTLIERS = 0.05
 LEAST_WEIGHT = 0.1  # by the loss: an edge with less is an outlier
 SMALLEST, LARGEST = 0.3, 3.0  # factor of a sigma
@@ -47,6 +49,9 @@ class NoiseScale:
     design_effect : how alike errors of one pass by a landmark are: 1 for independent ones
     factor : what the configured sigmas should be multiplied by; where that is not known, what they are multiplied by
     reason : why it is not known; empty where it is
+    per_rad, per_m : of odometry: the variance [m^2 or rad^2, summed over the directions of the part] that should be
+        added for each radian turned and each metre driven; where that is not known, what is added
+    per_s : of odometry: the rest of the variance, for each second
     """
 
     label: str
@@ -58,11 +63,41 @@ class NoiseScale:
     design_effect: float
     factor: float
     reason: str = ""
+    per_rad: float = 0.0
+    per_m: float = 0.0
+    per_s: float = 0.0
 
     @property
     def key(self) -> Key:
         """The key of its group."""
         return self.label, self.source, self.part
+
+
+def factors_of(scales: Sequence[NoiseScale]) -> dict[Key, float]:
+    """The factors and added variances of the groups for which they are known."""
+    out = dict[Key, float]()
+    for one in scales:
+        if not one.reason:
+            out[one.key] = one.factor
+            if one.label == "odometry":
+                out[one.label, one.source, one.part + PER_RAD] = one.per_rad
+                out[one.label, one.source, one.part + PER_M] = one.per_m
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Errors:
+    """Errors of a part of odometry, of the edges that are sampled: as for ``fit_growth``.
+
+    Attributes
+    ----------
+    own_per_s : variance for each second as configured, of all edges
+    """
+
+    motions: Motions
+    square: Array
+    left: Array
+    own_per_s: float
 
 
 @dataclass(slots=True)
@@ -77,6 +112,7 @@ class _Sums:
     passes: int = 0
     of_means: float = 0.0
     of_singles: float = 0.0
+    errors: _Errors | None = None
 
 
 def estimate_noise(
@@ -105,9 +141,26 @@ def estimate_noise(
             block = _Block(table, rows, label, solver, values, losses)
             passes = _passes(block.ends, stamp_of) if label == "landmarks" else []
             for part, axes in parts_of(table.type, label, block.measured).items():
-                key = (label, source, part)
-                block.add_to(sums.setdefault(key, _Sums()), axes, factors.get(key, 1.0), passes)
-    return [_scale(key, total, factors.get(key, 1.0)) for key, total in sums.items()]
+                key, total = (label, source, part), sums.setdefault((label, source, part), _Sums())
+                if grows(table.type, label):
+                    now = growth_of(factors, key)
+                    block.add_odometry(total, axes, now, stamp_of)
+                else:
+                    block.add_to(total, axes, factors.get(key, 1.0), passes)
+    scales = [_scale(key, total, factors.get(key, 1.0)) for key, total in sums.items()]
+    return [_grown(one, sums[one.key].errors, growth_of(factors, one.key)) for one in scales]
+
+
+def _grown(one: NoiseScale, errors: "_Errors | None", now: Growth) -> NoiseScale:
+    """The scale of a part of odometry, with how it grows; any other is as it was."""
+    if errors is None:
+        return one
+    if one.reason:
+        return replace(one, per_rad=now.per_rad, per_m=now.per_m, per_s=now.factor**2 * errors.own_per_s)
+    is_rotation = one.part == "rotation"
+    found = fit_growth(errors.motions, errors.square, errors.left, now, is_rotation=is_rotation)
+    per_s = found.factor**2 * errors.own_per_s
+    return replace(one, factor=found.factor, per_rad=found.per_rad, per_m=found.per_m, per_s=per_s)
 
 
 class _Block:
@@ -145,6 +198,26 @@ class _Block:
             total.of_means += len(those) * float(np.sum(white[those].mean(axis=0) ** 2))
             total.of_singles += float(np.mean(np.sum(white[those] ** 2, axis=1)))
 
+    def _seconds(self, stamp_of: Index) -> float:
+        """The time between the vertices of its edges, in all."""
+        return float(np.sum(np.abs(np.diff(stamp_of[self.ends[:, :2]], axis=1)))) * 1e-9
+
+    def add_odometry(self, total: "_Sums", axes: Array, now: Growth, stamp_of: Index) -> None:
+        """Add a part of odometry's residuals, and how its noise grows."""
+        count, kinds = len(self.residual), axes.shape[2]
+        variance = np.einsum("nij,nik,nkj->n", axes, self.covariance, axes)
+        square = np.sum(np.einsum("nij,ni->nj", axes, self.residual) ** 2, axis=1)
+        known = np.einsum("nij,nik,nkj->n", axes[self.sampled], self.hat, axes[self.sampled])
+        motions = Motions.of(self.measured, variance, now)
+        share = known / variance[self.sampled]
+        total.edges += count
+        total.residuals += float(kinds * count)
+        total.leverage += float(share.mean()) * kinds * count
+        total.chi2 += kinds * float(np.sum(square / motions.own))
+        own_per_s = float(motions.own.sum()) / max(1e-9, self._seconds(stamp_of))
+        sampled = motions.at(self.sampled), square[self.sampled], known
+        total.errors = _Errors(*sampled, own_per_s)
+
 
 def _passes(ends: Index, stamp_of: Index) -> list[Index]:
     """Sightings of each pass by a landmark, those of three or more."""
@@ -162,10 +235,13 @@ def _scale(key: Key, total: _Sums, factor_now: float) -> NoiseScale:
     if total.passes >= LEAST_PASSES and total.of_singles > 0.0:
         design_effect = max(1.0, total.of_means / total.of_singles)
     scale = NoiseScale(*key, total.edges, dof, per_dof, design_effect, factor_now)
-    if dof < LEAST_DOF:
-        return replace(scale, reason=f"{max(dof, 0.0):.0f} degrees of freedom, fewer than {LEAST_DOF:.0f}")
+    least = LEAST_DOF_OF_MOTION if total.errors else LEAST_DOF
+    if dof < least:
+        return replace(scale, reason=f"{max(dof, 0.0):.0f} degrees of freedom, fewer than {least:.0f}")
     if total.outliers > MOST_OUTLIERS * total.edges:
         return replace(scale, reason=f"{total.outliers / total.edges:.0%} outliers, more than {MOST_OUTLIERS:.0%}")
+    if total.errors is not None:
+        return scale
     factor = float(np.sqrt(per_dof * design_effect))
     if factor < 1.0 and key[0] == "landmarks" and total.passes < LEAST_PASSES:
         few = f"{total.passes} passes by landmarks, fewer than {LEAST_PASSES}: smaller sigmas are not believed"

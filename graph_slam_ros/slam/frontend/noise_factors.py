@@ -1,4 +1,8 @@
-"""Edges whose noise is what is configured, times factors: by class of edges, input and part of the residual."""
+"""Edges whose noise is what is configured, times factors: by class of edges, input and part of the residual.
+
+Odometry errs with what was turned and driven, which configured noise may not say. The variance of an edge of odometry
+is therefore what is configured times a factor, plus a variance for each radian turned and each metre driven.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,15 +17,41 @@ from graph_slam_ros.typing import Array, Index
 CLASSES = ("odometry", "landmarks", "fixes", "closures", "custom")
 FIRST_DUE = 50  # keyframes
 LEAST_CHANGE = 0.02  # of a sigma: less changes nothing
+_LEAST_OWN = 1e-9  # part of a variance that is not of the motion: less is rounding
+
+PER_RAD, PER_M = " per rad", " per m"
 
 Key = tuple[str, str, str]
-"""Class of edges, input, part of the residual."""
+"""Class of edges, input, part of the residual; of odometry with ``PER_RAD`` or ``PER_M`` a variance that is added."""
+
+
+def grows(edge: EdgeType, label: str) -> bool:
+    """Return whether the noise of edges grows with the motion that they measured."""
+    return label == "odometry" and edge.name.removesuffix(" 3D") == "relative pose"
+
+
+def motion_sizes(measured: Array) -> tuple[Array, Array]:
+    """Radians turned and metres driven by motions (n, 3) or (n, 7): each (n,)."""
+    if measured.shape[1] == 3:
+        return np.abs(measured[:, 2]), np.hypot(measured[:, 0], measured[:, 1])
+    turned = 2.0 * np.arctan2(np.linalg.norm(measured[:, 3:6], axis=1), np.abs(measured[:, 6]))
+    return turned, np.linalg.norm(measured[:, :3], axis=1)
+
+
+def added_variance(part: str, of_group: Mapping[str, float], measured: Array) -> Array:
+    """The variance that motions add to a part of odometry's, summed over its directions: (n,)."""
+    turned, way = motion_sizes(measured)
+    return of_group.get(part + PER_RAD, 0.0) * turned + of_group.get(part + PER_M, 0.0) * way
+
+
+def configured_variance(now: Array, part: str, of_group: Mapping[str, float], measured: Array) -> Array:
+    """What a part of odometry's variance (n,) was before it was scaled, and some was added to it."""
+    own = now - added_variance(part, of_group, measured)
+    return np.maximum(own, _LEAST_OWN * now) / of_group.get(part, 1.0) ** 2
 
 
 def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
     """Split the residual of edges into parts: orthonormal directions (n, m, k) of each.
-
-    Odometry is one part: what little its edges say of their own noise does not tell position from heading.
 
     Parameters
     ----------
@@ -36,7 +66,7 @@ def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
         return _sight_parts(measured[:, :m])
     if name == "range and bearing":
         return {"range": axes[:, :, :1], "bearing": axes[:, :, 1:]}
-    if name in ("relative pose", "pose prior") and label != "odometry":
+    if name in ("relative pose", "pose prior"):
         d = {3: 2, 6: 3}[m]
         return {"position": axes[:, :, :d], "rotation": axes[:, :, d:]}
     if name.startswith("range") or name == "bearing":
@@ -68,20 +98,22 @@ class Rescaling:
     Attributes
     ----------
     first, last : of the edges; ``last`` is the first that is not among them
-    changed : by how much sigmas of each group were multiplied
+    before, after : the factors of each group that changed
     """
 
     first: int
     last: int
-    changed: dict[Key, float]
+    before: dict[Key, float]
+    after: dict[Key, float]
 
     def apply(self, graph: Graph) -> None:
-        """Multiply sigmas of those of its edges that are there; whoever has solved with them must begin anew."""
+        """Rescale those of its edges that are there; whoever has solved with them must begin anew."""
         for table, rows, label, source in groups(graph, range(self.first, self.last)):
-            factors = _of(self.changed, label, source)
-            if factors:
+            before, after = _of(self.before, label, source), _of(self.after, label, source)
+            if after:
                 roots = table.sqrt_information.values
-                roots[rows] = _rescaled(table.type, label, table.measured.values[rows], roots[rows], factors)
+                measured = table.measured.values[rows]
+                roots[rows] = _rescaled(table.type, label, measured, roots[rows], before, after)
 
 
 class NoiseScales:
@@ -115,30 +147,56 @@ class NoiseScales:
         factors = _of(self.factors, label, source)
         if factors:
             z = edge.whole(np.asarray(measured, dtype=float)[None])
-            noise = Gaussian(_rescaled(edge, label, z, noise.sqrt_information[None], factors)[0])
+            noise = Gaussian(_rescaled(edge, label, z, noise.sqrt_information[None], {}, factors)[0])
         return self.graph.add_edge(edge, vertices, measured, noise, label, source)
 
     def change(self, factors: Mapping[Key, float], first_edge: int) -> bool:
         """Have all edges from a number on, and all that come, scaled by these factors; whether that changed them."""
-        changed = {key: factor / self.factors.get(key, 1.0) for key, factor in factors.items()}
-        if all(abs(np.log(ratio)) < LEAST_CHANGE for ratio in changed.values()):
+        before = {key: self.factors.get(key, neutral(key)) for key in factors}
+        if all(_is_same(before[key], factor) for key, factor in factors.items()):
             return False
-        rescaling = Rescaling(first_edge, self.graph.edge_count, changed)
+        rescaling = Rescaling(first_edge, self.graph.edge_count, before, dict(factors))
         rescaling.apply(self.graph)
         self.factors |= factors
         self.history.append(rescaling)
         return True
+
+    def neutral(self) -> dict[Key, float]:
+        """Factors of all groups that change nothing."""
+        return {key: neutral(key) for key in self.factors}
+
+
+def neutral(key: Key) -> float:
+    """Return the factor, or the added variance, that changes nothing."""
+    return 0.0 if key[2].endswith((PER_RAD, PER_M)) else 1.0
+
+
+def _is_same(before: float, after: float) -> bool:
+    return abs(after - before) <= LEAST_CHANGE * before
 
 
 def _of(factors: Mapping[Key, float], label: str, source: str) -> dict[str, float]:
     return {part: factor for (one, other, part), factor in factors.items() if (one, other) == (label, source)}
 
 
-def _rescaled(edge: EdgeType, label: str, measured: Array, roots: Array, factors: Mapping[str, float]) -> Array:
+def _rescaled(
+    edge: EdgeType, label: str, measured: Array, roots: Array, before: Mapping[str, float], after: Mapping[str, float]
+) -> Array:
     narrower = np.zeros((len(measured), edge.residual_size, edge.residual_size))
     for part, axes in parts_of(edge, label, measured).items():
-        narrower += axes @ np.swapaxes(axes, 1, 2) / factors.get(part, 1.0)
+        ratio = np.full(len(measured), after.get(part, 1.0) / before.get(part, 1.0))
+        if grows(edge, label):
+            now = variance_of(roots, axes)
+            own = configured_variance(now, part, before, measured) * after.get(part, 1.0) ** 2
+            ratio = np.sqrt((own + added_variance(part, after, measured)) / now)
+        narrower += axes @ np.swapaxes(axes, 1, 2) / ratio[:, None, None]
     return roots @ narrower
+
+
+def variance_of(roots: Array, axes: Array) -> Array:
+    """The variance along directions (n, m, k), summed over these: (n,)."""
+    spread = np.linalg.solve(np.swapaxes(roots, 1, 2), axes)
+    return np.einsum("nij,nij->n", spread, spread)
 
 
 def groups(graph: Graph, edges: range) -> Iterator[tuple[EdgeTable, Index, str, str]]:
@@ -163,6 +221,6 @@ def factors_record(factors: Mapping[Key, float]) -> list[list[Any]]:
 def read_factors(factors: Sequence[Any]) -> dict[Key, float]:
     """Inverse of ``factors_record``. Raises ValueError where a factor is not above 0."""
     out = {(str(label), str(source), str(part)): float(factor) for label, source, part, factor in factors}
-    if not all(np.isfinite(factor) and factor > 0.0 for factor in out.values()):
+    if not all(np.isfinite(factor) and (factor > 0.0 or factor == neutral(key)) for key, factor in out.items()):
         raise ValueError(f"a factor of the noise is not above 0: {factors}")
     return out

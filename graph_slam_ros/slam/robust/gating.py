@@ -352,7 +352,9 @@ class OutlierGate:
         freedom = self._solver.degrees_of_freedom
         self.is_calibrated = freedom >= _TYPICAL
         if self.is_calibrated:
-            noise_ratio = self._solver.evaluate().chi2_final / freedom
+            # estimated noise allows for errors that are alike, so residuals are smaller: that says nothing of odometry
+            is_stated = self._config.noise_scale == "configured"
+            noise_ratio = self._solver.evaluate().chi2_final / freedom if is_stated else 1.0
             self._gate_scale = min(factor, max(_TIGHTEST, factor * noise_ratio))
         edges = np.concatenate((inside, ledger.outside))
         ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])

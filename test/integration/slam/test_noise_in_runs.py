@@ -5,13 +5,18 @@ import json
 import numpy as np
 import pytest
 
+from graph_slam_ros.analysis.consistency import noise_advice
 from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.config.config import Config
+from graph_slam_ros.config.frontend import OdometryConfig
+from graph_slam_ros.errors import SingularError
 from graph_slam_ros.runs.map_journal import read_map
+from graph_slam_ros.runs.outcome import unscaled
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.simulation import measurements, simulate, write_bag
 from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.frontend.noise_factors import FIRST_DUE
+from graph_slam_ros.slam.noise_scale import NoiseScale
 
 ESTIMATED = Config.from_mapping({"robust.noise_scale": "estimated"})
 
@@ -58,7 +63,8 @@ def test_a_run_that_goes_on_in_the_map_keeps_its_factors_or_goes_back_to_what_is
     saved = read_map(folder / "estimated", [])
     slam = GraphSlam(ESTIMATED if is_estimated else Config(), start=saved)
     expected = (estimated if is_estimated else configured).graph
-    assert set(slam.noise_factors.values()) == (set(estimated.noise_factors.values()) if is_estimated else {1.0})
+    neutral = slam.backend.noise.neutral()
+    assert slam.noise_factors == (estimated.noise_factors if is_estimated else neutral)
     for table in slam.graph.tables.values():
         same = expected.tables[table.type]
         count = min(len(same), len(table))
@@ -88,7 +94,51 @@ def test_the_summary_says_it_by_class_input_and_part(drive):
     folder, *_ = drive
     noise = json.loads((folder / "configured" / "run.json").read_text())["noise"]
     assert {(one["label"], one["source"], one["part"]) for one in noise} == {
-        ("odometry", "odom", "all"),
+        ("odometry", "odom", "position"),
+        ("odometry", "odom", "rotation"),
         ("landmarks", "detections", "position"),
         ("landmarks", "detections", "rotation"),
     }
+
+
+def test_a_drive_that_says_too_little_of_its_noise_is_told_so_at_its_end(drive):
+    folder, *_ = drive
+    summary = json.loads((folder / "estimated" / "run.json").read_text())
+    assert list(unscaled(summary)) == []
+    few = "61 degrees of freedom, fewer than 200"
+    summary["noise"][1]["reason"] = few
+    (said,) = unscaled(summary)
+    assert f"{summary['noise'][1]['source']} {summary['noise'][1]['part']}: {few}" in said
+    assert list(unscaled(summary | {"noise_scale": "configured"})) == []
+
+
+def test_a_map_whose_noise_cannot_be_estimated_says_why(tmp_path, monkeypatch):
+    write_bag(simulate("warehouse", 1, laps=1, aisles=2, aisle_m=4), tmp_path / "short.mcap")
+
+    def fails(*_arguments):
+        raise SingularError("landmark 3 is not determined")
+
+    monkeypatch.setattr("graph_slam_ros.slam.backend.estimate_noise", fails)
+    run = replay(tmp_path / "short.mcap", tmp_path / "run", ESTIMATED)
+    saved = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (saved["noise"], saved["noise_unknown"]) == ([], "landmark 3 is not determined")
+    assert any("no noise could be estimated at the end: landmark 3" in one for one in run.warnings)
+
+
+def test_parameters_that_say_the_estimated_noise_of_odometry_are_printed():
+    found = [
+        NoiseScale("odometry", "odom", "rotation", 100, 300.0, 2.0, 1.0, 0.5, "", 0.04, 0.002, 0.0003),
+        NoiseScale("odometry", "odom", "position", 100, 300.0, 2.0, 1.0, 2.0, "", 0.0, 0.0034, 0.00017),
+    ]
+    by_twist = noise_advice(found, is_applied=False, odometry=OdometryConfig())
+    turn, way = "turn_per_rad=0.04 turn_per_m=0.002 turn_per_s=0.0003", "way_per_m=0.0032 way_per_s=0.00016"
+    expected = " ".join(f"--set odometry.{one}" for one in f"noise=motion {turn} {way}".split())
+    assert by_twist.endswith(f"odometry for good: {expected}")
+    by_motion = noise_advice(found, is_applied=False, odometry=OdometryConfig(noise="motion"))
+    assert "turn_per_rad=0.045 --set odometry.turn_per_m=0.0025 --set odometry.turn_per_s=5e-05" in by_motion
+
+
+def test_gates_are_not_made_smaller_by_noise_that_is_made_larger_for_errors_that_are_alike(drive):
+    _, configured, estimated = drive
+    assert configured.backend.decisions.gate_scale < estimated.backend.decisions.gate_scale
+    assert estimated.backend.decisions.gate_scale == Config().robust.noise_factor ** 2
