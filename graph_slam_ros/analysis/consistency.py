@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
-from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.typing import Array
 
@@ -105,7 +105,7 @@ class Consistency:
 
 
 def _growth(one: NoiseScale) -> str:
-    """What is added to a variance of odometry with what was turned and driven."""
+    """Format the variance that turning and driving add to odometry."""
     unit = "rad^2" if one.part == "rotation" else "m^2"
     added = {"rad": one.per_rad, "m": one.per_m}
     return "".join(f" + {value:.2g} {unit}/{per}" for per, value in added.items() if value > 0.0)
@@ -190,19 +190,19 @@ def landmark_errors(
     return (true - positions)[:, :dimensions], relative
 
 
-def noise_advice(noise: Sequence[NoiseScale], *, is_applied: bool, odometry: OdometryConfig | None = None) -> str:
+def noise_advice(noise: Sequence[NoiseScale], *, is_applied: bool, config: Config | None = None) -> str:
     """The advice if residuals contradict the configured sigmas; else empty.
 
     Parameters
     ----------
     is_applied : whether the run used the factors already
-    odometry : parameters of the run; with these, parameters of odometry that say what was found
+    config : parameters of the run; with these, parameters of odometry that say what was found
     """
     wrong = [one for one in noise if not one.reason and _is_wrong(one)]
     if not wrong:
         return ""
     out = "the run used these factors" if is_applied else f"replay with --set {_ESTIMATED} to use these factors"
-    line = motion_setting([one for one in wrong if one.label == "odometry"], odometry) if odometry else ""
+    line = motion_setting([one for one in wrong if one.label == "odometry"], config) if config else ""
     return f"{out}\nodometry for good: {line}" if line else out
 
 
@@ -210,21 +210,22 @@ def _is_wrong(one: NoiseScale) -> bool:
     return one.per_rad > 0.0 or one.per_m > 0.0 or abs(np.log(one.factor)) > _WORTH_SAYING
 
 
-def motion_setting(noise: Sequence[NoiseScale], config: OdometryConfig) -> str:
+def motion_setting(noise: Sequence[NoiseScale], config: Config) -> str:
     """Parameters of ``odometry.noise: motion`` that say the estimated noise of odometry; empty where there is none."""
-    if not noise or config.noise == "density":
+    c = config.odometry
+    if not noise or c.noise == "density":
         return ""
     values = dict[str, float]()
     for one in noise:
         name = {"rotation": "turn", "position": "way"}[one.part]
         # a position's is summed over its directions
-        along = 1.0 if name == "turn" else 1.0 + (config.lateral_density / config.translation_density) ** 2
+        along = 1.0 if name == "turn" else 1.0 + (c.lateral_density / c.translation_density) ** 2
         found = {"per_rad": one.per_rad / along, "per_m": one.per_m / along, "per_s": one.per_s / along}
-        if config.noise == "motion":
-            found["per_s"] = one.factor**2 * getattr(config, f"{name}_per_s")
-            found["per_m"] += one.factor**2 * getattr(config, f"{name}_per_m")
-            found["per_rad"] += one.factor**2 * getattr(config, f"{name}_per_rad", 0.0)
-        values |= {f"{name}_{per}": value for per, value in found.items() if hasattr(config, f"{name}_{per}")}
+        if c.noise == "motion":
+            found["per_s"] = one.factor**2 * getattr(c, f"{name}_per_s")
+            found["per_m"] += one.factor**2 * getattr(c, f"{name}_per_m")
+            found["per_rad"] += one.factor**2 * getattr(c, f"{name}_per_rad", 0.0)
+        values |= {f"{name}_{per}": value for per, value in found.items() if hasattr(c, f"{name}_{per}")}
     return "--set odometry.noise=motion " + " ".join(f"--set odometry.{k}={v:.2g}" for k, v in values.items())
 
 

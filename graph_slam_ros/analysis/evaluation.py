@@ -280,7 +280,7 @@ def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
     is_held, noise = _noise(run)
     config = run_config(run)
     is_applied = config.robust.noise_scale == "estimated"
-    advice = noise_advice(noise, is_applied=is_applied, odometry=config.odometry)
+    advice = noise_advice(noise, is_applied=is_applied, config=config)
     reason = _why_no_nees(known, drive, path, true, is_held)
     if reason:
         return Consistency(None, None, None, noise, {"poses and landmarks": reason}, advice)

@@ -16,8 +16,8 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 * ``processed``: records of the ingest sequence that all of it came of; ``used``: stamp and input of the last odometry
   that was used by then;
 * ``noise``: factors of the configured sigmas that the edges have from now on, ``[class, input, part, factor]`` each;
-  ``rescaled``: changes of edges of earlier records, in order: first edge, the first that is not among them, and by how
-  much the sigmas of each group were multiplied, as in ``noise``;
+  ``rescaled``: changes of edges of earlier records, in order: first edge, the first that is not among them, and the
+  factors of the groups that changed, before and after, as in ``noise``;
 * ``calibration``: corrections with those configured, ``[input, name, value]`` each; ``recalibrated``: edges of
   earlier records as they are by these: edge type, rows of its table, numbers measured, square roots of the information;
 * ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are; ``held``: the
@@ -123,9 +123,7 @@ class MapGrowth:
             out["noise"] = factors_record(a.noise_factors)
             self._noise = dict(a.noise_factors)
         changes = a.noise_changes[self._rescaled :] if first_edge else ()
-        out["rescaled"] = [
-            [one.first, one.last, factors_record(one.before), factors_record(one.after)] for one in changes
-        ]
+        out["rescaled"] = [one.as_record() for one in changes]
         self._rescaled = len(a.noise_changes)
         if a.calibration != self._calibration:
             out["calibration"], self._calibration = totals_record(a.calibration), dict(a.calibration)
@@ -320,8 +318,8 @@ def _apply_verdicts(state: MapSnapshot) -> None:
 
 def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     graph, ledger = state.graph, state.ledger
-    for first, last, *factors in record.get("rescaled", ()):
-        Rescaling(first, last, *map(read_factors, factors)).apply(graph)
+    for one in record.get("rescaled", ()):
+        Rescaling.from_record(one).apply(graph)
     for one in record.get("recalibrated", ()):
         Recalibration.from_record(one).apply(graph)
     state.calibration |= read_totals(record.get("calibration", ()))

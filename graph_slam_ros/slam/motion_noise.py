@@ -1,4 +1,4 @@
-"""How the noise of odometry grows with what was turned and driven, estimated from its residuals.
+"""Noise of odometry that grows with what was turned and driven, estimated from its residuals.
 
 The variance of an edge is what is configured times a factor, plus a variance for each radian turned and each metre
 driven: components of variance. They are estimated by expectation and maximisation (Dempster, Laird, Rubin, "Maximum

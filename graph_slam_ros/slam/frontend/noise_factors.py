@@ -45,7 +45,7 @@ def added_variance(part: str, of_group: Mapping[str, float], measured: Array) ->
 
 
 def configured_variance(now: Array, part: str, of_group: Mapping[str, float], measured: Array) -> Array:
-    """What a part of odometry's variance (n,) was before it was scaled, and some was added to it."""
+    """The configured variance (n,) of a part of odometry, from that which is scaled and added to."""
     own = now - added_variance(part, of_group, measured)
     return np.maximum(own, _LEAST_OWN * now) / of_group.get(part, 1.0) ** 2
 
@@ -105,6 +105,16 @@ class Rescaling:
     last: int
     before: dict[Key, float]
     after: dict[Key, float]
+
+    def as_record(self) -> list[Any]:
+        """Plain values."""
+        return [self.first, self.last, factors_record(self.before), factors_record(self.after)]
+
+    @classmethod
+    def from_record(cls, record: Sequence[Any]) -> "Rescaling":
+        """Inverse of ``as_record``. Raises ValueError where a factor is not above 0."""
+        first, last, before, after = record
+        return cls(first, last, read_factors(before), read_factors(after))
 
     def apply(self, graph: Graph) -> None:
         """Rescale those of its edges that are there; whoever has solved with them must begin anew."""

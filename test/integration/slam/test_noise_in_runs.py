@@ -8,7 +8,6 @@ import pytest
 from graph_slam_ros.analysis.consistency import noise_advice
 from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.config.config import Config
-from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.runs.map_journal import read_map
 from graph_slam_ros.runs.outcome import unscaled
@@ -130,11 +129,11 @@ def test_parameters_that_say_the_estimated_noise_of_odometry_are_printed():
         NoiseScale("odometry", "odom", "rotation", 100, 300.0, 2.0, 1.0, 0.5, "", 0.04, 0.002, 0.0003),
         NoiseScale("odometry", "odom", "position", 100, 300.0, 2.0, 1.0, 2.0, "", 0.0, 0.0034, 0.00017),
     ]
-    by_twist = noise_advice(found, is_applied=False, odometry=OdometryConfig())
+    by_twist = noise_advice(found, is_applied=False, config=Config())
     turn, way = "turn_per_rad=0.04 turn_per_m=0.002 turn_per_s=0.0003", "way_per_m=0.0032 way_per_s=0.00016"
     expected = " ".join(f"--set odometry.{one}" for one in f"noise=motion {turn} {way}".split())
     assert by_twist.endswith(f"odometry for good: {expected}")
-    by_motion = noise_advice(found, is_applied=False, odometry=OdometryConfig(noise="motion"))
+    by_motion = noise_advice(found, is_applied=False, config=Config.from_mapping({"odometry.noise": "motion"}))
     assert "turn_per_rad=0.045 --set odometry.turn_per_m=0.0025 --set odometry.turn_per_s=5e-05" in by_motion
 
 
