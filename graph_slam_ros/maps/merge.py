@@ -209,7 +209,9 @@ class _Second:
         free = chain([one.edit.name], (f"{one.edit.name}-{k}" for k in count(2)))
         name = next(name for name in free if name not in names)
         edges, added = (tuple(number[e] for e in ids if e in number) for ids in (one.edges, one.added))
-        return AppliedEdit(replace(one.edit, name=name), self._keyframes + one.keyframe, edges, added).record
+        arguments = {key: number.get(int(x), x) if key == "edge" else x for key, x in one.edit.arguments.items()}
+        edit = replace(one.edit, name=name, arguments=arguments)
+        return AppliedEdit(edit, self._keyframes + one.keyframe, edges, added).record
 
     def _bridge(self) -> list[Any]:
         """A weak edge from the last keyframe of the first map to the first keyframe of the second."""

@@ -11,6 +11,8 @@ from driven import drive, with_a_wrong_sighting, without_names
 from graph_slam_ros import cli, read_g2o
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.maps.alignment import laid_on
+from graph_slam_ros.maps.edit import Plan, edit, source_hash
+from graph_slam_ros.measurements.edits import edit_of
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.folder import run_config
@@ -525,3 +527,21 @@ def test_without_names_and_with_closures_a_frozen_map_stays(tmp_path):
     assert not any(slam.ledger.is_withdrawn(edge) for edge in closures[is_ours].tolist())
     assert all(slam.ledger.is_withdrawn(edge) for edge in closures[~is_ours].tolist())
     assert not any(mark.is_tentative for mark in read_map(tmp_path / "frozen", []).landmarks.values())
+
+
+def test_merge_keeps_the_edits_of_both_with_the_ids_of_their_edges(first, second, tmp_path):
+    edited = []
+    for number, folder in enumerate((first, second)):
+        edge = next(e.edge for e in SavedGraph(folder, []).entries if e.label == "landmarks" and e.is_in)
+        values = {"name": "a", "who": "Anna", "when": "2026-05-04T10:30:00Z", "why": "w", "do": "let_in_edge"}
+        plan = Plan(source_hash(folder), (edit_of(values | {"edge": edge}),))
+        edited.append(tmp_path / f"edited_{number}")
+        edit(folder, plan, edited[-1])
+    assert run("merge", *edited, "--out", tmp_path / "both") == 0
+    merged = SavedGraph(tmp_path / "both", [])
+    assert [one.edit.name for one in merged.edits] == ["a", "a-2"]
+    for one in merged.edits:
+        (out,), (added,) = one.edges, one.added
+        assert one.edit.arguments["edge"] == out
+        assert (merged.entries[out].is_in, merged.entries[added].is_in) == (False, True)
+        assert merged.entries[out].measured == merged.entries[added].measured
