@@ -116,7 +116,7 @@ KINDS: dict[str, Kind] = {
         "the robot drives more or less than odometry says", "wheel radius; odometry.distance_factor"
     ),
     "turn_scale": Kind("the robot turns more or less than odometry says", "track width; odometry.turn_factor"),
-    "not_observable": Kind("the drive does not tell a clock, mount or scale", "the manoeuvre that the text names"),
+    "not_observable": Kind("the drive cannot determine a clock, mount or scale", "the manoeuvre that the text names"),
     "over_confident": Kind("residuals of an input are larger than its noise says", "robust.noise_scale=estimated"),
     "odometry_over_confident": Kind("odometry is worse than its noise says", "robust.noise_scale=estimated"),
     "id_reused": Kind("an identity is of two places in turn", "one id for each landmark"),

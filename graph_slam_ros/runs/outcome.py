@@ -172,7 +172,7 @@ def unscaled(summary: Summary) -> Iterator[str]:
     unknown = [one for one in summary.get("noise", ()) if one["reason"]]
     if unknown:
         groups = "; ".join(f"{one['label']} {one['source']} {one['part']}: {one['reason']}" for one in unknown)
-        yield f"robust.noise_scale=estimated: not estimated at the end: {groups}; a longer drive tells more"
+        yield f"robust.noise_scale=estimated: not estimated at the end: {groups}; a longer drive has more data"
 
 
 def _unused(summary: Summary, name: str, received: int | None) -> str:

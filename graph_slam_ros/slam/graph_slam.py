@@ -62,7 +62,6 @@ class GraphSlam(MapView):
     ----------
     counters : counts of what was refused, repaired and used
     settings : parameters that were changed on the way
-    processed : measurements and control events that were handed over
     """
 
     def __init__(
@@ -87,7 +86,7 @@ class GraphSlam(MapView):
         kidnaps = KidnapDetector(config.space, config.odometry, backend, counters, frontend.path.segments)
         super().__init__(config, backend, frontend, landmarks, kidnaps, solution)
         self.settings: dict[str, Value] = {}
-        self.processed, self._sink, self._faults = 0, sink, Faults(counters)
+        self._sink, self._faults = sink or (lambda measurement: None), Faults(counters)
         self._anchor, self._edits = Anchor(config, backend), Edits(backend, landmarks.map, counters)
         self._custom = CustomEdges(config, backend, frontend, landmarks.map, self._anchor, counters)
         self._calibrator = Calibrator(config, backend, frontend, landmarks.map, counters, executor, start)
@@ -98,14 +97,17 @@ class GraphSlam(MapView):
                 self._solve(self.config.solver_settings())
         self._updates = UpdateLog(self)
 
+    @property
+    def processed(self) -> int:
+        """The number of measurements and control events that were handed over."""
+        return self._updates.begun
+
     def process(self, measurement: Measurement) -> Update:
         """Process one measurement or control event; returns what it changed.
 
         Of several faults the first is raised when all else was used; the others are counted.
         """
-        if self._sink is not None:
-            self._sink(measurement)
-        self.processed += 1
+        self._sink(measurement)
         self._updates.begin()
         with self._faults:
             self._process(measurement)
@@ -260,8 +262,7 @@ class GraphSlam(MapView):
 
     def restart(self) -> None:
         """Go back to the last good estimate, after a fault outside."""
-        self._solution.guard.go_back()
-        self._solution.vertices = 0
+        self._solution.go_back()
 
     def _set(self, values: dict[str, Value]) -> None:
         before, self.config = self.config, self.config.changed(values)

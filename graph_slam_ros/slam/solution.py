@@ -93,6 +93,11 @@ class Solution:
         self.vertices, self._edges = self._backend.handed_over
         self.begin(newest, keyframes)
 
+    def go_back(self) -> None:
+        """Take the last good estimate; it is not that of all edges."""
+        self.guard.go_back()
+        self.vertices = 0
+
     def is_due(self, keyframes: int, every_keyframes: int) -> bool:
         """Return whether there is enough that is unsolved."""
         return keyframes - self._keyframes + self.resting >= every_keyframes

@@ -54,10 +54,15 @@ NOTHING = Update()
 
 
 class UpdateLog:
-    """Makes each update of the difference to the one before."""
+    """Makes each update of the difference to the one before.
+
+    Attributes
+    ----------
+    begun : the number of updates that were begun
+    """
 
     def __init__(self, view: MapView) -> None:
-        self._view = view
+        self._view, self.begun = view, 0
         self._keyframes = self._edges = self._solves = 0
         self._report: Report | None = None
         self._changes = len(view.ledger.history)  # of verdicts, that updates have reported
@@ -66,6 +71,7 @@ class UpdateLog:
     def begin(self) -> None:
         """The next update begins here."""
         view = self._view
+        self.begun += 1
         self._keyframes, self._edges = len(view.keyframes), view.backend.handed_over[1]
         self._solves, self._report = view.solves, view.report
 

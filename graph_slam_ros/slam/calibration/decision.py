@@ -93,7 +93,7 @@ def _verdict(found: TrialFit, k: int, void: str, is_corrected: bool) -> tuple[Ve
     if abs(value) < least:
         return "nothing_to_correct", f"nothing to correct ({shown})"
     if correlation > MOST_CORRELATED:
-        return "not_separable", f"not told from {other} (correlation {correlation:.2f}): {quantity.manoeuvre}"
+        return "not_separable", f"not separable from {other} (correlation {correlation:.2f}): {quantity.manoeuvre}"
     if abs(value) > PRIOR_SIGMAS * found.priors[k]:
         most = amount(parameter, PRIOR_SIGMAS * float(found.priors[k]))
         return "refused", f"not used ({shown}): beyond {most}, a wrong configuration is more likely"

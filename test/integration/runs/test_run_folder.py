@@ -356,6 +356,8 @@ OF_FILES = {
     "node/memory.py": {"_STATM.read_text"},
     "analysis/plots.py": {"figure.savefig"},  # into memory
     "solver/problem.py": {"self._pending.touch"},
+    "report/page.py": {f"(_HERE / 'page.{kind}').read_text" for kind in ("css", "html", "js")} | {"file.read_text"},
+    "report/places.py": {"Image.open"},  # from memory
 }
 
 
@@ -385,7 +387,14 @@ def test_a_reader_of_a_run_folder_follows_no_link():
                 (value,) = (ast.unparse(k.value) for k in node.keywords if k.arg == "follow")
                 if value == "True":
                     found.add(f"{path.relative_to(PACKAGE).as_posix()}: {ast.unparse(node.args[0])}")
-    assert found == {"recordings/ros1_records.py: path", "recordings/bag.py: file", "analysis/trajectories.py: path"}
+    assert found == {
+        "recordings/ros1_records.py: path",
+        "recordings/bag.py: file",
+        "analysis/trajectories.py: path",
+        "report/places.py: file",
+        "report/places.py: file.parent / os.fspath(content['image'])",  # of a floor plan that the user names
+        "cli/calibrate.py: args.config",
+    }
 
 
 def test_the_recordings_of_a_run_are_told_from_those_of_a_simulation(tmp_path, bag):
