@@ -203,6 +203,9 @@ REASONS: dict[str, Reason] = {
     "too_many_points": Reason(_REFUSED, "the cloud has more than 100,000 points", "a scan is no list of landmarks"),
     "cut_off": Reason(_REFUSED, "the cloud has fewer bytes than it says", "correct the driver"),
     "undecided": Reason(_NOTED, "a stretch of the drive may be of several places that look alike: it is left as it is"),
+    "moves_left": Reason(
+        _NOTED, "the search for landmarks that are one reached its limit of work: some of them may still be two"
+    ),
     "reassigned": Reason(_NOTED, "what was seen without identity turned out to be of another landmark"),
     "given_up": Reason(_NOTED, "a new unnamed landmark was not seen again in landmarks.give_up_s"),
     # -- edges of plugins

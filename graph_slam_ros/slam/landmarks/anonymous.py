@@ -232,6 +232,8 @@ class AnonymousLandmarks:
             return
         if found.undecided:
             self._counters.count("landmarks", "undecided", found.undecided)
+        if not found.is_whole:
+            self._counters.count("landmarks", "moves_left")
         numbers = found.numbers(self.clusters.given, self.clusters.fresh)
         values = found.carried_to(self._space, self._solver, keyframes)
         changed, gone = found.changes(self.clusters.given, numbers)

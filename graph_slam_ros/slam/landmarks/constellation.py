@@ -37,6 +37,8 @@ def laid_on_the_map(drive: Drive, e: Estimate) -> tuple[Estimate, int]:
     for _ in range(_MOST_MOVES):
         undecided = 0
         for landmark, first, last in stretches(drive, e):
+            if not drive.may_move:
+                return e, undecided
             better = _laid(drive, e, landmark, first, last)
             undecided += better is e
             if better is not None and better is not e:

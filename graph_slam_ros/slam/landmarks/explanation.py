@@ -27,6 +27,7 @@ _HELD = 1e8  # information on the first pose
 _WEAK_PRIOR = 1e-6  # on a landmark
 _NEVER = 1e9  # the cost of a slip where none may be
 _DAMPED_AT_MOST = 1e6
+_MOST_WORK = 5_000_000  # rows that are linearised for moves: half a minute, ten times what 15 minutes of driving need
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +78,7 @@ class Drive:
     scan : (M,) the scan of each cluster
     points : (M, n) clusters, from their scans
     whiten : (M, n, n)
+    work : rows of odometry and clusters that were linearised by now
     """
 
     def __init__(self, scans: Sequence[Scan], motions: Sequence[Motion], settings: BeamSettings, costs: Costs) -> None:
@@ -88,11 +90,21 @@ class Drive:
         self.sort = np.array([c.sort for one in scans for c in one.clusters])
         self.whiten = _whitening(np.array([c.covariance for one in scans for c in one.clusters]))
         self._set_motions(motions)
+        self.work = self._free = 0
 
     @property
     def size(self) -> int:
         """Scans."""
         return len(self.stamps_s)
+
+    @property
+    def may_move(self) -> bool:
+        """Return whether there is work left for moves, each of which is solved completely."""
+        return self.work - self._free < _MOST_WORK
+
+    def begin_moves(self) -> None:
+        """What was done until now does not count as the work of moves."""
+        self._free = self.work
 
     def _set_motions(self, motions: Sequence[Motion]) -> None:
         n, r, c = self.n, 1 if self.n == 2 else 3, self.settings
@@ -223,6 +235,7 @@ class Drive:
     def _normal(self, e: Estimate, loss_scale: float, *, slips: bool) -> tuple[sparse.csc_matrix, Array, Array]:
         """Gauss-Newton matrix, right-hand side, and what is added to the diagonal."""
         n, dof, size = self.n, self._dof, self.size
+        self.work += size + len(self.scan)
         total = dof * size + n * len(e.landmarks) + 2
         blocks = [self._odometry_rows(e, total, slips=slips), self._cluster_rows(e, loss_scale)]
         rows, columns, values, b = [], [], [], np.zeros(total)

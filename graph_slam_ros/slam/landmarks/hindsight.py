@@ -49,11 +49,17 @@ class FrozenScans:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """An explanation of frozen scans; so many stretches fit several places."""
+    """An explanation of frozen scans; so many stretches fit several places.
+
+    Attributes
+    ----------
+    is_whole : whether all moves were tried
+    """
 
     frozen: FrozenScans
     estimate: Estimate
     undecided: int = 0
+    is_whole: bool = True
 
     def numbers(self, given: Sequence[int], fresh: Callable[[], int]) -> Ids:
         """A number for each landmark: that of most of its clusters, each once, or a fresh one."""
@@ -177,12 +183,14 @@ def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, cost
             continue
         starts = [Estimate(position, turn, np.empty((0, drive.n)), frozen.scales, which) for position, turn in paths]
         staged = min((drive.staged(start) for start in starts), key=lambda e: e.cost)
-        found.append(Found(frozen, refined(drive, staged)))
+        drive.begin_moves()
+        found.append(Found(frozen, refined(drive, staged), is_whole=drive.may_move))
     if not found:
         return None
     best = min(found, key=lambda one: drive.total(one.estimate))
+    drive.begin_moves()
     estimate, undecided = laid_on_the_map(drive, best.estimate)
-    return replace(best, estimate=estimate, undecided=undecided)
+    return replace(best, estimate=estimate, undecided=undecided, is_whole=best.is_whole and drive.may_move)
 
 
 def _indices(given: Ids) -> tuple[Ids, Ids]:

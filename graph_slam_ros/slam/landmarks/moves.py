@@ -19,6 +19,8 @@ TRIAL = 0.1  # a solve that compares ends where an iteration gains less
 def refined(drive: Drive, e: Estimate) -> Estimate:
     """Merge and reassign until nothing changes."""
     for _ in range(_ROUNDS):
+        if not drive.may_move:
+            break
         before = e.cost
         e = merged(drive, e)
         e, is_changed = reassigned(drive, e)
@@ -34,6 +36,8 @@ def merged(drive: Drive, e: Estimate) -> Estimate:
         for key, i, j in _pairs(e.landmarks):
             if key in tried:
                 continue
+            if not drive.may_move:
+                return e
             tried.add(key)
             one = _merged_pair(drive, e, i, j)
             if one is not None:

@@ -10,6 +10,7 @@ from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.slam.landmarks import hindsight
 from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.landmarks.beam import NOTHING, Beam, BeamSettings, Decision, Seed, changes
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
@@ -266,6 +267,19 @@ def test_what_was_taken_for_two_is_merged_and_what_was_given_wrongly_is_given_to
     assert len(e.landmarks) == len(ROUND)
     pairs = {(a, b) for a, b in zip(truth.tolist(), e.which.tolist(), strict=True)}
     assert len(pairs) == len(ROUND)
+
+
+def test_moves_end_at_their_limit_of_work_and_that_is_said(monkeypatch):
+    scans, truth = circle()
+    wrong = truth.copy()
+    wrong[(truth == 1) & (np.arange(len(truth)) > len(truth) // 2)] = len(ROUND)
+    poses = np.array([one.at.pose for one in scans])
+    frozen = hindsight.FrozenScans(tuple(scans), tuple(motions(scans)), poses, np.zeros(2), wrong, wrong)
+    found = {}
+    for most in (1_000_000, 0):
+        monkeypatch.setattr("graph_slam_ros.slam.landmarks.explanation._MOST_WORK", most)
+        found[most] = hindsight.explained(PLANAR, frozen, SETTINGS, COSTS)
+    assert [(one.is_whole, len(one.estimate.landmarks)) for one in found.values()] == [(True, 5), (False, 6)]
 
 
 def two_rooms(marks_of_second):
