@@ -6,6 +6,7 @@ import numpy as np
 
 from graph_slam_ros.check.columns import Columns, TopicColumns
 from graph_slam_ros.check.finding import Finding, Severity, Where, assignment
+from graph_slam_ros.config.node import TimeConfig
 from graph_slam_ros.typing import Array, Index
 
 _FEW, _BACK_NS = 3, 1_000_000_000
@@ -115,7 +116,9 @@ def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
     window_s = c.config.ordering.window_s if topic.use == "odometry" else c.config.ordering.late_s
     if most_s > max(c.config.time.jump_back_s, 1.0) and most_s > window_s:
         text = f"{topic.name}: stamps step back by up to {most_s:.2f} s: the clock was set, or two drives were joined"
-        yield Finding("time_jump", "error", most_s, 1.0, "s", text, **more)
+        is_expected = c.config.time.on_jump != TimeConfig().on_jump
+        severity: Severity = "note" if is_expected else "error"
+        yield Finding("time_jump", severity, most_s, 1.0, "s", text, **more)
     elif topic.use == "odometry" and most_s > window_s and count > _OUT_OF_ORDER * len(step_s):
         text = f"{topic.name}: {count} messages are older than the one before, by up to {most_s * 1e3:.0f} ms"
         setting = assignment("ordering.window_s", round(1.2 * most_s + 0.005, 3))

@@ -131,10 +131,9 @@ def test_what_residuals_say_of_the_noise_is_saved_and_a_sample_of_edges_says_the
     monkeypatch.setattr("graph_slam_ros.slam.noise_scale._MOST_SAMPLED", 10**6)
     exact = slam.noise_scale()
     measured = sum(3 * one.edges if one.part == "all" else one.edges * (1 + (one.part == "position")) for one in exact)
-    unknowns = (
-        3 * slam.graph.vertex_count - 3
-    )  # the anchor determines one pose; parts of an edge are correlated a little
-    assert measured - sum(one.dof for one in exact) == pytest.approx(unknowns, rel=2e-3)
+    unknowns = 3 * slam.graph.vertex_count - 3  # the anchor determines one pose
+    # parts of an edge are correlated a little; odometry's position is judged along and across together
+    assert measured - sum(one.dof for one in exact) == pytest.approx(unknowns, rel=2e-2)
     for one, other in zip(sampled, exact, strict=True):
         assert (one.key, one.edges) == (other.key, other.edges)
         assert one.dof == pytest.approx(other.dof, rel=0.05)
@@ -178,7 +177,7 @@ def test_a_flight_is_scored_in_space_in_words_and_in_plain_values(tmp_path):
     assert plain["consistency"]["landmarks"]["n"] == len(slam.landmarks)
     assert {one["label"] for one in plain["consistency"]["noise"]} == {"odometry", "landmarks"}
     text = str(scores)
-    assert all(word in text for word in ("angle [deg]", "NEES", "last pose", "chi2/dof", "not known: "))
+    assert all(word in text for word in ("angle [deg]", "NEES", "last pose", "chi2/dof", "times as large"))
     summary = json.loads((tmp_path / "run" / "run.json").read_text())
     summary["classes"]["fixes"] = {"edges": 1, "residuals": 3, "chi2": 1.0}
     (tmp_path / "run" / "run.json").write_text(json.dumps(summary))

@@ -172,7 +172,7 @@ def test_params_tells_default_unit_bounds_meaning_and_when_it_may_change(capsys)
 @pytest.mark.parametrize(
     ("typed", "offered"),
     [
-        (("rep",), {"replay"}),
+        (("repl",), {"replay"}),
         (("completion", ""), {"bash", "zsh"}),
         (("optimize", "--init", "c"), {"chordal"}),
         (("replay", "bag", "--fo"), {"--force"}),

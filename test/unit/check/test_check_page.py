@@ -1,4 +1,4 @@
-"""docs/check.md has a row for each finding; ``PYTHONPATH=test python test/unit/check/test_page.py`` writes them."""
+"""docs/check.md has a row for each finding: ``PYTHONPATH=test python test/unit/check/test_check_page.py``."""
 
 import re
 
@@ -25,7 +25,7 @@ def written(text):
 
 def test_every_finding_is_on_the_page():
     text = PAGE.read_text()
-    assert text == written(text), "PYTHONPATH=test python test/unit/check/test_page.py writes the table"
+    assert text == written(text), "PYTHONPATH=test python test/unit/check/test_check_page.py writes the table"
 
 
 def test_every_code_in_the_sources_has_a_row():
