@@ -103,7 +103,7 @@ class Drive:
         return self.work - self._free < _MOST_WORK
 
     def begin_moves(self) -> None:
-        """What was done until now does not count as the work of moves."""
+        """Begin to count the work of moves."""
         self._free = self.work
 
     def _set_motions(self, motions: Sequence[Motion]) -> None:
