@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaincinv
 
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.noise_scale import NoiseScale
@@ -51,8 +51,8 @@ class Nees:
         n, dof = len(values), errors.shape[1]
         if not n:
             return None
-        low, high = (2.0 * float(gammaincinv(0.5 * n * dof, edge)) / n for edge in _BAND)
-        single = [2.0 * float(gammaincinv(0.5 * dof, edge)) for edge in _BAND]
+        low, high = (quantile(edge, n * dof) / n for edge in _BAND)
+        single = [quantile(edge, dof) for edge in _BAND]
         inside = float(((values >= single[0]) & (values <= single[1])).mean())
         return cls(float(values.mean()), dof, (low, high), inside, n, len(errors) - n)
 
@@ -148,7 +148,7 @@ def nees_of_each(estimate: Array, truth: Array, covariances: Array) -> tuple[Arr
     As ``pose_errors``.
     """
     errors, relative = pose_errors(estimate, truth, covariances)
-    low, high = (2.0 * float(gammaincinv(0.5 * errors.shape[1], edge)) for edge in _BAND)
+    low, high = (quantile(edge, errors.shape[1]) for edge in _BAND)
     return _single(errors, relative), (low, high)
 
 

@@ -10,12 +10,12 @@ from scipy.special import gammainc
 
 from graph_slam_ros.analysis import measurement_text
 from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.formats.strict import integer
 from graph_slam_ros.runs.folder import SUMMARY, summary_of
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.slam import Config
-from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.ledger import FINAL, Reason, Verdict, VerdictChange
 
 _STATE = {

@@ -23,6 +23,7 @@ def check(args: argparse.Namespace) -> int:
         raise GraphSlamError(f"{args.bag}: a run folder; check its recording, or graph_slam explain {args.bag}")
     settings = dict(parse_setting(text) for text in args.set)
     topics = {"odometry": args.odom, "landmarks": args.landmarks}
+    own = [f"--set {shlex.quote(text)}" for text in args.set]
     done = checked(args.bag, settings, **topics, quick=args.quick, progress=console.progress("check"))
     if args.json:
         console.show(
@@ -35,7 +36,10 @@ def check(args: argparse.Namespace) -> int:
             console.show(*lines(one))
         counts = {s: sum(one.severity == s for one in done.findings) for s in ("error", "warning", "note")}
         console.show(", ".join(f"{n} {s}{'' if n == 1 else 's'}" for s, n in counts.items()))
-        console.then(done.command or console.command("info", args.bag))
+        mend = [
+            f"--set {shlex.quote(text)}" for one in done.findings if one.severity != "note" for text in one.settings
+        ]
+        console.then(" ".join([done.command, *own, *mend]) if done.command else console.command("info", args.bag))
     console.report_losses(done.losses, done.warnings)
     return console.DONE if done.is_clean else console.FOUND
 

@@ -8,10 +8,10 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import so3
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.typing import Array, Mask, Numbers
 
 _MOST_TRIALS = 2000  # minimal sets of points that are tried

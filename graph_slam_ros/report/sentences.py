@@ -15,9 +15,9 @@ from graph_slam_ros.analysis import measurement_text
 from graph_slam_ros.analysis.explain import Numbers, change_text, remedy, statements, title
 from graph_slam_ros.analysis.influence import Influences
 from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.report.packing import shown
 from graph_slam_ros.runs.ledger_file import Entry
-from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.ledger import FINAL
 from graph_slam_ros.typing import Array
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
-from scipy.special import gammaincinv
 
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.simulation.motion import space_of
@@ -76,7 +76,7 @@ def false_closures(
     if len(truth) < 2 * pairs + 2:
         raise GraphSlamError(f"false closures: {len(truth)} poses are too few for groups of {pairs}")
     draw = _aliased if policy == "aliased" else _local if policy.startswith("local") else _anywhere
-    limit = margin * 2.0 * float(gammaincinv(0.5 * roots.shape[-1], AGREES))
+    limit = margin * quantile(AGREES, roots.shape[-1])
     ends, measured, root = [np.empty((0, 2), dtype=np.int64)], [np.empty((0, truth.shape[1]))], [roots[:0]]
     found, tried = 0, 0
     while found < count:

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.counters import Counters
@@ -22,7 +23,6 @@ from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.assignments import Assigned, Assignments
-from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.landmarks.beam import Beam, BeamSettings, Decision, changes
 from graph_slam_ros.slam.landmarks.belief import SolverBelief
 from graph_slam_ros.slam.landmarks.hindsight import Found, FrozenScans, Hindsight

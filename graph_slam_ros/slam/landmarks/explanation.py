@@ -1,7 +1,7 @@
 """All scans of a drive at once: poses, landmarks and odometry's two scales that explain them, and what that costs.
 
 Gauss-Newton with Levenberg's damping. Odometry is tight or has slipped, whichever costs less; clusters have Cauchy's
-loss. It is solved in stages, since a local minimum scans like a wrong association: first nothing slips and the loss is
+loss. It is solved in stages, since a local minimum looks like a wrong association: first nothing slips and the loss is
 wide.
 """
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
-from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.landmarks.beam import NOTHING, BeamSettings, Ids
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
 from graph_slam_ros.slam.landmarks.explanation import UNUSED, Costs, Drive, Estimate

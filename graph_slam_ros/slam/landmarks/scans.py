@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
-from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.landmarks.rotations import lever, turn_of
 from graph_slam_ros.typing import Array, Numbers
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.frontend import motion_compensation
-from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.slam.robust.rigid_alignment import aligned, are_spread

@@ -12,10 +12,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
-from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.robust.innovation import innovation
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason, Verdict
 from graph_slam_ros.solver import Solver

@@ -14,7 +14,7 @@ from functools import cache, lru_cache
 import numpy as np
 from scipy.special import bdtr, betaincinv
 
-from graph_slam_ros.slam.landmarks.association import quantile
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.solver import Solver

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.landmarks import hindsight
-from graph_slam_ros.slam.landmarks.association import quantile
 from graph_slam_ros.slam.landmarks.beam import NOTHING, Beam, BeamSettings, Decision, Seed, changes
 from graph_slam_ros.slam.landmarks.constellation import laid_on_the_map
 from graph_slam_ros.slam.landmarks.explanation import Costs, Drive, Estimate
