@@ -1,6 +1,5 @@
 """The Python of docs/library.md and theory.md prints what the page says; the names at top level are what they say."""
 
-import fnmatch
 import re
 import subprocess
 import sys
@@ -83,24 +82,3 @@ def test_optimize_starts_where_it_is_told_and_as_it_is_told():
     assert (solution.start, solution.report.method) == ("chordal", "lm")
     assert solution.report.chi2_initial < 1e4
     assert solution.report.chi2_final == pytest.approx(465.969818, abs=1e-3)
-
-
-CASES = {"A": 33, "B": 23, "G": 22, "P": 24, "F": 36, "X": 14}
-
-
-def test_every_case_of_what_can_go_wrong_is_told_with_a_test_that_is_there_or_a_reason():
-    named = set(
-        re.findall(r"^def (test_\w+)", "\n".join(f.read_text() for f in (ROOT / "test").rglob("test_*.py")), re.M)
-    )
-    told = set()
-    for line in (ROOT / "docs/reliability.md").read_text().splitlines():
-        cases = re.findall(r"\b([ABGPFX])(\d+)(?:-[A-Z](\d+))?", line.split(" | ")[0])
-        if line.startswith("| ") and cases:
-            tests = re.findall(r"\b(test_[\w*]+)(?!\w|\*|\.py)", line.rsplit(" | ", 1)[1])
-            assert all(fnmatch.filter(named, test) for test in tests), tests
-            assert tests or re.search("[Oo]therwise|Not done", line), line
-            told |= {f"{letter}{k}" for letter, first, last in cases for k in range(int(first), int(last or first) + 1)}
-    assert told >= {f"{letter}{k}" for letter, count in CASES.items() for k in range(1, count + 1)}
-    for letter in CASES:  # none is left out
-        numbers = sorted(int(case[1:]) for case in told if case[0] == letter)
-        assert numbers == list(range(1, len(numbers) + 1))

@@ -1,6 +1,8 @@
-"""Each link within the documents leads to a file that is there, and to a heading that is in it."""
+"""Each link within the documents leads to a file and a heading, and each case of reliability.md has a test."""
 
+import fnmatch
 import re
+from collections import Counter
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -79,3 +81,25 @@ def test_a_link_that_leads_somewhere_is_none_of_them(tmp_path):
     text = "[x](a.md#the-a-of-it-15-x-all) [x](a.md#again-1) [x](https://example.org/#x) `[x](y.md)`\n"
     (tmp_path / "b.md").write_text(f"{text}\n```\n[x](y.md)\n# Not\n```\n")
     assert list(broken(tmp_path / "b.md")) == []
+
+
+CASES = {"A": 33, "B": 23, "G": 22, "P": 24, "F": 36, "X": 14}
+
+
+def test_every_case_of_what_can_go_wrong_is_told_with_a_test_that_is_there_or_a_reason():
+    named = set(
+        re.findall(r"^def (test_\w+)", "\n".join(f.read_text() for f in (ROOT / "test").rglob("test_*.py")), re.M)
+    )
+    told = []
+    for line in (ROOT / "docs/reliability.md").read_text().splitlines():
+        cases = re.findall(r"\b([ABGPFX])(\d+)(?:-[A-Z](\d+))?", line.split(" | ")[0])
+        if line.startswith("| ") and cases:
+            tests = re.findall(r"\b(test_[\w*]+)(?!\w|\*|\.py)", line.rsplit(" | ", 1)[1])
+            assert all(fnmatch.filter(named, test) for test in tests), tests
+            assert tests or re.search("[Oo]therwise|Not done", line), line
+            told += [f"{letter}{k}" for letter, first, last in cases for k in range(int(first), int(last or first) + 1)]
+    assert [case for case, times in Counter(told).items() if times > 1] == []  # a code names one row
+    assert set(told) >= {f"{letter}{k}" for letter, count in CASES.items() for k in range(1, count + 1)}
+    for letter in CASES:  # none is left out
+        numbers = sorted(int(case[1:]) for case in told if case[0] == letter)
+        assert numbers == list(range(1, len(numbers) + 1))
