@@ -1,4 +1,4 @@
-"""Quantiles of chi-square, which gates compare with."""
+"""Quantiles of the chi-square distribution, the limits of all gates."""
 
 from functools import cache
 

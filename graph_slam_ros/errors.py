@@ -1,4 +1,4 @@
-"""The one family of errors a user may see: each message names the culprit and fits on one line."""
+"""The one family of errors that a user may see: each message names the culprit and fits on one line."""
 
 
 class GraphSlamError(Exception):

@@ -1,4 +1,4 @@
-"""Edge types of plugins as a running pipeline needs them: tried once, measured at any stamp, never the end of a run."""
+"""Edge types of plugins for the running pipeline: each is tested once, and its failure never ends a run."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,6 +1,6 @@
-"""Plugins of other packages: Python entry points, looked up by group and name when asked for.
+"""Plugins of other packages: Python entry points, looked up by group and name.
 
-Nothing of a plugin is imported before its name is asked for, and a name that is built in is never asked for.
+A plugin is imported when its name is first used. A built-in name is never looked up.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Types of arrays, by one name each in the whole package."""
+"""Names of array types for the whole package."""
 
 from collections.abc import Callable
 from typing import Protocol, TypeAlias, TypeVar

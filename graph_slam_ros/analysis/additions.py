@@ -1,8 +1,8 @@
-"""Measurements that a run could be given: the edges that they would add, without a measurement having been made.
+"""Measurements that nobody has made yet, and the edges that they would add to a run.
 
-What a sensor sees, and how well, is learnt from the run: a keyframe can see a landmark if the run has a sighting of a
-landmark at nearly the same place relative to the robot, by the same input and of the same type. The new one gets the
-noise of that sighting.
+What a sensor sees, and how well, is learnt from the run. A keyframe can see a landmark if the run has a sighting by the
+same input, of the same type, at nearly the same place relative to the robot. The added sighting gets the noise of that
+one.
 """
 
 from collections import Counter

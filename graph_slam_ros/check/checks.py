@@ -1,4 +1,4 @@
-"""All checks of a recording's columns, in the order in which a finding can make the later ones meaningless."""
+"""All checks of a recording, in order: a finding of an early check can make the later ones meaningless."""
 
 from collections.abc import Callable, Iterator
 

@@ -1,7 +1,7 @@
-"""A recording as columns of numbers: what the checks look into, collected in one pass over its messages.
+"""A recording as columns of numbers, collected in one pass over its messages.
 
-A ``Collector`` is fed with each message as decoded and with what the converters make of it, the same ones as in a
-replay. ``Columns`` is what it has collected; checks are functions of it alone.
+A ``Collector`` gets each decoded message, and the measurements that the converters of a replay make of it. It returns
+``Columns``. Each check is a function of ``Columns`` alone.
 """
 
 from array import array

@@ -1,7 +1,7 @@
-"""A finding of ``graph_slam check``, and the table of all that there are.
+"""A finding of ``graph_slam check``, and the table of all kinds of findings.
 
-docs/check.md explains each row of ``KINDS``; a refusal that is counted is found under the name of its counter, which is
-explained in ``measurements/reasons.py``.
+docs/check.md explains each row of ``KINDS``. A refusal that is counted is a finding under the name of its counter;
+``measurements/reasons.py`` explains it.
 """
 
 import json

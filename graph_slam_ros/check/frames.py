@@ -1,4 +1,4 @@
-"""Frames of a recording: what is linked to the robot, and by how many."""
+"""Checks of the frames of a recording: which are linked to the robot, and by how many publishers."""
 
 from collections.abc import Iterator
 

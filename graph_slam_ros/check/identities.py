@@ -1,4 +1,4 @@
-"""Identities that are of two places, and landmarks that move: each sighting put into the map by an estimate."""
+"""Checks of identities: one id at two places, and landmarks that move. An estimate puts each sighting into the map."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

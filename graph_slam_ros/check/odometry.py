@@ -1,4 +1,4 @@
-"""Odometry by itself: does it move, jump, leave the plane, and agree with its twist."""
+"""Checks of odometry alone: whether it moves, jumps, leaves the plane, and agrees with its twist."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

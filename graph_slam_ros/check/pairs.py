@@ -1,4 +1,7 @@
-"""Sightings against odometry, without a fit: the same landmark a few seconds later, which drift does not matter to."""
+"""Checks of sightings against odometry without a fit: the same landmark, seen twice within a few seconds.
+
+Drift is negligible in so short a time.
+"""
 
 from collections import deque
 from collections.abc import Iterator, Mapping

@@ -1,4 +1,4 @@
-"""Refusals of the converters: each counter is a finding under its own name."""
+"""Checks of what the converters refuse: each counter is a finding under its own name."""
 
 from collections.abc import Iterator
 

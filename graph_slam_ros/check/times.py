@@ -1,4 +1,4 @@
-"""Times of a recording: clocks, order, gaps."""
+"""Checks of the times of a recording: clocks, order, gaps."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""The trial: a replay in memory, and a fit of clock, mount and scales that begins at its estimate."""
+"""A trial of a recording: a replay in memory, then a fit of clock, mount and scales that starts at its estimate."""
 
 from collections.abc import Iterable, Iterator
 

@@ -1,4 +1,4 @@
-"""The command ``calibrate``: what is wrong with odometry's scale, clocks and mounts, as settings."""
+"""The command ``calibrate``: estimates odometry's scale, clocks and mounts, and prints them as settings."""
 
 import argparse
 import json

@@ -1,6 +1,6 @@
 """The command ``completion``: a script for bash or zsh that completes commands, options and their choices.
 
-It is made from the parser, so it knows what the parser knows, and needs no Python at each press of a key.
+The script is made from the parser, and does not start Python while the user types.
 """
 
 import argparse

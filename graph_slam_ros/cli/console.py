@@ -1,4 +1,4 @@
-"""Shared by the commands: exit codes, what is said and where, and whether ROS is here."""
+"""Shared by the commands: exit codes, output, and the check whether ROS is installed."""
 
 import importlib.util
 import os

@@ -1,4 +1,4 @@
-"""The command ``edit``: a plan of edits by hand makes another map of a run."""
+"""The command ``edit``: applies a plan of edits by hand to a run, and writes the result as a new run."""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Parameters of one input: what is listened to, what it is used as, and what its messages leave unsaid."""
+"""Parameters of one input: its topic, its use, and values for what its messages do not contain."""
 
 import math
 from dataclasses import dataclass

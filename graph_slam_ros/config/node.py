@@ -1,4 +1,4 @@
-"""Parameters of what surrounds the pipeline in a running node: transforms, topics, files, time, health."""
+"""Parameters of the node outside the pipeline: transforms, topics, files, time, health."""
 
 import re
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Parameters: what is known of each, and how a section of them is declared."""
+"""The description of a parameter, and the declaration of a section of parameters."""
 
 import dataclasses
 import math

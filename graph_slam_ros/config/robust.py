@@ -1,4 +1,4 @@
-"""Parameters of what is believed."""
+"""Parameters of outlier rejection."""
 
 from dataclasses import dataclass
 

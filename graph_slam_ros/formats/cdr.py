@@ -1,4 +1,4 @@
-"""CDR, the bytes of a message, for what would be too slow as objects of a type store."""
+"""Fast reading and writing of CDR bytes, for messages that are too slow as objects of a type store."""
 
 import struct
 from typing import Any

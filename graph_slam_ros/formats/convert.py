@@ -1,4 +1,4 @@
-"""Graphs out in other texts: g2o, TORO, GTSAM, and the poses alone as a TUM trajectory."""
+"""Writing graphs in other formats: g2o, TORO, GTSAM, and the poses alone as a TUM trajectory."""
 
 from collections import Counter
 from dataclasses import dataclass

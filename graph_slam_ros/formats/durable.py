@@ -1,6 +1,6 @@
-"""Files that outlive whoever writes them: one that only grows, and one that is replaced whole or not at all.
+"""Files that survive a crash: one that only grows, and one that is replaced as a whole.
 
-No link is written through: a file is always created under a name that nothing had before.
+A file is always created under a new name, so that no link is followed.
 """
 
 import contextlib

@@ -1,6 +1,6 @@
 """The one way to open a file: only regular files are opened, and opening never blocks.
 
-A FIFO without a writer would block for ever, a device may never end, a file of a terabyte that is a hole would take all
+A FIFO without a writer would block for ever, a device may never end, and a sparse file of a terabyte would take all
 memory. In a run folder no symbolic link is followed, since a link may lead to any file of the user. A recording or a
 graph that the user names may be a link (``follow``).
 """

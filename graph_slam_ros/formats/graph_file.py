@@ -1,4 +1,4 @@
-"""A graph as text files know it, and g2o's words for its vertices and edges."""
+"""A graph as text files represent it, and g2o's tags of its vertices and edges."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Strict reading of text: what Python's own conversions would let through is refused by name."""
+"""Strict reading of text: refuses what Python's own conversions would accept by mistake."""
 
 import gzip
 import io

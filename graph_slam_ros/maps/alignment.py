@@ -1,4 +1,4 @@
-"""Two maps, one laid on the other: by points that both know, robustly, for some may have moved."""
+"""Alignment of two maps by the points that both have. It is robust, because some points may have moved."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""A plan of edits by hand, and the run that it makes of another."""
+"""A plan of edits by hand, and the run that it makes from another run."""
 
 import hashlib
 import json

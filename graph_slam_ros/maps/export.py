@@ -1,6 +1,6 @@
-"""Export of a run to formats of others: its path as TUM, its graph as g2o, both for viewers as mcap.
+"""Export of a run to other formats: its path as TUM, its graph as g2o, both as mcap for viewers.
 
-All is from the run's map, so it works where the run was never ended, too.
+Everything is read from ``map.mcap``. So a run that never ended can be exported, too.
 """
 
 from pathlib import Path

@@ -1,7 +1,6 @@
-"""One map of two sessions: landmarks that both know lay the second on the first, then all is solved together.
+"""One map from two sessions: common landmarks align the second with the first, then everything is solved together.
 
-The drive of the second follows as a new segment, as after a jump of time: nothing but landmarks tells how the robot
-came there.
+The drive of the second follows as a new segment, as after a jump of time. Only landmarks link it to the first drive.
 """
 
 from collections.abc import Mapping

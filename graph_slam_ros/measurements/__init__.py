@@ -1,4 +1,4 @@
-"""Measurements (metres, radians, stamps in nanoseconds), and what is counted by input and reason."""
+"""Measurements (metres, radians, stamps in nanoseconds), and counters by input and reason."""
 
 from graph_slam_ros.measurements.types import (
     Closure,

@@ -1,4 +1,4 @@
-"""Counters of what was dropped, repaired or used, by (source, reason)."""
+"""Counters of what was dropped, repaired or used, by source and reason."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator

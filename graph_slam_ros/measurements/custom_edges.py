@@ -1,4 +1,4 @@
-"""The check of a custom edge against the edge type that its plugin has."""
+"""The check whether a custom edge fits the edge type of its plugin."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Edits of a map by hand: what each kind needs, and the record of one that was applied."""
+"""Edits of a map by hand: the fields of each kind, and the record of an edit that was applied."""
 
 import re
 from collections.abc import Mapping

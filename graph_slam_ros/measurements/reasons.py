@@ -1,7 +1,7 @@
-"""Every reason under which something is counted: what it does to a message, what it means, and what mends it.
+"""Every reason that is counted: what happens to the message, what it means, and what mends it.
 
-``Counters`` count by (source, reason). Live diagnostics, the table at the end of a replay and docs/troubleshooting.md
-all explain a reason by its row here.
+``Counters`` count by source and reason. Live diagnostics, the table at the end of a replay and docs/troubleshooting.md
+explain a reason by its row here.
 """
 
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Measurements and events for ``GraphSlam.process``: immutable values, which JSON keeps exactly.
+"""Measurements and events for ``GraphSlam.process``: immutable values that JSON represents exactly.
 
 A pose is (x, y, theta) in the plane and (x, y, z, qx, qy, qz, qw) in space, in metres and radians. Covariances are flat
 and row-major, in the order of the tangent space: (x, y, theta), or (x, y, z, rotation vector). The values do not depend

@@ -1,7 +1,7 @@
-"""The border: messages come in as CDR bytes and leave as measurements, or are counted and refused.
+"""Conversion of incoming messages: CDR bytes in, measurements out. What is refused is counted.
 
-Works on the bytes of live subscriptions and of bags alike; needs no ROS. Every refusal and every repair adds to a
-counter by (input, reason).
+It works on the bytes of live subscriptions and of bags, and needs no ROS. Every refusal and every repair adds to a
+counter by input and reason.
 """
 
 import struct

@@ -1,4 +1,4 @@
-"""The graph as it is drawn: which of its edges, from where to where, and how well each fits."""
+"""The graph as markers: which edges are drawn, from where to where, and how well each fits."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

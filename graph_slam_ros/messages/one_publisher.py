@@ -1,8 +1,9 @@
-"""Several publishers on one odometry topic: their messages are told apart by continuity, and one of them is used.
+"""Several publishers on one odometry topic: their messages are separated by continuity, and one publisher is used.
 
-rclpy names no publisher with a message, and a recording keeps none. Each publisher's poses are continuous, so every
-message belongs to the track of poses that it continues best. A message that continues no track waits until either the
-track in use goes on, then it is another publisher's or an outlier, or is given up, then the odometry has jumped.
+rclpy does not name the publisher of a message, and a recording does not store it. The poses of each publisher are
+continuous. So every message belongs to the track of poses that it continues best. A message that continues no track is
+kept until the track in use goes on or is given up. In the first case it was another publisher's, or an outlier. In the
+second case odometry has jumped.
 """
 
 import math

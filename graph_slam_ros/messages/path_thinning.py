@@ -1,4 +1,4 @@
-"""Thinning of what is shown: the same as more comes, as long as that can be."""
+"""Thinning of published paths: the thinned path changes as little as possible while it grows."""
 
 import numpy as np
 

@@ -1,9 +1,9 @@
-"""The path as it changes: for who cannot take all of it each time.
+"""Updates of the path, for subscribers that cannot take the whole path each time.
 
-A message holds the keyframes that are new or have moved. Each pose is named by its own stamp: who receives it puts it
-where it has a pose of this stamp, else between its neighbours. A message without poses says to forget all, before all
-are sent again. Messages are counted, as those of interactive markers are (``seq_num``), and ``/diagnostics`` tells the
-count, for nav_msgs/Path has no room for a number: who has received fewer since the path began anew lacks some poses.
+A message has the keyframes that are new or have moved. Each pose is identified by its stamp: it replaces the pose with
+this stamp, or is inserted between its neighbours. A message without poses means: forget all, the whole path follows.
+Messages are numbered, as those of interactive markers are (``seq_num``). nav_msgs/Path has no field for the number, so
+``/diagnostics`` publishes the count. A subscriber that received fewer messages since the path began lacks some poses.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""The state of a run as messages: what the node publishes and what a run's recording holds are the same bytes."""
+"""Results as messages: the node publishes the same bytes that the recording of a run has."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""The file of surveyed landmarks: read once, at the start; from then on its lines are part of the configuration."""
+"""The file of surveyed landmarks. It is read once at the start, and its rows become part of the configuration."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Topics and services of the node besides its inputs: the node, the views and the tests read it here."""
+"""Names of the node's topics and services, except its inputs."""
 
 from dataclasses import dataclass
 

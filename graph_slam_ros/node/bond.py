@@ -1,7 +1,7 @@
-"""A bond with Nav2's lifecycle manager: heartbeats both ways on the topic ``bond``; it notices when we are gone.
+"""A bond with Nav2's lifecycle manager: both sides send heartbeats on the topic ``bond``.
 
-The protocol is that of bondcpp, with the name of the node as id. As for Nav2's own servers, a manager that falls silent
-is none of the node's business: only its word ends the bond.
+The manager notices when this node is gone. The protocol is that of bondcpp, with the name of the node as id. As in
+Nav2's own servers, silence of the manager does not end the bond; only its message does.
 """
 
 from typing import Any

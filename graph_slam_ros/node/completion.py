@@ -1,4 +1,4 @@
-"""Results of earlier runs that were stopped while measurements waited: a process of low priority makes them."""
+"""Completion of earlier runs that were stopped while measurements were in the queue, in a process of low priority."""
 
 import os
 import subprocess

@@ -1,7 +1,7 @@
-"""The state of the node: one verdict with its reasons, from facts that the node gathers.
+"""The state of the node: one verdict with its reasons, judged from facts.
 
-States: UNCONFIGURED, INACTIVE and FINALIZED by lifecycle; WAITING for what is missing; OK; DEGRADED, where the estimate
-goes on but is not what it could be; ERROR, where somebody must act.
+The lifecycle gives UNCONFIGURED, INACTIVE and FINALIZED. An active node is WAITING if something is missing, OK,
+DEGRADED if the estimate goes on but is worse than it could be, or ERROR if somebody must act.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The estimate that the worker's thread leaves for the others."""
+"""The estimate that the worker's thread publishes to the other threads."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

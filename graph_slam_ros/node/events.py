@@ -1,4 +1,4 @@
-"""The statuses of ``~/events``: one for each event, its numbers as values."""
+"""Messages of ``~/events``: one status for each event, with its numbers as values."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""The facts that the state of the node is judged by, collected from its parts."""
+"""Collects the facts from which the state of the node is judged."""
 
 import time
 

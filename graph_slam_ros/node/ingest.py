@@ -1,4 +1,4 @@
-"""The way of measurements from the callbacks to the worker: future stamps, jumps of time, memory, the gate."""
+"""The path of measurements from the callbacks to the worker: checks of future stamps, jumps of time and memory."""
 
 import time
 from collections import deque

@@ -1,4 +1,4 @@
-"""The services of slam_toolbox for a map by name, where that package is installed: its clients work with this node."""
+"""The map services of slam_toolbox, if its package is installed: its clients work with this node."""
 
 import math
 from collections.abc import Callable

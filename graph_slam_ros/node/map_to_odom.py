@@ -1,4 +1,4 @@
-"""The transform map -> odom to broadcast: each stamp once, never backwards, none without new odometry."""
+"""The transform map -> odom to broadcast: each stamp once, in order, and only with new odometry."""
 
 import math
 

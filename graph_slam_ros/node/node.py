@@ -1,4 +1,4 @@
-"""The ROS node: its lifecycle, parameters, services and state. What it does with messages is in ``runtime``."""
+"""The ROS node: its lifecycle, parameters, services and state. ``runtime`` handles the messages."""
 
 import os
 import re

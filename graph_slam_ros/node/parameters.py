@@ -1,4 +1,4 @@
-"""ROS parameters from the one configuration tree: declared with description, unit and range, read back as it."""
+"""ROS parameters, declared from the configuration tree with description, unit and range, and read back into it."""
 
 import sys
 from collections.abc import Iterable

@@ -1,8 +1,7 @@
-"""Plays a recording into a live ROS graph: the recorded bytes, with /clock, as fast as the node keeps up.
+"""Plays a recording into a live ROS graph: the recorded bytes and /clock, as fast as the node can follow.
 
-The node publishes how many messages it has received. The player never runs further ahead than its queues hold, and
-never lets a message of one topic overtake those of another by more than the node's window of stamps. So no message is
-lost; if one were, it would be counted.
+The node publishes how many messages it has received. The player stays within the depth of the node's queues. It keeps
+the order of the topics within the node's window of stamps. So no message is lost; a lost one would be counted.
 """
 
 import os

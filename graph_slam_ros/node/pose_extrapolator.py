@@ -1,4 +1,4 @@
-"""The robot in the map at each odometry message, from the last estimate on: it waits for no solve."""
+"""The pose of the robot in the map at each odometry message, extrapolated from the last estimate without a solve."""
 
 from collections import deque
 from itertools import takewhile

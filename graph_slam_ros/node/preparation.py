@@ -1,4 +1,4 @@
-"""Loading the kernels, and compiling them where that was never done, while the node answers."""
+"""Loads the kernels, or compiles them at the first start, while the node answers."""
 
 import threading
 from collections.abc import Callable

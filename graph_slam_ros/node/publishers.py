@@ -1,6 +1,6 @@
-"""Publishers of results: small messages at once, the others when they are due, have changed and have a subscriber.
+"""Publishers of results. Small messages are sent at once; others when they are due, changed, and subscribed to.
 
-A latched topic is sent once more to a late subscriber, who need not wait for the robot to move.
+A latched topic is sent once more to a late subscriber, even if the robot stands.
 """
 
 import time

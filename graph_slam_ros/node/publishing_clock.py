@@ -1,4 +1,4 @@
-"""The schedule of results: each topic in its period, and never so often that the pipeline falls behind."""
+"""The schedule of results: each topic has a period, which grows if the pipeline would fall behind."""
 
 import time
 from collections import Counter

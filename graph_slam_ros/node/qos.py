@@ -1,4 +1,4 @@
-"""QoS of the subscriptions of inputs, and why a publisher does not connect to one."""
+"""QoS of the input subscriptions, and the reason why a publisher does not connect to one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Counts of each input in the last seconds: a state is judged by these, not by all counts since the start."""
+"""Counts of each input in the last seconds. The state is judged from these, not from the counts since the start."""
 
 from collections import Counter, deque
 from collections.abc import Mapping

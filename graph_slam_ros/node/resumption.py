@@ -1,4 +1,4 @@
-"""The check whether a drive that was cut off goes on after a restart, by its odometry."""
+"""Checks by odometry whether an interrupted drive goes on after a restart."""
 
 import math
 

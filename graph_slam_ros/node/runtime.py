@@ -1,7 +1,7 @@
 """The parts of the node from configuration to clean-up, and the services on the run.
 
-The main thread has the callbacks, ``Ingest`` and map -> odom; the worker's thread has the pipeline (``Session``) and
-publishes its results. Between them stand a queue one way and ``Session.estimate`` the other.
+The main thread runs the callbacks, ``Ingest`` and map -> odom. The worker's thread runs the pipeline (``Session``) and
+publishes its results. A queue leads to the worker; ``Session.estimate`` leads back.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""Services whose answer takes long: given by whoever has the work done, while callbacks go on."""
+"""Services with a slow answer: the worker answers when the work is done, and callbacks go on meanwhile."""
 
 from collections.abc import Callable
 from concurrent.futures import Future

@@ -1,7 +1,7 @@
 """One run of the pipeline in a node, from configuration or reset to the next: its estimate, its recording, its files.
 
-The main thread accepts measurements (``accept``) in the order in which it hands them to the worker's thread. That does
-all the rest; others see ``estimate``, which is replaced whole.
+The main thread accepts measurements (``accept``) in the order in which it passes them to the worker's thread. The
+worker does everything else. It replaces ``estimate`` as a whole, which other threads read.
 """
 
 import threading

@@ -1,4 +1,4 @@
-"""The node's subscriptions while it is active: raw messages in, measurements out, and what each topic received."""
+"""The node's subscriptions while it is active: raw messages in, measurements out, and counts of each topic."""
 
 import math
 from collections import Counter

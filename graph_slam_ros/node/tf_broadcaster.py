@@ -1,4 +1,4 @@
-"""The broadcaster of map -> odom, which also notices another one."""
+"""The broadcaster of map -> odom. It also detects a second broadcaster."""
 
 import time
 from collections import deque

@@ -1,4 +1,4 @@
-"""Work beside the worker: a second look at the graph goes on in a thread of its own."""
+"""Threads for background work, such as the search for better hypotheses."""
 
 from collections.abc import Callable
 from concurrent.futures import Future

@@ -1,6 +1,6 @@
 """Bags: one iterator of CDR messages over mcap, sqlite3 and ROS 1 recordings, and a writer of mcap.
 
-Whole and damaged files are read the same way: what is whole is read, what is lost is told.
+Intact and damaged files are read the same way. Everything intact is read; what is lost is reported.
 """
 
 import heapq

@@ -1,4 +1,4 @@
-"""One look at a whole recording: of each topic its span, its frames, and what decides how it can be used."""
+"""A summary of a whole recording: the span and frames of each topic, and how it can be used."""
 
 import math
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Decompression that never makes more than it was told to: what a file says of its own size may be wrong, or a trap."""
+"""Decompression with a limit on the output, because the size that a file states may be wrong or malicious."""
 
 import bz2
 from io import BytesIO

@@ -1,4 +1,4 @@
-"""Recorded message definitions: a bag is decoded by what it says of itself, if that has what we need."""
+"""Recorded message definitions: a bag is decoded by its own definitions if they have the fields that we need."""
 
 from dataclasses import replace
 

@@ -1,7 +1,7 @@
-"""The records of an mcap file in order: one way to read whole, damaged and truncated files.
+"""The records of an mcap file in order: one reader for intact, damaged and truncated files.
 
-Records are parsed by the library. Walking from one to the next is ours: the library's readers end at the first damage,
-believe every length, and decompress whatever comes of it.
+The library parses the records. The walk from one record to the next is ours, because the library's readers end at the
+first damage, trust every length, and decompress without limit.
 """
 
 import io

@@ -1,4 +1,4 @@
-"""Types by the definitions that recordings carry: how long their messages are at least, and those of ROS 1 as CDR."""
+"""Types from the definitions in recordings: the least length of their messages, and ROS 1 types as CDR."""
 
 import re
 from typing import Any

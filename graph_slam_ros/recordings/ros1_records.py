@@ -1,6 +1,6 @@
-"""Connections and messages of a ROS 1 bag (format 2.0), chunk after chunk, whether or not it has an index.
+"""Connections and messages of a ROS 1 bag (format 2.0), chunk by chunk, with or without an index.
 
-rosbags needs the index that is written when a recording ends, and asserts on what it reads.
+rosbags needs the index, which is written when a recording ends, and fails with assertions on damaged files.
 """
 
 import os

@@ -1,6 +1,6 @@
-"""Topics and messages of a rosbag2 sqlite3 file: read only, in order of writing, up to where it is damaged.
+"""Topics and messages of a rosbag2 sqlite3 file: read only, in order of writing, up to the first damage.
 
-rosbags opens a file of which all is whole, and sorts it by time: one bad page, and nothing is read.
+rosbags sorts the file by time, so that one bad page makes all of it unreadable.
 """
 
 import sqlite3

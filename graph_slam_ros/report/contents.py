@@ -1,4 +1,4 @@
-"""The contents of a report: read from its folder, one part after another, each missing only where its files are."""
+"""The contents of a report, read from a run folder. A part is left out only if its files are missing."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field

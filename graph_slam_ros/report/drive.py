@@ -1,4 +1,4 @@
-"""The drive as it went on: what the estimate was at some moments, and where it jumped."""
+"""The history of the drive: the estimate at some moments, and the jumps of map -> odom."""
 
 import struct
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""Numbers and texts of a page, packed: JSON that refers to columns, and these in one compressed block."""
+"""The data of a page, packed: JSON that refers to columns, and the columns in one compressed block."""
 
 import base64
 import json

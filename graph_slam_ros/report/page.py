@@ -1,4 +1,4 @@
-"""The page: HTML, style, script and data in one file that asks nobody for anything."""
+"""The page: HTML, style, script and data in one file that makes no request."""
 
 import base64
 import hashlib

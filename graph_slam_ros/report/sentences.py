@@ -1,7 +1,6 @@
-"""The sentences of ``explain`` for all edges of a run: a few texts with places for numbers, and the numbers.
+"""The sentences of ``explain`` for all edges of a run: a few templates, and the numbers to fill in.
 
-The page has one text for all edges of which the same is said. It is made by ``explain`` itself, of an edge whose
-numbers are placeholders: so the page says what the command says.
+``explain`` itself makes each template, from an edge with placeholders as numbers. So page and command say the same.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""A recording is calibrated: replayed in memory, again with what was found, until nothing is left to correct."""
+"""The calibration of a recording: replays in memory, each with what the last one found, until nothing changes."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass

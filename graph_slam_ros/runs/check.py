@@ -1,4 +1,4 @@
-"""A recording is checked: its inputs are chosen, it is read once, and all findings are collected."""
+"""The check of a recording: choose its inputs, read it once, collect all findings."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace

@@ -1,9 +1,8 @@
-"""Run folders: which folder is a run, which of several is the newest, and what of a folder may be replaced.
+"""Run folders: which folder is a run, which run is the newest, and which files may be replaced.
 
-A folder is a run if its ``run.json`` says so (``format``); it does from the start of the run on. Only such a folder is
-ever cleared, and only of the files of a run: a recording in it is looked into before it is removed. Runs of earlier
-versions, whose ``run.json`` has no such mark or was never written, are known by their journal. They are read like any
-other, and never cleared.
+A folder is a run if its ``run.json`` says so (``format``), which is written when the run starts. Only such a folder is
+ever cleared, and only of the files of a run. A recording in it is read before it is removed. Runs of earlier versions
+lack this mark, or the file; they are recognised by their journal. They are read like others, and never cleared.
 """
 
 import contextlib

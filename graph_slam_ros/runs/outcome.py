@@ -1,6 +1,6 @@
-"""The outcome of each input of a run: a table for a person, and what makes the result less than what was asked for.
+"""The outcome of each input of a run: a table for a person, and the reasons why the result is incomplete.
 
-Both are made from ``run.json``, so they are the same for a live run, a replay and a recovered run.
+Both are made from ``run.json``. So they are the same for a live run, a replay and a recovered run.
 """
 
 import shlex

@@ -1,4 +1,4 @@
-"""Recording a run as it goes on, and saving its results."""
+"""Records a run while it goes on, and saves its results."""
 
 import contextlib
 import json

@@ -1,4 +1,4 @@
-"""A run after its end: it is recorded again from its events, or its map is gone on in."""
+"""A run after its end: repeated from its journal, or continued in its map."""
 
 import os
 import time

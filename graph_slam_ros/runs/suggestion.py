@@ -1,4 +1,4 @@
-"""The replay command that fits a recording: which topics are inputs, and which look like it but are not."""
+"""The replay command that fits a recording: which topics are inputs, and which only look like inputs."""
 
 import re
 import shlex

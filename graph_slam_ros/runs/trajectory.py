@@ -1,4 +1,4 @@
-"""Paths and maps out of files: TUM trajectories, and a run's tables of landmarks and covariances."""
+"""Paths and maps read from files: TUM trajectories, and a run's tables of landmarks and covariances."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""A recording as one mcap bag: what a robot would have recorded, and the truth beside it."""
+"""A recording as one mcap bag: the topics of the robot, and the truth as further topics."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

@@ -1,6 +1,6 @@
-"""A draft of measurements before it becomes a recording or a graph: faults are put into it and listed.
+"""A draft of measurements, into which faults are put before it becomes a recording or a graph.
 
-Recordings and graphs are made into the same draft, and the draft into either again; a fault knows the draft alone.
+Recordings and graphs are converted into the same draft, and back. A fault only changes the draft.
 """
 
 import csv

@@ -1,6 +1,6 @@
-"""A recording as decoded messages, for faults of drivers and clocks: any recording, not only of a world.
+"""A recording as decoded messages, for faults of drivers and clocks. It need not be a simulated one.
 
-Topics are those that ``write_bag`` writes, else the only ones of their types; all other messages stay bytes.
+The topics are those of ``write_bag``, or the only one of their type. All other messages stay bytes.
 """
 
 from collections.abc import Callable, Iterator

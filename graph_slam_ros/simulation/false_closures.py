@@ -1,9 +1,9 @@
-"""False loop closures: what place recognition says of two places that are not one.
+"""False loop closures, as place recognition makes them.
 
 They are drawn as by Vertigo, the generator that robust solvers are compared with (Suenderhauf, Protzel, "Switchable
 constraints for robust pose graph SLAM", 2012): two poses, and between them a relative pose near the identity. A draw
-that agrees with the truth is no false closure, and drawn again, as McGann et al. do it ("Robust incremental smoothing
-and mapping (riSAM)", 2023).
+that agrees with the truth is not false. It is drawn again, as in McGann et al. ("Robust incremental smoothing and
+mapping (riSAM)", 2023).
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
-"""Faults of real robots, by kind: wrong closures and identities, slipping wheels, what was moved meanwhile.
+"""Faults of real robots, by kind: wrong closures and identities, slipping wheels, moved landmarks.
 
-A fault is put into a ``Draft``, which notes what of it is wrong. The same seed gives the same faults; each draws from a
-stream of its own, so that one more changes none of the others.
+A fault is put into a ``Draft``, which lists what is wrong in it. The same seed gives the same faults. Each fault has
+its own stream of random numbers, so that one more fault changes none of the others.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Recordings and graphs with faults in them; what is true stays as it was, and what is wrong is listed.
+"""Recordings and graphs with faults. The truth stays as it was, and every wrong message is listed.
 
 faulty, wrong = faulty_recording(simulate("warehouse", 7), [Fault.named("swapped_ids", at=0.3)], seed=7)
 write_bag(faulty, "warehouse.mcap")

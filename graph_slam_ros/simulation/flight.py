@@ -1,4 +1,4 @@
-"""A hall: a drone flies laps at changing heights, banks in its turns and reads tags on walls and pillars."""
+"""A hall in which a drone flies laps at changing heights, banks in its turns, and reads tags on walls and pillars."""
 
 from dataclasses import dataclass
 

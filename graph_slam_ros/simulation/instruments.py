@@ -1,4 +1,4 @@
-"""A satellite receiver and an IMU on the robot of any world: what they measure of the true motion.
+"""A satellite receiver and an IMU on the robot of any world.
 
 The world's x points east, y north and z up; its origin is at ``DATUM``.
 """

@@ -1,4 +1,4 @@
-"""A city of square blocks: a robot strolls along its streets and sees a landmark at every corner."""
+"""A city of square blocks: a robot drives along its streets and sees a landmark at every corner."""
 
 from dataclasses import dataclass
 

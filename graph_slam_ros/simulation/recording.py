@@ -1,4 +1,4 @@
-"""A simulated recording and the truth it does not know: driven, measured, and with true loop closures."""
+"""A simulated recording with its truth: drive, measurements, and true loop closures."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace

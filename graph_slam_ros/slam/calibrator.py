@@ -1,7 +1,7 @@
-"""Calibration on the way: trial fits at fixed keyframes, and what they find taken over by correcting measurements.
+"""Calibration while driving: trial fits at fixed keyframes, whose findings correct the measurements.
 
-A trial begins at keyframes 50, 100, 200 and so on, and when everything is solved. It works on a copy, in the background
-where there is one, and its outcome is due a fixed number of keyframes later: a replay decides as the live run did.
+A trial starts at keyframes 50, 100, 200 and so on, and when everything is solved. It works on a copy, in the background
+if possible. Its outcome is used a fixed number of keyframes later, so that a replay decides as the live run did.
 """
 
 from collections.abc import Callable

@@ -1,8 +1,8 @@
-"""The pipeline: one object, one door. Node, replay and tests all call ``GraphSlam.process``.
+"""The pipeline. Node, replay, tests and benchmarks all call ``GraphSlam.process``, its only entry.
 
-From top to bottom it is the algorithm: measurements in order of stamp; odometry becomes keyframes; observations pass
-their gates, landmarks are associated, both become edges; these are gated, a kidnap is detected, and all is solved. The
-state is a function of the configuration and the sequence of accepted measurements, nothing else.
+Measurements are put in order of stamp. Odometry becomes keyframes. Observations pass their gates, landmarks are
+associated, and both become edges. The edges are gated, a kidnap is detected, and everything is solved. The state is a
+function of the configuration and the sequence of accepted measurements, and of nothing else.
 """
 
 from collections.abc import Callable, Iterable

@@ -1,4 +1,4 @@
-"""A map that can be taken up again: all of a run but what was on its way."""
+"""A map that a run can continue: everything of a run except unfinished work."""
 
 from dataclasses import dataclass, field
 from typing import Any

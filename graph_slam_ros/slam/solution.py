@@ -1,4 +1,4 @@
-"""The solution: what the last solve gave, and how far it moved map -> odom."""
+"""The solution: the outcome of the last solve, and the change of map -> odom."""
 
 import math
 from collections.abc import Callable

@@ -1,7 +1,7 @@
-"""Types of messages that can be inputs, what each can be used as, and how it is converted: one table.
+"""The table of message types that can be inputs: their uses, and their converters.
 
-A converter is a function of an input (``InputContext``) and a message; it raises ``MessageError`` where the whole
-message is refused, and ``NotYet`` where it is to be tried again when /tf has told more.
+A converter is a function of an input (``InputContext``) and a message. It raises ``MessageError`` to refuse the whole
+message, and ``NotYet`` if a transform is missing that may still come.
 """
 
 from collections.abc import Callable, Iterable, Mapping

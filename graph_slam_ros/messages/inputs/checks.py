@@ -1,4 +1,4 @@
-"""The checks of every message, whatever its type: a rule is here once."""
+"""Checks of every message, whatever its type."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""Messages of landmarks with a position or a pose: only read here, judged in ``landmarks``."""
+"""Reading of landmark messages with positions or poses; ``landmarks`` judges what they contain."""
 
 from collections.abc import Iterator
 from types import SimpleNamespace

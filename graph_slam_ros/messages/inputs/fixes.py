@@ -1,4 +1,4 @@
-"""Messages that say where the robot is in the map: fixes; and where it was earlier: closures."""
+"""Messages with the robot's pose in the map (fixes), or relative to an earlier pose (closures)."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Messages of landmarks by range and bearing, and of points with named fields: only read here."""
+"""Reading of landmark messages with range and bearing, and of points with named fields."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""One input at the border: its settings, where its sensor is, and the noise its messages do not tell."""
+"""One input: its settings, the mount of its sensor, and the noise that its messages do not contain."""
 
 import math
 from collections import Counter, deque

@@ -1,4 +1,4 @@
-"""Single stamps that are far from all others of their topic: a clock that was read wrongly, a byte that fell over."""
+"""Single stamps that are far from all others of their topic, such as a misread clock or a corrupted byte."""
 
 from collections.abc import Callable
 from typing import Generic, TypeVar

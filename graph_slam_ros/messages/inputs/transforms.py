@@ -1,4 +1,4 @@
-"""Transforms between frames: where sensors sit on the robot, fixed or on moving joints."""
+"""Transforms between frames: the mounts of sensors, fixed or on moving joints."""
 
 from bisect import bisect_left
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The front end: odometry becomes keyframes, each a vertex that odometry joins to the one before."""
+"""The front end: odometry becomes keyframes. Each is a vertex, joined to the one before by an odometry edge."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence

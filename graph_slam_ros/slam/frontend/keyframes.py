@@ -1,4 +1,4 @@
-"""The path: its keyframes, and the odometry in between as far back as late measurements may reach."""
+"""The path: its keyframes, and the odometry between them as far back as late measurements may reach."""
 
 from collections import deque
 from collections.abc import Sequence

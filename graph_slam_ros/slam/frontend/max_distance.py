@@ -1,4 +1,4 @@
-"""Plausibility: distances beyond a sensor's reach are refused; steep directions get regular axes."""
+"""Checks of plausibility: distances beyond a sensor's reach are refused, and steep directions get regular axes."""
 
 import math
 from collections.abc import Iterable

@@ -1,7 +1,7 @@
-"""Edges whose noise is what is configured, times factors: by class of edges, input and part of the residual.
+"""The noise of edges: the configured noise times factors, by class of edges, input and part of the residual.
 
-Odometry errs with what was turned and driven, which configured noise may not say. The variance of an edge of odometry
-is therefore what is configured times a factor, plus a variance for each radian turned and each metre driven.
+Odometry errs with each radian turned and each metre driven, which configured noise may not say. So the variance of an
+odometry edge is the configured one times a factor, plus a variance per radian and per metre.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

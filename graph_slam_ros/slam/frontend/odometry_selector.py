@@ -1,4 +1,4 @@
-"""One odometry out of several: the first in priority that is alive, told as steps; and where it does not hold."""
+"""Chooses one odometry of several, the first in priority that is alive. It returns steps, and marks where it jumps."""
 
 import math
 from collections import deque

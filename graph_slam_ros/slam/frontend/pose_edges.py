@@ -1,4 +1,4 @@
-"""Edges of poses of the graph: fixes, loop closures and poses that are given."""
+"""Edges from poses: fixes, loop closures and given poses."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Sightings that became edges: when each was, and where the robot and the sensor were, seen from its keyframe."""
+"""The origin of each sighting edge: its stamp, and the poses of robot and sensor relative to its keyframe."""
 
 from copy import deepcopy
 

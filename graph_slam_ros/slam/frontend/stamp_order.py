@@ -1,7 +1,8 @@
-"""Measurements arrive nearly in order of stamp; they are used exactly in order of stamp.
+"""Puts measurements that arrive nearly in order of stamp into exact order of stamp.
 
-Odometry is the clock: what is ``window_s`` of stamp time older than the newest odometry is released. A landmark message
-may come early (it is pending until odometry has reached its stamp) or late within the window. No wall clock is read.
+Odometry is the clock: a measurement is released when it is ``window_s`` older than the newest odometry. A landmark
+message may come early; then it is kept until odometry has reached its stamp. It may be late within the window. No wall
+clock is read.
 """
 
 import heapq

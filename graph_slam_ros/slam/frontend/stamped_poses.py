@@ -1,4 +1,4 @@
-"""Instants in order, in columns: what asks for all of them gets arrays, what asks for one gets a record."""
+"""Poses with stamps, stored in columns: all of them are read as arrays, one of them as a record."""
 
 from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar

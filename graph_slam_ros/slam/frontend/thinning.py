@@ -1,4 +1,4 @@
-"""Thinning: what comes faster than its errors change is used in part, with the noise of all of it."""
+"""Thinning: measurements that come faster than their errors change are used in part, with the noise of all of them."""
 
 from dataclasses import replace
 

@@ -1,8 +1,9 @@
-"""Landmarks whose sightings do not say which they are: several explanations at once, and nothing is final.
+"""Landmarks whose sightings have no id: several explanations are kept, and each decision can be revised.
 
-Sightings become scans (``scans.py``), which a beam of hypotheses explains (``beam.py``). The graph has what the leader
-says: where the leader changes, sightings change hands. Now and then all scans are explained at once on a copy, in the
-background (``explanation.py``, ``moves.py``, ``constellation.py``); what that finds is taken over some keyframes later.
+Sightings are collected into scans (``scans.py``). A beam of hypotheses explains the scans (``beam.py``). The graph
+follows the leading hypothesis: when the leader changes, sightings are moved to other landmarks. From time to time all
+scans are explained at once, in the background on a copy (``explanation.py``, ``moves.py``, ``constellation.py``). The
+result is used a fixed number of keyframes later.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The landmark of each cluster in the graph: given at once, and another when that is known better."""
+"""The landmark of each cluster in the graph. It is assigned at once, and changed when another one fits better."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence

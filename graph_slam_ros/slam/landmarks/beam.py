@@ -1,9 +1,9 @@
-"""Several explanations at once of what is seen: a beam of joint Gaussians of pose, odometry's scales and landmarks.
+"""A beam of hypotheses: joint Gaussians of the pose, odometry's scales and the landmarks.
 
-A hypothesis says which landmark each cluster is, and where odometry slipped. For each cluster each becomes several: one
-for every landmark that fits, one where it is new, one where it is nothing. Updates come one after another with the
-joint covariance, so what fits fits jointly (Neira and Tardos, 2001). Kept are the likeliest, and of those that have
-decided alike for long only the best. The first is the leader.
+A hypothesis says which landmark each cluster is, and where odometry slipped. Each new cluster makes several hypotheses
+of each one: for every landmark that fits, for a new landmark, and for a false sighting. They are updated one after
+another with the joint covariance, so that the assignments are jointly compatible (Neira and Tardos, 2001). The
+likeliest are kept. Of hypotheses with the same recent decisions only the best is kept. The first one is the leader.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The solver's belief, in the coordinates of the beam: a beginning, and landmarks that come back."""
+"""The solver's joint Gaussian in the coordinates of the beam, to start the beam and to bring back landmarks."""
 
 from collections.abc import Mapping
 

@@ -1,8 +1,8 @@
-"""A stretch of the drive, laid on the rest of the map as one constellation.
+"""Alignment of a stretch of the drive with the rest of the map, all its landmarks at once.
 
-Where what is seen in a stretch is a twin of what is seen elsewhere, no landmark by itself can be mended. Candidates for
-the motion come from pairs of what is seen in the stretch and pairs of landmarks as far apart; the best few are solved
-completely and compared by what they cost.
+Where the landmarks of a stretch are copies of landmarks elsewhere, they cannot be mended one by one. Candidate motions
+come from pairs of landmarks in the stretch and equally distant pairs in the map. The best few are solved completely,
+and their costs are compared.
 """
 
 from collections.abc import Iterator

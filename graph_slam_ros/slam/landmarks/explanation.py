@@ -1,8 +1,7 @@
-"""All scans of a drive at once: poses, landmarks and odometry's two scales that explain them, and what that costs.
+"""The explanation of all scans of a drive at once: poses, landmarks and odometry's two scales, and its cost.
 
-Gauss-Newton with Levenberg's damping. Odometry is tight or has slipped, whichever costs less; clusters have Cauchy's
-loss. It is solved in stages, since a local minimum looks like a wrong association: first nothing slips and the loss is
-wide.
+The method is Gauss-Newton with Levenberg's damping. Odometry is tight or has slipped, whichever costs less. Clusters
+have Cauchy's loss. The first stage has no slip and a wide loss, because a local minimum looks like a wrong association.
 """
 
 from collections.abc import Sequence

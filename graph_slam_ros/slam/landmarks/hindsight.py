@@ -1,7 +1,7 @@
-"""All scans explained at once, in the background: it begins on a copy, and is taken over at a fixed later keyframe.
+"""Explains all scans at once, in the background on a copy. The result is used at a fixed later keyframe.
 
-Solved in stages from odometry and from the present path, the cheaper one; then what moves take back. Where in between
-the work is done changes nothing.
+The scans are solved in stages, once from odometry and once from the present path, and the cheaper solution is kept.
+Then moves correct the association. The result does not depend on when the work is done.
 """
 
 from collections.abc import Callable, Sequence

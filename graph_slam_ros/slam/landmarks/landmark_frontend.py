@@ -1,4 +1,4 @@
-"""Landmarks from sightings: which landmark each is of, what passes, and the review of those without identity."""
+"""The front end of landmarks: assigns sightings to landmarks, applies the gates, reviews sightings without id."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

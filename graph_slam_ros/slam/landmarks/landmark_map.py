@@ -1,4 +1,4 @@
-"""Landmarks: from sightings to vertices and edges, and what still waits to be determined, with the reason."""
+"""Landmarks: sightings become vertices and edges. A landmark that is not determined yet is kept with the reason."""
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Moves that take association back: two landmarks become one, clusters change hands. Each is kept if it costs less."""
+"""Moves that correct an association: merge two landmarks, reassign clusters. A move is kept if it costs less."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Rotations of many poses at once, in the plane and in space: arrays instead of one pose after another."""
+"""Rotations of many poses at once as arrays, in the plane and in space."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,7 @@
-"""Scans: what was seen of things without identity within half a second, carried to one instant by odometry.
+"""Scans: the sightings without id of half a second, moved to one instant by odometry.
 
-Sightings of one thing are a cluster. A cluster is the mean of its sightings and has the covariance of one of them: what
-is wrong for half a second is wrong in all of them alike. Clusters of one scan are of different landmarks.
+The sightings of one landmark in a scan are a cluster. A cluster is their mean, with the covariance of a single one,
+because an error that lasts half a second is the same in all of them. The clusters of one scan are different landmarks.
 """
 
 from bisect import bisect_right

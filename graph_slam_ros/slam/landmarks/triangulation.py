@@ -1,8 +1,7 @@
-"""Triangulation of a landmark from ranges and bearings taken at known places: all places that fit, and how well.
+"""Triangulation of a landmark from ranges and bearings at known places: all places that fit, and how well.
 
-A range from one place leaves a circle, from two places two points; bearings from one place leave a ray. So the search
-begins at many points of the circle, sphere or ray that the first sighting leaves, each followed to the least squares
-next to it.
+One range leaves a circle, two ranges leave two points, and bearings from one place leave a ray. So the search starts at
+many points of the circle, sphere or ray of the first sighting. Each start is refined to the nearest least squares.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """Search for better hypotheses in the background, while the robot drives on.
 
-Both are keyframes, told by the ingest sequence alone, so that a replay decides as the live run did: it begins on a
-frozen copy; at a fixed later keyframe its outcome is taken over, waited for if it must be. Where in between the work is
-done, in a thread or at the end, changes nothing.
+A search starts on a frozen copy at one keyframe, and its outcome is used at a fixed later one. If it is not done by
+then, the pipeline waits. Both keyframes follow from the ingest sequence alone, so that a replay decides as the live run
+did.
 """
 
 from collections.abc import Callable

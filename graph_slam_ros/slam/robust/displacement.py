@@ -1,8 +1,8 @@
 """Search for a displacement after a slip or a kidnap: the landmarks and odometry disagree on the pose.
 
-Odometry that is wrong without a jump leaves traces in what is held back: those sightings agree with one another, at
+Odometry that is wrong without a jump leaves traces in the sightings that are held back: they agree with one another at
 another pose of the robot, and not with odometry. Sightings with wrong identities do not agree with one another. The
-evidence is counted: sightings that are held back and fit the other pose, minus those that are believed and do not.
+evidence is a count: held-back sightings that fit the other pose, minus believed ones that do not.
 """
 
 from collections import deque

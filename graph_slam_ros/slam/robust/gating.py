@@ -1,9 +1,9 @@
 """Outlier rejection: closures, sightings and fixes are candidates, odometry is not.
 
-A candidate that would be too unlikely given what was known just before is held back: its innovation is compared with
-the joint covariance of what it is between and its own (Neira and Tardos, "Data association in stochastic mapping using
-the joint compatibility test", 2001, eq. 2). One that does not fit after the solve pulls ever less, by its loss, and is
-taken out below a weight. Nothing is final: all are looked at again, and what fits then comes back.
+A candidate that is too unlikely given all earlier measurements is held back: its innovation is compared with the joint
+covariance of its vertices and its own (Neira and Tardos, "Data association in stochastic mapping using the joint
+compatibility test", 2001, eq. 2). One that does not fit after the solve loses weight by its loss, and is removed below
+a limit. No verdict is final: all are judged again, and one that fits later is used.
 """
 
 from collections.abc import Sequence

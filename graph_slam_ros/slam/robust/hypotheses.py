@@ -1,10 +1,10 @@
-"""A second look at everything: solve, judge, solve again, from more than one start; the best explanation wins.
+"""Search for the best explanation: solve, judge, solve again, from several starts; the lowest cost wins.
 
-What an online run believes first may rest on a false closure that came before the true ones. So the whole is explained
-from the online estimate and what is believed there; from the candidates that agree with a neighbour, there and along
-odometry alone; and from the largest group that is out. In each, all is solved and every candidate judged by how it
-fits, in turn, until no verdict changes; what is out then costs as much as the gate would have let it cost (truncated
-least squares). The lowest cost wins.
+The first verdicts of an online run may rest on a false closure that came before the true ones. So there are several
+starts: the online estimate with its verdicts; the candidates that agree with a neighbour, at that estimate and at
+odometry alone; and the largest group of rejected candidates. From each start, everything is solved and every candidate
+is judged by its residual, until no verdict changes. A rejected candidate costs the limit of its gate (truncated least
+squares).
 """
 
 from collections.abc import Iterator

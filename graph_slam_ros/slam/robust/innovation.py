@@ -1,4 +1,4 @@
-"""The innovation: how far a measurement is from what all else predicts of it, in units of both their uncertainties."""
+"""The innovation: the difference between a measurement and its prediction, normalised by both covariances."""
 
 from collections.abc import Sequence
 

@@ -1,10 +1,9 @@
 """Monitor of whether the newest sightings contradict odometry: a test on the sum of their innovations.
 
-Each sighting has a normalised innovation squared: how far it is from what all else predicts, in sigmas, squared. Over a
-window of the newest, of which no landmark has more than a few (sightings of one landmark err together), the sum is
-compared with the quantile of chi2 of as many degrees of freedom. Some sightings carry wrong identities, however good
-the odometry is: as many of the worst as that explains, at the rate that the drive has shown, are left out of the sum.
-So ranges and bearings count as well, which do not tell a pose.
+Each sighting has a normalised innovation squared (NIS). A window has the newest sightings, a few of each landmark,
+since sightings of one landmark err together. The sum of NIS is compared with the chi-square quantile of its degrees of
+freedom. Some sightings have wrong identities, however good odometry is. So the worst sightings are left out of the sum,
+as many as the rate of such errors in this drive explains. Ranges and bearings are used, too.
 """
 
 from collections import deque

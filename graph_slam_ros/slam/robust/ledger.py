@@ -1,4 +1,4 @@
-"""The ledger: of every measurement that may be wrong, what was decided about it, when, by what, and what before."""
+"""The ledger: all decisions on every measurement that may be wrong, with keyframe and reason."""
 
 from copy import copy, deepcopy
 from dataclasses import dataclass

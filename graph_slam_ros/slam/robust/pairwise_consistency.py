@@ -1,8 +1,8 @@
-"""Pairwise consistency of loop closures: two that join the same two stretches of the path, nearly in one place.
+"""Pairwise consistency of loop closures that join the same two stretches of the path.
 
-Odometry between near poses is good, so such a pair and the two short ways between their ends make a loop that must
-close: pairwise consistency (Mangelson et al., "Pairwise consistent measurement set maximization", ICRA 2018, eq. 3),
-between neighbours only, where the odometry tells something.
+Odometry between near poses is good. So two such closures and the two short ways between their ends form a loop that
+must close: pairwise consistency (Mangelson et al., "Pairwise consistent measurement set maximization", ICRA 2018,
+eq. 3). Only neighbours are compared, where odometry is precise enough.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Rigid alignment: the rotation and shift that lay points on their places."""
+"""Rigid alignment: the rotation and translation that move points onto their counterparts."""
 
 import numpy as np
 
