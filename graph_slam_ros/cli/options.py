@@ -51,7 +51,7 @@ def diff(sub: CommandParser) -> None:
     sub.codes = f"{CODES} 4: they differ."
     sub.add_argument("a", type=Path, metavar="A", help="run folder")
     sub.add_argument("b", type=Path, metavar="B", help="run folder")
-    sub.add_argument("--json", action="store_true", help="print all of it as one line of JSON")
+    _add_json(sub)
 
 
 def merge(sub: CommandParser) -> None:
@@ -83,7 +83,7 @@ def check(sub: CommandParser, *, of_check: bool = True) -> None:
     )
     if of_check:
         sub.add_argument("--quick", action="store_true", help="leave out what needs a replay and a fit")
-    sub.add_argument("--json", action="store_true", help="print all of it as one line of JSON")
+    _add_json(sub)
 
 
 def calibrate(sub: CommandParser) -> None:
@@ -140,7 +140,7 @@ def optimize(sub: CommandParser) -> None:
         "--certify", action="store_true", help="prove that the result is the global optimum; for graphs of poses only"
     )
     _add_reading(sub)
-    sub.add_argument("--json", action="store_true", help="print the answer as one line of JSON")
+    _add_json(sub, "the answer")
     sub.add_argument("--out", type=Path, metavar="FILE.g2o", help="write the solved graph")
     sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the initial estimate and the result")
     _add_force(sub)
@@ -211,7 +211,7 @@ def evaluate(sub: CommandParser) -> None:
         metavar="FILE",
         help="trajectory to evaluate (default: sightings.tum; path.tum without observations)",
     )
-    sub.add_argument("--json", action="store_true", help="print the numbers as one line of JSON")
+    _add_json(sub, "the numbers")
     sub.add_argument(
         "--plot", type=Path, metavar="FILE.png", help="file of the picture (default: path.png in the run folder)"
     )
@@ -270,25 +270,13 @@ def solve(sub: CommandParser) -> None:
     """Add the options of ``solve``."""
     sub.codes = f"Edges have the ids of explain and of the run's ledger. {CODES}"
     add_run(sub)
-    sub.add_argument(
-        "--without",
-        nargs="+",
-        action="extend",
-        type=values.edge,
-        default=[],
-        metavar="EDGE",
-        help="ids of edges to remove",
-    )
-    sub.add_argument(
-        "--with",
-        dest="let_in",
-        nargs="+",
-        action="extend",
-        type=values.edge,
-        default=[],
-        metavar="EDGE",
-        help="ids of edges to include with full weight, without a robust loss",
-    )
+    for name, dest, about in (
+        ("--without", "without", "ids of edges to remove"),
+        ("--with", "let_in", "ids of edges to include with full weight, without a robust loss"),
+    ):
+        sub.add_argument(
+            name, dest=dest, nargs="+", action="extend", type=values.edge, default=[], metavar="EDGE", help=about
+        )
     sub.add_argument(
         "--loss",
         type=values.loss,
@@ -300,25 +288,13 @@ def solve(sub: CommandParser) -> None:
 def influence(sub: CommandParser) -> None:
     """Add the options of ``influence``."""
     add_run(sub)
-    sub.add_argument(
-        "--count",
-        type=values.count,
-        default=10,
-        metavar="N",
-        help="number of edges that are left out in turn (default: 10)",
-    )
+    _add_count(sub, 10, "number of edges that are left out in turn")
 
 
 def advise(sub: CommandParser) -> None:
     """Add the options of ``advise``."""
     add_run(sub)
-    sub.add_argument(
-        "--count",
-        type=values.count,
-        default=1,
-        metavar="N",
-        help="additions of each kind that are listed for each weakest direction (default: 1)",
-    )
+    _add_count(sub, 1, "additions of each kind that are listed for each weakest direction")
     sub.add_argument(
         "--survey-sigma",
         type=values.positive,
@@ -326,7 +302,7 @@ def advise(sub: CommandParser) -> None:
         metavar="M",
         help="sigma of each coordinate of a surveyed landmark [m] (default: 0.02)",
     )
-    sub.add_argument("--json", action="store_true", help="print all of it as one line of JSON")
+    _add_json(sub)
 
 
 def demo(sub: CommandParser) -> None:
@@ -369,6 +345,14 @@ def _add_out(sub: CommandParser, *, required: bool = True, default: str = "") ->
     about = f"folder for the results{f' (default: {default})' if default else ''}"
     sub.add_argument("--out", type=Path, metavar="DIR", required=required, help=about)
     _add_force(sub)
+
+
+def _add_json(sub: CommandParser, what: str = "all of it") -> None:
+    sub.add_argument("--json", action="store_true", help=f"print {what} as one line of JSON")
+
+
+def _add_count(sub: CommandParser, default: int, about: str) -> None:
+    sub.add_argument("--count", type=values.count, default=default, metavar="N", help=f"{about} (default: {default})")
 
 
 def _add_force(sub: CommandParser) -> None:

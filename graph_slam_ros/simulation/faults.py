@@ -4,7 +4,7 @@ A fault is put into a ``Draft``, which lists what is wrong in it. The same seed 
 its own stream of random numbers, so that one more fault changes none of the others.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from graph_slam_ros.simulation.draft import Draft
 from graph_slam_ros.simulation.drive import Drive
 from graph_slam_ros.simulation.false_closures import GROUP, POLICIES, Closures, count_for, false_closures
 from graph_slam_ros.simulation.message_faults import MESSAGE_KINDS
-from graph_slam_ros.simulation.options import fill, option
+from graph_slam_ros.simulation.options import Kind, fill, option
 from graph_slam_ros.typing import Array
 
 _OFTEN = 3  # times that a landmark must be seen, and seen again later, to be worth a fault
@@ -247,19 +247,6 @@ def _some(rng: Generator, names: Sequence[str], count: int, fault: str) -> list[
     if len(names) < count:
         raise GraphSlamError(f"{fault}: needs {count} landmarks that are seen often enough; there are {len(names)}")
     return [names[k] for k in rng.permutation(len(names))[:count].tolist()]
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A kind of fault: its dataclass of options, and the function that puts it into a draft."""
-
-    options: type
-    put: Callable[[Draft, Any, Generator], None]
-
-    @property
-    def about(self) -> str:
-        """One sentence on it."""
-        return (self.options.__doc__ or "").strip().splitlines()[0]
 
 
 KINDS: dict[str, Kind] = {

@@ -8,15 +8,12 @@ import numpy as np
 from numpy.random import Generator
 
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.cdr import NS
 from graph_slam_ros.lie import se3
 from graph_slam_ros.simulation.drive import Drive, Message, Sightings
-from graph_slam_ros.simulation.odometry_faults import ODOMETRY_KINDS, MessageKind
-from graph_slam_ros.simulation.options import option
+from graph_slam_ros.simulation.odometry_faults import AT, CHANGED, ODOMETRY_KINDS
+from graph_slam_ros.simulation.options import Kind, option
 from graph_slam_ros.typing import Array
-
-_S = 1_000_000_000
-_AT = "when, as a part of the messages: 0 the first, 1 the last"
-_CHANGED = "of the messages"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +41,7 @@ class Uptime:
 class ZeroStamps:
     """Landmarks whose driver leaves stamps at zero."""
 
-    rate: float = option(0.3, _CHANGED, "", 0, 1)
+    rate: float = option(0.3, CHANGED, "", 0, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +49,7 @@ class ClockSetBack:
     """A clock of the whole robot that is set back."""
 
     seconds: float = option(30.0, "by so much", "s", 0, 1e9)
-    at: float = option(0.5, _AT, "", 0, 1)
+    at: float = option(0.5, AT, "", 0, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +120,7 @@ class NewIds:
 class Blind:
     """A sensor that sees nothing after a while."""
 
-    after: float = option(0.25, _AT, "", 0, 1)
+    after: float = option(0.25, AT, "", 0, 1)
 
 
 def _stamped(change: Callable[[Any, Any, Generator], Any]) -> Callable[[Drive, Any, Generator], None]:
@@ -134,7 +131,7 @@ def _stamped(change: Callable[[Any, Any, Generator], Any]) -> Callable[[Drive, A
 def _clock_set_back(drive: Drive, fault: ClockSetBack, _rng: Generator) -> None:
     at_ns = np.quantile(drive.odometry_ns, fault.at)
     for messages in (drive.odometry, drive.landmarks):
-        drive.restamp(messages, lambda t: np.where(t > at_ns, t - round(fault.seconds * _S), t))
+        drive.restamp(messages, lambda t: np.where(t > at_ns, t - round(fault.seconds * NS), t))
 
 
 def _wrong_frames(drive: Drive, fault: WrongFrames, _rng: Generator) -> None:
@@ -232,7 +229,7 @@ def _new_ids(drive: Drive, fault: NewIds, _rng: Generator) -> None:
     names: dict[tuple[str, int], str] = {}
 
     def change(seen: Sightings, m: Message) -> None:
-        period = int((m.stamp_ns - first_ns) / (fault.seconds * _S))
+        period = int((m.stamp_ns - first_ns) / (fault.seconds * NS))
         seen.ids = [names.setdefault((name, period), str(len(names))) for name in seen.ids]
 
     _each(drive, change)
@@ -243,22 +240,22 @@ def _blind(drive: Drive, fault: Blind, _rng: Generator) -> None:
     drive.drop([m for m in drive.landmarks if m.stamp_ns > at_ns])
 
 
-MESSAGE_KINDS: dict[str, MessageKind] = {
+MESSAGE_KINDS: dict[str, Kind] = {
     **ODOMETRY_KINDS,
-    "clock_offset": MessageKind(ClockOffset, _stamped(lambda t, f, _: t + round(f.seconds * _S))),
-    "clock_drift": MessageKind(ClockDrift, _stamped(lambda t, f, _: t + ((t - t[0]) * f.ppm * 1e-6).astype(np.int64))),
-    "uptime": MessageKind(Uptime, _stamped(lambda t, f, _: t - t[0] + round(f.seconds * _S))),
-    "zero_stamps": MessageKind(ZeroStamps, _stamped(lambda t, f, rng: np.where(rng.random(len(t)) < f.rate, 0, t))),
-    "clock_set_back": MessageKind(ClockSetBack, _clock_set_back),
-    "wrong_frames": MessageKind(WrongFrames, _wrong_frames),
-    "two_parents": MessageKind(TwoParents, _two_parents),
-    "wrong_mount": MessageKind(WrongMount, _wrong_mount),
-    "wrong_axes": MessageKind(WrongAxes, _wrong_axes),
-    "wrong_units": MessageKind(WrongUnits, _wrong_units),
-    "noisy": MessageKind(Noisy, _noisy),
-    "track_ids": MessageKind(TrackIds, _track_ids),
-    "random_ids": MessageKind(RandomIds, _random_ids),
-    "new_ids": MessageKind(NewIds, _new_ids),
-    "blind": MessageKind(Blind, _blind),
+    "clock_offset": Kind(ClockOffset, _stamped(lambda t, f, _: t + round(f.seconds * NS))),
+    "clock_drift": Kind(ClockDrift, _stamped(lambda t, f, _: t + ((t - t[0]) * f.ppm * 1e-6).astype(np.int64))),
+    "uptime": Kind(Uptime, _stamped(lambda t, f, _: t - t[0] + round(f.seconds * NS))),
+    "zero_stamps": Kind(ZeroStamps, _stamped(lambda t, f, rng: np.where(rng.random(len(t)) < f.rate, 0, t))),
+    "clock_set_back": Kind(ClockSetBack, _clock_set_back),
+    "wrong_frames": Kind(WrongFrames, _wrong_frames),
+    "two_parents": Kind(TwoParents, _two_parents),
+    "wrong_mount": Kind(WrongMount, _wrong_mount),
+    "wrong_axes": Kind(WrongAxes, _wrong_axes),
+    "wrong_units": Kind(WrongUnits, _wrong_units),
+    "noisy": Kind(Noisy, _noisy),
+    "track_ids": Kind(TrackIds, _track_ids),
+    "random_ids": Kind(RandomIds, _random_ids),
+    "new_ids": Kind(NewIds, _new_ids),
+    "blind": Kind(Blind, _blind),
 }
 """Faults that any recording can have; those of worlds (``faults.KINDS``) need its truth."""

@@ -2,32 +2,18 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.random import Generator
 
+from graph_slam_ros.formats.cdr import NS
 from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.simulation.drive import Drive
-from graph_slam_ros.simulation.options import option
+from graph_slam_ros.simulation.options import Kind, option
 from graph_slam_ros.typing import Array
 
-_S = 1_000_000_000
-_AT = "when, as a part of the messages: 0 the first, 1 the last"
-_CHANGED = "of the messages"
-
-
-@dataclass(frozen=True, slots=True)
-class MessageKind:
-    """A kind of fault: its dataclass of options, and the function that puts it into a drive."""
-
-    options: type
-    put: Callable[[Drive, Any, Generator], None]
-
-    @property
-    def about(self) -> str:
-        """One sentence on it."""
-        return (self.options.__doc__ or "").strip().splitlines()[0]
+AT = "when, as a part of the messages: 0 the first, 1 the last"
+CHANGED = "of the messages"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +26,7 @@ class OutOfOrder:
     """Odometry of which some messages are stamped too early."""
 
     seconds: float = option(0.2, "by so much", "s", 0, 100)
-    rate: float = option(0.02, _CHANGED, "", 0, 1)
+    rate: float = option(0.02, CHANGED, "", 0, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +34,7 @@ class Gap:
     """Odometry of which a stretch is lost."""
 
     seconds: float = option(5.0, "how long", "s", 0, 1e6)
-    at: float = option(0.33, _AT, "", 0, 1)
+    at: float = option(0.33, AT, "", 0, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +84,7 @@ class Standing:
 class Restarted:
     """Odometry whose driver is restarted, and begins at zero again."""
 
-    at: float = option(0.5, _AT, "", 0, 1)
+    at: float = option(0.5, AT, "", 0, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +100,7 @@ class Corrected:
 class NotANumber:
     """Odometry with positions that are no numbers."""
 
-    rate: float = option(0.01, _CHANGED, "", 0, 1)
+    rate: float = option(0.01, CHANGED, "", 0, 1)
 
 
 def _recorded_twice(drive: Drive, _fault: RecordedTwice, _rng: Generator) -> None:
@@ -126,12 +112,12 @@ def _recorded_twice(drive: Drive, _fault: RecordedTwice, _rng: Generator) -> Non
 
 def _out_of_order(drive: Drive, fault: OutOfOrder, rng: Generator) -> None:
     for m in drive.odometry:
-        m.stamp_ns -= round(fault.seconds * _S) if rng.random() < fault.rate else 0
+        m.stamp_ns -= round(fault.seconds * NS) if rng.random() < fault.rate else 0
 
 
 def _gap(drive: Drive, fault: Gap, _rng: Generator) -> None:
     at_ns = np.quantile(drive.odometry_ns, fault.at)
-    drive.drop([m for m in drive.odometry if at_ns < m.stamp_ns <= at_ns + fault.seconds * _S])
+    drive.drop([m for m in drive.odometry if at_ns < m.stamp_ns <= at_ns + fault.seconds * NS])
 
 
 def _slow(drive: Drive, fault: SlowOdometry, _rng: Generator) -> None:
@@ -144,7 +130,7 @@ def _slow(drive: Drive, fault: SlowOdometry, _rng: Generator) -> None:
 
 
 def _jitter(drive: Drive, fault: Jitter, rng: Generator) -> None:
-    drive.restamp(drive.odometry, lambda t: np.sort(t + (rng.exponential(fault.seconds, len(t)) * _S).astype(np.int64)))
+    drive.restamp(drive.odometry, lambda t: np.sort(t + (rng.exponential(fault.seconds, len(t)) * NS).astype(np.int64)))
 
 
 def _chained(first: Array, moved: Array, turned: Array) -> Array:
@@ -215,7 +201,7 @@ def _restarted(drive: Drive, fault: Restarted, _rng: Generator) -> None:
 
 def _corrected(drive: Drive, fault: Corrected, rng: Generator) -> None:
     poses, stamps_ns = drive.poses, drive.odometry_ns
-    for at_ns in np.arange(stamps_ns[0] + fault.every_s * _S, stamps_ns[-1], fault.every_s * _S):
+    for at_ns in np.arange(stamps_ns[0] + fault.every_s * NS, stamps_ns[-1], fault.every_s * NS):
         at = int(np.searchsorted(stamps_ns, at_ns))
         by = (*(fault.sigma_m * rng.standard_normal(2)), 0.0, *so3.exp((0.0, 0.0, fault.sigma_rad * rng.normal())))
         poses = _moved(poses, at, se3.compose(tuple(poses[at].tolist()), by))
@@ -228,17 +214,17 @@ def _not_a_number(drive: Drive, fault: NotANumber, rng: Generator) -> None:
             m.content.pose.pose.position.x = float("nan")
 
 
-ODOMETRY_KINDS: dict[str, MessageKind] = {
-    "recorded_twice": MessageKind(RecordedTwice, _recorded_twice),
-    "out_of_order": MessageKind(OutOfOrder, _out_of_order),
-    "gap": MessageKind(Gap, _gap),
-    "slow_odometry": MessageKind(SlowOdometry, _slow),
-    "jitter": MessageKind(Jitter, _jitter),
-    "wrong_scale": MessageKind(WrongScale, _wrong_scale),
-    "wrong_twist": MessageKind(WrongTwist, _wrong_twist),
-    "twist_variance": MessageKind(TwistVariance, _twist_variance),
-    "standing": MessageKind(Standing, _standing),
-    "restarted": MessageKind(Restarted, _restarted),
-    "corrected": MessageKind(Corrected, _corrected),
-    "not_a_number": MessageKind(NotANumber, _not_a_number),
+ODOMETRY_KINDS: dict[str, Kind] = {
+    "recorded_twice": Kind(RecordedTwice, _recorded_twice),
+    "out_of_order": Kind(OutOfOrder, _out_of_order),
+    "gap": Kind(Gap, _gap),
+    "slow_odometry": Kind(SlowOdometry, _slow),
+    "jitter": Kind(Jitter, _jitter),
+    "wrong_scale": Kind(WrongScale, _wrong_scale),
+    "wrong_twist": Kind(WrongTwist, _wrong_twist),
+    "twist_variance": Kind(TwistVariance, _twist_variance),
+    "standing": Kind(Standing, _standing),
+    "restarted": Kind(Restarted, _restarted),
+    "corrected": Kind(Corrected, _corrected),
+    "not_a_number": Kind(NotANumber, _not_a_number),
 }

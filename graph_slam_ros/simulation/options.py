@@ -2,9 +2,11 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
+
+from numpy.random import Generator
 
 from graph_slam_ros.errors import GraphSlamError
 
@@ -36,6 +38,19 @@ class Option:
         elif kind is not bool and not (self.low <= value <= self.high and value != math.inf):
             raise GraphSlamError(f"{world}: {self.name}: {value!r} is not in [{self.low:g}, {self.high:g}]")
         return value
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of fault: its dataclass of options, and the function that puts it into a ``Draft`` or a ``Drive``."""
+
+    options: type
+    put: Callable[[Any, Any, Generator], None]
+
+    @property
+    def about(self) -> str:
+        """One sentence on it."""
+        return (self.options.__doc__ or "").strip().splitlines()[0]
 
 
 _ARTICLE = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}
