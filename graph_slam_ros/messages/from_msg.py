@@ -39,7 +39,7 @@ def decoder(type_name: str) -> Decoder:
 
 
 def is_correction(cdr: bytes, map_frame: str) -> bool:
-    """Return whether a tf2_msgs/TFMessage is about the map frame, by its first transform, without decoding it."""
+    """Return whether a tf2_msgs/TFMessage has the map frame in its first transform, without decoding it."""
     reader = CdrReader(cdr)
     try:
         reader.numbers("I")
@@ -52,7 +52,7 @@ def is_correction(cdr: bytes, map_frame: str) -> bool:
 def twist_of(cdr: bytes, base_frame: str) -> bytes | None:
     """The geometry_msgs/TwistWithCovariance, little endian, of a nav_msgs/Odometry, without decoding the rest.
 
-    None where it is of another frame than the base: what a wheel or a sensor does is not what the robot does.
+    None if its frame is not the base, because the motion of a wheel or a sensor is not that of the robot.
     """
     reader = CdrReader(cdr)
     try:
@@ -67,7 +67,7 @@ def twist_of(cdr: bytes, base_frame: str) -> bytes | None:
 
 
 class MessageConverter:
-    """Turns messages into measurements.
+    """Converts messages into measurements.
 
     Parameters
     ----------
@@ -137,32 +137,32 @@ class MessageConverter:
         return out
 
     def finish(self, *, is_end: bool = True) -> list[Measured]:
-        """Use or refuse what is pending for /tf; at the end of all messages, odometry that is pending, too."""
+        """Use or refuse what still needs a transform; at the end of all messages also the odometry that is kept."""
         out: list[Measured] = [m for one in self._publishers.values() for m in one.finish()] if is_end else []
         out += [one for pending in self._pending for one in self._hurried(*pending)]
         self._pending.clear()
         return out
 
     def unlinked(self, name: str) -> tuple[tuple[str, str], ...]:
-        """Frames of an input, each with the frame that nothing links it to, of the last messages refused for that."""
+        """Frames of an input, each with the frame that it is not linked to, from the last messages refused for that."""
         return tuple(self._sources[name].unlinked)
 
     def not_found(self, name: str) -> str:
-        """The odometry on /tf of which no transform has come yet, and what mends it; else empty."""
+        """The odometry on /tf whose transform has never come, and the remedy; else empty."""
         source = self._sources[name]
         return odometry.not_found(source) if source.use == "odometry" else ""
 
     def initial_pose(self, cdr: bytes) -> list[InitialPose]:
-        """Convert a geometry_msgs/PoseWithCovarianceStamped of ``initialpose``, if it can be used."""
+        """Convert a geometry_msgs/PoseWithCovarianceStamped of ``initialpose`` if it can be used."""
         out: list[Any] = self.convert(INITIAL_POSE, cdr)
         return out
 
     def begin_at(self, datum: tuple[float, ...]) -> None:
-        """Fixes are of a map that begins at this latitude, longitude and height, where no input says another."""
+        """Set the datum: the latitude, longitude and height for inputs that have no datum of their own."""
         self._origin.datum = datum
 
     def forget_time(self) -> None:
-        """Stamps begin anew: what /tf has told of moving joints is of another time."""
+        """Begin anew with the stamps: earlier transforms of moving joints belong to another time."""
         self._pending.clear()
         for publishers in self._publishers.values():
             publishers.forget_time()

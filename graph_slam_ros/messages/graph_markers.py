@@ -20,7 +20,7 @@ _COORDINATES = {SE2: 2, SE3: 3, R2: 2, R3: 3}
 
 @dataclass(frozen=True, slots=True)
 class GraphView:
-    """The lines and points that are drawn of a graph.
+    """The lines and points that represent a graph.
 
     Attributes
     ----------
@@ -38,8 +38,8 @@ class GraphView:
 def graph_view(slam: GraphSlam, most: int) -> GraphView:
     """Draw at most so many keyframes, landmarks and edges of the graph at its estimate.
 
-    An edge is a line between what it joins; one of a position alone, from there to the point of the robot that it is
-    of. What says nothing of a position is not drawn.
+    An edge is a line between its vertices. An edge of a position alone is a line from there to the point of the robot.
+    An edge without a position is not drawn.
     """
     graph, at = slam.graph, _positions(slam)
     drawn = {table: ends for table in graph.tables.values() if (ends := _drawn(slam.space, table.type))}
@@ -117,7 +117,7 @@ def _of_antenna(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
 
 
 def _of_coordinate(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
-    """A line from the nearest point that has the coordinate that was measured."""
+    """A line from the nearest point with the measured coordinate."""
     n, measured, antenna = slam.space.dimensions, some.measured, _antenna(slam, some)
     along = measured[:, :n]
     residual = np.einsum("ij,ij->i", along, antenna) - measured[:, n]
@@ -125,7 +125,7 @@ def _of_coordinate(slam: GraphSlam, at: Array, some: EdgeRows) -> Ends:
 
 
 def _antenna(slam: GraphSlam, some: EdgeRows) -> Array:
-    """The antenna, whose position was measured, (n, 2) or (n, 3); it is at the row's end."""
+    """The measured position of the antenna, (n, 2) or (n, 3), at the end of the row."""
     poses = slam.solver.estimate(some.vertices[:, 0]).reshape(-1, slam.space.pose.size)
     lever = some.measured[:, -slam.space.dimensions :]
     return np.stack(slam.space.group.act(tuple(poses.T), tuple(lever.T)), axis=-1)

@@ -27,7 +27,7 @@ _DASHES = 5
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """Edges to be drawn, from ``start`` to ``end``, (n, 3) each; ``misfit`` (n,) is chi2 per number measured."""
+    """Edges to draw, from ``start`` to ``end``, (n, 3) each; ``misfit`` (n,) is chi2 per degree of freedom."""
 
     start: Array
     end: Array
@@ -58,10 +58,10 @@ def landmark_markers(
 def graph_markers(
     stamp_ns: int, frame: str, poses: Array, landmarks: Array, classes: Mapping[str, Lines], rejected: Lines
 ) -> bytes:
-    """Vertices as points (n, 3), the edges of each class as lines of the colour of their misfit, those out dashed.
+    """Vertices as points (n, 3), and edges as lines: those of each class by their misfit, rejected ones dashed.
 
-    The namespaces are ``poses``, ``landmarks``, ``edges/CLASS`` and ``rejected``, where there is something to draw:
-    RViz calls a marker without points an error.
+    The namespaces are ``poses``, ``landmarks``, ``edges/CLASS`` and ``rejected``, as far as they are not empty: RViz
+    reports a marker without points as an error.
     """
     shapes = [
         ("poses", _POINTS, 0.06, poses, _OF_POSES, _PLAIN),
@@ -80,7 +80,7 @@ def graph_markers(
 
 
 def misfit_colours(misfit: ArrayLike) -> NDArray[np.float32]:
-    """Colours (n, 4): green up to 1, what is expected, by the root of the misfit to red from 9, three sigmas, on."""
+    """Colours (n, 4): green up to 1, which is expected, then by the root of the misfit to red from 9 (three sigmas)."""
     place = (len(_RAMP) - 1) * np.clip(0.5 * (np.sqrt(np.asarray(misfit)) - 1.0), 0.0, 1.0)
     out = np.ones((len(place), 4), dtype=np.float32)
     for channel in range(3):
@@ -89,7 +89,7 @@ def misfit_colours(misfit: ArrayLike) -> NDArray[np.float32]:
 
 
 def _dashed(lines: Lines) -> Array:
-    """The ends of the dashes of lines, which begin and end with one."""
+    """The ends of the dashes of lines. Each line begins and ends with a dash."""
     along = np.arange(2 * _DASHES) / (2 * _DASHES - 1)
     return (lines.start[:, None] + along[:, None] * (lines.end - lines.start)[:, None]).reshape(-1, 3)
 
@@ -97,7 +97,7 @@ def _dashed(lines: Lines) -> Array:
 def _two_sigma(covariances: Array) -> tuple[Array, Array]:
     """Ellipses of covariances (n, 2, 2) or (n, 3, 3): the orientations (n, 4) and diameters (n, 3) [m].
 
-    These are never too small to see, also where a covariance is unknown.
+    They have a minimum size, also if a covariance is unknown.
     """
     count, n, _ = covariances.shape
     known = np.isfinite(covariances).all(axis=(1, 2), keepdims=True)

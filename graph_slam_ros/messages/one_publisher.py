@@ -34,7 +34,7 @@ _MOST_HELD, _MOST_SINCE, _MOST_SINGLE = 100, 1000, 5
 
 @dataclass(slots=True, eq=False)
 class _Track:
-    """Poses that continue one another.
+    """A sequence of poses that continue one another.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class _Track:
     since: deque[Odometry] = field(default_factory=deque)
 
     def add(self, m: Odometry) -> None:
-        """Go on with a message; one that is not newer changes no prediction."""
+        """Add a message. One that is not newer does not change the prediction."""
         self.count += 1
         self.first_ns = self.first_ns or m.stamp_ns
         if not self.past or m.stamp_ns > self.past[-1][0]:
@@ -71,7 +71,7 @@ class _Track:
         return (self.newest_ns - self.past[0][0]) / (len(self.past) - 1) if len(self.past) > 1 else _USUAL_NS
 
     def misfit(self, m: Odometry) -> float:
-        """Return how far a message is from where the track leads; up to 1 it may continue the track."""
+        """Return the distance of a message from the track's prediction; up to 1 it may continue the track."""
         (first_ns, first), (last_ns, last), pose = self.past[0], self.past[-1], m.T_odom_base
         dt = (m.stamp_ns - last_ns) * 1e-9
         span_s, within_s = (last_ns - first_ns) * 1e-9, min(max(abs(dt), _LEAST_S), _MOST_S)
@@ -98,10 +98,10 @@ def _turn(a: Numbers, b: Numbers) -> float:
 
 
 class OnePublisher:
-    """Select, of the odometry messages of one input, those of one publisher.
+    """Selects the messages of one publisher among the odometry messages of an input.
 
-    The first publisher that is heard is used. When it falls silent while another goes on, that one takes over under a
-    source of its own (``odom#2``): the choice between sources of odometry then links the two.
+    The first publisher is used. If it falls silent while another goes on, that one takes over as a source of its own
+    (``odom#2``). The choice between sources of odometry then links the two.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ class OnePublisher:
         self._usual = 0.0  # misfit of the odometry in use
 
     def accept(self, m: Odometry) -> list[Odometry]:
-        """Accept a message; returns those that may be used now, in the order they came."""
+        """Accept a message. Returns those that may be used now, in order of arrival."""
         newest_ns, room_ns = m.stamp_ns, _GAP_NS
         if self._tracks and (used := self._tracks[0]).past:
             newest_ns = min(m.stamp_ns, used.newest_ns)
@@ -152,18 +152,18 @@ class OnePublisher:
         return self._jumped() if len(self._held) > _MOST_HELD or _has_jumped(track, used) else []
 
     def _is_older(self, m: Odometry) -> bool:
-        """Return whether it is left to the order of stamps."""
+        """Return whether its place is decided by the order of stamps."""
         used = self._tracks[0]
         return bool(used.past) and m.stamp_ns < used.newest_ns - _BACK_NS
 
     def finish(self) -> list[Odometry]:
-        """No more messages come: what waits is what the odometry has jumped to."""
+        """No more messages come: odometry has jumped to those that are kept."""
         out = self._jumped() if self._held else []
         self.forget_time()
         return out
 
     def forget_time(self) -> None:
-        """Stamps begin anew, and with them the tracks."""
+        """Begin anew with the stamps, without tracks."""
         self._leap.forget()
         self._begin_anew()
 
@@ -174,13 +174,13 @@ class OnePublisher:
         self._tracks.clear()
 
     def _drop(self, some: deque[Any], kept: int) -> None:
-        """Use none of these, but perhaps the last few."""
+        """Use none of these, except perhaps the last few."""
         while len(some) > kept:
             some.popleft()
             self._refuse()
 
     def _continued(self, m: Odometry) -> _Track:
-        """The track that a message continues best; a new one where it continues none."""
+        """The track that a message continues best; a new one if it continues none."""
         used = self._tracks[0]
         if not used.past:
             return used
@@ -200,7 +200,7 @@ class OnePublisher:
         return self._tracks[-1]
 
     def _at_speed(self, m: Odometry) -> _Track | None:
-        """The track that two tracks of one pose each and a message make, where the robot is fast as it begins."""
+        """The track of a message and two tracks of one pose each, for a robot that is fast from the start."""
         single = [track for track in self._tracks if len(track.past) == 1][-_MOST_SINGLE:]
         for a, b in combinations(single, 2):
             joined = _Track(past=deque([*a.past, *b.past], maxlen=_REMEMBERED))
@@ -212,7 +212,7 @@ class OnePublisher:
         return None
 
     def _go_on(self, at: Odometry) -> list[Odometry]:
-        """The track in use goes on: what came since and does not continue it is not used."""
+        """Continue the track in use. Messages since then that do not continue it are not used."""
         used = self._tracks[0]
         out = [_labelled(m, used) for track, m in self._held if track is used]
         for track, m in self._held:
@@ -229,7 +229,7 @@ class OnePublisher:
         return out
 
     def _jumped(self) -> list[Odometry]:
-        """The odometry goes on as the newest track; where there are too many to tell, with all that waits."""
+        """Continue with the newest track; with all that is kept if there are too many tracks to decide."""
         track, used = self._held[-1][0], self._tracks[0]
         out = [m for of, m in self._held if of is track or len(self._held) > _MOST_HELD]
         for _ in range(len(self._held) - len(out)):
@@ -240,7 +240,7 @@ class OnePublisher:
         return [_labelled(m, track) for m in out]
 
     def _switch_to(self, track: _Track) -> list[Odometry]:
-        """Nothing, until the track in use has been silent for so long that another one takes over."""
+        """Use another track once the track in use has been silent for long enough."""
         if track.count < _SURE or track.newest_ns - track.since[0].stamp_ns <= self._timeout_ns:
             self._drop(track.since, _MOST_SINCE)
             return []
@@ -256,7 +256,7 @@ class OnePublisher:
 
 
 def _has_jumped(track: _Track, used: _Track) -> bool:
-    """Return whether a new track has gone on for so long without the one in use that this is given up."""
+    """Return whether a new track has gone on without the one in use for so long that the latter is given up."""
     return track.count >= _SURE and track.newest_ns - track.first_ns >= _PERIODS * used.period_ns
 
 

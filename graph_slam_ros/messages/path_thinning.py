@@ -6,9 +6,10 @@ from graph_slam_ros.typing import Array, Index
 
 
 def thinned(count: int, most: int) -> Index:
-    """Indices to show of ``count`` if at most ``most`` (two or more; 0: all) may be, with first and last.
+    """Indices to show of ``count`` if at most ``most`` (two or more; 0: all) are allowed, with first and last.
 
-    Every second, every fourth, and so on: as more come the same are chosen until they are too many, then half of them.
+    It takes every second, every fourth, and so on. While the count grows the choice stays the same until it is too
+    large; then it is halved.
     """
     stride = 1
     while most and -(-(count - 1) // stride) + 1 > max(most, 2):
@@ -18,9 +19,9 @@ def thinned(count: int, most: int) -> Index:
 
 
 def worst_and_some(ids: Index, misfit: Array, most: int) -> Index:
-    """Ids of edges with a misfit (n,) each no more than ``most``, in order of their ids (n,).
+    """Select ids of edges with a misfit (n,), no more than ``most``, in order of their ids (n,).
 
-    Half of these are the worst; of the others all whose ids divide by a power of two.
+    Half of them are the worst edges. The others are all edges whose id is divisible by a power of two.
     """
     if len(ids) <= most:
         return ids

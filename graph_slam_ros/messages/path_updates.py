@@ -15,7 +15,7 @@ from graph_slam_ros.typing import Array
 
 
 class PathUpdates:
-    """Remembers what was sent of one path. What has moved since is found by comparing: 20,000 poses take under 1 ms.
+    """Remembers what was sent of one path. A comparison finds what has moved: 20,000 poses take under 1 ms.
 
     Parameters
     ----------
@@ -32,18 +32,18 @@ class PathUpdates:
         self._sent: Array = np.empty((0, 0))
 
     def restart(self, slam: GraphSlam) -> bytes:
-        """nav_msgs/Path without poses: forget all; the next update tells of every keyframe.
+        """nav_msgs/Path without poses: forget all; the next update contains every keyframe.
 
-        It is due where somebody has just joined, and where another ``GraphSlam`` follows.
+        It is due for a new subscriber, and after another ``GraphSlam`` has begun.
         """
         self.version = 1
         self._sent = np.empty((0, 0))
         return to_msg.path(slam.config.frames.map, [], self._sent)
 
     def update(self, slam: GraphSlam) -> bytes | None:
-        """nav_msgs/Path of the keyframes that are new or have moved, in order of time, dated as the newest of all.
+        """nav_msgs/Path of the keyframes that are new or have moved, in order of time, with the newest stamp of all.
 
-        None where there are none.
+        None if there are none.
         """
         now, old = slam.trajectory(), self._sent
         changed = np.ones(len(now), dtype=bool)

@@ -30,7 +30,7 @@ def newest_pose(slam: GraphSlam) -> Numbers:
 
 
 def path(slam: GraphSlam, most: int = 0) -> bytes:
-    """The corrected path: every keyframe at its own stamp, or so many of them as ``thinned`` chooses."""
+    """The corrected path: every keyframe at its own stamp, or those that ``thinned`` selects."""
     kept = thinned(len(slam.keyframes), most)
     return to_msg.path(slam.config.frames.map, slam.keyframes.stamps_ns[kept], slam.trajectory()[kept])
 
@@ -52,13 +52,13 @@ def map_to_odom(slam: GraphSlam, stamp_ns: int) -> bytes:
 
 
 def odom_to_base(slam: GraphSlam) -> bytes:
-    """The newest keyframe's odometry as a transform: recorded, never published (the robot's driver does that)."""
+    """The newest keyframe's odometry as a transform. It is recorded, and only the robot's driver publishes it."""
     newest, frames = slam.keyframes[-1], slam.config.frames
     return to_msg.transform(newest.stamp_ns, frames.odom, frames.base, newest.T_odom_base)
 
 
 def landmarks(slam: GraphSlam, estimates: Sequence[Estimate] | None = None) -> bytes:
-    """Landmarks as 2-sigma ellipses, in space ellipsoids, with names; of all, or of ``landmark_estimates``."""
+    """Landmarks as 2-sigma ellipses, in space ellipsoids, with names; all, or those of ``landmark_estimates``."""
     n = slam.config.space.dimensions
     known = landmark_estimates(slam) if estimates is None else estimates
     positions = np.array([value[:n] for _, value, _ in known]).reshape(-1, n)
@@ -87,7 +87,7 @@ def landmarks_estimate(slam: GraphSlam, estimates: Sequence[Estimate] | None = N
 
 
 def graph(slam: GraphSlam, most: int) -> bytes:
-    """The graph: at most so many keyframes, landmarks and edges, these coloured by how well they fit."""
+    """The graph with a limited number of keyframes, landmarks and edges, coloured by how well they fit."""
     view = graph_view(slam, most)
     frame = slam.config.frames.map
     return markers.graph_markers(_stamp_ns(slam), frame, view.poses, view.landmarks, view.classes, view.rejected)

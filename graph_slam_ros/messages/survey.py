@@ -9,7 +9,7 @@ from graph_slam_ros.slam import Config
 
 
 def with_survey(config: Config) -> Config:
-    """The configuration with the lines of ``landmarks.surveyed_file``, if it has none yet: a run repeats with its own.
+    """The configuration with the rows of ``landmarks.surveyed_file``, unless it has some, as a repeated run does.
 
     Raises
     ------

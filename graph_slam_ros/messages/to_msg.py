@@ -35,7 +35,7 @@ def make(name: str, /, **fields: Any) -> Any:
 
 
 def time(stamp_ns: int) -> Any:
-    """builtin_interfaces/Time; what is later is the latest that it can say."""
+    """builtin_interfaces/Time; later stamps become the largest that it can represent."""
     sec, nanosec = divmod(min(int(stamp_ns), LATEST_NS), NS)
     return make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
 
@@ -72,7 +72,7 @@ def pose(p: ArrayLike) -> Any:
 
 
 def covariance6(covariance: Array, unused: float) -> Array:
-    """ROS's row-major 6x6, of (6, 6), or of (3, 3) over (x, y, yaw): z, roll and pitch get the variance ``unused``."""
+    """ROS's row-major 6x6, from (6, 6), or from (3, 3) over (x, y, yaw) with the variance ``unused`` for the rest."""
     if len(covariance) == 6:
         return np.ravel(covariance)
     full = np.zeros(36)
@@ -102,7 +102,7 @@ def pose_with_covariance_stamped(stamp_ns: int, frame: str, p: Numbers, covarian
 
 
 def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Numbers) -> bytes:
-    """tf2_msgs/TFMessage with one transform; quick, for it is sent with every odometry message."""
+    """tf2_msgs/TFMessage with one transform. It is fast, because it is sent with every odometry message."""
     one, motion = np.uint32(1).tobytes(), se3.in_space(T_parent_child).tobytes()
     return b"".join((HEADER, one, stamp(stamp_ns), _frames(12, parent, child), motion))
 
@@ -110,7 +110,7 @@ def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Numbers) -
 def odometry(
     stamp_ns: int, frame: str, child: str, p: Numbers, covariance: Array, unused: float, twist: bytes | None = None
 ) -> bytes:
-    """nav_msgs/Odometry; quick, for it is sent with every odometry message.
+    """nav_msgs/Odometry. It is fast, because it is sent with every odometry message.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def odometry(
 
 @cache
 def _frames(start: int, *names: str) -> bytes:
-    """Strings, each at a multiple of 4 from the head of the message, and padding to a multiple of 8."""
+    """Strings, each aligned to 4 bytes from the start of the message, and padding to 8 bytes."""
     out = b""
     for name in names:
         out += b"\x00" * (-(start + len(out)) % 4) + np.uint32(len(name.encode()) + 1).tobytes()
@@ -155,7 +155,7 @@ class Status:
 
 
 def diagnostics(stamp_ns: int, statuses: Iterable[Status]) -> bytes:
-    """diagnostic_msgs/DiagnosticArray; it is about no frame."""
+    """diagnostic_msgs/DiagnosticArray, without a frame."""
     return encode(
         make(
             "diagnostic_msgs/msg/DiagnosticArray",
@@ -183,9 +183,9 @@ def clock(stamp_ns: int) -> bytes:
 
 
 def path(frame: str, stamps_ns: ArrayLike, poses: Array, newest_ns: int | None = None) -> bytes:
-    """nav_msgs/Path of poses (n, 3) or (n, 7) and their stamps (n,); its header carries the newest stamp: the last.
+    """nav_msgs/Path of poses (n, 3) or (n, 7) and their stamps (n,). Its header has the newest stamp, the last one.
 
-    All poses after the first take the same number of bytes; the first is preceded by its own padding.
+    All poses after the first take the same number of bytes. The first has its own padding.
     """
     stamps = np.asarray(stamps_ns, dtype=np.int64)
     name = frame.encode() + b"\x00"
@@ -200,7 +200,7 @@ def path(frame: str, stamps_ns: ArrayLike, poses: Array, newest_ns: int | None =
 
 
 def _pose_rows(name: bytes, stamps: NDArray[np.int64], poses: Array, start: int) -> NDArray[np.uint8]:
-    """PoseStamped rows, as bytes, that begin at a multiple of 8 plus ``start`` from the head of the message."""
+    """PoseStamped rows as bytes, aligned to 8 bytes plus ``start`` from the start of the message."""
     text = 12 + len(name)
     row = np.dtype(
         [
@@ -220,7 +220,7 @@ def _pose_rows(name: bytes, stamps: NDArray[np.int64], poses: Array, start: int)
 
 
 def detections(stamp_ns: int, frame: str, names: Sequence[str], poses: Array, covariances: Array) -> bytes:
-    """vision_msgs/Detection3DArray: things seen, or known, by their identity, each with one hypothesis of no class.
+    """vision_msgs/Detection3DArray: detected or known objects by id, each with one hypothesis without a class.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class Interface:
     """A topic or service; ``~`` is the node's own name, a relative name is in the node's namespace.
 
-    ``latched`` is reliable and transient local with depth 1: who joins late gets the last message.
+    ``latched`` means reliable and transient local with depth 1: a late subscriber gets the last message.
     """
 
     name: str
@@ -16,7 +16,7 @@ class Interface:
     latched: bool = False
 
     def resolved(self, node: str = "/graph_slam") -> str:
-        """The name on a node of this fully qualified name."""
+        """The name on a node with this fully qualified name."""
         if self.name.startswith("~/"):
             return node + self.name[1:]
         return self.name if self.name.startswith("/") else f"{node.rpartition('/')[0]}/{self.name}"

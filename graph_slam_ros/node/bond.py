@@ -33,7 +33,7 @@ def is_installed() -> bool:
 
 
 class Bond:
-    """Our end of a bond, from now on until ``end``.
+    """One end of a bond. It lasts until ``end``.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class Bond:
         self._timer = node.create_timer(_PERIOD_S, node.guarded(self._beat), clock=steady)
 
     def end(self) -> None:
-        """Tell the manager that the node goes, so that it need not wait for silence."""
+        """Tell the manager that the node ends, so that it does not have to notice the silence."""
         self._node.destroy_timer(self._timer)
         if not self._is_over:
             self._publish(is_active=False)

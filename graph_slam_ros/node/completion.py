@@ -25,7 +25,7 @@ class Completion:
         self._run = Path()
 
     def tick(self) -> None:
-        """See whether one has ended, and begin the next."""
+        """Check whether a process has ended, and start the next."""
         if self._process is not None and self._process.poll() is not None:
             self._report(self._process)
             self._process = None
@@ -33,7 +33,7 @@ class Completion:
             self._begin(self._runs.pop(0))
 
     def stop(self) -> None:
-        """End what is going on: the next start begins it again."""
+        """Stop the process that runs. The next start of the node starts it again."""
         self._runs.clear()
         if self._process is not None:
             self._process.kill()

@@ -149,7 +149,7 @@ def _errors(facts: Facts) -> Iterator[str]:
 
 
 def _missing(facts: Facts) -> Iterator[str]:
-    """The reasons why there is no estimate yet; landmarks give one only where something is wrong."""
+    """Reasons why there is no estimate yet. Landmarks are among them only if something is wrong with them."""
     if facts.preparing:
         yield facts.preparing
     if facts.loads:
@@ -180,7 +180,7 @@ def _silence(one: InputFacts) -> Iterator[str]:
 
 
 def _refused(one: InputFacts) -> str:
-    """The part of an input that was refused lately, with the most frequent reason and its remedy."""
+    """The fraction of an input that was refused lately, with the most frequent reason and its remedy."""
     recent = one.recent
     meaning = explain(recent.worst).meaning
     if recent.worst in _UNLINKED and one.frames:
@@ -242,7 +242,7 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
 
 
 def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
-    """The statuses of /diagnostics: the verdict, each input, and the graph."""
+    """Return the statuses of /diagnostics: the verdict, each input, and the graph."""
     message = "; ".join((verdict.state, *verdict.reasons))
     healthy = {"healthy": str(verdict.is_healthy), "state": verdict.state}
     reasons = {f"reason {k}": reason for k, reason in enumerate(verdict.reasons, 1)}
@@ -267,7 +267,7 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
 
 
 def _weakness(facts: Facts, estimate: Estimate) -> str:
-    """The weakest direction of the newest pose, and the way without a landmark where that is long."""
+    """The weakest direction of the newest pose, and the distance without a landmark if it is long."""
     weakest, unseen_m = ", ".join(facts.weakest.values()), estimate.unseen.length_m
     uses_landmarks = any(one.use == "landmarks" for one in facts.inputs)
     unseen = f"no landmark seen for {unseen_m:.0f} m" if uses_landmarks and unseen_m >= _UNSEEN_M else ""

@@ -15,7 +15,7 @@ from graph_slam_ros.typing import Numbers
 
 @dataclass(frozen=True, slots=True)
 class UnseenWay:
-    """The way driven since a landmark was seen last.
+    """The distance driven since a landmark was last seen.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class UnseenWay:
     direction: Numbers = ()
 
     def goes_on(self, slam: GraphSlam) -> "UnseenWay":
-        """Return the way after an update."""
+        """Return the distance after an update."""
         count, changes = len(slam.keyframes), slam.landmark_changes
         positions = slam.keyframes.poses[max(self.keyframes - 1, 0) : count, : slam.space.dimensions]
         steps = np.diff(positions, axis=0)
@@ -43,7 +43,7 @@ class UnseenWay:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """The state of the pipeline after an update, for whoever must not wait for the next.
+    """The state of the pipeline after an update, for threads that cannot wait for the next one.
 
     Attributes
     ----------

@@ -11,12 +11,12 @@ _EDGES = 1000  # of one update that are moved one by one
 
 
 def happened(what: str, message: str, level: int = OK, **values: object) -> Status:
-    """An event that is not of an update: a reset, a jump of the clock, a second authority."""
+    """An event that no update caused: a reset, a jump of the clock, a second broadcaster."""
     return Status(level, f"graph_slam: {what}", message, "", {name: str(value) for name, value in values.items()})
 
 
 def of_update(slam: GraphSlam, update: Update) -> Iterator[Status]:
-    """New vertices, edges and segments, verdicts that changed, and the correction, if there was one."""
+    """New vertices, edges and segments, changed verdicts, and the correction if there was one."""
     graph = slam.graph
     for k in update.keyframes:
         keyframe = slam.keyframes[k]
@@ -72,7 +72,7 @@ def _alarm(alarm: Alarm) -> Status:
 
 
 def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:
-    """The motion of the robot in the map by a solve, and the edges that caused it."""
+    """The motion of the robot in the map that a solve caused, and the edges that caused it."""
     moved = update.correction
     causes = [
         f"{e} ({name_of(slam, e)}, {fit:.1f})" for e, fit in zip(moved.edges, moved.chi2, strict=True) if fit > 1.0

@@ -17,7 +17,7 @@ from graph_slam_ros.slam import Counters
 
 
 class FactCollector:
-    """Collects facts about once a second; what it calls recent is since the last time.
+    """Collects facts about once a second. Recent facts are those since the last collection.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class FactCollector:
         broadcaster: TfBroadcaster | None,
         preparation: Preparation,
     ) -> Facts:
-        """Collect the facts of now.
+        """Collect the present facts.
 
         Parameters
         ----------

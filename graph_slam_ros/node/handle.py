@@ -12,7 +12,7 @@ Guard = Callable[[Callback], Callback]
 
 
 class Logger(Protocol):
-    """The logger of a node, as far as it is used."""
+    """The part of a logger that the node uses."""
 
     def info(self, message: str) -> object:
         """Log as INFO."""
@@ -25,7 +25,7 @@ class Logger(Protocol):
 
 
 class NodeHandle(Protocol):
-    """The node as its components see it: what rclpy gives, and what ``GraphSlamNode`` adds.
+    """The node as its components see it: methods of rclpy and of ``GraphSlamNode``.
 
     Messages, publishers, subscriptions, timers and clocks are rclpy's, which has no types for them.
 
@@ -38,17 +38,17 @@ class NodeHandle(Protocol):
 
     @property
     def now_ns(self) -> int:
-        """ROS time; 0 before the first /clock where that is used."""
+        """ROS time; 0 before the first /clock if simulated time is used."""
 
     @property
     def has_player(self) -> bool:
         """Return whether somebody subscribes to the number of received messages."""
 
     def guarded(self, callback: Callback) -> Callback:
-        """Return a callback that raises nothing: what the given one raises is counted and logged."""
+        """Return a callback that never raises: exceptions of the given one are counted and logged."""
 
     def report_fault(self, error: Exception) -> None:
-        """Count and log what a job raised."""
+        """Count and log the exception of a job."""
 
     def acknowledge(self, count: int) -> None:
         """Publish the number of messages received."""
@@ -61,14 +61,14 @@ class NodeHandle(Protocol):
 
     @property
     def create_subscription(self) -> Callable[..., Any]:
-        """Create a subscription; as rclpy's, whose types are of each message."""
+        """Create a subscription, with the arguments of rclpy."""
 
     def destroy_subscription(self, subscription: Any) -> object:
         """Remove a subscription."""
 
     @property
     def create_timer(self) -> Callable[..., Any]:
-        """Create a timer; as rclpy's."""
+        """Create a timer, with the arguments of rclpy."""
 
     def destroy_timer(self, timer: Any) -> object:
         """Remove a timer."""
@@ -108,7 +108,7 @@ class MapServer(NodeHandle, Protocol):
     """A node that can save and load maps by name."""
 
     def configured(self) -> "MapRun":
-        """Return what there is since configuration. Raises GraphSlamError before."""
+        """Return the runtime that exists since configuration. Raises GraphSlamError before."""
 
     def change(self, values: dict[str, Any]) -> None:
         """Set parameters, by name."""
@@ -121,7 +121,7 @@ class MapRun(Protocol):
         """Save the run, and its map under the name of the configuration."""
 
     def check_map(self, name: str) -> None:
-        """Raise RunError where no run of that name can be loaded."""
+        """Raise RunError if no run of that name can be loaded."""
 
     def load(self, config: Config | None = None) -> "Future[str]":
-        """Go on from the run that the configuration names."""
+        """Continue from the run that the configuration names."""

@@ -35,9 +35,9 @@ _PATIENCE_S = 1.0  # for the clock to reach a stamp
 
 
 class Ingest:
-    """Hands measurements to the worker in the order they came, or refuses and counts them.
+    """Passes measurements to the worker in order of arrival, or refuses and counts them.
 
-    All of it is in the main thread.
+    All of it runs in the main thread.
 
     Parameters
     ----------
@@ -84,18 +84,18 @@ class Ingest:
         )
 
     def activate(self) -> None:
-        """Notice jumps of the clock."""
+        """Watch the clock for jumps."""
         back = Duration(nanoseconds=-round(self._node.config.time.jump_back_s * 1e9))
         threshold = JumpThreshold(min_forward=None, min_backward=back, on_clock_change=True)
         clock, callback = self._node.get_clock(), self._node.guarded(self._on_clock_jump)
         self._clock_jumps = clock.create_jump_callback(threshold, post_callback=callback)
 
     def deactivate(self) -> None:
-        """Notice no jump of the clock any more."""
+        """Stop watching the clock for jumps."""
         self._clock_jumps.unregister()
 
     def finish(self) -> None:
-        """Hand over or refuse all held messages, and unsubscribe."""
+        """Pass on or refuse all held messages, and unsubscribe."""
         for measured in self._future_stamps.drain():
             self.hand_over(measured)
         for subscription in self._subscriptions:
@@ -103,13 +103,13 @@ class Ingest:
         self.hand_over(self.converter.finish())
 
     def tick(self) -> None:
-        """Hand over the held messages that are due, ten times a second."""
+        """Pass on the held messages that are due, ten times a second."""
         for measured in self._future_stamps.due():
             self.hand_over(measured)
         self._publishes_odometry = self._publishers.has_subscribers("odometry")
 
     def watch_memory(self) -> None:
-        """Have the pipeline spare memory while the process has more than ``health.memory_mib``."""
+        """Make the pipeline save memory while the process has more than ``health.memory_mib``."""
         limit, before = self._node.config.health.memory_mib, self.memory_is_short
         self.memory_is_short = is_short(limit, was_short=before)
         if self.memory_is_short != before:
@@ -118,7 +118,7 @@ class Ingest:
     # -- measurements ------------------------------------------------------------------------------------------------
 
     def receive(self, measured: Sequence[Measured], cdr: bytes) -> None:
-        """Pass on the measurements of a message, and those that waited for it.
+        """Pass on the measurements of a message, and earlier ones that its transforms complete.
 
         Parameters
         ----------
@@ -136,7 +136,7 @@ class Ingest:
             self.hand_over(some)
 
     def hand_over(self, measured: Sequence[Measured]) -> None:
-        """Hand a message to the worker, unless the gate refuses it; then it was not accepted."""
+        """Pass a message to the worker unless the gate refuses it. A refused message is not accepted."""
         passage = self.gate.admit(measured, self._node.config.time.on_jump, has_room=self._worker.has_room)
         if passage.jump:
             self._on_jump(passage, "stamps", "odometry has gone back in time and stays there")
@@ -150,7 +150,7 @@ class Ingest:
             self._clock.refused += 1
 
     def refuse(self, reason: str, measured: Sequence[Measured]) -> None:
-        """Count a message that goes no further."""
+        """Count a message that is refused."""
         self.gate.refuse(reason, measured)
         self._clock.refused += 1
 
@@ -163,7 +163,7 @@ class Ingest:
     # -- odometry in the map -----------------------------------------------------------------------------------------
 
     def _is_newest(self, m: Odometry) -> bool:
-        """Return whether odometry is the newest; a message ahead of the clock would be the newest for long."""
+        """Return whether odometry is the newest. A message ahead of the clock would stay the newest for long."""
         return not self._future_stamps.is_ahead([m]) and self.extrapolator.on_odometry(m, self._session.estimate)
 
     def _publish_odometry(self, m: Odometry, cdr: bytes) -> None:
@@ -178,12 +178,12 @@ class Ingest:
     # -- events ------------------------------------------------------------------------------------------------------
 
     def in_sequence(self, events: Sequence[Control | InitialPose]) -> "Future[None]":
-        """Accept and process what is no measurement, at its place among those."""
+        """Accept and process an event at its place among the measurements."""
         self._session.accept(events)
         return self._worker.call(partial(self._session.process, events))
 
     def in_background(self, future: "Future[Any]") -> None:
-        """Log where a job fails whose result nobody waits for."""
+        """Log the exception of a job whose result is not used."""
 
         def report(done: "Future[Any]") -> None:
             if (error := done.exception()) is not None:
@@ -206,16 +206,16 @@ class Ingest:
     # -- time --------------------------------------------------------------------------------------------------------
 
     def forget_time(self) -> None:
-        """Drop what is known by the stamps until now: what comes next is of another time."""
+        """Forget everything that depends on stamps: the next stamps belong to another time."""
         self.converter.forget_time()
         self.extrapolator.forget()
 
     def _stamp_clock_ns(self) -> int:
-        """The clock that stamps are judged by; 0 where a recording is played: it is no better than they are."""
+        """The clock for the check of stamps; 0 if a recording is played, whose clock is no better than its stamps."""
         return 0 if self._node.get_parameter("use_sim_time").value else self._node.now_ns
 
     def _on_clock_jump(self, jump: Any) -> None:
-        """Decide on a clock that jumped back, or on another that is used now."""
+        """Decide what to do after the clock jumped back, or was replaced by another."""
         self._future_stamps.forget_time()
         self.gate.clock_jumped(jump.delta.nanoseconds)
         if self._session.estimate is None and not self._worker.waiting:
@@ -225,7 +225,7 @@ class Ingest:
 
 
 class FutureStamps:
-    """Holds messages that are dated ahead of the clock, which may be late itself; refuses those that stay ahead.
+    """Holds messages dated ahead of the clock, which may be late itself. Refuses those that stay ahead.
 
     Parameters
     ----------
@@ -242,14 +242,14 @@ class FutureStamps:
         self._held: deque[tuple[float, Sequence[Measured]]] = deque()
 
     def pass_on(self, messages: Sequence[Measured]) -> Iterable[Sequence[Measured]]:
-        """The measurements of messages that are due now: of this one and of those that were held."""
+        """The measurements of messages that are due now: this one and held ones."""
         if not self._held and (not self._most_ns or not self.is_ahead(messages)):
             return (messages,)
         self._held.append((time.monotonic(), messages))
         return self.due()
 
     def due(self) -> list[Sequence[Measured]]:
-        """The held measurements that are due now; those held for too long are refused."""
+        """The held measurements that are due now. Those held for too long are refused."""
         out = []
         while self._held:
             since_s, messages = self._held[0]
@@ -272,7 +272,7 @@ class FutureStamps:
         return bool(now_ns) and newest_ns > self._until_ns
 
     def drain(self) -> list[Sequence[Measured]]:
-        """Hold nothing any more: refuse measurements ahead of the clock, and return the others."""
+        """Stop holding: refuse measurements ahead of the clock, and return the others."""
         out: list[Sequence[Measured]] = []
         for _, messages in self._held:
             if self.is_ahead(messages):
@@ -283,11 +283,11 @@ class FutureStamps:
         return out
 
     def forget_time(self) -> None:
-        """The clock begins anew."""
+        """Begin anew with the clock."""
         self._until_ns = 0
 
 
 def _installed(config: Config) -> dict[str, Decoder]:
-    """Decoders of the types whose layout is known to the packages that are installed, and not to us."""
+    """Decoders of types whose layout only an installed package has."""
     names = {one.type for one in config.sources if one.name in uses(config)} - set(typestore().types)
     return {name: partial(deserialize_message, message_type=message_class(name)) for name in names}

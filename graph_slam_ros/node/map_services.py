@@ -16,16 +16,16 @@ Values = dict[str, Any]
 
 
 class MatchTypeError(GraphSlamError):
-    """A request that does not say where the robot is."""
+    """A request that does not contain where the robot is."""
 
 
 def saved_as(request: Any) -> Values:
-    """The parameters that a SerializePoseGraph request asks for. Raises ConfigError without a name."""
+    """Convert a SerializePoseGraph request into parameters. Raises ConfigError without a name."""
     return {"output.save_as": _name(request)}
 
 
 def loaded_from(request: Any, dimensions: int) -> Values:
-    """The parameters that a DeserializePoseGraph request asks for.
+    """Convert a DeserializePoseGraph request into parameters.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def loaded_from(request: Any, dimensions: int) -> Values:
 
 
 def serve_maps(node: MapServer, serve_later: Callable[..., None]) -> None:
-    """Serve ``~/serialize_map`` and ``~/deserialize_map`` if slam_toolbox is installed; as ``deferred.serve_later``."""
+    """Serve ``~/serialize_map`` and ``~/deserialize_map`` if slam_toolbox is installed, by ``deferred.serve_later``."""
     try:
         types = import_module("slam_toolbox.srv")
     except ImportError:
@@ -62,7 +62,7 @@ def serve_maps(node: MapServer, serve_later: Callable[..., None]) -> None:
         return run.load(config)
 
     def answer(response: Any, message: str, error: BaseException | None) -> Any:
-        """The response has a number alone, so the log has the words."""
+        """Fill the response with its result code; the log gets the message, for which it has no field."""
         if error is None:
             node.get_logger().info(message)
         else:

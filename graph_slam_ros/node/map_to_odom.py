@@ -9,7 +9,7 @@ from graph_slam_ros.typing import Numbers
 
 
 class MapToOdom:
-    """The correction as it is broadcast; it follows the estimate at once, or at a limited speed of the robot in map.
+    """The correction to broadcast. It follows the estimate at once, or with a limited speed of the robot in the map.
 
     Attributes
     ----------
@@ -24,14 +24,14 @@ class MapToOdom:
         self.behind_s = 0.0
 
     def forget_time(self) -> None:
-        """Stamps begin anew."""
+        """Begin anew with the stamps."""
         self._newest_ns = self._sent_ns = None
         self.behind_s = 0.0
 
     def next(
         self, config: TfConfig, now_ns: int, odometry_ns: int, T_odom_base: Numbers, T_map_odom: Numbers
     ) -> tuple[int, Numbers] | None:
-        """Stamp and transform to broadcast now; None where there is nothing new to broadcast.
+        """Stamp and transform to broadcast now; None if nothing is new.
 
         Parameters
         ----------
@@ -52,7 +52,7 @@ class MapToOdom:
         return stamp_ns, self._published
 
     def _followed(self, config: TfConfig, T_map_odom: Numbers, T_odom_base: Numbers, elapsed_s: float) -> Numbers:
-        """The last transform moved towards the estimate, as far as the limits of speed allow in that time."""
+        """The last transform, moved towards the estimate as far as the limits of speed allow."""
         last, group, n = self._published, self._space.group, self._space.dimensions
         if last is None or last == T_map_odom or not (config.max_speed_m_s or config.max_turn_rad_s):
             return T_map_odom

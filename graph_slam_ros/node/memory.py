@@ -8,7 +8,7 @@ _ENOUGH = 0.95  # of the limit: less, and there is room again
 
 
 def resident_mib() -> float:
-    """The resident memory of this process in MiB; 0 where there is no /proc."""
+    """The resident memory of this process in MiB; 0 if there is no /proc."""
     try:
         pages = int(_STATM.read_text().split()[1])
     except OSError:
@@ -17,5 +17,5 @@ def resident_mib() -> float:
 
 
 def is_short(limit_mib: float, *, was_short: bool) -> bool:
-    """Return whether the process has more memory than the limit; 0 is no limit."""
+    """Return whether the process has more memory than the limit; a limit of 0 means none."""
     return 0.0 < (_ENOUGH if was_short else 1.0) * limit_mib < resident_mib()

@@ -42,10 +42,11 @@ _SWITCH_S = 5e-4  # a callback waits no longer than this for the worker's Python
 
 
 class GraphSlamNode(LifecycleNode):
-    """Online pose-graph SLAM of odometry, landmark sightings, fixes and closures; topics are in ``messages/topics.py``.
+    """Online pose-graph SLAM with odometry, landmark sightings, fixes and closures.
 
-    Configured, it has read its parameters, opened its run folder and has its publishers; its kernels are loaded or
-    compiled meanwhile. Active, it listens and broadcasts map -> odom.
+    Its topics are in ``messages/topics.py``. When configured, it has read its parameters, opened its run folder and
+    made its publishers. Its kernels are loaded or compiled meanwhile. When active, it subscribes and broadcasts
+    map -> odom.
 
     Parameters
     ----------
@@ -89,15 +90,15 @@ class GraphSlamNode(LifecycleNode):
     # -- lifecycle ---------------------------------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Check the parameters and files, begin to load or compile the kernels, make the publishers."""
+        """Check parameters and files, start to load or compile the kernels, create the publishers."""
         return self._transition(self._configure)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Listen and broadcast."""
+        """Subscribe and broadcast."""
         return self._transition(self._activate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Unsubscribe; accepted measurements stay."""
+        """Unsubscribe. Accepted measurements stay."""
         return self._transition(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -105,7 +106,7 @@ class GraphSlamNode(LifecycleNode):
         return self._transition(self.finish)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Save and end, even where it cannot be saved."""
+        """Save and end, even if saving fails."""
         return self._transition(self.finish, _FAILURE)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -114,7 +115,7 @@ class GraphSlamNode(LifecycleNode):
 
     @property
     def _state(self) -> str:
-        """The state of the lifecycle, as rclpy has it."""
+        """The state of the lifecycle, by rclpy."""
         return str(self._state_machine.current_state[1])
 
     def _transition(
@@ -160,7 +161,7 @@ class GraphSlamNode(LifecycleNode):
         return self._run
 
     def finish(self, patience_s: float | None = None) -> None:
-        """Save what was not saved yet, and take everything away.
+        """Save what was not saved yet, and remove everything.
 
         Parameters
         ----------
@@ -172,16 +173,16 @@ class GraphSlamNode(LifecycleNode):
             run.finish(patience_s, self._is_stop_requested)
 
     def destroy_node(self) -> None:
-        """Destroy the node at once: rclpy's state machine would keep it in the graph until it is collected."""
+        """Destroy the node at once; rclpy's state machine would keep it in the graph until garbage collection."""
         super().destroy_node()
         self._state_machine = None
 
     # -- parameters --------------------------------------------------------------------------------------------------
 
     def set_parameters_atomically(self, parameter_list: Any) -> SetParametersResult:
-        """Set parameters as rclpy does, after our own checks, whose refusals name the parameter.
+        """Set parameters by rclpy after our own checks, whose refusals name the parameter.
 
-        A whole number is a number, as it is at the start.
+        An integer is accepted for a float, as it is at the start.
         """
         try:
             _, values = changed(self.config, parameter_list, is_configured=self._run is not None)
@@ -192,11 +193,11 @@ class GraphSlamNode(LifecycleNode):
         )
 
     def change(self, values: dict[str, Any]) -> None:
-        """Set parameters, by name, as anybody may."""
+        """Set parameters by name, as a ROS client would."""
         self.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
 
     def _on_set(self, given: Sequence[Any]) -> SetParametersResult:
-        """All of them or none, and what may change at work takes effect at its place among the measurements."""
+        """Set all or none. Parameters that may change at run time take effect at their place among the measurements."""
         try:
             config, values = changed(self.config, given, is_configured=self._run is not None)
         except ConfigError as error:
@@ -209,10 +210,10 @@ class GraphSlamNode(LifecycleNode):
     # -- the run -----------------------------------------------------------------------------------------------------
 
     def _answered(self, service: Any) -> Callable[[Any, Any], Any]:
-        """The callback of a service, which answers that nothing was done where it would raise.
+        """Wrap the callback of a service: it answers that nothing was done instead of raising.
 
-        rclpy's own callbacks raise for a transition number that the present state does not have, and for a parameter
-        of an unknown type. The executor raises that again, and the node would end.
+        rclpy's own callbacks raise for a transition that the present state does not have, and for a parameter of an
+        unknown type. The executor would raise that again, and the node would end.
         """
         answer = service.callback
 
@@ -229,7 +230,7 @@ class GraphSlamNode(LifecycleNode):
         return start(self.configured())
 
     def configured(self) -> Runtime:
-        """The run, from configuration on. Raises GraphSlamError before."""
+        """The runtime, from configuration on. Raises GraphSlamError before."""
         if self._run is None:
             raise GraphSlamError(f"not active: the node is {self._state}")
         return self._run
@@ -245,11 +246,11 @@ class GraphSlamNode(LifecycleNode):
 
     @property
     def now_ns(self) -> int:
-        """ROS time; 0 before the first /clock where that is used."""
+        """ROS time; 0 before the first /clock if simulated time is used."""
         return int(self.get_clock().now().nanoseconds)
 
     def guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Return a callback that raises nothing: an exception is counted, and logged with its traceback once."""
+        """Return a callback that never raises: an exception is counted, and logged with its traceback once."""
 
         def guarded(*arguments: Any) -> None:
             try:
@@ -284,9 +285,9 @@ class GraphSlamNode(LifecycleNode):
         self._diagnostics.publish(to_msg.diagnostics(self.now_ns, statuses))
 
     def _log(self, verdict: diagnostics.Health) -> None:
-        """Log a verdict that is new but for its numbers; repeat one that needs action every few seconds.
+        """Log a new verdict; changed numbers alone are no new one. Repeat every few seconds one that needs action.
 
-        A node that has just begun to wait is no reason to warn: publishers take a moment to be discovered.
+        A node that has just started to wait is no reason to warn: publishers need a moment to be discovered.
         """
         before, self._verdict = self._verdict, verdict
         has_lasted = before.state == verdict.state and time.monotonic() - self._logged_s > _AGAIN_S
@@ -306,9 +307,9 @@ def _without_numbers(verdict: diagnostics.Health) -> tuple[str, ...]:
 
 
 class _StopRequest:
-    """Notes Ctrl-C and SIGTERM instead of raising, so that each message is processed as a whole.
+    """Notes Ctrl-C and SIGTERM instead of raising, so that each message is processed completely.
 
-    A launch file forwards Ctrl-C to a node that has it from the terminal already: two at once count as one.
+    A launch file forwards Ctrl-C to a node that already has it from the terminal: two at once count as one.
     """
 
     def __init__(self) -> None:
@@ -318,7 +319,7 @@ class _StopRequest:
 
     @property
     def is_set(self) -> bool:
-        """Return whether one of them came."""
+        """Return whether a stop was requested."""
         return self.at_s > 0.0
 
     def _note(self, number: int, frame: Any) -> None:

@@ -17,7 +17,7 @@ _AT_START = {"inputs.names", "output.folder", "node.autostart", "landmarks.surve
 
 
 def declare_parameters(node: Any) -> Config:
-    """Declare every parameter on a node and return the configuration it was started with.
+    """Declare every parameter on a node, and return the configuration with the values that it was started with.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def declare_parameters(node: Any) -> Config:
 
 
 def changed(config: Config, given: Iterable[Any], *, is_configured: bool) -> tuple[Config, dict[str, Any]]:
-    """The configuration with ROS parameters that are to be set, and those of them that are ours, in their types.
+    """Return the configuration after a change of ROS parameters, and those of them that are ours, in their types.
 
     Raises
     ------

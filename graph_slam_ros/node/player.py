@@ -50,7 +50,7 @@ _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durabilit
 
 
 class PlayError(GraphSlamError):
-    """The live graph does not do its part."""
+    """The live graph does not respond as it should."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class Player:
         self._node.create_subscription(UInt64, f"{node_name}/received", self._on_received, _LATCHED)
 
     def play(self, rate: float | None, progress: Callable[[Iterable[Any], int], Iterable[Any]]) -> Played:
-        """Send everything, wait until it has arrived, have it saved.
+        """Send everything, wait until it has arrived, and make the node save it.
 
         Parameters
         ----------
@@ -139,7 +139,7 @@ class Player:
         self._on_the_way[message.topic] = min(oldest, stamp_ns), max(newest, stamp_ns)
 
     def _keep_order(self, message: BagMessage) -> None:
-        """Wait where the queues are full, or where it would matter which of two topics' messages arrives first."""
+        """Wait while the queues are full, or while the order of arrival of two topics would matter."""
         stamp_ns = self._stamp_ns(message)
         others = [stamps for topic, stamps in self._on_the_way.items() if topic != message.topic]
         apart = self._overtake_ns
@@ -149,7 +149,7 @@ class Player:
             self._until_received(self._sent - self._lost - _AHEAD // 2)
 
     def _stamp_ns(self, message: BagMessage) -> int:
-        """Stamp of the header, or of the first in a list; 0 where the message is too short for one."""
+        """The stamp of the header, or of the first in a list; 0 if the message is too short for one."""
         reader = CdrReader(message.cdr)
         try:
             if self._bag.topics[message.topic].type in _LISTS:
@@ -162,7 +162,7 @@ class Player:
         self._until_received(self._sent - self._lost)
 
     def _until_received(self, count: int) -> None:
-        """Wait for that many; what does not arrive while nothing moves is counted as lost."""
+        """Wait for this number of messages. What does not arrive while nothing changes is counted as lost."""
         last, deadline = self._received, time.monotonic() + _PATIENCE_S
         while self._received < count:
             rclpy.spin_once(self._node, timeout_sec=0.1)
@@ -204,7 +204,7 @@ class Player:
 
 
 def config_of(node_name: str) -> Config:
-    """The configuration of a running node, by its parameters: what it listens to.
+    """The configuration of a running node, read from its parameters.
 
     Raises
     ------

@@ -17,7 +17,7 @@ _MOST = 2_000  # messages since the newest keyframe: of a robot that stands ther
 
 
 class PoseExtrapolator:
-    """The last estimate composed with the odometry since; its covariance grows with that."""
+    """The last estimate composed with the odometry since then. Its covariance grows accordingly."""
 
     def __init__(self, config: Config) -> None:
         self._space, self._max_speed_m_s = config.space, config.odometry.max_speed_m_s
@@ -29,11 +29,11 @@ class PoseExtrapolator:
 
     @property
     def newest(self) -> Odometry | None:
-        """The newest odometry of the source that is in use."""
+        """The newest odometry of the source in use."""
         return self._since[-1] if self._since else None
 
     def on_odometry(self, m: Odometry, estimate: Estimate | None) -> bool:
-        """Add an odometry message; return whether it is of the source in use, and newer than the last."""
+        """Add an odometry message. Return whether it is of the source in use, and newer than the last."""
         if estimate is not None and estimate.source != m.source:
             return False
         if self._since and m.source == self._since[-1].source and m.stamp_ns <= self._since[-1].stamp_ns:
@@ -42,7 +42,7 @@ class PoseExtrapolator:
         return True
 
     def forget(self) -> None:
-        """Stamps, or the map, begin anew."""
+        """Begin anew with the stamps or the map."""
         self._since.clear()
         self._estimate = self._motion = None
 

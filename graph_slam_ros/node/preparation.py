@@ -9,7 +9,7 @@ from graph_slam_ros.warmup import Compiling, are_compiled, warmup
 
 
 class Preparation:
-    """The work that must be done before the first measurement is processed.
+    """The work that must be done before the first measurement can be processed.
 
     Attributes
     ----------
@@ -23,7 +23,7 @@ class Preparation:
         self.status = self.fault = ""
 
     def run(self, is_stop_requested: Callable[[], bool]) -> bool:
-        """Load or compile the kernels in the thread of the caller; False where that was stopped or failed."""
+        """Load or compile the kernels in the caller's thread; False if that was stopped or failed."""
         self.status = "loading kernels"
         if not are_compiled(self._dimensions):
             self._log.info("compiling kernels, once per installation: about a minute")
@@ -41,7 +41,7 @@ class Preparation:
         return True
 
     def stop(self) -> None:
-        """Do not compile any further: the next start goes on from there."""
+        """Stop compiling. The next start continues from there."""
         self._stopped.set()
 
     def _note(self, progress: Compiling) -> None:

@@ -37,7 +37,7 @@ class _Topic:
 
 
 class Publishers:
-    """Publishers of results, and what is due on them; made by the node, used by the worker's thread.
+    """Publishers of results. The node creates them, and the worker's thread uses them.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class Publishers:
         self.begin(config)
 
     def begin(self, config: Config, *, has_map: bool = False) -> None:
-        """Begin a new run, perhaps in a map: earlier messages are of another run."""
+        """Begin a new run, perhaps in a loaded map: earlier messages belong to another run."""
         self._has_something |= has_map
         output = config.output
         self._updates = PathUpdates(output.path_moved_m, output.path_moved_rad)
@@ -68,12 +68,12 @@ class Publishers:
             topic.is_stale = topic.begins_anew = True
 
     def forget_time(self) -> None:
-        """Begin anew after a jump of time: subscribers that know poses by their stamps need all of them again."""
+        """Begin anew after a jump of time: subscribers identify poses by their stamps, and need all of them again."""
         self._topics["path_updates"].begins_anew = True
 
     @property
     def path_version(self) -> int:
-        """Messages of ``~/path_updates`` since it began anew."""
+        """The number of messages of ``~/path_updates`` since it began anew."""
         return self._updates.version
 
     def close(self) -> None:
@@ -99,7 +99,7 @@ class Publishers:
             self.publish_events(slam.keyframes[-1].stamp_ns, events.of_update(slam, update))
 
     def publish_events(self, stamp_ns: int, happened: Iterable[Status]) -> None:
-        """Publish events, whoever subscribes."""
+        """Publish events, with or without subscribers."""
         if statuses := list(happened):
             self._events.publish(to_msg.diagnostics(stamp_ns, statuses))
 
@@ -117,12 +117,12 @@ class Publishers:
         topic.is_stale, topic.sent_s = False, time.monotonic()
 
     def _landmarks_due(self, slam: GraphSlam, update: Update) -> bool:
-        """Return whether landmarks are due: from the first on regularly, and after each solve of everything."""
+        """Return whether landmarks are due: regularly from the first on, and after each complete solve."""
         regularly = bool(slam.landmarks) and len(slam.keyframes) >= self._landmarks_at
         return update.report is not None or (update.solved and regularly)
 
     def _send_updates(self, slam: GraphSlam) -> None:
-        """Publish changes of the path; a late subscriber lacks the earlier ones, so all of it is sent again."""
+        """Publish changes of the path. A late subscriber lacks the earlier ones, so the whole path is sent again."""
         if self._topics["path_updates"].begins_anew:
             self._topics["path_updates"].begins_anew = False
             self._send("path_updates", self._updates.restart(slam))
@@ -132,7 +132,7 @@ class Publishers:
     # -- when due ----------------------------------------------------------------------------------------------------
 
     def are_due(self, config: Config) -> bool:
-        """Return whether ``publish_due`` has something to publish; called often, from any thread."""
+        """Return whether ``publish_due`` has something to publish. It is called often, from any thread."""
         now_s = time.monotonic()
         return any(self._is_due(config, name, now_s) for name in _LATER)
 

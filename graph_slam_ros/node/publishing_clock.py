@@ -19,7 +19,7 @@ _MOST_UNPUBLISHED_S, _AGAIN_S = 4.0, 5.0
 
 
 class PublishingClock:
-    """Has the worker publish what is due, and acknowledges messages to a player.
+    """Makes the worker publish what is due, and acknowledges messages to a player.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class PublishingClock:
     # -- in the main thread ------------------------------------------------------------------------------------------
 
     def tick(self, session: Session) -> None:
-        """Offer the worker to publish what is due, ten times a second; where it never rests, that becomes overdue."""
+        """Offer the worker a job to publish what is due, ten times a second. It is overdue if the worker is busy."""
         self._has_player = self._node.has_player
         self._acknowledge()
         is_due = self._publishers.are_due(self._node.config)
@@ -61,7 +61,7 @@ class PublishingClock:
     # -- in the worker's thread --------------------------------------------------------------------------------------
 
     def after_message(self, session: Session, measured: Sequence[Measured]) -> None:
-        """Count what was processed of another message, publish what is overdue, and acknowledge."""
+        """Count another processed message, publish what is overdue, and acknowledge."""
         self._done += 1
         for m in measured:
             self.processed[input_of(m)] += size_of(m)
@@ -71,7 +71,7 @@ class PublishingClock:
             self._acknowledge()
 
     def on_update(self, slam: GraphSlam, update: Update, *, is_located: bool) -> None:
-        """Publish what an update changed, and log where it moved the robot far."""
+        """Publish what an update changed, and log large moves of the robot."""
         self._publishers.update(slam, update, is_located=is_located)
         moved, tf = update.correction, slam.config.tf
         if update.solved and (moved.distance_m > tf.report_jump_m or moved.angle_rad > tf.report_jump_rad):

@@ -36,7 +36,7 @@ class InputQos:
         )
 
     def mismatch(self, publisher: Any) -> str:
-        """The reason why a publisher does not connect, by its endpoint info; empty where it does."""
+        """The reason why a publisher does not connect, from its endpoint info; empty if it connects."""
         offers, name = publisher.qos_profile, publisher.node_name
         if self.reliability and offers.reliability == ReliabilityPolicy.BEST_EFFORT:
             return f"{name} offers best effort, {self.reliability} asks for reliable delivery (QoS)"
@@ -47,7 +47,7 @@ class InputQos:
 
 @dataclass(frozen=True, slots=True)
 class InputTopic:
-    """A topic to subscribe to, with the inputs that it is of."""
+    """A topic to subscribe to, with its inputs."""
 
     type_name: str
     name: str

@@ -28,17 +28,17 @@ class Recent:
 
     @property
     def times(self) -> int:
-        """The number that was refused."""
+        """The number of refusals."""
         return sum(self.refused.values())
 
     @property
     def worst(self) -> str:
-        """The reason of most; empty where nothing was refused."""
+        """The most frequent reason; empty if nothing was refused."""
         return max(self.refused, key=lambda reason: self.refused[reason], default="")
 
     @property
     def is_bad(self) -> bool:
-        """Return whether more than a tenth was refused, and still is."""
+        """Return whether more than a tenth was refused, and refusals go on."""
         return self.goes_on and self.times >= _LEAST and self.times > _SHARE * self.came
 
     @property
@@ -51,13 +51,13 @@ Counts = Mapping[str, Mapping[str, int]]
 
 
 class RecentInputs:
-    """Totals of the last seconds, of which it makes the differences."""
+    """Remembers totals of the last seconds, and returns their differences."""
 
     def __init__(self) -> None:
         self._past: deque[tuple[float, Counter[str], Counter[tuple[str, str]]]] = deque([(0.0, Counter(), Counter())])
 
     def observe(self, now_s: float, accepted: Mapping[str, int], before: Counts, after: Counts) -> dict[str, Recent]:
-        """The counts of each input in the last seconds; to be called every second or so.
+        """Return the counts of each input in the last seconds. Call it about every second.
 
         Parameters
         ----------

@@ -44,7 +44,7 @@ class Resumption:
 
 
 def _begins_anew(slam: GraphSlam, moved: Numbers, T_odom_base: Numbers) -> bool:
-    """Return whether odometry is nearer to its origin than to its last pose; a metre counts as much as a radian."""
+    """Return whether odometry is nearer to its origin than to its last pose. A metre counts as much as a radian."""
     far, from_begin = (_size(slam, pose) for pose in (moved, T_odom_base))
     return far > _NEAR and from_begin < far
 
@@ -54,5 +54,5 @@ def _size(slam: GraphSlam, pose: Numbers) -> float:
 
 
 def _name(source: str) -> str:
-    """The name of the input; its publishers are numbered anew after a restart."""
+    """The name of the input. Its publishers are numbered anew after a restart."""
     return source.partition("#")[0]

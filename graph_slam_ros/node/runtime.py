@@ -34,7 +34,7 @@ _HINTS = {"future": ", ahead of the clock: is use_sim_time to be set, or does a 
 
 
 class Runtime:
-    """The parts of the node from configuration to clean-up: made, connected, ended; and the services on the run.
+    """The parts of the node from configuration to clean-up, and the services on the run.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Runtime:
         self._broadcaster: TfBroadcaster | None = None
 
     def prepare(self, is_stop_requested: Callable[[], bool]) -> None:
-        """Have the worker load the kernels, compiled where they are not yet, before it does anything else."""
+        """Make the worker load or compile the kernels before anything else."""
 
         def prepare() -> None:
             if not self._preparation.run(is_stop_requested):
@@ -82,7 +82,7 @@ class Runtime:
         self._worker.call(prepare)
 
     def activate(self) -> None:
-        """Subscribe and broadcast; a second call changes nothing."""
+        """Subscribe and broadcast. A second call changes nothing."""
         if self._subscriptions is not None:
             return
         node, config, ingest = self._node, self._node.config, self._ingest
@@ -100,7 +100,7 @@ class Runtime:
         ingest.activate()
 
     def deactivate(self) -> None:
-        """Neither subscribe nor broadcast."""
+        """Unsubscribe and stop broadcasting."""
         if self._subscriptions is None or self._broadcaster is None:
             return
         self._subscriptions.close()
@@ -109,13 +109,13 @@ class Runtime:
         self._subscriptions = self._broadcaster = None
 
     def _now(self) -> tuple[Config, Estimate | None, Odometry | None]:
-        """Configuration, estimate and odometry that ``map -> odom`` is made of."""
+        """Configuration, estimate and odometry, from which ``map -> odom`` is made."""
         return self._node.config, self._session.estimate, self._ingest.extrapolator.newest
 
     def finish(self, patience_s: float | None, is_urgent: Callable[[], bool] = lambda: False) -> None:
         """Save what is not saved yet, and remove everything.
 
-        The next start completes what takes longer: all accepted measurements are in the journal.
+        The next start completes what takes longer, because all accepted measurements are in the journal.
 
         Parameters
         ----------
@@ -160,13 +160,13 @@ class Runtime:
         self._clock.tick(self._session)
 
     def _on_exit_of_a_job(self) -> None:
-        """Go on after what a job raised would have ended its thread, from the last good estimate."""
+        """Continue from the last good estimate after an exception that would have ended the thread."""
         self.counters.count("node", "worker_restarted")
         self._node.get_logger().error("a job has ended the solver's thread; it goes on with the graph that there is")
         self._session.slam.restart()
 
     def _begin_anew(self, passage: Passage, source: str, why: str) -> None:
-        """Do what the gate has decided on a jump of time."""
+        """Carry out the gate's decision on a jump of time."""
         self._warn(source, f"{why}: {passage.jump}")
         self._ingest.forget_time()
         self._publishers.forget_time()
@@ -186,37 +186,37 @@ class Runtime:
         self._clock.on_update(slam, update, is_located=estimate is not None and estimate.is_located)
 
     def facts(self, lifecycle: str) -> Facts:
-        """Collect what the state of the node is judged by."""
+        """Collect the facts from which the state of the node is judged."""
         return self._facts.collect(lifecycle, self._subscriptions, self._broadcaster, self._preparation)
 
     # -- services: begun here, done by the worker --------------------------------------------------------------------
 
     def save(self, config: Config | None = None) -> "Future[str]":
-        """Solve everything and write the run folder, and the map under the name that the parameters say."""
+        """Solve everything, and write the run folder and the map under its configured name."""
         self._ingest.hand_over(self._ingest.converter.finish(is_end=False))
         name = (config or self._node.config).output.save_as
         return self._worker.call(partial(self._session.save, self._session.accept_save(), name))
 
     @property
     def was_cut_off(self) -> bool:
-        """Return whether the last run was never ended: its map can be loaded."""
+        """Return whether the last run never ended: its map can be loaded."""
         return self._session.was_cut_off
 
     def check_map(self, name: str) -> None:
-        """Raise RunError where no run of that name can be loaded."""
+        """Raise RunError if no run of that name can be loaded."""
         self._session.earlier(name)
 
     def load(self, config: Config | None = None) -> "Future[str]":
-        """Go on from an earlier run, with the robot where the parameters say."""
+        """Continue from an earlier run, with the robot at the configured pose."""
         config = config or self._node.config
         return self._begin_run(partial(self._session.load, config.output.load, config.load_pose))
 
     def resume(self) -> "Future[str]":
-        """Go on from the last run, which was never ended."""
+        """Continue from the last run, which never ended."""
         return self._begin_run(self._session.resume)
 
     def reset(self) -> "Future[str]":
-        """Save, and begin anew."""
+        """Save, and begin a new run."""
         return self._begin_run(self._session.reset)
 
     def _begin_run(self, job: Callable[[], str]) -> "Future[str]":
@@ -239,7 +239,7 @@ class Runtime:
         return self._worker.call(begin)
 
     def pause(self, is_paused: bool) -> "Future[str]":
-        """Refuse measurements, or process them again."""
+        """Pause or resume the processing of measurements."""
         self._ingest.gate.is_paused = is_paused
         return self._worker.call(lambda: "paused" if is_paused else "takes measurements")
 
@@ -250,9 +250,9 @@ class Runtime:
         return self._worker.call(partial(self._session.control, asked))
 
     def set(self, values: dict[str, Any]) -> None:
-        """Change parameters at this place of the ingest sequence."""
+        """Change parameters at this place in the ingest sequence."""
         self.in_background(self._ingest.in_sequence([Control("set", tuple(values.items()))]))
 
     def in_background(self, future: "Future[Any]") -> None:
-        """Log the failure of a job whose result nobody uses."""
+        """Log the exception of a job whose result is not used."""
         self._ingest.in_background(future)

@@ -28,11 +28,10 @@ Answer = Callable[[Any, str, BaseException | None], Any]
 def serve_later(
     node: NodeHandle, name: str, start: Callable[[Any], "Future[str]"], kind: Any = Trigger, answer: Answer = _triggered
 ) -> None:
-    """Serve requests, of ``std_srvs/Trigger`` by default: ``start`` begins the work, what comes of it is the message.
+    """Serve requests, of ``std_srvs/Trigger`` by default: ``start`` starts the work, and its result is the message.
 
-    ``answer`` fills the response with the message or the error.
-
-    rclpy's own way, a coroutine, holds up a single-threaded executor, and its events executor knows none.
+    ``answer`` fills the response with the message or the error. rclpy's own way, a coroutine, blocks a single-threaded
+    executor, and its events executor does not support it.
     """
 
     def on_request(request: Any, response: Any) -> Any:

@@ -88,18 +88,18 @@ class Session:
         self._fit, self._fitted_at, self._fit_due_s = float("nan"), 0, 0.0
 
     def _warn_first(self, source: str, reason: str) -> None:
-        """Log a reason that is counted for the first time, with the error of a plugin where that is the reason."""
+        """Log a reason when it is first counted, with the error of a plugin if that is the reason."""
         fault = self.slam.counters.faults.get(source) if reason == "plugin_failed" else None
         self._warn(source, f"{reason}: {fault}" if fault else reason)
 
     @property
     def incomplete(self) -> list[Path]:
-        """Earlier runs that were ended while measurements waited, and whose results are not made yet."""
+        """Earlier runs that ended while measurements were in the queue, and whose results are not complete."""
         return incomplete_runs(self._folder) if self._folder is not None else []
 
     @property
     def failures(self) -> int:
-        """Solves that failed."""
+        """The number of failed solves."""
         return sum(self.slam.counters.as_dict().get("solver", {}).values())
 
     # -- measurements ------------------------------------------------------------------------------------------------
@@ -115,13 +115,13 @@ class Session:
                     recorder.accept(measurement)
 
     def hold(self) -> None:
-        """Hold accepted measurements until ``release``: they belong to a run that is still to begin."""
+        """Hold accepted measurements until ``release``: they belong to the next run."""
         self._has_news = False
         with self._accepting:
             self._held.append([])
 
     def release(self) -> None:
-        """Write the held measurements: the run has begun, or the one before goes on."""
+        """Write the held measurements, now that the run has begun or the previous one goes on."""
         with self._accepting:
             held = self._held.popleft()
             if (recorder := self._recorder) is not None:
@@ -129,7 +129,7 @@ class Session:
                     recorder.accept(measurement)
 
     def flush_in_background(self) -> None:
-        """Write accepted measurements to the disk, however busy the worker is."""
+        """Write accepted measurements to disk even while the worker is busy."""
         if (recorder := self._recorder) is not None:
             recorder.flush_in_background()
 
@@ -160,7 +160,7 @@ class Session:
         self._on_update(self.slam, update)
 
     def _recorded(self, write: Callable[[RunRecorder], None]) -> bool:
-        """Write to the recording; a disk that fails is reported and tried again, while the robot goes on."""
+        """Write to the recording. A failing disk is reported and tried again, while the robot drives on."""
         if self._recorder is None:
             return False
         try:
@@ -194,12 +194,12 @@ class Session:
 
     @property
     def _is_sure(self) -> bool:
-        """Return whether the newest keyframe is known better in the map than across a jump of odometry."""
+        """Return whether the newest keyframe is better known in the map than across a jump of odometry."""
         covariance = self.slam.pose_covariance
         return float(covariance[0, 0] + covariance[1, 1]) ** 0.5 < _CONFIRMED * self.slam.config.odometry.jump_sigma_m
 
     def evaluate(self) -> None:
-        """Compute how well all measurements fit, when idle, for a fiftieth of the time at most."""
+        """Compute how well all measurements fit, when idle, in at most a fiftieth of the time."""
         if self.estimate is None or self._fitted_at == self.slam.solves or time.perf_counter() < self._fit_due_s:
             return
         start = time.perf_counter()
@@ -217,7 +217,7 @@ class Session:
         return f"{len(self.slam.keyframes)} keyframes"
 
     def accept_save(self) -> list[Control]:
-        """The events that belong before a save, at their place in the journal; none where nothing is new."""
+        """The events that come before a save in the journal; none if nothing is new."""
         events = [Control("flush"), Control("optimize")] if self._has_news else []
         self.accept(events)
         self._has_news = False
@@ -237,7 +237,7 @@ class Session:
         return f"{folder}, {self._save_as(Path(folder), name)}" if name else folder
 
     def _save_as(self, folder: Path, name: str) -> Path:
-        """Write the map as a run in the same directory as the folder, which was saved already."""
+        """Write the map as a run next to the folder, which is already saved."""
         if is_name_of_earlier(folder, name):
             raise RunError(
                 f"{folder.name} is saved; {name}: earlier runs are called so, and are removed: choose another name"
@@ -259,14 +259,14 @@ class Session:
         return folder
 
     def reset(self) -> str:
-        """Save, keep that, and begin anew."""
+        """Save, keep that run, and begin a new one."""
         saved = self.finish() or ("recording was stopped" if self.recording_fails else "nothing to save")
         self.config = self.slam.config
         self._begin()
         return saved
 
     def load(self, name: str, T_map_base: Numbers | None = None) -> str:
-        """Save, keep that, and go on from an earlier run.
+        """Save, keep that run, and continue from an earlier one.
 
         Parameters
         ----------
@@ -275,7 +275,7 @@ class Session:
         return self._load(self.earlier(name), T_map_base)
 
     def resume(self) -> str:
-        """Go on from the run that was cut off: in its map, and where the robot was if its odometry goes on."""
+        """Continue from the run that was cut off: in its map, and at the robot's pose if odometry continues."""
         try:
             return self._load(self.earlier(""), resumes=True)
         except GraphSlamError:
@@ -317,7 +317,7 @@ class Session:
         return ": ".join([run.name, f"{len(self.slam.keyframes)} keyframes", *where, *losses[:1]])
 
     def _place(self, T_map_base: Numbers) -> None:
-        """Begin the sequence with where the robot is, as uncertain as a pose on ``initialpose`` without covariance."""
+        """Begin the sequence with the robot's pose, as uncertain as a pose on ``initialpose`` without covariance."""
         prior, space = self.config.initialpose, self.config.space
         sigmas = np.array(space.sigmas(prior.sigma_m, prior.sigma_rad))
         pose = InitialPose(T_map_base, tuple(np.diag(sigmas**2).ravel().tolist()))
@@ -326,7 +326,7 @@ class Session:
         self._process(pose)
 
     def earlier(self, name: str) -> Path:
-        """The run of that name in the same directory; of an empty name, the newest earlier. Raises RunError: none."""
+        """The run of that name in the same directory; the newest earlier one for an empty name. Raises RunError."""
         if self._folder is None:
             raise GraphSlamError("output.folder is empty: nothing to load")
         if not name:
@@ -340,7 +340,7 @@ class Session:
         return run
 
     def finish(self) -> str:
-        """Save what was not saved yet, and end the recording; returns the folder, or nothing."""
+        """Save what is not saved yet, and end the recording. Returns the folder, or nothing."""
         if self._recorder is None:
             return ""
         folder, recorder = "", self._recorder
@@ -354,11 +354,11 @@ class Session:
         return folder
 
     def leave(self) -> tuple[int, int]:
-        """End the recording though measurements wait for the pipeline.
+        """End the recording while measurements are in the queue.
 
-        Returns how many: those in the journal, whose results the next start makes, or ``graph_slam recover``; and those
-        for a run that has not begun, which are lost. May be called while the worker is busy: of what that still does
-        nothing is recorded or published.
+        Returns their number: those in the journal, whose results the next start or ``graph_slam recover`` makes, and
+        those of a run that has not begun, which are lost. It may be called while the worker is busy; what the worker
+        still does is neither recorded nor published.
         """
         self._is_left = True
         recorder = self._recorder
@@ -372,13 +372,13 @@ class Session:
             raise RunError(f"{recorder.folder}: {error.strerror}") from None
 
     def _counters(self) -> Counters:
-        """The counters of the run: those of the border since it began, and those of the pipeline."""
+        """The counters of the run: of the converters since it began, and of the pipeline."""
         counters = self._border.since(self._refused_before)
         counters.update(self.slam.counters)
         return counters
 
     def abandon(self) -> None:
-        """End the recording as it is, where it was not finished."""
+        """End the recording as it is, if it was not finished."""
         self._is_left = True
         if self._recorder is None:
             return

@@ -29,7 +29,7 @@ _STATIC = InputQos(100, "/tf_static", "/tf_static")
 
 
 def full_name(endpoint: Any) -> str:
-    """The full name of the node of a publisher or subscription; one that is just being discovered has none yet."""
+    """The full name of the node of a publisher or subscription. One that is just being discovered has none yet."""
     if endpoint.node_name.startswith("_NODE_NAME"):
         return "a node"
     return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
@@ -92,7 +92,7 @@ class Subscriptions:
         self._topics.clear()
 
     def _subscribe(self, topic: InputTopic) -> None:
-        """Convert every message of a topic for each of its inputs, one after the other."""
+        """Convert every message of a topic for each of its inputs, one input after another."""
         converter, map_frame, names, is_tf = self._converter, self._config.frames.map, topic.inputs, TF in topic.inputs
         counted = self._topics[topic.name] = _Received()
 
@@ -116,7 +116,7 @@ class Subscriptions:
         self._subscriptions.append(self._created(topic, self._guarded(on_message), self._guarded(on_lost)))
 
     def _created(self, topic: InputTopic, on_message: Callback, on_lost: Callback) -> Any:
-        """A subscription, with the event of lost messages if the middleware has it."""
+        """A subscription, with the event of lost messages if the middleware supports it."""
         create = partial(self._node.create_subscription, message_class(topic.type_name), topic.name, on_message)
         try:
             return create(topic.qos.profile, raw=True, event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost))
@@ -126,9 +126,9 @@ class Subscriptions:
     # -- facts -------------------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
-        """Note which topics have something new; by the clock of the node, so that a pause of it silences nobody.
+        """Note which topics have new data. It uses the node's clock, so that a pause makes no input silent.
 
-        Odometry on /tf has something new when a message gave odometry: /tf carries all transforms.
+        Odometry on /tf has new data when a message contained odometry, because /tf carries all transforms.
         """
         for name, found in self._on_tf.items():
             topic = self._topics[self._of_input[name].name]
@@ -141,7 +141,7 @@ class Subscriptions:
     def facts(
         self, now_ns: int, counted: Mapping[str, Mapping[str, int]], recent: Mapping[str, Recent]
     ) -> tuple[InputFacts, ...]:
-        """The facts of each input, with its counters since the start and what became of it lately."""
+        """The facts of each input, with its counters since the start and in the last seconds."""
         used = uses(self._config)
         out = []
         for one in self._config.sources:
@@ -174,7 +174,7 @@ class Subscriptions:
         return tuple(out)
 
     def _mismatches(self, topic: InputTopic) -> str:
-        """The reasons why publishers of a topic do not connect to its subscription; empty where all do."""
+        """The reasons why publishers of a topic do not connect to its subscription; empty if all connect."""
         publishers = self._node.get_publishers_info_by_topic(topic.name)
         return "; ".join(filter(None, (_mismatch(publisher, topic) for publisher in publishers)))
 

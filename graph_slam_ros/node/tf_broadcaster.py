@@ -42,17 +42,17 @@ class TfBroadcaster:
         self._timer = node.create_timer(config.tf.transform_publish_period, guarded(self._tick))
 
     def close(self) -> None:
-        """Take timer and publisher away; a tick that is on its way already finds it so."""
+        """Remove timer and publisher. A tick that is already on its way finds them removed."""
         self._is_closed = True
         self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)
 
     def forget_time(self) -> None:
-        """Stamps begin anew."""
+        """Begin anew with the stamps."""
         self._policy.forget_time()
 
     def on_correction(self, cdr: bytes) -> None:
-        """A transform from map, ours or another's."""
+        """Note a transform from map, ours or another broadcaster's."""
         if cdr[4:] not in self._ours:
             self._others_s = time.monotonic()
 
@@ -67,7 +67,7 @@ class TfBroadcaster:
         return time.monotonic() - self._others_s < _OTHERS_S
 
     def candidates(self) -> tuple[str, ...]:
-        """The other nodes that publish on /tf: one of them broadcasts the transform."""
+        """The other nodes that publish on /tf, one of which broadcasts the transform."""
         own = self._node.get_fully_qualified_name()
         names = set(map(full_name, self._node.get_publishers_info_by_topic("/tf")))
         return tuple(sorted(names - {own}))

@@ -9,7 +9,7 @@ Result = TypeVar("Result")
 
 
 def run_in_thread(work: Callable[[], Result]) -> Callable[[], Result]:
-    """Begin work in a thread that nobody waits for at the end; returns what waits for its result, or its exception."""
+    """Start work in a daemon thread. Returns a function that waits for its result or raises its exception."""
     future: Future[Result] = Future()
     Thread(target=_run, args=(work, future), name="second look", daemon=True).start()
     return future.result

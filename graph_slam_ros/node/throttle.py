@@ -4,7 +4,7 @@ import time
 
 
 class Throttle:
-    """Lets pass what comes first and then no more than one in so many seconds.
+    """Passes the first item, and then at most one in a given time.
 
     Parameters
     ----------
@@ -17,7 +17,7 @@ class Throttle:
         self._left_out = 0
 
     def next(self) -> int | None:
-        """The number left out since the last that passed; None where this one is left out, too."""
+        """The number left out since the last that passed; None if this one is left out, too."""
         now_s = time.monotonic()
         if now_s - self._passed_s < self._period_s:
             self._left_out += 1

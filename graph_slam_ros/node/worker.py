@@ -40,14 +40,14 @@ class Worker:
         self._thread.start()
 
     def offer(self, *jobs: Job) -> bool:
-        """Queue jobs that follow one another, whatever the first raises; False where the queue is full."""
+        """Queue jobs that follow one another, even if the first one raises; False if the queue is full."""
         if not self.has_room:
             return False
         self._jobs.put((jobs, None, time.monotonic()))
         return True
 
     def call(self, job: Job) -> "Future[Any]":
-        """Queue a job; the future has its result or exception."""
+        """Queue a job. The future has its result or exception."""
         future: Future[Any] = Future()
         self._jobs.put(([job], future, time.monotonic()))
         return future
@@ -59,13 +59,13 @@ class Worker:
 
     @property
     def lag_s(self) -> float:
-        """The time since the job in hand was queued."""
+        """The time since the present job was queued."""
         since = self._since
         return 0.0 if since is None else time.monotonic() - since
 
     @property
     def busy_s(self) -> float:
-        """The time since the job in hand began."""
+        """The time since the present job started."""
         begun = self._begun
         return 0.0 if begun is None else time.monotonic() - begun
 
@@ -80,11 +80,11 @@ class Worker:
         return self._jobs.qsize() < self._most
 
     def leave(self) -> None:
-        """Begin no further job; queued jobs are not done."""
+        """Start no further job. Queued jobs are dropped."""
         self._is_left = True
 
     def stop(self, timeout_s: float | None = None, is_urgent: Callable[[], bool] = lambda: False) -> bool:
-        """Do the queued jobs, then end; False if that takes longer: then no further job is begun.
+        """Do the queued jobs, then end. False if that takes too long; then no further job is started.
 
         Parameters
         ----------
@@ -117,7 +117,7 @@ class Worker:
 
 
 def _failure(job: Job, future: "Future[Any] | None") -> BaseException | None:
-    """Run a job; what it raises does not end the thread, and goes to its future if it has one."""
+    """Run a job. Its exception does not end the thread, and goes to its future if it has one."""
     try:
         result = job()
     except BaseException as error:

@@ -50,7 +50,7 @@ def calibrate(
     landmarks: str | None = None,
     progress: Progress = lambda items, total: items,
 ) -> Calibrated:
-    """Estimate what is wrong with odometry's scale, clocks and mounts; nothing is written.
+    """Estimate corrections of odometry's scale, clocks and mounts. Nothing is written.
 
     Parameters
     ----------

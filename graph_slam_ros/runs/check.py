@@ -107,7 +107,7 @@ def check(
 
 
 def _trial(columns: Columns, measured: list[Measurements]) -> list[Finding]:
-    """Findings of a replay in memory; none where the pipeline fails at such measurements, which is its to say."""
+    """Findings of a replay in memory; none if the pipeline fails with such measurements, which a replay reports."""
     warmup(dimensions=columns.config.world.dimensions)
     try:
         with np.errstate(all="ignore"):
@@ -121,7 +121,7 @@ def _topic(chosen: Mapping[str, str], name: str, config: Config) -> str | None:
 
 
 def _suggestion(bag: Bag, recording: Recording, path: Path, odometry: str | None, landmarks: str | None) -> Suggestion:
-    """The choice of ``info``, if the topics that a person has named were the only ones of their kinds."""
+    """The choice of ``info`` if the named topics were the only ones of their kinds."""
     topics = dict(recording.topics)
     if odometry in topics:
         topics = {n: one for n, one in topics.items() if n == odometry or one.topic.type != topics[odometry].topic.type}
@@ -131,7 +131,7 @@ def _suggestion(bag: Bag, recording: Recording, path: Path, odometry: str | None
 
 
 def _unused(recording: Recording, suggestion: Suggestion, *, has_landmarks: bool) -> Iterator[Finding]:
-    """Topics that are meant for landmarks or odometry, and that cannot be used."""
+    """Topics that are meant as landmarks or odometry, and that cannot be used."""
     has_landmarks = has_landmarks or any(name not in ("odom", "gps", "imu", "pose") for name in suggestion.names)
     for name, why in suggestion.unused.items():
         one = recording.topics[name]
@@ -148,7 +148,7 @@ def _unused(recording: Recording, suggestion: Suggestion, *, has_landmarks: bool
 
 
 def _is_defect(one: TopicContents, why: str) -> bool:
-    """Return whether a topic is not used since something is wrong with it, not since there is a better one."""
+    """Return whether a topic is unused because something is wrong with it, not because another one is better."""
     return bool(one.trouble) or one.is_zero or "another clock" in why
 
 

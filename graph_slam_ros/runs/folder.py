@@ -75,7 +75,7 @@ def _is_marked(folder: Path) -> bool:
 
 
 def _is_recorded(file: Path) -> bool:
-    """Return whether a file with the name of a run's recording is one: its head and its first record say so."""
+    """Return whether a file with the name of a run's recording is one, by its head and its first record."""
     name = _RECORDED.fullmatch(file.name)
     if name is None or not is_regular(file):
         return False
@@ -92,7 +92,7 @@ def _is_recorded(file: Path) -> bool:
 
 
 def is_cut_off(folder: Path) -> bool:
-    """Return whether the newest run, there or moved out of its way, holds something and was never ended."""
+    """Return whether the newest run, in place or moved away, has contents and never ended."""
     earlier = earlier_runs(folder)
     newest = folder if _holds_something(folder) else earlier[max(earlier)] if earlier else folder
     if not _holds_something(newest):
@@ -101,18 +101,18 @@ def is_cut_off(folder: Path) -> bool:
 
 
 def incomplete_runs(folder: Path) -> list[Path]:
-    """Earlier runs that were ended before all that they had accepted was processed, the newest first."""
+    """Earlier runs that ended before all accepted measurements were processed, the newest first."""
     earlier = earlier_runs(folder)
     return [earlier[number] for number in sorted(earlier, reverse=True) if is_incomplete(earlier[number])]
 
 
 def is_incomplete(folder: Path) -> bool:
-    """Return whether a run ended before all that it had accepted was processed: its results are to be made."""
+    """Return whether a run ended before all accepted measurements were processed: its results are incomplete."""
     return summary_of(folder).get("is_incomplete") is True
 
 
 def was_saved_whole(folder: Path) -> bool:
-    """Return whether the map of a run has all of its journal, by its summary."""
+    """Return whether the map of a run includes all of its journal, by its summary."""
     parts = list(_parts(folder))
     return summary_of(folder).get("unprocessed") == 0 and bool(parts) and all(then == now for _, then, now in parts)
 
@@ -146,7 +146,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
 
 
 def recording_of(folder: Path) -> str:
-    """The name of the recording that a run was replayed from; empty where it was a live run, or is not known."""
+    """The name of the recording that a run was replayed from; empty if it was a live run, or is unknown."""
     name = summary_of(folder).get("recording", "")
     return name if isinstance(name, str) else ""
 
@@ -163,7 +163,7 @@ def run_config(folder: Path) -> Config:
 
 
 def changed_since(folder: Path) -> list[str]:
-    """Files that are not those that ``run.json`` was written with: of a save that was cut off, exchanged, or edited."""
+    """Files that differ from those of ``run.json``: from an interrupted save, exchanged, or edited."""
     out = list(_not_as_saved(folder, "files", lambda file: checksum(read_bytes(file))))
     out += [change for change in _not_as_saved(folder, "recorded", ends_of) if change not in out]
     if any(now > then for _, then, now in _parts(folder)) or is_incomplete(folder):
@@ -172,13 +172,13 @@ def changed_since(folder: Path) -> list[str]:
 
 
 def missing(folder: Path) -> list[str]:
-    """The recordings with fewer parts than when the run was saved, or with other ones."""
+    """The recordings that have fewer or other parts than when the run was saved."""
     fewer = [f"{name}: {then} parts when it was saved, {now} now" for name, then, now in _parts(folder) if now < then]
     return fewer + list(_not_as_saved(folder, "recorded", ends_of))
 
 
 def _not_as_saved(folder: Path, kind: str, mark_of: Callable[[Path], str]) -> Iterator[str]:
-    """The files whose mark differs from the summary's, that are gone, or that cannot be read."""
+    """The files whose checksum differs from the summary's, and those that are missing or unreadable."""
     summary = summary_of(folder)
     if not summary and os.path.lexists(folder / SUMMARY):
         yield f"{SUMMARY} is not the summary of a run: whether its files belong together is not known"
@@ -214,7 +214,7 @@ def ends_of(file: Path) -> str:
 
 
 def _parts(folder: Path) -> Iterator[tuple[str, int, int]]:
-    """The parts of each recording of a run that was saved: how many parts it had then and has now."""
+    """The parts of each recording of a saved run: their number then and now."""
     parts = summary_of(folder).get("parts")
     recorded: dict[str, Any] = parts if isinstance(parts, dict) else {}
     for name in (INGEST, MAP):
@@ -237,7 +237,7 @@ def suggested_out(source: Path) -> Path:
 
 
 def check_room(folder: Path, source: Path | None = None, *, force: bool = False) -> None:
-    """Refuse a folder that holds anything but a run that may be replaced, or the source that is about to be read.
+    """Refuse a folder that contains anything but a run that may be replaced, or the source that is about to be read.
 
     Parameters
     ----------
@@ -270,12 +270,10 @@ def check_room(folder: Path, source: Path | None = None, *, force: bool = False)
 
 
 def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> Path | None:
-    """Move an earlier run out of the way: to ``folder-1``, or one more than the last; so many of them are kept.
+    """Move an earlier run away, to ``folder-1`` or the next number. A limited number of them is kept.
 
-    Returns where it is now; None where there is none to keep.
-
-    One that holds nothing is not kept; one that was never ended, or that an earlier version wrote, is in any case. Of
-    older ones the files of the run are removed, and nothing else.
+    Returns where it is now; None if there is none to keep. An empty run is not kept. A run that never ended, or that an
+    earlier version wrote, is always kept. Of older ones the files of the run are removed, and nothing else.
 
     Parameters
     ----------
@@ -299,7 +297,7 @@ def keep_earlier(folder: Path, most: int, loaded: Path | None = None) -> Path | 
 
 
 def earlier_runs(folder: Path) -> dict[int, Path]:
-    """Earlier runs beside a run folder, by number."""
+    """Earlier runs next to a run folder, by number."""
     return {number: run for number, run in _numbered(folder).items() if _is_readable_run(run)}
 
 
@@ -310,7 +308,7 @@ def _is_readable_run(folder: Path) -> bool:
 
 
 def is_name_of_earlier(folder: Path, name: str) -> bool:
-    """Return whether an earlier run of a folder could have that name, and so be removed with the oldest of these."""
+    """Return whether an earlier run of a folder could have that name, and so be removed as the oldest of these."""
     return _earlier_name(folder).fullmatch(name) is not None
 
 
@@ -319,7 +317,7 @@ def _earlier_name(folder: Path) -> re.Pattern[str]:
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
-    """The folders with a name of an earlier run, by its number."""
+    """The folders whose name is that of an earlier run, by number."""
     named = _earlier_name(folder)
     there = folder.parent.iterdir() if folder.parent.is_dir() else ()
     return {int(match[1]): run for run in there if (match := named.fullmatch(run.name))}
@@ -354,7 +352,7 @@ def room(folder: Path, *, force: bool = False) -> Iterator[None]:
 
 
 def discard(folder: Path) -> None:
-    """Remove a run that was begun and not saved yet; a saved one stays."""
+    """Remove a run that has begun and was not saved yet. A saved one stays."""
     with contextlib.suppress(OSError):
         if read_bytes(folder / SUMMARY) == BEGUN:
             remove(folder)
@@ -371,13 +369,13 @@ def remove(folder: Path) -> None:
 
 
 def _clear(folder: Path) -> None:
-    """Remove the files of a run but for its mark: who is stopped half-way leaves a folder that may be cleared again."""
+    """Remove the files of a run except its mark, so that a folder that was half cleared can be cleared again."""
     for file in _contents(folder)[0]:
         file.unlink()
 
 
 def _contents(folder: Path) -> tuple[list[Path], list[Path]]:
-    """The files that a run has made, without its mark, and what only has the name of one."""
+    """The files that a run has made, without its mark, and others that have such a name."""
     ours, foreign = list[Path](), list[Path]()
     for file in sorted(folder.iterdir(), reverse=True):
         if _RECORDED.fullmatch(file.name):
@@ -390,5 +388,5 @@ def _contents(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _is_unfinished(file: Path) -> bool:
-    """Return what a process that was killed while it wrote a file has left."""
+    """Return whether a file was left by a process that was killed while it wrote."""
     return _UNFINISHED.fullmatch(file.name) is not None and is_regular(file)

@@ -29,7 +29,7 @@ _SCHEMA = _ENCODE({"type": "object", "properties": {"type": {"type": "string"}},
 
 
 class RecordWriter:
-    """Appends records to one new file: they wait in memory for the next ``flush`` of that."""
+    """Appends records to one new file. They stay in memory until the next flush of that file."""
 
     def __init__(self, path: Path, schema: str = MEASUREMENT) -> None:
         self.file = AppendedFile(path)
@@ -42,7 +42,7 @@ class RecordWriter:
         self._stamp_ns = 0
 
     def write(self, several: Iterable[Mapping[str, Any]]) -> None:
-        """Append records, as one chunk; one without a stamp is filed under the last."""
+        """Append records as one chunk. A record without a stamp gets the last stamp."""
         *others, last = several
         for record in others:
             self._add(record)
@@ -60,7 +60,7 @@ class RecordWriter:
         self._sequence += 1
 
     def end(self) -> AppendedFile:
-        """Append the index; returns the file, which is to be closed."""
+        """Append the index. Returns the file, which the caller closes."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         return self.file
 
@@ -70,9 +70,9 @@ class RecordWriter:
 
 
 class Parts:
-    """The records of one name in a folder, part after part, each a file of its own.
+    """The records of one name in a folder, in parts, each of which is a file.
 
-    What the disk does not take waits, of parts that were ended as of the present one, and is written in that order.
+    What the disk does not accept is kept, for ended parts and the present one, and is written in that order.
     """
 
     def __init__(self, folder: Path, name: str, schema: str) -> None:
@@ -82,35 +82,35 @@ class Parts:
         self._ended: list[AppendedFile] = []
 
     def begin(self) -> RecordWriter:
-        """Have the present part, also where nothing is to be written yet."""
+        """Create the present part, even if there is nothing to write yet."""
         if self._present is None:
             self._present = RecordWriter(self._folder / part_name(self._name, self._part), self._schema)
         return self._present
 
     def write(self, several: Sequence[Mapping[str, Any]]) -> None:
-        """Append records: they wait for ``flush``."""
+        """Append records. They are kept until ``flush``."""
         if several:
             self.begin().write(several)
 
     @property
     def unwritten(self) -> int:
-        """Bytes that are not in files yet."""
+        """The number of bytes that are not in files yet."""
         return sum(file.unwritten for file in self._files())
 
     def flush(self) -> None:
-        """Write what waits. Raises OSError: then some of it waits still."""
+        """Write what is kept in memory. Raises OSError; then some of it is still kept."""
         close_all(self._ended)
         for file in self._files():
             file.flush()
 
     def sync(self) -> None:
-        """Have the disk take what was flushed. May be called from another thread; raises OSError."""
+        """Sync to disk what was flushed. It may be called from another thread. Raises OSError."""
         present = self._present
         if present is not None:
             present.file.sync()
 
     def end(self) -> None:
-        """End the present part: what comes is of the next. Raises OSError as ``flush`` does."""
+        """End the present part, and begin the next with the next record. Raises OSError as ``flush`` does."""
         if self._present is not None:
             self._ended.append(self._present.end())
             self._present = None
@@ -118,7 +118,7 @@ class Parts:
         close_all(self._ended)
 
     def abandon(self) -> None:
-        """Leave everything as it is on the disk."""
+        """Leave everything on the disk as it is."""
         for file in self._files():
             file.abandon()
 
@@ -127,14 +127,14 @@ class Parts:
 
 
 def close_all(files: list[AppendedFile]) -> None:
-    """Close files in order; those that were are out of the list. Raises OSError of the first that could not be."""
+    """Close files in order. Closed ones leave the list. Raises OSError of the first that could not be closed."""
     while files:
         files[0].close()
         del files[0]
 
 
 class _Chunk(int):
-    """The size beyond which the library ends a chunk: none, until the last record of a flush comes."""
+    """The size at which the library ends a chunk: unlimited, until the last record of a flush."""
 
     is_full = False
 
@@ -143,7 +143,7 @@ class _Chunk(int):
 
 
 def part_name(name: str, part: int) -> str:
-    """The name of one of the files that a recording is split over."""
+    """The file name of one part of a recording."""
     return f"{name}_{part}.mcap" if part else f"{name}.mcap"
 
 
@@ -187,9 +187,9 @@ def _measurements(records: Iterable[dict[str, Any]], losses: list[str]) -> Itera
 
 
 def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[str]) -> list[Measurement]:
-    """The measurements that a map lacks which has processed the first so many records.
+    """The measurements that a map lacks which has processed a given number of records.
 
-    These are the records after them, and those before that waited for their turn then: newer than the last odometry
+    These are the records after them. Added are earlier ones that were not in order yet: newer than the last odometry
     that was used. Events of another version add to ``losses``.
     """
     waited: list[dict[str, Any]] = []
@@ -210,7 +210,7 @@ def read_rest(folder: Path, processed: int, used_ns: int | None, losses: list[st
 
 
 def read_records(folder: Path, name: str, losses: list[str], kind: str = "") -> Iterator[dict[str, Any]]:
-    """Records in the order they were written, up to the first that cannot be read; what is lost adds to ``losses``.
+    """Records in the order of writing, up to the first that cannot be read. What is lost adds to ``losses``.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def _decoded(file: str, message: Message) -> Any:
 
 
 def _messages(folder: Path, name: str, losses: list[str]) -> Iterator[tuple[str, str, Message]]:
-    """The same before they are decoded, each with its file and its kind."""
+    """The same before decoding, each with its file and its kind."""
     lost = len(losses)
     for part, file in enumerate(parts_of(folder, name)):
         if file.name != (due := part_name(name, part)):

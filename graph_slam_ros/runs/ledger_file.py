@@ -34,7 +34,7 @@ _ROUNDING = 1e-6  # of a statistic, which is then below 0
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """An edge: what was measured, what was decided about it, and how it stands now.
+    """An edge: its measurement, the decision on it, and its present state.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Entry:
 
     @property
     def about(self) -> str:
-        """The edge's class, and the landmark it is about."""
+        """The class of the edge, and the landmark that it observes."""
         return f"{self.label} {self.landmark}".strip()
 
     @property
@@ -96,24 +96,24 @@ class Entry:
 
     @property
     def sigma_factor(self) -> float:
-        """The factor of all sigmas with which it would just have passed."""
+        """The factor of all sigmas with which it would just have passed its gate."""
         return float((self.statistic / self.threshold) ** 0.5)
 
     @property
     def information_matrix(self) -> NDArray[np.float64]:
-        """The whole of it, (dof, dof)."""
+        """The full information matrix, (dof, dof)."""
         upper = np.zeros((self.dof, self.dof))
         upper[np.triu_indices(self.dof)] = self.information
         return upper + np.triu(upper, 1).T
 
 
 def ledger_text(slam: GraphSlam, ids: list[int]) -> str:
-    """All edges that the solver has; ``ids`` are the numbers of the vertices in the file."""
+    """All edges of the solver as a table; ``ids`` are the numbers of the vertices in the file."""
     return _text(Entry, ledger_entries(slam, ids))
 
 
 def changes_text(slam: GraphSlam) -> str:
-    """The history of all verdicts."""
+    """The history of all verdicts as a table."""
     return _text(VerdictChange, slam.ledger.history)
 
 
@@ -129,7 +129,7 @@ def read_ledger(folder: Path) -> list[Entry]:
 
 
 def _fault(entry: Entry) -> str:
-    """Return what of an edge does not go together."""
+    """Return which fields of an edge contradict one another."""
     try:
         edge = map_edge_of(entry.tag)
     except ConfigError as error:
@@ -157,7 +157,7 @@ def _upper(size: int) -> tuple[Any, Any]:
 
 
 def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
-    """Each edge that the solver has; ``ids`` are the numbers that its vertices are to have."""
+    """Each edge of the solver; ``ids`` are the numbers of its vertices in the file."""
     graph, ledger = slam.graph, slam.ledger
     names = {mark.vertex: name for name, mark in slam.landmarks.items()}
     chi2, _ = slam.solver.chi2_of(np.arange(len(ledger)))
@@ -230,7 +230,7 @@ def _word(value: Any) -> str:
 
 
 def _read(kind: type[Row], file: Path) -> Iterator[tuple[int, Row]]:
-    """Each row with the line it ends on."""
+    """Each row with the number of its last line."""
     hints = get_type_hints(kind)
     if not os.path.lexists(file):
         raise FormatError(f"{file}: no such file: is it a run, and saved by this version?")

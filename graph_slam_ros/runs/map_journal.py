@@ -85,7 +85,7 @@ class MapGrowth:
             self.first += [self.since(start), _estimate(start.values), {"type": "start"}]
 
     def of(self, slam: GraphSlam) -> Iterator[Record]:
-        """The growth since the last call, and now and then where all of it is thought to be."""
+        """The growth since the last call, and from time to time the whole estimate."""
         changed = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
         self._settings = dict(slam.settings)
         used = {"used": [slam.newest_odometry_ns, slam.odometry_source]} if slam.odometry_source else {}
@@ -142,17 +142,17 @@ class MapGrowth:
 
 
 def has_map(folder: Path) -> bool:
-    """Return whether a run folder has one."""
+    """Return whether a run folder has a map."""
     return bool(parts_of(folder, MAP))
 
 
 def grew(folder: Path) -> bool:
-    """Return whether there is anything in it."""
+    """Return whether there is any growth."""
     return any(record.get("type") == "growth" for record in read_records(folder, MAP, []))
 
 
 def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> MapSnapshot | None:
-    """The map of a run folder, as far as it can be read; None where there is none.
+    """The map of a run folder, as far as it can be read; None if there is none.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> Ma
 
 
 def state_of(slam: GraphSlam) -> MapSnapshot:
-    """The map of a pipeline, apart from it."""
+    """A copy of the map of a pipeline."""
     state = MapSnapshot()
     extend(state, MapGrowth().since(slam))
     state.values, state.settings = slam.solver.values, dict(slam.settings)
@@ -199,13 +199,13 @@ def state_of(slam: GraphSlam) -> MapSnapshot:
 
 
 def extend(state: MapSnapshot, record: Mapping[str, Any]) -> None:
-    """Take a ``growth`` in, after what there is."""
+    """Append a ``growth`` to the map."""
     _grow(state, record)
     _apply_verdicts(state)
 
 
 def _fault(state: MapSnapshot) -> str:
-    """Return where the parts do not fit together; empty if they do."""
+    """Return where the parts contradict one another; empty if they do not."""
     graph = state.graph
     kinds = [graph.kinds[code] for code in graph.kind.values.tolist()]
     pose = next((kind for kind in kinds if kind in GROUPS), None)
@@ -283,7 +283,7 @@ def _named(verdict: Verdict, reason: Reason) -> tuple[str, str]:
 
 
 def _as_json(number: float) -> float | str:
-    """JSON has no infinity."""
+    """Replace infinity, which JSON does not have."""
     return number if math.isfinite(number) else repr(number)
 
 
@@ -293,7 +293,7 @@ def _landmark(mark: Landmark) -> list[Any]:
 
 
 def _newer(seen: Sequence[LandmarkEdge], first_edge: int) -> Iterable[LandmarkEdge]:
-    """The sightings of new edges: they are at the end."""
+    """The sightings of new edges, which are at the end."""
     count = next((k for k, one in enumerate(reversed(seen)) if one.edge < first_edge), len(seen))
     return seen[len(seen) - count :]
 
@@ -308,7 +308,7 @@ def _seen(one: LandmarkEdge) -> list[Any]:
 
 
 def _apply_verdicts(state: MapSnapshot) -> None:
-    """Apply verdicts: what is rejected has no weight; what another landmark got is withdrawn from the first."""
+    """Apply verdicts: a rejected edge has weight zero; an edge that moved to another landmark is withdrawn."""
     out = np.flatnonzero(np.isin(state.ledger.verdict.values, (Verdict.PENDING, Verdict.REJECTED)))
     state.graph.set_weights(out, 0.0)
     for mark in state.landmarks.values():

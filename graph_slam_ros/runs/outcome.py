@@ -30,7 +30,7 @@ _EXTREME = "distances or noise that no robot means do that: --set INPUT.max_dist
 
 
 def text(summary: Summary) -> list[str]:
-    """Numbers of a run, what waits, and what came of each input."""
+    """The numbers of a run, the size of its queue, and the outcome of each input."""
     lines = [
         f"keyframes  {summary['keyframes']:8d}   over {summary['span_s']:.1f} s",
         f"landmarks  {summary['landmarks']:8d}   from {summary['sightings']} sightings",
@@ -57,7 +57,7 @@ def text(summary: Summary) -> list[str]:
 
 
 def calibration(summary: Summary) -> Iterator[str]:
-    """Yield what calibration has corrected, with the settings that have it, and what it could not determine."""
+    """Yield the corrections of the calibration with their settings, and what it could not determine."""
     report = summary.get("calibration")
     if not report:
         return
@@ -70,7 +70,7 @@ def calibration(summary: Summary) -> Iterator[str]:
 
 
 def _solves(summary: Summary) -> str:
-    """The number of solves; a map that is only read is solved once, before the run counts."""
+    """The number of solves. A map that is only read is solved once, before the run counts."""
     count = summary["solves"]
     if count:
         return f"after {count} solve{'s' * (count > 1)}"
@@ -78,22 +78,22 @@ def _solves(summary: Summary) -> str:
 
 
 def _counted_lines(source: str, reason: str, times: int) -> Iterator[str]:
-    """Return what was repaired or noted, and the line that mends it where it came again and again."""
+    """Return what was repaired or noted, with the remedy if it was frequent."""
     yield from _wrapped(f"counted    {source}: {reason} {times} ({explain(reason).meaning})", 11)
     if times > 1 and reason in _MENDED and (mend := explain(reason).remedy):
         yield from textwrap.wrap(f"-> {mend}", _WIDTH, initial_indent=" " * 11, subsequent_indent=" " * 14)
 
 
 def _wrapped(line: str, indent: int) -> list[str]:
-    """The words of a line, as many as it takes; a name that came with a message cannot begin one."""
+    """The words of a line, in as many lines as needed. A name from a message never begins a line."""
     return textwrap.wrap(" ".join(line.splitlines()), _WIDTH, subsequent_indent=" " * indent)
 
 
 def table(summary: Summary) -> list[str]:
-    """A row for each input, with the reasons of what was refused and the lines that mend them.
+    """A row for each input, with the reasons of refusals and their remedies.
 
-    ``received`` counts messages; the others count what is in them: odometry, sightings, fixes, closures. ``believed``
-    is what the estimate follows.
+    ``received`` counts messages. The other columns count odometry, sightings, fixes and closures in them. ``believed``
+    counts those that the estimate uses.
     """
     inputs: Mapping[str, Any] = summary.get("inputs", {})
     if not inputs:
@@ -112,7 +112,7 @@ def table(summary: Summary) -> list[str]:
 
 
 def shortcomings(summary: Summary) -> Iterator[str]:
-    """Return why the result is less than what was asked for, a sentence each; nothing where it is not."""
+    """Return the reasons why the result is incomplete, one sentence each; empty if it is complete."""
     inputs: Mapping[str, Any] = summary.get("inputs", {})
     yield from checked(summary, "error")
     if summary.get("failing"):
@@ -145,7 +145,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
 
 
 def doubts(summary: Summary) -> Iterator[str]:
-    """Return a sentence for each input of which more than a few measurements are not believed, but most are."""
+    """Return a sentence for each input of which many measurements are rejected, but fewer than half."""
     for name, counts in summary.get("inputs", {}).items():
         if counts["use"] == "odometry" or not counts["used"]:
             continue
@@ -156,7 +156,7 @@ def doubts(summary: Summary) -> Iterator[str]:
 
 
 def checked(summary: Summary, severity: str) -> Iterator[str]:
-    """Return the worst finding of the recording, if it is so severe; ``graph_slam check`` lists all."""
+    """Return the worst finding of the recording if it is severe enough; ``graph_slam check`` lists all."""
     found = summary.get("check")
     if found is not None and found["severity"] == severity:
         mend = " ".join(f"--set {shlex.quote(text)}" for text in found["settings"])
@@ -164,7 +164,7 @@ def checked(summary: Summary, severity: str) -> Iterator[str]:
 
 
 def unscaled(summary: Summary) -> Iterator[str]:
-    """Return why noise that was to be estimated is as configured."""
+    """Return why noise that should be estimated is as configured."""
     if summary.get("noise_scale") != "estimated":
         return
     if why := summary.get("noise_unknown"):
@@ -186,7 +186,7 @@ def _unused(summary: Summary, name: str, received: int | None) -> str:
 
 
 def _because(name: str, counted: Mapping[str, int]) -> str:
-    """The most frequent reason, and what mends it."""
+    """The most frequent reason, and its remedy."""
     if not counted:
         return "it holds nothing"
     reason = next(iter(counted))

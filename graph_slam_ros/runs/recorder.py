@@ -40,9 +40,9 @@ _TOGETHER = 256  # measurements that are written at once: one by one, as they co
 class RunRecorder:
     """Records a run while it goes on, and saves its results.
 
-    What was accepted is in the journal once ``flush`` has returned. A disk that is full loses nothing: what could not
-    be written is written when there is room. One thread accepts measurements (``accept``) while another processes them
-    and calls everything else; ``leave`` may be called by either.
+    What was accepted is in the journal once ``flush`` has returned. A full disk loses nothing: what could not be
+    written is written when there is room. One thread accepts measurements (``accept``), and another one processes
+    them and makes all other calls. Both may call ``leave``.
 
     Parameters
     ----------
@@ -93,12 +93,12 @@ class RunRecorder:
             raise RunError(f"{self.folder}: {error.strerror}") from None
 
     def accept(self, measurement: Measurement) -> None:
-        """Take a measurement for the journal; it waits for ``flush`` or ``flush_in_background``."""
+        """Add a measurement to the journal. It is kept in memory until ``flush`` or ``flush_in_background``."""
         self._accepted.append(measurement)
         self.accepted += 1
 
     def flush_in_background(self) -> None:
-        """Have a thread write what was accepted, if that waits: the one that processes may be busy for long."""
+        """Write accepted measurements in a thread, because the thread that processes them may be busy for long."""
         if self._accepted and not self._is_ended and (self._flushing is None or self._flushing.done()):
             with contextlib.suppress(RuntimeError):  # the recording has just been ended
                 self._flushing = self._writer_thread().submit(self._flush_journal)
@@ -123,7 +123,7 @@ class RunRecorder:
             self.flush()
 
     def flush(self) -> None:
-        """Bring to the disk what was accepted and what came of it: before any of that is told to anybody.
+        """Write accepted measurements and their results to disk, before any result is published.
 
         Raises
         ------
@@ -152,11 +152,11 @@ class RunRecorder:
 
     @property
     def unwritten(self) -> int:
-        """Bytes of the journal that wait for room on the disk."""
+        """The number of bytes of the journal that are not on the disk."""
         return self._journal.unwritten + self._map.unwritten
 
     def _sync_if_due(self) -> Future[None] | None:
-        """The disk may take long: nobody waits for it."""
+        """Start to sync in the background, because the disk may be slow."""
         now = time.monotonic()
         if not self._sync_s or now < self._due_s:
             return None
@@ -164,7 +164,7 @@ class RunRecorder:
         return self._writer_thread().submit(self._sync)
 
     def join_sync(self) -> None:
-        """Wait until the disk has taken what it was asked to take. Raises OSError: it did not, which is told once."""
+        """Wait until the disk has synced. Raises OSError once if it failed."""
         asked, self._syncing = self._syncing, None
         if asked is not None:
             asked.result()
@@ -192,7 +192,7 @@ class RunRecorder:
             self._record_map(slam)
 
     def save(self, slam: GraphSlam, summary: dict[str, Any] | None = None) -> Path:
-        """Write all results; recording may go on, in new parts of ``ingest`` and ``run``. Returns the folder.
+        """Write all results. Recording may go on, in new parts of ``ingest`` and ``run``. Returns the folder.
 
         Raises
         ------
@@ -214,7 +214,7 @@ class RunRecorder:
         return self.folder
 
     def _ended_parts(self) -> dict[str, Any]:
-        """The parts for the summary: their number (with more the run went on), and their marks."""
+        """The parts for the summary: their number, which grows if the run goes on, and their checksums."""
         parts = {name: len(parts_of(self.folder, name)) for name in (INGEST, MAP)}
         return {"parts": parts, "recorded": recorded_files(self.folder)}
 
@@ -223,9 +223,9 @@ class RunRecorder:
             raise RunError(f"{self.folder}: its recording has been ended")
 
     def leave(self, processed: int, keyframes: int, counters: Counters) -> int:
-        """End the recording before all of it was processed, and note that in the summary; returns what waits.
+        """End the recording before everything was processed, and note that in the summary. Returns how many are left.
 
-        What has been saved until now stays; ``complete`` makes the results of the whole.
+        What was saved until now stays; ``complete`` makes the results of the whole.
 
         Raises
         ------
@@ -250,7 +250,7 @@ class RunRecorder:
         return unprocessed
 
     def close(self) -> None:
-        """End the recording: somebody else may have the folder.
+        """End the recording, and release the folder.
 
         Raises
         ------
@@ -263,7 +263,7 @@ class RunRecorder:
             self._room.close()
 
     def abandon(self) -> None:
-        """End the recording as it is on the disk: what waits is lost."""
+        """End the recording as it is on the disk. What is in memory is lost."""
         with self._writing:
             self._is_ended = True
             self._abandon()
@@ -280,14 +280,14 @@ class RunRecorder:
             self._bag.abandon()
 
     def discard(self) -> None:
-        """End the recording and remove what was written of it, if it was not saved yet."""
+        """End the recording, and remove its files if it was never saved."""
         with self._writing, self._room:
             self._is_ended = True
             self._abandon()
             discard(self.folder)
 
     def _end_parts(self) -> None:
-        """End the present parts: what comes is of the next."""
+        """End the present parts, and begin the next ones with the next record."""
         self._fill()
         failed = self._syncing.exception() if self._syncing is not None else None
         self._syncing = None
@@ -317,7 +317,7 @@ class RunRecorder:
 def save_results(
     folder: Path, slam: GraphSlam, summary: dict[str, Any], check: Callable[[], None] = lambda: None
 ) -> None:
-    """All that can be computed first, then file by file; the summary, the last, tells which belong together.
+    """Compute everything, then write file after file. The summary is last; it says which files belong together.
 
     Parameters
     ----------
@@ -335,7 +335,7 @@ def save_results(
 
 
 def _put(folder: Path, name: str, text: str) -> str:
-    """Write a file whole or not at all; returns its CRC-32."""
+    """Write a file completely or not at all. Returns its CRC-32."""
     data = text.encode()
     write_whole(folder / name, data)
     return checksum(data)

@@ -54,7 +54,7 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class EarlierRun:
-    """A run that ended when time jumped back (``time.on_jump`` is reset), and its summary."""
+    """A run that ended when time jumped back (``time.on_jump`` is reset), with its summary."""
 
     folder: Path
     summary: dict[str, Any]
@@ -77,7 +77,7 @@ class Replayed:
 
 
 def choose_inputs(bag: Bag, config: Config, odometry: str | None = None, landmarks: str | None = None) -> Inputs:
-    """The topic of each input: the one named, else the configured one, else the only one of its type.
+    """The topic of each input: the named one, else the configured one, else the only one of its type.
 
     Parameters
     ----------
@@ -134,10 +134,10 @@ def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> 
 def measurements(
     bag: Bag, inputs: Inputs, config: Config, counters: Counters, datum: tuple[float, ...] = ()
 ) -> Iterator[list[Measured | Control]]:
-    """The measurements of each recorded message, in order, and at the end of what has waited.
+    """The measurements of each recorded message, in order, and at the end those that were kept.
 
-    Where the stamps of odometry begin anew, ``time.on_jump`` says what becomes of the run. Static transforms are read
-    first: they hold for the whole recording.
+    If the stamps of odometry begin anew, ``time.on_jump`` decides what happens to the run. Static transforms are read
+    first, because they hold for the whole recording.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def measurements(
 
 
 class RecordedRuns:
-    """The measurements of a recording as the gate lets them pass: one run, or several where ``time.on_jump`` is reset.
+    """The measurements of a recording that pass the gate: one run, or several if ``time.on_jump`` is reset.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ class RecordedRuns:
             self._converter.begin_at(datum)
 
     def __iter__(self) -> Iterator[tuple[int, list[Measured | Control]]]:
-        """Yield the number of the run, from 0, and what comes of each message; the end of a run is among it."""
+        """Yield the number of the run, from 0, and the measurements of each message, the end of a run included."""
         bag, by_topic = self._bag, self._inputs.by_topic()
         if TF_STATIC in self._inputs.topics:
             for message in bag.messages({self._inputs.topics[TF_STATIC]}):
@@ -221,12 +221,12 @@ class RecordedRuns:
         yield len(self.counted), [*passage.events, *passage.measured]
 
     def counted_in(self, number: int) -> Counters:
-        """The counts while a run lasted, by its number; of the last, until now."""
+        """The counts of one run, by its number; of the last run, until now."""
         end = self.counted[number] if number < len(self.counted) else self._counters
         return end.since(self.counted[number - 1] if number else Counters())
 
     def _counted_before(self, names: Sequence[str]) -> Counters:
-        """The counts before a message of these inputs, which is of the next run."""
+        """The counts before a message of these inputs that belongs to the next run."""
         before = Counters()
         before.update(self._counters)
         before.received.subtract(names)
@@ -297,7 +297,7 @@ def _recorded(
     *,
     force: bool,
 ) -> Replayed:
-    """The runs of a recording: the last is in ``out``, those before it beside it."""
+    """The runs of a recording. The last is in ``out``, the earlier ones are next to it."""
     losses: list[str] = []
     state = None if map_folder is None else map_of(map_folder, losses)
     if map_folder is not None and state is not None:
@@ -326,7 +326,7 @@ def _recorded(
 
 
 def _checked(columns: Collector, counters: Counters) -> dict[str, Any]:
-    """The worst finding of the recording so far, of the checks that need no fit."""
+    """The worst finding of the recording so far, from the checks that need no fit."""
     found = worst_of_replay(columns.columns(counters))
     return {} if found is None else {"check": found.as_dict()}
 
@@ -344,7 +344,7 @@ def _warnings(slam: GraphSlam, summary: dict[str, Any]) -> list[str]:
 
 
 def _kept(out: Path) -> Path:
-    """Move a run out of the way of the next, as the node does; none is removed for it."""
+    """Move a run away before the next one begins, as the node does. None is removed for that."""
     if (kept := keep_earlier(out, sys.maxsize)) is None:
         raise RunError(f"{out}: the run until time jumped back holds nothing")
     return kept
@@ -353,7 +353,7 @@ def _kept(out: Path) -> Path:
 def _measured(
     run: Iterable[tuple[int, Sequence[Measurement]]], runs: RecordedRuns, number: int, refused: Counters
 ) -> Iterator[Measurement]:
-    """The measurements of a run one by one, and at its end in ``refused`` what was counted meanwhile."""
+    """The measurements of a run one by one. At its end ``refused`` has what was counted meanwhile."""
     for _, some in run:
         yield from some
     refused.update(runs.counted_in(number))

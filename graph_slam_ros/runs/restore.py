@@ -32,7 +32,7 @@ Stopwatch = Callable[[], dict[str, float]]
 
 
 def map_of(folder: Path, losses: list[str], counters: Counters | None = None) -> MapSnapshot:
-    """The map of a run: as it was written down, with what its journal holds besides; or by repeating the drive.
+    """The map of a run: as recorded, with what its journal has in addition; or by repeating the drive.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def map_of(folder: Path, losses: list[str], counters: Counters | None = None) ->
 
 
 def config_of(folder: Path, state: MapSnapshot) -> Config:
-    """The configuration of a run when its map was as it is: with what was changed on the way."""
+    """The configuration of a run at the time of its map, with the changes during the run."""
     try:
         return run_config(folder).changed(state.settings)
     except ConfigError as error:
@@ -78,7 +78,7 @@ def _repeated(folder: Path, losses: list[str], counters: Counters) -> MapSnapsho
 
 
 def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Counters) -> MapSnapshot:
-    """The map after those measurements, too, that were accepted and not processed any more."""
+    """The map with measurements that were accepted and not processed."""
     if state.processed is None or was_saved_whole(folder):
         return state
     rest = read_rest(folder, state.processed, state.used_ns, losses)
@@ -96,7 +96,7 @@ def _with_rest(folder: Path, state: MapSnapshot, losses: list[str], counters: Co
 
 
 def restored(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
-    """The map of a run, solved; as ``map_of``."""
+    """The map of a run, solved; see ``map_of``."""
     lost = len(losses)
     state = map_of(folder, losses, counters)
     losses[lost:] = [f"{folder}: {loss}" for loss in losses[lost:]]
@@ -107,7 +107,7 @@ def restored(folder: Path, losses: list[str], counters: Counters | None = None) 
 
 
 def restored_and_solved(folder: Path, losses: list[str], counters: Counters | None = None) -> GraphSlam:
-    """The same with all of it judged. Raises GraphSlamError, too, where it cannot be solved."""
+    """The same with all edges judged. Raises GraphSlamError also if it cannot be solved."""
     slam = restored(folder, losses, counters)
     slam.process(Control("optimize"))
     if not slam.is_solved:
@@ -174,13 +174,13 @@ def record_run(
 
 
 def stopwatch() -> Stopwatch:
-    """A stopwatch for what follows."""
+    """Return a stopwatch that starts now."""
     start_s, cpu_s = time.perf_counter(), time.process_time()
     return lambda: {"time_s": time.perf_counter() - start_s, "cpu_s": time.process_time() - cpu_s}
 
 
 def recover(folder: Path, out: Path, *, force: bool = False) -> Summary:
-    """Write the results of a run that was never ended, from its map: the drive is not repeated."""
+    """Write the results of a run that never ended, from its map. The drive is not repeated."""
     took = stopwatch()
     check_room(out, folder, force=force)
     losses: list[str] = []
@@ -191,7 +191,7 @@ def recover(folder: Path, out: Path, *, force: bool = False) -> Summary:
 
 
 def complete(folder: Path) -> Summary:
-    """Write into a run the results of all that it holds; its recordings stay as they are.
+    """Write the results of all measurements of a run into its folder. Its recordings stay as they are.
 
     Raises
     ------
@@ -214,7 +214,7 @@ def complete(folder: Path) -> Summary:
 
 
 def save_copy(slam: GraphSlam, out: Path) -> None:
-    """Write the map of a pipeline as a run of its own, which others can load; the pipeline goes on as it was.
+    """Write the map of a pipeline as a run of its own, which others can load. The pipeline goes on unchanged.
 
     Raises
     ------
@@ -235,7 +235,7 @@ def save_copy(slam: GraphSlam, out: Path) -> None:
 
 
 def freeze(folder: Path, out: Path, *, force: bool = False) -> Summary:
-    """Write a run that begins in the map of another, all of which then stays as it is."""
+    """Write a run that begins in the map of another run. That map then never changes."""
     took = stopwatch()
     check_room(out, folder, force=force)
     losses: list[str] = []

@@ -46,7 +46,7 @@ _CLOCKS_DIFFER_S, _MOST_OFFSET_S = 2.0, 3600.0
 
 
 class Suggestion:
-    """A command, and what a person should know of it.
+    """A command, and notes for the user.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Suggestion:
             self.trouble = self._refused(bag)
 
     def command(self, more: Mapping[str, Any] | None = None) -> str:
-        """The command as it is pasted into a shell, with more settings."""
+        """The command to paste into a shell, with additional settings."""
         path = str(self._path)
         words = ["graph_slam", "replay", f"./{path}" if path.startswith("-") else path]
         for option, name in (("--odom", "odom"), ("--landmarks", "detections")):
@@ -84,7 +84,7 @@ class Suggestion:
         return shlex.join([*words, "--out", str(suggested_out(self._path))])
 
     def _refused(self, bag: Bag) -> str:
-        """Return why the command would be; empty where it is not."""
+        """Return why the command would be refused; empty if it would not be."""
         try:
             config = Config.from_mapping(self.settings)
             choose_inputs(bag, config, self.topics.get("odom"), self.topics.get("detections"))
@@ -104,7 +104,7 @@ class Suggestion:
         return ""
 
     def _of_type(self, *types: str) -> Iterator[TopicContents]:
-        """Topics that can be read and are no truth."""
+        """Topics that can be read and are not the truth."""
         for name, one in self._recording.topics.items():
             if one.topic.type in types and one.topic.count:
                 if _TRUTH.search(name):
@@ -141,7 +141,7 @@ class Suggestion:
         return ""
 
     def _merit(self, one: TopicContents) -> tuple[Any, ...]:
-        """Whole and moving first, then fused, then in a frame of odometry, then the one with the most messages."""
+        """The order of preference: complete and moving, then fused, then in a frame of odometry, then most messages."""
         longest = max(other.last_ns - other.first_ns for other in self._recording.topics.values())
         is_whole = one.last_ns - one.first_ns >= 0.5 * longest
         name = one.topic.name
@@ -183,7 +183,7 @@ class Suggestion:
             self.settings["frames.base"] = self._base = child
 
     def _unlinked_base(self, child: str) -> str:
-        """The base that carries the sensors on /tf_static where odometry's child is not linked to it, else empty."""
+        """The base that carries the sensors on /tf_static if odometry's child is not linked to it, else empty."""
         fixed = self._recording.fixed
         if child in fixed or child in fixed.values():
             return ""
@@ -225,7 +225,7 @@ class Suggestion:
                 self.unused[name] = "markers are mostly pictures; an input of this type and topic takes them"
 
     def _tag_number(self, one: TopicContents) -> str:
-        """The number of the tag whose pose a topic has, as the camera sees it; empty for any other topic."""
+        """The number of the tag whose pose in the camera's frame a topic has; empty for any other topic."""
         found = _TAG_TOPIC.search(one.topic.name)
         return found[1] if found and one.frame not in (*_MAPS, "world", self._odom) else ""
 
@@ -348,7 +348,7 @@ class Suggestion:
         self.settings |= {f"{name}.{key}": value for key, value in chosen.items()}
 
     def _mount(self, topic: str, frame: str) -> dict[str, str]:
-        """Return where a sensor is that TF does not have."""
+        """Return the pose of a sensor that TF does not have."""
         if frame and self._recording.is_linked(frame, self._base):
             return {}
         mount = _OPTICAL if "optical" in frame else "0 0 0 0 0 0"
@@ -371,7 +371,7 @@ class Suggestion:
         self._not_read()
 
     def _not_read(self) -> None:
-        """Topics of types that no input reads, of which one may be what was hoped for."""
+        """Topics of types that no input reads, one of which the user may expect to be used."""
         known = known_types()
         found = [
             f"{name} ({one.topic.type or 'no type'})"

@@ -27,7 +27,7 @@ _POSE = {3: "x,y,theta", 6: "x,y,z,qx,qy,qz,qw"}
 
 
 def result_texts(slam: GraphSlam) -> dict[str, str]:
-    """The results but for the summary, by the names of their files."""
+    """All results except the summary, by file name."""
     stamps = slam.sighting_poses.stamps_ns.tolist()
     ids, vertices = numbered(slam)
     return {
@@ -45,7 +45,7 @@ def result_texts(slam: GraphSlam) -> dict[str, str]:
 
 
 def noise_summary(slam: GraphSlam) -> dict[str, Any]:
-    """The estimate of the noise, whether it is applied, and why there is none where there is none."""
+    """The estimated noise, whether it is applied, and the reason if there is none."""
     out: dict[str, Any] = {"noise_scale": slam.config.robust.noise_scale, "noise": []}
     if not slam.is_solved:
         return out | {"noise_unknown": "nothing is solved"}
@@ -56,7 +56,7 @@ def noise_summary(slam: GraphSlam) -> dict[str, Any]:
 
 
 def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any]:
-    """Return what happened, in numbers; ``earlier`` was counted of the same run before this pipeline went on in it."""
+    """Return the numbers of a run; ``earlier`` was counted in the same run before this pipeline continued it."""
     counters = Counters()
     for some in (earlier or Counters(), slam.counters):
         counters.update(some)
@@ -89,10 +89,10 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
 
 
 def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
-    """Return what was counted, and what came of each input.
+    """Return all counters, and the outcome of each input.
 
-    ``received`` counts messages, ``used`` what was measured by them, ``believed`` the edges of that (odometry aside)
-    that the estimate follows.
+    ``received`` counts messages, ``used`` the measurements from them, ``believed`` the edges of those (odometry
+    excepted) that the estimate uses.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
 
 
 def counted(counters: Counters) -> dict[str, Any]:
-    """The same of a pipeline that is still at work: its graph is not looked into."""
+    """The same of a pipeline that is still working, without looking into its graph."""
     inputs = {
         name: {"use": "", "received": counters.received.get(name), "used": counters.used[name], "believed": None}
         for name in dict.fromkeys([*counters.received, *counters.used])
@@ -122,7 +122,7 @@ def counted(counters: Counters) -> dict[str, Any]:
 
 
 def counters_of(summary: Mapping[str, Any]) -> Counters:
-    """Return what ``account`` or ``counted`` was made of. Raises ValueError where a summary has anything else there."""
+    """Return the counters from which ``account`` or ``counted`` was made. Raises ValueError if a summary has others."""
     out = Counters()
     try:
         for source, counts in summary.get("counters", {}).items():
@@ -144,7 +144,7 @@ def _times(value: Any) -> int:
 
 
 def _accepted_by_input(slam: GraphSlam, first: int) -> dict[str, int]:
-    """Edges of landmarks, fixes and closures that pull, from the keyframe of a vertex on, by input."""
+    """Accepted edges of landmarks, fixes and closures by input, from the keyframe of a vertex on."""
     out = Counter[str]()
     inside = [Verdict.NOT_EVALUATED, *INSIDE]
     verdicts = slam.ledger.verdict.values
@@ -161,16 +161,16 @@ def _accepted_by_input(slam: GraphSlam, first: int) -> dict[str, int]:
 
 
 def _drives(slam: GraphSlam) -> list[dict[str, int]]:
-    """Return where each drive begins in ``path.tum`` and in ``sightings.tum``: rows, from 0."""
+    """Return the first row of each drive in ``path.tum`` and in ``sightings.tum``, from 0."""
     of = slam.sighting_poses.ids
     return [{"keyframe": first, "sighting": int(np.sum(of < first))} for first in slam.drives]
 
 
 def numbered(slam: GraphSlam) -> tuple[list[int], str]:
-    """The number of each vertex, and the table of them.
+    """The number of each vertex, and the table of all vertices.
 
-    Poses are numbered from 0 in order of time, landmarks after them: other tools read odometry from that. What is
-    neither is an offset that the ranges of a sensor share.
+    Poses are numbered from 0 in order of time, landmarks after them, because other tools read odometry from that order.
+    Any other vertex is an offset that the ranges of a sensor share.
     """
     names: list[tuple[int, str, int | str, str]] = []
     for k, keyframe in enumerate(slam.keyframes):

@@ -36,7 +36,7 @@ class Trajectory:
         return replace(self, poses=np.stack(se3.compose(T_new_old, tuple(self.poses.T)), axis=1))
 
     def in_plane(self) -> "Trajectory":
-        """The trajectory in the plane: without height, roll and pitch."""
+        """The trajectory in the plane, without height, roll and pitch."""
         return replace(self, poses=se3.in_space(se3.in_plane(self.poses)))
 
     def at(self, index: Any) -> "Trajectory":
@@ -90,7 +90,7 @@ def read_tum(path: Path, *, follow: bool = False) -> Trajectory:
 
 
 def trajectory(stamps_s: Array, poses: Array, source: str) -> Trajectory:
-    """Poses in order of stamp, with unit quaternions: files round them."""
+    """Poses in order of stamp, with unit quaternions, because files contain rounded ones."""
     norm = np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
     if not (norm > 0.0).all():
         raise GraphSlamError(f"{source}: a quaternion of zeros is no rotation")

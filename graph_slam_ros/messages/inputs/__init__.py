@@ -65,7 +65,7 @@ CONVERTERS: Mapping[str, Mapping[str, Converter]] = {
 
 
 def converters(type_name: str) -> Mapping[str, Converter] | None:
-    """Return the converters of a type by use, of the table or else of a plugin; None where neither has it.
+    """Return the converters of a type by use, from the table or from a plugin; None if neither has it.
 
     Raises
     ------
@@ -76,12 +76,12 @@ def converters(type_name: str) -> Mapping[str, Converter] | None:
 
 
 def known_types() -> set[str]:
-    """Return the types that can be inputs, those of installed plugins among them; no plugin is imported."""
+    """Return the types that can be inputs, with those of installed plugins. No plugin is imported."""
     return {*CONVERTERS, *plugins.types()}
 
 
 def uses(config: Config) -> dict[str, str]:
-    """Return what each input is used as, by its name; those that are not used are left out.
+    """Return the use of each input by its name. Inputs that are not used are left out.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def uses(config: Config) -> dict[str, str]:
 
 
 def recorded_uses(config: Config) -> dict[str, str]:
-    """Return what each input of a recorded run was used as, without those whose plugin is not installed here."""
+    """Return the use of each input of a recorded run, without inputs whose plugin is not installed here."""
     out = {}
     for settings in config.sources:
         with suppress(ConfigError):

@@ -33,7 +33,7 @@ def stamp_ns(stamp: Any) -> int:
 
 
 def point(v: Any) -> tuple[float, float, float]:
-    """Finite coordinates of a Point or Vector3 that could be on this planet's maps."""
+    """Finite coordinates of a Point or Vector3 of plausible size."""
     if not (math.isfinite(v.x) and math.isfinite(v.y) and math.isfinite(v.z)):
         raise MessageError("nonfinite")
     if max(abs(v.x), abs(v.y), abs(v.z)) > _FARTHEST_M:
@@ -42,7 +42,7 @@ def point(v: Any) -> tuple[float, float, float]:
 
 
 def quaternion(q: Any) -> tuple[tuple[float, float, float, float], bool]:
-    """Unit quaternion (x, y, z, w), and whether it had to be brought to unit length."""
+    """Unit quaternion (x, y, z, w), and whether it had to be normalised."""
     norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
     if abs(norm - 1.0) <= _NORM_EXACT:
         return (q.x, q.y, q.z, q.w), False
@@ -96,7 +96,7 @@ def covariance(block: Array, lengths: int) -> tuple[Array, list[str]]:
 
 
 def direction(azimuth: float, elevation: float = 0.0) -> tuple[tuple[float, float], bool]:
-    """Angles within half a turn, and whether they had to be brought there."""
+    """Angles within half a turn, and whether they had to be wrapped."""
     if max(abs(azimuth), abs(elevation)) > _MOST_TURNED_RAD:
         raise MessageError("bearing_out_of_range")
     wrapped = float(se2.wrap(azimuth)), float(se2.wrap(elevation))

@@ -28,14 +28,14 @@ def detections(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
 
 
 def pose_stamped(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped: one landmark, of configured identity."""
+    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped: one landmark, with the configured id."""
     has_covariance = hasattr(m.pose, "covariance")
     at, covariance = (m.pose.pose, m.pose.covariance) if has_covariance else (m.pose, None)
     yield ObservedLandmark(m.header.stamp, m.header.frame_id, "", at.position, at.orientation, covariance)
 
 
 def transforms(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """tf2_msgs/TFMessage: frames whose names begin as configured; a stamp that is sent again is left out."""
+    """tf2_msgs/TFMessage: frames whose names begin as configured. A repeated stamp is left out."""
     last = source.state.setdefault("stamps", {})
     for t in m.transforms:
         child = t.child_frame_id.lstrip("/")
@@ -51,7 +51,7 @@ def transforms(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
 
 
 def markers(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """visualization_msgs/MarkerArray: identity is namespace and id; only what is added (or modified) is seen."""
+    """visualization_msgs/MarkerArray: the id is namespace and id. Only added or modified markers are sightings."""
     for one in m.markers:
         if one.action in (_DELETE, _DELETEALL):
             continue
@@ -66,7 +66,7 @@ def markers(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
 
 
 def apriltags(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """apriltag_msgs/AprilTagDetectionArray: poses are on /tf, as frames that are named by family and id."""
+    """apriltag_msgs/AprilTagDetectionArray: poses are on /tf, in frames named by family and id."""
     settings = source.settings
     for one in m.detections:
         if one.hamming > settings.hamming_max or one.decision_margin < settings.decision_margin_min:
@@ -79,7 +79,8 @@ def apriltags(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
 def aruco_markers(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """aruco_msgs and aruco_markers_msgs/MarkerArray: the header of the pose, else of the marker, else of the array.
 
-    The detector aruco_markers stamps the array when it sends it, and poses and markers with the stamp of the image.
+    The detector aruco_markers stamps the array with the time of sending, and poses and markers with the stamp of the
+    image.
     """
     for one in m.markers:
         headers = [of.header for of in (one.pose, one, m) if hasattr(of, "header")]
@@ -105,14 +106,14 @@ def aruco_opencv(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
 
 
 def fiducials(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """fiducial_msgs/FiducialTransformArray: its errors are of one image, and no covariance."""
+    """fiducial_msgs/FiducialTransformArray: its errors are those in the image, not a covariance."""
     for one in m.transforms:
         at = one.transform
         yield ObservedLandmark(m.header.stamp, m.header.frame_id, str(one.fiducial_id), at.translation, at.rotation)
 
 
 def rtabmap(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """rtabmap_msgs/LandmarkDetections: an id of zero or less is none."""
+    """rtabmap_msgs/LandmarkDetections: an id of zero or less means none."""
     for one in m.landmarks:
         name = str(one.id) if one.id > 0 else ""
         frame, at = one.header.frame_id or m.header.frame_id, one.pose.pose
@@ -120,7 +121,7 @@ def rtabmap(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
 
 
 def cartographer(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
-    """cartographer_ros_msgs/LandmarkList: a residual times its weight is one, so sigma is 1 / weight; 0: unknown."""
+    """cartographer_ros_msgs/LandmarkList: sigma is 1 / weight, as a residual times its weight is one; 0: unknown."""
     for one in m.landmarks:
         at = one.tracking_from_landmark_transform
         sigmas = [1.0 / w if w else 0.0 for w in (one.translation_weight, one.rotation_weight)]

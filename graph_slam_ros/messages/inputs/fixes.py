@@ -27,7 +27,7 @@ _ECCENTRICITY2 = _FLATTENING * (2.0 - _FLATTENING)
 def pose_fix(source: InputContext, m: Any) -> Iterator[Fix]:
     """nav_msgs/Odometry, geometry_msgs/PoseWithCovarianceStamped and PoseStamped: a pose of the robot in the map.
 
-    It is that of the base, or of the configured mount; where its orientation is not known, a position.
+    It is the pose of the base, or of the configured mount. Without a known orientation, it is a position.
     """
     stamp_ns = source.stamp_ns(m.header.stamp)
     p, flat = (m.pose.pose, m.pose.covariance) if hasattr(m.pose, "covariance") else (m.pose, None)
@@ -54,7 +54,7 @@ def pose_fix(source: InputContext, m: Any) -> Iterator[Fix]:
 
 
 def initial_pose(source: InputContext, m: Any) -> Iterator[InitialPose]:
-    """geometry_msgs/PoseWithCovarianceStamped in the map frame: where somebody says that the base is, now."""
+    """geometry_msgs/PoseWithCovarianceStamped in the map frame: the present pose of the base, given by a person."""
     frame = source.frame(m.header.frame_id)
     T_map_frame = source.T_fixed(source.config.frames.map, frame)
     checks.point(m.pose.pose.position)
@@ -72,7 +72,7 @@ def initial_pose(source: InputContext, m: Any) -> Iterator[InitialPose]:
 
 
 def gnss(source: InputContext, m: Any) -> Iterator[Fix]:
-    """sensor_msgs/NavSatFix: the antenna's position, east, north and up of the datum."""
+    """sensor_msgs/NavSatFix: the antenna's position east, north and up of the datum."""
     stamp_ns = source.stamp_ns(m.header.stamp)
     if m.status.status <= _NO_FIX:
         raise MessageError("no_fix")
@@ -103,7 +103,7 @@ def gnss(source: InputContext, m: Any) -> Iterator[Fix]:
 
 
 def east_north_up(here: tuple[float, float, float], datum: tuple[float, ...]) -> tuple[float, float, float]:
-    """Coordinates [m] in the plane that touches the ellipsoid at the datum.
+    """Coordinates [m] in the plane tangent to the ellipsoid at the datum.
 
     Parameters
     ----------

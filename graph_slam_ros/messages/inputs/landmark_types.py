@@ -15,7 +15,7 @@ from graph_slam_ros.messages.inputs.source import InputContext
 
 @dataclass(frozen=True, slots=True)
 class LandmarkType:
-    """A type of messages, and how they are read.
+    """A type of landmark messages, and its reader.
 
     Attributes
     ----------

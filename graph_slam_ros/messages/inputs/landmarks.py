@@ -27,7 +27,7 @@ _POLAR = {"range": (1,), "bearing": (1, 2), "range_bearing": (2, 3)}  # numbers 
 
 @dataclass(frozen=True, slots=True)
 class ObservedLandmark:
-    """One landmark, as a message says it.
+    """One landmark as a message describes it.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class ObservedLandmark:
 
 
 def sightings(source: InputContext, found: Iterable[ObservedLandmark]) -> Iterator[Sightings]:
-    """One measurement for each stamp of a message; what cannot be used of it is counted."""
+    """One measurement for each stamp of a message. What cannot be used is counted."""
     by_stamp: dict[tuple[int, int], list[ObservedLandmark]] = {}
     for one in _nearest(source, list(found)):
         by_stamp.setdefault((one.stamp.sec, one.stamp.nanosec), []).append(one)
@@ -85,7 +85,7 @@ def sightings(source: InputContext, found: Iterable[ObservedLandmark]) -> Iterat
 
 
 def _nearest(source: InputContext, found: list[ObservedLandmark]) -> list[ObservedLandmark]:
-    """The nearest of a message's landmarks, as many as are taken."""
+    """The nearest landmarks of a message, up to the limit."""
     if len(found) <= (most := source.config.landmarks.max_per_message):
         return found
     source.count("too_many", len(found) - most)
@@ -94,7 +94,7 @@ def _nearest(source: InputContext, found: list[ObservedLandmark]) -> list[Observ
 
 
 def _reach(seen: ObservedLandmark) -> float:
-    """The distance from the frame of the message; a bearing alone is as good as near."""
+    """The distance from the frame of the message; zero for a bearing alone."""
     if seen.polar is None:
         return math.hypot(seen.position.x, seen.position.y, seen.position.z)
     kind, measured = seen.polar
@@ -123,7 +123,7 @@ def _sighting(source: InputContext, stamp_ns: int, seen: ObservedLandmark) -> Si
 
 
 def _sensor(source: InputContext, T_base_frame: se3.Pose) -> Numbers | None:
-    """The place of a sensor on the base, where calibration may turn it about its origin; None at the base."""
+    """The pose of a sensor on the base if calibration may turn it about its origin; None at the base."""
     at, n = se3.position(T_base_frame), source.space.dimensions
     if not (source.config.calibrate.is_on or source.settings.mount_correction) or not any(at[:n]):
         return None
@@ -184,7 +184,7 @@ def _polar(
 def _levelled(
     kind: str, measured: Numbers, sigmas: list[float], T_base_sensor: se3.Pose
 ) -> tuple[Numbers, list[float]]:
-    """The horizontal part, as a sensor at the same place whose axes are the base's would measure it."""
+    """The horizontal part, as a sensor at the same place with the base's axes would measure it."""
     angles = 1 if kind == "range_bearing" else 0
     azimuth, elevation = (*measured[angles:], 0.0)[:2]
     up = so3.act(se3.rotation(T_base_sensor), (0.0, 0.0, 1.0))
@@ -206,7 +206,7 @@ def _levelled(
 
 
 def _agreed(source: InputContext, seen: list[Sighting]) -> list[Sighting]:
-    """One sighting per id: repeats that agree within 3 sigma are merged, others are all dropped."""
+    """One sighting per id: repeats that agree within 3 sigma are merged, all others of that id are dropped."""
     by_id: dict[str, list[Sighting]] = {}
     for k, one in enumerate(seen):
         by_id.setdefault(one.id or f"\n{k}", []).append(one)  # those without an id are each their own
@@ -227,7 +227,7 @@ def _agreed(source: InputContext, seen: list[Sighting]) -> list[Sighting]:
 
 
 def _merge(source: InputContext, a: Sighting, b: Sighting) -> Sighting | None:
-    """Information-weighted mean of two sightings that agree, else None."""
+    """The information-weighted mean of two sightings that agree, else None."""
     if a.kind != b.kind:
         return None
     group, m = source.space.group, math.isqrt(len(a.covariance))

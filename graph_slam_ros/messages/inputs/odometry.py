@@ -37,7 +37,7 @@ def pose_stamped(source: InputContext, m: Any) -> Iterator[Odometry]:
 
 
 def transforms(source: InputContext, m: Any) -> Iterator[Odometry]:
-    """tf2_msgs/TFMessage: the transform from odometry's frame, or the one configured in its place, to the base."""
+    """tf2_msgs/TFMessage: the transform from odometry's frame, or from the configured one, to the base."""
     frames = source.config.frames
     parent = source.settings.frame or frames.odom
     for t in m.transforms:
@@ -56,14 +56,14 @@ def transforms(source: InputContext, m: Any) -> Iterator[Odometry]:
 
 
 def _note_similar(source: InputContext, parent: str, child: str, *, is_similar: bool) -> None:
-    """Remember a transform that may be the odometry by other names."""
+    """Remember a transform that may be the odometry under other names."""
     similar: dict[tuple[str, str], None] = source.state.setdefault("similar", {})
     if is_similar and len(similar) < _MOST_SIMILAR and not source.state.get("found"):
         similar[parent, child] = None
 
 
 def not_found(source: InputContext) -> str:
-    """The transform of odometry on /tf, if that has never come, and what may be meant; else empty."""
+    """The transform of odometry on /tf if it has never come, and the transform that may be meant; else empty."""
     if source.settings.type != "tf2_msgs/msg/TFMessage" or source.state.get("found"):
         return ""
     frames, name = source.config.frames, source.name
@@ -99,7 +99,7 @@ def _named(source: InputContext, child: str) -> str:
 
 
 def _twist_covariance(source: InputContext, flat: Any) -> Numbers | None:
-    """The covariance of a twist in the base frame; None where it is unknown, in part or altogether."""
+    """The covariance of a twist in the base frame; None if any part of it is unknown."""
     raw = flat.tobytes()
     if raw != source.state.get("raw"):  # drivers repeat the same one
         source.state.update(raw=raw, judged=_judged(source, np.asarray(flat, dtype=float).reshape(6, 6)))

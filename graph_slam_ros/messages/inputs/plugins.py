@@ -46,14 +46,14 @@ class InputType:
 
 
 class PluginFault(MessageError):
-    """A message that a plugin failed at; its text names the plugin and the error."""
+    """A message on which a plugin failed. Its text names the plugin and the error."""
 
 
 _loaded: dict[str, tuple[InputType, str]] = {}
 
 
 def input_type(type_name: str) -> InputType | None:
-    """Return what a plugin has for a type ``package/msg/Name``; None where there is none.
+    """Return the plugin's input type for ``package/msg/Name``; None if there is none.
 
     Raises
     ------
@@ -78,12 +78,12 @@ def converters(type_name: str) -> Mapping[str, Callable[[InputContext, Any], Ite
 
 
 def types() -> set[str]:
-    """Return the types that installed plugins have, usable or not."""
+    """Return the types of installed plugins, usable or not."""
     return {name.replace(".", "/") for name in names(INPUTS)}
 
 
 def described(built_in: Iterable[str]) -> list[str]:
-    """Return a line for each type that an installed plugin reads, and why it cannot be used where that is so."""
+    """Return a line for each type of an installed plugin, with the reason if it cannot be used."""
     lines = []
     for name, distribution in sorted(names(INPUTS).items()):
         type_name = name.replace(".", "/")
@@ -100,7 +100,7 @@ def described(built_in: Iterable[str]) -> list[str]:
 
 
 def _wrong(there: Any) -> str:
-    """Return what is wrong with the object of an entry point; empty where nothing is."""
+    """Return what is wrong with the object of an entry point; empty if nothing is."""
     if not isinstance(there, InputType):
         return f"it is a {type(there).__name__}, not an InputType"
     if not isinstance(there.converters, Mapping) or not there.converters or not set(there.converters) <= set(_YIELDS):

@@ -24,17 +24,17 @@ _LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # of a robot that moves 
 
 @dataclass(slots=True)
 class Origin:
-    """The datum of the map, for all inputs without their own; empty before the first fix."""
+    """The datum of the map for all inputs without their own; empty before the first fix."""
 
     datum: Numbers = ()
 
 
 class NotYet(Exception):
-    """/tf may still tell where the sensor was: the message is to be tried again."""
+    """A transform of the message may still come: the message is tried again later."""
 
 
 class InputContext:
-    """The context of a converter: what it knows besides the message.
+    """The context of a converter: everything it needs besides the message.
 
     Parameters
     ----------
@@ -68,11 +68,11 @@ class InputContext:
         self._mount = _mount(settings)
 
     def count(self, reason: str, times: int = 1) -> None:
-        """A refusal or a repair."""
+        """Count a refusal or a repair."""
         self.tally[reason] += times
 
     def stamp_ns(self, stamp: Any) -> int:
-        """The stamp of a header, by the clock of the robot."""
+        """The stamp of a header, in the clock of the robot."""
         out = checks.stamp_ns(stamp) + self._offset_ns
         if not 0 < out <= LATEST_NS:
             raise MessageError("bad_stamp")
@@ -81,7 +81,7 @@ class InputContext:
     # -- frames ------------------------------------------------------------------------------------------------------
 
     def frame(self, name: str) -> str:
-        """The frame as configured, else as the message says."""
+        """The configured frame, else that of the message."""
         if self.settings.frame:
             return self.settings.frame
         if name.startswith("/"):
@@ -93,11 +93,11 @@ class InputContext:
 
     @property
     def has_mount(self) -> bool:
-        """Return whether it is configured where its frame is on the robot."""
+        """Return whether the pose of its frame on the robot is configured."""
         return self._mount is not None
 
     def T_base(self, frame: str, stamp_ns: int) -> se3.Pose:
-        """Return where a frame was on the robot: by TF, else as configured.
+        """Return the pose of a frame on the robot, by TF, else as configured.
 
         Raises
         ------
@@ -116,7 +116,7 @@ class InputContext:
         raise NotYet
 
     def mount_position(self, name: str, stamp_ns: int) -> tuple[float, float, float]:
-        """The position of the sensor of a message on the robot; the base, counted, if its frame is unknown.
+        """The position of a message's sensor on the robot; the base, which is counted, if its frame is unknown.
 
         Raises NotYet as ``T_base`` does.
         """
@@ -129,12 +129,12 @@ class InputContext:
         return 0.0, 0.0, 0.0
 
     def _may_come(self, stamp_ns: int) -> bool:
-        """Return whether /tf may still tell of a stamp."""
+        """Return whether a transform for a stamp may still come."""
         now_ns = self.transforms.now_ns
         return not (self.hurried or (now_ns is not None and now_ns > stamp_ns + self._wait_ns))
 
     def T_base_child(self, child: str) -> se3.Pose:
-        """Return where a frame always is on the robot; an empty one is where it is configured to be, or the base."""
+        """Return the fixed pose of a frame on the robot. An empty name is the configured mount, or the base."""
         found = self.transforms.lookup(self.config.frames.base, child) if child else None
         if found is None:
             found = self._mount if self._mount is not None or child else se3.IDENTITY
@@ -143,7 +143,7 @@ class InputContext:
         return found
 
     def T_fixed(self, target: str, frame: str) -> se3.Pose:
-        """The transform between frames that do not move: a message's, and that of odometry or of the map."""
+        """The transform between two frames that do not move: that of a message, and that of odometry or of the map."""
         found = self.transforms.lookup(target, frame)
         if found is None and target == self.config.frames.odom:
             raise self._not_linked("odom_frame_unknown", frame, target)
@@ -173,7 +173,7 @@ class InputContext:
         return float(T[0]), float(T[1]), math.atan2(ahead[1], ahead[0])
 
     def of_robot(self, T: se3.Pose) -> Numbers:
-        """A pose of the robot; in the plane it is counted where it leaves that of the first."""
+        """A pose of the robot. In the plane it is counted if it leaves the plane of the first one."""
         if self.space.dimensions == 2:
             up = so3.act(se3.rotation(T), (0.0, 0.0, 1.0))
             if abs(T[2] - self.state.setdefault("height", T[2])) > _LEVEL_M or up[2] < _UPRIGHT:
@@ -188,17 +188,17 @@ class InputContext:
     # -- noise -------------------------------------------------------------------------------------------------------
 
     def block(self, covariance: Array) -> Array:
-        """The part of a pose's covariance (6, 6) that the space has of it: (3, 3) or all."""
+        """The part of a pose's covariance (6, 6) for this space: (3, 3), or all of it."""
         return covariance if self.space.dimensions == 3 else covariance[_PLANAR]
 
     def orientation_known(self, covariance: Array) -> bool:
-        """Return whether a pose's covariance (6, 6) says so: for the heading in the plane, all axes in space."""
+        """Return whether a pose's covariance (6, 6) has an orientation: the heading in the plane, all axes in space."""
         variances = np.diag(covariance)[5 if self.space.dimensions == 2 else 3 :]
         most = self.config.landmarks.orientation_known_below_rad**2
         return bool(((variances > 0.0) & (variances < most)).all())
 
     def pose_covariance(self, flat: Any, distance_m: float) -> Array:
-        """Covariance (6, 6) in the axes of the frame: of the message, or of the settings where it has none."""
+        """Covariance (6, 6) in the axes of the frame, from the message, or from the settings if it has none."""
         if flat is None or self.settings.noise == "sigmas":
             sigmas = [self.sigma_m(distance_m)] * 3 + [self.settings.sigma_rad] * 3
             return np.diag(np.square(sigmas))
@@ -208,7 +208,7 @@ class InputContext:
         return np.clip(covariance, -_BEYOND_MEANING, _BEYOND_MEANING)
 
     def sigma_m(self, distance_m: float = 0.0) -> float:
-        """Standard deviation of a position at a distance where the message does not tell it."""
+        """Standard deviation of a position at a distance, for messages that do not contain it."""
         sigma_m = self.settings.sigma_m
         if sigma_m == 0.0 and self.use == "landmarks":
             sigma_m = self.config.landmarks.sigma_m
@@ -217,7 +217,7 @@ class InputContext:
         return sigma_m + self.settings.sigma_per_m * distance_m
 
     def checked(self, block: Array, lengths: int, distance_m: float = 0.0) -> Numbers:
-        """Flat covariance; positions' part is that of the settings where all of it is zero.
+        """Flat covariance. If its position part is all zero, that part is taken from the settings.
 
         Parameters
         ----------

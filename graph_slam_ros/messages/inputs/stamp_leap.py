@@ -10,7 +10,7 @@ _MOST_HELD = 100
 
 
 class StampLeap(Generic[Item]):
-    """Holds what is dated far from the newest until others agree with it; it is refused where the rest goes on without.
+    """Holds items dated far from the newest until others agree with them. Refuses them if the rest goes on without.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ class StampLeap(Generic[Item]):
         self._held: list[tuple[int, Item]] = []
 
     def accept(self, stamp_ns: int, item: Item, newest_ns: int, room_ns: float) -> list[tuple[int, Item]]:
-        """Accept an item; returns those that may be used now, with their stamps, in the order they came.
+        """Accept an item. Returns those that may be used now, with their stamps, in order of arrival.
 
         Parameters
         ----------
@@ -50,7 +50,7 @@ class StampLeap(Generic[Item]):
         return agreeing
 
     def forget(self) -> None:
-        """The rest goes on without what is held, or ends: it is refused."""
+        """Refuse what is held, because the rest goes on without it, or ends."""
         for _ in self._held:
             self._refuse()
         self._held.clear()

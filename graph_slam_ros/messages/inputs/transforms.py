@@ -34,18 +34,18 @@ class Transforms:
         self.now_ns: int | None = None
 
     def add(self, parent: str, child: str, T_parent_child: se3.Pose) -> None:
-        """Take one that holds always; a later one for the same child replaces it."""
+        """Add a static transform. A later one for the same child replaces it."""
         self._fixed[child] = (parent, T_parent_child)
 
     def add_at(self, stamp_ns: int, parent: str, child: str, T_parent_child: se3.Pose) -> None:
-        """Take one that holds at its stamp."""
+        """Add a transform at its stamp."""
         joint = self._moving.get(child)
         if joint is None or joint.parent != parent:
             joint = self._moving[child] = _Joint(parent, self._keep_ns, self._refuse)
         joint.add(stamp_ns, T_parent_child)
 
     def forget_time(self) -> None:
-        """Stamps begin anew; what holds always stays."""
+        """Begin anew with the stamps. Static transforms stay."""
         self._moving.clear()
         self.now_ns = None
 
@@ -54,7 +54,7 @@ class Transforms:
         return frame in self._fixed or frame in self._moving
 
     def are_linked(self, a: str, b: str) -> bool:
-        """Return whether two frames are in one tree, whatever the stamps of its joints."""
+        """Return whether two frames are in one tree, whatever the stamps."""
         return self._root(a) == self._root(b)
 
     def _root(self, frame: str) -> str:
@@ -67,7 +67,7 @@ class Transforms:
         return frame
 
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> se3.Pose | None:
-        """``T_target_source`` at a stamp, or of what never moves; None where the frames are not linked then."""
+        """``T_target_source`` at a stamp, or of static transforms only; None if the frames are not linked then."""
         if target == source:
             return se3.IDENTITY
         to_root_target, to_root_source = self._to_root(target, stamp_ns), self._to_root(source, stamp_ns)
@@ -124,7 +124,7 @@ class _Joint:
         del self._stamps_ns[:old], self._poses[:old]
 
     def at(self, stamp_ns: int) -> se3.Pose | None:
-        """Interpolated; None before the first and after the last: nothing is extrapolated."""
+        """Interpolated pose; None before the first and after the last, because nothing is extrapolated."""
         after = bisect_left(self._stamps_ns, stamp_ns)
         if after == len(self._stamps_ns):
             return None
