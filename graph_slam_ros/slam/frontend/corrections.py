@@ -12,9 +12,11 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.config.inputs import InputConfig
 from graph_slam_ros.lie import so3
-from graph_slam_ros.measurements.types import Observation, Sighting, Sightings
+from graph_slam_ros.measurements.types import Observation, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.typing import Array, Numbers
+
+_LONGEST_LAG_S = 1.0  # a clock that is corrected by more is another clock, not a late one
 
 Key = tuple[str, str]
 """Input, and the name of what is corrected."""
@@ -121,19 +123,30 @@ class Corrections:
 
     # -- sightings ---------------------------------------------------------------------------------------------------
 
+    def stamp_ns(self, m: Odometry | Observation) -> int:
+        """The stamp of a measurement, corrected."""
+        return m.stamp_ns + (round(self.found.get((m.topic, "clock"), 0.0) * 1e9) if isinstance(m, Sightings) else 0)
+
+    def lag_ns(self) -> int:
+        """Return how much later than odometry of their stamp sightings come whose clock is corrected."""
+        clocks = {(one.name, "clock") for one in self._inputs.values() if one.offset_s}
+        clocks |= {key for key in self.found if key[1] == "clock"}
+        lags = (-self.total(key) for key in clocks)
+        return round(1e9 * max((lag for lag in lags if 0.0 < lag <= _LONGEST_LAG_S), default=0.0))
+
     def observation(self, m: Observation) -> Observation:
         """An observation, corrected."""
         if not isinstance(m, Sightings):
             return m
-        shift_ns = round(self.found.get((m.topic, "clock"), 0.0) * 1e9)
         mount = [self.total((m.topic, axis)) for axis in AXES]
         scale = self.total((m.topic, "range_factor"))
         offset = self.total((m.topic, "range_offset"))
-        if not shift_ns and not any(mount) and (scale, offset) == (1.0, 0.0):
+        stamp_ns = self.stamp_ns(m)
+        if stamp_ns == m.stamp_ns and not any(mount) and (scale, offset) == (1.0, 0.0):
             return m
         turned = self._turn(mount)
         sightings = tuple(self._sighting(s, mount, turned, scale, offset) for s in m.sightings)
-        return replace(m, stamp_ns=m.stamp_ns + shift_ns, sightings=sightings)
+        return replace(m, stamp_ns=stamp_ns, sightings=sightings)
 
     def _turn(self, mount: list[float]) -> Numbers:
         if self._space.dimensions == 2:

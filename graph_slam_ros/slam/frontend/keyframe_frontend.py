@@ -70,7 +70,8 @@ class KeyframeFrontend:
         self.odometry = OdometrySelector(config.odometry, config.inputs.names.split(), self._space, counters)
         self.path = KeyframeList(self._noise, self._space)
         self.sighting_poses = StampedPoses(SightingPose, self._space.pose.size)
-        self.order = StampOrder(config.ordering, counters)
+        self.corrections = Corrections(config)
+        self.order = StampOrder(config.ordering, counters, self.corrections)
         self.pending = PendingObservations(config.ordering, self.path, self.odometry, counters)
         self.datum = DatumGate(datum)
         self._arrivals = GateChain[Observation]((self.datum,), size_of, counters)
@@ -82,7 +83,6 @@ class KeyframeFrontend:
         )
         self.edges = PoseEdges(self._space, edges, counters)
         self.covariance = np.zeros((self._space.dof, self._space.dof))
-        self.corrections = Corrections(config)
         self._T_odom_base = self._space.identity  # of the last step of odometry, as its messages have it
         self.initial_pose: InitialPose | None = None
         self.held_covariance: Array | None = None

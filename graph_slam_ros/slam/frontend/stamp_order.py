@@ -3,6 +3,9 @@
 Odometry is the clock: a measurement is released when it is ``window_s`` older than the newest odometry. A landmark
 message may come early; then it is kept until odometry has reached its stamp. It may be late within the window. No wall
 clock is read.
+
+A sensor whose clock is corrected to an earlier time comes late by that: odometry waits for it, as long as it would
+without the correction. Else no keyframe could be made where a sighting was.
 """
 
 import heapq
@@ -10,6 +13,7 @@ import heapq
 from graph_slam_ros.config.frontend import OrderingConfig
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import Observation, Odometry
+from graph_slam_ros.slam.frontend.corrections import Corrections
 from graph_slam_ros.slam.frontend.ingest_gate import size_of
 from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector
@@ -19,9 +23,15 @@ _REMEMBERED = 100  # messages of each topic, by which one that comes again is kn
 
 
 class StampOrder:
-    """A bounded queue that releases measurements by (stamp, odometry first, topic, arrival)."""
+    """A bounded queue that releases measurements by (corrected stamp, odometry first, topic, arrival).
 
-    def __init__(self, config: OrderingConfig, counters: Counters) -> None:
+    Parameters
+    ----------
+    corrections : of the clocks of sensors
+    """
+
+    def __init__(self, config: OrderingConfig, counters: Counters, corrections: Corrections) -> None:
+        self._corrections = corrections
         self._window_ns = round(config.window_s * NS)
         self._max_pending = config.max_waiting
         self._counters = counters
@@ -77,13 +87,13 @@ class StampOrder:
     def push(self, m: Odometry | Observation) -> list[Odometry | Observation]:
         """Take one measurement; returns those whose turn has come."""
         rank, topic = (0, "") if isinstance(m, Odometry) else (1, m.topic)
-        heapq.heappush(self._heap, (m.stamp_ns, rank, topic, self._arrivals, m))
+        heapq.heappush(self._heap, (self._corrections.stamp_ns(m), rank, topic, self._arrivals, m))
         self._arrivals += 1
         if isinstance(m, Odometry):
             self._newest_odometry_ns = max(m.stamp_ns, self._newest_odometry_ns or m.stamp_ns)
         if self._newest_odometry_ns is None:
             return []
-        return self._release(self._newest_odometry_ns - self._window_ns)
+        return self._release(self._newest_odometry_ns - self._window_ns - self._corrections.lag_ns())
 
     def flush(self) -> list[Odometry | Observation]:
         """Release everything that waits for its turn."""

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graph_slam_ros.slam import Config, Counters, Odometry, Sighting, Sightings
+from graph_slam_ros.slam.frontend.corrections import Corrections
 from graph_slam_ros.slam.frontend.stamp_order import StampOrder
 
 MS = 1_000_000
@@ -23,7 +24,15 @@ def seen(ms, topic="/landmarks", name="a"):
 
 def order(window_s=0.05, max_waiting=1000):
     config = Config.from_mapping({"ordering": {"window_s": window_s, "max_waiting": max_waiting}})
-    return StampOrder(config.ordering, Counters())
+    return StampOrder(config.ordering, Counters(), Corrections(config))
+
+
+def with_clock(settings, found_s):
+    """A queue by a configuration, where a clock's correction was found."""
+    config = Config.from_mapping(settings)
+    corrections = Corrections(config)
+    corrections.found["detections", "clock"] = found_s
+    return StampOrder(config.ordering, Counters(), corrections)
 
 
 def through(queue, measurements):
@@ -124,3 +133,24 @@ def test_flush_releases_everything_and_is_harmless_when_nothing_waits(window_s):
     queue.push(seen(3))
     assert queue.flush() == [seen(3)]
     assert queue.flush() == []
+
+
+@pytest.mark.parametrize("offset_s", [0.0, -0.1])
+def test_odometry_waits_for_a_sensor_whose_clock_is_corrected(offset_s):
+    """A sighting is seen 100 ms before its stamp, and perhaps 100 ms of that are configured."""
+    queue = with_clock({"detections.offset_s": offset_s}, -0.1)
+    late_ms = round(-1000 * offset_s)
+    out = []
+    for ms in range(0, 1000, 20):
+        out += queue.push(odometry(ms))
+        out += queue.push(seen(ms + 5 - late_ms, "detections"))
+    out += queue.flush()
+    corrected = [m.stamp_ns - 100 * MS * isinstance(m, Sightings) for m in out]
+    assert corrected == sorted(corrected)
+    assert len(out) == 100
+
+
+def test_odometry_does_not_wait_for_another_clock():
+    queue = with_clock({"detections.offset_s": -3000.0}, 0.0)
+    out = [m for ms in range(0, 1000, 20) for m in queue.push(odometry(ms))]
+    assert len(out) > 40
