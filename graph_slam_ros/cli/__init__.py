@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def node_main() -> int:
-    """Run the ROS node; without ROS, say so."""
+    """Run the ROS node; without ROS, print how to install it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing to tell or save while modules are imported
     if not console.has_ros():
         console.warn("ROS 2 is not installed here (no rclpy); replay works without it", "graph_slam_node")

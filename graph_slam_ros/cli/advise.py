@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def advise(args: argparse.Namespace) -> int:
-    """Say what is weak in a run, and which single addition would help most."""
+    """Print what is weak in a run, and which single addition would help most."""
     from graph_slam_ros.analysis.advice import Advisor
     from graph_slam_ros.analysis.weakness import Weakness
     from graph_slam_ros.analysis.what_if import SavedGraph

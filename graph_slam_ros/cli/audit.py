@@ -16,7 +16,7 @@ _SHOWN = 10  # edges that fit worse
 
 
 def explain(args: argparse.Namespace) -> int:
-    """Say why."""
+    """Print why measurements are in or out."""
     from graph_slam_ros.analysis.explain import explain_calibration, explain_edge, explain_run
     from graph_slam_ros.analysis.what_if import SavedGraph
 
@@ -34,7 +34,7 @@ def explain(args: argparse.Namespace) -> int:
 
 
 def solve(args: argparse.Namespace) -> int:
-    """Solve a run's graph again with other edges in, or another loss; say what moves."""
+    """Solve a run's graph again with other edges or another loss, and print what moves."""
     from graph_slam_ros.analysis.what_if import SavedGraph
 
     if not (args.without or args.let_in or args.loss):
@@ -50,7 +50,7 @@ def solve(args: argparse.Namespace) -> int:
 
 
 def influence(args: argparse.Namespace) -> int:
-    """Say which edges the last pose hangs on."""
+    """Print the edges with the largest influence on the last pose."""
     from graph_slam_ros.analysis.what_if import SavedGraph
 
     losses: list[str] = []

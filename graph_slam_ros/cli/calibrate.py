@@ -16,7 +16,7 @@ _WIDTH = 100
 
 
 def calibrate(args: argparse.Namespace) -> int:
-    """Calibrate a recording; returns 4 where something is to be corrected, 3 where the data do not say all."""
+    """Calibrate a recording; returns 4 if something is to be corrected, 3 if the data do not determine everything."""
     from graph_slam_ros.runs.folder import is_run
 
     if is_run(args.bag):

@@ -14,7 +14,7 @@ _WIDTH = 100
 
 
 def check(args: argparse.Namespace) -> int:
-    """Check a recording; returns 4 where something above a note was found."""
+    """Check a recording; returns 4 if there is a finding above a note."""
     from graph_slam_ros.formats.parameters import parse_setting
     from graph_slam_ros.runs.check import check as checked
     from graph_slam_ros.runs.folder import is_run
@@ -45,7 +45,7 @@ def check(args: argparse.Namespace) -> int:
 
 
 def lines(one: Finding) -> Iterator[str]:
-    """A finding as a person reads it: what, its value and limit, and what mends it."""
+    """A finding for a person: its name, its value and limit, and its remedy."""
     first = f"[{one.severity}] {one.code}: {one.text}"
     yield from textwrap.wrap(" ".join(first.splitlines()), _WIDTH, subsequent_indent="    ", break_on_hyphens=False)
     limit = f"    {one.value:.4g} {one.unit}, limit {one.limit:.4g}"

@@ -39,7 +39,7 @@ def completion(args: argparse.Namespace) -> int:
 
 
 def script(whole: argparse.ArgumentParser) -> str:
-    """The script for bash, which zsh runs, too."""
+    """The script for bash, which zsh can run, too."""
     (commands,) = (a for a in whole._actions if isinstance(a, argparse._SubParsersAction))
     names = [*commands.choices, *(option for a in whole._actions for option in a.option_strings)]
     choices, options = [], []

@@ -33,7 +33,7 @@ def escaped(text: str) -> str:
 def show(*lines: str) -> None:
     """Print the answer of a command to standard output.
 
-    Each argument is one line: control characters in it, line ends included, are escaped, since names in it may come
+    Each argument is one line. Control characters in it, line ends included, are escaped, because its names may come
     from a file or a message.
     """
     for line in lines:
@@ -51,7 +51,7 @@ def command(*words: object) -> str:
 
 
 def check_file(*paths: Path | None, force: bool, source: Path | None = None) -> None:
-    """Refuse to replace what is there, before anything is computed.
+    """Refuse to replace a file, before anything is computed.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def check_file(*paths: Path | None, force: bool, source: Path | None = None) -> 
 
 
 def warn(what: str, programme: str = "graph_slam", most: int = _MAX_CHARACTERS) -> None:
-    """Print a line on standard error, beside the answer, whatever is in the names that it tells.
+    """Print a line on standard error, with control characters escaped.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def warn(what: str, programme: str = "graph_slam", most: int = _MAX_CHARACTERS) 
 
 
 def shortened(line: str, most: int) -> str:
-    """A line of at most so many characters: the longest words, such as paths, lose their middle first."""
+    """A line of limited length. The longest words, such as paths, lose their middle first."""
     for word in sorted(set(line.split(" ")), key=len, reverse=True)[:4]:
         excess = len(line) - most
         if excess > 0 and len(word) > _LEAST_WORD:
@@ -96,20 +96,20 @@ def _without_middle(text: str, most: int) -> str:
 
 
 class Throttled:
-    """Tells how far something is: at once, and then every few seconds."""
+    """Prints the progress of something: at once, and then every few seconds."""
 
     def __init__(self, period_s: float = 5.0) -> None:
         self._period_s, self._due_s = period_s, 0.0
 
     def __call__(self, message: str) -> None:
-        """Tell it, if it is time."""
+        """Print it if it is time."""
         if time.monotonic() >= self._due_s:
             self._due_s = time.monotonic() + self._period_s
             warn(message)
 
 
 def report_losses(losses: Sequence[str], warnings: Sequence[str] = ()) -> int:
-    """Tell what was lost, and what to beware of; returns the exit code."""
+    """Print what was lost, and warnings; returns the exit code."""
     for warning in warnings:
         warn(f"beware: {warning}", most=SENTENCE)
     distinct = list(dict.fromkeys(losses))
@@ -121,7 +121,7 @@ def report_losses(losses: Sequence[str], warnings: Sequence[str] = ()) -> int:
 
 
 def progress(label: str) -> Any:
-    """A bar on standard error around what is iterated over, where a person may be looking."""
+    """Wrap an iterable in a progress bar on standard error, if that is a terminal."""
     from tqdm import tqdm
 
     def bar(items: Iterable[Any], total: int) -> Iterable[Any]:

@@ -21,7 +21,7 @@ _BAG = Path(__file__).resolve().parents[2] / "data" / "demo.mcap"
 
 
 def demo(out: Path, *, live: bool, force: bool, progress: Callable[[str], Any], show: Callable[[str], None]) -> int:
-    """Run it and say what happened; returns the exit code (3 if messages were lost)."""
+    """Run the demonstration and print the outcome; returns the exit code (3 if messages were lost)."""
     check_room(out, force=force)
     with tempfile.TemporaryDirectory() as scratch:
         recording = _BAG

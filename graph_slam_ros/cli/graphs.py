@@ -29,7 +29,7 @@ _SAME = 1e-6  # of chi2: what one optimum may differ by from another run to it
 
 
 def optimize(args: argparse.Namespace) -> int:
-    """Solve a graph, say how it went, write it and draw it."""
+    """Solve a graph, print the outcome, write it and draw it."""
     from graph_slam_ros.formats.g2o_writer import write_g2o
     from graph_slam_ros.optimization import optimize as solve
     from graph_slam_ros.optimization import started
@@ -78,7 +78,7 @@ def _after(args: argparse.Namespace, converged: bool) -> str:
 
 
 def _options(args: argparse.Namespace) -> Iterable[str]:
-    """Return what was asked for of the solution, as it was typed."""
+    """Return the options of the solution as they were typed."""
     from graph_slam_ros.cli.parser import parser
 
     usual = parser().parse_args(["optimize", "GRAPH"])
@@ -133,7 +133,7 @@ def _warn_unknown(file: "G2oFile") -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Proof:
-    """The certificate of what was solved, and what came of a second start where it did not do."""
+    """The certificate of a solution, and the outcome of a second start if the first was not certified."""
 
     first: "Certificate"
     start: str = ""
@@ -163,7 +163,7 @@ class _Proof:
 
 
 def _certify(solution: "Solution", settings: "Settings") -> _Proof:
-    """Ask for the certificate; where it is not given, though it could be, try another start."""
+    """Compute the certificate. If it fails and could succeed from another start, try that one."""
     from graph_slam_ros.certificate import CERTIFIED, certify, other_start
     from graph_slam_ros.optimization import optimize
 
@@ -178,7 +178,7 @@ def _certify(solution: "Solution", settings: "Settings") -> _Proof:
 
 
 def _starts(solution: "Solution") -> dict[str, Any]:
-    """The starts for JSON: which were tried, and why more than one."""
+    """The starts for JSON: which were tried, and the reason if there was more than one."""
     tried = [
         {"start": one.start, "chi2": None if one.failure else one.chi2, "failure": one.failure}
         for one in solution.attempts
@@ -187,7 +187,7 @@ def _starts(solution: "Solution") -> dict[str, Any]:
 
 
 def _starts_text(solution: "Solution") -> Iterable[str]:
-    """The text on a suspicious first result: why it is, what other starts gave, and which is the answer."""
+    """The text on a suspicious first result: the reason, the results of other starts, and the one that is used."""
     if not solution.suspicion:
         return
     first, *others = solution.attempts
@@ -221,7 +221,7 @@ def _answer(report: "Report", start: str, args: argparse.Namespace) -> dict[str,
 
 
 def _optimize_text(report: "Report", start: str, loss: "Loss") -> Iterable[str]:
-    """The cost stands beside chi2 where a loss makes it another number."""
+    """The result as text. The cost is given in addition to chi2 if a loss makes them differ."""
     robust = _loss_text(loss)
 
     def both(chi2: float, cost: float) -> str:

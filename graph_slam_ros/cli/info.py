@@ -11,7 +11,7 @@ from graph_slam_ros.runs.suggestion import Suggestion
 
 
 def describe(bag: Bag, path: Path) -> tuple[list[str], bool]:
-    """Topics, types, rates, frames, plugins and span of a recording, then what is to be known of the command, then it.
+    """Describe a recording: topics, types, rates, frames, plugins and span, then notes, then the command.
 
     Returns
     -------

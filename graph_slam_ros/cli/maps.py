@@ -7,7 +7,7 @@ from graph_slam_ros.cli import console
 
 
 def export(args: argparse.Namespace) -> int:
-    """Write what a run knows in another format."""
+    """Write a run in another format."""
     from graph_slam_ros.maps.export import export as exported
     from graph_slam_ros.maps.export import files_of
 
@@ -29,7 +29,7 @@ def _then_use(args: argparse.Namespace) -> None:
 
 
 def diff(args: argparse.Namespace) -> int:
-    """Say what differs between two runs' maps."""
+    """Print the differences between two runs' maps."""
     from graph_slam_ros.maps.diff import diff as compared
 
     losses: list[str] = []
@@ -59,7 +59,7 @@ def merge(args: argparse.Namespace) -> int:
 
 
 def freeze(args: argparse.Namespace) -> int:
-    """Make a map in which to be located, and which nothing changes."""
+    """Make a map for localization that never changes."""
     from graph_slam_ros.runs import outcome
     from graph_slam_ros.runs.restore import freeze as frozen
 

@@ -22,7 +22,7 @@ def params(args: argparse.Namespace) -> int:
 
 
 def _matches(p: Parameter, pattern: str) -> bool:
-    """Match by the name, with * and ?; or where a plain word is in the name or the meaning."""
+    """Match by the name, with * and ?; a plain word also matches within the name or the meaning."""
     word = pattern.lower()
     return fnmatch.fnmatchcase(p.name, word) or word in p.name or word in p.meaning.lower()
 

@@ -10,7 +10,7 @@ from graph_slam_ros.cli.usage import CommandParser
 
 
 class Command:
-    """A command: its function, its options, what it is for, and examples of its arguments."""
+    """A command: its function, its options, its purpose, and examples of its arguments."""
 
     def __init__(
         self,
@@ -26,7 +26,7 @@ class Command:
 
 
 def _later(name: str) -> Callable[[argparse.Namespace], int]:
-    """The function of a command whose module has its name: imported when it is run."""
+    """The function of a command in the module of its name, which is imported when it is run."""
 
     def run(args: argparse.Namespace) -> int:
         return int(getattr(import_module(f"graph_slam_ros.cli.{name}"), name)(args))

@@ -70,7 +70,7 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
 
 
 def recover(args: argparse.Namespace) -> int:
-    """Write the results of a run that was never ended, or before all was processed."""
+    """Write the results of a run that never ended, or that ended before everything was processed."""
     from graph_slam_ros.runs.restore import complete
     from graph_slam_ros.runs.restore import recover as recovered
 
@@ -82,7 +82,7 @@ def recover(args: argparse.Namespace) -> int:
 
 
 def info(args: argparse.Namespace) -> int:
-    """Say what a recording holds."""
+    """Print the contents of a recording."""
     from graph_slam_ros.cli.info import describe
     from graph_slam_ros.recordings.bag import open_bag
     from graph_slam_ros.runs.folder import is_run, suggested_out
@@ -134,7 +134,7 @@ def plot(args: argparse.Namespace) -> int:
 
 
 def _animate(args: argparse.Namespace) -> int:
-    """Draw the drive as it went on."""
+    """Draw the drive as an animation."""
     from graph_slam_ros.analysis.animation import animate_run
     from graph_slam_ros.runs.folder import changed_since
     from graph_slam_ros.warmup import compile_all
@@ -150,7 +150,7 @@ def _animate(args: argparse.Namespace) -> int:
 
 
 def _draw(run: Path, truth: Any = None, out: Path | None = None, *, align: bool = True, quiet: bool = False) -> None:
-    """Draw a run besides something else, which does not fail where this cannot be done."""
+    """Draw a run in addition to other output. A failure to draw does not fail the command."""
     from graph_slam_ros.runs.folder import PICTURE
 
     if not _has_matplotlib():
@@ -191,7 +191,7 @@ def demo(args: argparse.Namespace) -> int:
 
 
 def _refuse_idle_options(args: argparse.Namespace, of_run: bool) -> None:
-    """An option that would have no effect is a mistake of the caller's: say so."""
+    """Refuse an option that would have no effect, because it is a mistake of the user."""
     idle = {
         "--odom or --landmarks: a run knows its own inputs": of_run and (args.odom or args.landmarks),
         "--ros: the events of a run cannot be played, only its recording": of_run and args.ros,
@@ -209,7 +209,7 @@ def _refuse_idle_options(args: argparse.Namespace, of_run: bool) -> None:
 
 
 def config_of(args: argparse.Namespace) -> "Config":
-    """Defaults, then the run's own or the given file, then single settings."""
+    """The configuration: defaults, then the run's own or the given file, then single settings."""
     from graph_slam_ros.config.config import flatten
     from graph_slam_ros.formats.parameters import parse_setting, read_parameters
     from graph_slam_ros.runs.folder import is_run
@@ -227,7 +227,7 @@ def config_of(args: argparse.Namespace) -> "Config":
 
 
 def _print_summary(source: Path, summary: dict[str, Any]) -> int:
-    """Print what came of a run; returns the exit code, 3 where that is less than what was asked for."""
+    """Print the outcome of a run; returns the exit code, 3 if the result is incomplete."""
     from graph_slam_ros.runs import outcome
 
     console.show(*outcome.text(summary))
@@ -238,7 +238,7 @@ def _print_summary(source: Path, summary: dict[str, Any]) -> int:
 
 
 def _print_earlier(folder: Path, summary: dict[str, Any]) -> int:
-    """Say what came of a run that ended where time jumped back; returns as ``_print_summary``."""
+    """Print the outcome of a run that ended when time jumped back; returns as ``_print_summary``."""
     from graph_slam_ros.runs import outcome
 
     console.show(*outcome.text(summary))

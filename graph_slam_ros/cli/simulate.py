@@ -64,7 +64,7 @@ def _is_recording(path: Path) -> bool:
 
 
 def _spoil_recording(args: argparse.Namespace, faults: "list[Fault]") -> int:
-    """A recording of the user's, with faults in its messages."""
+    """A recording of the user with faults in its messages."""
     for what, given in (("--set", args.set), ("--closures", args.closures), ("--poses", args.poses)):
         if given:
             raise GraphSlamError(f"{args.scenario}: no use for {what}: it is no world")
@@ -113,7 +113,7 @@ def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:
 
 
 def _spoil(args: argparse.Namespace, faults: "list[Fault]") -> int:
-    """The graph of a file; its optimum is taken for the truth."""
+    """The graph of a file with faults. Its optimum is taken as the truth."""
     from graph_slam_ros.formats.g2o import read_g2o
     from graph_slam_ros.optimization import optimize
 
@@ -164,7 +164,7 @@ def _options(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _companion(out: Path, ending: str) -> Path:
-    """``world.mcap`` and ``world.g2o.gz`` have a ``world.faults.csv``."""
+    """The name of the table of faults: ``world.mcap`` and ``world.g2o.gz`` have ``world.faults.csv``."""
     whole = out.with_suffix("") if out.suffix.lower() == ".gz" else out
     return whole.with_suffix(ending)
 

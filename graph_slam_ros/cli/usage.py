@@ -10,7 +10,7 @@ CODES = "Exit codes: 0 done, 1 internal error, 2 refused, 3 done but something w
 
 
 class _Formatter(argparse.HelpFormatter):
-    """Paragraphs are wrapped; lines that begin with a space stay as they are."""
+    """Wraps paragraphs. Lines that begin with a space stay as they are."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         fill = super()._fill_text
@@ -18,7 +18,7 @@ class _Formatter(argparse.HelpFormatter):
 
 
 class CommandParser(argparse.ArgumentParser):
-    """Says what is wrong in one line; its help ends with examples and the exit codes."""
+    """Reports usage errors in one line. Its help ends with examples and the exit codes."""
 
     more: Callable[[], str] | None = None  # what the help tells besides, where it takes imports to know it
     codes = CODES

@@ -58,7 +58,7 @@ class CalibrateConfig:
 
     @property
     def chooses(self) -> bool:
-        """Return whether groups follow what the inputs measure, beyond those that are named."""
+        """Return whether groups are chosen by what the inputs measure, in addition to the named ones."""
         return "auto" in self.groups.split()
 
     def prior(self, name: str) -> float:

@@ -73,7 +73,7 @@ class Config:
     sources: tuple[InputConfig, ...] = DEFAULT_INPUTS
 
     def __repr__(self) -> str:
-        """The parameters that are not at their default, as ``from_mapping`` takes them."""
+        """The parameters that differ from their defaults, as ``from_mapping`` takes them."""
         given = dict(flatten(self.as_mapping()))
         usual = {p.name: p.default for p in parameters(one.name for one in self.sources)}
         changed = [f"{name}={value!r}" for name, value in given.items() if value != usual[name]]
@@ -90,7 +90,7 @@ class Config:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> "Config":
-        """Read nested or dotted names and their values; what is not named keeps its default.
+        """Read nested or dotted names and their values. A parameter that is not named keeps its default.
 
         Raises
         ------
@@ -135,12 +135,12 @@ class Config:
 
     @property
     def start_pose(self) -> Numbers | None:
-        """``T_map_base`` of the first keyframe; None where odometry says it."""
+        """``T_map_base`` of the first keyframe; None if odometry determines it."""
         return self._pose("anchor.pose", self.anchor.pose)
 
     @property
     def load_pose(self) -> Numbers | None:
-        """``T_map_base`` of the robot when a map is loaded; None where it is unknown."""
+        """``T_map_base`` of the robot when a map is loaded; None if it is unknown."""
         return self._pose("output.load_pose", self.output.load_pose)
 
     def _pose(self, name: str, text: str) -> Numbers | None:
@@ -152,14 +152,14 @@ class Config:
 
     @property
     def survey(self) -> dict[str, Surveyed]:
-        """Landmarks whose place is known, by identity."""
+        """Surveyed landmarks by id."""
         try:
             return surveyed(self.landmarks.surveyed, self.world.dimensions)
         except ConfigError as error:
             raise ConfigError(f"landmarks.surveyed: {error}") from None
 
     def _losses(self) -> dict[LossKey, Sequence[Loss]]:
-        """The stages of the loss of each class of edges, and of each class and input with a loss of its own."""
+        """The stages of the loss of each class of edges, and of each class and input with its own loss."""
         landmarks, robust = self.landmarks, self.robust
         others = narrow_then_wide(robust.loss, robust.loss_scale)
         out: dict[LossKey, Sequence[Loss]] = {"landmarks": landmark_stages(landmarks.loss, landmarks.loss_scale)}
@@ -192,7 +192,7 @@ class Config:
 
 
 def _sections() -> Iterator[tuple[str, Any]]:
-    """Name and defaults of each section but those of inputs."""
+    """Name and defaults of each section except those of inputs."""
     for section in dataclasses.fields(Config):
         if section.name != "sources":
             yield section.name, section.default
@@ -213,7 +213,7 @@ def _input_names(text: Any) -> list[str]:
 
 
 def _unlisted(name: str, names: list[str]) -> str:
-    """A hint where a parameter looks like one of an input."""
+    """A hint if a parameter looks like one of an input."""
     section, _, key = name.partition(".")
     if section in names or section in dict(_sections()) or key not in InputConfig.__slots__:
         return ""
@@ -229,7 +229,7 @@ def parameters(names: Iterable[str] = USUAL_INPUTS) -> Iterator[Parameter]:
 
 
 def notes() -> dict[str, str]:
-    """Meaning, unit and choices of every parameter by name, as a parameter file says them."""
+    """Meaning, unit and choices of every parameter by name, as in a parameter file."""
     out = {}
     for p in parameters():
         unit = f" [{p.unit}]" if p.unit else ""

@@ -120,7 +120,7 @@ class OdometryConfig:
 
     @property
     def has_densities(self) -> bool:
-        """Return whether a density is other than its default."""
+        """Return whether a density differs from its default."""
         return any(getattr(self, one.name) != one.default for one in fields(self) if one.name.endswith("_density"))
 
 

@@ -151,7 +151,7 @@ class InputConfig:
             )
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """Numbers of a text; none if it is empty. Raises ConfigError for anything else than ``count`` of them."""
+        """Numbers of a text; none if it is empty. Raises ConfigError unless there are ``count`` of them."""
         return numbers(f"{self.name}.{key}", getattr(self, key), count)
 
 
@@ -162,5 +162,5 @@ DEFAULT_INPUTS = (
 
 
 def default_input(name: str) -> InputConfig:
-    """The default input of a name."""
+    """The default settings of the input of a name."""
     return next((one for one in DEFAULT_INPUTS if one.name == name), InputConfig(name, topic=name))

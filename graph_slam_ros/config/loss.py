@@ -8,15 +8,14 @@ _WIDE = 2.3  # times as wide in the end: 4.6 standard deviations, the gate of th
 
 
 def landmark_stages(name: str, scale: float) -> list[Loss]:
-    """The loss of landmarks: of ``huber_then_cauchy``, Huber's loss until it has converged, then Cauchy's."""
+    """The loss of landmarks: for ``huber_then_cauchy``, Huber's loss until convergence, then Cauchy's."""
     return [Loss.named(one, scale) for one in name.split("_then_")]
 
 
 def narrow_then_wide(name: str, scale: float) -> list[Loss]:
-    """The loss of closures and fixes: narrow at first, so that what is far off bends nothing; then wide.
+    """The loss of closures and fixes: narrow first, so that outliers do not bend the map; then wide.
 
-    A measurement that fits so well that the gate accepts it has its full weight then: without outliers the optimum is
-    that of least squares.
+    A measurement that the gate accepts then has its full weight: without outliers the optimum is that of least squares.
     """
     first, *_, last = 2 * name.split("_then_")
     return [Loss.named(first, scale), Loss.named(last, _WIDE * scale)]

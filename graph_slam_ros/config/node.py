@@ -12,7 +12,7 @@ _FILE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,99}")
 
 
 def check_run_name(what: str, name: str) -> None:
-    """Refuse what is not empty and not the plain name of a run folder, a path above all.
+    """Refuse a value that is neither empty nor the plain name of a run folder, above all a path.
 
     Raises
     ------
@@ -108,7 +108,7 @@ class InputsConfig:
 
 @dataclass(frozen=True, slots=True)
 class InitialPoseConfig:
-    """A pose that somebody gives on ``initialpose``."""
+    """A pose that a person gives on ``initialpose``."""
 
     use: str = setting(
         "segment",
@@ -201,7 +201,7 @@ class OutputConfig:
 
 @dataclass(frozen=True, slots=True)
 class JournalConfig:
-    """The journal of a run, which outlives the process."""
+    """The journal of a run, which survives the process."""
 
     resume: bool = setting(
         True, "true: a node whose last run did not end resumes its map when configured, as ~/load would"

@@ -11,7 +11,7 @@ from graph_slam_ros.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A parameter; ``low`` and ``high`` are inclusive; ``live``: it may change at work."""
+    """A parameter. ``low`` and ``high`` are inclusive; ``live``: it may change at run time."""
 
     name: str
     type: type
@@ -58,14 +58,14 @@ def setting(
     choices: tuple[str, ...] = (),
     live: bool = False,
 ) -> Any:
-    """A field of a section: its default, meaning, unit, bounds and choices, and whether it may change at work."""
+    """Declare a field of a section: default, meaning, unit, bounds and choices; ``live``: it may change at run time."""
     if isinstance(default, float):
         low, high = -_LARGEST if low is None else low, _LARGEST if high is None else high
     return field(default=default, metadata={"about": (meaning, unit, low, high, choices, live)})
 
 
 def numbers(name: str, text: str, *counts: int) -> tuple[float, ...]:
-    """Numbers of a parameter's text; none if it is empty. Raises ConfigError for other than so many of them."""
+    """Numbers of a parameter's text; none if it is empty. Raises ConfigError if their number is another."""
     try:
         found = tuple(map(float, text.split()))
     except ValueError:
@@ -76,7 +76,7 @@ def numbers(name: str, text: str, *counts: int) -> tuple[float, ...]:
 
 
 def section_parameters(section: str, members: Any) -> Iterator[Parameter]:
-    """The parameters of a section: ``members`` holds their defaults."""
+    """The parameters of a section; ``members`` are its defaults."""
     for key in dataclasses.fields(members):
         if "about" in key.metadata:
             meaning, unit, *limits = key.metadata["about"]

@@ -10,7 +10,7 @@ _SOLVER = Settings()  # its defaults are ours, but for when the solve at the end
 
 @dataclass(frozen=True, slots=True)
 class SolveConfig:
-    """The solver: a little at each keyframe, and everything at the end."""
+    """The solver: limited work at each keyframe, and everything at the end."""
 
     every_keyframes: int = setting(
         1, "the estimate is updated after this many keyframes", "keyframes", low=1, high=1_000_000, live=True

@@ -40,7 +40,7 @@ _FLAT = 0.5  # the horizontal part of an x axis that is too short to have a head
 
 @dataclass(frozen=True, slots=True)
 class Surveyed:
-    """The place of a landmark by a survey, and how well that is known.
+    """The surveyed pose of a landmark, and its covariance.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Surveyed:
 
     @property
     def pose(self) -> Numbers:
-        """Pose in map, of a landmark whose orientation was surveyed."""
+        """Pose in map of a landmark with a surveyed orientation."""
         return *self.position, *self.orientation
 
     @property
@@ -76,9 +76,9 @@ class _Layout(NamedTuple):
 
 
 def surveyed(text: str, dimensions: int) -> dict[str, Surveyed]:
-    """Landmarks by identity, of lines of comma-separated values below a header.
+    """Landmarks by id, from lines of comma-separated values below a header.
 
-    In the plane z is left out, and of an orientation all but the heading of the x axis, as of a sighting.
+    In the plane z is left out, and of an orientation everything but the heading of the x axis, as for a sighting.
 
     Raises
     ------

@@ -19,7 +19,7 @@ class FramesConfig:
 
 @dataclass(frozen=True, slots=True)
 class WorldConfig:
-    """The world: a plane or space."""
+    """The world: the plane or space."""
 
     dimensions: int = setting(
         2, "2: the robot moves in a plane, measurements are projected onto it; 3: it moves in space", low=2, high=3
@@ -28,9 +28,9 @@ class WorldConfig:
 
 @dataclass(frozen=True, slots=True)
 class AnchorConfig:
-    """The prior on the first keyframe, which fixes the gauge: map begins where odom begins, or where it is said to.
+    """The prior on the first keyframe, which fixes the gauge: map begins where odom begins, or at a given pose.
 
-    While its sigmas are 0, it gives way to the first fix or surveyed landmark: the map is laid onto that.
+    If its sigmas are 0, the first fix or surveyed landmark replaces it, and the map is moved there.
     """
 
     pose: str = setting(
@@ -61,7 +61,7 @@ class AnchorConfig:
 
 @dataclass(frozen=True, slots=True)
 class MapConfig:
-    """Mapping, or localization in a map that is held."""
+    """Mapping, or localization in a fixed map."""
 
     localize: bool = setting(
         False,

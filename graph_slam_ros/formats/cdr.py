@@ -12,12 +12,12 @@ LATEST_NS = (2**31 - 1) * NS + 999_999_999  # that a builtin_interfaces/Time can
 
 
 def stamp(stamp_ns: int) -> bytes:
-    """builtin_interfaces/Time; what is later is the latest that it can say."""
+    """builtin_interfaces/Time; later stamps become the largest that it can represent."""
     return struct.pack("<iI", *divmod(min(stamp_ns, LATEST_NS), NS))
 
 
 class CdrWriter:
-    """Appends the fields of a message in their order, each number at a multiple of its size from the first."""
+    """Appends the fields of a message in order. Each number is aligned to its size."""
 
     __slots__ = ("_out",)
 
@@ -36,7 +36,7 @@ class CdrWriter:
         self._out += encoded
 
     def array(self, values: ArrayLike, dtype: DTypeLike = "<f8") -> None:
-        """All numbers of an array, the last index first; of a sequence its length goes before."""
+        """All numbers of an array, the last index first, after the length if it is a sequence."""
         numbers = np.ascontiguousarray(values, dtype=dtype)
         if numbers.size:  # nothing is aligned for what is not there
             self._align(numbers.itemsize)
@@ -57,9 +57,9 @@ class CdrWriter:
 
 
 class CdrReader:
-    """Reads the first fields of a message in their order, of either byte order, without decoding the rest.
+    """Reads the first fields of a message in order, of either byte order, without decoding the rest.
 
-    Raises ``struct.error`` where the message ends before the field.
+    Raises ``struct.error`` if the message ends before the field.
     """
 
     __slots__ = ("_at", "_data", "_order")
@@ -81,7 +81,7 @@ class CdrReader:
         return int(self.numbers("i")[0]) * NS + int(self.numbers("I")[0])
 
     def text(self) -> bytes:
-        """A string, without its zero."""
+        """A string, without its terminating zero."""
         (length,) = self.numbers("I")
         self._at += length
         return bytes(self._data[self._at - length : self._at]).rstrip(b"\0")

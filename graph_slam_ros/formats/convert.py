@@ -21,7 +21,7 @@ NAMES = {"g2o": "g2o", "toro": "TORO", "gtsam": "GTSAM's text", "tum": "TUM"}
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """The result of writing: how many vertices and edges, and a line for what the format cannot say."""
+    """The result of writing: the number of vertices and edges, and a line for what the format cannot represent."""
 
     vertices: int
     edges: int
@@ -29,7 +29,7 @@ class Written:
 
 
 def format_of(path: Path) -> str:
-    """The format by the ending. Raises FormatError."""
+    """The format by the suffix of the name. Raises FormatError."""
     try:
         return ENDINGS[ending(path)]
     except KeyError:
@@ -67,7 +67,7 @@ def write_graph(path: Path, file: G2oFile, values: Values | None, target: str) -
 
 
 def _translated(lines: list[str], text: Text) -> tuple[list[str], Counter[str]]:
-    """The lines in another text's words, and how many lines of each tag it has no words for."""
+    """The lines in another format, and the number of lines of each tag that it cannot represent."""
     out: list[str] = []
     missing: Counter[str] = Counter()
     for line in lines:
@@ -86,7 +86,7 @@ def _translated(lines: list[str], text: Text) -> tuple[list[str], Counter[str]]:
 
 
 def _landmarks_from(file: G2oFile, target: str) -> int:
-    """Landmarks that were read from GTSAM's text get the numbers back that they had there."""
+    """Landmarks that were read from GTSAM's text get their original numbers back."""
     points = [file.ids[vertex] for vertex in _of_kind(file.graph, R2)]
     return LANDMARK_IDS_FROM if target == "gtsam" and points and min(points) >= LANDMARK_IDS_FROM else 0
 
@@ -109,7 +109,7 @@ def _of_kind(graph: Graph, kind: VertexKind) -> list[int]:
 
 
 def _only_seen(graph: Graph) -> set[int]:
-    """Landmarks, also those that are full poses: at the far end of sightings, and in no other edge."""
+    """Landmarks, also full poses: vertices at the far end of sightings, and in no other edge."""
     seen: set[int] = set()
     others: set[int] = set()
     for table in graph.tables.values():

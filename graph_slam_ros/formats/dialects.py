@@ -32,7 +32,7 @@ _UPPER_3D = np.triu_indices(6)
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """The meaning of the lines of a text.
+    """The interpretation of a text's lines.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Text:
 
 
 def in_g2o_words(words: Words, text: Text) -> Words:
-    """The same line in g2o's words; a line that is of no dialect is returned as it is.
+    """The same line as a line of g2o. A line of no dialect is returned unchanged.
 
     Raises
     ------
@@ -66,14 +66,14 @@ def in_g2o_words(words: Words, text: Text) -> Words:
 
 
 def may_be_roots(words: Words, text: Text) -> bool:
-    """Return whether a line may give the root of its information, and it is unknown: in EDGE3 both look the same."""
+    """Return whether a line may contain the root of its information: in EDGE3 both look the same."""
     if text.dialect or words[0] != "EDGE3" or len(words) != 3 + 6 + 21:
         return False
     return not np.array_equal(numbers(words[9:]), np.eye(6)[_UPPER_3D])  # which is its own root
 
 
 def from_g2o_words(words: Words, text: Text) -> Words | None:
-    """The g2o line in the words of the text's dialect; None where that has no line for it."""
+    """The g2o line in the text's dialect; None if the dialect has no such line."""
     translate = _WRITTEN[text.dialect or "g2o"].get(words[0])
     return None if translate is None else translate(words, text)
 
@@ -87,7 +87,7 @@ def _vertex2(words: Words, _: Text) -> Words:
 
 
 def _edge2(words: Words, text: Text) -> Words:
-    """Rows of the upper triangle may be the information or its square root: where only they can be meant, ask."""
+    """The fields of a g2o line from an EDGE2, in the order of its dialect; an order that must be named is refused."""
     expect(words, 11)
     rows = numbers(words[6:])
     if text.dialect == "isam":
@@ -106,7 +106,7 @@ def _vertex3(words: Words, _: Text) -> Words:
 
 
 def _edge3(words: Words, text: Text) -> Words:
-    """The words of a g2o line; information is the identity where there is none, rotations are rotation vectors."""
+    """The fields of a g2o line. The information is the identity if there is none; rotations are rotation vectors."""
     if len(words) != 9:
         expect(words, 29)
     values = numbers(words[3:])
@@ -252,7 +252,7 @@ def _is_definite(upper: list[float]) -> bool:
 
 
 def _squared(rows: list[float]) -> list[float]:
-    """The upper triangle of ``R'R``, of R by the rows of its upper triangle."""
+    """The upper triangle of ``R'R``, from the rows of the upper triangle of R."""
     size = {3: 2, 6: 3, 21: 6}[len(rows)]
     at, root = np.triu_indices(size), np.zeros((size, size))
     root[at] = rows
@@ -261,7 +261,7 @@ def _squared(rows: list[float]) -> list[float]:
 
 
 def _inverse(upper: list[float], what: str) -> list[float]:
-    """The inverse of a symmetric matrix by its upper triangle and the correlations: units may differ much."""
+    """The inverse of a symmetric matrix from its upper triangle, computed by correlations as units may differ much."""
     size = 3 if len(upper) == 6 else 2
     matrix = np.zeros((size, size))
     at = np.triu_indices(size)

@@ -16,10 +16,10 @@ from graph_slam_ros.formats.files import created
 
 
 class AppendedFile:
-    """A file that is new and only grows; what cannot be written is kept, and written the next time.
+    """A new file that only grows. What cannot be written is kept, and written the next time.
 
-    What was flushed outlives the process, what was synced a power cut. There are no holes: a process that dies in the
-    middle leaves the first part of what it had to say. The first flush makes the file: a name that exists is refused.
+    Flushed data survive the process, synced data a power cut. There are no holes: a process that dies while writing
+    leaves the first part of its data. The first flush creates the file; an existing name is refused.
     """
 
     def __init__(self, path: Path) -> None:
@@ -30,21 +30,21 @@ class AppendedFile:
         self._unwritten = bytearray()
 
     def write(self, data: bytes) -> int:
-        """Append; it is in the file after the next flush."""
+        """Append data. It is in the file after the next flush."""
         self._unwritten += data
         return len(data)
 
     def tell(self) -> int:
-        """Return where the next byte goes."""
+        """Return the position of the next byte."""
         return self._end + len(self._unwritten)
 
     @property
     def unwritten(self) -> int:
-        """Bytes that are not in the file yet."""
+        """The number of bytes that are not in the file yet."""
         return len(self._unwritten)
 
     def flush(self) -> None:
-        """Write what waits. Raises OSError: then some of it waits still."""
+        """Write what is kept in memory. Raises OSError; then some of it is still kept."""
         if self._fd == _NOT_MADE:
             self._fd = created(self._path)
         if not self._is_named and self._fd >= 0:
@@ -56,19 +56,19 @@ class AppendedFile:
             del self._unwritten[:written]
 
     def sync(self) -> None:
-        """Have the disk take what was flushed, if anything was. May be called from another thread; raises OSError."""
+        """Sync what was flushed, if anything was. It may be called from another thread. Raises OSError."""
         if (fd := self._fd) >= 0:
             os.fsync(fd)
 
     def close(self) -> None:
-        """Flush, sync and close. Raises OSError: then it is open still, and may be closed again."""
+        """Flush, sync and close. After an OSError the file is still open, and may be closed again."""
         if self._fd != _CLOSED:
             self.flush()
             self.sync()
             self.abandon()
 
     def abandon(self) -> None:
-        """Close it as it is on the disk: what waits is lost."""
+        """Close the file as it is on the disk. What is in memory is lost."""
         fd, self._fd = self._fd, _CLOSED
         if fd >= 0:
             os.close(fd)
@@ -79,9 +79,9 @@ _NOT_MADE, _CLOSED = -1, -2
 
 @contextlib.contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """The name of a new file to be written in its place; a reader sees the old file or the new one, at any time.
+    """The name of a new file that replaces an old one; a reader always sees the old file or the new one.
 
-    A link that has the name is replaced itself, not what it leads to.
+    A link of that name is replaced itself, not its target.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def replaced(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all. Raises OSError as ``replaced``."""
+    """Write a file completely or not at all. Raises OSError as ``replaced``."""
     with replaced(path) as new:
         file = AppendedFile(new)
         file.write(data)
@@ -122,7 +122,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Have a folder to oneself among those who ask, until the end of it or of the process.
+    """Lock a folder against others that lock it, until the end of the block or of the process.
 
     Raises
     ------
@@ -149,7 +149,7 @@ def _locked(fd: int) -> bool:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the disk know the names that were made or changed in a folder."""
+    """Sync the names that were created or changed in a folder."""
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(fd)

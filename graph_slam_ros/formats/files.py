@@ -17,7 +17,7 @@ _CREATE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 class _Regular(io.FileIO):
-    """Some files of the kernel say that they are regular, and have nothing to read until something happens."""
+    """Refuses kernel files that claim to be regular, and block on reading."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         found: bytes | None = super().read(-1 if size is None else size)
@@ -50,7 +50,7 @@ def read_text(path: Path, *, follow: bool = False) -> str:
 
 
 def is_regular(path: Path) -> bool:
-    """Return whether a regular file has this name; a link to one is not."""
+    """Return whether a regular file has this name; a link to one does not count."""
     try:
         return stat.S_ISREG(path.lstat().st_mode)
     except OSError:
@@ -58,9 +58,9 @@ def is_regular(path: Path) -> bool:
 
 
 def is_empty(path: Path) -> bool:
-    """Return whether there is nothing to read: no such file, or a regular one of no bytes.
+    """Return whether there is nothing to read: no such file, or a regular one without bytes.
 
-    A FIFO or a link is not empty, nor is what cannot be looked at: to open it raises the reason.
+    A FIFO or a link is not empty, nor is a file that cannot be inspected: opening it raises the reason.
     """
     try:
         there = path.lstat()
@@ -72,7 +72,7 @@ def is_empty(path: Path) -> bool:
 
 
 def created(path: Path) -> int:
-    """Create a file that does not exist yet; returns its descriptor. Raises OSError: also where a link has the name."""
+    """Create a file that does not exist yet; returns its descriptor. Raises OSError, also if a link has the name."""
     return os.open(path, _CREATE, 0o644)
 
 

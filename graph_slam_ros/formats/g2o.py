@@ -56,7 +56,7 @@ class _Edge:
 
 
 class _Reader:
-    """State of one reading: what each line declared, before it becomes arrays."""
+    """The state of one reading: the declarations of each line, before they become arrays."""
 
     def __init__(self, name: str, lenient: bool, text: Text) -> None:
         self.name, self.lenient, self.text = name, lenient, text
@@ -79,7 +79,7 @@ class _Reader:
 
     @cached_property
     def plugin_tags(self) -> frozenset[str]:
-        """Tags of plugins; looked up when the first tag comes that is not built in."""
+        """Tags of plugins, looked up at the first tag that is not built in."""
         return plugin_tags()
 
     def read_line(self, line: int, text: str) -> None:
@@ -137,7 +137,7 @@ class _Reader:
         return _Edge(line, vertices, measured, values[size:], self.label, offset)
 
     def declare_all(self) -> None:
-        """A file of edges alone: its vertices are those the edges name, in order of id and without values."""
+        """Declare the vertices of a file of edges alone: those that edges name, in order of id, without values."""
         self.has_values = False
         kinds: dict[int, str] = {}
         tags = {kind: tag for tag, kind in VERTEX_TAGS.items()}
@@ -213,7 +213,7 @@ class _Reader:
                     yield edge
 
     def _is_at(self, tag: str, edge: _Edge) -> bool:
-        """Return whether the place of an edge's sensor is known, and such that its measurement can be used."""
+        """Return whether the pose of an edge's sensor is known, and allows its measurement to be used."""
         offset = self.offsets.get(edge.offset or 0)
         if offset is None and edge.offset:  # some files leave out parameter 0, which is then the robot's frame itself
             self.refuse(edge.line, f"parameter {edge.offset}, which is not declared")
@@ -333,7 +333,7 @@ def by_traces(information: Array, lengths: int) -> Array | None:
 
 
 def _quaternion_at(edge: EdgeType) -> int | None:
-    """Return where in what an edge measured a quaternion begins, if there is one."""
+    """Return the index of a quaternion in the measurement of an edge, if there is one."""
     if edge in (RELATIVE_POSE_3D, POSE_PRIOR_3D):
         return 3
     if edge is ATTITUDE_PRIOR_3D:
@@ -342,7 +342,7 @@ def _quaternion_at(edge: EdgeType) -> int | None:
 
 
 def _with_unit_quaternion(numbers: list[float], at: int | None) -> list[float]:
-    """A quaternion (x, y, z, w) that begins there, if the numbers reach so far, brought to unit length."""
+    """Normalise the quaternion (x, y, z, w) at an index, if the numbers reach so far."""
     if at is None or len(numbers) <= at:
         return numbers
     square = sum(q * q for q in numbers[at:])

@@ -38,12 +38,12 @@ def g2o_text(file: G2oFile, values: Values) -> str:
 
 
 def weightless(graph: Graph) -> int:
-    """Return how many edges are of weight 0."""
+    """Return the number of edges with weight 0."""
     return sum(int((table.weight.values == 0.0).sum()) for table in graph.tables.values())
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Write a file whole or not at all, gzipped where its name ends so. Raises FormatError."""
+    """Write a file completely or not at all, gzipped if its suffix says so. Raises FormatError."""
     path, content = Path(path), text.encode()
     try:
         write_whole(path, gzip.compress(content, mtime=0) if is_gzipped(path) else content)
@@ -64,7 +64,7 @@ def graph_lines(file: G2oFile, values: Values | None) -> list[str]:
 
 
 def _offset_lines(file: G2oFile) -> list[str]:
-    """The parameters; number 0, the robot's own frame, is added where edges name it."""
+    """The parameters. Number 0, the robot's own frame, is added if edges name it."""
     named = any(edge in file.graph.tables for edge in (LANDMARK_POSITION_3D, POSE_PRIOR_3D))
     offsets = ({0: se3.IDENTITY} if named else {}) | file.offsets
     return [f"{OFFSET} {number} {_text(offset)}" for number, offset in sorted(offsets.items())]
@@ -107,7 +107,7 @@ def _edge_lines(file: G2oFile) -> Iterator[tuple[int, int, str]]:
 
 
 def _short(edge: EdgeType, measured: list[float]) -> list[float]:
-    """The measured values, without a tail that has its default values."""
+    """The measured values without trailing default values."""
     head = edge.measured_size - len(edge.tail)
     return measured[:head] if tuple(measured[head:]) == edge.tail else measured
 

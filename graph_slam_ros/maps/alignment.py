@@ -22,7 +22,7 @@ _SPREAD = 3.0  # standard deviations of a point, so far the points must spread t
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """The alignment of map b in map a, and how far its points then are from where a has them.
+    """The alignment of map b with map a, and the remaining differences of their points.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Alignment:
     fits: Mask
 
     def distance(self, k: int) -> tuple[float, float]:
-        """Return how far a point has moved in metres, and in standard deviations that way."""
+        """Return the distance by which a point has moved, in metres and in standard deviations in that direction."""
         metres = float(np.linalg.norm(self.apart[k]))
         if metres < _ROUNDING_M:
             return metres, 0.0
@@ -49,7 +49,7 @@ class Alignment:
 
 
 def positions(slam: GraphSlam, names: Sequence[str]) -> tuple[Array, Array]:
-    """Positions of landmarks (k, n), and their covariance together (k n, k n), in the axes of map."""
+    """Positions of landmarks (k, n), and their joint covariance (k n, k n), in the axes of map."""
     space, n = slam.space, slam.space.dimensions
     vertices = [slam.landmarks[name].vertex for name in names]
     values = [tuple(slam.solver.estimate([vertex])[0].tolist()) for vertex in vertices]
@@ -67,7 +67,7 @@ def positions(slam: GraphSlam, names: Sequence[str]) -> tuple[Array, Array]:
 def align(
     space: Geometry, a: tuple[Array, Array], b: tuple[Array, Array], gate: float, factor: float
 ) -> Alignment | None:
-    """Lay points of b on the same of a; None where too few agree to tell how: two in the plane, three in space.
+    """Align points of b with the same points of a; None if too few agree: two are needed in the plane, three in space.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def align(
 
 
 def as_they_are(space: Geometry, a: tuple[Array, Array], b: tuple[Array, Array], T_a_b: Numbers) -> Alignment:
-    """Points that are not laid on one another, where b is in a by other means."""
+    """Differences without an alignment by points, where the transform is known otherwise."""
     count, n = a[0].shape
     moved = np.stack(space.group.act(T_a_b, tuple(b[0].T)), axis=-1).reshape(count, n)
     turn, variances = space.turn(T_a_b), [np.einsum("kikj->kij", c.reshape(count, n, count, n)) for _, c in (a, b)]
@@ -104,7 +104,7 @@ def as_they_are(space: Geometry, a: tuple[Array, Array], b: tuple[Array, Array],
 
 
 def laid_on(space: Geometry, a: Array, b: Array) -> Numbers | None:
-    """Return where map b is in map a, by points of which none has moved; None where they are too few, or on a line."""
+    """Return the pose of map b in map a by points that have not moved; None if they are too few, or on a line."""
     spread = np.linalg.svd(b - b.mean(axis=0), compute_uv=False) if len(b) else np.empty(0)
     n = space.dimensions
     if len(spread) < n - 1 or len(b) < n or spread[n - 2] < 1e-6 * len(b):
@@ -113,7 +113,7 @@ def laid_on(space: Geometry, a: Array, b: Array) -> Numbers | None:
 
 
 def _motion(a: Array, b: Array) -> tuple[Array, Array]:
-    """Rotations (..., n, n) and translations (..., n) that take points (..., k, n) of b nearest to those of a."""
+    """Rotations (..., n, n) and translations (..., n) that best align points (..., k, n) of b with those of a."""
     middle_a, middle_b = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
     u, _, vt = np.linalg.svd(np.swapaxes(a - middle_a, -1, -2) @ (b - middle_b))
     u[..., -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
@@ -133,7 +133,7 @@ def _variances(*maps: tuple[Array, Array]) -> Array:
 
 
 def _first(a: tuple[Array, Array], b: tuple[Array, Array], limit: float) -> Mask:
-    """The points that agree best: of as few as tell a motion, tried in turn, or by chance where there are many."""
+    """The points that agree best with a minimal sample: all samples, or random ones if there are many."""
     count, n = a[0].shape
     if math.comb(count, n) <= _MOST_TRIALS:
         sets = np.array(list(combinations(range(count), n)))
@@ -148,7 +148,7 @@ def _first(a: tuple[Array, Array], b: tuple[Array, Array], limit: float) -> Mask
 
 
 def _is_determined(a: tuple[Array, Array], b: tuple[Array, Array], fits: Mask) -> bool:
-    """Return whether points tell all of a motion: enough of them, not in one place, in space not on a line."""
+    """Return whether points determine a motion: enough of them, not in one place, in space not on a line."""
     count, n = int(fits.sum()), a[0].shape[1]
     if count < n:
         return False
@@ -157,7 +157,7 @@ def _is_determined(a: tuple[Array, Array], b: tuple[Array, Array], fits: Mask) -
 
 
 def _covariance(a: tuple[Array, Array], b: tuple[Array, Array], turn: Array, fits: Mask) -> Array:
-    """The covariance of each difference, once those that fit are laid on one another as well as can be (k, n, n)."""
+    """The covariance (k, n, n) of each difference after the alignment of the points that fit."""
     count, n = a[0].shape
     axes = np.kron(np.eye(count), turn)
     total = a[1] + axes @ b[1] @ axes.T
@@ -170,7 +170,7 @@ def _covariance(a: tuple[Array, Array], b: tuple[Array, Array], turn: Array, fit
 
 
 def _derivative(points: Array) -> Array:
-    """The derivative of points that are moved and turned, by how (k n, dof)."""
+    """The derivative (k n, dof) of points that are moved and turned."""
     count, n = points.shape
     about = [(0.0, 0.0, 1.0)] if n == 2 else [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
     turned = [(points @ so3.hat(axis)[:n, :n].T).reshape(-1, 1) for axis in about]

@@ -23,7 +23,7 @@ _SHOWN = 10
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """Counts of each map, and of those that are in both."""
+    """Counts of each map, and of what is in both."""
 
     a: int
     b: int
@@ -32,7 +32,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class MovedLandmark:
-    """A landmark that is elsewhere in B: by how many metres, and how many standard deviations of both."""
+    """A landmark that is elsewhere in B: by how many metres, and how many standard deviations of both maps."""
 
     landmark: str
     distance_m: float
@@ -41,7 +41,7 @@ class MovedLandmark:
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A measurement that both have and do not judge alike: its class, its edge in each, what each says."""
+    """A measurement in both maps with different verdicts: its class, its edge in each, each verdict."""
 
     about: str
     edge_a: int
@@ -80,14 +80,14 @@ class Difference:
 
     @property
     def is_same(self) -> bool:
-        """Return whether both tell the same, to a millimetre."""
+        """Return whether both are equal to a millimetre."""
         counted = (self.keyframes, self.landmarks, self.edges)
         is_there = all(one.a == one.b == one.both for one in counted)
         is_moved = any(one.distance_m > _SAME_M for one in self.moved) or self.keyframes_m[1] > _SAME_M
         return is_there and not (is_moved or self.verdicts or self.edits_a or self.edits_b)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values; what there is not is None."""
+        """Plain values; a missing one is None."""
         apart = [None if math.isnan(metres) else metres for metres in self.keyframes_m]
         return asdict(self) | {"keyframes_m": apart, "same": self.is_same}
 
@@ -132,7 +132,7 @@ def _shown(lines: Iterable[str]) -> Iterator[str]:
 
 
 def diff(a: Path, b: Path, losses: list[str]) -> Difference:
-    """Compare the maps of two runs; what could not be read of them is added to ``losses``.
+    """Compare the maps of two runs. What could not be read of them is added to ``losses``.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def diff(a: Path, b: Path, losses: list[str]) -> Difference:
 
 
 def refuse_other_space(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
-    """Raise GraphSlamError where one is in the plane and one in space."""
+    """Raise GraphSlamError if one is in the plane and one in space."""
     if one.space is not two.space:
         dimensions = (slam.space.dimensions for slam in (one, two))
         counts = " and ".join(f"{folder}: {n}" for folder, n in zip((a, b), dimensions, strict=True))
@@ -173,7 +173,7 @@ def refuse_other_space(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None
 
 
 def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
-    """The landmarks of one name that were seen to have it, in both."""
+    """The landmarks with the same id in both."""
     return [
         name
         for name, mark in one.landmarks.items()
@@ -182,7 +182,7 @@ def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
 
 
 def _aligned(one: GraphSlam, two: GraphSlam, common: list[str]) -> tuple[Alignment, str, Numbers]:
-    """Align by landmarks, else by stamps, else not at all."""
+    """Align by landmarks, else by stamps, else use the maps as they are."""
     space, robust = one.space, one.config.robust
     a, b = positions(one, common), positions(two, common)
     found = align(space, a, b, robust.gate, robust.noise_factor)
@@ -196,7 +196,7 @@ def _aligned(one: GraphSlam, two: GraphSlam, common: list[str]) -> tuple[Alignme
 
 
 def _of_one_stamp(one: GraphSlam, two: GraphSlam) -> tuple[Array, Array]:
-    """Poses of the keyframes of one stamp; where there are several the first and the first, and so on."""
+    """Poses of the keyframes with the same stamp. Several of one stamp are paired in order."""
     a, b = _by_stamp(one), _by_stamp(two)
     common = [stamp for stamp in a if stamp in b]
     return one.trajectory()[[a[stamp] for stamp in common]], two.trajectory()[[b[stamp] for stamp in common]]
@@ -226,7 +226,7 @@ def _chi2(slam: GraphSlam) -> float:
 
 
 def _edges(one: GraphSlam, two: GraphSlam) -> tuple[Counts, list[Judged]]:
-    """The edges of one type between the same with the same measurement, and those of them that are not judged alike."""
+    """Edges in both maps, with equal type, vertices and measurement, and those of them with different verdicts."""
     a, b, names = _by_meaning(one), _by_meaning(two), _names(one)
     pairs = [pair for key in a if key in b for pair in zip(a[key], b[key], strict=False)]
     unlike = []
@@ -250,13 +250,13 @@ def _by_meaning(slam: GraphSlam) -> dict[Any, list[int]]:
 
 
 def _names(slam: GraphSlam) -> dict[int, int | str]:
-    """Return what a vertex is in any map: a stamp, or a name."""
+    """Return the identity of a vertex in any map: a stamp, or a name."""
     poses = dict(zip(slam.keyframes.ids.tolist(), slam.keyframes.stamps_ns.tolist(), strict=True))
     return poses | {mark.vertex: name for name, mark in slam.landmarks.items()}
 
 
 def _about(slam: GraphSlam, names: dict[int, int | str], edge: int) -> str:
-    """The edge's class, and the landmark it is about or the stamp that it is of."""
+    """The edge's class, and its landmark or stamp."""
     one = slam.graph.edge(edge)
     name = names.get(one.vertices[-1], "")
     what = f"{name / 1e9:.3f} s" if isinstance(name, int) else name

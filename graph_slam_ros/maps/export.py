@@ -18,7 +18,7 @@ from graph_slam_ros.slam import GraphSlam
 
 
 def export(folder: Path, out: Path, target: str, losses: list[str], *, last_drive: bool = False) -> list[Path]:
-    """Write what a run knows; returns the files.
+    """Write a run in another format. Returns the files.
 
     Parameters
     ----------
@@ -49,13 +49,13 @@ def files_of(out: Path, target: str) -> list[Path]:
 
 
 def _tum(slam: GraphSlam, out: Path, first: int = 0) -> list[Path]:
-    """The keyframes, from one on."""
+    """The keyframes from a number on."""
     write_text(out, tum_text(slam.keyframes.stamps_ns.tolist()[first:], slam.trajectory()[first:]))
     return [out]
 
 
 def _g2o(slam: GraphSlam, out: Path) -> list[Path]:
-    """All that is believed; g2o has neither stamps nor names: these are in a table beside it."""
+    """All accepted edges. g2o has neither stamps nor names; a second table has these."""
     ids, table = numbered(slam)
     _, names_file = files_of(out, "g2o")
     write_g2o(out, graph_file(slam, ids), slam.solver.estimate)

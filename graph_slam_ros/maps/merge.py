@@ -83,7 +83,7 @@ def _refuse_other_datum(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> Non
 
 
 def _refuse_same_drive(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:
-    """Refuse two maps of one drive: what was measured once would count twice."""
+    """Refuse two maps of one drive, because its measurements would count twice."""
     driven = {(k.stamp_ns, k.T_odom_base) for k in one.keyframes}
     same = sum((k.stamp_ns, k.T_odom_base) in driven for k in two.keyframes)
     if same > 1:  # two robots may begin at one time
@@ -91,7 +91,7 @@ def _refuse_same_drive(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None
 
 
 def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:
-    """Landmarks of both. Raises GraphSlamError where they cannot be one."""
+    """Landmarks in both maps. Raises GraphSlamError if a pair cannot be the same landmark."""
     for name, mark in two.landmarks.items():
         other = one.landmarks.get(name)
         if other is None or (mark.is_unnamed and other.is_unnamed):
@@ -107,7 +107,7 @@ def _shared(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> list[str]:
 
 
 def _absolute(slam: GraphSlam) -> list[str]:
-    """The classes of edges that say where the map lies; of custom edges those whose chi2 changes if all is moved."""
+    """The classes of edges that are absolute in the map; of custom edges those whose chi2 changes if all is moved."""
     space, values, here = slam.space, slam.solver.values, slam.solver.evaluate().classes.get("custom")
     found = [label for label in _ABSOLUTE if len(slam.graph.edges_of(label))]
     if here is None:
@@ -135,7 +135,7 @@ def _aligned(one: GraphSlam, two: GraphSlam, shared: list[str]) -> Alignment:
 
 
 def _leave_out(state: MapSnapshot, first_edge: int, chi2: Mapping[int, float], limit: float) -> None:
-    """Take out what the second session saw of landmarks that are elsewhere in it; what fits after all comes back."""
+    """Remove the second session's sightings of landmarks that are elsewhere in it. Those that fit come back later."""
     last, inside = len(state.keyframes) - 1, state.ledger.inside
     for edge in inside[inside >= first_edge].tolist():
         statistic = chi2.get(landmark_of(state.graph, edge) or 0)
@@ -158,7 +158,7 @@ class _Second:
         self._shared = set(shared)
 
     def record(self) -> Record:
-        """A record with the numbers that vertices, edges and keyframes have after those of the first."""
+        """A record with numbers of vertices, edges and keyframes that follow those of the first map."""
         growth, first = MapGrowth().since(self._two), self._keyframes
         others = MapGrowth().since(self._one)["edges"]
         known = {(label, *vertices) for _, vertices, *_, label, _ in others if label in _ONCE}
@@ -185,7 +185,7 @@ class _Second:
         }
 
     def _value(self, vertex: int, kind: str) -> list[Any]:
-        """Return where it is in the first map."""
+        """Return its value in the first map."""
         space, value = self._one.space, tuple(self._two.solver.estimate([vertex])[0].tolist())
         of = self._two.graph.kind_of(vertex)
         if of is space.pose:
@@ -203,7 +203,7 @@ class _Second:
         return [tag, [self._vertex[vertex] for vertex in vertices], measured, root, label, source]
 
     def _edit_record(self, one: AppliedEdit, number: Mapping[int, int]) -> list[Any]:
-        """An edit of the second map; a name that the first has is changed."""
+        """An edit of the second map, renamed if the first has that name."""
         names = {other.edit.name for other in self._one.edits}
         free = chain([one.edit.name], (f"{one.edit.name}-{k}" for k in count(2)))
         name = next(name for name in free if name not in names)

@@ -38,7 +38,7 @@ class Counters:
             own.update(more)
 
     def raise_to(self, other: "Counters") -> None:
-        """Keep the larger of each count, if both have counted the same things."""
+        """Keep the larger of each count, if both objects have counted the same measurements."""
         for own, counts in self._with(other):
             for key, times in counts.items():
                 own[key] = max(own[key], times)
@@ -54,7 +54,7 @@ class Counters:
         return out
 
     def _with(self, other: "Counters") -> Iterator[tuple[Counter[Any], Counter[Any]]]:
-        """Pairs of own counts and a copy of the other's, in which another thread may be counting."""
+        """Pairs of our counts and a copy of the other's, which another thread may be changing."""
         yield self._counts, Counter(other._counts)
         yield self.received, Counter(other.received)
         yield self.used, Counter(other.used)

@@ -17,7 +17,7 @@ _LONGEST_NAME = 128  # bytes, of a landmark
 
 
 def refuse_unusable(tag: str) -> None:
-    """Raise ConfigError where a custom edge cannot be of this edge type: it is built in, or no plugin can be used."""
+    """Raise ConfigError if a custom edge cannot have this edge type: it is built in, or its plugin cannot be used."""
     if tag in EDGE_TAGS:
         raise ConfigError(f"{tag}: a built-in edge type: choose another tag, or give a Sighting, Fix or Closure")
     map_edge_of(tag)

@@ -10,7 +10,7 @@ from enum import Enum
 
 
 class Effect(Enum):
-    """The effect of a reason: what it does to what was measured."""
+    """The effect of a reason on a measurement."""
 
     REFUSED = "refused"
     """It is not used, and something is lost."""
@@ -307,12 +307,12 @@ REASONS: dict[str, Reason] = {
 
 
 def explain(reason: str) -> Reason:
-    """The row of a reason; exceptions are counted by their type and share one."""
+    """The row of a reason. Exceptions are counted by their type and share one row."""
     return REASONS.get(reason, REASONS["fault"])
 
 
 def warnings(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """Return what was repaired and can be mended, of counts by source and reason: a line each."""
+    """Return a line for each repair that the user can avoid, from counts by source and reason."""
     return [
         f"{source}: {times} times, {explain(reason).meaning}; mend it by {remedy(source, reason)}"
         for source, by_reason in counts.items()
@@ -322,5 +322,5 @@ def warnings(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
 
 
 def remedy(source: str, reason: str) -> str:
-    """Return what mends it for this input; empty where nothing is to be done."""
+    """Return the remedy for this input; empty if nothing is to be done."""
     return explain(reason).remedy.replace("INPUT", source)

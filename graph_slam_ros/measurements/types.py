@@ -133,7 +133,7 @@ class Closure:
 
 @dataclass(frozen=True, slots=True)
 class CustomEdge:
-    """A measurement whose edge type a plugin has: it becomes one edge between poses of the robot and landmarks.
+    """A measurement for a plugin's edge type: it becomes one edge between poses of the robot and landmarks.
 
     Attributes
     ----------

@@ -30,7 +30,7 @@ _WINDOW_BYTES, _OVERHEAD = 64 * 2**20, 256
 
 
 class BagError(GraphSlamError):
-    """A recording that cannot be read, or does not hold what was asked for."""
+    """A recording that cannot be read, or lacks what was asked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class BagMessage:
 
 
 class Bag:
-    """A recording, opened: one file, or the parts of one.
+    """An open recording: one file, or several parts.
 
     Attributes
     ----------
@@ -84,14 +84,14 @@ class Bag:
         self.topics[topic.name] = replace(topic, count=topic.count + (old.count if old else 0))
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        """Messages of the named topics by the time they were received; those of one time in order of the file.
+        """Messages of the named topics in order of receive time; those of one time in order of the file.
 
-        Messages are put in order within a window: one that was written later than 64 MiB of others is not.
+        Messages are sorted within a window. A message that was written more than 64 MiB too late stays out of order.
         """
         return _in_order(self._merged(topics))
 
     def _merged(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        """The messages of several parts, split by time or topic; a part is opened when its time has come."""
+        """The messages of several parts, split by time or topic. A part is opened when its time has come."""
         pending = deque(enumerate(self._parts))
         heads: list[tuple[int, int, BagMessage, Iterator[BagMessage]]] = []
         while pending or heads:
@@ -115,7 +115,7 @@ class Bag:
 
 
 def open_bag(path: Path | str) -> Bag:
-    """Open a file (mcap, db3, ROS 1 bag) or a folder that holds them, split or not.
+    """Open a file (mcap, db3, ROS 1 bag), or a folder of such files, split or not.
 
     Raises
     ------
@@ -146,12 +146,12 @@ def _files(path: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """bag_2 before bag_10."""
+    """Sort key that puts bag_2 before bag_10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def _part(file: Path) -> "_Part":
-    """Open a file by how it begins: whatever its name says."""
+    """Open a file by its first bytes, whatever its name."""
     with opened(file, follow=True) as stream:
         begins = stream.read(16)
     if not begins:
@@ -237,7 +237,7 @@ class _SqlitePart:
 
 
 class _Ros1Part:
-    """A ROS 1 bag; messages are turned into CDR where what their type holds of ours is as ours."""
+    """A ROS 1 bag. Messages are converted to CDR if the fields of their type agree with ours."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -307,14 +307,14 @@ def _in_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
 
 
 def _plain(message: BagMessage) -> BagMessage:
-    """The message without rosbag2's own compression; CDR never begins so."""
+    """The message without rosbag2's own compression; no CDR message begins like a compressed one."""
     return replace(message, cdr=zstd_message(message.cdr)) if message.cdr.startswith(ZSTD_MAGIC) else message
 
 
 class BagWriter:
-    """Writes CDR messages into one mcap file that Foxglove and ``ros2 bag`` open; every chunk carries its CRC.
+    """Writes CDR messages into one mcap file, which Foxglove and ``ros2 bag`` can open. Each chunk has its CRC.
 
-    What could not be written, since the disk is full, waits: the next ``write`` tries again.
+    What a full disk does not accept is kept, and the next ``write`` tries again.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -326,7 +326,7 @@ class BagWriter:
         self._sequence: dict[str, int] = {}
 
     def write(self, topic: str, type_name: str, stamp_ns: int, cdr: bytes) -> None:
-        """Append one message, received at ``stamp_ns``. Raises OSError, and keeps it."""
+        """Append one message, received at ``stamp_ns``. Raises OSError, and keeps the message."""
         if topic not in self._channels:
             if type_name not in self._schemas:
                 text, _ = typestore().generate_msgdef(type_name, ros_version=2)
@@ -339,12 +339,12 @@ class BagWriter:
         self._file.flush()
 
     def end(self) -> AppendedFile:
-        """Append the index; returns the file, which is to be closed."""
+        """Append the index. Returns the file, which the caller closes."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         return self._file
 
     def abandon(self) -> None:
-        """Close the file as it is on the disk, without an index: what waits is lost."""
+        """Close the file as it is on the disk, without an index. What is in memory is lost."""
         self._file.abandon()
 
     def close(self) -> None:

@@ -88,7 +88,7 @@ class Recording:
     fixed: dict[str, str] = field(default_factory=dict)
 
     def is_linked(self, frame: str, base: str) -> bool:
-        """Return whether TF tells where a frame is on the robot."""
+        """Return whether TF has the pose of a frame on the robot."""
         links = self.fixed | {child: parent for child, parent in self.moving.items() if child != base}
         return _root(links, frame) == _root(links, base)
 
@@ -158,7 +158,7 @@ def _plain(frame: str) -> str:
 
 
 def _any(one: TopicContents, m: Any) -> None:
-    """The number of landmarks in a message of a package that need not be installed."""
+    """The number of landmarks in a message of a package that may not be installed."""
     for name in ("landmarks", "markers", "sensed_data", "detections", "poses"):
         if hasattr(m, name):
             one.items += len(getattr(m, name))

@@ -14,9 +14,9 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
 def decompressed(data: bytes, codec: str, size: int) -> bytes:
-    """Decompress what was compressed as ``zstd``, ``lz4``, ``bz2``, or not at all (``none``, empty), of that size.
+    """Decompress data of known size, compressed with ``zstd``, ``lz4``, ``bz2``, or not at all (``none``, empty).
 
-    The size is checked before anything is decompressed, and no more than that is made, whatever the data hold.
+    The size is checked before decompression, and the output is limited to it.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def decompressed(data: bytes, codec: str, size: int) -> bytes:
 
 
 def zstd_message(data: bytes) -> bytes:
-    """A message that rosbag2 compressed by itself. Raises FormatError."""
+    """Decompress a message that rosbag2 compressed by itself. Raises FormatError."""
     size = zstandard.frame_content_size(data)
     if size < 0:
         raise FormatError("zstd: it does not say its size")

@@ -45,7 +45,7 @@ _NEEDED = {
 
 
 def recorded_decoder(topic: Topic) -> Decoder:
-    """A decoder from CDR bytes of a topic to message objects, by the definition recorded with it.
+    """A decoder from CDR bytes of a topic to message objects, by the recorded definition.
 
     Raises
     ------

@@ -56,7 +56,7 @@ class Contents:
 
 
 class _Stream(io.BufferedReader):
-    """A file that is never asked for more than there is, up to ``end``: a length in a damaged file may be 2^60."""
+    """A file that is never read beyond ``end``, because a length in a damaged file may be 2^60."""
 
     def __init__(self, path: Path, follow: bool = True) -> None:
         super().__init__(opened(path, follow=follow))
@@ -74,14 +74,14 @@ class _Stream(io.BufferedReader):
 
 
 def begin(profile: str = "", library: str = LIBRARY) -> bytes:
-    """Return how a file of ours begins."""
+    """Return the first bytes of a file that we write."""
     head = io.BytesIO()
     Writer(head, use_chunking=False).start(profile, library)
     return head.getvalue()
 
 
 def contents(path: Path) -> Contents:
-    """The contents, from the summary or by reading everything where there is no whole one."""
+    """The contents, from the summary, or by reading everything if the summary is damaged or missing."""
     try:
         with _Stream(path) as stream:
             summary = _summary(stream)
@@ -109,8 +109,8 @@ def records(
 ) -> Iterator[McapRecord]:
     """Schemas, channels and messages in order of the file.
 
-    What is damaged is passed over up to the next chunk; a cut tail ends it. Each adds a line to ``losses``; one in
-    ``warnings`` says where there is damage, and no checksum that would tell of more. ``follow``: the file may be a
+    A damaged part is skipped up to the next chunk; a truncated end stops the reading. Each adds a line to ``losses``. A
+    line in ``warnings`` names damage in a file without checksums, which may have more. ``follow``: the file may be a
     symbolic link.
     """
     known = len(losses)
@@ -160,9 +160,9 @@ def records(
 
 
 def _record(stream: _Stream, at: int) -> tuple[McapRecord | None, int]:
-    """The record that begins there, or nothing for one of no interest, and where the next begins.
+    """The record at a position, or nothing if it is of no interest, and the position of the next one.
 
-    Raises almost anything where it is damaged.
+    Raises almost any exception if the record is damaged.
     """
     stream.go(at)
     opcode, length = _HEAD.unpack(stream.read(_HEAD.size))
@@ -189,7 +189,7 @@ def _parsed(opcode: int, stream: ReadDataStream, length: int) -> McapRecord:
 
 
 def _inside(chunk: Chunk) -> Iterator[McapRecord]:
-    """One after another: a list of them all would take the chunk's memory a second time."""
+    """The records of a chunk one by one, because a list of them would double the memory."""
     plain = decompressed(chunk.data, chunk.compression, chunk.uncompressed_size)
     if chunk.uncompressed_crc not in (0, zlib.crc32(plain)):
         raise FormatError("its checksum is another")
@@ -205,9 +205,9 @@ def _inside(chunk: Chunk) -> Iterator[McapRecord]:
 
 
 def _next_chunk(stream: _Stream, at: int) -> int | None:
-    """Return where the next chunk begins that is whole: its head agrees with itself, and its end is in the file.
+    """Return the position of the next intact chunk: its header is consistent, and its end is in the file.
 
-    The blocks that are searched begin small and double: forged heads, one after another, cost little each.
+    The search reads small blocks first and doubles their size, so that many forged headers cost little.
     """
     size = _FIRST_BLOCK
     while (at := _data_from(stream, at)) < stream.size:
@@ -227,7 +227,7 @@ def _next_chunk(stream: _Stream, at: int) -> int | None:
 
 
 def _data_from(stream: _Stream, at: int) -> int:
-    """The next byte that is on the disk: a file may say to be a terabyte and hold nothing."""
+    """The next byte that is stored on the disk: a sparse file may claim a terabyte."""
     try:
         return os.lseek(stream.fileno(), at, os.SEEK_DATA)
     except OSError:  # nothing follows; or the file system does not know
@@ -257,7 +257,7 @@ def _summary(stream: _Stream) -> Summary | None:
 
 
 def _announced(stream: _Stream) -> int | None:
-    """Return how many messages there are by the summary; None where it is damaged itself, or does not say."""
+    """Return the number of messages by the summary; None if it is damaged or does not have the number."""
     try:
         summary = _summary(stream)
     except Exception:  # see contents
@@ -266,7 +266,7 @@ def _announced(stream: _Stream) -> int | None:
 
 
 def _has_whole_summary(stream: _Stream) -> bool:
-    """The footer: where the summary begins, and its checksum, 0 where there is none."""
+    """The footer: the position of the summary, and its checksum, 0 if there is none."""
     end = stream.size - MAGIC_SIZE - 4
     stream.go(end - 16)
     summary, _, crc = struct.unpack("<QQI", stream.read(20))

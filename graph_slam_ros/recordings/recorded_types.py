@@ -23,7 +23,7 @@ def has_too_many_values(recorded: Any, type_name: str) -> bool:
 
 
 def _length(types: Any, name: str, known: dict[str, float]) -> float:
-    """Return how many values a message has at least, each sequence with one."""
+    """Return the least number of values of a message, with one element for each sequence."""
     known[name] = float("inf")  # of a type that holds itself, there is no end
     total = 0.0
     for _, (kind, of) in types[name][1]:
@@ -40,7 +40,7 @@ def _length(types: Any, name: str, known: dict[str, float]) -> float:
 
 
 def store_with(recorded: Any) -> Typestore:
-    """Return the recorded types, with ours for those that are not among them."""
+    """Return a store of the recorded types, with ours for those that were not recorded."""
     store = get_typestore(Stores.EMPTY)
     basic = {name: fields for name, fields in typestore().fielddefs.items() if name not in recorded}
     store.register({**basic, **recorded})
@@ -48,10 +48,10 @@ def store_with(recorded: Any) -> Typestore:
 
 
 def ros1_store(type_name: str, definition: str) -> Typestore | None:
-    """Return what turns messages of a recorded ROS 1 type into CDR.
+    """Return the converter of messages of a recorded ROS 1 type to CDR.
 
-    None where a type of ours that it is or holds has other fields there (a header's ``seq`` aside), or where the
-    definition is of no use, or of a foreign type that no input reads.
+    None if a type of ours that it is or contains has other fields there (a header's ``seq`` aside), if the definition
+    is unusable, or if no input reads the type.
     """
     if len(definition) > MOST_TEXT:
         return None

@@ -23,7 +23,7 @@ Fields = dict[str, bytes]
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A topic as one publisher gave it; the definition is ROS .msg text."""
+    """A topic of one publisher; the definition is ROS .msg text."""
 
     topic: str
     type: str
@@ -41,7 +41,7 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """Connections and their messages by number, time of the first message, and what of the file could not be read."""
+    """Connections and their messages by number, time of the first message, and what could not be read."""
 
     connections: dict[int, Connection]
     counts: dict[int, int]
@@ -68,7 +68,7 @@ def contents(path: Path) -> Contents:
 
 
 def messages(path: Path, losses: list[str]) -> Iterator[Message]:
-    """Messages in order of the file; a damaged chunk is passed over, a cut tail ends it: each adds to ``losses``."""
+    """Messages in order of the file. A damaged chunk is skipped, a truncated end stops; each adds to ``losses``."""
     topics: dict[int, str] = {}
     for fields, data in _records(path, losses):
         number = _number(fields, "conn")
@@ -100,7 +100,7 @@ def _indexed(path: Path) -> Contents:
 
 
 def _records(path: Path, losses: list[str]) -> Iterator[tuple[Fields, bytes]]:
-    """Connections and messages, those in chunks and those outside."""
+    """Connections and messages, inside and outside of chunks."""
     read = 0
     with BufferedReader(opened(path, follow=True)) as stream:
         size = os.fstat(stream.fileno()).st_size
@@ -131,7 +131,7 @@ def _records(path: Path, losses: list[str]) -> Iterator[tuple[Fields, bytes]]:
 
 
 def _checked(fields: Fields, data: bytes) -> tuple[Fields, bytes] | None:
-    """A connection or a message that can be used, and nothing for other records; raises as ``_record`` does."""
+    """A connection or a message that can be used; nothing for other records. Raises as ``_record`` does."""
     if fields["op"] == _CONNECTION:
         _connection(fields, data)
     elif fields["op"] == _MESSAGE:
@@ -143,7 +143,7 @@ def _checked(fields: Fields, data: bytes) -> tuple[Fields, bytes] | None:
 
 
 def _record(stream: BinaryIO, size: int) -> tuple[Fields, bytes]:
-    """The next record's header and data; no length is believed that leads beyond the end."""
+    """The next record's header and data. A length beyond the end of the file is refused."""
     fields = _fields(_sized(stream, size, _MOST_HEADER))
     if "op" not in fields:
         raise FormatError("a record of no kind")

@@ -31,7 +31,7 @@ class Contents:
 
 
 def contents(path: Path) -> Contents:
-    """Raises FormatError: it is no rosbag2 file, or not even its topics can be read."""
+    """Read the topics. Raises FormatError if it is no rosbag2 file, or if its topics cannot be read."""
     try:
         with closing(_connection(path)) as database:
             kinds = dict(database.execute("SELECT name, type FROM sqlite_master WHERE name IN ('topics', 'messages')"))
@@ -55,7 +55,7 @@ def contents(path: Path) -> Contents:
 
 
 def _refuse_computed(database: sqlite3.Connection, path: Path, table: str) -> None:
-    """Raise FormatError where reading a table would compute its columns: a few bytes may then give gigabytes."""
+    """Raise FormatError if a table has computed columns: a few bytes may then produce gigabytes."""
     columns = database.execute(f"PRAGMA table_xinfo({table})").fetchall()
     computed = [str(name) for _, name, *_, hidden in columns if hidden]
     if computed:
@@ -63,7 +63,7 @@ def _refuse_computed(database: sqlite3.Connection, path: Path, table: str) -> No
 
 
 def messages(path: Path, topics: Sequence[int], losses: list[str]) -> Iterator[tuple[int, int, bytes]]:
-    """Topic, time and bytes of each message of some topics in order of writing; what is lost adds to ``losses``."""
+    """Topic, time and bytes of each message of some topics in order of writing. What is lost adds to ``losses``."""
     if _has_companion(path, "-journal"):
         losses.append(f"{path.name}: its recorder was stopped while it wrote; what it wrote last may be lost")
     read = 0
@@ -81,7 +81,7 @@ def messages(path: Path, topics: Sequence[int], losses: list[str]) -> Iterator[t
 
 
 def damage(path: Path) -> str:
-    """The damage that sqlite finds in the file, or nothing: rows may be missing that reading does not notice."""
+    """The damage that sqlite reports, or nothing. Rows may be missing that reading does not notice."""
     try:
         with closing(_connection(path)) as database:
             (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
@@ -91,7 +91,7 @@ def damage(path: Path) -> str:
 
 
 def _connection(path: Path) -> sqlite3.Connection:
-    """Nothing is written, nor are locks taken, unless there is a log of writes that must be read with it."""
+    """Open read-only and without locks, unless a log of writes must be read with the file."""
     how = "mode=ro" if _has_companion(path, "-wal") else "mode=ro&immutable=1"
     database = sqlite3.connect(f"file:{quote(str(path.absolute()))}?{how}", uri=True)
     database.text_factory = _text
@@ -103,7 +103,7 @@ def _connection(path: Path) -> sqlite3.Connection:
 
 
 def _most(path: Path) -> int:
-    """Bytes of the longest text or blob that the file and its log of writes can hold."""
+    """The length of the longest text or blob that the file and its log can contain."""
     log = path.with_name(path.name + "-wal")
     size = path.stat().st_size + (log.stat().st_size if log.is_file() else 0)
     return min(MOST_BYTES, max(_LEAST_LIMIT, size))

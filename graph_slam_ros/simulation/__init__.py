@@ -23,14 +23,14 @@ from graph_slam_ros.simulation.recording import Recording, measurements, with_cl
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A world: its dataclass of options and the function that drives through it."""
+    """A world: the dataclass of its options, and the function that drives through it."""
 
     options: type
     drive: Callable[[int, Any], Recording]
 
     @property
     def about(self) -> str:
-        """One sentence on it."""
+        """Describe it in one sentence."""
         return (self.drive.__doc__ or "").strip().splitlines()[0]
 
 

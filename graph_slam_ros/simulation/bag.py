@@ -37,7 +37,7 @@ _FIX, _NO_FIX, _GPS, _DIAGONAL_KNOWN = 0, -1, 1, 2
 
 
 def gnss_messages(gnss: Gnss | None) -> Iterator[Message]:
-    """sensor_msgs/NavSatFix in order of stamp; without a fix latitude, longitude and height are NaN."""
+    """sensor_msgs/NavSatFix in order of stamp. Without a fix, latitude, longitude and height are NaN."""
     if gnss is None:
         return
     if gnss.antenna is not None:
@@ -59,7 +59,7 @@ def gnss_messages(gnss: Gnss | None) -> Iterator[Message]:
 
 
 def imu_messages(imu: Imu | None) -> Iterator[Message]:
-    """sensor_msgs/Imu in order of stamp; of rates and accelerations the covariance is unknown."""
+    """sensor_msgs/Imu in order of stamp. The covariances of rates and accelerations are unknown."""
     if imu is None:
         return
     yield _mounted(int(imu.stamps_ns[0]), IMU_FRAME, imu.T_base_imu)
@@ -148,7 +148,7 @@ def _stamp_of(message: Message) -> int:
 
 
 def recorded_names(recording: Recording) -> dict[str, str]:
-    """Return what each landmark goes by in a bag: its id, or where messages hold no names a number."""
+    """Return the name of each landmark in a bag: its id, or a number if the messages have no names."""
     polar = _is_polar(recording)
     return {name: str(k) if polar else name for k, name in enumerate(recording.landmarks)}
 
@@ -177,7 +177,7 @@ def _odometry(recording: Recording, k: int, twist_covariance: Array) -> bytes:
 
 
 def _true_landmarks(recording: Recording, space: Geometry) -> Sightings:
-    """The true map, as sightings from the origin of world."""
+    """The true map, as sightings from the origin of the world."""
     known = []
     for name, at in recording.landmarks.items():
         kind, dof = ("pose", space.dof) if len(at) == space.pose.size else ("position", space.dimensions)
@@ -191,7 +191,7 @@ def _detections(seen: Sightings, frame: str, space: Geometry) -> bytes:
 
 
 def _closures(several: list[Closure], space: Geometry) -> bytes:
-    """The earlier poses of the base, seen from the later: moving a pose by ``d`` moves its inverse by ``-Ad d``."""
+    """Earlier poses of the base relative to the later ones: a motion ``d`` of a pose is ``-Ad d`` of its inverse."""
     head, detections = header(several[0].stamp_ns, "base_link"), []
     for one in several:
         back = space.group.adjoint(one.T_from_base)

@@ -67,22 +67,22 @@ class Draft:
         return len(self.odometry)
 
     def pose_at(self, fraction: float) -> int:
-        """The pose at a part of the whole: 0 the first, 1 the last."""
+        """The pose at a fraction of the drive: 0 is the first, 1 the last."""
         return round(fraction * (len(self) - 1))
 
     def true_id(self, number: int) -> str:
-        """The landmark that a sighting is of, whatever it carries by now."""
+        """The landmark that was really seen, whatever id the sighting has now."""
         wrong = self.wrong.get(("sighting", number))
         return wrong.true_id if wrong else self.sightings[number].id
 
     def spoil(self, number: int, fault: str, sighting: Sighting) -> None:
-        """Put another sighting in the place of one."""
+        """Replace a sighting by a wrong one."""
         before = self.wrong.get(("sighting", number))
         self.wrong["sighting", number] = Wrong(_both(before, fault), self.true_id(number))
         self.sightings[number] = sighting
 
     def spoil_odometry(self, later: Sequence[int], fault: str) -> None:
-        """Say that the motion up to some poses is wrong."""
+        """Mark the motion up to some poses as wrong."""
         for pose in later:
             self.wrong["odometry", pose] = Wrong(_both(self.wrong.get(("odometry", pose)), fault))
 
@@ -98,7 +98,7 @@ class Draft:
         )
 
     def seen_from(self, number: int, displaced: Array) -> Sighting:
-        """A sighting as it would have been, noise and all, had the landmark stood elsewhere.
+        """A sighting as it would have been, with its noise, if the landmark had been elsewhere.
 
         Parameters
         ----------
@@ -128,7 +128,7 @@ def _both(before: Wrong | None, fault: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class WrongMessage:
-    """A line of a recording's table: a message that is wrong, or one of its detections.
+    """A row of a recording's table: a wrong message, or one of its detections.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class WrongMessage:
 
 @dataclass(frozen=True, slots=True)
 class WrongLine:
-    """A line of a graph's table: an edge that is wrong.
+    """A row of a graph's table: a wrong edge.
 
     Attributes
     ----------

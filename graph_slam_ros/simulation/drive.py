@@ -26,14 +26,14 @@ _DOUBLE = 8  # of sensor_msgs/PointField
 
 
 class Message:
-    """One message: when it was recorded, and its object, or its bytes where nobody changes it."""
+    """One message: its receive time, and its object, or its bytes if nothing changes it."""
 
     def __init__(self, topic: str, type_name: str, log_ns: int, content: Any) -> None:
         self.topic, self.type, self.log_ns, self.content = topic, type_name, log_ns, content
 
     @property
     def stamp_ns(self) -> int:
-        """The stamp of its header; of detections, of theirs, too, where it is set."""
+        """The stamp of its header. Setting it also sets the stamps of its detections."""
         stamp = self.content.header.stamp
         return int(stamp.sec * NS + stamp.nanosec)
 
@@ -119,7 +119,7 @@ class Drive:
             m.stamp_ns = stamp_ns
 
     def drop(self, messages: list[Message]) -> None:
-        """Leave some messages out."""
+        """Remove some messages."""
         out = set(map(id, messages))
         self.messages = [m for m in self.messages if id(m) not in out]
 
@@ -130,7 +130,7 @@ class Drive:
         self.messages.insert(0, Message("/tf_static", _TRANSFORMS, first_ns, content))
 
     def write(self, path: Path | str) -> None:
-        """Write the recording as mcap, whole or not at all."""
+        """Write the recording as mcap, completely or not at all."""
         with replaced(Path(path)) as new, BagWriter(new) as bag:
             for m in self.messages:
                 bag.write(m.topic, m.type, m.log_ns, m.content if isinstance(m.content, bytes) else encode(m.content))
@@ -171,13 +171,13 @@ class Sightings:
 
     @property
     def sigmas(self) -> Array:
-        """(k,) The standard deviation of the position along x, or of the range."""
+        """The standard deviation (k,) of the position along x, or of the range."""
         if hasattr(self, "_rows"):
             return np.array(self._column["sigma"])
         return np.array([max(float(one.results[0].pose.covariance[0]), 0.0) ** 0.5 for one in self._content.detections])
 
     def store(self, turn: Array | None = None) -> None:
-        """Write ids and points back; orientations are turned by an orthogonal matrix (3, 3)."""
+        """Write ids and points back. Orientations are turned by an orthogonal matrix (3, 3)."""
         if hasattr(self, "_rows"):
             x, y, z = self.points.T
             self._column["id"][:] = [float(name) for name in self.ids]

@@ -47,7 +47,7 @@ class Closures:
 
 
 def count_for(rate: float, true: int) -> int:
-    """Return how many false closures beside so many true ones are a given part of all: ``p n / (1 - p)``."""
+    """Return the number of false closures that makes up a fraction of all: ``p n / (1 - p)`` for n true ones."""
     return round(rate * true / (1.0 - rate))
 
 
@@ -118,7 +118,7 @@ def _local(rng: Generator, truth: Array, _root: Array, pairs: int) -> tuple[Inde
 
 
 def _aliased(rng: Generator, truth: Array, root: Array, pairs: int) -> tuple[Index, Array]:
-    """The two most alike stretches that do not overlap: the same sight at two places.
+    """The two most similar stretches that do not overlap: the same view at two places.
 
     With W the wrong motion of the second stretch, a pair is measured as ``Ti^-1 W Tj``.
     """
@@ -140,7 +140,7 @@ def _aliased(rng: Generator, truth: Array, root: Array, pairs: int) -> tuple[Ind
 
 
 def _distant_pair(earlier: int, later: int, last: int) -> tuple[int, int]:
-    """Poses that odometry does not join."""
+    """Two poses that no odometry edge joins."""
     if later - earlier >= 2:
         return earlier, later
     return (earlier, earlier + 2) if earlier + 2 <= last else (earlier - 2, earlier)

@@ -28,7 +28,7 @@ from graph_slam_ros.typing import Array, Numbers
 
 
 def faulty_recording(recording: Recording, faults: Sequence[Fault], seed: int) -> tuple[Recording, list[WrongMessage]]:
-    """Put faults into a recording; what is true stays as it was.
+    """Put faults into a recording. The truth stays as it was.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def _recorded_closures(recording: Recording, draft: Draft) -> tuple[tuple[Closur
 
 
 def faulty_graph(file: G2oFile, truth: Array, faults: Sequence[Fault], seed: int) -> tuple[G2oFile, list[WrongLine]]:
-    """Put faults into a graph; its initial values stay as they were.
+    """Put faults into a graph. Its initial values stay as they were.
 
     Poses are taken in order of their ids, as read from a file. Sightings are edges from a pose to a landmark.
 
@@ -136,7 +136,7 @@ def faulty_graph(file: G2oFile, truth: Array, faults: Sequence[Fault], seed: int
 
 
 class _Parts:
-    """A graph's edges by what they are: odometry, sightings, closures, and others, which no fault touches."""
+    """A graph's edges by kind: odometry, sightings, closures, and others, which no fault changes."""
 
     def __init__(self, file: G2oFile, truth: Array) -> None:
         graph = file.graph
@@ -159,7 +159,7 @@ class _Parts:
         self.sightings.sort(key=lambda one: one[:2])
 
     def _landmark_poses(self) -> set[int]:
-        """Vertices that are landmarks though they are poses: what an edge of a class ``landmarks`` leads to."""
+        """Vertices that are landmarks although they are poses: the ends of edges of the class ``landmarks``."""
         table = self.file.graph.tables.get(self.space.relative_pose)
         if table is None or "landmarks" not in self.file.graph.labels:
             return set()
@@ -183,7 +183,7 @@ class _Parts:
             self.sightings.append((self.place[ends[0]], edge, seen))
 
     def draft(self) -> Draft:
-        """Return what faults are put into: odometry as a chain from the origin, closures so that they lead forward."""
+        """Return the draft for the faults: odometry as a chain from the origin, and closures that lead forward."""
         space, group = self.space, self.space.group
         chain: list[Numbers] = [space.identity]
         for k in range(1, len(self.poses)):
@@ -257,7 +257,7 @@ class _Parts:
         return self.truth[self.file.graph.vertex(vertex).stored]
 
     def _step(self, later: int) -> Numbers:
-        """Measured by odometry; where there is none, the true one."""
+        """The motion by odometry; the true one if there is none."""
         group = self.space.group
         if later not in self.odometry:
             earlier, this = (tuple(self._true(int(v)).tolist()) for v in self.poses[later - 1 : later + 1])

@@ -84,7 +84,7 @@ def simulate(seed: int, options: Flight) -> Recording:
 
 
 def _path(options: Flight) -> Array:
-    """Poses (n, 7) at ticks: x ahead along the way, tilted so that the thrust, along z, carries and turns the drone."""
+    """Poses (n, 7) at ticks: x points ahead, and z along the thrust that carries and turns the drone."""
     a, b = 0.5 * options.length_m - MARGIN_M, 0.5 * options.width_m - MARGIN_M
     dt_s = TICK_NS * 1e-9
     rate = SPEED_M_S / np.sqrt(0.5 * (a**2 + b**2))  # of the angle on the ellipse, rad/s
@@ -120,7 +120,7 @@ def _tags(options: Flight) -> dict[str, Numbers]:
 
 
 def _tag(ahead: float, left: float, z: float, heading: float, center: float = 0.0) -> Numbers:
-    """The pose of a tag, from where it is seen along its own heading from a point on the middle line."""
+    """The pose of a tag, relative to a point on the middle line, from which it is seen along its own heading."""
     c, s = float(np.cos(heading)), float(np.sin(heading))
     half = 0.5 * heading
     x, y = center + c * ahead - s * left, s * ahead + c * left

@@ -28,7 +28,7 @@ _STREAM = 1  # of the seed: the drive is the same with and without instruments
 
 @dataclass(frozen=True, slots=True)
 class Instruments:
-    """Options of every world, besides its own: a satellite receiver and an IMU."""
+    """Options of every world in addition to its own: a satellite receiver and an IMU."""
 
     landmarks: bool = option(True, "whether the robot sees landmarks at all")
     gnss: float = option(0.0, "fixes of a satellite receiver, on /gps/fix; 0: there is none", "Hz", 0, 100)
@@ -43,7 +43,7 @@ class Instruments:
 
 
 def with_instruments(recording: Recording, seed: int, options: Instruments) -> Recording:
-    """A recording with what the chosen instruments measure besides, or without landmarks."""
+    """A recording with the measurements of the chosen instruments added, or without landmarks."""
     streams = [Generator(PCG64(SeedSequence(seed, spawn_key=(_STREAM, k)))) for k in range(2)]
     gnss = _gnss(streams[0], recording, options) if options.gnss > 0.0 else None
     imu = _imu(streams[1], recording, options) if options.imu > 0.0 else None
@@ -81,7 +81,7 @@ def _imu(rng: Generator, recording: Recording, options: Instruments) -> Imu:
 
 
 def _second_derivative(positions: Array, dt_s: float) -> Array:
-    """The second derivative of positions (n, 3) over time; its ends have that of their neighbours."""
+    """The second derivative of positions (n, 3) over time. The ends get the values of their neighbours."""
     out = np.zeros_like(positions)
     if len(positions) > 2:
         out[1:-1] = np.diff(positions, 2, axis=0) / dt_s**2
@@ -90,7 +90,7 @@ def _second_derivative(positions: Array, dt_s: float) -> Array:
 
 
 def _true_poses(recording: Recording, rate_hz: float) -> tuple[Stamps, Array]:
-    """Stamps from the first of odometry on, and the true poses (n, 7) then, between two stamps of odometry too."""
+    """Stamps from the first odometry on, and the true poses (n, 7) then, interpolated between stamps of odometry."""
     ticks_ns = recording.stamps_ns
     count = int((ticks_ns[-1] - ticks_ns[0]) * 1e-9 * rate_hz) + 1
     stamps_ns = ticks_ns[0] + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)

@@ -36,7 +36,7 @@ class Manhattan:
 
 
 def stroll(rng: Generator, steps: int, blocks: int) -> tuple[Index, Index]:
-    """A walk along the streets from the city's middle: straight on at half of the crossings, never back, never out.
+    """Walk along the streets from the city's middle: straight on at half of the crossings, never back, never out.
 
     Returns
     -------

@@ -50,7 +50,7 @@ class VelocityNoise:
 
 
 def space_of(pose: Sequence[float] | Array) -> Geometry:
-    """Return where a pose is, by how many numbers it has."""
+    """Return the space of a pose by its number of values."""
     return PLANAR if len(pose) == PLANAR.pose.size else SPATIAL
 
 

@@ -73,7 +73,7 @@ def city_graph(seed: int, **values: float) -> tuple[Graph, Array]:
 def _closures(rng: Generator, cells: Index) -> Index:
     """Pairs (earlier, later), at most one per later pose, chosen evenly among the earlier ones around it.
 
-    While streets are new there is nothing to close; what is owed then is made up for when they are revisited.
+    While streets are new there is nothing to close. The missing closures are added when streets are revisited.
     """
     visits: dict[tuple[int, int], list[int]] = {}
     reach = range(-CLOSURE_RANGE_STEPS, CLOSURE_RANGE_STEPS + 1)
@@ -159,7 +159,7 @@ def landmark_graph(recording: Recording) -> Graph:
 
 
 def _first_seen(graph: Graph, space: Geometry, T_odom_base: Numbers, s: Sighting) -> int:
-    """A vertex for a landmark, where a sighting has it."""
+    """A vertex for a landmark, at its first sighting."""
     group, seen = space.group, s.measured
     if s.kind == "pose":
         return graph.add_vertex(space.pose, group.compose(T_odom_base, seen))
@@ -174,7 +174,7 @@ def _first_seen(graph: Graph, space: Geometry, T_odom_base: Numbers, s: Sighting
 
 
 def write_graph(graph: Graph, path: Path | str) -> None:
-    """Write a graph as g2o at its initial values, with the first vertex held by a FIX line."""
+    """Write a graph as g2o at its initial values. A FIX line holds the first vertex."""
     write_g2o(path, G2oFile(graph, list(range(graph.vertex_count)), [0]), values_of(graph, graph.initial.values))
 
 

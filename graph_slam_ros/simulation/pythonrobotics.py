@@ -30,7 +30,7 @@ class PythonRobotics:
 
 
 def simulate(seed: int, options: PythonRobotics) -> Recording:
-    """Drive in a circle; the noise of a tick is drawn once and acts for the whole tick."""
+    """Drive in a circle. The noise is drawn once for each tick."""
     rng = Generator(PCG64(seed))
     speed, turn, distance, bearing = 0.1, np.deg2rad(10.0), 0.2, np.deg2rad(1.0)
     if options.as_original:

@@ -101,9 +101,9 @@ class Recording:
 
 
 def measurements(recording: Recording) -> Iterator[Odometry | Sightings | Closure]:
-    """Return what ``GraphSlam.process`` takes, in order of stamp, odometry before what was seen at the same stamp.
+    """Return the input of ``GraphSlam.process`` in order of stamp; at one stamp odometry comes first.
 
-    What a satellite receiver or an IMU says is not among it: that becomes a fix at the border, from a bag.
+    Measurements of a satellite receiver or an IMU are not among it: converters make fixes of them, from a bag.
     """
     twist_covariance = tuple(recording.twist_covariance.ravel().tolist())
     seen = {s.stamp_ns: s for s in recording.seen}
@@ -167,14 +167,14 @@ _STREAM = 0
 
 
 def places(poses: Array) -> Index:
-    """Numbers of the poses (n, 3) or (n, 7) at which so much has been driven since the one before, and the first."""
+    """Numbers of the first pose, and of each pose (n, 3) or (n, 7) after a given distance from the one before."""
     steps = np.linalg.norm(np.diff(poses[:, : space_of(poses[0]).dimensions], axis=0), axis=1)
     count = np.floor(np.concatenate([[0.0], np.cumsum(steps)]) / PLACE_M)
     return np.flatnonzero(np.diff(count, prepend=-1.0) > 0.0)
 
 
 def with_closures(recording: Recording, count: int, seed: int) -> Recording:
-    """A recording with so many true closures, evenly among the places that the robot came back to.
+    """Add a number of true closures to a recording, evenly among the revisited places.
 
     Raises
     ------

@@ -102,7 +102,7 @@ def _is_facing(T_world_base: Numbers, tags: Array) -> NDArray[np.bool_]:
 
 
 def _route(options: Warehouse) -> Array:
-    """Waypoints (n, 2): a serpentine for each lap, then along a cross aisle and through the first aisle again."""
+    """Waypoints (n, 2): a serpentine for each lap, then a cross aisle and the first aisle again."""
     south, north = -CROSS_AISLE_M, options.aisle_m + CROSS_AISLE_M
     points = [START[:2]]
     for _ in range(options.laps):
