@@ -35,14 +35,14 @@ class Anchor:
         self._sigmas = np.full(self._space.dof, np.inf)  # along and about the axes of map; infinite: there is none
 
     def begin(self, vertex: int, T_map_base: Numbers) -> Array:
-        """Hold the first keyframe; returns its covariance (dof, dof)."""
+        """Add the prior of the first keyframe. Returns its covariance (dof, dof)."""
         settings = self._config.anchor
         self._sigmas = np.array(self._space.sigmas(settings.sigma_m or _TIGHT, settings.sigma_rad or _TIGHT))
         self._add(vertex, T_map_base, Gaussian.from_sigmas(*self._sigmas))
         return np.diag(np.square(self._sigmas))
 
     def restore(self) -> None:
-        """Go on with the prior of a map that was loaded, if it can still be loosened."""
+        """Continue with the prior of a loaded map, if it can still be loosened."""
         for edge in self._graph.edges_of("anchor").tolist():
             one = self._graph.edge(edge)
             (vertex,) = one.vertices
@@ -54,12 +54,12 @@ class Anchor:
 
     @property
     def is_located(self) -> bool:
-        """Return whether the map lies in the frame of surveys and fixes: by its start, or by one of them."""
+        """Return whether the map is in the frame of surveys and fixes, by its start or by one of them."""
         is_given = self._config.start_pose is not None or self._config.anchor.sigma_m > 0.0
         return is_given or bool((self._sigmas[: self._space.dimensions] > _TIGHT).all())
 
     def align_to_fix(self, m: Fix, T_map_base: Numbers, keyframe: int) -> bool:
-        """Loosen the prior for a fix, if that says more than was known; returns whether the map has moved.
+        """Loosen the prior for a more precise fix. Returns whether the map has moved.
 
         Parameters
         ----------
@@ -89,7 +89,7 @@ class Anchor:
     # -- how far ---------------------------------------------------------------------------------------------------
 
     def _looser(self, wanted: Array) -> Array | None:
-        """Sigmas (dof,) with all that is wanted; None where nothing changes."""
+        """Sigmas (dof,) with the wanted ones added; None if nothing changes."""
         settings, n = self._config.anchor, self._space.dimensions
         if self._config.start_pose is not None:  # somebody has said roughly where the robot starts
             roughly = self._config.initialpose
@@ -103,7 +103,7 @@ class Anchor:
         return np.array([_UNCERTAIN_M] * n + [_TILT_RAD] * (angles - 1) + [_UNCERTAIN_RAD])
 
     def _determined_by(self, m: Fix) -> Array:
-        """The sigmas (dof,) that a fix determines, by its kind; zero where it says nothing."""
+        """The sigmas (dof,) that a fix determines, by its kind; zero for those that it does not."""
         space, n = self._space, self._space.dimensions
         out = self._position()
         match m.kind:
@@ -123,7 +123,7 @@ class Anchor:
     # -- the map moves ---------------------------------------------------------------------------------------------
 
     def _onto_fix(self, m: Fix, T_map_base: Numbers) -> Numbers:
-        """``T_new_old`` of a map that agrees with the fix, as far as that says anything."""
+        """``T_new_old`` of a map that agrees with the fix, in the directions that the fix determines."""
         space, group, n = self._space, self._space.group, self._space.dimensions
         if m.kind == "pose":
             return _floats(group.compose(m.measured, group.inverse(T_map_base)))
@@ -143,14 +143,14 @@ class Anchor:
         return (*map(float, shift), *self._space.identity[self._space.dimensions :])
 
     def _turned(self, turn: Numbers) -> Numbers:
-        """About where the map begins."""
+        """The rotation about the first keyframe, as a motion of the map."""
         n = self._space.dimensions
         at = self._backend.solver.estimate([self._vertex])[0, :n]
         there = np.array(self._space.group.act(turn, tuple(at.tolist())))
         return (*map(float, at - there), *turn[n:])
 
     def _move(self, T_new_old: Numbers, sigmas: Array, keyframe: int) -> bool:
-        """Move the map, unless somebody has said where it begins, and put a looser prior in the place of the old."""
+        """Move the map, unless its start is given, and replace the prior by a looser one."""
         moves = self._config.start_pose is None
         if moves:
             self._backend.move(T_new_old, self._space)

@@ -31,7 +31,7 @@ _UPDATES = 6  # until what was let in fits, before everything is solved for it
 
 
 class Backend:
-    """Solves what is added to ``graph``, keyframe by keyframe, and keeps the verdicts on its edges.
+    """Solves the additions to ``graph`` keyframe by keyframe, and owns the verdicts on its edges.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Backend:
 
     @property
     def decides(self) -> bool:
-        """Return whether anything is held back and taken out at all."""
+        """Return whether outlier rejection is on."""
         return self._config.decide
 
     @property
@@ -88,7 +88,7 @@ class Backend:
         return self.decisions.ledger
 
     def restore(self, vertices: Sequence[int], values: Array, held: tuple[int, int] = (0, 0)) -> Report:
-        """Solve all that is believed in a graph that was taken over: some of its vertices, from some values.
+        """Solve all accepted edges of a loaded graph: some of its vertices, from given values.
 
         Parameters
         ----------
@@ -110,7 +110,7 @@ class Backend:
         return report
 
     def hold_map(self) -> None:
-        """Keep all vertices of now where they are, and the verdicts on all edges of now."""
+        """Fix all present vertices, and the verdicts on all present edges."""
         self.hand_over()
         self._background.cancel(self.ledger.outside_count)
         self._hold(self.graph.vertex_count, len(self.ledger))
@@ -123,14 +123,14 @@ class Backend:
         self.ledger.finish(edges)
 
     def release_map(self) -> None:
-        """Undo ``hold_map``: everything but a frozen map is estimated again."""
+        """Undo ``hold_map``. A frozen map stays fixed."""
         held, self.held = self.solver.held, (0, 0)
         self.solver.release(held[held >= self.frozen])
         self.ledger.finish(self.frozen_edges)
         self._background.cancel(self.ledger.outside_count)
 
     def hand_over(self) -> None:
-        """Give the solver what is new in the graph."""
+        """Pass new vertices and edges to the solver."""
         vertices, edges = self.handed_over
         if (vertices, edges) == (self.graph.vertex_count, self.graph.edge_count):
             return
@@ -138,13 +138,13 @@ class Backend:
         self.handed_over = self.graph.vertex_count, self.graph.edge_count
 
     def gate_new(self, keyframe: int) -> None:
-        """Judge what is new by its own noise; what does not fit waits until it is compared with all else."""
+        """Judge new edges by their own noise. Those that do not fit are held back for a comparison with all others."""
         self.hand_over()
         new = self.decisions.gate_new(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
         self._pending = [*self._pending, *new][-_MAX_PENDING:]
 
     def update(self, keyframe: int) -> None:
-        """Take in what is new and believed, then what is believed of the rest."""
+        """Solve with the new accepted edges, then judge the held-back ones."""
         self.gate_new(keyframe)
         if self.holds_back:
             self.solver.update()
@@ -162,7 +162,7 @@ class Backend:
             self._background.start(self._frozen(keyframe, self.solver.settings), out)
 
     def optimize(self, keyframe: int, settings: Settings) -> Report:
-        """Solve everything, and have a second look at all that was decided."""
+        """Solve everything, and search for a better explanation."""
         self.gate_new(keyframe)
         report = self.solver.optimize(settings)
         if not self._config.decide or self.holds_back:
@@ -178,7 +178,7 @@ class Backend:
         return report
 
     def scale_noise(self, keyframes: StampedPoses[Keyframe], everything: Settings | None) -> Report | None:
-        """Estimate the scale of the noise where that is due, and solve with it; returns the last report of a solve.
+        """Estimate the scale of the noise if that is due, and solve with it. Returns the last report of a solve.
 
         It is due at 50 keyframes, 100, 200 and so on, and when everything is solved.
         """
@@ -206,7 +206,7 @@ class Backend:
         return report if everything else None
 
     def noise_scale(self, keyframes: StampedPoses[Keyframe]) -> list[NoiseScale]:
-        """The scale of the noise at the present estimate; nothing is changed."""
+        """Estimate the scale of the noise without changing anything."""
         stamps = np.zeros(self.graph.vertex_count, dtype=np.int64)
         stamps[keyframes.ids] = keyframes.stamps_ns
         edges = range(self._first_free_edge, self.handed_over[1])
@@ -220,7 +220,7 @@ class Backend:
     def trial_problem(
         self, space: Geometry, path: KeyframeList, origins: SightingEdges, settings: Settings | None = None
     ) -> TrialProblem:
-        """A copy of the present problem for a trial fit: sightings that are out are in, under their loss."""
+        """A copy of the present problem for a trial fit. Rejected sightings are included, under their loss."""
         graph, solver, out = self.graph.copy(), self.solver, self.ledger.outside
         graph.set_weights(out[graph.has_label(out, ("landmarks",))], 1.0)
         keyframes = path.keyframes.ids.copy(), path.keyframes.stamps_ns.copy(), tuple(path.segments)
@@ -228,11 +228,11 @@ class Backend:
         return TrialProblem(space, graph, *problem, origins.copy(), *keyframes, self._first_free_edge)
 
     def cancel_search(self) -> None:
-        """Drop a second look under way: all was reviewed."""
+        """Cancel a running search, because everything was reviewed."""
         self._background.cancel(self.ledger.outside_count)
 
     def move(self, T_new_old: Numbers, space: Geometry) -> None:
-        """Move everything rigidly, what a second look works on besides: that is dropped."""
+        """Move everything rigidly. A running search is cancelled."""
         values, graph = self.solver.values, self.graph
         for kind in (space.pose, space.point):
             if kind not in graph.kinds:
@@ -245,7 +245,7 @@ class Backend:
         self._background.cancel(self.ledger.outside_count)
 
     def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
-        """Take edges out for good."""
+        """Remove edges permanently."""
         self.decisions.withdraw(edges, keyframe, reason)
         self._pending = [edge for edge in self._pending if edge not in edges]
         self.rivals = self._standing(self.rivals)
@@ -258,9 +258,9 @@ class Backend:
         found: DisplacementHypothesis,
         keyframe: int,
     ) -> int:
-        """Begin a segment in the past: of odometry nearly nothing is believed there, of the landmarks what fits.
+        """Begin a segment in the past: odometry there gets next to no weight, and sightings are judged anew.
 
-        Returns the edge that stands in odometry's place.
+        Returns the edge that replaces odometry's.
 
         Parameters
         ----------
@@ -280,7 +280,7 @@ class Backend:
         return edge
 
     def rejoin(self, link: int, replacement: int, values: Array, found: DisplacementHypothesis, keyframe: int) -> None:
-        """Undo ``split``: odometry's edge is in again, that in its place is out, all else is judged by how it fits.
+        """Undo ``split``: odometry's edge is accepted again, its replacement is rejected, all others are judged anew.
 
         Parameters
         ----------
@@ -299,7 +299,7 @@ class Backend:
         self._make_fit(list(found.fitting), keyframe)
 
     def _admit(self, keyframe: int) -> None:
-        """Compare with all that is known what has come and does not fit by itself."""
+        """Judge held-back edges by the joint covariance of the estimate."""
         pending = [edge for edge in self._pending if not self.ledger.is_inside(edge)]
         admitted = self.decisions.admit_compatible(pending, keyframe)
         self._pending = []
@@ -307,10 +307,10 @@ class Backend:
             self._make_fit(admitted, keyframe)
 
     def _make_fit(self, admitted: Sequence[int], keyframe: int) -> None:
-        """Solve until what was let in against appearances fits; what does not in the end is out again.
+        """Solve until edges that were accepted despite a bad fit do fit. Those that still do not are rejected.
 
-        Its loss lets go of what is far off. Only where nothing has told yet how good odometry is may it pull with all
-        its weight: later that would bend the map for whatever is false and just possible.
+        Their loss lets go of large residuals. Only while the accuracy of odometry is unknown may they have their full
+        weight, because later that would bend the map for false edges that are barely possible.
         """
         before = self.solver.values
         for _ in range(_UPDATES):
@@ -332,7 +332,7 @@ class Backend:
         return self.solver.evaluate().cost_final > self.solver.evaluate(at=before).cost_final
 
     def _guarded(self, search: Work) -> Outcome | None:
-        """The outcome of a search; None where it failed, which changes nothing."""
+        """The outcome of a search; None if it failed, which changes nothing."""
         try:
             with failed_edges():  # of another estimate: nothing is withdrawn for it
                 return search()
@@ -341,7 +341,7 @@ class Backend:
             return None
 
     def _adopt(self, outcome: Outcome, keyframe: int) -> bool:
-        """Take over what a second look has found; whether that is other than what was known."""
+        """Use the outcome of a search. Returns whether it differs from the present verdicts."""
         self.rivals = self._standing(outcome.rivals)
         if not self.decisions.adopt_verdicts(outcome.ledger, keyframe):
             return False
@@ -349,7 +349,7 @@ class Backend:
         return True
 
     def _standing(self, rivals: Sequence[Alternative]) -> tuple[Alternative, ...]:
-        """Explanations of which nothing was withdrawn."""
+        """Explanations of which no edge was withdrawn."""
         reason = self.ledger.reason.values
         return tuple(one for one in rivals if not np.isin(reason[list(one.only_here)], FINAL).any())
 

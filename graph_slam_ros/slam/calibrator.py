@@ -35,7 +35,7 @@ Trial = Callable[[], "TrialFit | None"]
 
 
 class Calibrator:
-    """Decides when parameters are fitted, and takes over what is found.
+    """Decides when parameters are fitted, and applies the findings.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Calibrator:
             self._admitted = {Parameter(*key) for key in start.calibration}
 
     def after_solve(self, keyframe: int, everything: Settings | None) -> Report | None:
-        """Begin a trial where it is due, and take over the outcome of one; returns the report of a solve."""
+        """Start a trial if it is due, and apply the outcome of an earlier one. Returns the report of a solve."""
         if not self._config.calibrate.is_on or self._backend.holds_back:
             return None
         if everything is not None:
@@ -115,7 +115,7 @@ class Calibrator:
     # -- taking over -------------------------------------------------------------------------------------------------
 
     def _adopt(self, found: TrialFit | None, keyframe: int, everything: Settings | None) -> Report | None:
-        """Take over what a trial has found; None where that is nothing."""
+        """Apply the findings of a trial; None if there are none."""
         if found is None:
             return None
         self.trials += 1
@@ -135,7 +135,7 @@ class Calibrator:
         return sum(not mark.is_tentative for mark in self._landmarks.known.values())
 
     def _correct(self, values: Values, keyframe: int, everything: Settings | None) -> Report | None:
-        """Correct all measurements, those that come included, and solve; what fails is undone."""
+        """Correct all measurements, present and future, and solve. A failure is undone."""
         backend, corrections = self._backend, self._frontend.corrections
         before, start = dict(corrections.found), backend.solver.values
         changes, origins = self._changes(values)
@@ -162,7 +162,7 @@ class Calibrator:
         return report
 
     def _changes(self, values: Values) -> "tuple[list[Recalibration], list[tuple[Index, Index, Array]]]":
-        """Return what all edges will have measured, and the origins of sightings by then."""
+        """Return the corrected measurements of all edges, and the corrected origins of sightings."""
         problem = self._problem()
         model, path = problem.model(), problem.path(problem.values)
         changes, origins = [], []
@@ -190,7 +190,7 @@ class Calibrator:
     # -- what it says ------------------------------------------------------------------------------------------------
 
     def summary(self) -> dict[str, Any]:
-        """Return what was found, for a person and for programs; empty where nothing is calibrated."""
+        """Return the findings, for a person and for programs; empty if nothing is calibrated."""
         if not self._config.calibrate.is_on and not self._frontend.corrections.found:
             return {}
         corrections = self._frontend.corrections
@@ -214,7 +214,7 @@ def _add(found: dict[tuple[str, str], float], key: tuple[str, str], value: float
 
 
 def _rounded(value: float) -> float:
-    """A value with six digits: the last ones of a sine depend on where in memory an array is."""
+    """A value with six digits, because the last ones of a sine depend on the memory alignment of an array."""
     return float(f"{value:.6g}")
 
 

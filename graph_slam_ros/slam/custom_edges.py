@@ -25,10 +25,10 @@ _LABEL = "custom"
 
 
 class CustomEdges:
-    """Adds custom edges to the graph, and withdraws those at which their plugin fails.
+    """Adds custom edges to the graph, and withdraws those on which their plugin fails.
 
-    The poses of an edge are those of the robot at the stamps of the measurement: the motion from the keyframe before is
-    part of what is measured, and its noise is added.
+    The poses of an edge are those of the robot at the stamps of the measurement. The motion from the keyframe before is
+    part of the measurement, and its noise is added.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class CustomEdges:
         frontend.custom_noise_dominates = self._motion_dominates
 
     def add(self, m: CustomEdge) -> None:
-        """Add an edge; what cannot be used is counted.
+        """Add an edge. One that cannot be used is counted.
 
         Raises
         ------
@@ -83,7 +83,7 @@ class CustomEdges:
         self._counters.used[m.topic] += 1
 
     def withdraw(self, failed: Iterable[FailedEdge], keyframe: int) -> bool:
-        """Withdraw edges at which their plugin has failed during a solve; returns whether there were any."""
+        """Withdraw edges on which their plugin failed during a solve. Returns whether there were any."""
         found = {edge: one.fault for one in failed for edge in self._edges_of(one)}
         for edge, fault in found.items():
             source = self._backend.graph.source_of(edge)
@@ -98,7 +98,7 @@ class CustomEdges:
         self._counters.count(topic, "plugin_failed")
 
     def _edges_of(self, failed: FailedEdge) -> list[int]:
-        """The edges of the graph that a failure is of, without those that were withdrawn."""
+        """The edges of the graph that caused a failure, without withdrawn ones."""
         graph, ledger = self._backend.graph, self._backend.ledger
         table = graph.tables.get(map_edge_of(failed.tag))
         if table is None:
@@ -116,7 +116,7 @@ class CustomEdges:
     # -- vertices ------------------------------------------------------------------------------------------------
 
     def _begin_surveyed(self, m: CustomEdge, name: str) -> None:
-        """Begin a landmark at its surveyed place, where the map lies in the frame of the survey already."""
+        """Begin a landmark at its surveyed place, if the map is in the frame of the survey."""
         known = self._config.survey.get(name)
         if known is None or name in self._landmarks.known or not self._landmarks.begins_new:
             return
@@ -126,7 +126,7 @@ class CustomEdges:
             self._landmarks.begin_surveyed(m.topic, name, m.stamp_ns)
 
     def _unusable(self, m: CustomEdge, edge: EdgeType) -> str:
-        """Return why the ends of an edge cannot be used; empty where they can."""
+        """Return why the ends of an edge cannot be used; empty if they can."""
         reason = ""
         for end, kinds in zip(m.ends, edge.accepts, strict=True):
             landmark = self._landmarks.known.get(end) if isinstance(end, str) else None
@@ -139,7 +139,7 @@ class CustomEdges:
         return reason
 
     def _poses(self, m: CustomEdge) -> dict[int, PoseAtStamp]:
-        """The pose of the robot at each slot that has one."""
+        """The pose of the robot for each end that has one."""
         where = self._frontend.path.where
         return {slot: where(end) for slot, end in enumerate(m.ends) if isinstance(end, int)}
 
@@ -178,7 +178,7 @@ class CustomEdges:
         return out
 
     def _motion_dominates(self, m: CustomEdge, where: PoseAtStamp, most: float) -> bool:
-        """Return whether that is more than a part of the variance of any number of the residual."""
+        """Return whether it exceeds a fraction of the variance of any number of the residual."""
         edge, measured = edge_type_of(m)
         poses = {slot: pose for slot, pose in self._poses(m).items() if m.ends[slot] == where.stamp_ns}
         vertices = self._vertices(m, self._poses(m))

@@ -27,14 +27,14 @@ _TRIALS = 30  # solves in search of what is to blame
 
 @dataclass(frozen=True, slots=True)
 class _Suspect:
-    """Edges that are in or out together: one, or all of a landmark that is new."""
+    """Edges that are accepted or rejected together: one, or all of a new landmark."""
 
     edges: tuple[int, ...]
     landmark: int | None = None
 
 
 class FailureGuard:
-    """Has a back-end solved, and sees to it that its estimate is always one that is good.
+    """Runs solves of a back-end, and restores the last good estimate after a failure.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class FailureGuard:
         self._in_a_row = 0  # failures since
 
     def solve(self, work: Callable[[], Result], keyframe: int) -> Result | None:
-        """Solve by ``work`` and return its result; None where it fails, or gives what cannot be."""
+        """Solve by ``work`` and return its result; None if it fails, or if its result is impossible."""
         try:
             return self._done(lambda: self._damped(work))
         except Exception as error:
@@ -65,22 +65,22 @@ class FailureGuard:
             return None
 
     def note_good(self) -> None:
-        """The present estimate is one to come back to."""
+        """Remember the present estimate as good."""
         self._good, self._good_vertices = self._solver.values, self._graph.vertex_count
         self._good_edges, self._in_a_row, self.failing = self._graph.edge_count, 0, ""
 
     def note_moved(self) -> None:
-        """The map was moved rigidly: so is the estimate to come back to."""
+        """Move the remembered estimate with the map."""
         self._good = self._solver.values[: len(self._good)]
 
     def go_back(self) -> None:
-        """Have the last good estimate, in a solver that is made anew."""
+        """Return to the last good estimate, in a new solver."""
         self._solver.start_at(self._last_good())
         with suppress(Exception):  # e.g. no memory for it: the estimate is good without
             self._solver.rebuild()
 
     def _damped(self, work: Callable[[], Result]) -> Result:
-        """Work; where its steps overshoot since much turns, once more from a damped solve of everything."""
+        """Run the work. If its steps overshoot, repeat it after a damped solve of everything."""
         done = work()
         try:
             self._refuse_absurd()
@@ -104,7 +104,7 @@ class FailureGuard:
         self._drop_unmeasured()
 
     def _drop_unmeasured(self) -> None:
-        """Take out vertices that a fault parted from the edges they were added for: nothing tells where they are."""
+        """Remove vertices that lost their edges by a fault, and are undetermined."""
         vertices = self._solver.vertices
         unmeasured = set(vertices[vertices >= self._good_vertices].tolist())
         for edge in range(self._good_edges, self._graph.edge_count):
@@ -114,13 +114,13 @@ class FailureGuard:
         self._on_gone(unmeasured)
 
     def _last_good(self) -> Array:
-        """The last good estimate; newer vertices are where they were initialised."""
+        """The last good estimate, with newer vertices at their initial values."""
         out: Array = self._graph.initial.values.copy()
         out[: len(self._good)] = self._good
         return out
 
     def _refuse_absurd(self) -> None:
-        """Raise where the estimate is no number, or far from the last and explains the measurements far worse."""
+        """Raise if the estimate is not finite, or far from the last one with a much worse fit."""
         values, before = self._solver.values, self._last_good()
         if not np.isfinite(values).all():
             raise DivergedError("the estimate is not finite")
@@ -136,7 +136,7 @@ class FailureGuard:
     # -- quarantine --------------------------------------------------------------------------------------------------
 
     def _quarantine(self, keyframe: int) -> bool:
-        """Take out for good without what it can be solved, of the candidates that are new; whether it can."""
+        """Remove new candidates permanently without which the problem can be solved. Returns whether it can."""
         suspects = self._suspects()
         self._exclude(suspects)
         if not self._is_solvable():
@@ -164,14 +164,14 @@ class FailureGuard:
         return list(found.values())
 
     def _new_landmark_of(self, edge: int) -> int | None:
-        """A landmark that a custom edge has and the last good estimate has not."""
+        """A landmark of a custom edge that the last good estimate lacks."""
         one = self._graph.edge(edge)
         new = [vertex for vertex in one.vertices if vertex >= self._good_vertices]
         landmarks = [vertex for vertex in new if self._graph.kind_of(vertex) not in GROUPS]
         return landmarks[0] if one.label == "custom" and landmarks else None
 
     def _to_blame(self, suspects: list[_Suspect]) -> list[_Suspect]:
-        """The suspects that are out and that cannot come back, half by half; the others are in again."""
+        """The suspects that must stay rejected, found by halving. The others are accepted again."""
         blamed, groups = list[_Suspect](), [suspects] if suspects else []
         for _ in range(_TRIALS):
             if not groups:

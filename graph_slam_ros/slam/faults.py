@@ -6,7 +6,7 @@ from graph_slam_ros.measurements.counters import Counters
 
 
 class Faults:
-    """Context that collects what is raised in it: one fault costs its own measurement, step or sighting only."""
+    """Context that collects exceptions, so that a fault loses only its own measurement, step or sighting."""
 
     def __init__(self, counters: Counters) -> None:
         self._counters = counters
@@ -23,7 +23,7 @@ class Faults:
         return False
 
     def raise_first(self) -> None:
-        """Raise the first fault, which the caller counts; the others are counted here."""
+        """Raise the first exception, which the caller counts. The others are counted here."""
         if self._faults:
             (first, *others), self._faults = self._faults, []
             for error in others:

@@ -99,13 +99,13 @@ class GraphSlam(MapView):
 
     @property
     def processed(self) -> int:
-        """The number of measurements and control events that were handed over."""
+        """The number of processed measurements and control events."""
         return self._updates.begun
 
     def process(self, measurement: Measurement) -> Update:
-        """Process one measurement or control event; returns what it changed.
+        """Process one measurement or control event. Returns the changes.
 
-        Of several faults the first is raised when all else was used; the others are counted.
+        Of several exceptions the first is raised after everything else was processed; the others are counted.
         """
         self._sink(measurement)
         self._updates.begin()
@@ -136,7 +136,7 @@ class GraphSlam(MapView):
                 self._on_step(step)
 
     def _on_step(self, step: Step) -> None:
-        """Integrate odometry, use the observations that it reaches, and add a keyframe where one is due."""
+        """Integrate odometry, use the observations that it has reached, and add a keyframe if one is due."""
         frontend = self._frontend
         self._add_assigned(self._landmarks.travel(step))
         if not self.keyframes:
@@ -161,7 +161,7 @@ class GraphSlam(MapView):
                 self._on_observation(m)
 
     def _on_observation(self, m: Observation) -> None:
-        """Pass an observation through the gates, and add what it measured from the keyframe before it."""
+        """Pass an observation through the gates, and add it to the keyframe before it."""
         admitted = self._frontend.gates.admit(m) if self._frontend.pending.is_reached(m) else None
         if admitted is None:
             return
@@ -183,7 +183,7 @@ class GraphSlam(MapView):
         self._add_assigned(self._landmarks.identified(m, where))
 
     def _add_assigned(self, sightings: Iterable[Assigned]) -> None:
-        """Add sightings of landmarks; the first of a surveyed landmark locates the map."""
+        """Add sightings of landmarks. The first one of a surveyed landmark locates the map."""
         for one in sightings:
             with self._faults:
                 found = self._landmarks.map.survey_of(one.name, one.sighting, one.where)
@@ -207,7 +207,7 @@ class GraphSlam(MapView):
             self._solve()
 
     def _solve(self, everything: Settings | None = None) -> None:
-        """Solve for what is new, or everything; where that fails the last estimate stays, and it is counted."""
+        """Solve the new part, or everything. After a failure, which is counted, the last estimate stays."""
         if self.keyframes:
             count = len(self.keyframes)
             with failed_edges() as failed:
@@ -261,7 +261,7 @@ class GraphSlam(MapView):
                 self.restart()
 
     def restart(self) -> None:
-        """Go back to the last good estimate, after a fault outside."""
+        """Return to the last good estimate after an exception outside."""
         self._solution.go_back()
 
     def _set(self, values: dict[str, Value]) -> None:
@@ -273,7 +273,7 @@ class GraphSlam(MapView):
             self._hold_map(self.config.map.localize)
 
     def _hold_map(self, is_held: bool) -> None:
-        """Begin or end localization: the map of now stays, and the pose's covariance adds to the next odometry edge."""
+        """Begin or end localization: the map is fixed, and the pose's covariance adds to the next odometry edge."""
         if is_held:
             self._solve(self.config.solver_settings())
             self._frontend.held_covariance = self.pose_covariance if self.keyframes else None
@@ -285,7 +285,7 @@ class GraphSlam(MapView):
         self._solution.guard.note_good()
 
     def _restore(self, start: MapSnapshot) -> None:
-        """Solve a loaded map; the robot's pose in it is still unknown."""
+        """Solve a loaded map. The robot's pose in it is not known yet."""
         frontend, localizes = self._frontend, self.config.map.localize
         if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")

@@ -58,28 +58,28 @@ class MapSnapshot:
 
     @property
     def noise_changes(self) -> tuple[Rescaling, ...]:
-        """None: the edges are as they were read."""
+        """None, because the edges are as they were read."""
         return ()
 
     @property
     def recalibrations(self) -> tuple[Recalibration, ...]:
-        """None: the edges are as they were read."""
+        """None, because the edges are as they were read."""
         return ()
 
     @property
     def frozen_edges(self) -> int:
-        """Verdicts of the first so many edges stay."""
+        """The number of edges whose verdicts are final."""
         return self.ledger.final
 
     @property
     def vertices(self) -> list[int]:
-        """The vertices of the problem; the others were of landmarks that were given up."""
+        """The vertices of the problem. The others belonged to removed landmarks."""
         poses = {one.vertex for one in self.keyframes}
         points = {mark.vertex for mark in self.landmarks.values()}
         return sorted(poses | points | {*self.range_offsets.values()})
 
     def freeze(self) -> None:
-        """Have all of it stay as it is; what is too new to be believed is given up first.
+        """Fix everything. Landmarks that are too new are removed first.
 
         All of its edges must have been judged.
         """
@@ -101,5 +101,5 @@ class MapSnapshot:
 
     @property
     def landmark_changes(self) -> int:
-        """Each is one."""
+        """The number of landmarks, each of which is one change."""
         return len(self.landmarks)

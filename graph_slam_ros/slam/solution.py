@@ -18,7 +18,7 @@ _BLAMED = 5  # edges that are named as the cause of a correction
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """The correction of a solve: how far it moved map -> odom, and what new edges, odometry apart, it had to reconcile.
+    """The correction of a solve: the motion of map -> odom, and the new edges, odometry excepted, that caused it.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Solved:
 
 
 class Solution:
-    """The outcome of the last solve, and what is unsolved since.
+    """The outcome of the last solve, and the unsolved additions since.
 
     Attributes
     ----------
@@ -83,27 +83,27 @@ class Solution:
         return out
 
     def begin(self, newest: Keyframe, keyframes: int) -> None:
-        """The map begins, with so many keyframes."""
+        """Begin the map with a number of keyframes."""
         self._T_map_odom, self._keyframes = self.T_map_odom(newest), keyframes
 
     def restore(self, report: Report, newest: Keyframe, keyframes: int) -> None:
-        """A map was solved that was loaded."""
+        """Note that a loaded map was solved."""
         self.guard.note_good()
         self.report = report
         self.vertices, self._edges = self._backend.handed_over
         self.begin(newest, keyframes)
 
     def go_back(self) -> None:
-        """Take the last good estimate; it is not that of all edges."""
+        """Use the last good estimate, which does not include all edges."""
         self.guard.go_back()
         self.vertices = 0
 
     def is_due(self, keyframes: int, every_keyframes: int) -> bool:
-        """Return whether there is enough that is unsolved."""
+        """Return whether enough is unsolved."""
         return keyframes - self._keyframes + self.resting >= every_keyframes
 
     def solve(self, work: Callable[[], Solved], newest: Keyframe, keyframes: int) -> Solved | None:
-        """Solve by some work; None where that fails: the last estimate stays, and it is counted."""
+        """Solve by some work; None if it fails. A failure is counted, and the last estimate stays."""
         self._keyframes, self.resting, self.vertices = keyframes, 0, 0
         solved = self.guard.solve(work, keyframes - 1)
         if solved is None:
@@ -115,14 +115,14 @@ class Solution:
         return solved
 
     def fits(self) -> list[tuple[float, int]]:
-        """(chi2 per number measured, edge) of the new edges that fit least: what may move the map."""
+        """(chi2 per degree of freedom, edge) of the new edges with the worst fit, which may move the map."""
         edges = range(self._edges, self._backend.handed_over[1])
         chi2, numbers = self._backend.solver.chi2_of(edges)
         fit = chi2 / numbers
         return [(float(fit[k]), edges[k]) for k in np.argsort(-fit, kind="stable")[:_BLAMED].tolist()]
 
     def _note_correction(self, fits: list[tuple[float, int]], newest: Keyframe) -> None:
-        """Against where the robot would be by the last solve and its odometry."""
+        """Note the difference to the pose by the previous solve and its odometry."""
         group = self._space.group
         before, self._T_map_odom = self._T_map_odom, self.T_map_odom(newest)
         moved = group.between(group.compose(before, newest.T_odom_base), self.pose(newest.vertex))

@@ -54,7 +54,7 @@ NOTHING = Update()
 
 
 class UpdateLog:
-    """Makes each update of the difference to the one before.
+    """Makes each update from the difference to the previous one.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class UpdateLog:
         self._alarms, self._corrections = view.alarms, len(view.corrected)
 
     def begin(self) -> None:
-        """The next update begins here."""
+        """Mark the start of the next update."""
         view = self._view
         self.begun += 1
         self._keyframes, self._edges = len(view.keyframes), view.backend.handed_over[1]

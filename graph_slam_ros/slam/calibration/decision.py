@@ -26,7 +26,7 @@ Verdict = Literal["admitted", "nothing_to_correct", "not_determined", "not_repro
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The result of a trial fit for one parameter, judged.
+    """The judged result of a trial fit for one parameter.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Finding:
 
     @property
     def is_determined(self) -> bool:
-        """Return whether the drive tells the parameter."""
+        """Return whether the drive determines the parameter."""
         return self.verdict in ("admitted", "nothing_to_correct")
 
 
@@ -60,13 +60,13 @@ def decide(found: TrialFit, landmarks: int, corrected: Collection[Parameter] = (
 
 
 def amount(parameter: Parameter, value: float, digits: int = 2) -> str:
-    """A number of a parameter in its unit."""
+    """A value of a parameter in its unit, as text."""
     quantity = parameter.quantity
     return f"{value * quantity.shown:.{digits}g}{' ' * bool(quantity.unit)}{quantity.unit}"
 
 
 def _void(found: TrialFit, landmarks: int) -> str:
-    """Return why nothing of a fit is believed; empty where it may be."""
+    """Return why a whole fit is not used; empty if it may be."""
     if landmarks < LEAST_LANDMARKS:
         return f"{landmarks} landmarks were seen, it needs {LEAST_LANDMARKS}"
     if found.lost > MOST_LOST:
@@ -105,5 +105,5 @@ def _verdict(found: TrialFit, k: int, void: str, is_corrected: bool) -> tuple[Ve
 
 
 def _agree(first: float, second: float) -> bool:
-    """Return whether each half's estimate lowers the cost of the other, a parabola around its own."""
+    """Return whether each half's estimate lowers the cost of the other half, taken as a parabola."""
     return 0.0 < first / second < 2.0 and 0.0 < second / first < 2.0 if first and second else False

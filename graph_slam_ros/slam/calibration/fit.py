@@ -73,7 +73,7 @@ class TrialFit:
         return float(self.values[self.parameters.index(parameter)]) if parameter in self.parameters else 0.0
 
     def worst_correlation(self, k: int) -> tuple[float, Parameter | None]:
-        """The largest correlation of a parameter with another, and that other."""
+        """The largest correlation of a parameter with another one, and that one."""
         row = np.abs(self.correlation[k])
         row[k] = 0.0
         other = int(row.argmax())
@@ -81,7 +81,7 @@ class TrialFit:
 
 
 def fit(problem: TrialProblem, priors: Mapping[Parameter, float], start: Values | None = None) -> TrialFit:
-    """Fit parameters together with all unknowns of a graph; begin at its estimate.
+    """Fit parameters together with all unknowns of a graph, starting at its estimate.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class _Fit:
         self._linear = Linearization(problem, self._parameters, self._free)
 
     def run(self, start: Values) -> TrialFit:
-        """Iterate until the parameters stand still."""
+        """Iterate until the parameters converge."""
         x, theta = self._p.values.copy(), np.array([start.get(p, 0.0) for p in self._parameters])
         stages = self._p.settings.stages()
         for k in range(_ITERATIONS):
@@ -123,11 +123,11 @@ class _Fit:
         return self._outcome(x, theta, self._linear.rows(x, theta, stages[-1]))
 
     def _information(self, rest: Array) -> Array:
-        """Return the information on the parameters, all else marginalised, with their priors."""
+        """Return the information of the parameters with all else marginalised, priors included."""
         return np.asarray(rest.T @ rest + np.diag(self._priors**-2.0))
 
     def _stride(self, move: Array, step: Array) -> float:
-        """The part of a step that is not too long for the linearisation."""
+        """The fraction of a step within the range of the linearisation."""
         graph, lengths = self._p.graph, self._p.space.dimensions
         largest = float(np.abs(step).max(initial=0.0)) / _STRIDE
         for kind, _, steps in self._steps(graph, move):
@@ -163,7 +163,7 @@ class _Fit:
         return TrialFit(self._parameters, theta, self._priors, covariance, robust, first, second, lost, x)
 
     def _meat(self, scores: Array, rows: Rows) -> Array:
-        """The larger one, by its trace, of the scatter of scores by landmark and by half a minute."""
+        """The scatter of scores, grouped by landmark or by half a minute, whichever is larger relative to them."""
         block = ((rows.stamp_ns - self._p.stamps_ns.min()) * 1e-9 // _BLOCK_S).astype(np.int64)
         block -= block.min()
         by_landmark = np.where(rows.landmark >= 0, rows.landmark, int(rows.landmark.max()) + 1 + block)
@@ -172,7 +172,7 @@ class _Fit:
         return max(both, key=lambda meat: float(np.sum(np.diag(meat) / scale**2)))
 
     def _halves(self, rest: Array, scores: Array, theta: Array, stamps_ns: Index) -> tuple[Array, Array]:
-        """Each parameter's estimates from the halves of the drive, split where half of what tells it has come."""
+        """Each parameter's estimates from two halves of the drive, split at half of its information."""
         order = np.argsort(stamps_ns, kind="stable")
         out = np.zeros((2, len(theta)))
         for k in range(len(theta)):

@@ -69,7 +69,7 @@ class Sightings:
 
 
 class MeasurementModel:
-    """The measurements of a graph as functions of corrections, by parameter; one that is missing is 0.
+    """The measurements of a graph as functions of corrections by parameter. A missing correction is 0.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class MeasurementModel:
     def _sightings(
         self, table: EdgeTable, rows: Index, source: str, origins: SightingEdges, stamps_ns: Index
     ) -> Sightings:
-        """Sightings whose origin is unknown, of an older map, are taken for those of their keyframe."""
+        """Sightings without a known origin, in older maps, are treated as taken at their keyframe."""
         z, places, n = table.measured.values[rows].copy(), origins.places(table.id.values[rows]), self._space.dimensions
         known, roots = places >= 0, table.sqrt_information.values[rows].copy()
         poses = np.tile(np.array(self._space.identity), (len(rows), 1))
@@ -148,7 +148,7 @@ class MeasurementModel:
         return edges.stamps_ns + np.where(known, round(clock * 1e9), 0)
 
     def seen(self, edges: Sightings, values: Values) -> Array:
-        """Measurements (n, p) from the base at the stamp, by a sensor that is elsewhere."""
+        """Measurements (n, p) from the base at the stamp, by a sensor with a corrected position."""
         named, z, n = _of(values, edges.source), edges.seen.copy(), self._space.dimensions
         turn, shift = self._mount(named)
         sensor = tuple(edges.sensor.T)
@@ -167,7 +167,7 @@ class MeasurementModel:
         return z
 
     def roots(self, edges: Sightings, values: Values, T_a_b: Numbers | None = None) -> Array:
-        """Square roots (n, m, m) of their information by a sensor that is turned, in the axes of the base or of a."""
+        """Square roots (n, m, m) of their information for a turned sensor, in the axes of the base or of a keyframe."""
         if edges.kind not in _POINTS:
             return edges.roots
         turn, _ = self._mount(_of(values, edges.source))
@@ -182,7 +182,7 @@ class MeasurementModel:
         return np.stack(columns, axis=-1)
 
     def _mount(self, named: Mapping[str, float]) -> tuple[Numbers, Array]:
-        """The rotation of a sensor, as a pose, and its shift."""
+        """The rotation of a sensor as a pose, and its translation."""
         shift = np.array([named.get(axis, 0.0) for axis in "xyz"])
         if self._space.dimensions == 2:
             return (0.0, 0.0, named.get("yaw", 0.0)), shift
@@ -190,7 +190,7 @@ class MeasurementModel:
         return (0.0, 0.0, 0.0, *turned), shift
 
     def from_pose(self, edges: Sightings, z: Array, T_a_b: Numbers) -> Array:
-        """Measurements (n, p) that were seen from b as they are from a; the poses are arrays."""
+        """Measurements (n, p) seen from pose b, converted to pose a. The poses are arrays."""
         out, n, group = z.copy(), self._space.dimensions, self._space.group
         if edges.kind in _POINTS:
             out[:, :n] = np.stack(group.act(T_a_b, tuple(z[:, :n].T)), axis=-1)
@@ -206,13 +206,13 @@ def clock_of(values: Values, source: str) -> float:
 
 
 def _of(values: Values, source: str | None, names: tuple[str, ...] = ()) -> dict[str, float]:
-    """Corrections of an input, or of some names whatever the input, by name."""
+    """Corrections of an input by name, or of names whatever the input."""
     chosen = (p for p in values if (source is None or p.source == source) and (not names or p.name in names))
     return {p.name: values[p] for p in chosen}
 
 
 def _rows(graph: Graph, table: EdgeTable, edges: range) -> "list[tuple[str, str, Index]]":
-    """Class, input and rows of the edges of a table that parameters may concern."""
+    """Class, input and rows of the edges of a table that parameters may affect."""
     ids, out = table.id.values, []
     here = (ids >= edges.start) & (ids < edges.stop)
     for label in {"odometry", "landmarks"} & set(graph.labels):

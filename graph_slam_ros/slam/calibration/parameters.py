@@ -64,14 +64,14 @@ OF_ODOMETRY = ("distance", "turn", "turn_bias")
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A quantity of an input: its name is that of ``QUANTITIES``."""
+    """A parameter: a quantity of an input, with a name of ``QUANTITIES``."""
 
     source: str
     name: str
 
     @property
     def quantity(self) -> Quantity:
-        """Return what is known of its kind."""
+        """Return the row of its quantity."""
         return QUANTITIES[self.name]
 
     def __str__(self) -> str:

@@ -29,7 +29,7 @@ class Between:
 
 
 class EstimatedPath:
-    """Estimated keyframes, and constant velocity between two of them.
+    """Estimated keyframes, with constant velocity between each two.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class EstimatedPath:
         self._gaps = np.flatnonzero(is_open)
 
     def knows(self, stamps_ns: Index, most_s: float) -> Mask:
-        """Return whether the path is known (n,) around each stamp, up to so many seconds away."""
+        """Return whether (n,) the path is known around each stamp, up to a number of seconds away."""
         since_s, reach = (stamps_ns - self._origin_ns) * 1e-9, most_s + _AROUND_S
         inside = (since_s - reach >= self._own_s[0]) & (since_s + reach <= self._own_s[-1])
         for gap in self._gaps.tolist():
@@ -59,7 +59,7 @@ class EstimatedPath:
         return np.asarray(inside)
 
     def at(self, stamps_ns: Index, after_s: float) -> Between:
-        """The poses so long after some stamps."""
+        """The poses at an offset from some stamps."""
         since_s = (stamps_ns - self._origin_ns) * 1e-9 + after_s
         k = np.clip(np.searchsorted(self._own_s, since_s, side="right") - 1, 0, len(self._own_s) - 2)
         fraction = np.clip((since_s - self._own_s[k]) / (self._own_s[k + 1] - self._own_s[k]), 0.0, 1.0)
@@ -74,7 +74,7 @@ class EstimatedPath:
         return np.stack(tangent, axis=-1) / (2.0 * _AROUND_S)
 
     def motion(self, stamps_ns: Index, after_s: float) -> Numbers:
-        """The motion from each stamp to so long after it, as arrays (n,)."""
+        """The motion from each stamp over a time, as arrays (n,)."""
         a, b = (tuple(self.at(stamps_ns, after).poses.T) for after in (0.0, after_s))
         out: Numbers = self._space.group.between(a, b)
         return out

@@ -13,7 +13,7 @@ from graph_slam_ros.typing import Array, Index
 
 @dataclass(frozen=True, slots=True)
 class Recalibration:
-    """A correction of measurements that were in the graph.
+    """A correction of measurements that are in the graph already.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class Recalibration:
     roots: Array
 
     def only_changed(self, graph: Graph) -> "Recalibration | None":
-        """The rows that are not as they are in a graph; None where there is none."""
+        """The rows that differ from those of a graph; None if there is none."""
         z, roots = self._columns(graph)
         same = (z[self.rows] == self.measured).all(axis=1) & (roots[self.rows] == self.roots).all(axis=(1, 2))
         if same.all():
@@ -40,7 +40,7 @@ class Recalibration:
         return table.measured.values, table.sqrt_information.values
 
     def apply(self, graph: Graph) -> "Recalibration":
-        """Correct them; returns what undoes it. Rows that a graph does not have are left out."""
+        """Correct them. Returns the change that undoes it. Rows that a graph lacks are left out."""
         if not any(edge_type.name == self.table for edge_type in graph.tables):
             return self
         z, roots = self._columns(graph)
@@ -57,7 +57,7 @@ class Recalibration:
 
     @classmethod
     def from_record(cls, record: Sequence[Any]) -> "Recalibration":
-        """Inverse of ``as_record``. Raises ValueError where its numbers are not finite, or too few."""
+        """Inverse of ``as_record``. Raises ValueError if a number is not finite, or missing."""
         table, *numbers = record
         rows, measured, roots = (np.array(one, dtype=float) for one in numbers)
         if not (len(rows) == len(measured) == len(roots) and np.isfinite(measured).all() and np.isfinite(roots).all()):
@@ -74,7 +74,7 @@ def totals_record(totals: Totals) -> list[list[Any]]:
 
 
 def read_totals(record: Sequence[Any]) -> Totals:
-    """Inverse of ``totals_record``. Raises ValueError where a value is not finite."""
+    """Inverse of ``totals_record``. Raises ValueError if a value is not finite."""
     totals = {(str(source), str(name)): float(value) for source, name, value in record}
     if not all(map(math.isfinite, totals.values())):
         raise ValueError(f"a calibration is not finite: {record}")

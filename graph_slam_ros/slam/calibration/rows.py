@@ -24,7 +24,7 @@ from graph_slam_ros.typing import Array, Index
 
 @dataclass(frozen=True, slots=True)
 class TrialProblem:
-    """A graph to be fitted: copies, which nobody else changes.
+    """A graph to be fitted: copies that nothing else changes.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ _COLUMNS = ("columns", "residual", "landmark", "stamp_ns", "weight")
 
 
 class _Eyes:
-    """The poses from which the sightings of one group are seen, as vertices of the copy.
+    """The poses from which the sightings of one group were taken, as vertices of the copy.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class _Eyes:
     def place(
         self, x: Array, values: Values, model: MeasurementModel, path: EstimatedPath, parameters: tuple[Parameter, ...]
     ) -> None:
-        """Put them where the path is at the corrected stamps; x is changed."""
+        """Move them to the path at the corrected stamps. It changes x."""
         space, offset = self._p.space, self._p.graph.offset.values
         size, group = np.arange(space.pose.size), space.group
         own = tuple(x[offset[self._own][:, None] + size].T)
@@ -244,10 +244,10 @@ class Linearization:
         return sparse.csr_matrix((jacobian[free], (row[free], column[free])), shape=(n * m, self.unknowns))
 
     def _through_eyes(self, ends: Index, jacobian: Array, columns: Array, x: Array) -> tuple[Index, Array]:
-        """Ends and Jacobians with the two keyframes around instead of the pose between them.
+        """Ends and Jacobians with the two neighbouring keyframes instead of the pose between them.
 
-        With ``X = A Exp(f Log(A^-1 B))`` its step is that of A by 1 - f and of B by f, each as seen from X; what that
-        leaves out is of second order in the motion from A to B.
+        For ``X = A Exp(f Log(A^-1 B))``, a step of X is that of A times 1 - f plus that of B times f, each in the frame
+        of X, to first order in the motion from A to B.
         """
         space, offset, size = self._p.space, self._p.graph.offset.values, np.arange(self._p.space.pose.size)
         dof = space.dof

@@ -45,7 +45,7 @@ _POSITIONED = ("position", "pose", "range_bearing")
 
 
 class AnonymousLandmarks:
-    """Association of sightings with landmarks over a lag.
+    """Association of sightings without id with landmarks, by hypotheses over a lag.
 
     Parameters
     ----------
@@ -86,24 +86,24 @@ class AnonymousLandmarks:
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
 
     def restore(self) -> None:
-        """Go on with the landmarks of a map."""
+        """Continue with the landmarks of a map."""
         self._hindsight.is_on = not self.clusters.restore()
 
     # -- odometry and sightings become scans -------------------------------------------------------------------------
 
     def travel(self, step: Step) -> list[Assigned]:
-        """Go on by a step of odometry; the sightings of a scan that ended long before it."""
+        """Add a step of odometry. Returns the sightings of a scan that ended long before it."""
         stands = step.broken or self._noise.stands(step.T_last_base, self._reckoning.since_s(step.stamp_ns))
         self._reckoning.step(step, stands=stands)
         began_ns = self._builder.began_ns
         return self.end_scan() if began_ns is not None and began_ns < step.stamp_ns - 2 * SCAN_NS else []
 
     def forget_belief(self) -> None:
-        """The map has moved: what follows begins with the solver's belief."""
+        """Restart the beam from the solver's estimate, because the map has moved."""
         self._beam = None
 
     def see(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
-        """Add the sightings without identity to a scan; those of the scan before, where that is over."""
+        """Add the sightings without id to a scan. Returns those of the previous scan if it has ended."""
         at = self._reckoning.at(m.stamp_ns)
         out = self.end_scan() if self._builder.is_full(at) else []
         for s in m.sightings:
@@ -112,7 +112,7 @@ class AnonymousLandmarks:
         return out
 
     def identified(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
-        """The sightings that can be used now, each with its landmark; those refused are counted."""
+        """The sightings that can be used now, each with its landmark. Refused ones are counted."""
         known = self._landmarks.known
         named = [s for s in m.sightings if s.id]
         out = [Assigned(m.topic, s.id, s, where) for s in named if s.id not in known or not known[s.id].is_unnamed]
@@ -124,7 +124,7 @@ class AnonymousLandmarks:
         return out + (self.see(replace(m, sightings=unnamed), where) if unnamed else [])
 
     def _point(self, s: Sighting) -> tuple[Array, Array]:
-        """The point (n,) that was seen, from the base, and its covariance (n, n)."""
+        """The observed point (n,) in the base frame, and its covariance (n, n)."""
         space, n = self._space, self._space.dimensions
         own = motion_compensation.as_matrix(s.covariance)
         if s.kind == "range_bearing":
@@ -139,7 +139,7 @@ class AnonymousLandmarks:
         return np.array(point), own + rounding * np.eye(n)
 
     def _widened(self, s: Sighting, where: PoseAtStamp) -> Sighting:
-        """The sighting with what is unknown of where on its landmark it is."""
+        """The sighting with a covariance that includes the extent of the landmark."""
         n, covariance = self._space.dimensions, motion_compensation.as_matrix(s.covariance)
         axes = np.eye(n)
         if s.kind == "range_bearing":
@@ -151,7 +151,7 @@ class AnonymousLandmarks:
     # -- scans are explained -----------------------------------------------------------------------------------------
 
     def end_scan(self) -> list[Assigned]:
-        """End the scan; its sightings with their landmarks."""
+        """End the scan. Returns its sightings with their landmarks."""
         scan = self._builder.close()
         if scan is None:
             return []
@@ -170,7 +170,7 @@ class AnonymousLandmarks:
         return self.clusters.begin(first, changed)
 
     def _explained(self, scan: Scan, first: int) -> Decision | None:
-        """The leader's last decision."""
+        """Explain the scan. Returns the leader's last decision."""
         self._hand_over()
         beam, names = self._beam, self.clusters.names
         if beam is None or (self._motions and self._motions[-1].is_broken):
@@ -189,7 +189,7 @@ class AnonymousLandmarks:
     # -- afterwards --------------------------------------------------------------------------------------------------
 
     def review(self, keyframes: StampedPoses[Keyframe]) -> None:
-        """Take over what was found in the background, and begin anew; believe landmarks and give them up."""
+        """Use the result of the background search, start the next one, and accept or remove landmarks."""
         if not self._landmarks.begins_new:
             self.clusters.finish()
             return
@@ -207,7 +207,7 @@ class AnonymousLandmarks:
             self.clusters.judge(keyframes[-1].stamp_ns)
 
     def _guarded(self, search: Callable[[], Found | None]) -> Found | None:
-        """The outcome of a search; None where it failed, which changes nothing."""
+        """The outcome of a search; None if it failed, which changes nothing."""
         try:
             return search()
         except Exception as error:
@@ -228,7 +228,7 @@ class AnonymousLandmarks:
         return FrozenScans(tuple(scans), tuple(self._motions), poses, scales.copy(), given, leader)
 
     def _adopt(self, found: Found | None, keyframes: StampedPoses[Keyframe]) -> None:
-        """Take over an explanation of all scans up to one."""
+        """Use an explanation of all scans up to one."""
         if found is None:
             return
         if found.undecided:
@@ -246,7 +246,7 @@ class AnonymousLandmarks:
         self._hindsight.note(self.clusters.given)
 
     def _with_new(self, values: Array) -> Array:
-        """Stored numbers, with those of vertices that were added since."""
+        """Stored numbers, extended by those of vertices that were added since."""
         return np.concatenate([values, self._solver.values[len(values) :]])
 
     def _named(self, places: dict[int, list[float]]) -> dict[str, list[float]]:

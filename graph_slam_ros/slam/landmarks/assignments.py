@@ -26,7 +26,7 @@ _FROM_MAP = -100  # numbers of landmarks that no cluster of this drive began, do
 
 @dataclass(frozen=True, slots=True)
 class Assigned:
-    """A sighting, and the name of the landmark it is of."""
+    """A sighting, and the name of its landmark."""
 
     topic: str
     name: str
@@ -35,7 +35,7 @@ class Assigned:
 
 
 def last_number(names: Iterable[str]) -> int:
-    """The highest that follows ``NAME``; 0 where there is none."""
+    """The highest number after ``NAME``; 0 if there is none."""
     numbers = (name.removeprefix(NAME) for name in names)
     return max((int(number) for number in numbers if number.isdecimal()), default=0)
 
@@ -67,29 +67,29 @@ class Assignments:
         self._given_up: dict[int, list[int]] = {}  # landmarks that were, with their clusters
 
     def restore(self) -> bool:
-        """Go on with the landmarks of a map, if there are any; new names are other than theirs."""
+        """Continue with the landmarks of a map, if there are any. New names differ from theirs."""
         unnamed = [name for name, mark in self._landmarks.known.items() if mark.is_unnamed]
         self._begun = last_number(unnamed)
         self.names = {self.fresh(): name for name in unnamed}
         return bool(unnamed)
 
     def fresh(self) -> int:
-        """A number for a landmark that no cluster begins."""
+        """A number for a landmark that no cluster has begun."""
         self._fresh -= 1
         return self._fresh
 
     def finish(self) -> None:
-        """All clusters of now stay with their landmarks."""
+        """Fix the assignment of all present clusters."""
         self._final = len(self.given)
 
     def append(self, clusters: Sequence[Cluster]) -> int:
-        """Add clusters, of nothing yet; returns the number of the first."""
+        """Add clusters without a landmark. Returns the number of the first."""
         self.seen += [cluster.seen for cluster in clusters]
         self.given += [NOTHING] * len(clusters)
         return len(self.given) - len(clusters)
 
     def begin(self, first: int, landmarks: Mapping[int, int]) -> list[Assigned]:
-        """Give the clusters from one on for the first time; their sightings, each with the name of its landmark."""
+        """Assign new clusters, from a number on. Returns their sightings, each with its landmark's name."""
         out = []
         for cluster in range(first, len(self.given)):
             landmark = self.given[cluster] = landmarks.get(cluster, NOTHING)
@@ -102,7 +102,7 @@ class Assignments:
         return out
 
     def give(self, changed: Mapping[int, int]) -> bool:
-        """Give clusters to other landmarks; whether there were any."""
+        """Assign clusters to other landmarks. Returns whether there were any."""
         changed = {c: k for c, k in changed.items() if c >= self._final and self.given[c] != k}
         lost: dict[str, set[tuple[int, str, Sighting]]] = {}
         for cluster in changed:
@@ -122,7 +122,7 @@ class Assignments:
         return bool(changed)
 
     def _add(self, cluster: int) -> None:
-        """The sightings of a cluster to its landmark."""
+        """Add the sightings of a cluster to its landmark."""
         landmark = self.given[cluster]
         name = self._name(landmark) if landmark != NOTHING else NOT_IN_MAP
         if name != NOT_IN_MAP:
@@ -146,7 +146,7 @@ class Assignments:
         return self.names.setdefault(landmark, f"{NAME}{self._begun}")
 
     def judge(self, now_ns: int) -> None:
-        """Believe landmarks that were seen often enough; give up those that were not seen again."""
+        """Accept landmarks that were seen often enough, and remove those that were not seen again."""
         c, known = self._config, self._landmarks.known
         counts = [n for k, n in self._scans.items() if n >= LEAST_SCANS and k != NOTHING]
         least = _OF_MEDIAN * float(np.median(counts)) if counts else 0.0

@@ -56,7 +56,7 @@ class BeamSettings:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """The landmark of a cluster, after what was decided before; ``count`` decisions in all."""
+    """The landmark of a cluster, linked to the previous decision; ``count`` decisions in all."""
 
     before: "Decision | None"
     cluster: int
@@ -65,7 +65,7 @@ class Decision:
 
 
 def changes(last: Decision | None, now: Decision | None) -> dict[int, int]:
-    """The decisions of one chain that differ from another's: the landmark by the cluster."""
+    """The decisions of one chain that differ from another's, as landmark by cluster."""
     out: dict[int, int] = {}
     while now is not last:
         if last is None or (now is not None and now.count > last.count):
@@ -82,7 +82,7 @@ def changes(last: Decision | None, now: Decision | None) -> dict[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Seed:
-    """A belief to begin with: position (n,), rotation (n, n), odometry's scales, landmarks (k, n) by number.
+    """The start of a beam: position (n,), rotation (n, n), odometry's scales, landmarks (k, n) by number.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class Beam:
     # -- a scan ------------------------------------------------------------------------------------------------------
 
     def advance(self, motion: Motion) -> None:
-        """Move all to the next scan; now and then each is there once more with odometry in doubt."""
+        """Move all hypotheses to the next scan. At intervals each one also branches into a slip of odometry."""
         self._predict(motion)
         self._since_slip += motion.moving_s
         if self._since_slip >= self.settings.slip_every_s and not motion.is_broken:
@@ -146,7 +146,7 @@ class Beam:
             self._since_slip = 0.0
 
     def explain(self, scan: Scan, first: int) -> Decision | None:
-        """Explain a scan; returns the leader's last decision.
+        """Explain a scan. Returns the leader's last decision.
 
         Parameters
         ----------
@@ -191,7 +191,7 @@ class Beam:
         p[:, : n + r, : n + r] += g @ m.covariance @ g.transpose(0, 2, 1)
 
     def _slip(self, since_s: float) -> None:
-        """Each hypothesis once more, with odometry of this stretch in doubt."""
+        """Copy each hypothesis, with a slip of odometry in this stretch."""
         c, count, n, r = self.settings, len(self.log_weight), self._n, self._r
         self._keep(np.tile(np.arange(count), 2))
         part = min(max(since_s / c.slip_every_s, 1.0), _SLIP_LONGEST)
@@ -203,7 +203,7 @@ class Beam:
     # -- a cluster ---------------------------------------------------------------------------------------------------
 
     def _explain_cluster(self, cluster: Cluster, number: int, used: list[frozenset[int]]) -> list[frozenset[int]]:
-        """Branch over what a cluster is; returns the landmarks that each has given to clusters of this scan."""
+        """Branch over the landmarks of a cluster. Returns the landmarks that each hypothesis has used in this scan."""
         c, slots = self.settings, self.ids.shape[1]
         what = self._expect(cluster)
         fits = what.log_likelihood
@@ -237,7 +237,7 @@ class Beam:
         return [used[i] | {name} if name != NOTHING else used[i] for i, _, name in kept]
 
     def _expect(self, cluster: Cluster) -> _Expected:
-        """Predict all landmarks in all hypotheses: the likelihood of the cluster, and what an update needs."""
+        """Predict all landmarks in all hypotheses: the likelihood of the cluster, and the terms of an update."""
         n, r, b = self._n, self._r, self._base
         count, slots = self.ids.shape
         back = self.turn.transpose(0, 2, 1)
@@ -265,7 +265,7 @@ class Beam:
         return _Expected(log_likelihood, residual, inverse, of_turn, back)
 
     def _update(self, source: Ids, options: Ids, what: _Expected) -> None:
-        """Kalman updates of those that are of a landmark they have."""
+        """Kalman updates of the hypotheses that assign the cluster to a landmark of theirs."""
         n, r, b = self._n, self._r, self._base
         which = np.flatnonzero(options < self.ids.shape[1])
         if not len(which):
@@ -291,7 +291,7 @@ class Beam:
     # -- landmarks that come and go ----------------------------------------------------------------------------------
 
     def _begin(self, which: Ids, cluster: Cluster, number: int) -> None:
-        """A new landmark where the cluster is, in some hypotheses."""
+        """Add a new landmark at the cluster, in some hypotheses."""
         if not len(which):
             return
         if cluster.sort:
@@ -306,7 +306,7 @@ class Beam:
         self._place(which, slot, self.position[which] + away, rows, own, number)
 
     def recall(self, number: int, points: Array, rows: Array, own: Array) -> None:
-        """A landmark comes back, in all hypotheses: its place (K, n) and covariance, as for a new one."""
+        """Bring back a landmark in all hypotheses, with its position (K, n) and covariance, as for a new one."""
         which = np.arange(len(self.ids))
         slot = self._slots_for(which)
         self._place(
@@ -320,7 +320,7 @@ class Beam:
 
     @property
     def is_sound(self) -> bool:
-        """Return whether all of it are numbers."""
+        """Return whether all values are finite."""
         return bool(
             np.isfinite(self.covariance).all()
             and np.isfinite(self.position).all()
@@ -328,7 +328,7 @@ class Beam:
         )
 
     def _place(self, which: Ids, slot: Ids, points: Array, rows: Array, own: Array, number: int) -> None:
-        """A landmark in some hypotheses, with its covariance with all else (m, n, D) and its own (m, n, n)."""
+        """Store a landmark in some hypotheses, with its cross-covariance (m, n, D) and covariance (m, n, n)."""
         n, b = self._n, self._base
         columns = b + n * slot[:, None] + np.arange(n)
         p = self.covariance
@@ -340,7 +340,7 @@ class Beam:
         self.last[which, slot] = self._scans
 
     def _slots_for(self, which: Ids) -> Ids:
-        """A free slot of each of some hypotheses; where there is none, that of the landmark not seen for longest."""
+        """A free slot in each hypothesis; if there is none, that of the landmark not seen for longest."""
         is_free = self.ids[which] == _FREE
         if not is_free.any(axis=1).all() and self.ids.shape[1] < self.settings.slots:
             self._grow(min(_MORE_SLOTS, self.settings.slots - self.ids.shape[1]))

@@ -25,7 +25,7 @@ class SolverBelief:
         self._space, self._solver, self._landmarks = space, solver, landmarks
 
     def seed(self, scan: Scan, names: Mapping[int, str], scales: Array, scale_sigma: float) -> Seed:
-        """The pose at a scan, and the landmarks around.
+        """The pose at a scan and the landmarks around it, with their joint covariance.
 
         Raises
         ------
@@ -49,7 +49,7 @@ class SolverBelief:
         return Seed(position, turn, scales, points[near], numbers[near], whole)
 
     def recall(self, beam: Beam, scan: Scan, names: Mapping[int, str]) -> None:
-        """Landmarks that the map has, and the beam has not, come back where something is seen near them."""
+        """Bring back landmarks of the map that the beam lacks, if something is seen near them."""
         inside = set(beam.ids[0].tolist())
         out = np.array(
             [k for k, name in names.items() if k not in inside and name in self._landmarks.known], dtype=np.int64
@@ -66,7 +66,7 @@ class SolverBelief:
             self._recall(beam, scan, k, names)
 
     def _recall(self, beam: Beam, scan: Scan, number: int, names: Mapping[int, str]) -> None:
-        """A landmark comes back: given what the solver and each hypothesis both know, it is as the solver says."""
+        """Bring back a landmark: the solver's conditional given what it shares with each hypothesis."""
         n, dof = self._space.dimensions, self._space.dof
         shared = self._shared(beam, number, names)
         position, turn, _ = self._pose(scan)
@@ -90,7 +90,7 @@ class SolverBelief:
         beam.recall(number, points, cross, own + left)
 
     def _shared(self, beam: Beam, number: int, names: Mapping[int, str]) -> Ids:
-        """The landmarks nearest to one that all hypotheses and the map have."""
+        """The landmarks nearest to one that all hypotheses and the map share."""
         common = set(beam.ids[0].tolist())
         for row in beam.ids[1:].tolist():
             common &= set(row)

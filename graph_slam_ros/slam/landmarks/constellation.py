@@ -32,7 +32,7 @@ Motion = tuple[Array, Array]  # rotation, translation
 
 
 def laid_on_the_map(drive: Drive, e: Estimate) -> tuple[Estimate, int]:
-    """Lay stretches on the map, as long as that costs less; and how many stay as they are, which fit several places."""
+    """Move stretches onto the map while that lowers the cost. Returns also how many fit several places."""
     undecided = 0
     for _ in range(_MOST_MOVES):
         undecided = 0
@@ -50,7 +50,7 @@ def laid_on_the_map(drive: Drive, e: Estimate) -> tuple[Estimate, int]:
 
 
 def stretches(drive: Drive, e: Estimate) -> list[tuple[int, int, int]]:
-    """Landmarks that were seen in one stretch of time only, or little, and the scans around."""
+    """Landmarks that were seen in a single stretch of time, or rarely, and the scans around them."""
     stamps, counts = drive.stamps_s, np.bincount(e.which[e.which >= 0], minlength=len(e.landmarks))
     out: list[tuple[int, int, int]] = []
     for landmark in np.argsort(counts, kind="stable").tolist():
@@ -67,7 +67,7 @@ def stretches(drive: Drive, e: Estimate) -> list[tuple[int, int, int]]:
 
 
 def _grown(stamps: Array, first: int, last: int) -> tuple[int, int]:
-    """A stretch of scans, as long as there is no gap."""
+    """A stretch of scans without a gap."""
     while first > 0 and stamps[first] - stamps[first - 1] < _GAP_S and stamps[last] - stamps[first - 1] < _LONGEST_S:
         first -= 1
     while (
@@ -80,9 +80,9 @@ def _grown(stamps: Array, first: int, last: int) -> tuple[int, int]:
 
 
 def _laid(drive: Drive, e: Estimate, landmark: int, first: int, last: int) -> Estimate | None:
-    """Lay a stretch on landmarks that were seen before it; None if that does not cost less.
+    """Move a stretch onto landmarks that were seen before it; None if that does not lower the cost.
 
-    Returns ``e`` itself where two ways to lay it cost nearly the same.
+    Returns ``e`` itself if two such motions cost nearly the same.
     """
     is_inside = (drive.scan >= first) & (drive.scan <= last)
     outside = np.bincount(e.which[(e.which >= 0) & ~is_inside], minlength=len(e.landmarks))
@@ -109,12 +109,12 @@ def _laid(drive: Drive, e: Estimate, landmark: int, first: int, last: int) -> Es
 
 
 def _are_apart(a: Estimate, b: Estimate, scans: slice) -> bool:
-    """Return whether two estimates have a stretch elsewhere."""
+    """Return whether two estimates have a stretch at different places."""
     return float(np.linalg.norm(a.position[scans] - b.position[scans], axis=1).max()) > _APART_M
 
 
 def _solved(drive: Drive, e: Estimate, inside: Ids, of_inside: Ids, scans: slice, turn: Array, move: Array) -> Estimate:
-    """Solve with a stretch moved and its clusters given to other landmarks."""
+    """Solve with a stretch moved, and its clusters assigned to other landmarks."""
     which, position, turns = e.which.copy(), e.position.copy(), e.turn.copy()
     which[inside] = of_inside
     position[scans], turns[scans] = position[scans] @ turn.T + move, turn @ turns[scans]
@@ -152,7 +152,7 @@ def _candidates(drive: Drive, e: Estimate, inside: Ids, strong: Ids, middle: int
 
 
 def _rough_scores(local: Array, there: Array, turns: Array, moves: Array) -> Array:
-    """The misfit of a stretch with the landmarks, of each motion."""
+    """The misfit of a stretch with the landmarks, for each motion."""
     at = np.einsum("mij,uj->mui", turns, local) + moves[:, None]
     nearest = np.concatenate([_nearest(there, some) for some in np.array_split(at, max(1, len(at) // 256))])
     return np.asarray(np.minimum(np.square(nearest / _MOVE_M), _MOST_COST).sum(axis=1))
@@ -163,7 +163,7 @@ def _nearest(there: Array, at: Array) -> Array:
 
 
 def _priors(turns: Array, moves: Array, centre: Array) -> Array:
-    """The cost of each motion: a turn and a way."""
+    """The prior cost of each motion, from its rotation and translation."""
     gone = np.square(turns @ centre + moves - centre).sum(axis=1)
     return np.minimum(
         np.square(np.arctan2(turns[:, 1, 0], turns[:, 0, 0]) / _TURN_RAD) + gone / _MOVE_M**2, _MOST_PRIOR
@@ -171,7 +171,7 @@ def _priors(turns: Array, moves: Array, centre: Array) -> Array:
 
 
 def _motions(local: Array, there: Array, centre: Array) -> Iterator[Motion]:
-    """Motions that lay what is seen on landmarks: as it lies, by one of each, by two."""
+    """Motions that align clusters with landmarks: none, by one pair, by two pairs."""
     n = len(centre)
     yield np.eye(n), np.zeros(n)
     bearing = np.arctan2((there - centre)[:, 1], (there - centre)[:, 0])

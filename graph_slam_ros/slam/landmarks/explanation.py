@@ -69,7 +69,7 @@ class Estimate:
 
 
 class Drive:
-    """Scans as arrays, and the least squares over them.
+    """Scans as arrays, and their least squares.
 
     Attributes
     ----------
@@ -93,16 +93,16 @@ class Drive:
 
     @property
     def size(self) -> int:
-        """Scans."""
+        """The number of scans."""
         return len(self.stamps_s)
 
     @property
     def may_move(self) -> bool:
-        """Return whether there is work left for moves, each of which is solved completely."""
+        """Return whether the work limit allows further moves, each of which is solved completely."""
         return self.work - self._free < _MOST_WORK
 
     def begin_moves(self) -> None:
-        """Begin to count the work of moves."""
+        """Start to count the work of moves."""
         self._free = self.work
 
     def _set_motions(self, motions: Sequence[Motion]) -> None:
@@ -141,7 +141,7 @@ class Drive:
         return np.asarray(np.square(away @ whiten.transpose(0, 2, 1)).sum(axis=-1))
 
     def cost_of(self, e: Estimate, *, loss_scale: float = 0.0, slips: bool = True) -> float:
-        """Cost of an estimate."""
+        """The cost of an estimate."""
         residual = self._odometry(e)[0]
         tight, slipped = self._both(residual, slips=slips)
         used = e.which >= 0
@@ -152,7 +152,7 @@ class Drive:
         return float(np.minimum(tight, slipped).sum() + clusters) + scales
 
     def total(self, e: Estimate) -> float:
-        """Cost of an estimate with its landmarks."""
+        """The cost of an estimate with its landmarks."""
         return e.cost + self.costs.landmark * len(e.landmarks)
 
     def _both(self, residual: Array, *, slips: bool) -> tuple[Array, Array]:
@@ -171,7 +171,7 @@ class Drive:
         return np.concatenate([moved - (1.0 + e.scales[0]) * local, turned], axis=1), moved, local
 
     def _residuals(self, e: Estimate, used: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Residuals of the clusters that are used, and where their landmarks are from the scans."""
+        """Residuals of the clusters that are used, and the positions of their landmarks relative to the scans."""
         k = self.scan[used]
         away = e.landmarks[e.which[used]] - e.position[k]
         seen = (e.turn[k].transpose(0, 2, 1) @ away[..., None])[..., 0]
@@ -182,7 +182,7 @@ class Drive:
     def solve(
         self, e: Estimate, iterations: int = 15, *, enough: float = 1e-3, loss_scale: float = 0.0, slips: bool = True
     ) -> Estimate:
-        """The estimate with the least cost next to one."""
+        """The estimate at the nearest local minimum of the cost."""
         damping = 1e-6
         e = replace(e, cost=self.cost_of(e, loss_scale=loss_scale, slips=slips))
         for _ in range(iterations):
@@ -203,14 +203,14 @@ class Drive:
         return e
 
     def staged(self, e: Estimate) -> Estimate:
-        """Solve in stages: nothing slips and the loss is wide, then less so."""
+        """Solve in stages: first without slip and with a wide loss, then with a narrower one."""
         e = replace(e, landmarks=self.landmarks_of(e))
         e = self.solve(e, 25, enough=0.1, loss_scale=30.0, slips=False)
         e = self.solve(e, 15, enough=0.1, loss_scale=10.0)
         return self.solve(e, 40)
 
     def landmarks_of(self, e: Estimate) -> Array:
-        """The median of what was seen of each landmark."""
+        """The median of the observed positions of each landmark."""
         seen = self.seen_at(e)
         return np.array([np.median(seen[e.which == j], axis=0) for j in range(int(e.which.max(initial=-1)) + 1)])
 
@@ -232,7 +232,7 @@ class Drive:
         return self.n + self.turned.shape[1]
 
     def _normal(self, e: Estimate, loss_scale: float, *, slips: bool) -> tuple[sparse.csc_matrix, Array, Array]:
-        """Gauss-Newton matrix, right-hand side, and what is added to the diagonal."""
+        """Gauss-Newton matrix, right-hand side, and the damping of the diagonal."""
         n, dof, size = self.n, self._dof, self.size
         self.work += size + len(self.scan)
         total = dof * size + n * len(e.landmarks) + 2
@@ -290,7 +290,7 @@ def _whitening(covariances: Array) -> Array:
 
 
 def compressed(e: Estimate) -> Estimate:
-    """The estimate without landmarks that no cluster is of."""
+    """The estimate without landmarks that have no cluster."""
     used = np.unique(e.which[e.which >= 0])
     index = np.full(len(e.landmarks) + 1, UNUSED)
     index[used] = np.arange(len(used))

@@ -30,7 +30,7 @@ _SCALE_SIGMA = 0.02  # of odometry's scales, once they were found
 
 @dataclass(frozen=True, slots=True)
 class FrozenScans:
-    """The input of an explanation, and how all is explained now: copies.
+    """The input of an explanation: copies of the scans and of the present assignment.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class FrozenScans:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """An explanation of frozen scans; so many stretches fit several places.
+    """An explanation of frozen scans; ``undecided`` stretches fit several places.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Found:
     is_whole: bool = True
 
     def numbers(self, given: Sequence[int], fresh: Callable[[], int]) -> Ids:
-        """A number for each landmark: that of most of its clusters, each once, or a fresh one."""
+        """The number of each landmark: that of most of its clusters, each used once, or a fresh one."""
         which = self.estimate.which
         before = np.array(given)[: len(which)]
         pairs, sizes = np.unique(np.stack([which, before])[:, which >= 0], axis=1, return_counts=True)
@@ -76,7 +76,7 @@ class Found:
         return out
 
     def changes(self, given: Sequence[int], numbers: Ids) -> tuple[dict[int, int], dict[int, int]]:
-        """The landmark of each cluster, also of those seen since, that has another now; and of each that is none."""
+        """The new landmark of each changed cluster, later clusters included, and the successor of each removed one."""
         which, before = self.estimate.which, np.array(given)
         after, frozen = before.copy(), before[: len(which)]
         of_none = np.where(np.isin(frozen, _indices(frozen)[0]), NOTHING, frozen)
@@ -90,7 +90,7 @@ class Found:
         return {c: int(after[c]) for c in np.flatnonzero(after != before).tolist()}, gone
 
     def carried_to(self, space: Geometry, solver: Solver, keyframes: StampedPoses[Keyframe]) -> Array:
-        """Stored numbers with the keyframes where this explanation has them; what is between scans moves with both."""
+        """Stored numbers with the keyframes moved to this explanation. Keyframes between scans are interpolated."""
         group, values = space.group, solver.values
         n, scans = space.dimensions, self.frozen.scans
         found = tuple(poses_of(space, self.estimate.position, self.estimate.turn).T)
@@ -114,7 +114,7 @@ class Found:
 
 
 class Hindsight:
-    """Explains all scans at once now and then.
+    """Explains all scans at once, at growing intervals.
 
     Attributes
     ----------
@@ -135,24 +135,24 @@ class Hindsight:
         self.scales: tuple[Array, float] = np.zeros(2), settings.scale_sigma
 
     def is_due(self, scans: int) -> bool:
-        """Return whether so many scans deserve it."""
+        """Return whether an explanation is due at this number of scans."""
         return self.is_on and self._job is None and scans >= self._next
 
     def start(self, frozen: FrozenScans, keyframes: int) -> None:
-        """Begin with what there is now."""
+        """Start with the present scans."""
         self._next = round(_MORE * len(frozen.scans))
         work = self._executor(lambda: explained(self._space, frozen, self._settings, self._costs))
         self._job = keyframes + self._after, work
 
     def outcome(self, keyframes: int) -> Found | None:
-        """The explanation that is due at a keyframe; waits for it."""
+        """The explanation that is due at a keyframe. It waits for it."""
         if self._job is None or keyframes < self._job[0]:
             return None
         (_, work), self._job = self._job, None
         return self._noted(work())
 
     def found(self, freeze: Callable[[], FrozenScans]) -> Found | None:
-        """Explain what there is, at once; None where that was done, or finds nothing."""
+        """Explain the present scans at once; None if that was done before, or finds nothing."""
         self._job = None
         if not self.is_on:
             return None
@@ -162,7 +162,7 @@ class Hindsight:
         return self._noted(explained(self._space, frozen, self._settings, self._costs))
 
     def note(self, given: Sequence[int]) -> None:
-        """All was explained: each cluster is given to this landmark."""
+        """Note that everything was explained, and the landmark of each cluster."""
         self._last = np.array(given)
 
     def _noted(self, found: Found | None) -> Found | None:
@@ -172,7 +172,7 @@ class Hindsight:
 
 
 def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, costs: Costs) -> Found | None:
-    """Explain all scans at once, from what the graph has and from what the beam says; None where little was seen."""
+    """Explain all scans, from the graph's assignment and from the beam's; None if too little was seen."""
     drive = Drive(frozen.scans, frozen.motions, settings, costs)
     here = matrices_of(space, frozen.poses)
     paths = here, drive.along_odometry(here[0][0], here[1][0], frozen.scales)
@@ -194,7 +194,7 @@ def explained(space: Geometry, frozen: FrozenScans, settings: BeamSettings, cost
 
 
 def _indices(given: Ids) -> tuple[Ids, Ids]:
-    """Numbers of the landmarks that were seen often enough, and which of them each cluster is."""
+    """Numbers of the landmarks that were seen often enough, and the index among them for each cluster."""
     numbers, indices = np.unique(given, return_inverse=True)
     which = without_few(np.where(given == NOTHING, UNUSED, indices))
     used = np.unique(which[which >= 0])

@@ -28,7 +28,7 @@ class NamedSightings:
     named: tuple[Assigned, ...]
 
     def only(self, known: Mapping[str, Landmark]) -> "NamedSightings | None":
-        """The sightings of known landmarks; None where there is none."""
+        """The sightings of known landmarks; None if there is none."""
         named = tuple(one for one in self.named if one.name in known)
         return replace(self, named=named) if named else None
 
@@ -47,7 +47,7 @@ class HeldMapGate:
 
 
 class AlarmGate:
-    """Refuses new landmarks while an alarm cannot be decided: nobody knows where the robot is.
+    """Refuses new landmarks during an undecided alarm, because the robot's pose is unknown then.
 
     Parameters
     ----------
@@ -101,12 +101,12 @@ class LandmarkFrontend:
         )
 
     def restore(self, landmarks: dict[str, Landmark], range_offsets: dict[str, int]) -> None:
-        """Go on with the landmarks of a map."""
+        """Continue with the landmarks of a map."""
         self.map.restore(landmarks, range_offsets)
         self.anonymous.restore()
 
     def identified(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
-        """The sightings to be used now, each with the landmark it is of; the others are counted."""
+        """The sightings that can be used now, each with its landmark. The others are counted."""
         how = self._config.association
         if how == "none":
             self._counters.count(m.topic, "not_used", len(m.sightings))
@@ -120,11 +120,11 @@ class LandmarkFrontend:
         return self._passed(named)
 
     def travel(self, step: Step) -> list[Assigned]:
-        """Go on by a step of odometry; the sightings to be used of what was seen before."""
+        """Add a step of odometry. Returns the sightings of earlier scans that can be used now."""
         return self._passed(self.anonymous.travel(step)) if self._is_anonymous else []
 
     def end_scan(self) -> list[Assigned]:
-        """The sightings to be used of what was seen before."""
+        """End the scan. Returns its sightings that can be used."""
         return self._passed(self.anonymous.end_scan())
 
     @property
@@ -140,7 +140,7 @@ class LandmarkFrontend:
         return out
 
     def review(self, keyframes: StampedPoses[Keyframe], *, everything: bool) -> None:
-        """Review the landmarks without identity; what that changes is part of the next solve."""
+        """Review the landmarks without id. The next solve includes the changes."""
         if self._is_anonymous and everything:
             self.anonymous.explain_all(keyframes)
         elif self._is_anonymous:

@@ -28,7 +28,7 @@ _MAX_SIGHTINGS = 60  # sightings of one landmark: every other is forgotten beyon
 
 @dataclass(frozen=True, slots=True)
 class LandmarkEdge:
-    """One sighting of a landmark, and the edge that says so."""
+    """One sighting of a landmark, and its edge."""
 
     edge: int
     topic: str
@@ -61,7 +61,7 @@ class Landmark:
 
 @dataclass(slots=True)
 class UndeterminedLandmark:
-    """A landmark that no vertex has yet: what was seen of it, where it may be, and why that is not enough."""
+    """A landmark without a vertex yet: its sightings, its possible positions, and why they are not enough."""
 
     topic: str
     seen: list[tuple[PoseAtStamp, Sighting]] = field(default_factory=list)
@@ -109,7 +109,7 @@ class Landmarks:
         self.origins = SightingEdges(self._space)
 
     def add(self, topic: str, name: str, s: Sighting, where: PoseAtStamp) -> None:
-        """Add a sighting of a landmark with this identity."""
+        """Add a sighting of a landmark with this id."""
         name = self.aliases.get(name, name)
         landmark = self.known.get(name)
         if landmark is not None:
@@ -129,9 +129,9 @@ class Landmarks:
             self._note_undetermined(topic, name, s, where)
 
     def survey_of(self, name: str, s: Sighting, where: PoseAtStamp) -> tuple[Surveyed, Array] | None:
-        """The survey of a landmark that was not seen before, and where a sighting puts it, or may put it.
+        """The survey of a landmark that was not seen before, and its possible values by a sighting.
 
-        That is a pose where both the survey and the sighting have the orientation, else a position (n,).
+        The value is a pose if both the survey and the sighting have the orientation, else a position (n,).
         """
         if name not in self._survey or self.aliases.get(name, name) in self.known:
             return None
@@ -150,7 +150,7 @@ class Landmarks:
         return self._survey[name], self._from_sensor(s, where, motion_compensation.point_of(self._space, measured))
 
     def restore(self, known: dict[str, Landmark], offsets: dict[str, int]) -> None:
-        """Go on with these, whose vertices and edges are in the graph."""
+        """Continue with these landmarks, whose vertices and edges are in the graph."""
         self.known.update(known)
         self.offsets.update(offsets)
         self.touched += known
@@ -158,7 +158,7 @@ class Landmarks:
     # -- in the graph --------------------------------------------------------------------------------------------
 
     def _begin(self, topic: str, name: str, s: Sighting, where: PoseAtStamp, value: Numbers) -> None:
-        """Add a vertex; ``value`` is in map, but for a pose, which is still in the keyframe's frame."""
+        """Add a vertex. ``value`` is in map; a pose is still in the keyframe's frame."""
         kind = self._space.pose if s.kind == "pose" else self._space.point
         if s.kind == "pose":
             value = self._space.group.compose(self._pose(where), value)
@@ -176,7 +176,7 @@ class Landmarks:
         self.touched.append(name)
 
     def _hold(self, topic: str, landmark: Landmark, known: Surveyed) -> None:
-        """A prior on what was surveyed; without a loss, what contradicts it is the sightings' fault."""
+        """Add a prior for the survey. It has no loss, because sightings that contradict it are wrong."""
         space, vertices = self._space, [landmark.vertex]
         is_pose = self._graph.kind_of(landmark.vertex) is space.pose
         if is_pose and known.orientation:
@@ -234,7 +234,7 @@ class Landmarks:
         return motion_compensation.seen_from_sensor(self._space, s, where, seen)
 
     def _blurred(self, s: Sighting, compensated: KeyframeMeasurement) -> Array:
-        """The covariance with what messages leave out: clocks, mounting, size."""
+        """The covariance with errors that messages do not contain: clocks, mounting, size."""
         covariance, added = compensated.covariance.copy(), self._config.landmarks.added_sigma_m**2
         if s.kind in ("pose", "position"):
             n = self._space.dimensions
@@ -244,7 +244,7 @@ class Landmarks:
         return covariance
 
     def _offset(self, topic: str) -> int:
-        """The vertex of what all ranges of a topic have in common."""
+        """The vertex of the offset that all ranges of a topic share."""
         if topic not in self.offsets:
             vertex = self._graph.add_vertex(R1, [0.0])
             noise = Gaussian.from_sigmas(self._config.landmarks.range_offset_sigma_m)
@@ -255,20 +255,20 @@ class Landmarks:
     # -- taken back ----------------------------------------------------------------------------------------------
 
     def prune(self, name: str) -> None:
-        """Take a landmark and its edges out of the problem."""
+        """Remove a landmark and its edges from the problem."""
         landmark = self.known.pop(name)
         self.touched.append(name)
         self._withdraw_sightings(landmark.seen)
         self._solver.remove(landmark.vertex)
 
     def forget(self, vertices: set[int]) -> None:
-        """Forget landmarks that were removed from the problem: a new observation of one begins another."""
+        """Forget landmarks that were removed from the problem. A new observation begins a new landmark."""
         for name in [name for name, landmark in self.known.items() if landmark.vertex in vertices]:
             self.touched.append(name)
             del self.known[name]
 
     def remove_sightings(self, name: str, seen: Set[tuple[int, str, Sighting]]) -> None:
-        """Take sightings from a landmark, each by its stamp, topic and itself; with its last it is gone."""
+        """Remove sightings from a landmark, by stamp, topic and sighting. Without any it is removed itself."""
         landmark = self.known[name]
         gone = [one for one in landmark.seen if (one.where.stamp_ns, one.topic, one.sighting) in seen]
         edges = {one.edge for one in gone}
@@ -285,7 +285,7 @@ class Landmarks:
         self.touched.append(name)
 
     def confirm(self, name: str, *, is_sure: bool) -> None:
-        """Believe a landmark, or no longer."""
+        """Mark a landmark as accepted, or as tentative again."""
         self.known[name].is_tentative = not is_sure
         self.touched.append(name)
 
@@ -305,7 +305,7 @@ class Landmarks:
         return out
 
     def axes(self, landmark: Landmark) -> Array:
-        """The rotation from a landmark's tangent space to the map's axes, of its position."""
+        """The rotation from a landmark's tangent space to the map's axes, for its position."""
         if self.kind_of(landmark.vertex) is self._space.point:
             return np.eye(self._space.dimensions)
         return self._space.turn(tuple(self._solver.estimate([landmark.vertex])[0].tolist()))
@@ -319,15 +319,15 @@ class Landmarks:
         return values
 
     def is_held(self, name: str) -> bool:
-        """Return whether a landmark stays where it is."""
+        """Return whether a landmark is fixed."""
         return self._solver.is_held(self.known[name].vertex)
 
     def kind_of(self, vertex: int) -> VertexKind:
-        """Point or pose."""
+        """Return the kind of its vertex: point or pose."""
         return self._graph.kind_of(vertex)
 
     def chi2_of(self, edges: Sequence[int]) -> tuple[float, int]:
-        """Sum of the squared whitened residuals of some edges, without loss, and how many numbers they are."""
+        """Sum of the squared whitened residuals of some edges, without loss, and their number."""
         chi2, numbers = self._solver.chi2_of(edges)
         return float(chi2.sum()), int(numbers.sum())
 
@@ -355,7 +355,7 @@ class Landmarks:
                 self._add_edge(candidate.topic, landmark, s, where)
 
     def _why_not(self, places: list[PositionHypothesis], glances: list[PartialObservation]) -> str:
-        """Return why a landmark is not determined; empty where it is."""
+        """Return why a landmark is not determined; empty if it is."""
         settings, count = self._config.landmarks, len(glances)
         if count <= self._space.dimensions - (glances[0].kind != "range"):
             return f"{count} {'sightings' if count > 1 else 'sighting'} by {glances[0].kind}: too few"

@@ -30,7 +30,7 @@ def refined(drive: Drive, e: Estimate) -> Estimate:
 
 
 def merged(drive: Drive, e: Estimate) -> Estimate:
-    """Merge pairs, the nearest first, where that costs less than the landmark it saves."""
+    """Merge pairs, the nearest first, if that costs less than the landmark that it saves."""
     tried: set[tuple[tuple[float, ...], tuple[float, ...]]] = set()
     while True:
         for key, i, j in _pairs(e.landmarks):
@@ -48,7 +48,7 @@ def merged(drive: Drive, e: Estimate) -> Estimate:
 
 
 def _pairs(landmarks: Array) -> list[tuple[tuple[tuple[float, ...], tuple[float, ...]], int, int]]:
-    """Pairs that are close, the nearest first, with their places."""
+    """Pairs of close landmarks, the nearest first, with their positions."""
     apart = np.linalg.norm(landmarks[:, None] - landmarks[None], axis=2)
     i, j = np.nonzero(np.tril(apart < _MERGE_M, -1))
     order = np.argsort(apart[i, j], kind="stable")
@@ -72,7 +72,7 @@ def _merged_pair(drive: Drive, e: Estimate, i: int, j: int) -> Estimate | None:
 
 
 def reassigned(drive: Drive, e: Estimate) -> tuple[Estimate, bool]:
-    """Give each cluster to the landmark that it fits better, one to one in a scan, if the whole costs less."""
+    """Assign each cluster to the landmark that fits best, one to one in a scan, if the total cost falls."""
     chi2 = drive.chi2_with(e)
     chi2[drive.sort[:, None] != sorts_of(drive, e)] = np.inf
     rows = np.arange(len(chi2))
@@ -99,6 +99,6 @@ def sorts_of(drive: Drive, e: Estimate) -> Array:
 
 
 def without_few(which: Ids) -> Ids:
-    """Clusters of landmarks that hardly any scan shows are of none."""
+    """Unassign the clusters of landmarks that hardly any scan contains."""
     counts = np.bincount(which[which >= 0], minlength=1)
     return np.where((which >= 0) & (counts[np.maximum(which, 0)] < LEAST_SCANS), UNUSED, which)

@@ -25,7 +25,7 @@ _SAME = 0.9973  # probability with which two sightings of one thing fall into on
 
 @dataclass(frozen=True, slots=True)
 class MotionNoise:
-    """Variances of odometry by what it drove: they grow with what was turned and driven, hardly with time.
+    """Variances of odometry that grow with what was turned and driven, and hardly with time.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class MotionNoise:
 
     @classmethod
     def of(cls, c: OdometryConfig) -> "MotionNoise":
-        """The noise that is configured."""
+        """The configured noise."""
         return cls(c.turn_per_rad, c.turn_per_m, c.turn_per_s, c.way_per_m, c.way_per_s)
 
 
@@ -65,14 +65,14 @@ class Reckoned:
 
 
 class DeadReckoning:
-    """Odometry added up, as far back as late sightings may reach."""
+    """The sum of odometry, as far back as late sightings may reach."""
 
     def __init__(self, space: Geometry, remembered_s: float) -> None:
         self._space, self._remembered_ns = space, round(remembered_s * 1e9)
         self._samples: list[Reckoned] = []
 
     def step(self, step: Step, *, stands: bool) -> None:
-        """Go on by one step of odometry."""
+        """Add one step of odometry."""
         if not self._samples:
             self._samples.append(Reckoned(step.stamp_ns, self._space.identity))
             return
@@ -157,21 +157,21 @@ def motion_between(space: Geometry, noise: MotionNoise, a: Reckoned, b: Reckoned
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """A sighting without identity: its input, and where the robot was."""
+    """A sighting without id: its input, and the robot's pose."""
 
     topic: str
     sighting: Sighting
     where: PoseAtStamp
 
     def shared_by(self, count: int) -> "Seen":
-        """The same as one of several that are wrong alike: together they say as much as one."""
+        """The sighting as one of several with the same error: together they count as one."""
         covariance = tuple(count * c for c in self.sighting.covariance)
         return replace(self, sighting=replace(self.sighting, covariance=covariance))
 
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """Sightings of one thing: where it is from the scan, with covariance (n, n)."""
+    """Sightings of one landmark: its position relative to the scan, with covariance (n, n)."""
 
     point: Array
     covariance: Array
@@ -181,7 +181,7 @@ class Cluster:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """Clusters seen at one instant; ``where`` is that of its middle sighting."""
+    """Clusters seen at one instant; ``where`` is the pose of its middle sighting."""
 
     at: Reckoned
     where: PoseAtStamp
@@ -198,7 +198,7 @@ class _Glimpse:
 
 
 class ScanBuilder:
-    """Collects sightings until a scan is full; it is closed by stamps, never by when they come.
+    """Collects sightings until a scan is full. Stamps alone decide that, never arrival times.
 
     Parameters
     ----------
@@ -212,11 +212,11 @@ class ScanBuilder:
 
     @property
     def began_ns(self) -> int | None:
-        """Stamp of the first sighting; None where nothing was seen."""
+        """Stamp of the first sighting; None if there is none."""
         return self._glimpses[0].at.stamp_ns if self._glimpses else None
 
     def is_full(self, at: Reckoned) -> bool:
-        """Return whether what is seen at an instant belongs to another scan."""
+        """Return whether a sighting at this instant belongs to another scan."""
         if not self._glimpses:
             return False
         first = self._glimpses[0].at
@@ -228,7 +228,7 @@ class ScanBuilder:
         self._glimpses.append(_Glimpse(at, point, covariance, seen, sort))
 
     def close(self) -> Scan | None:
-        """The scan, and begin another; None where nothing was seen."""
+        """End the scan and begin another. Returns it; None if nothing was seen."""
         glimpses, self._glimpses = sorted(self._glimpses, key=lambda one: one.at.stamp_ns), []
         if not glimpses:
             return None
@@ -254,7 +254,7 @@ class ScanBuilder:
 def _clustered(
     points: Sequence[Array], covariances: Sequence[Array], glimpses: Sequence[_Glimpse], close_m: float
 ) -> list[list[int]]:
-    """Indices of the sightings of each thing; those of one message are of one thing only where they are close."""
+    """Indices of the sightings of each landmark. Those of one message are of one landmark only if they are close."""
     groups: list[list[int]] = []
     limit = quantile(_SAME, len(points[0]))
     for k, point in enumerate(points):

@@ -28,7 +28,7 @@ Field = tuple[str, Array, Array, Array, Array]
 
 @dataclass(frozen=True, slots=True)
 class PartialObservation:
-    """One sighting from a place that is taken for known.
+    """One sighting from a sensor pose that is assumed known.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class PositionHypothesis:
 def places(
     space: Geometry, glances: Sequence[PartialObservation], offset_sigma_m: float = 0.0
 ) -> list[PositionHypothesis]:
-    """Every place that fits the sightings best among those next to it, the best first.
+    """All local minima of the misfit to the sightings, the best first.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def _directions(n: int) -> Array:
 
 
 def _descend(space: Geometry, fields: list[Field], starts: Array, known: float) -> list[PositionHypothesis]:
-    """Levenberg-Marquardt from all starts at once, each to the nearest minimum; those that arrive, in their order.
+    """Levenberg-Marquardt from all starts at once, each to the nearest minimum. Returns those that converge, in order.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ Work = Callable[[], Outcome | None]
 
 
 def run_when_asked(work: Callable[[], Result], /) -> Callable[[], Result]:
-    """Does it when its result is asked for."""
+    """Runs the work when its result is requested."""
     return work
 
 
@@ -31,7 +31,7 @@ class _Job:
 
 
 class Background:
-    """Run at most one search at a time; its outcome is due at a fixed keyframe."""
+    """Runs at most one search at a time. Its outcome is due at a fixed keyframe."""
 
     def __init__(self, config: RobustConfig, executor: Executor) -> None:
         self._config, self._executor = config, executor
@@ -39,26 +39,26 @@ class Background:
         self._job: _Job | None = None
 
     def is_due(self, out: int) -> bool:
-        """Return whether so many candidates that are out deserve a look."""
+        """Return whether this number of rejected candidates makes a search due."""
         after, self._out = self._config.second_look_after, min(self._out, out)
         return self._job is None and after > 0 and out >= max(self._out + after, _MORE * self._out)
 
     def start(self, frozen: FrozenGraph, out: int) -> None:
-        """Begin with what there is now."""
+        """Start with the present graph."""
         self._out = out
         wanted = CancelToken()
         outcome = self._executor(lambda: search_alternatives(self._config, frozen, wanted))
         self._job = _Job(frozen.keyframe + self._config.apply_after_keyframes, outcome, wanted)
 
     def outcome(self, keyframe: int) -> Outcome | None:
-        """The outcome of the search at the keyframe it is for; waits for it. None if there is none."""
+        """The outcome of the search at its keyframe, after waiting for it; None if there is none."""
         if self._job is None or keyframe < self._job.apply_at:
             return None
         job, self._job = self._job, None
         return job.outcome()
 
     def cancel(self, out: int) -> None:
-        """Cancel the search under way: all was reviewed, and so many are out."""
+        """Cancel the running search, because everything was reviewed with this number of rejected candidates."""
         if self._job is not None:
             self._job.wanted.still = False
         self._job, self._out = None, out

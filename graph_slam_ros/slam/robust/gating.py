@@ -31,7 +31,7 @@ _REVIEWED_AT_ONCE = 1000  # accepted edges that one review looks at, besides as 
 
 
 class OutlierGate:
-    """Judge of the candidates among the edges of a graph; what it decides is weights, and stands in its ledger."""
+    """Judges the candidates among the edges of a graph. Its verdicts are weights, recorded in its ledger."""
 
     def __init__(self, config: RobustConfig, graph: Graph, solver: Solver, ledger: Ledger | None = None) -> None:
         self._config, self._graph, self._solver = config, graph, solver
@@ -51,9 +51,9 @@ class OutlierGate:
     # -- what is new -------------------------------------------------------------------------------------------------
 
     def gate_new(self, count: int, keyframe: int, *, trusts_sightings: bool = True) -> list[int]:
-        """Look at the edges that are new, up to a count, by their own noise.
+        """Judge the new edges, up to a count, by their own noise.
 
-        Those that fit are accepted; the others, which are told, wait outside, and all sightings where none is trusted.
+        Those that fit are accepted. The others are returned and held back, as are all sightings if none is trusted.
         """
         ids = np.arange(len(self.ledger), count)
         chi2, numbers = self._solver.chi2_of(ids)
@@ -76,13 +76,13 @@ class OutlierGate:
         return pending
 
     def _is_of_known(self, edge: int) -> bool:
-        """Return whether it is of a landmark that the last solve had: without it that is as determined as it was."""
+        """Return whether its landmark was part of the last solve: without the edge it is determined as before."""
         landmark = landmark_of(self._graph, edge)
         is_custom = self._graph.label_of(edge) == "custom"  # nothing needs it
         return is_custom or (landmark is not None and landmark < self._vertices)
 
     def admit_compatible(self, pending: Sequence[int], keyframe: int) -> list[int]:
-        """Compare with all that is known: the likeliest first, then the others with that; who is let in."""
+        """Compare held-back edges with the estimate, the likeliest first; returns those that are accepted."""
         out, admitted = list(pending), list[int]()
         while out:
             innovation = {edge: self._innovation(edge) for edge in out}
@@ -108,7 +108,7 @@ class OutlierGate:
         return bool((chi2 <= self.ledger.threshold.values[edges]).all())
 
     def refuse_unfit(self, edges: Sequence[int], keyframe: int) -> bool:
-        """Take those of some edges out that do not fit after all was done for it; whether there are any."""
+        """Reject those of some edges that still do not fit. Returns whether there were any."""
         chi2, _ = self._solver.chi2_of(edges)
         unfit = np.flatnonzero(chi2 > self.ledger.threshold.values[edges])
         for k in unfit.tolist():
@@ -118,7 +118,7 @@ class OutlierGate:
     # -- what was decided ---------------------------------------------------------------------------------------------
 
     def review(self, keyframe: int) -> None:
-        """Look again at the newest verdicts and, in turn, at some of the others."""
+        """Judge the newest verdicts again and, in turn, some of the others."""
         self.recalibrate()
         inside = self.ledger.inside
         if len(inside) > 2 * _REVIEWED_AT_ONCE:
@@ -139,7 +139,7 @@ class OutlierGate:
             self._readmit(edge, keyframe, fit, self._innovation_gate(edge))
 
     def reclassify(self, keyframe: int) -> bool:
-        """Reclassify all candidates after a full solve: in if they fit; returns whether a verdict changed."""
+        """Judge all candidates again after a full solve, by their residuals. Returns whether a verdict changed."""
         self.recalibrate()
         ledger, changed = self.ledger, False
         inside, outside = ledger.inside, ledger.outside
@@ -157,7 +157,7 @@ class OutlierGate:
         return changed
 
     def readmit_next(self, keyframe: int) -> bool:
-        """Let in what would fit if it were in, of that which fits least badly without; whether there was any."""
+        """Accept the rejected edge that fits best, if it would fit once accepted. Returns whether there was one."""
         outside = self.ledger.outside
         chi2, _ = self._solver.chi2_of(outside)
         for edge in outside[np.argsort(chi2, kind="stable")[:_READMISSIONS]].tolist():
@@ -168,7 +168,7 @@ class OutlierGate:
         return False
 
     def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
-        """Take edges out for good: who calls has other reasons than how they fit."""
+        """Remove edges permanently, for a reason other than their fit."""
         for edge in edges:
             if edge >= len(self.ledger):
                 self._solver.set_weight(edge, 0.0)
@@ -180,27 +180,27 @@ class OutlierGate:
 
     @property
     def gate_scale(self) -> float:
-        """The factor by which the gate of an innovation is wider than a quantile of chi2.
+        """The factor by which the gate of an innovation exceeds the chi-square quantile.
 
-        ``robust.noise_factor`` squared, times how good odometry has shown itself to be.
+        It is ``robust.noise_factor`` squared, times the observed accuracy of odometry.
         """
         return self._gate_scale
 
     def are_beyond_noise(self, edges: Sequence[int]) -> bool:
-        """Return whether most of some edges that are out are farther off than odometry's noise explains.
+        """Return whether most of some rejected edges are farther off than odometry's noise explains.
 
-        However good odometry has shown itself to be: it may be ``robust.noise_factor`` times worse than it is said.
+        That noise is ``robust.noise_factor`` times the configured one, however accurate odometry has been.
         """
         factor, numbers = self._config.noise_factor**2, self.ledger.numbers.values
         far = [self._innovation(edge) > factor * quantile(self._config.gate, int(numbers[edge])) for edge in edges]
         return 2 * sum(far) > len(far)
 
     def innovations(self, edges: Sequence[int]) -> list[float]:
-        """Return what believing each of some edges that are out would cost, given all that is in."""
+        """Return the cost of accepting each of some rejected edges, given all accepted ones."""
         return [self._innovation(edge) for edge in edges]
 
     def supersede(self, link: int, keyframe: int, evidence: float) -> None:
-        """Take an edge of odometry out: another with more noise is there in its place."""
+        """Reject an odometry edge that another one with more noise replaces."""
         self._solver.set_weight(link, 0.0)
         self.ledger.note(link, keyframe, Verdict.REJECTED, Reason.DISPLACED, evidence)
 
@@ -210,7 +210,7 @@ class OutlierGate:
         self.ledger.note(link, keyframe, Verdict.NOT_EVALUATED, Reason.NONE, evidence)
 
     def exchange(self, included: Sequence[int], excluded: Sequence[int], keyframe: int) -> None:
-        """Believe some edges and not others, which may come back; by how they fit it is judged afterwards."""
+        """Accept some edges and reject others, which may come back. Their fit is judged afterwards."""
         for edge in included:
             if not self.ledger.is_inside(edge):
                 self._readmit(edge, keyframe, float(self.ledger.statistic.values[edge]))
@@ -219,19 +219,19 @@ class OutlierGate:
                 self._reject(edge, keyframe, Reason.DOES_NOT_FIT, float(self.ledger.statistic.values[edge]))
 
     def adopt_verdicts(self, other: Ledger, keyframe: int) -> bool:
-        """Take over verdicts on the same edges from who has had a second look; whether that changed one."""
+        """Take over the verdicts of a search on the same edges. Returns whether that changed one."""
         mine, known = self.ledger, len(other)
         judged = mine.final + np.flatnonzero(mine.verdict.values[mine.final : known] != Verdict.NOT_EVALUATED)
         standing = judged[~np.isin(mine.reason.values[judged], FINAL)]
         return self._set_verdicts(standing, np.isin(standing, other.inside), keyframe, other)
 
     def force_inliers(self, edges: Index, keyframe: int) -> None:
-        """Have these candidates in and no others, to see what comes of it."""
+        """Accept these candidates and no others, as a trial."""
         candidates = np.sort(np.concatenate((self.ledger.inside, self.ledger.outside)))
         self._set_verdicts(candidates, np.isin(candidates, edges), keyframe, self.ledger)
 
     def _set_verdicts(self, edges: Index, wanted: NDArray[np.bool_], keyframe: int, judge: Ledger) -> bool:
-        """Include the edges that are wanted, exclude the others; returns whether a verdict has changed."""
+        """Accept the wanted edges, and reject the others. Returns whether a verdict has changed."""
         inside = np.isin(edges, self.ledger.inside)
         changed = 0
         for edge in edges[wanted & ~inside].tolist():
@@ -245,7 +245,7 @@ class OutlierGate:
         return changed > 0
 
     def _reweight(self, edges: Index, keyframe: int) -> None:
-        """Down-weight or reject edges by what their losses leave of the weight."""
+        """Reduce the weight of edges, or reject them, by the weight that their losses leave."""
         ledger = self.ledger
         chi2, _ = self._solver.chi2_of(edges)
         unfit = chi2 > ledger.threshold.values[edges]
@@ -261,7 +261,7 @@ class OutlierGate:
                 ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)
 
     def _innovation(self, edge: int) -> float:
-        """Return what believing an edge would cost; infinite where no number comes of it."""
+        """Return the cost of accepting an edge; infinite if it cannot be computed."""
         try:
             return innovation(self._graph, self._solver, edge)
         except (np.linalg.LinAlgError, ValueError):
@@ -271,7 +271,7 @@ class OutlierGate:
         return innovation <= self._innovation_gate(edge)
 
     def _innovation_gate(self, edge: int) -> float:
-        """Return what an innovation is held against."""
+        """Return the threshold of an innovation."""
         return self._gate_scale * quantile(self._config.gate, int(self.ledger.numbers.values[edge]))
 
     # -- one edge ----------------------------------------------------------------------------------------------------
@@ -296,7 +296,7 @@ class OutlierGate:
         self._count(edge, -1)
 
     def _landmark(self, edge: int) -> tuple[int, dict[int, int]] | None:
-        """The landmark that an edge is of, and among which of its edges it counts."""
+        """The landmark of an edge, and the edges among which it counts."""
         landmark = landmark_of(self._graph, edge)
         if landmark is None:
             return None
@@ -310,7 +310,7 @@ class OutlierGate:
             among[landmark] = among.get(landmark, 0) + more
 
     def _is_needed(self, edge: int) -> bool:
-        """Return whether a landmark may be undetermined without it: its last, or one of the few that do so together."""
+        """Return whether a landmark may be undetermined without the edge: it is the last, or one of very few."""
         found = self._landmark(edge)
         if found is None:
             return False
@@ -324,7 +324,7 @@ class OutlierGate:
     # -- what is too much --------------------------------------------------------------------------------------------
 
     def _limits(self, edges: Index, numbers: Index) -> Array:
-        """Return what chi2 is held against: the gate, or less where residuals of a class are far below their noise."""
+        """Return the thresholds of chi2: the gate, or less if residuals of a class are far below their noise."""
         limit = {int(n): quantile(self._config.gate, int(n)) for n in np.unique(numbers)}
         out = np.array([limit[n] for n in numbers.tolist()], dtype=float)
         for label, tightness in self._tightness.items():
@@ -332,14 +332,14 @@ class OutlierGate:
         return out
 
     def cautious_losses(self) -> dict[str, list[Loss]]:
-        """Losses by class under which what is false among candidates lets go by itself: Huber's, then DCS."""
+        """Losses by class that let go of false candidates: Huber's, then DCS."""
         stages = [Loss.named(name, self._config.loss_scale) for name in ("huber", "dcs")]
         return dict.fromkeys(CANDIDATES, stages)
 
     def recalibrate(self) -> None:
-        """Follow what residuals are like: whoever gives a noise ten times too large would let in all that is false.
+        """Adapt the gates to the residuals: with a configured noise that is ten times too large they would accept all.
 
-        The median of what is inside is compared with that of chi2; what is false does not move it.
+        The median of accepted residuals is compared with that of chi2. False candidates do not change it.
         """
         inside, ledger, factor = self.ledger.inside, self.ledger, self._config.noise_factor**2
         chi2, numbers = self._solver.chi2_of(inside)
@@ -361,14 +361,14 @@ class OutlierGate:
 
 
 def landmark_of(graph: Graph, edge: int) -> int | None:
-    """The vertex of the landmark that an edge is of."""
+    """The vertex of an edge's landmark."""
     if graph.label_of(edge) != "landmarks":
         return None
     return graph.edge(edge).vertices[1]
 
 
 def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:
-    """The statistic and what it was held against."""
+    """The statistic and its threshold."""
     return float(ledger.statistic.values[edge]), float(ledger.threshold.values[edge])
 
 

@@ -29,7 +29,7 @@ _STORY = 5  # closures that agree with one another and not with the map
 
 @dataclass(frozen=True, slots=True)
 class FrozenGraph:
-    """The input of a search: copies, which nobody else changes.
+    """The input of a search: copies that nothing else changes.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class FrozenGraph:
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """Another explanation that holds together, too, and costs not much more: who sees both cannot tell by this graph.
+    """Another consistent explanation at a similar cost: this graph cannot decide between the two.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Alternative:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """An explanation: from which start, what is believed, the stored numbers of all vertices, its truncated cost."""
+    """An explanation: its start, its verdicts, the stored numbers of all vertices, its truncated cost."""
 
     start: str
     ledger: Ledger
@@ -76,7 +76,7 @@ class Outcome:
     rivals: tuple[Alternative, ...] = ()
 
     def carried_to(self, graph: Graph, values: Array) -> Array:
-        """Stored numbers of a graph that has grown since: what is new moves with the newest pose that was there."""
+        """Stored numbers of the grown graph. Newer vertices move with the newest pose of the search."""
         out, known, old = values.copy(), len(self.values), self.frozen.graph
         odometry = old.edges_of("odometry")
         if known == len(values) or not len(odometry):
@@ -99,13 +99,13 @@ class Outcome:
 
 @dataclass(slots=True)
 class CancelToken:
-    """A token that cancels a search nobody waits for."""
+    """A token that cancels a search whose outcome is not needed any more."""
 
     still: bool = True
 
 
 def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: CancelToken | None = None) -> Outcome | None:
-    """Explain a graph anew, from each start; the least cost wins. None where nothing can be solved, or nobody waits."""
+    """Explain a graph anew from each start; the lowest cost wins. None if nothing can be solved, or if cancelled."""
     found: list[Outcome] = []
     for name, start, inliers in _starts(frozen):
         if wanted is not None and not wanted.still:
@@ -135,9 +135,9 @@ def _rival(one: Outcome, best: Outcome) -> Alternative | None:
 
 
 def _starts(frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
-    """The online estimate with what is believed; closures that agree with a neighbour, there and along odometry alone.
+    """The online verdicts; closures that agree with a neighbour, at the online estimate and along odometry alone.
 
-    And the largest group that is out, as if it alone were true.
+    The last start accepts the largest rejected group alone.
     """
     yield "online", frozen.values, None
     ledger, graph = frozen.ledger, frozen.graph
@@ -161,9 +161,9 @@ def _starts(frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
 def _explained(
     name: str, config: RobustConfig, frozen: FrozenGraph, start: Array, inliers: Index | None, hopeless: float
 ) -> Outcome:
-    """Solve and judge in turn, beginning with what is believed in the ledger, or with these candidates instead.
+    """Solve and judge in turn, starting with the verdicts of the ledger, or with these candidates.
 
-    It ends when no verdict changes, or when the cost is hopeless.
+    It ends when no verdict changes, or when the cost is too high.
     """
     graph, mine = frozen.graph.copy(), frozen.ledger.copy()
     solver = Solver(graph, frozen.settings)
@@ -188,7 +188,7 @@ def _explained(
 
 
 def _cost(solver: Solver, ledger: Ledger) -> float:
-    """Chi2 of all that is in, but of no candidate more than what it costs to be out."""
+    """Chi2 of all accepted edges; a candidate costs at most its threshold."""
     inside, limits = ledger.inside, ledger.threshold.values
     chi2, _ = solver.chi2_of(inside)
     doubted = float(np.minimum(chi2, limits[inside]).sum() + limits[ledger.outside].sum())
@@ -196,7 +196,7 @@ def _cost(solver: Solver, ledger: Ledger) -> float:
 
 
 def _along_odometry(graph: Graph, values: Array, held: set[int]) -> Array:
-    """Return where odometry alone says that the robot was; landmarks, and what is held, stay where they are."""
+    """Return the path by odometry alone. Landmarks and fixed vertices stay where they are."""
     out = values.copy()
     for edge in graph.edges_of("odometry").tolist():
         one = graph.edge(edge)

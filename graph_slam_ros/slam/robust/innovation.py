@@ -16,7 +16,7 @@ _LINEAR_RAD2 = 0.1  # of a direction: beyond, a linear prediction is none
 
 
 class _Enough(Exception):
-    """A search has evaluated as much as it may."""
+    """Raised when a search has used all its evaluations."""
 
 
 def innovation(graph: Graph, solver: Solver, edge: int) -> float:
@@ -45,7 +45,7 @@ def innovation(graph: Graph, solver: Solver, edge: int) -> float:
 
 
 def _least_cost(graph: Graph, x: Array, edge: Edge, joint: Array) -> float:
-    """The least of ``|u|^2 + |R r|^2`` over steps ``d = L u`` of the vertices, with ``L L' = Sigma``, by search."""
+    """The minimum of ``|u|^2 + |R r|^2`` over steps ``d = L u`` of the vertices, with ``L L' = Sigma``, by search."""
     variances, axes = np.linalg.eigh(joint)
     sigmas = axes * np.sqrt(np.maximum(variances, 0.0))
     ends = [graph.vertex(v) for v in edge.vertices]

@@ -22,11 +22,11 @@ class LandmarkHistory:
         self._earliest: dict[int, list[tuple[int, int]]] = {}  # (edge, keyframe) of each landmark's first sightings
 
     def add_survey(self, landmark: int) -> None:
-        """A landmark, by its vertex, whose position is known from a survey."""
+        """Note a landmark, by its vertex, whose position is surveyed."""
         self._surveyed.add(landmark)
 
     def add(self, edge: int, keyframe: int, landmark: int) -> None:
-        """A sighting of a landmark."""
+        """Note a sighting of a landmark."""
         earliest = self._earliest.setdefault(landmark, [])
         if len(earliest) < _FIRST:
             earliest.append((edge, keyframe))

@@ -46,7 +46,7 @@ _ACCEPTED, _DOWN_WEIGHTED = _INSIDE = tuple(map(int, INSIDE))  # comparing with 
 
 @dataclass(frozen=True, slots=True)
 class VerdictChange:
-    """A verdict that changed: at which keyframe, to what and why, and the statistic with its threshold."""
+    """A changed verdict: its keyframe, verdict, reason, statistic and threshold."""
 
     edge: int
     keyframe: int
@@ -79,7 +79,7 @@ class Ledger:
         self._out: set[int] = set()
 
     def finish(self, edges: int) -> None:
-        """Verdicts of the first so many edges stay; those of all others may change."""
+        """Make the verdicts of the first edges, up to a count, final. All others may change."""
         self.final = edges
         verdict, reason = self.verdict.values[edges:], self.reason.values[edges:]
         is_out = np.isin(verdict, (Verdict.PENDING, Verdict.REJECTED)) & ~np.isin(reason, FINAL)
@@ -89,7 +89,7 @@ class Ledger:
         return len(self.verdict)
 
     def copy(self) -> "Ledger":
-        """Another with the same records; its history begins empty."""
+        """Another ledger with the same records and an empty history."""
         out = copy(self)
         for name, column in vars(self).items():
             if isinstance(column, Column):
@@ -106,7 +106,7 @@ class Ledger:
         residuals: Array,
         judged: NDArray[Any],
     ) -> Index:
-        """Open a record for each new edge, accepted where it is to be judged at all; returns their ids.
+        """Open a record for each new edge. Edges that are never judged are accepted. Returns their ids.
 
         Parameters
         ----------
@@ -127,11 +127,11 @@ class Ledger:
         return ids
 
     def hold_back(self, edge: int) -> None:
-        """An edge that has just come is out until it is compared with all else."""
+        """Reject a new edge until it is compared with all others."""
         self.put(edge, Verdict.PENDING, Reason.UNLIKELY)
 
     def put(self, edge: int, verdict: Verdict, reason: Reason) -> None:
-        """A verdict, without a word of how it came."""
+        """Set a verdict without adding to the history."""
         self.verdict.values[edge], self.reason.values[edge] = verdict, reason
         if verdict in (Verdict.PENDING, Verdict.REJECTED) and reason not in FINAL:
             self._out.add(edge)
@@ -147,42 +147,42 @@ class Ledger:
         statistic: float,
         threshold: float | None = None,
     ) -> None:
-        """Write a verdict down, and that it was changed; without a threshold it was held against the edge's own."""
+        """Set a verdict and add it to the history. The default threshold is that of the edge."""
         self.put(edge, verdict, reason)
         self.statistic.values[edge] = statistic
         limit = float(self.threshold.values[edge]) if threshold is None else threshold
         self.history.append(VerdictChange(edge, keyframe, verdict, reason, float(statistic), limit))
 
     def residual(self, edge: int) -> Array:
-        """Return how the measurement differed from what was expected when it came, in its units."""
+        """Return the difference between the measurement and its prediction when it came, in its units."""
         first = int(self._residual_at.values[edge])
         out: Array = self._residual.values[first : first + int(self.numbers.values[edge])]
         return out
 
     def verdict_of(self, edge: int) -> Verdict:
-        """The verdict on one edge, also where it is too new to have a record."""
+        """The verdict on one edge; new edges without a record have one, too."""
         return Verdict(int(self.verdict.values[edge])) if edge < len(self) else Verdict.NOT_EVALUATED
 
     def is_inside(self, edge: int) -> bool:
-        """Return whether an edge pulls."""
+        """Return whether an edge has a weight."""
         return self.verdict.values.item(edge) in _INSIDE
 
     def is_withdrawn(self, edge: int) -> bool:
-        """Return whether an edge was taken out for good."""
+        """Return whether an edge was removed permanently."""
         return edge < len(self) and self.reason.values.item(edge) in FINAL and self.verdict.values.item(edge) != 0
 
     @property
     def inside(self) -> Index:
-        """Edges that were judged and pull, and may be judged anew."""
+        """Judged edges with a weight that may be judged again."""
         verdict = self.verdict.values[self.final :]
         return self.final + np.flatnonzero((verdict == _ACCEPTED) | (verdict == _DOWN_WEIGHTED))
 
     @property
     def outside(self) -> Index:
-        """Edges that are out and may come back."""
+        """Rejected edges that may come back."""
         return np.array(sorted(self._out), dtype=np.int64)
 
     @property
     def outside_count(self) -> int:
-        """Number of these."""
+        """The number of rejected edges that may come back."""
         return len(self._out)

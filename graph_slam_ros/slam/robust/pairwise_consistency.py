@@ -21,7 +21,7 @@ _NEAR = 5.0  # poses between the ends of neighbours
 
 
 def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Array) -> list[Index]:
-    """Groups of closures each of which agrees with a neighbour of its group; without those that agree with none.
+    """Groups of closures, each of which agrees with a neighbour in its group. Others are left out.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def consistent_groups(graph: Graph, values: Array, closures: Index, limits: Arra
 
 
 def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
-    """The place of each vertex along odometry, -1 if it has none; and of each place, the noise of all steps before."""
+    """The place of each vertex along odometry, -1 if none; and for each place the noise of all steps before it."""
     code = graph.labels.index("odometry") if "odometry" in graph.labels else -1
     rows = np.flatnonzero(table.label.values == code)
     order = np.full(graph.vertex_count, -1)
@@ -80,13 +80,13 @@ def _along_odometry(graph: Graph, table: EdgeTable) -> tuple[Index, Array]:
 
 
 def _walked(group: Any, motion: Array, noise: Array) -> Array:
-    """Covariance of the steps of a motion, as if all had erred half way, where turns weigh as they do on average."""
+    """Covariance of the steps of a motion, as if all errors were made half way, with the average effect of turns."""
     half = _columns(group.exp, 0.5 * _columns(group.log, motion))
     return _propagated(group, half, noise)
 
 
 def _propagated(group: Any, motion: Array, covariance: Array) -> Array:
-    """The covariance, in right tangent coordinates, of what is followed by a motion."""
+    """The covariance, in right tangent coordinates, after a further motion."""
     adjoint = np.array([group.adjoint(tuple(one)) for one in _columns(group.inverse, motion).tolist()])
     return adjoint @ covariance @ adjoint.transpose(0, 2, 1)
 

@@ -8,13 +8,13 @@ _LEAST_APART_M = 0.5  # two landmarks nearer to each other tell little of a head
 
 
 def are_spread(points: Array) -> bool:
-    """Return whether points are far enough from one another, and three not on a line, to tell a rigid motion."""
+    """Return whether points determine a rigid motion: apart from one another, and three not on a line."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[points.shape[1] - 2] >= 0.5 * _LEAST_APART_M)
 
 
 def aligned(points: Array, places: Array, weights: Array) -> tuple[Array, Array]:
-    """Rotation and shift that lay points on places with the least weighted squares (Kabsch)."""
+    """Rotation and translation that move points onto their counterparts with weighted least squares (Kabsch)."""
     w = weights / weights.sum()
     p, m = w @ points, w @ places
     u, _, vt = np.linalg.svd((points - p).T @ ((places - m) * w[:, None]))
