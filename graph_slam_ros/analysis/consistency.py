@@ -66,6 +66,7 @@ class Consistency:
     noise : the scale of the noise of each class of edges, input and part
     advice : what the user can do; empty if nothing
     left_out : why there is no NEES: by ``poses`` and ``landmarks``, a reason for each that is None
+    frame : where errors are seen from, if not from the first pose
     """
 
     last_pose: Nees | None
@@ -74,6 +75,7 @@ class Consistency:
     noise: tuple[NoiseScale, ...] = ()
     left_out: dict[str, str] = field(default_factory=dict)
     advice: str = ""
+    frame: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -82,6 +84,7 @@ class Consistency:
     def __str__(self) -> str:
         lines = []
         named = {"last pose": self.last_pose, "poses": self.poses, "landmarks": self.landmarks}
+        lines += [f"{'NEES':30s}{self.frame}"] if self.frame else []
         if any(named.values()):
             lines.append(
                 f"{'NEES':30s}{'mean':>10s}{'expected':>10s}{'95 % band':>16s}{'inside':>8s}{'n':>7s}{'skipped':>9s}"

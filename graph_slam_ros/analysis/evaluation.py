@@ -2,18 +2,16 @@
 
 For the errors, the estimate is aligned to the truth by the rigid motion that fits best, without scale. The motion is in
 the plane or in space, as the run is. Poses are compared if their stamps differ by at most 0.05 s. Consistency is
-computed in the frame of the run's first pose.
+computed in the frame of a pose.
 """
 
-import json
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.analysis.consistency import Consistency, Nees, landmark_nees, noise_advice, pose_nees
+from graph_slam_ros.analysis.consistency import Consistency
 from graph_slam_ros.analysis.path_error import (
     STATISTICS,
     Drift,
@@ -21,17 +19,15 @@ from graph_slam_ros.analysis.path_error import (
     Statistics,
     alignment,
     associate,
-    interpolated,
     path_error,
 )
+from graph_slam_ros.analysis.run_consistency import consistency_of
 from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.formats.files import is_empty, read_text
+from graph_slam_ros.formats.files import is_empty
 from graph_slam_ros.lie import se3
-from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, is_run, run_config, summary_of
-from graph_slam_ros.runs.trajectory import Point, Trajectory, read_covariances, read_landmarks, read_tum
-from graph_slam_ros.slam.noise_scale import NoiseScale
-from graph_slam_ros.typing import Array
+from graph_slam_ros.runs.folder import is_run, run_config, summary_of
+from graph_slam_ros.runs.trajectory import Point, Trajectory, read_landmarks, read_tum
 
 _KEYFRAMES = ("path.tum", "path_odometry.tum")  # estimate and dead reckoning
 _SIGHTINGS = ("sightings.tum", "odometry.tum")
@@ -180,7 +176,7 @@ def evaluate(
         path_error(drive.estimate, known.trajectory, dimensions, align=align),
         None if odometry is None else path_error(odometry, known.trajectory, dimensions),
         _map_rmse(landmarks, known.landmarks, dimensions),
-        _consistency(run, known, drive),
+        consistency_of(run, known, drive.keyframes, is_first=drive.number == 1),
         dimensions,
         known.losses,
         tuple(warnings),
@@ -263,76 +259,3 @@ def _map_rmse(landmarks: dict[str, Point], true: dict[str, Point], dimensions: i
     points, reference = (np.array([where[name] for name in shared]) * flat for where in (landmarks, true))
     moved = np.stack(se3.act(alignment(points[:, :dimensions], reference[:, :dimensions]), tuple(points.T)), axis=1)
     return float(np.sqrt(np.mean(np.sum((moved - reference) ** 2, axis=1))))
-
-
-def _consistency(run: Path, known: Truth, drive: Drive) -> Consistency | None:
-    """The consistency of a run; None if it has no covariances."""
-    if not os.path.lexists(run / COVARIANCES):
-        return None
-    path, covariances = read_tum(run / "path.tum"), read_covariances(run / COVARIANCES)
-    if len(covariances) != len(path.stamps_s):
-        raise GraphSlamError(
-            f"{run / COVARIANCES}: {len(covariances)} rows, and path.tum has {len(path.stamps_s)} poses"
-        )
-    path, covariances = path.at(drive.keyframes), covariances[drive.keyframes]
-    truth = known.trajectory if covariances.shape[1] == 6 else known.trajectory.in_plane()
-    true = interpolated(truth, path.stamps_s)
-    is_held, noise = _noise(run)
-    config = run_config(run)
-    is_applied = config.robust.noise_scale == "estimated"
-    advice = noise_advice(noise, is_applied=is_applied, config=config)
-    reason = _why_no_nees(known, drive, path, true, is_held)
-    if reason:
-        return Consistency(None, None, None, noise, {"poses and landmarks": reason}, advice)
-    landmarks = read_landmarks(run / "landmarks.csv")
-    unknown = (np.nan, np.nan, np.nan)
-    of_landmarks = landmark_nees(
-        np.array([landmark.position for landmark in landmarks.values()]).reshape(-1, 3),
-        np.array([known.landmarks.get(name, unknown) for name in landmarks]).reshape(-1, 3),
-        np.array([landmark.covariance for landmark in landmarks.values()]).reshape(-1, 3, 3),
-        path.poses[0],
-        true[0],
-        covariances[0],
-    )
-    last, poses = pose_nees(path.poses, true, covariances)
-    left_out = _left_out(last, poses, of_landmarks, known, len(landmarks))
-    return Consistency(last, poses, of_landmarks, noise, left_out, advice)
-
-
-def _why_no_nees(known: Truth, drive: Drive, path: Trajectory, true: Array, is_held: bool) -> str:
-    """The reason why errors and covariances cannot be compared; empty if they can."""
-    if not known.trajectory.has_orientation:
-        return f"{known.source} has no orientation, which says how the map lies in its frame"
-    if is_held:
-        return "fixes hold the map, not its first pose, and how their frame lies in that of the truth is not known"
-    if drive.number > 1:
-        return "the map was there before the drive, so the first pose of the drive does not hold it"
-    if not np.isfinite(true[0]).all():
-        return f"the first keyframe, at {path.stamps_s[0]:.3f} s, has no truth within 0.05 s: both frames meet there"
-    return ""
-
-
-def _left_out(
-    last: Nees | None, poses: Nees | None, of_landmarks: Nees | None, known: Truth, landmarks: int
-) -> dict[str, str]:
-    out = {}
-    if poses is None:
-        out["poses"] = "none but the first has a truth within 0.05 s and a covariance"
-    elif last is None:
-        out["last pose"] = "it has no truth within 0.05 s, or no covariance"
-    if of_landmarks is None and landmarks:
-        out["landmarks"] = (
-            "none of them has a covariance and is among the true ones"
-            if known.landmarks
-            else "the truth has none (/landmarks_ground_truth)"
-        )
-    return out
-
-
-def _noise(run: Path) -> tuple[bool, tuple[NoiseScale, ...]]:
-    """Return whether fixes hold the map, and the noise estimated from residuals, from the summary of a run."""
-    try:
-        summary = json.loads(read_text(run / SUMMARY))
-        return "fixes" in summary["classes"], tuple(NoiseScale(**one) for one in summary.get("noise", ()))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run ({type(error).__name__}: {error})") from None

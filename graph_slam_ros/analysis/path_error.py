@@ -197,16 +197,24 @@ def statistics(errors: Array) -> Statistics:
 
 
 def interpolated(truth: Trajectory, stamps_s: Array) -> Array:
-    """True poses (n, 7) at stamps (n,), between neighbours at most twice 0.05 s apart; elsewhere NaN."""
-    after = np.clip(np.searchsorted(truth.stamps_s, stamps_s), 1, max(1, len(truth.stamps_s) - 1))
+    """True poses (n, 7) at stamps (n,), between neighbours at most twice 0.05 s apart; elsewhere NaN.
+
+    Up to 0.05 s before the first and after the last, the motion of the truth goes on.
+    """
+    known_s, longest_s = truth.stamps_s, 2.0 * MAX_STAMP_DIFFERENCE_S
+    after = np.clip(np.searchsorted(known_s, stamps_s), 1, max(1, len(known_s) - 1))
     before = after - 1
-    after = np.minimum(after, len(truth.stamps_s) - 1)
-    first, gap = truth.stamps_s[before], truth.stamps_s[after] - truth.stamps_s[before]
+    after = np.minimum(after, len(known_s) - 1)
+    # the motion that goes on is that of 0.1 s: of two poses nearer to one another it would be their noise
+    after = np.where(stamps_s < known_s[0], np.searchsorted(known_s, known_s[0] + longest_s, "right") - 1, after)
+    before = np.where(stamps_s > known_s[-1], np.searchsorted(known_s, known_s[-1] - longest_s), before)
+    first, gap = known_s[before], known_s[after] - known_s[before]
     fraction = (stamps_s - first) / np.where(gap > 0.0, gap, 1.0)
     out = np.stack(se3.interpolate(tuple(truth.poses[before].T), tuple(truth.poses[after].T), fraction), axis=1)
-    off_s = np.minimum(np.abs(stamps_s - first), np.abs(truth.stamps_s[after] - stamps_s))
-    between = (fraction >= 0.0) & (fraction <= 1.0) & (gap <= 2.0 * MAX_STAMP_DIFFERENCE_S)
-    out[~(between | (off_s <= _ROUNDING))] = np.nan
+    off_s = np.minimum(np.abs(stamps_s - first), np.abs(known_s[after] - stamps_s))
+    outside_s = np.maximum(known_s[0] - stamps_s, stamps_s - known_s[-1])
+    known = (outside_s <= MAX_STAMP_DIFFERENCE_S + _ROUNDING) & (gap > 0.0) & (gap <= longest_s + _ROUNDING)
+    out[~(known | (off_s <= _ROUNDING))] = np.nan
     return out
 
 

@@ -6,7 +6,7 @@ on TF) or its position alone (PointStamped; NavSatFix, then east, north and up o
 
 import math
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from graph_slam_ros.messages.inputs.fixes import east_north_up
 from graph_slam_ros.recordings.bag import Bag, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
 from graph_slam_ros.runs.trajectory import Point, Trajectory, read_tum, trajectory
+from graph_slam_ros.typing import Array
 
 TRUTH_TOPIC = "/ground_truth"
 TRUE_LANDMARKS_TOPIC = "/landmarks_ground_truth"
@@ -34,6 +35,7 @@ _POSE_TYPES = (
     _FIX,
     _ODOMETRY,
 )
+_BENT = 0.05  # size of a path across its longest direction, as a part of that: a line has less
 Row = tuple[int, tuple[float, ...]]  # stamp [ns] and pose (7,)
 
 
@@ -75,7 +77,8 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
     if path.suffix in (".tum", ".txt"):
         if topic:
             raise GraphSlamError(f"{path}: a TUM file has no topics: leave out {topic}")
-        return Truth(read_tum(path, follow=True), {}, source=str(path))
+        known = read_tum(path, follow=True)
+        return Truth(replace(known, has_orientation=not _is_empty_heading(known.poses)), {}, source=str(path))
     bag = open_bag(path)
     name, _, frames = (topic or _only_topic(bag, path, not_these)).partition(":")
     if name not in bag.topics or bag.topics[name].type not in (*_POSE_TYPES, _TF):
@@ -91,10 +94,17 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
     # One rounding, as of the decimal text in a TUM file: equal stamps stay equal.
     stamps_s = np.array([stamp_ns / 10**9 for stamp_ns, _ in rows])
     found = trajectory(stamps_s, np.array([pose for _, pose in rows], dtype=float), f"{path}, {name}")
-    has_orientation = kind not in (_FIX, _POINT)
-    found = Trajectory(found.stamps_s, found.poses, has_orientation)
+    found = replace(found, has_orientation=kind not in (_FIX, _POINT) and not _is_empty_heading(found.poses))
     landmarks = _recorded_landmarks(bag)
     return Truth(found, landmarks, tuple(bag.losses), f"{topic or name} ({kind})", name)
+
+
+def _is_empty_heading(poses: Array) -> bool:
+    """Return whether all orientations are the same, although the path does not go along a line."""
+    if len(poses) < 3 or (poses[:, 3:] != poses[0, 3:]).any():
+        return False
+    sizes = np.linalg.svd(poses[:, :3] - poses[:, :3].mean(axis=0), compute_uv=False)
+    return bool(sizes[1] > _BENT * sizes[0])
 
 
 def _file_and_topic(truth: str) -> tuple[Path, str]:

@@ -1,7 +1,7 @@
 """Consistency: NEES and the noise of classes come out as they were put in, and a good run is found to be good."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,9 @@ from scipy.stats import chi2
 from graph_slam_ros.analysis.consistency import Nees, landmark_nees, pose_nees
 from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.path_error import interpolated
+from graph_slam_ros.analysis.relative_covariance import RelativeCovariances
+from graph_slam_ros.analysis.trajectories import read_truth
+from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.runs.recorder import RunRecorder
@@ -109,6 +112,96 @@ def test_the_truth_is_taken_between_its_neighbours_and_not_across_gaps_or_beyond
     assert interpolated(Trajectory(truth.stamps_s[:1], truth.poses[:1]), np.array([0.0])) == pytest.approx(
         truth.poses[:1]
     )
+
+
+def test_the_motion_of_the_truth_goes_on_for_a_twentieth_of_a_second_beyond_its_ends():
+    stamps = np.arange(1.0, 2.0, 0.01)
+    truth = Trajectory(stamps, se3.in_space([[3.0 * t, 0.0, 0.0] for t in stamps]))
+    at = interpolated(truth, np.array([0.94, 0.96, 0.989, stamps[-1] + 0.03, stamps[-1] + 0.06]))
+    assert np.isfinite(at[:, 0]).tolist() == [False, True, True, True, False]
+    assert at[1:4, 0] == pytest.approx(3.0 * np.array([0.96, 0.989, stamps[-1] + 0.03]))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A drive among landmarks, and its run."""
+    folder = tmp_path_factory.mktemp("recorded")
+    write_bag(simulate("pythonrobotics", 3), folder / "bag.mcap")
+    replay(folder / "bag.mcap", folder / "run")
+    return folder
+
+
+def test_covariances_seen_from_other_poses_are_those_of_how_the_estimate_moves_in_their_frame(recorded):
+    """Jacobians by central differences, with the joint covariance of the solver."""
+    saved = SavedGraph(recorded / "run", [])
+    vertices = [saved.keyframes[k] for k in (2, 9, 5)]
+    joint = saved.solver.joint_marginal(vertices)
+    values = [tuple(one) for one in saved.solver.estimate(vertices)]
+
+    def from_pose(poses):
+        return np.array(se2.between(poses[0], poses[2]))
+
+    def from_line(poses):
+        """The point's coordinates along the line and across it, in the axes that the map has now."""
+        first, last, point = (np.array(pose[:2]) for pose in poses)
+        axes = [(last - first) / np.linalg.norm(last - first) for first, last in ((first, last), ends)]
+        turn = [np.array([axis, [-axis[1], axis[0]]]) for axis in axes]
+        return turn[1].T @ turn[0] @ (point - first)
+
+    ends = [np.array(value[:2]) for value in values[:2]]
+
+    def jacobian(function):
+        h, columns = 1e-6, []
+        for e in h * np.eye(9):
+            moved = [
+                function([se2.retract(v, tuple(s * e[3 * k : 3 * k + 3])) for k, v in enumerate(values)])
+                for s in (1, -1)
+            ]
+            columns.append((moved[0] - moved[1]) / (2.0 * h))
+        return np.array(columns).T
+
+    by = jacobian(from_line)
+    line = RelativeCovariances(saved, (2, 9))
+    assert line.positions([5])[0] == pytest.approx(by @ joint @ by.T, rel=1e-5, abs=1e-12)
+    by, turn = jacobian(from_pose), np.eye(3)
+    c, s = np.cos(from_pose(values)[2]), np.sin(from_pose(values)[2])
+    turn[:2, :2] = [[c, s], [-s, c]]  # from the axes of the frame into those of the pose
+    pose = RelativeCovariances(saved, (2,))
+    should = [turn @ by @ joint @ by.T @ turn.T, np.zeros((3, 3))]
+    assert pose.poses([5, 2]) == pytest.approx(np.array(should), rel=1e-5)
+    name, place = next(iter(saved.landmarks.items()))
+    spot, h = saved.solver.estimate([place])[0], 1e-6
+
+    def seen_from(e):
+        return np.array(se2.act(se2.inverse(se2.retract(values[0], tuple(e[:3]))), tuple(spot + e[3:])))
+
+    by = np.array([(seen_from(h * e) - seen_from(-h * e)) / (2.0 * h) for e in np.eye(5)]).T
+    by = se2.to_matrix(values[0])[:2, :2] @ by
+    found = pose.landmarks([name, "unknown"])
+    assert found[0] == pytest.approx(by @ saved.solver.joint_marginal([vertices[0], place]) @ by.T, rel=1e-5, abs=1e-12)
+    assert np.isnan(found[1]).all()
+
+
+def test_a_truth_that_begins_late_or_has_no_heading_tells_of_consistency_too(recorded):
+    truth = read_truth(recorded / "bag.mcap")
+    first = evaluate(recorded / "run", truth).consistency
+    assert (first.frame, first.poses.dof) == ("", 3)
+    path = truth.trajectory
+    late = evaluate(recorded / "run", replace(truth, trajectory=path.at(slice(12, None)))).consistency
+    assert late.frame.startswith("seen from keyframe ") and late.poses.dof == 3
+    still = path.poses.copy()
+    still[:, 3:] = se3.IDENTITY[3:]
+    rows = "".join(f"{stamp} {' '.join(map(str, pose))}\n" for stamp, pose in zip(path.stamps_s, still, strict=True))
+    (recorded / "positions.tum").write_text(rows)
+    found = read_truth(recorded / "positions.tum")
+    assert not found.trajectory.has_orientation
+    positions = evaluate(recorded / "run", replace(truth, trajectory=found.trajectory)).consistency
+    assert positions.frame.startswith("of positions, seen from the line between keyframes ")
+    assert (positions.poses.dof, positions.landmarks.dof) == (2, 2)
+    for one in (first, late, positions):
+        assert one.poses.inside > 0.75
+        assert one.landmarks.n == first.landmarks.n
+    assert positions.frame in str(positions)
 
 
 CLEAN = {"odometry.twist_correlation_s": 0.0, "landmarks.added_sigma_m": 0.0, "landmarks.loss": "none"}

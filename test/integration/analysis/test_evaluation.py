@@ -544,10 +544,8 @@ def test_why_there_is_no_nees_is_told(run, tmp_path):
     write_bag(simulate("pythonrobotics", 0), tmp_path / "bag.mcap")
     replay(tmp_path / "bag.mcap", tmp_path / "replayed")
     truth = read_truth(tmp_path / "bag.mcap").trajectory
-    write_tum(tmp_path / "late.tum", truth.stamps_s[5:], truth.poses[5:])
-    assert "left out: the first keyframe, at" in str(evaluate(tmp_path / "replayed", tmp_path / "late.tum"))
     write_tum(tmp_path / "all.tum", truth.stamps_s, truth.poses)
     scores = evaluate(tmp_path / "replayed", tmp_path / "all.tum")
     assert scores.consistency.left_out == {"landmarks": "the truth has none (/landmarks_ground_truth)"}
     write_fixes(tmp_path / "fixes.mcap", truth.stamps_s, truth.poses)
-    assert "has no orientation" in str(evaluate(tmp_path / "replayed", tmp_path / "fixes.mcap"))
+    assert "of positions" in str(evaluate(tmp_path / "replayed", tmp_path / "fixes.mcap"))

@@ -1,0 +1,167 @@
+"""The consistency of a saved run: the NEES of its poses and landmarks, and the noise that it found.
+
+Errors are seen from the first keyframe with a true pose. Where the truth is positions only, those of the plane are seen
+from the line between two of them: the first, and the one that is farthest from it.
+"""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+
+from graph_slam_ros.analysis.consistency import Consistency, Nees, landmark_nees, noise_advice, pose_nees
+from graph_slam_ros.analysis.path_error import interpolated
+from graph_slam_ros.analysis.relative_covariance import RelativeCovariances
+from graph_slam_ros.analysis.trajectories import Truth
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.files import read_text
+from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, run_config
+from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_tum
+from graph_slam_ros.slam.noise_scale import NoiseScale
+from graph_slam_ros.typing import Array
+
+_MOST = 500  # poses for which joint covariances are computed
+_All = tuple[Nees | None, Nees | None, Nees | None]  # of the last pose, of poses, of landmarks
+
+
+def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool) -> Consistency | None:
+    """Return the consistency of a drive of a run; None if it has no covariances.
+
+    Parameters
+    ----------
+    keyframes : of the drive
+    is_first : whether the map began with this drive
+    """
+    if not os.path.lexists(run / COVARIANCES):
+        return None
+    path, covariances = read_tum(run / "path.tum"), read_covariances(run / COVARIANCES)
+    if len(covariances) != len(path.stamps_s):
+        raise GraphSlamError(
+            f"{run / COVARIANCES}: {len(covariances)} rows, and path.tum has {len(path.stamps_s)} poses"
+        )
+    path, covariances = path.at(keyframes), covariances[keyframes]
+    is_planar = covariances.shape[1] == 3
+    true = interpolated(known.trajectory.in_plane() if is_planar else known.trajectory, path.stamps_s)
+    is_held, noise = _noise(run)
+    config = run_config(run)
+    is_applied = config.robust.noise_scale == "estimated"
+    advice = noise_advice(noise, is_applied=is_applied, config=config)
+    reason = _why_no_nees(known, true, is_first=is_first, is_held=is_held, is_planar=is_planar)
+    if reason:
+        return Consistency(None, None, None, noise, {"poses and landmarks": reason}, advice)
+    landmarks = read_landmarks(run / "landmarks.csv")
+    drive = _Compared(run, path, true, landmarks, known)
+    if not known.trajectory.has_orientation:
+        found, frame = drive.positions()
+    elif np.isfinite(true[0]).all():
+        found, frame = drive.poses(0, covariances, [one.covariance for one in landmarks.values()]), ""
+    else:
+        found, frame = drive.later()
+    return Consistency(*found, noise, _left_out(*found, known, len(landmarks)), advice, frame)
+
+
+class _Compared:
+    """A drive and its truth, in the frames that they can be compared in."""
+
+    def __init__(self, run: Path, path: Trajectory, true: Array, landmarks: dict[str, Landmark], known: Truth) -> None:
+        self._run, self._path, self._true, self._names = run, path, true, list(landmarks)
+        unknown = (np.nan, np.nan, np.nan)
+        self._places = np.array([one.position for one in landmarks.values()]).reshape(-1, 3)
+        self._true_places = np.array([known.landmarks.get(name, unknown) for name in landmarks]).reshape(-1, 3)
+        self._with_truth = np.flatnonzero(np.isfinite(true).all(axis=1))
+
+    def poses(self, first: int, covariances: Array, of_landmarks: list[Array]) -> _All:
+        """NEES seen from a pose whose covariance all others contain; ``covariances`` begin there."""
+        estimate, true = self._path.poses[first:], self._true[first:]
+        spreads = np.array(of_landmarks).reshape(-1, 3, 3)
+        seen = landmark_nees(self._places, self._true_places, spreads, estimate[0], true[0], covariances[0])
+        return *pose_nees(estimate, true, covariances), seen
+
+    def later(self) -> tuple[_All, str]:
+        """NEES seen from the first keyframe with truth, where that is not the first."""
+        first = int(self._with_truth[0])
+        frame = RelativeCovariances(SavedGraph(self._run, []), (first,))
+        some = self._some()
+        of_some = frame.poses(some)
+        covariances = np.full((len(self._true) - first, *of_some.shape[1:]), np.nan)
+        covariances[some - first] = of_some
+        found = self.poses(first, covariances, _in_space(frame.landmarks(self._names)))
+        return found, f"seen from keyframe {first}, the first with a true pose"
+
+    def positions(self) -> tuple[_All, str]:
+        """NEES of positions in the plane, seen from the line between two of them."""
+        path, true = self._path.poses[:, :2], self._true[:, :2]
+        first, some = int(self._with_truth[0]), self._some()
+        last = int(some[np.argmax(np.linalg.norm(true[some] - true[first], axis=1))])
+        frame = RelativeCovariances(SavedGraph(self._run, []), (first, last))
+        line, true_line = path[last] - path[first], true[last] - true[first]
+        angle = np.arctan2(line[1], line[0]) - np.arctan2(true_line[1], true_line[0])
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+        def errors(estimate: Array, truth: Array) -> Array:
+            return path[first] + (truth[:, :2] - true[first]) @ turn.T - estimate[:, :2]
+
+        some = some[some != first]
+        off, covariances = errors(path[some], true[some]), frame.positions(some)
+        off_landmarks = errors(self._places, self._true_places)
+        found = (
+            Nees.of(off[-1:], covariances[-1:]),
+            Nees.of(off, covariances),
+            Nees.of(off_landmarks, frame.landmarks(self._names)),
+        )
+        text = f"of positions, seen from the line between keyframes {first} and {last}: the truth has no heading"
+        return found, text
+
+    def _some(self) -> Array:
+        """The keyframes with truth, at most so many as are computed, the first and last among them."""
+        known = self._with_truth
+        return known[np.unique(np.linspace(0, len(known) - 1, min(_MOST, len(known))).astype(int))]
+
+
+def _in_space(covariances: Array) -> list[Array]:
+    """Covariances of positions in the plane or in space: (3, 3), 0 for what a plane does not have."""
+    missing = 3 - covariances.shape[1]
+    return [np.pad(one, ((0, missing), (0, missing))) for one in covariances]
+
+
+def _why_no_nees(known: Truth, true: Array, *, is_first: bool, is_held: bool, is_planar: bool) -> str:
+    """Return why errors and covariances cannot be compared; empty if they can."""
+    if is_held:
+        return "fixes hold the map, not its first pose, and how their frame lies in that of the truth is not known"
+    if not is_first:
+        return "the map was there before the drive, so the first pose of the drive does not hold it"
+    if np.count_nonzero(np.isfinite(true).all(axis=1)) < 2:
+        return "fewer than two keyframes have a truth within 0.05 s"
+    if known.trajectory.has_orientation:
+        return ""
+    if not is_planar:
+        return f"{known.source} has no orientation, which says how the map lies in its frame"
+    return ""
+
+
+def _left_out(
+    last: Nees | None, poses: Nees | None, of_landmarks: Nees | None, known: Truth, landmarks: int
+) -> dict[str, str]:
+    out = {}
+    if poses is None:
+        out["poses"] = "none but the first has a truth within 0.05 s and a covariance"
+    elif last is None:
+        out["last pose"] = "it has no truth within 0.05 s, or no covariance"
+    if of_landmarks is None and landmarks:
+        out["landmarks"] = (
+            "none of them has a covariance and is among the true ones"
+            if known.landmarks
+            else "the truth has none (/landmarks_ground_truth)"
+        )
+    return out
+
+
+def _noise(run: Path) -> tuple[bool, tuple[NoiseScale, ...]]:
+    """Return whether fixes hold the map, and the noise estimated from residuals, from the summary of a run."""
+    try:
+        summary = json.loads(read_text(run / SUMMARY))
+        return "fixes" in summary["classes"], tuple(NoiseScale(**one) for one in summary.get("noise", ()))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise GraphSlamError(f"{run / SUMMARY}: not a summary of a run ({type(error).__name__}: {error})") from None
