@@ -21,7 +21,7 @@ _STILL_M, _STILL_RAD = 0.5, 1.0
 _WINDOW_S, _LONGEST_S = 1.0, 3.0
 _SCALE, _EXPLAINED, _UNEXPLAINED = 0.1, 0.5, 0.7
 _LATERAL, _FITS, _WORSE_M = 0.1, 0.3, 0.02
-_TINY, _USELESS, _UNUSED_M_S, _SLOWEST_M_S, _TINY_RAD_S = 1e-3, 3.0, 500.0, 0.05, 1e-4
+_TINY, _USELESS, _UNUSED_M_S, _SLOWEST_M_S, _TINY_RAD_S = 1e-3, 3.0, 1e3, 0.05, 1e-4
 _OFF_PLANE, _LEVEL_M = 0.05, 0.5
 _UNITS = {
     -1.0: "mirrored",
@@ -220,12 +220,12 @@ def _covariance(o: OdometryColumns, steps: Steps, where: Where) -> Iterator[Find
         severity: Severity = "error" if bad.mean() > 0.5 else "warning"  # such messages are refused
         yield Finding("covariance_negative", severity, int(bad.sum()), 0, "messages", text, settings=_DENSITY, **where)
         return
-    if not used.any():
+    if not used.any() or (np.median(used, axis=0) >= _UNUSED_M_S**2).any():
         text = f"{o.topic}: the twist has no covariance: the configured densities are used"
         yield Finding("covariance_zero", "note", 0.0, 0.0, "m/s", text, **where)
         return
     sigmas, speed = np.sqrt(np.median(used, axis=0)), max(steps.fastest_m_s, _SLOWEST_M_S)
-    if _USELESS * speed < sigmas[0] < _UNUSED_M_S:
+    if sigmas[0] > _USELESS * speed:
         text = f"{o.topic}: the twist's sigma is {sigmas[0]:.2g} m/s, the robot's speed at most {speed:.2g} m/s"
         yield Finding(
             "covariance_useless", "warning", sigmas[0] / speed, _USELESS, "times", text, settings=_DENSITY, **where

@@ -112,10 +112,11 @@ def _twist_covariance(source: InputContext, flat: Any) -> Numbers | None:
 
 
 def _judged(source: InputContext, full: Any) -> tuple[Numbers | MessageError | None, list[str]]:
-    block, variances = source.block(full), np.diag(full)
+    block = source.block(full)
     if not block.any():
         return None, ["covariance_unknown"]
-    if source.space.dimensions == 3 and ((variances == 0.0) | (variances >= _UNUSED)).any():
+    variances = np.diag(block)
+    if (variances >= _UNUSED).any() or (source.space.dimensions == 3 and (variances == 0.0).any()):
         return None, ["covariance_of_some_axes_unknown"]
     try:
         covariance, repairs = checks.covariance(block, source.space.dimensions)

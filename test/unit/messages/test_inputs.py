@@ -81,6 +81,14 @@ def test_in_space_a_twist_covariance_that_leaves_out_an_axis_is_not_used():
         assert counted(b) == {"odom": {"covariance_of_some_axes_unknown": 1}}
 
 
+@pytest.mark.parametrize("variances", [(1e6, 1e6, 1e6), (0.04, 1e6, 0.02), (0.04, 0.01, 1e6)])
+def test_in_the_plane_a_twist_of_which_an_axis_is_unknown_leaves_the_configured_noise(variances):
+    b = border()
+    x, y, turn = variances
+    assert heard(b, "odom", odometry(twist=np.diag([x, y, 1e6, 1e6, 1e6, turn]))).twist_covariance is None
+    assert counted(b) == {"odom": {"covariance_of_some_axes_unknown": 1}}
+
+
 def test_in_space_the_lever_arm_of_a_linked_child_frame_is_applied_with_its_tilt():
     arm, q = (0.5, 0.2, 0.1), quaternion(0.1, 0.2, 0.3)
     T_base_imu = (*arm, *numbers(q))
