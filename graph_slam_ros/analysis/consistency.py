@@ -79,7 +79,7 @@ class Consistency:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
-        return asdict(self)
+        return asdict(self) | {"noise": [one.as_dict() for one in self.noise]}
 
     def __str__(self) -> str:
         lines = []
@@ -101,8 +101,9 @@ class Consistency:
             lines.append(f"{'noise of class, input, part':40s}{head}   configured sigmas should be")
         for one in self.noise:
             name = " ".join(filter(None, (one.label, one.source, one.part)))
+            per_dof = f"{one.per_dof:.3f}" if np.isfinite(one.per_dof) else "-"
             should = f"not known: {one.reason}" if one.reason else f"{one.factor:.3g} times as large{_growth(one)}"
-            lines.append(f"{name:40s}{one.dof:8.0f}{one.per_dof:10.3f}{one.design_effect:8.2f}   {should}")
+            lines.append(f"{name:40s}{one.dof:8.0f}{per_dof:>10s}{one.design_effect:8.2f}   {should}")
         lines += [self.advice] if self.advice else []
         return "\n".join(lines)
 

@@ -154,7 +154,7 @@ def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
 
 def _step(values: Any) -> float:
     """The step of a column of measured numbers: what is shown of it is no finer."""
-    largest = float(np.nanmax(np.abs(values)))
+    largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
     return _MM if largest < 1e6 else largest * 1e-9
 
 

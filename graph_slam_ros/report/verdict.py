@@ -1,5 +1,6 @@
 """The verdict on a run in three sentences, and its tables."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from graph_slam_ros.runs import outcome
 
 Row = list[Any]
 _FINE = 0.5, 2.0  # chi2 per degree of freedom
+_MOST_REASONS = 3  # that the sentence on rejected measurements names
 
 
 def verdict(
@@ -57,12 +59,12 @@ def _state(
         if scores.odometry is not None:
             error += f", dead reckoning {scores.odometry.position_m['rmse']:.3f} m"
     if short:
-        return f"Do not rely on this map yet ({size}{error}): {short[0]}."
+        return f"Do not rely on this map yet: {size}{error}."
     if not summary.get("converged", True):
-        return f"Do not rely on this map yet ({size}{error}): the last solve did not converge."
+        return f"Do not rely on this map yet: {size}{error}; the last solve did not converge."
     if doubts or losses:
         return f"Use this map with care: {size}{error}{fit}."
-    return f"The map can be used as far as the run itself can say: {size}{error}{fit}."
+    return f"The run shows nothing wrong with this map: {size}{error}{fit}."
 
 
 def _fit(saved: SavedGraph) -> str:
@@ -84,18 +86,16 @@ def chi2_per_dof(saved: SavedGraph) -> float | None:
 def _judged(saved: SavedGraph | None) -> str:
     judged = [e for e in saved.entries if e.verdict] if saved else []
     if not judged:
-        return "No measurement was judged: there is nothing but odometry."
+        return "The map is odometry alone: no landmark, fix or closure is in it."
     out = [e for e in judged if not e.is_in]
     weak = sum(e.verdict.name == "DOWN_WEIGHTED" for e in judged)
     low = f"; {weak} more have little weight" if weak else ""
     if not out:
-        return f"All {len(judged)} measurements that were judged are in the map{low}."
+        return f"All {len(judged)} measurements are in the map{low}."
     counted = Counter((e.source or e.label, e.reason.name.lower().replace("_", " ")) for e in out)
-    (name, why), most = counted.most_common(1)[0]
-    return (
-        f"{len(out)} of {len(judged)} measurements that were judged are not in the map{low};"
-        f" most of them, {most}, are of {shown(name)} ({why})."
-    )
+    several = [f"{times} of {shown(name)} ({why})" for (name, why), times in counted.most_common(_MOST_REASONS)]
+    rest = "; the most are " if len(counted) > _MOST_REASONS else ": "
+    return f"{len(out)} of {len(judged)} measurements are not in the map{rest}{', '.join(several)}{low}."
 
 
 def _next(
@@ -111,11 +111,11 @@ def _next(
         return f"First get the run whole: {losses[0]} ({again})."
     first = next((some[0] for some in several if some), "")
     if first:
-        return f"Next: {first.removeprefix('warning: ')}{'' if first.endswith('.') else '.'}"
+        return f"Why, and what to do: {first.removeprefix('warning: ')}{'' if first.endswith('.') else '.'}"
     if has_truth:
-        return "Nothing calls for a change."
+        return "Nothing needs to be changed."
     truth = f"graph_slam report {run.name} --truth TRUTH"
-    return f"Nothing calls for a change; whether the map is true only a truth can say: {truth}."
+    return f"Next: compare it with a ground truth, if there is one: {truth}."
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------
@@ -197,8 +197,9 @@ def noise(summary: Mapping[str, Any]) -> list[Row]:
     rows = []
     for one in summary.get("noise", ()):
         name = " ".join(filter(None, (one["label"], one["source"], one["part"])))
+        per_dof = one["per_dof"] if one["per_dof"] is not None and math.isfinite(one["per_dof"]) else None
         should = one["reason"] if one["reason"] else f"{one['factor']:.3g} times as large"
-        rows.append([shown(name), one["dof"], one["per_dof"], one["design_effect"], should])
+        rows.append([shown(name), one["dof"], per_dof, one["design_effect"], should])
     return rows
 
 

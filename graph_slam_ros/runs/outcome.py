@@ -139,7 +139,10 @@ def shortcomings(summary: Summary) -> Iterator[str]:
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
             )
     if not sum(counts["believed"] or 0 for counts in inputs.values()):
-        yield "this is odometry alone: no landmark, fix or closure is in the result"
+        yield (
+            "this is odometry alone: no landmark, fix or closure is in the result; "
+            "graph_slam check BAG says what of the recording cannot be used"
+        )
     elif summary["landmarks"] and summary["sightings"] == summary["landmarks"]:
         yield "no landmark was seen twice, so they correct nothing: do ids change? --set landmarks.association=joint"
 

@@ -50,7 +50,7 @@ def noise_summary(slam: GraphSlam) -> dict[str, Any]:
     if not slam.is_solved:
         return out | {"noise_unknown": "nothing is solved"}
     try:
-        return out | {"noise": [asdict(one) for one in slam.noise_scale()]}
+        return out | {"noise": [one.as_dict() for one in slam.noise_scale()]}
     except GraphSlamError as error:  # what cannot be said of a singular map must not cost its results
         return out | {"noise_unknown": str(error)}
 

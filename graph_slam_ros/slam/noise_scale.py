@@ -10,8 +10,10 @@ independent ones. The variance of a sighting is therefore multiplied by the desi
 "Survey sampling", 1965): the variance of a pass's mean against that of independent errors.
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -71,6 +73,10 @@ class NoiseScale:
     def key(self) -> Key:
         """The key of its group."""
         return self.label, self.source, self.part
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values; a number that JSON has not is null."""
+        return asdict(self) | {"per_dof": self.per_dof if math.isfinite(self.per_dof) else None}
 
 
 def factors_of(scales: Sequence[NoiseScale]) -> dict[Key, float]:
@@ -229,7 +235,7 @@ def _passes(ends: Index, stamp_of: Index) -> list[Index]:
 
 
 def _scale(key: Key, total: _Sums, factor_now: float) -> NoiseScale:
-    dof = total.residuals - total.leverage
+    dof = max(total.residuals - total.leverage, 0.0)
     per_dof = total.chi2 / dof if dof > 0.0 else float("nan")
     design_effect = 1.0
     if total.passes >= LEAST_PASSES and total.of_singles > 0.0:
@@ -237,7 +243,7 @@ def _scale(key: Key, total: _Sums, factor_now: float) -> NoiseScale:
     scale = NoiseScale(*key, total.edges, dof, per_dof, design_effect, factor_now)
     least = LEAST_DOF_OF_MOTION if total.errors else LEAST_DOF
     if dof < least:
-        return replace(scale, reason=f"{max(dof, 0.0):.0f} degrees of freedom, fewer than {least:.0f}")
+        return replace(scale, reason=f"{dof:.0f} degrees of freedom, fewer than {least:.0f}")
     if total.outliers > MOST_OUTLIERS * total.edges:
         return replace(scale, reason=f"{total.outliers / total.edges:.0%} outliers, more than {MOST_OUTLIERS:.0%}")
     if total.errors is not None:

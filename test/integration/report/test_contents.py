@@ -123,7 +123,21 @@ def test_the_sentences_on_top_say_what_is_out_and_what_to_do(made, run):
     out = [e for e in SavedGraph(run, []).entries if not e.is_in]
     assert "keyframes" in state
     assert judged.startswith(f"{len(out)} of ")
-    assert after.startswith("Next: ")
+    assert after.startswith("Why, and what to do: ")
+
+
+def test_a_run_of_odometry_alone_has_a_report(tmp_path, capsys):
+    bag, run = tmp_path / "drive.mcap", tmp_path / "run"
+    assert cli.main(["simulate", "manhattan", "--out", str(bag), "--poses", "60", "--set", "landmarks=false"]) == 0
+    assert cli.main(["replay", str(bag), "--out", str(run), "--set", "inputs.names=odom"]) == 3
+    assert "NaN" not in (run / "run.json").read_text()
+    capsys.readouterr()
+    assert cli.main(["report", str(run)]) == 0
+    state, judged, after = capsys.readouterr().out.splitlines()[:3]
+    assert state.startswith("Do not rely on this map")
+    assert "odometry alone" in judged
+    assert "graph_slam check" in after, "what to do, not what is wrong again"
+    assert (tmp_path / "run.html").stat().st_size > 10_000
 
 
 def test_jumps_name_measurements_judged_there(made, saved):

@@ -331,7 +331,8 @@ def test_refused_messages_are_counted_and_shown_but_are_no_loss(bag, tmp_path, c
         for k, m in enumerate(open_bag(bag).messages({"/odom"})):
             writer.write("/odom", "nav_msgs/msg/Odometry", m.log_ns, m.cdr[:50] if k % 10 == 3 else m.cdr)
     code, out, err = told(capsys, "replay", file, "--out", tmp_path / "run")
-    assert (code, err) == (3, ["graph_slam: this is odometry alone: no landmark, fix or closure is in the result"])
+    assert (code, len(err)) == (3, 1)
+    assert err[0].startswith("graph_slam: this is odometry alone: no landmark, fix or closure is in the result")
     refused = json.loads((tmp_path / "run" / "run.json").read_text())["counters"]["odom"]["undecodable"]
     assert refused > 5
     assert f"undecodable {refused}: the bytes are not a message of this type" in out
