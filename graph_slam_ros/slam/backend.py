@@ -218,14 +218,25 @@ class Backend:
         return max(self.frozen_edges, self.held[1])
 
     def trial_problem(
-        self, space: Geometry, path: KeyframeList, origins: SightingEdges, settings: Settings | None = None
+        self,
+        space: Geometry,
+        path: KeyframeList,
+        origins: SightingEdges,
+        settings: Settings | None = None,
+        factors: tuple[float, float] = (1.0, 1.0),
     ) -> TrialProblem:
-        """A copy of the present problem for a trial fit. Rejected sightings are included, under their loss."""
+        """A copy of the present problem for a trial fit. Rejected sightings are included, under their loss.
+
+        Parameters
+        ----------
+        factors : of distance and turn, by which odometry is corrected
+        """
         graph, solver, out = self.graph.copy(), self.solver, self.ledger.outside
         graph.set_weights(out[graph.has_label(out, ("landmarks",))], 1.0)
         keyframes = path.keyframes.ids.copy(), path.keyframes.stamps_ns.copy(), tuple(path.segments)
         problem = solver.vertices, solver.held, solver.values, settings or solver.settings
-        return TrialProblem(space, graph, *problem, origins.copy(), *keyframes, self._first_free_edge)
+        track = path.samples.track(path.keyframes.poses, factors)
+        return TrialProblem(space, graph, *problem, origins.copy(), *keyframes, track, self._first_free_edge)
 
     def cancel_search(self) -> None:
         """Cancel a running search, because everything was reviewed."""

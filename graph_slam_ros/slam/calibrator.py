@@ -123,7 +123,8 @@ class Calibrator:
         values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
         moved = any(one.parameter in values and abs(one.value) > one.sigma for one in findings)
         self._steady = 0 if moved else self._steady + bool(self._admitted)
-        report = self._correct(values, keyframe, everything) if values else None
+        x = found.path if everything is not None else None
+        report = self._correct(values, keyframe, everything, x) if values else None
         if report is not None:
             self._admitted |= values.keys()
             self.corrected += [one for one in findings if one.parameter in values]
@@ -134,11 +135,16 @@ class Calibrator:
     def _count_landmarks(self) -> int:
         return sum(not mark.is_tentative for mark in self._landmarks.known.values())
 
-    def _correct(self, values: Values, keyframe: int, everything: Settings | None) -> Report | None:
-        """Correct all measurements, present and future, and solve. A failure is undone."""
+    def _correct(self, values: Values, keyframe: int, everything: Settings | None, x: Array | None) -> Report | None:
+        """Correct all measurements, present and future, and solve. A failure is undone.
+
+        Parameters
+        ----------
+        x : stored numbers of the fit, where they are of all vertices
+        """
         backend, corrections = self._backend, self._frontend.corrections
         before, start = dict(corrections.found), backend.solver.values
-        changes, origins = self._changes(values)
+        changes, origins = self._changes(values, x)
         undo = [change.apply(backend.graph) for change in changes]
         try:
             for parameter, value in values.items():
@@ -161,17 +167,21 @@ class Calibrator:
         backend.cancel_search()
         return report
 
-    def _changes(self, values: Values) -> "tuple[list[Recalibration], list[tuple[Index, Index, Array]]]":
+    def _changes(
+        self, values: Values, x: Array | None
+    ) -> "tuple[list[Recalibration], list[tuple[Index, Index, Array]]]":
         """Return the corrected measurements of all edges, and the corrected origins of sightings."""
         problem = self._problem()
-        model, path = problem.model(), problem.path(problem.values)
+        x = problem.values if x is None else x
+        model, path = problem.model(), problem.path(x, values)
         changes, origins = [], []
         for odometry in model.odometry:
             roots = odometry.table.sqrt_information.values[odometry.rows]
             z = model.corrected_odometry(odometry, values)
             changes.append(Recalibration(odometry.table.type.name, odometry.rows, _exact(z), roots.copy()))
         for seen in model.sightings:
-            base = model.base(seen, values, path)
+            own = problem.poses(x, seen.table.vertices.values[seen.rows, 0])
+            base = model.base(seen, values, path, own)
             T_keyframe_base = tuple(base.T)
             z = model.from_pose(seen, model.seen(seen, values), T_keyframe_base)
             roots = model.roots(seen, values, T_keyframe_base)
@@ -184,7 +194,8 @@ class Calibrator:
 
     def _problem(self, settings: Settings | None = None) -> TrialProblem:
         path, origins = self._frontend.path, self._landmarks.origins
-        problem = self._backend.trial_problem(self._config.space, path, origins, settings)
+        factors = self._frontend.corrections.factors
+        problem = self._backend.trial_problem(self._config.space, path, origins, settings, factors)
         return replace(problem, first_edge=max(problem.first_edge, self._first_edge))
 
     # -- what it says ------------------------------------------------------------------------------------------------

@@ -188,7 +188,8 @@ class MapView:
         SingularError
             The edges do not determine the estimate.
         """
-        problem = self.backend.trial_problem(self.space, self._frontend.path, self._landmarks.map.origins)
+        frontend, origins = self._frontend, self._landmarks.map.origins
+        problem = self.backend.trial_problem(self.space, frontend.path, origins, factors=frontend.corrections.factors)
         wanted = parameters_of(problem, groups)
         found = fit(problem, {one: one.quantity.prior for one in wanted})
         return found, decide(found, len(self.landmarks))

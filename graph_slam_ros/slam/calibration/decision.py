@@ -86,7 +86,7 @@ def _verdict(found: TrialFit, k: int, void: str, is_corrected: bool) -> tuple[Ve
     shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
     if void:
         return "refused", f"not used ({shown}): {void}"
-    if sigma >= quantity.determined_below:
+    if sigma >= quantity.determined_below and not is_corrected:
         needs = f"sigma {amount(parameter, sigma)}, needs {amount(parameter, quantity.determined_below)}"
         return "not_determined", f"not determined ({needs}): {quantity.manoeuvre}"
     least = FOLLOWED * sigma if is_corrected else max(SIGMAS * sigma, quantity.least)

@@ -131,15 +131,15 @@ class MeasurementModel:
         out: Numbers = group.exp(tuple(f * x for f, x in zip(factors, group.log(pose), strict=True)))
         return out
 
-    def base(self, edges: Sightings, values: Values, path: EstimatedPath) -> Array:
-        """Poses (n, size) of the base from the keyframes, at the corrected stamps."""
-        group, clock = self._space.group, clock_of(values, edges.source)
-        out = self.scaled(tuple(edges.T_keyframe_base.T), values)
-        if clock:
-            known = path.knows(edges.stamps_ns, abs(clock))
-            moved = np.stack(group.compose(out, path.motion(edges.stamps_ns, clock)), axis=-1)
-            return np.where(known[:, None], moved, np.stack(out, axis=-1))
-        return np.stack(out, axis=-1)
+    def base(self, edges: Sightings, values: Values, path: EstimatedPath, own: Array) -> Array:
+        """Poses (n, size) of the base from the keyframes (n, size), at the corrected stamps."""
+        group, is_asked = self._space.group, any((p.source, p.name) == (edges.source, "clock") for p in values)
+        out = np.stack(self.scaled(tuple(edges.T_keyframe_base.T), values), axis=-1)
+        if not is_asked:
+            return out
+        clock = clock_of(values, edges.source)
+        there = group.between(tuple(own.T), tuple(path.at(edges.stamps_ns, clock).poses.T))
+        return np.where(path.knows(edges.stamps_ns, abs(clock))[:, None], np.stack(there, axis=-1), out)
 
     def stamps(self, edges: Sightings, values: Values, path: EstimatedPath) -> Index:
         """Corrected stamps (n,)."""

@@ -1,15 +1,21 @@
-"""The path of an estimate, at any stamp: what clocks of sensors are compared with."""
+"""The path of an estimate, at any stamp: what clocks of sensors are compared with.
+
+Between two keyframes it moves as odometry has it; what the estimate corrects of that is spread evenly over the time. A
+robot that stands and goes is nowhere near half-way when half of the time is over.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.frontend.odometry_track import OdometryTrack
 from graph_slam_ros.typing import Array, Index, Mask, Numbers
 
 _AROUND_S = 0.25  # to either side of a stamp: shorter, and a velocity is noise
-_REST_S = 3.0  # between two keyframes: longer, and nobody knows when of it the robot moved
+_REST_S = 3.0  # between two samples of odometry: longer, and nobody knows when of it the robot moved
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +25,7 @@ class Between:
     Attributes
     ----------
     first : (n,) index of the keyframe before; the other is the next
-    fraction : (n,) of the motion between them
+    fraction : (n,) of the time between them
     poses : (n, size)
     """
 
@@ -29,7 +35,7 @@ class Between:
 
 
 class EstimatedPath:
-    """Estimated keyframes, with constant velocity between each two.
+    """Estimated keyframes, and odometry between two of them.
 
     Parameters
     ----------
@@ -38,34 +44,64 @@ class EstimatedPath:
     segments : keyframes to which odometry does not lead
     """
 
-    def __init__(self, space: Geometry, stamps_ns: Index, poses: Array, segments: Sequence[int]) -> None:
+    def __init__(
+        self, space: Geometry, stamps_ns: Index, poses: Array, segments: Sequence[int], track: OdometryTrack
+    ) -> None:
         backwards = np.flatnonzero(np.diff(stamps_ns) <= 0)
-        self._first = (
-            int(backwards[-1]) + 1 if len(backwards) else 0
-        )  # stamps began anew: before, none is told by its own
-        self._space, self._poses = space, poses[self._first :]
-        self._origin_ns = int(stamps_ns[self._first])
-        self._own_s = (stamps_ns[self._first :] - self._origin_ns) * 1e-9
-        is_open = np.diff(self._own_s) > _REST_S
-        is_open[[k - self._first - 1 for k in segments if k > self._first]] = True
-        self._gaps = np.flatnonzero(is_open)
+        # Stamps began anew: before, nothing is known by its own.
+        first = self._first = int(backwards[-1]) + 1 if len(backwards) else 0
+        self._space, self._poses, self._track = space, poses[first:], track
+        self._origin_ns = int(stamps_ns[first])
+        self._own_s = (stamps_ns[first:] - self._origin_ns) * 1e-9
+        self._sample_s, self._samples = self._with_samples(track)
+        stands = (np.diff(self._samples, axis=0) == 0.0).all(axis=1)
+        is_open = (np.diff(self._sample_s) > _REST_S) & ~stands
+        gaps = [(self._sample_s[k], self._sample_s[k + 1]) for k in np.flatnonzero(is_open).tolist()]
+        joints = [k - first for k in segments if first < k < len(stamps_ns)]
+        self._gaps = [*gaps, *((self._own_s[k - 1], self._own_s[k]) for k in joints)]
+
+    def _with_samples(self, track: OdometryTrack) -> tuple[Array, Array]:
+        """Seconds and poses of odometry at the keyframes and between them."""
+        since_s = (track.stamps_ns - self._origin_ns) * 1e-9
+        inside = (since_s > self._own_s[0]) & (since_s < self._own_s[-1]) & ~np.isin(since_s, self._own_s)
+        seconds = np.concatenate((self._own_s, since_s[inside]))
+        order = np.argsort(seconds, kind="stable")
+        return seconds[order], np.concatenate((track.keyframes[self._first :], track.poses[inside]))[order]
 
     def knows(self, stamps_ns: Index, most_s: float) -> Mask:
         """Return whether (n,) the path is known around each stamp, up to a number of seconds away."""
         since_s, reach = (stamps_ns - self._origin_ns) * 1e-9, most_s + _AROUND_S
         inside = (since_s - reach >= self._own_s[0]) & (since_s + reach <= self._own_s[-1])
-        for gap in self._gaps.tolist():
-            inside &= (since_s + reach <= self._own_s[gap]) | (since_s - reach >= self._own_s[gap + 1])
+        for begin_s, end_s in self._gaps:
+            inside &= (since_s + reach <= begin_s) | (since_s - reach >= end_s)
         return np.asarray(inside)
 
     def at(self, stamps_ns: Index, after_s: float) -> Between:
         """The poses at an offset from some stamps."""
-        since_s = (stamps_ns - self._origin_ns) * 1e-9 + after_s
-        k = np.clip(np.searchsorted(self._own_s, since_s, side="right") - 1, 0, len(self._own_s) - 2)
-        fraction = np.clip((since_s - self._own_s[k]) / (self._own_s[k + 1] - self._own_s[k]), 0.0, 1.0)
-        a, b, group = tuple(self._poses[k].T), tuple(self._poses[k + 1].T), self._space.group
-        step = tuple(fraction * one for one in group.local(b, a))
-        return Between(k + self._first, fraction, np.stack(group.compose(a, group.exp(step)), axis=-1))
+        since_s, group = (stamps_ns - self._origin_ns) * 1e-9 + after_s, self._space.group
+        k, fraction = _interval(self._own_s, since_s)
+        s, part = _interval(self._sample_s, since_s)
+        odom = group.compose(*self._step(self._samples, s, part))
+        start, end = (tuple(self._track.keyframes[self._first + at].T) for at in (k, k + 1))
+        moved, whole = (self._corrected(group.between(start, one)) for one in (odom, end))
+        a, b = tuple(self._poses[k].T), tuple(self._poses[k + 1].T)
+        rest = tuple(fraction * one for one in group.local(b, group.compose(a, whole)))
+        poses = group.compose(group.compose(a, moved), group.exp(rest))
+        return Between(k + self._first, fraction, np.stack(poses, axis=-1))
+
+    def _step(self, poses: Array, k: Index, part: Array) -> tuple[Numbers, Numbers]:
+        """The poses before, and the motions from there as far as a part of that to the next."""
+        a, b = tuple(poses[k].T), tuple(poses[k + 1].T)
+        step: Numbers = self._space.group.exp(tuple(part * one for one in self._space.group.local(b, a)))
+        return a, step
+
+    def _corrected(self, motion: Numbers) -> Numbers:
+        n, factors = self._space.dimensions, (self._track.distance, self._track.turn)
+        if factors == (1.0, 1.0):
+            return motion
+        tangent = self._space.group.log(motion)
+        out: Numbers = self._space.group.exp(tuple(x * factors[k >= n] for k, x in enumerate(tangent)))
+        return out
 
     def velocity(self, stamps_ns: Index, after_s: float) -> Array:
         """Twist (n, dof) of the base around these times, in its own axes [m/s, rad/s]."""
@@ -73,8 +109,8 @@ class EstimatedPath:
         tangent = self._space.group.local(tuple(behind.T), tuple(before.T))
         return np.stack(tangent, axis=-1) / (2.0 * _AROUND_S)
 
-    def motion(self, stamps_ns: Index, after_s: float) -> Numbers:
-        """The motion from each stamp over a time, as arrays (n,)."""
-        a, b = (tuple(self.at(stamps_ns, after).poses.T) for after in (0.0, after_s))
-        out: Numbers = self._space.group.between(a, b)
-        return out
+
+def _interval(seconds: Any, at_s: Any) -> tuple[Index, Array]:
+    """The interval (n,) that each time is in, and the part of it that is over."""
+    k = np.clip(np.searchsorted(seconds, at_s, side="right") - 1, 0, len(seconds) - 2)
+    return k, np.clip((at_s - seconds[k]) / (seconds[k + 1] - seconds[k]), 0.0, 1.0)

@@ -5,7 +5,7 @@ correction, between two keyframes whose steps move it. So a clock may be off by 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,9 @@ from scipy import sparse
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.calibration.model import MeasurementModel, OdometryEdges, Sightings, Values, clock_of
-from graph_slam_ros.slam.calibration.parameters import Parameter
+from graph_slam_ros.slam.calibration.parameters import OF_ODOMETRY, Parameter
 from graph_slam_ros.slam.calibration.path import EstimatedPath
+from graph_slam_ros.slam.frontend.odometry_track import OdometryTrack
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.solver import LossKey, Settings
 from graph_slam_ros.solver.linearization import Block, Losses, linearize, rows_of
@@ -33,6 +34,7 @@ class TrialProblem:
     values : stored numbers of all vertices, where the fit begins
     origins : of its sightings
     keyframes, stamps_ns, segments : vertex and stamp of each keyframe, and where odometry does not lead to
+    track : odometry between the keyframes
     first_edge : edges before are of a map that is held, and not corrected
     """
 
@@ -46,6 +48,7 @@ class TrialProblem:
     keyframes: Index
     stamps_ns: Index
     segments: tuple[int, ...]
+    track: OdometryTrack
     first_edge: int
 
     def model(self) -> MeasurementModel:
@@ -55,10 +58,16 @@ class TrialProblem:
         edges = range(self.first_edge, self.graph.edge_count)
         return MeasurementModel(self.space, self.graph, self.origins, stamp_of, edges)
 
-    def path(self, x: Array) -> EstimatedPath:
-        """The path at stored values x."""
-        at = self.graph.offset.values[self.keyframes][:, None] + np.arange(self.space.pose.size)
-        return EstimatedPath(self.space, self.stamps_ns, x[at], self.segments)
+    def path(self, x: Array, values: Values) -> EstimatedPath:
+        """The path at stored values x and with other parameters."""
+        named, track = {p.name: value for p, value in values.items() if p.name in OF_ODOMETRY}, self.track
+        distance, turn = (1.0 + named.get(name, 0.0) for name in ("distance", "turn"))
+        track = replace(track, distance=track.distance * distance, turn=track.turn * turn)
+        return EstimatedPath(self.space, self.stamps_ns, self.poses(x, self.keyframes), self.segments, track)
+
+    def poses(self, x: Array, vertices: Index) -> Array:
+        """The poses (n, size) of some vertices at stored values x."""
+        return np.asarray(x[self.graph.offset.values[vertices][:, None] + np.arange(self.space.pose.size)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +178,7 @@ class Linearization:
         graph = self._p.graph
         values = dict(zip(self._parameters, theta.tolist(), strict=True))
         all_x = np.concatenate((x, graph.initial.values[len(x) :]))
-        path = self._p.path(x)
+        path = self._p.path(x, values)
         for eyes in self._eyes:
             eyes.place(all_x, values, self._model, path, self._parameters)
         derivative = self._correct(all_x, values)

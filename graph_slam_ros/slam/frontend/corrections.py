@@ -103,6 +103,11 @@ class Corrections:
         return out if isinstance(out[0], np.ndarray) else tuple(map(float, out))
 
     @property
+    def factors(self) -> tuple[float, float]:
+        """The factors of distance and turn."""
+        return self._of_odometry("distance"), self._of_odometry("turn")
+
+    @property
     def are_configured(self) -> bool:
         """Return whether the configuration corrects odometry."""
         c = self._config.odometry

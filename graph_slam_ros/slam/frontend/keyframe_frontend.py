@@ -148,6 +148,7 @@ class KeyframeFrontend:
             return step.stamp_ns
         if not step.broken:
             motion.step(step)
+            self.path.samples.add(step)
         return motion.now.stamp_ns
 
     def is_due(self) -> bool:

@@ -10,6 +10,7 @@ from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise, StationaryDetector
 from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.slam.frontend.odometry_track import OdometrySamples
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.typing import Numbers
 
@@ -39,6 +40,7 @@ class KeyframeList:
     ----------
     segments : keyframes at which odometry began, or began anew
     drives : the first keyframe of each drive: more than one where the map was loaded
+    samples : odometry between the keyframes
     """
 
     def __init__(self, noise: OdometryNoise, space: Geometry) -> None:
@@ -50,6 +52,7 @@ class KeyframeList:
         self._motions: deque[IntegratedOdometry] = deque()
         self._rest = StationaryDetector(noise, space)
         self._epoch = 0  # the first keyframe since stamps began anew
+        self.samples = OdometrySamples(space)
 
     @property
     def motion(self) -> IntegratedOdometry | None:
@@ -104,6 +107,7 @@ class KeyframeList:
     def forget_time(self) -> None:
         """Stamps begin anew: none before can be told from them."""
         self._motions.clear()
+        self.samples.forget()
         self._rest = StationaryDetector(self._noise, self._space)
         self._epoch = len(self.keyframes)
 

@@ -1,0 +1,57 @@
+"""Odometry between the keyframes, in its own frame: kept for trial fits of a calibration."""
+
+from dataclasses import dataclass
+
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.typing import Array, Index, Numbers
+
+_SAMPLED_NS = 50_000_000
+Sample = tuple[int, int, Numbers]
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryTrack:
+    """Odometry in its own frame, as its driver has it.
+
+    Attributes
+    ----------
+    keyframes : (n, size) at each keyframe
+    stamps_ns, poses : (m,), (m, size) samples between them
+    distance, turn : factors by which it is corrected
+    """
+
+    keyframes: Array
+    stamps_ns: Index
+    poses: Array
+    distance: float = 1.0
+    turn: float = 1.0
+
+
+class OdometrySamples:
+    """Samples of odometry: at most twenty a second, none while it stands still."""
+
+    def __init__(self, space: Geometry) -> None:
+        self._space = space
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew with stamps of another time."""
+        self._kept = StampedPoses[Sample](lambda *sample: sample, self._space.pose.size)
+        self._last: Step | None = None
+
+    def add(self, step: Step) -> None:
+        """Keep a step where it is time for it, and the one before where the robot begins to move."""
+        kept, last, self._last = self._kept, self._last, step
+        if len(kept) and last is not None:
+            kept_ns, there = int(kept.stamps_ns[-1]), tuple(kept.poses[-1].tolist())
+            if step.stamp_ns - kept_ns < _SAMPLED_NS or step.T_odom_base == there:
+                return
+            if last.stamp_ns > kept_ns and last.T_odom_base == there:
+                kept.append(0, last.stamp_ns, there)
+        kept.append(0, step.stamp_ns, step.T_odom_base)
+
+    def track(self, keyframes: Array, factors: tuple[float, float]) -> OdometryTrack:
+        """Copies of all samples, with odometry at the keyframes and the factors of distance and turn."""
+        return OdometryTrack(keyframes.copy(), self._kept.stamps_ns.copy(), self._kept.poses.copy(), *factors)
