@@ -227,7 +227,7 @@ def gnss(latitude=48.0, longitude=11.0, altitude=500.0, covariance=None, kind=2,
     return encode(message)
 
 
-def imu(q, covariance, frame="base_link", stamp_ns=STAMP_NS):
+def imu(q, covariance, frame="base_link", stamp_ns=STAMP_NS, rate=(0.0, 0.0, 0.0), rate_covariance=(0.0,) * 9):
     """sensor_msgs/Imu."""
     zero = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
     return encode(
@@ -236,8 +236,8 @@ def imu(q, covariance, frame="base_link", stamp_ns=STAMP_NS):
             header=header(stamp_ns, frame),
             orientation=q,
             orientation_covariance=np.asarray(covariance, dtype=float).ravel(),
-            angular_velocity=zero,
-            angular_velocity_covariance=np.zeros(9),
+            angular_velocity=vector(*rate),
+            angular_velocity_covariance=np.asarray(rate_covariance, dtype=float).ravel(),
             linear_acceleration=zero,
             linear_acceleration_covariance=np.zeros(9),
         )

@@ -16,6 +16,7 @@ from typing import Any
 
 from graph_slam_ros.config.calibrate import CalibrateConfig
 from graph_slam_ros.config.frontend import KeyframesConfig, OdometryConfig, OrderingConfig
+from graph_slam_ros.config.gyro import GyroConfig
 from graph_slam_ros.config.inputs import DEFAULT_INPUTS, InputConfig, default_input
 from graph_slam_ros.config.landmarks import LandmarksConfig
 from graph_slam_ros.config.loss import landmark_stages, narrow_then_wide
@@ -54,6 +55,7 @@ class Config:
     world: WorldConfig = WorldConfig()
     frames: FramesConfig = FramesConfig()
     odometry: OdometryConfig = OdometryConfig()
+    gyro: GyroConfig = GyroConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
     landmarks: LandmarksConfig = LandmarksConfig()
     anchor: AnchorConfig = AnchorConfig()
@@ -80,7 +82,7 @@ class Config:
         return f"Config({', '.join(changed)})"
 
     def __post_init__(self) -> None:
-        _ = self.start_pose, self.load_pose, self.survey  # what they are made of is refused here, not later
+        _ = self.start_pose, self.load_pose, self.survey, self.gyro_input  # a wrong one is refused here, not later
         words = self.calibrate.groups.split()
         if "range_factor" in words and {"factors", "auto"} & set(words) and not self.survey:
             raise ConfigError(
@@ -142,6 +144,14 @@ class Config:
     def load_pose(self) -> Numbers | None:
         """``T_map_base`` of the robot when a map is loaded; None if it is unknown."""
         return self._pose("output.load_pose", self.output.load_pose)
+
+    @property
+    def gyro_input(self) -> str:
+        """The name of the input that is used as gyro; empty where there is none."""
+        names = [one.name for one in self.sources if one.use == "gyro"]
+        if len(names) > 1:
+            raise ConfigError(f"{names[1]}.use: {names[0]} is the gyro already: one input can be, the other use: none")
+        return names[0] if names else ""
 
     def _pose(self, name: str, text: str) -> Numbers | None:
         counts = (3,) if self.world.dimensions == 2 else (3, 6)

@@ -28,7 +28,7 @@ class InputConfig:
     use: str = setting(
         "auto",
         "use of the input; auto: the first use that its type allows; none: the input is ignored",
-        choices=("auto", "odometry", "landmarks", "fix", "closure", "edges", "none"),
+        choices=("auto", "odometry", "gyro", "landmarks", "fix", "closure", "edges", "none"),
     )
     frame: str = setting("", "frame of the measurements, instead of the one in the messages; empty: as in the messages")
     mount: str = setting(

@@ -1,6 +1,7 @@
 """Measurements (metres, radians, stamps in nanoseconds), and counters by input and reason."""
 
 from graph_slam_ros.measurements.types import (
+    AngularVelocity,
     Closure,
     Control,
     CustomEdge,
@@ -14,6 +15,7 @@ from graph_slam_ros.measurements.types import (
 )
 
 __all__ = [
+    "AngularVelocity",
     "Closure",
     "Control",
     "CustomEdge",

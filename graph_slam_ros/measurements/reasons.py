@@ -142,6 +142,24 @@ REASONS: dict[str, Reason] = {
     "switched_to_unlinked": Reason(
         _NOTED, "this odometry took over, but had not come before: the motion between is unknown"
     ),
+    "turn_slips": Reason(
+        _NOTED,
+        "a turn of this odometry contradicts the gyro beyond gyro.gate: wheels slip, and the gyro's turn is used alone",
+        "odometry.turn_factor, if that is always so",
+    ),
+    "gyro_silent": Reason(
+        _NOTED,
+        "a step of odometry turned without the gyro: it has no message for longer than gyro.timeout_s",
+        "the driver's rate and stamps; gyro.timeout_s, INPUT.offset_s",
+    ),
+    "gyro_doubted": Reason(
+        _NOTED,
+        "a step of odometry turned without the gyro: most of the time it contradicts odometry",
+        "rad/s, counter-clockwise positive; its frame and TF or INPUT.mount; odometry.turn_factor",
+    ),
+    "no_angular_velocity": Reason(
+        _REFUSED, "the IMU says that it has no angular velocity", "another input as gyro, or none (INPUT.use=fix)"
+    ),
     "jump": Reason(
         _NOTED,
         "odometry (or tf: the correction) jumped; after a jump of odometry a new segment begins",
@@ -241,7 +259,9 @@ REASONS: dict[str, Reason] = {
         "anchor.sigma_m and anchor.sigma_rad hold the map where it begins",
     ),
     "no_altitude": Reason(_REPAIRED, "the fix has no altitude: it counts in the horizontal only"),
-    "no_orientation": Reason(_REFUSED, "the IMU says that it has no orientation", "an IMU with a filter, or no input"),
+    "no_orientation": Reason(
+        _REFUSED, "the IMU says that it has no orientation", "an IMU with a filter; its gyro alone: INPUT.use=gyro"
+    ),
     "not_in_this_space": Reason(
         _REFUSED, "such a fix or edge does not exist in this many dimensions", "world.dimensions"
     ),

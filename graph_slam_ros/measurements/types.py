@@ -43,6 +43,22 @@ class Odometry:
 
 
 @dataclass(frozen=True, slots=True)
+class AngularVelocity:
+    """The turn rate of the base, by a gyro.
+
+    Attributes
+    ----------
+    rate : about z in the plane, about the axes of the base in space [rad/s]
+    covariance : flat, of one message's ``rate``, whose errors are independent; None if unknown
+    """
+
+    stamp_ns: int
+    topic: str
+    rate: Numbers
+    covariance: Numbers | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Sighting:
     """One observation of a landmark by a sensor of the robot.
 
@@ -224,11 +240,12 @@ class Control:
 
 
 Observation: TypeAlias = Sightings | Fix | Closure | CustomEdge
-Measured: TypeAlias = Odometry | Observation
-Measurement: TypeAlias = Odometry | Observation | InitialPose | Control
+Measured: TypeAlias = Odometry | AngularVelocity | Observation
+Measurement: TypeAlias = Measured | InitialPose | Control
 
 _TYPES = {
     "odometry": Odometry,
+    "angular_velocity": AngularVelocity,
     "sightings": Sightings,
     "fix": Fix,
     "closure": Closure,
@@ -245,6 +262,9 @@ def to_record(measurement: Measurement) -> dict[str, Any]:
         case Odometry(stamp_ns, pose, covariance, source):  # by hand: thousands a second
             out = {"type": "odometry", "stamp_ns": stamp_ns, "T_odom_base": pose, "twist_covariance": covariance}
             return out | {"source": source}
+        case AngularVelocity(stamp_ns, topic, rate, covariance):
+            out = {"type": "angular_velocity", "stamp_ns": stamp_ns, "topic": topic}
+            return out | {"rate": rate, "covariance": covariance}
         case _:
             return {"type": _NAMES[type(measurement)], **asdict(measurement)}
 

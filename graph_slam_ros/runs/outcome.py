@@ -18,6 +18,7 @@ _COLUMNS = ("received", "used", "believed")
 _OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does not move in a plane
 _JUMPY, _MOST_JUMPS = 0.02, 5  # of all messages of an odometry; with more its motion is hardly used
 _MOSTLY = 0.5
+_MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by one
 _DOUBTED = 0.05  # of an input: as many that are not believed are said
 _MENDED = ("displaced", "displacement_taken_back", "jump")  # of what is noted, signs of a wrong setting
 _CONTRADICT = (
@@ -53,7 +54,14 @@ def text(summary: Summary) -> list[str]:
         if source not in inputs or explain(reason).effect is not Effect.REFUSED
         for line in _counted_lines(source, reason, times)
     ]
-    return [*lines, *undetermined, *others, *calibration(summary), *table(summary)]
+    return [*lines, *undetermined, *others, *_gyro(summary), *calibration(summary), *table(summary)]
+
+
+def _gyro(summary: Summary) -> Iterator[str]:
+    """The bias of the gyro, and whether it has a part in odometry."""
+    if gyro := summary.get("gyro"):
+        bias = ", ".join(f"{b:.5f} +- {s:.5f}" for b, s in zip(gyro["bias"], gyro["sigma"], strict=True))
+        yield f"gyro       bias {bias} rad/s; {gyro['state']}"
 
 
 def calibration(summary: Summary) -> Iterator[str]:
@@ -122,8 +130,8 @@ def shortcomings(summary: Summary) -> Iterator[str]:
     for name, counts in inputs.items():
         counted = _counted(summary, name, Effect.REFUSED)
         refused = sum(counted.values())
-        is_odometry = counts["use"] == "odometry"
-        if not counts["used"] and not is_odometry:
+        is_odometry = counts["use"] in _MOTION
+        if not counts["used"] and counts["use"] != "odometry":
             yield _unused(summary, name, counts["received"])
         elif refused > _MOSTLY * (refused + counts["used"]):
             yield f"{name}: most of it was refused: {_because(name, counted)}"
@@ -138,6 +146,9 @@ def shortcomings(summary: Summary) -> Iterator[str]:
                 f"{name}: {jumps} jumps, each begins a segment, and the motion across it is not used: odometry in "
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
             )
+    if (gyro := summary.get("gyro")) and gyro["state"] == "doubted":
+        counted = summary["counters"].get(gyro["name"], {})
+        yield f"{gyro['name']}: {_because(gyro['name'], {'gyro_doubted': counted.get('gyro_doubted', 0)})}"
     if not sum(counts["believed"] or 0 for counts in inputs.values()):
         yield (
             "this is odometry alone: no landmark, fix or closure is in the result; "
@@ -150,7 +161,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
 def doubts(summary: Summary) -> Iterator[str]:
     """Return a sentence for each input of which many measurements are rejected, but fewer than half."""
     for name, counts in summary.get("inputs", {}).items():
-        if counts["use"] == "odometry" or not counts["used"]:
+        if counts["use"] in _MOTION or not counts["used"]:
             continue
         accepted = (counts["believed"] or 0) / counts["used"]
         if _MOSTLY <= accepted < 1.0 - _DOUBTED:

@@ -306,15 +306,14 @@ class Suggestion:
 
     def _choose_imu(self, found: Iterator[TopicContents], is_needed: bool) -> None:
         for one in sorted(found, key=lambda one: -one.usable):
+            names = " ".join([*self.names, "imu"])
+            mount = "" if self._recording.is_linked(one.frame, self._base) else " --set 'imu.mount=0 0 0 0 0 0'"
+            chosen = f"--set 'inputs.names={names}' --set imu.type={IMU} --set imu.topic={one.topic.name}{mount}"
+            as_gyro = f"Its gyro as part of odometry: {chosen} --set imu.use=gyro"
             if one.usable < 0.5 * one.read:
-                self.unused[one.topic.name] = "it has no orientation (an IMU with a filter has)"
+                self.unused[one.topic.name] = f"it has no orientation (an IMU with a filter has). {as_gyro}"
             elif not is_needed:
-                names = " ".join([*self.names, "imu"])
-                mount = "" if self._recording.is_linked(one.frame, self._base) else " --set 'imu.mount=0 0 0 0 0 0'"
-                self.unused[one.topic.name] = (
-                    "its heading may drift, and there is better. With it: "
-                    f"--set 'inputs.names={names}' --set imu.type={IMU} --set imu.topic={one.topic.name}{mount}"
-                )
+                self.unused[one.topic.name] = f"its heading may drift, and there is better. {as_gyro}"
             else:
                 self._add("imu", one, {} if one.has_noise else {"sigma_rad": 0.05})
                 is_needed = False

@@ -83,6 +83,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
             "displacements": [asdict(alarm) for alarm in slam.alarms],
             "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
         }
+        | ({"gyro": asdict(gyro)} if (gyro := slam.gyro) else {})
         | ({"calibration": report} if (report := slam.calibration_report) else {})
         | account(slam, counters)
     )

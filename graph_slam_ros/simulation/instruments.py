@@ -19,7 +19,7 @@ DATUM = (47.4, 8.55, 440.0)  # latitude [deg], longitude [deg], height above the
 ANTENNA_M = (0.3, 0.1, 0.8)  # in base_link
 T_BASE_IMU = (0.1, 0.0, 0.2, 0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5)))  # turned to the left
 UP = 2.0  # a fix is so many times worse upwards
-SIGMA_RATE_RAD_S, SIGMA_ACCELERATION_M_S2 = 0.002, 0.02
+SIGMA_ACCELERATION_M_S2 = 0.02
 GRAVITY_M_S2 = 9.81
 EARTH_M = 6.37e6  # its radius, nearly
 _STEPS = 6
@@ -40,13 +40,17 @@ class Instruments:
     imu_sigma_rad: float = option(0.02, "error of its roll, pitch and heading", "rad", 1e-6, 1)
     imu_correlation_s: float = option(5.0, "how long such an error lasts (1/e)", "s", 0, 1e4)
     imu_drift_rad_s: float = option(0.0, "its heading drifts besides: there is no compass", "rad/s", -1, 1)
+    imu_sigma_rate_rad_s: float = option(0.002, "error of each of its turn rates", "rad/s", 0, 10)
+    imu_bias_rad_s: float = option(0.0, "bias of its turn rates, about each axis", "rad/s", -10, 10)
+    imu_bias_walk: float = option(0.0, "random walk of that", "rad/s/sqrt(s)", 0, 1)
 
 
 def with_instruments(recording: Recording, seed: int, options: Instruments) -> Recording:
     """A recording with the measurements of the chosen instruments added, or without landmarks."""
-    streams = [Generator(PCG64(SeedSequence(seed, spawn_key=(_STREAM, k)))) for k in range(2)]
+    streams = [Generator(PCG64(SeedSequence(seed, spawn_key=(_STREAM, k)))) for k in range(3)]
     gnss = _gnss(streams[0], recording, options) if options.gnss > 0.0 else None
     imu = _imu(streams[1], recording, options) if options.imu > 0.0 else None
+    imu = _biased(streams[2], imu, options) if imu else None
     return replace(recording, gnss=gnss, imu=imu, seen=recording.seen if options.landmarks else ())
 
 
@@ -75,9 +79,15 @@ def _imu(rng: Generator, recording: Recording, options: Instruments) -> Imu:
     rate[1:] = np.stack(se3.local(next_, last)[3:], axis=1) / dt_s
     felt = _second_derivative(np.stack(se3.position(true), axis=1), dt_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
     acceleration = np.stack(so3.act(so3.inverse(turned), tuple(felt.T)), axis=1)
-    rate += SIGMA_RATE_RAD_S * rng.standard_normal(rate.shape)
+    rate += options.imu_sigma_rate_rad_s * rng.standard_normal(rate.shape)
     acceleration += SIGMA_ACCELERATION_M_S2 * rng.standard_normal(acceleration.shape)
     return Imu(stamps_ns, np.stack(orientation, axis=1), noise.covariance, rate, acceleration, T_BASE_IMU)
+
+
+def _biased(rng: Generator, imu: Imu, options: Instruments) -> Imu:
+    """An IMU whose gyro has a bias that walks."""
+    steps = options.imu_bias_walk * np.sqrt(1.0 / options.imu) * rng.standard_normal(imu.rate.shape)
+    return replace(imu, rate=imu.rate + options.imu_bias_rad_s + np.cumsum(steps, axis=0))
 
 
 def _second_derivative(positions: Array, dt_s: float) -> Array:

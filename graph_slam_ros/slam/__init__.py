@@ -3,6 +3,7 @@
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import (
+    AngularVelocity,
     Closure,
     Control,
     CustomEdge,
@@ -18,6 +19,7 @@ from graph_slam_ros.slam.landmarks.landmark_map import Landmark
 from graph_slam_ros.slam.update import Update
 
 __all__ = [
+    "AngularVelocity",
     "Closure",
     "Config",
     "Control",

@@ -98,9 +98,12 @@ class Calibrator:
 
     def _trial(self, settings: Settings) -> Trial:
         problem, calibrate = self._problem(settings), self._config.calibrate
+        has_gyro = bool(self._config.gyro_input)
 
         def run() -> TrialFit | None:
             wanted = parameters_of(problem, calibrate.asked, chooses=calibrate.chooses)
+            if has_gyro:  # odometry's turn is mostly that of the gyro
+                wanted = [one for one in wanted if one.name != "turn"]
             return fit(problem, {one: calibrate.prior(one.name) for one in wanted}) if wanted else None
 
         return run

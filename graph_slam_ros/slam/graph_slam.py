@@ -240,7 +240,7 @@ class GraphSlam(MapView):
                 self._use(self._frontend.order.flush())
             case "end" | "time_jump":
                 self._use(self._frontend.order.flush())
-                self._frontend.pending.drop()
+                self._frontend.drop_pending()
                 self._add_assigned(self._landmarks.end_scan())
                 if event == "time_jump":
                     self._frontend.forget_time()

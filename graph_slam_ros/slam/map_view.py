@@ -16,6 +16,7 @@ from graph_slam_ros.slam.calibration.fit import TrialFit, fit
 from graph_slam_ros.slam.calibration.parameters import DEFAULT_GROUPS
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibrator import Calibrator
+from graph_slam_ros.slam.frontend.gyro import GyroState
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
@@ -27,7 +28,7 @@ from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.slam.solution import Correction, Solution
 from graph_slam_ros.solver import Report, Solver
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Index, Numbers
 
 
 class MapView:
@@ -94,17 +95,29 @@ class MapView:
 
         The correction of odometry between two keyframes is spread evenly over the time between them.
         """
-        poses, odometry, group = self.trajectory(), self.keyframes.poses, self.space.group
+        poses, group = self.trajectory(), self.space.group
         found, stamps_ns = self._at_sightings(poses), self.keyframes.stamps_ns
         since_ns = self.sighting_poses.stamps_ns - stamps_ns[self.sighting_poses.ids]
         ends = np.isin(self.sighting_poses.ids + 1, [*self.segments, len(self.keyframes)])
         a = self.sighting_poses.ids[~ends]
-        motion = group.between(tuple(odometry[a].T), tuple(odometry[a + 1].T))
-        motion = self._frontend.corrections.motion(motion)
+        motion = self._motions(a)
         wrong = group.local(tuple(poses[a + 1].T), group.compose(tuple(poses[a].T), motion))
         part = np.minimum(since_ns[~ends] / np.maximum(stamps_ns[a + 1] - stamps_ns[a], 1), 1.0)
         found[~ends] = np.stack(group.retract(tuple(found[~ends].T), tuple(part * d for d in wrong)), axis=-1)
         return found
+
+    def _motions(self, keyframes: Index) -> Numbers:
+        """The motion from each of some keyframes to the next as measured, in arrays."""
+        odometry, group = self.keyframes.poses, self.space.group
+        motion: Numbers = group.between(tuple(odometry[keyframes].T), tuple(odometry[keyframes + 1].T))
+        if self._frontend.gyro is None:
+            return self._frontend.corrections.motion(motion)
+        out, ids = np.stack(motion, axis=-1), self.keyframes.ids
+        edges = map(self.graph.edge, self.graph.edges_of("odometry").tolist())
+        measured = {tuple(edge.vertices): edge.measured for edge in edges}
+        for k, ends in enumerate(zip(ids[keyframes].tolist(), ids[keyframes + 1].tolist(), strict=True)):
+            out[k] = measured.get(ends, out[k])
+        return tuple(out.T)
 
     def sighting_odometry(self) -> Array:
         """Return the poses of odometry alone, ``T_odom_base`` at the stamps of the sightings, (n, 3) or (n, 7)."""
@@ -133,6 +146,11 @@ class MapView:
     def odometry_sources(self) -> Set[str]:
         """The names of the odometry inputs that have been used."""
         return self._frontend.odometry.sources
+
+    @property
+    def gyro(self) -> GyroState | None:
+        """The present estimate of the gyro; None where no input is one."""
+        return self._frontend.gyro.state if self._frontend.gyro else None
 
     # -- landmarks -------------------------------------------------------------------------------------------------
 

@@ -41,7 +41,7 @@ WITHIN = {
     "certificate": {"lie", "graph", "solver", "optimization"},
     "measurements": {"edge_tags", "graph"},
     "config": {"lie", "graph", "solver"},
-    "slam/frontend": {"lie", "graph", "measurements", "config"},
+    "slam/frontend": {"chi_square", "lie", "graph", "measurements", "config"},
     "slam/landmarks": {"chi_square", "lie", "graph", "solver", "measurements", "config", "slam/frontend"},
     "slam/robust": {
         "chi_square",

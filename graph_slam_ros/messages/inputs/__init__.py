@@ -55,7 +55,7 @@ CONVERTERS: Mapping[str, Mapping[str, Converter]] = {
     "geometry_msgs/msg/PoseStamped": _POSE,
     "tf2_msgs/msg/TFMessage": {"odometry": odometry.transforms, "landmarks": _landmarks(detections.transforms)},
     "sensor_msgs/msg/NavSatFix": {"fix": fixes.gnss},
-    "sensor_msgs/msg/Imu": {"fix": fixes.imu},
+    "sensor_msgs/msg/Imu": {"fix": fixes.imu, "gyro": odometry.angular_velocity},
     "vision_msgs/msg/Detection3DArray": {"landmarks": _landmarks(detections.detections), "closure": fixes.closures},
     "sensor_msgs/msg/PointCloud2": {"landmarks": _landmarks(ranges.point_cloud)},
     "visualization_msgs/msg/MarkerArray": {"landmarks": _landmarks(detections.markers)},

@@ -1,12 +1,13 @@
-"""Messages that become odometry: absolute poses in a frame that drifts."""
+"""Messages that become odometry: absolute poses in a frame that drifts, and the turn rate of a gyro."""
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.lie import se3
-from graph_slam_ros.measurements.types import Odometry
+from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.measurements.types import AngularVelocity, Odometry
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.source import InputContext
@@ -60,6 +61,32 @@ def _note_similar(source: InputContext, parent: str, child: str, *, is_similar: 
     similar: dict[tuple[str, str], None] = source.state.setdefault("similar", {})
     if is_similar and len(similar) < _MOST_SIMILAR and not source.state.get("found"):
         similar[parent, child] = None
+
+
+def angular_velocity(source: InputContext, m: Any) -> Iterator[AngularVelocity]:
+    """sensor_msgs/Imu as a gyro: its rate about the axes of the base, in the plane about z."""
+    stamp_ns = source.stamp_ns(m.header.stamp)
+    if m.angular_velocity_covariance[0] == -1.0:
+        raise MessageError("no_angular_velocity")
+    w, plane = m.angular_velocity, source.space.dimensions == 2
+    if not (math.isfinite(w.x) and math.isfinite(w.y) and math.isfinite(w.z)):
+        raise MessageError("nonfinite")
+    turn = se3.rotation(source.T_base(source.frame(m.header.frame_id), stamp_ns))
+    rate = tuple(map(float, so3.act(turn, (w.x, w.y, w.z))))
+    covariance = _rate_covariance(source, turn, m.angular_velocity_covariance)
+    yield AngularVelocity(stamp_ns, source.name, rate[2:] if plane else rate, covariance)
+
+
+def _rate_covariance(source: InputContext, turn: so3.Quaternion, flat: Any) -> Numbers | None:
+    """The covariance of a turn rate in the axes of the base; None where it is unknown."""
+    key = flat.tobytes(), turn
+    if source.settings.noise == "message" and key != source.state.get("rate_key"):  # drivers repeat the same one
+        rotation = so3.matrix(turn)
+        full = rotation @ np.asarray(flat, dtype=float).reshape(3, 3) @ rotation.T
+        block = full[2:, 2:] if source.space.dimensions == 2 else full
+        source.state.update(rate_key=key, rate_covariance=source.checked(block, 0) if block.any() else None)
+    covariance: Numbers | None = source.state.get("rate_covariance")
+    return covariance
 
 
 def not_found(source: InputContext) -> str:

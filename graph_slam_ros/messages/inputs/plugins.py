@@ -11,7 +11,7 @@ from graph_slam_ros import edge_tags
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.measurements.custom_edges import edge_type_of, refuse_unusable
 from graph_slam_ros.measurements.reasons import REASONS
-from graph_slam_ros.measurements.types import Closure, CustomEdge, Fix, Measured, Odometry, to_record
+from graph_slam_ros.measurements.types import AngularVelocity, Closure, CustomEdge, Fix, Measured, Odometry, to_record
 from graph_slam_ros.messages.inputs.checks import MessageError
 from graph_slam_ros.messages.inputs.landmarks import ObservedLandmark, sightings
 from graph_slam_ros.messages.inputs.source import InputContext, NotYet
@@ -22,6 +22,7 @@ _YIELDS: Mapping[str, type] = {
     "fix": Fix,
     "closure": Closure,
     "odometry": Odometry,
+    "gyro": AngularVelocity,
     "edges": CustomEdge,
 }
 
@@ -32,9 +33,10 @@ class InputType:
 
     Attributes
     ----------
-    converters : by use (``landmarks``, ``fix``, ``closure``, ``odometry``, ``edges``; the first is that of ``auto``),
-        a function of ``InputContext`` and a message that yields ``ObservedLandmark``, ``Fix``, ``Closure``,
-        ``Odometry`` or ``CustomEdge``. It raises ``MessageError(reason)`` for a message that is to be refused
+    converters : by use (``landmarks``, ``fix``, ``closure``, ``odometry``, ``gyro``, ``edges``; the first is that of
+        ``auto``), a function of ``InputContext`` and a message that yields ``ObservedLandmark``, ``Fix``, ``Closure``,
+        ``Odometry``, ``AngularVelocity`` or ``CustomEdge``. It raises ``MessageError(reason)`` for a message that is
+        to be refused
     definition : the text of its .msg file, for recordings that hold no definitions; types of other packages that ROS
         does not have follow it, each after a line of ``=`` and one of ``MSG: package/Name``
     edges : the tags of the edge types that its custom edges have; each is loaded, compiled and tried at the start

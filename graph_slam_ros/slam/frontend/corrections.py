@@ -89,9 +89,24 @@ class Corrections:
         motion = self.motion(step.T_last_base, seconds)
         return step if motion is step.T_last_base else replace(step, T_last_base=motion)
 
+    def without_bias(self, step: Step) -> Step:
+        """A step of odometry with its factors corrected, before the turn of a gyro is part of it."""
+        factors = self._of_odometry("distance"), self._of_odometry("turn"), 0.0
+        return replace(step, T_last_base=self._corrected(step.T_last_base, 0.0, factors))
+
+    def with_bias(self, step: Step, seconds: float) -> Step:
+        """A step whose factors are corrected, with the turn rate that is added."""
+        factors = 1.0, 1.0, self._of_odometry("turn_bias")
+        return replace(step, T_last_base=self._corrected(step.T_last_base, seconds, factors))
+
     def motion(self, motion: Numbers, seconds: float = 0.0) -> Numbers:
         """A motion by odometry, corrected; its numbers may be arrays."""
         distance, turn, bias = (self._of_odometry(name) for name in _ODOMETRY)
+        return self._corrected(motion, seconds, (distance, turn, bias))
+
+    def _corrected(self, motion: Numbers, seconds: float, factors: tuple[float, float, float]) -> Numbers:
+        """A motion, its distance and turn multiplied, and turned at a rate besides."""
+        distance, turn, bias = factors
         if (distance, turn, bias) == (1.0, 1.0, 0.0):
             return motion
         group, n = self._space.group, self._space.dimensions

@@ -2,16 +2,27 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from typing import TypeGuard
 
 import numpy as np
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edge_noise import edge_noise
-from graph_slam_ros.measurements.types import Closure, CustomEdge, InitialPose, Observation, Odometry, Sightings
+from graph_slam_ros.measurements.types import (
+    AngularVelocity,
+    Closure,
+    CustomEdge,
+    InitialPose,
+    Measured,
+    Observation,
+    Odometry,
+    Sightings,
+)
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.corrections import Corrections
 from graph_slam_ros.slam.frontend.gates import ClosureStart, DatumGate, GateChain
+from graph_slam_ros.slam.frontend.gyro import GyroFusion
 from graph_slam_ros.slam.frontend.ingest_gate import size_of
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList, SightingPose
 from graph_slam_ros.slam.frontend.max_distance import MaxDistance
@@ -50,6 +61,7 @@ class KeyframeFrontend:
     gates : what an observation passes before it is used
     edges : adds fixes, loop closures and poses that are given
     corrections : of odometry and sightings
+    gyro : as part of odometry; None where no input is one
     covariance : (dof, dof) of the newest keyframe's pose, by the last solve and the odometry since
     initial_pose : the pose that is given for the next odometry
     held_covariance : (dof, dof) of the newest pose when the map was held, for the next odometry
@@ -83,6 +95,7 @@ class KeyframeFrontend:
         )
         self.edges = PoseEdges(self._space, edges, counters)
         self.covariance = np.zeros((self._space.dof, self._space.dof))
+        self.gyro = GyroFusion(config, self._noise, counters) if config.gyro_input else None
         self._T_odom_base = self._space.identity  # of the last step of odometry, as its messages have it
         self.initial_pose: InitialPose | None = None
         self.held_covariance: Array | None = None
@@ -122,9 +135,14 @@ class KeyframeFrontend:
         self.odometry.forget()
         self.path.forget_time()
         self._thinning.forget_time()
+        if self.gyro:
+            self.gyro.forget()
 
-    def accepts(self, m: Odometry | Observation) -> bool:
-        """Return whether a measurement may be used when its turn comes; else it is counted."""
+    def accepts(self, m: Measured) -> TypeGuard[Odometry | Observation]:
+        """Return whether a measurement may be used when its turn comes; else it is counted, or of the gyro."""
+        if isinstance(m, AngularVelocity):
+            self._add_to_gyro(m)
+            return False
         return self.order.accepts(m) and (isinstance(m, Odometry) or self._arrivals.admit(m) is not None)
 
     def steps(self, m: Odometry) -> Iterator[Step]:
@@ -133,7 +151,23 @@ class KeyframeFrontend:
         for step in self.odometry.steps(m):
             seconds = 0.0 if before_ns is None else (step.stamp_ns - before_ns) * 1e-9
             before_ns, self._T_odom_base = step.stamp_ns, step.T_odom_base
-            yield self.corrections.step(step, seconds)
+            if self.gyro is None:
+                yield self.corrections.step(step, seconds)
+                continue
+            fused = self.gyro.fuse(self.corrections.without_bias(step), seconds, m.source)
+            yield self.corrections.with_bias(fused, seconds)
+
+    def _add_to_gyro(self, m: AngularVelocity) -> None:
+        if self.gyro is None or m.topic != self.gyro.name:
+            self._counters.count(m.topic, "not_in_use")
+        else:
+            self.gyro.add(m)
+
+    def drop_pending(self) -> None:
+        """No odometry comes any more for what is pending."""
+        self.pending.drop()
+        if self.gyro:
+            self.gyro.drop()
 
     # -- the motion since the last keyframe ------------------------------------------------------------------------
 
@@ -281,7 +315,9 @@ class KeyframeFrontend:
         stood = motion.now.stands
         rest = motion.cut(where.stamp_ns)
         T_odom_base = group.compose(keyframes[where.keyframe].T_odom_base, where.T_keyframe_base)
-        if self.corrections.found or self.corrections.are_configured:  # odometry's own frame has no part in them
+        if (
+            self.gyro or self.corrections.found or self.corrections.are_configured
+        ):  # odometry's own frame has no part in them
             left = self.corrections.uncorrected(rest.T_last_base) if rest is not None else self._space.identity
             T_odom_base = tuple(map(float, group.compose(self._T_odom_base, group.inverse(left))))
         self._append(

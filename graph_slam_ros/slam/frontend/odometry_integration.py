@@ -24,6 +24,7 @@ class OdometrySample:
     covariance: Array
     twist_covariance: Numbers | None = None
     stands: bool = False  # since the odometry before
+    turn_variance: Numbers | None = None  # of the rotation about each axis, for each second, where a gyro is part of it
 
 
 class OdometryNoise:
@@ -66,11 +67,25 @@ class OdometryNoise:
         c, n = self._config, self._space.dimensions
         return bool(sum(x * x for x in moved[:n]) < c.still_m**2 and self._space.angle(moved) < c.still_rad)
 
-    def of(self, step: Numbers, dt: float, twist_covariance: Numbers | None) -> Array:
-        """Covariance (dof, dof) of the velocities' integral over a step in dt seconds of motion."""
+    def of(
+        self, step: Numbers, dt: float, twist_covariance: Numbers | None, turn_variance: Numbers | None = None
+    ) -> Array:
+        """Covariance (dof, dof) of the velocities' integral over a step in dt seconds of motion.
+
+        Parameters
+        ----------
+        turn_variance : of the rotation about each axis, for each second, where it is not that of odometry
+        """
         if self._by_twist and twist_covariance is not None:
-            return self._twist(twist_covariance) * (dt * max(dt, self._config.twist_correlation_s))
-        return self._motion(step, dt) if self._by_motion else self._density * dt
+            out = self._twist(twist_covariance) * (dt * max(dt, self._config.twist_correlation_s))
+        else:
+            out = self._motion(step, dt) if self._by_motion else self._density * dt
+        if turn_variance is None:
+            return out
+        n, turns = self._space.dimensions, np.zeros_like(out)
+        turns[:n, :n] = out[:n, :n]
+        turns[n:, n:] = np.diag(turn_variance) * dt
+        return turns
 
     def _motion(self, step: Numbers, dt: float) -> Array:
         if dt == 0.0:
@@ -100,7 +115,7 @@ class StationaryDetector:
     def update(self, step: Step, dt: float) -> bool:
         """Add a step of dt seconds; returns whether the robot stood."""
         stands = self._noise.stands(step.T_last_base, dt)
-        if self._T_odom_base is None or step.broken:
+        if self._T_odom_base is None or step.broken or step.slips:
             self._begin(step)
             return stands and not step.broken
         moved = self._space.group.between(self._T_odom_base, step.T_odom_base)
@@ -172,7 +187,8 @@ class IntegratedOdometry:
         b, group = self._moved[k + 1], self._space.group
         fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
         step = group.interpolate(self._space.identity, group.between(a.T_keyframe_base, b.T_keyframe_base), fraction)
-        return self._extended(a, stamp_ns, group.compose(a.T_keyframe_base, step), step, b.twist_covariance, b.stands)
+        rest = Step(stamp_ns, step, step, b.twist_covariance, turn_variance=b.turn_variance)
+        return self._extended(a, group.compose(a.T_keyframe_base, step), rest, b.stands)
 
     def cut(self, stamp_ns: int) -> Step | None:
         """End the motion at a stamp after the last odometry but one; returns the step that is left over, if any."""
@@ -183,7 +199,7 @@ class IntegratedOdometry:
         # the next cut is made of this rest: without a norm of 1 its error would double from cut to cut
         rest = self._space.normalized(group.between(at.T_keyframe_base, last.T_keyframe_base))
         self._moved[-1] = at
-        return Step(last.stamp_ns, rest, rest, last.twist_covariance)
+        return Step(last.stamp_ns, rest, rest, last.twist_covariance, turn_variance=last.turn_variance)
 
     @property
     def is_long(self) -> bool:
@@ -197,21 +213,13 @@ class IntegratedOdometry:
 
     def _after(self, step: Step, stands: bool) -> OdometrySample:
         to = self._space.group.compose(self.now.T_keyframe_base, step.T_last_base)
-        return self._extended(self.now, step.stamp_ns, to, step.T_last_base, step.twist_covariance, stands)
+        return self._extended(self.now, to, step, stands)
 
-    def _extended(
-        self,
-        a: OdometrySample,
-        stamp_ns: int,
-        to: Numbers,
-        T_a_b: Numbers,
-        twist_covariance: Numbers | None,
-        stands: bool,
-    ) -> OdometrySample:
-        moving_ns = (stamp_ns - a.stamp_ns) * (not stands)
-        noise = self._noise.of(T_a_b, moving_ns * 1e-9, twist_covariance)
-        covariance = self._space.group.propagate_during(a.covariance, T_a_b, noise)
-        return OdometrySample(stamp_ns, to, covariance, twist_covariance, stands)
+    def _extended(self, a: OdometrySample, to: Numbers, step: Step, stands: bool) -> OdometrySample:
+        moving_ns = (step.stamp_ns - a.stamp_ns) * (not stands)
+        noise = self._noise.of(step.T_last_base, moving_ns * 1e-9, step.twist_covariance, step.turn_variance)
+        covariance = self._space.group.propagate_during(a.covariance, step.T_last_base, noise)
+        return OdometrySample(step.stamp_ns, to, covariance, step.twist_covariance, stands, step.turn_variance)
 
 
 def _stamp(moved: OdometrySample) -> int:

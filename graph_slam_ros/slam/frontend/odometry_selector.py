@@ -22,6 +22,8 @@ class Step:
     ----------
     T_odom_base : the pose in the frame of the odometry in use
     broken : whether odometry jumped here, so that ``T_last_base`` is no motion of the robot
+    turn_variance : of the rotation about each axis, for each second, where a gyro is part of it [rad^2/s]
+    slips : whether a gyro contradicts odometry, so that the robot may turn where odometry stands
     """
 
     stamp_ns: int
@@ -29,6 +31,8 @@ class Step:
     T_odom_base: Numbers
     twist_covariance: Numbers | None = None
     broken: bool = False
+    turn_variance: Numbers | None = None
+    slips: bool = False
 
 
 class OdometrySelector:

@@ -78,7 +78,7 @@ def satellite(frame="gps", status=0, kind=2):
 
 def compass(covariance=0.01, frame="imu_link"):
     return lambda k, stamp_ns, truth, drifting: imu(
-        quaternion(yaw=truth[2]), np.eye(3) * covariance, frame=frame, stamp_ns=stamp_ns
+        quaternion(yaw=truth[2]), np.eye(3) * covariance, frame=frame, stamp_ns=stamp_ns, rate=(0.0, 0.0, 0.3)
     )
 
 
@@ -381,10 +381,11 @@ def test_an_imu_is_offered_where_nothing_else_is(info, capsys, covariance):
     _, lines, words = info(ODOMETRY, SEEN, ("/imu/data", IMU, compass()), name="b.mcap")
     assert not any("imu" in word for word in words)
     assert any(line.startswith("not used: /imu/data: its heading may drift") for line in lines)
-    offered = shlex.split(" ".join(lines).split("With it: ")[1].split(" what is wrong")[0])
-    assert run([*words[:-2], *offered, "--out", "b_imu"], capsys)[0]["inputs"]["imu"]["believed"] > 0
+    offered = shlex.split(" ".join(lines).split("part of odometry: ")[1].split(" what is wrong")[0])
+    assert run([*words[:-2], *offered, "--out", "b_imu"], capsys)[0]["inputs"]["imu"]["used"] > 0
     _, lines, _ = info(ODOMETRY, ("/imu/raw", IMU, compass(-1.0)), name="c.mcap")
     assert any(line.startswith("not used: /imu/raw: it has no orientation") for line in lines)
+    assert "--set imu.topic=/imu/raw --set 'imu.mount=0 0 0 0 0 0' --set imu.use=gyro" in " ".join(lines)
 
 
 def test_poses_are_offered_where_nothing_else_is_but_no_estimates_and_no_truth(info, capsys):

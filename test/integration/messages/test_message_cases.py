@@ -228,6 +228,12 @@ def test_A13_an_imu_that_flags_its_orientation_as_absent():
     none_of(compass(2, sigma_rad=0.1), "imu", imu(quaternion(), np.diag([-1.0, 0.0, 0.0])), "no_orientation")
 
 
+def test_A13_an_imu_that_flags_its_angular_velocity_as_absent():
+    absent = imu(quaternion(), np.zeros((3, 3)), rate_covariance=np.diag([-1.0, 0.0, 0.0]))
+    for dimensions in (2, 3):
+        none_of(compass(dimensions, use="gyro"), "imu", absent, "no_angular_velocity")
+
+
 # -- frames ------------------------------------------------------------------------------------------------------------
 
 

@@ -344,6 +344,24 @@ def test_an_imu_gives_the_attitude_of_the_base_in_space_and_its_heading_in_the_p
     assert m.covariance == pytest.approx((0.091,))
 
 
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_an_imu_as_gyro_gives_the_rate_about_the_axes_of_the_base(dimensions):
+    mount = ("base_link", "chip", (0.1, 0.0, 0.0), quaternion(2.0, 0.3, -0.6))
+    turn, covariance = so3.matrix(numbers(mount[3])), np.diag([1e-4, 2e-4, 9e-4]) + 1e-5
+    rate = np.array([0.1, -0.2, 0.7])
+    sent = imu(quaternion(), -np.eye(3), "chip", rate=tuple(turn.T @ rate), rate_covariance=turn.T @ covariance @ turn)
+    m = heard(compass(dimensions, mount, use="gyro"), "imu", sent)
+    axes = slice(2, 3) if dimensions == 2 else slice(0, 3)
+    assert (m.stamp_ns, m.topic) == (STAMP_NS, "imu")
+    assert m.rate == pytest.approx(rate[axes])
+    assert matrix(m.covariance, len(m.rate)) == pytest.approx(covariance[axes, axes])
+    unknown = imu(quaternion(), np.eye(3), "chip", rate=tuple(turn.T @ rate))
+    assert heard(compass(dimensions, mount, use="gyro"), "imu", unknown).covariance is None
+    assert heard(compass(dimensions, mount, use="gyro", noise="sigmas"), "imu", sent).covariance is None
+    out = compass(dimensions, mount, use="gyro")
+    assert out.convert("imu", imu(quaternion(), np.eye(3), "chip", rate=(0.0, math.nan, 0.0))) == []
+
+
 # -- closures -------------------------------------------------------------------------------------------------------
 
 

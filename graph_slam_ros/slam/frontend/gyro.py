@@ -1,0 +1,206 @@
+"""A gyro as part of odometry: its turn and that of odometry become one, by their covariances.
+
+The bias of the gyro is estimated on the way: while the robot stands, and, where odometry goes nearly straight, from the
+turn that odometry has. Its error is common to all steps, so each counts as if it lasted ``gyro.bias_correlation_s``.
+
+Over each second odometry's turn must agree with the gyro's. Where it does not, wheels slip, and the gyro's is used
+alone. A gyro that most of the time disagrees is itself wrong: in other units, or mounted otherwise.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+
+from graph_slam_ros.chi_square import quantile
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.measurements.counters import Counters
+from graph_slam_ros.measurements.types import AngularVelocity
+from graph_slam_ros.slam.frontend.gyro_samples import GyroSamples, Turn
+from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise, StationaryDetector
+from graph_slam_ros.slam.frontend.odometry_selector import Step
+from graph_slam_ros.typing import Numbers
+
+_WINDOW_S = 1.0
+_STRAIGHT_RAD_S = 0.1  # above, errors of odometry's turn factor would pass for a bias
+_QUIET, _QUIET_RAD_S = 10.0, 0.02  # times its noise, and rate, by which a gyro at rest may vary
+_DOUBTED_AFTER_S, _MEMORY_S = 10.0, 60.0
+_DOUBTED, _TRUSTED = 0.5, 0.25  # part of the time in motion in which they disagree
+
+
+@dataclass(frozen=True, slots=True)
+class GyroState:
+    """The present estimate of a gyro.
+
+    Attributes
+    ----------
+    name : of the input
+    bias, sigma : about each axis [rad/s]
+    state : ``used``; ``silent``: no message for longer than ``gyro.timeout_s``; ``doubted``: it disagrees with odometry
+        most of the time; ``waiting``: no odometry yet. Only while it is ``used`` it has a part in odometry
+    """
+
+    name: str
+    bias: Numbers
+    sigma: Numbers
+    state: str
+
+    @property
+    def fault(self) -> str:
+        """The reason why it has no part in odometry; empty where it has."""
+        if self.state == "silent":
+            return f"{self.name}: the gyro is silent, odometry turns alone (gyro.timeout_s)"
+        if self.state == "doubted":
+            return (
+                f"{self.name}: gyro and odometry contradict each other most of the time, odometry turns alone: rad/s, "
+                f"counter-clockwise positive? Its frame and TF or {self.name}.mount? odometry.turn_factor?"
+            )
+        return ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """One step of a window: seconds, the gyro's turn less odometry's, and the variance of that."""
+
+    seconds: float
+    difference: Numbers
+    variance: Numbers
+
+
+class GyroFusion:
+    """Fuses the steps of odometry with a gyro.
+
+    Parameters
+    ----------
+    noise : of odometry
+    """
+
+    def __init__(self, config: Config, noise: OdometryNoise, counters: Counters) -> None:
+        self._config, self._space, self._noise, self._counters = config.gyro, config.space, noise, counters
+        self._still_rad = config.odometry.still_rad
+        self.name = config.gyro_input
+        self._axes = self._space.dof - self._space.dimensions
+        self._samples = GyroSamples(config.gyro, self._axes, counters)
+        self._rest = StationaryDetector(noise, self._space)
+        self._bias = [0.0] * self._axes
+        self._bias_variance = [self._config.bias_sigma**2] * self._axes
+        self._window: deque[_Step] = deque()
+        self._limit = quantile(self._config.gate, self._axes)
+        self._seen_s = self._disagrees = 0.0
+        self._is_doubted = False
+        self._state = "waiting"
+
+    @property
+    def state(self) -> GyroState:
+        """The present estimate of it."""
+        return GyroState(self.name, tuple(self._bias), tuple(map(math.sqrt, self._bias_variance)), self._state)
+
+    def add(self, m: AngularVelocity) -> None:
+        """Add a message of the gyro, in any order."""
+        self._samples.add(m)
+
+    def drop(self) -> None:
+        """No odometry comes any more for the messages that are pending."""
+        self._samples.forget()
+
+    def forget(self) -> None:
+        """Stamps begin anew: the bias may be another by then."""
+        self.drop()
+        self._window.clear()
+        self._rest = StationaryDetector(self._noise, self._space)
+        self._bias_variance = [self._config.bias_sigma**2] * self._axes
+
+    def fuse(self, step: Step, seconds: float, source: str) -> Step:
+        """A step of odometry, with the gyro as part of its turn.
+
+        Parameters
+        ----------
+        seconds : since the step before
+        source : the odometry, for what is counted
+        """
+        if seconds <= 0.0 or step.broken:
+            self._rest.update(step, max(seconds, 0.0))
+            self._samples.begin(step.stamp_ns)
+            self._window.clear()
+            return step
+        stood = self._rest.update(step, seconds)
+        walked = self._config.bias_walk**2 * seconds
+        self._bias_variance = [v + walked for v in self._bias_variance]
+        turn = self._samples.turn(step.stamp_ns - round(seconds * 1e9), step.stamp_ns)
+        if turn is None:
+            self._counters.count(self.name, "gyro_silent")
+            self._state = "silent"
+            self._window.clear()
+            return step
+        return self._fused(step, seconds, turn, stood, source)
+
+    def _fused(self, step: Step, seconds: float, turn: Turn, stood: bool, source: str) -> Step:
+        n, group = self._space.dimensions, self._space.group
+        tangent = tuple(map(float, group.log(step.T_last_base)))
+        odometry = (0.0,) * self._axes if stood else tangent[n:]
+        noise = self._noise.of(step.T_last_base, 0.0 if stood else seconds, step.twist_covariance)
+        of_odometry = tuple(map(float, noise.diagonal()[n:]))
+        own = tuple(v + self._config.turn_per_rad * abs(a) for v, a in zip(turn.variance, turn.angle, strict=True))
+        measured = tuple(a - b * seconds for a, b in zip(turn.angle, self._bias, strict=True))
+        difference = tuple(self._wrapped(a - b) for a, b in zip(measured, odometry, strict=True))
+        white = tuple(a + b for a, b in zip(of_odometry, own, strict=True))
+        slips = self._contradicts(_Step(seconds, difference, white), stood)
+        self._judge(seconds, slips, is_moving=slips or not stood)
+        if self._is_doubted:
+            self._counters.count(self.name, "gyro_doubted")
+            self._state = "doubted"
+            return step
+        self._state = "used"
+        persisting = [v * self._config.bias_correlation_s * seconds for v in self._bias_variance]
+        if not slips and self._shows_bias(turn, seconds, odometry, stood):
+            self._learn(difference, white, seconds)
+        if stood and not slips:
+            return step
+        variance = [a + b for a, b in zip(own, persisting, strict=True)]
+        weight = [1.0 if slips else o / (o + g) for o, g in zip(of_odometry, variance, strict=True)]
+        if slips:
+            self._counters.count(source, "turn_slips")
+        fused = tuple(o + w * d for o, w, d in zip(odometry, weight, difference, strict=True))
+        motion = tuple(map(float, group.exp((*tangent[:n], *fused))))
+        density = tuple(w * v / seconds for w, v in zip(weight, variance, strict=True))
+        return replace(step, T_last_base=motion, turn_variance=density, slips=slips)
+
+    def _wrapped(self, angle: float) -> float:
+        return math.remainder(angle, 2.0 * math.pi) if self._axes == 1 else angle
+
+    def _contradicts(self, step: _Step, stood: bool) -> bool:
+        """Return whether the turns of the last second differ by more than their errors."""
+        window = self._window
+        window.append(step)
+        while len(window) > 1 and sum(one.seconds for one in window) - window[0].seconds >= _WINDOW_S:
+            window.popleft()
+        seconds = sum(one.seconds for one in window)
+        statistic = 0.0
+        for axis in range(self._axes):
+            apart = sum(one.difference[axis] for one in window)
+            variance = sum(one.variance[axis] for one in window) + self._bias_variance[axis] * seconds**2
+            variance += self._still_rad**2 * stood
+            statistic += apart**2 / variance
+        return statistic > self._limit
+
+    def _judge(self, seconds: float, slips: bool, *, is_moving: bool) -> None:
+        """Follow how often they disagree: wheels slip now and then, a gyro that is wrong always is."""
+        if not is_moving:
+            return
+        self._seen_s = min(self._seen_s + seconds, _MEMORY_S)
+        self._disagrees += (slips - self._disagrees) * min(1.0, seconds / self._seen_s)
+        if self._seen_s >= _DOUBTED_AFTER_S:
+            self._is_doubted = self._disagrees > (_TRUSTED if self._is_doubted else _DOUBTED)
+
+    def _shows_bias(self, turn: Turn, seconds: float, odometry: Numbers, stood: bool) -> bool:
+        """Return whether the difference to odometry is the bias, and not a turn of one of them."""
+        if not stood:
+            return math.hypot(*odometry) < _STRAIGHT_RAD_S * seconds
+        return turn.spread < max(_QUIET_RAD_S, _QUIET * math.sqrt(max(turn.variance)) / seconds)
+
+    def _learn(self, difference: Numbers, variance: Numbers, seconds: float) -> None:
+        """One step of a Kalman filter of the bias, an axis at a time."""
+        for axis, apart in enumerate(difference):
+            before = self._bias_variance[axis]
+            gain = before * seconds / (before * seconds**2 + variance[axis])
+            self._bias[axis] += gain * apart
+            self._bias_variance[axis] = (1.0 - gain * seconds) * before

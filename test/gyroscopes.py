@@ -1,0 +1,88 @@
+"""Drives of a robot whose wheels are wrong, with a gyro: simulated, without a bag."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from graph_slam_ros.lie import so3
+from graph_slam_ros.simulation import simulate
+from graph_slam_ros.simulation.instruments import Instruments, with_instruments
+from graph_slam_ros.simulation.motion import integrate
+from graph_slam_ros.simulation.recording import measurements
+from graph_slam_ros.slam import AngularVelocity, Config, Control, GraphSlam, Odometry, Sightings
+
+TICK_NS, TICK_S = 20_000_000, 0.02
+GYRO = {"inputs.names": "odom detections imu", "imu.type": "sensor_msgs/msg/Imu", "imu.use": "gyro"}
+TRUE_NOISE = {"odometry.twist_correlation_s": 1.0}  # of the simulated wheels: errors last 0.5 s to either side
+SLIPPING = 1.4  # turns of wheels for each turn of the robot
+
+
+def stood(recording, seconds):
+    """The same drive after some time at rest."""
+    count = round(seconds / TICK_S)
+
+    def longer(rows, first=None):
+        return np.concatenate([np.repeat(rows[:1] if first is None else first, count, axis=0), rows])
+
+    return replace(
+        recording,
+        stamps_ns=recording.stamps_ns[0] + TICK_NS * np.arange(len(recording.stamps_ns) + count),
+        T_odom_base=longer(recording.T_odom_base),
+        twist=longer(recording.twist),
+        odom_covariance=longer(recording.odom_covariance),
+        T_world_base=longer(recording.T_world_base),
+        seen=tuple(replace(s, stamp_ns=s.stamp_ns + count * TICK_NS) for s in recording.seen),
+    )
+
+
+def with_wrong_wheels(recording, factor=1.0, *, slips=False):
+    """Wheels that turn by a factor more than the robot, or slip in every other turn."""
+    twist = recording.twist.copy()
+    twist[:, 2] *= factor
+    if slips:
+        is_turning = np.convolve(np.abs(twist[:, 2]), np.full(25, 0.04), "same") > 0.3
+        number = np.cumsum(np.diff(is_turning, prepend=False) & is_turning)
+        twist[is_turning & (number % 2 == 1), 2] *= SLIPPING
+    return replace(recording, twist=twist, T_odom_base=integrate((0.0, 0.0, 0.0), twist[1:] * TICK_S))
+
+
+def drive(seed, *, rest_s=0.0, bias=0.0, every=20, factor=1.0, slips=False, walk=2e-5, **options):
+    """What a robot with a gyro measures, in order of stamp, and its recording; few tags are seen."""
+    world = simulate("warehouse", seed, sensor="position", **options)
+    recording = stood(with_wrong_wheels(world, factor, slips=slips), rest_s)
+    recording = with_instruments(recording, seed, Instruments(imu=100.0, imu_bias_rad_s=bias, imu_bias_walk=walk))
+    out = [
+        replace(m, source="odom") if isinstance(m, Odometry) else m
+        for k, m in enumerate(measurements(recording))
+        if not isinstance(m, Sightings) or m.stamp_ns // (8 * TICK_NS) % every == 0
+    ]
+    return sorted([*out, *rates(recording.imu)], key=lambda m: m.stamp_ns), recording
+
+
+def rates(imu):
+    turn = imu.T_base_imu[3:]
+    for stamp_ns, rate in zip(imu.stamps_ns.tolist(), imu.rate.tolist(), strict=True):
+        yield AngularVelocity(stamp_ns, "imu", (float(so3.act(turn, tuple(rate))[2]),))
+
+
+def driven(measured, recording, settings):
+    """The pipeline after a drive that begins where the robot truly was."""
+    start = " ".join(map(repr, recording.T_world_base[0].tolist()))
+    slam = GraphSlam(Config.from_mapping({"anchor.pose": start, **TRUE_NOISE, **settings}))
+    has_gyro = "imu" in slam.config.inputs.names
+    for m in [*measured, Control("end"), Control("optimize")]:
+        if has_gyro or not isinstance(m, AngularVelocity):
+            slam.process(m)
+    return slam
+
+
+def errors(slam, recording):
+    """RMS of the position's error [m], and the mean of the squares of some poses' errors in their sigmas (NEES)."""
+    at = np.searchsorted(recording.stamps_ns, slam.keyframes.stamps_ns)
+    truth, found = recording.T_world_base[at], slam.trajectory()
+    squares = []
+    for k in range(5, len(found), 7):
+        (covariance,) = slam.solver.marginal([int(slam.keyframes.ids[k])])
+        d = np.array(slam.space.group.local(tuple(found[k].tolist()), tuple(truth[k].tolist())))
+        squares.append(d @ np.linalg.solve(covariance, d))
+    return float(np.sqrt(np.mean(np.sum((found - truth)[:, :2] ** 2, axis=1)))), float(np.mean(squares))

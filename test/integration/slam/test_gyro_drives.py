@@ -1,0 +1,113 @@
+"""A drive with a gyro against the same without; the gyro of a recording, and what is said of it."""
+
+import json
+
+import numpy as np
+import pytest
+from gyroscopes import GYRO, drive, driven, errors
+from reliability import tell, times
+
+from graph_slam_ros.cli import main
+from graph_slam_ros.config.config import Config
+from graph_slam_ros.simulation import simulate
+from graph_slam_ros.simulation.bag import write_bag
+from graph_slam_ros.simulation.instruments import Instruments, with_instruments
+from graph_slam_ros.slam import AngularVelocity
+
+SEEDS = times(1, 20)
+BAND = (1.0, 5.0)
+"""Of the mean NEES of 3 numbers: the bias's error is common to all steps, and counted as if it lasted 10 s."""
+WHEELS = {"turn too much": {"factor": 1.05}, "slip": {"slips": True}}
+
+
+@pytest.mark.parametrize("wheels", WHEELS)
+def test_with_a_gyro_wheels_that_are_wrong_do_less_harm(wheels):
+    """Its bias is 0.01 rad/s, found while the robot stands for 5 s."""
+    found = []
+    for seed in range(SEEDS):
+        measured, recording = drive(seed, rest_s=5.0, bias=0.01, **WHEELS[wheels])
+        found.append([errors(driven(measured, recording, settings), recording) for settings in ({}, GYRO)])
+    without, with_it = np.mean(found, axis=0)
+    worse = sum(b[0] > a[0] for a, b in found)
+    print(f"{wheels}: error {without[0]:.3f} without, {with_it[0]:.3f} m with; NEES {without[1]:.1f}, {with_it[1]:.1f}")
+    tell(f"gyro_{wheels.replace(' ', '_')}", tried=SEEDS, failed=worse)
+    assert with_it[0] < 0.5 * without[0]
+    assert BAND[0] < with_it[1] < BAND[1]
+
+
+def test_a_bias_that_is_never_seen_at_rest_does_no_harm():
+    """The robot drives from the first message on."""
+    found = []
+    for seed in range(SEEDS):
+        measured, recording = drive(seed, bias=0.01, factor=1.05)
+        found.append([errors(driven(measured, recording, settings), recording) for settings in ({}, GYRO)])
+    without, with_it = np.mean(found, axis=0)
+    print(f"no rest: error {without[0]:.3f} without, {with_it[0]:.3f} m with; NEES {without[1]:.1f}, {with_it[1]:.1f}")
+    tell("gyro_without_rest", tried=SEEDS, failed=0)
+    assert with_it[0] < without[0]
+    assert BAND[0] < with_it[1] < BAND[1]
+
+
+def test_the_order_of_arrival_changes_nothing_and_a_silent_gyro_leaves_wheels_as_they_are():
+    measured, recording = drive(0, rest_s=2.0, bias=0.01, aisles=2, laps=1, aisle_m=4.0)
+    rates = [m for m in measured if isinstance(m, AngularVelocity)]
+    others = [m for m in measured if not isinstance(m, AngularVelocity)]
+    late = sorted(measured, key=lambda m: m.stamp_ns + 20_000_000 * isinstance(m, AngularVelocity))
+    usual = driven(measured, recording, GYRO)
+    assert driven(late, recording, GYRO).trajectory().tobytes() == usual.trajectory().tobytes()
+    assert usual.counters.used["imu"] > 0.99 * len(rates)
+    without = driven(others, recording, {})
+    alone = driven(others, recording, GYRO)
+    assert alone.trajectory().tobytes() == without.trajectory().tobytes()
+    assert alone.gyro.fault
+
+
+def test_sightings_between_keyframes_lie_on_the_fused_path():
+    measured, recording = drive(1, rest_s=5.0, factor=1.3, every=4, aisles=2, laps=1, aisle_m=6.0)
+    slam = driven(measured, recording, GYRO)
+    at = np.searchsorted(recording.stamps_ns, slam.sighting_poses.stamps_ns)
+    apart = (slam.sighting_trajectory() - recording.T_world_base[at])[:, :2]
+    assert np.sqrt(np.mean(np.sum(apart**2, axis=1))) < 1.2 * errors(slam, recording)[0] + 0.01
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    """A short drive with an IMU of bias 0.01 rad/s."""
+    path = tmp_path_factory.mktemp("gyro") / "drive.mcap"
+    recording = simulate("warehouse", 3, aisles=2, laps=1, aisle_m=4.0)
+    write_bag(with_instruments(recording, 3, Instruments(imu=100.0, imu_bias_rad_s=0.01)), path)
+    return path
+
+
+def replayed(bag, out, *settings):
+    arguments = [f"--set={name}={value}" for name, value in [*GYRO.items(), ("imu.topic", "/imu/data"), *settings]]
+    return main(["replay", str(bag), "--out", str(out), *arguments])
+
+
+def test_a_recording_with_a_gyro_is_replayed_and_repeated_to_the_same_bytes(bag, tmp_path, capsys):
+    assert replayed(bag, tmp_path / "run") == 0
+    said = capsys.readouterr().out
+    assert "gyro       bias 0.0" in said
+    run = json.loads((tmp_path / "run/run.json").read_text())
+    assert run["gyro"]["state"] == "used"
+    assert run["gyro"]["bias"][0] == pytest.approx(0.01, abs=4.0 * run["gyro"]["sigma"][0])
+    assert run["inputs"]["imu"]["used"] > 0.98 * run["inputs"]["imu"]["received"]
+    assert main(["replay", str(tmp_path / "run"), "--out", str(tmp_path / "again")]) == 0
+    for name in ("path.tum", "landmarks.csv", "graph.g2o", "ledger.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
+
+
+def test_a_gyro_in_degrees_is_said_at_the_end(bag, tmp_path, capsys, monkeypatch):
+    from graph_slam_ros.messages.inputs import odometry
+
+    usual = odometry.so3.act
+    monkeypatch.setattr(odometry.so3, "act", lambda q, v: tuple(57.3 * x for x in usual(q, v)))
+    replayed(bag, tmp_path / "run", ("odometry.noise", "motion"), ("odometry.turn_per_rad", 0.001))
+    said = " ".join(capsys.readouterr().err.split())
+    assert "imu: gyro_doubted" in said
+    assert "counter-clockwise positive" in said
+
+
+def test_one_input_can_be_the_gyro():
+    with pytest.raises(Exception, match=r"second\.use: imu is the gyro already"):
+        Config.from_mapping({**GYRO, "inputs.names": "odom imu second", "second.use": "gyro"})

@@ -1,0 +1,247 @@
+"""A gyro as part of odometry: what its messages add up to, its bias, and whom to believe."""
+
+import math
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.config.gyro import GyroConfig
+from graph_slam_ros.lie import se2, se3, so3
+from graph_slam_ros.slam import AngularVelocity, Config, Counters
+from graph_slam_ros.slam.frontend.gyro import GyroFusion
+from graph_slam_ros.slam.frontend.gyro_samples import GyroSamples
+from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
+from graph_slam_ros.slam.frontend.odometry_selector import Step
+
+MS = 1_000_000
+T0 = 1_700_000_000_000 * MS
+
+
+def sample(ms, *rate, covariance=None):
+    return AngularVelocity(T0 + ms * MS, "imu", tuple(map(float, rate)), covariance)
+
+
+def samples(*some, axes=1, counters=None, **settings):
+    out = GyroSamples(GyroConfig(**settings), axes, Counters() if counters is None else counters)
+    for one in some:
+        out.add(one)
+    return out
+
+
+def turned(gyro, a_ms, b_ms):
+    found = gyro.turn(T0 + a_ms * MS, T0 + b_ms * MS)
+    return None if found is None else found.angle
+
+
+# -- what messages add up to ---------------------------------------------------------------------------------------
+
+
+def test_a_rate_that_changes_evenly_is_integrated_exactly_whatever_the_stamps():
+    stamps = [0, 7, 20, 33, 34, 60, 90]
+    gyro = samples(*(sample(ms, 0.01 * ms) for ms in stamps))
+    assert turned(gyro, 5, 40) == pytest.approx((0.01 * (40**2 - 5**2) / 2 / 1000,))
+    assert turned(gyro, 40, 85) == pytest.approx((0.01 * (85**2 - 40**2) / 2 / 1000,))
+
+
+def test_what_was_assumed_before_the_next_message_is_made_up_for():
+    """Odometry comes before the gyro's message of the same time: no turn is lost in the end."""
+    gyro, total = samples(sample(0, 0.0)), 0.0
+    for ms in range(50, 1050, 50):
+        total += turned(gyro, ms - 50, ms)[0]
+        gyro.add(sample(ms, 0.002 * ms))
+    total += turned(gyro, 1000, 1001)[0]
+    assert total == pytest.approx(0.002 * 1000**2 / 2 / 1000, abs=0.003)
+
+
+def test_turns_in_space_are_composed_in_their_order():
+    gyro = samples(*(sample(ms, 2.0 if ms < 50 else 0.0, 0.0, 0.0 if ms < 50 else 2.0) for ms in range(100)), axes=3)
+    expected = so3.log(so3.compose(so3.exp((0.099, 0.0, 0.0)), so3.exp((0.0, 0.0, 0.099))))
+    assert turned(gyro, 0, 99) == pytest.approx(expected, abs=1e-3)
+    assert turned(gyro, 99, 99 + 50) is not None
+
+
+def test_in_space_too_a_rate_that_was_held_is_made_up_for():
+    gyro = samples(sample(0, 1.0, 0.0, 0.0), axes=3)
+    first = turned(gyro, 0, 50)
+    gyro.add(sample(40, 0.0, 0.0, 1.0))
+    gyro.add(sample(60, 0.0, 0.0, 1.0))
+    both = so3.log(so3.compose(so3.exp(first), so3.exp(turned(gyro, 50, 60))))
+    whole = samples(sample(0, 1.0, 0.0, 0.0), sample(40, 0.0, 0.0, 1.0), sample(60, 0.0, 0.0, 1.0), axes=3)
+    assert both == pytest.approx(turned(whole, 0, 60), abs=1e-12)
+
+
+def test_a_gap_is_no_turn_and_what_follows_is_one_again():
+    gyro = samples(*(sample(ms, 1.0) for ms in (0, 50, 100, 400, 450, 500)))
+    assert turned(gyro, 0, 100) == pytest.approx((0.1,))
+    assert turned(gyro, 100, 300) is None
+    assert turned(gyro, 300, 420) is None
+    assert turned(gyro, 420, 480) == pytest.approx((0.06,))
+    assert turned(gyro, 480, 800) is None
+
+
+def test_before_the_first_message_nothing_is_known():
+    assert turned(samples(sample(50, 1.0)), 0, 60) is None
+    assert turned(samples(), 0, 60) is None
+
+
+def test_a_stamp_far_ahead_keeps_nobody_from_going_on():
+    gyro = samples(sample(0, 1.0), sample(3_600_000, 9.0), sample(50, 1.0))
+    assert turned(gyro, 0, 60) == pytest.approx((0.06,))
+    gyro.add(sample(100, 1.0))
+    assert turned(gyro, 60, 110) == pytest.approx((0.05,))
+
+
+def test_each_message_is_counted_once():
+    counters = Counters()
+    gyro = samples(*(sample(ms, 0.0) for ms in range(0, 100, 10)), counters=counters)
+    gyro.begin(T0 + 25 * MS)
+    turned(gyro, 25, 55)
+    gyro.add(sample(60, 0.0))
+    gyro.add(sample(60, 1.0))
+    gyro.add(sample(30, 1.0))
+    gyro.forget()
+    expected = {"before_odometry": 2, "duplicate": 1, "duplicate_stamp": 1, "late": 1, "after_odometry": 4}
+    assert (counters.used["imu"], counters.as_dict()) == (3, {"imu": expected})
+    # 10 messages: 2 before, 3 used (20, 30, 40), 50 in use, 4 that odometry did not reach
+
+
+def test_noise_is_that_of_the_messages_where_they_have_it():
+    by_message = samples(*(sample(ms, 0.0, covariance=(4e-4,)) for ms in (0, 10, 20, 30)))
+    assert by_message.turn(T0, T0 + 20 * MS).variance == pytest.approx((4e-4 * 0.01 * 0.02,))
+    configured = samples(*(sample(ms, 0.0) for ms in (0, 10, 20)), density=0.01)
+    assert configured.turn(T0, T0 + 20 * MS).variance == pytest.approx((1e-4 * 0.02,))
+
+
+# -- whom to believe -----------------------------------------------------------------------------------------------
+
+
+class Robot:
+    """Wheels and a gyro, each with its own opinion of how the robot turns; 50 Hz and 100 Hz."""
+
+    def __init__(self, dimensions=2, **settings):
+        names = {"inputs.names": "odom imu", "imu.type": "sensor_msgs/msg/Imu", "imu.use": "gyro"}
+        config = Config.from_mapping({"world.dimensions": dimensions, **names, **settings})
+        self.space, self.counters = config.space, Counters()
+        self.gyro = GyroFusion(config, OdometryNoise(config.odometry, config.space), self.counters)
+        self.axes = 1 if dimensions == 2 else 3
+        self.ms, self.pose, self.fused = 0, self.space.identity, self.space.identity
+        self.gyro.fuse(Step(T0, self.pose, self.pose), 0.0, "odom")
+        self.speaks = True
+
+    def drive(self, seconds, *, speed=0.0, wheels=0.0, gyro=0.0):
+        """Go on for a time; the last step is returned."""
+        axis = np.eye(self.axes)[-1]
+        for _ in range(round(seconds * 50)):
+            for ms in (self.ms, self.ms + 10, self.ms + 20) if self.speaks else ():
+                if ms == self.ms + 20 or self.ms == 0 or ms % 20:
+                    self.gyro.add(sample(ms, *(gyro * axis)))
+            self.ms += 20
+            moved = (speed * 0.02, *[0.0] * (self.space.dimensions - 1), *(wheels * 0.02 * axis))
+            motion = tuple(map(float, self.space.group.exp(moved)))
+            self.pose = self.space.normalized(self.space.group.compose(self.pose, motion))
+            step = self.gyro.fuse(Step(T0 + self.ms * MS, motion, self.pose), 0.02, "odom")
+            self.fused = self.space.normalized(self.space.group.compose(self.fused, step.T_last_base))
+        return step
+
+    def heading(self):
+        return self.space.heading(self.fused)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_the_bias_is_found_at_rest_and_its_sigma_grows_afterwards(dimensions):
+    robot = Robot(dimensions)
+    robot.drive(5.0, gyro=0.012)
+    after_rest = robot.gyro.state
+    assert after_rest.bias[-1] == pytest.approx(0.012, abs=3.0 * after_rest.sigma[-1] + 1e-6)
+    assert after_rest.sigma[-1] < 1e-3
+    assert robot.heading() == 0.0
+    robot.speaks = False
+    robot.drive(100.0, speed=0.5)
+    later = robot.gyro.state
+    assert later.sigma[-1] == pytest.approx(math.hypot(after_rest.sigma[-1], 1e-4 * math.sqrt(100.0)), rel=1e-3)
+    assert later.state == "silent"
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_wheels_that_slip_in_a_turn_have_no_part_in_it(dimensions):
+    robot = Robot(dimensions, **{"odometry.turn_per_rad": 1e-3})
+    robot.drive(5.0, gyro=0.01)
+    robot.drive(20.0, speed=0.5, gyro=0.01)
+    before = robot.heading()
+    step = robot.drive(2.0, speed=0.5, wheels=1.0, gyro=0.51)
+    assert step.slips
+    assert robot.heading() - before == pytest.approx(1.0, abs=0.1)  # the gyro: 0.5 rad/s for 2 s
+    assert robot.counters["odom", "turn_slips"] > 50
+    assert np.linalg.norm(step.T_last_base[:2]) == pytest.approx(0.01, rel=1e-3)  # as far as the wheels say
+
+
+def test_wheels_that_agree_count_by_their_noise():
+    robot = Robot()
+    robot.drive(5.0)
+    step = robot.drive(1.0, speed=0.5, wheels=0.3, gyro=0.31)
+    assert not step.slips
+    assert 0.3 * 0.02 < step.T_last_base[2] < 0.31 * 0.02
+    assert 0.0 < step.turn_variance[0] < 1e-4
+
+
+def test_a_robot_that_is_turned_by_hand_turns_though_its_wheels_stand():
+    robot = Robot()
+    robot.drive(5.0, gyro=0.01)
+    step = robot.drive(2.0, gyro=0.81)
+    assert step.slips
+    assert robot.heading() == pytest.approx(1.6, abs=0.2)
+    assert robot.gyro.state.bias == pytest.approx((0.01,), abs=2e-3)
+
+
+@pytest.mark.parametrize("wrong", ["degrees", "sign"])
+def test_a_gyro_that_most_of_the_time_contradicts_is_not_used(wrong):
+    """Its units are degrees, or it is mounted upside down."""
+    factor = {"degrees": 180.0 / math.pi, "sign": -1.0}[wrong]
+    robot = Robot(**{"odometry.turn_per_rad": 1e-3})
+    robot.drive(3.0)
+    for k in range(40):
+        rate = 0.5 if k % 2 else -0.5
+        robot.drive(1.0, speed=0.5, wheels=rate, gyro=factor * rate)
+    assert robot.gyro.state.state == "doubted"
+    assert "rad/s" in robot.gyro.state.fault
+    assert robot.counters["imu", "gyro_doubted"] > 1000
+    step = robot.drive(1.0, speed=0.5, wheels=0.5, gyro=factor * 0.5)
+    assert step.turn_variance is None
+    assert step.T_last_base[2] == pytest.approx(0.01)
+    for k in range(120):  # it is mended
+        robot.drive(1.0, speed=0.5, wheels=0.5 if k % 2 else -0.5, gyro=0.5 if k % 2 else -0.5)
+    assert robot.gyro.state.state == "used"
+
+
+def test_a_gyro_that_falls_silent_leaves_the_turn_to_the_wheels():
+    robot = Robot()
+    robot.drive(5.0)
+    robot.speaks = False
+    step = robot.drive(1.0, speed=0.5, wheels=0.3)
+    assert step.turn_variance is None
+    assert step.T_last_base[2] == pytest.approx(0.006)
+    assert robot.counters["imu", "gyro_silent"] == 45  # 0.1 s are bridged
+    assert "gyro_silent" not in robot.gyro.state.fault
+    assert "silent" in robot.gyro.state.fault
+    robot.speaks = True
+    robot.drive(1.0, speed=0.5, wheels=0.3, gyro=0.3)
+    assert robot.gyro.state.fault == ""
+
+
+def test_a_turn_factor_that_is_wrong_is_no_bias():
+    """Wheels turn 5 % too much: in circles that looks as 0.025 rad/s."""
+    robot = Robot()
+    robot.drive(5.0)
+    robot.drive(60.0, speed=0.5, wheels=0.525, gyro=0.5)
+    assert abs(robot.gyro.state.bias[0]) < 2e-3
+
+
+def test_the_motion_and_not_its_turn_is_that_of_the_wheels():
+    robot = Robot()
+    robot.drive(5.0)
+    step = robot.drive(1.0, speed=1.0, wheels=0.5, gyro=0.5)
+    assert se2.log(step.T_last_base)[:2] == pytest.approx((0.02, 0.0), abs=1e-9)
+    robot = Robot(3)
+    robot.drive(5.0)
+    step = robot.drive(1.0, speed=1.0, wheels=0.5, gyro=0.5)
+    assert se3.log(step.T_last_base)[:3] == pytest.approx((0.02, 0.0, 0.0), abs=1e-9)
