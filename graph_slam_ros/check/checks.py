@@ -53,5 +53,5 @@ def worst_of_replay(c: Columns) -> Finding | None:
 
 def _nothing_corrects(c: Columns) -> Iterator[Finding]:
     if not any(topic.use != "odometry" and len(topic.stamp_ns) for topic in c.topics.values()):
-        text = "no landmark, fix or closure: the result would be odometry alone"
-        yield Finding("no_landmarks", "note", 0, 1, "topics", text, c.odometry.topic)
+        text = "the recording has no landmark, fix or closure that is used: a replay would be odometry alone"
+        yield Finding("no_landmarks", "warning", 0, 1, "topics", text, c.odometry.topic)

@@ -35,98 +35,123 @@ class Kind:
 
 
 _DRIVER = "correct the driver (REP 103: metres, radians, x ahead, y to the left, turning left is positive)"
-_DENSITY = "correct the driver; until then odometry.noise=density"
-_MOUNT = "publish the transform on /tf_static, or INPUT.mount"
-_ONE_CLOCK = "synchronise the clocks (chrony, PTP); use_sim_time for all nodes or for none"
-_SEE = "drive again: "
+_DENSITY = "correct the driver; until then set odometry.noise=density"
+_MOUNT = "publish the transform on /tf_static, or set INPUT.mount"
+_ONE_CLOCK = "synchronise the clocks (chrony, PTP); set use_sim_time for all nodes or for none"
+_PUBLISHER = "let one node only publish each frame"
+_ID = "give each landmark an id of its own"
+_WHEELS = "choose the topic of the wheels with --odom"
 
 KINDS: dict[str, Kind] = {
     # -- inputs
-    "no_odometry": Kind("no odometry in the recording can be used", "record nav_msgs/Odometry, or odom on /tf", True),
+    "no_odometry": Kind(
+        "the recording has no odometry that can be used", "record nav_msgs/Odometry, or odom -> base_link on /tf", True
+    ),
     "no_landmarks": Kind(
-        "no landmark, fix or closure is in the recording, so nothing corrects odometry", "record a landmark topic"
+        "the recording has no landmark, fix or closure, so nothing corrects odometry", "record a topic of landmarks"
     ),
-    "input_unused": Kind("a topic of landmarks or odometry cannot be used", "as the text says"),
-    "damaged": Kind("a part of the recording cannot be read", "record it again; ros2 bag reindex"),
+    "input_unused": Kind("a topic of landmarks or odometry cannot be used", "do what the text of the finding says"),
+    "damaged": Kind("a part of the recording cannot be read", "try ros2 bag reindex, or record it again"),
     # -- times
-    "clock_domains": Kind("stamps of two inputs are of different clocks", f"{_ONE_CLOCK}; INPUT.offset_s"),
-    "latency": Kind("messages are recorded before the time they are stamped with", f"{_ONE_CLOCK}; INPUT.offset_s"),
+    "clock_domains": Kind("two inputs are stamped by different clocks", f"{_ONE_CLOCK}; or set INPUT.offset_s"),
+    "latency": Kind("messages were recorded before the time in their stamps", f"{_ONE_CLOCK}; or set INPUT.offset_s"),
     "clock_drift": Kind(
-        "the clock of an input runs faster or slower than the recorder's", f"{_ONE_CLOCK}: an offset mends no drift"
+        "the clock of an input runs faster or slower than the recorder's",
+        f"{_ONE_CLOCK}; a constant offset does not help",
     ),
-    "no_overlap": Kind("sightings are stamped outside the time of odometry", f"{_ONE_CLOCK}; INPUT.offset_s", True),
+    "no_overlap": Kind(
+        "sightings are stamped before odometry begins or after it ends", f"{_ONE_CLOCK}; or set INPUT.offset_s", True
+    ),
     "time_jump": Kind(
         "stamps step back by more than time.jump_back_s: the clock was set, or two recordings were joined",
-        "cut the recording in two; time.on_jump says what becomes of the rest",
+        "cut the recording in two; time.on_jump sets what a run does at the step",
     ),
     "duplicates": Kind(
-        "messages repeat the stamp before", "one publisher for each topic: ros2 topic info -v TOPIC; record once"
+        "messages have the stamp of the message before",
+        "let one node publish the topic (ros2 topic info -v TOPIC), and record it once",
     ),
-    "out_of_order": Kind("messages are older than the one before, by more than is put in order", "ordering.window_s"),
-    "gap": Kind("odometry is silent while the robot moves", "the recorder's CPU and disk; the driver"),
+    "out_of_order": Kind(
+        "messages are older than the one before, by more than the window that sorts them", "set ordering.window_s"
+    ),
+    "gap": Kind("odometry is silent for a while", "check the CPU and the disk of the recorder, and the driver"),
     "slow_odometry": Kind(
-        "odometry is rare, so the pose at a sighting is interpolated over a long time", "10 Hz or more"
+        "odometry is so slow that the pose at a sighting is interpolated over a long time",
+        "publish odometry at 10 Hz or more",
     ),
-    "jitter": Kind("the times between stamps vary a lot", "stamp where it is measured, not on arrival"),
+    "jitter": Kind("the times between stamps vary a lot", "stamp messages when they are measured, not on arrival"),
     # -- frames
-    "frame_unlinked": Kind("no transform has the pose of a frame on the robot", _MOUNT),
-    "two_parents": Kind(
-        "a frame has two parents, so transforms through it are arbitrary", "one publisher of each frame"
-    ),
-    "static_changes": Kind("a static transform is published twice and differs", "one publisher of each frame"),
+    "frame_unlinked": Kind("no transform links a sensor's frame to the robot", _MOUNT),
+    "two_parents": Kind("a frame has two parents, so transforms through it are arbitrary", _PUBLISHER),
+    "static_changes": Kind("a static transform is published twice, with different values", _PUBLISHER),
     "seen_in_fixed_frame": Kind(
         "sightings are given in a frame that does not move with the robot", "publish them in the sensor's frame"
     ),
     "tf_differs": Kind(
-        "odometry's topic and /tf are not the same motion", "choose with --odom, or stop one of the two"
+        "odometry's topic and /tf do not describe the same motion", "choose one with --odom, or stop the other"
     ),
-    "odometry_in_map": Kind(
-        "odometry is given in the frame of a map: somebody's estimate", "--odom: the wheels' topic"
-    ),
+    "odometry_in_map": Kind("odometry is given in the frame of a map, so it is the output of a localiser", _WHEELS),
     # -- odometry
-    "static": Kind("the robot does not move", "another topic, or drive", True),
-    "units": Kind("distances or speeds are beyond any robot's", _DRIVER, True),
-    "odometry_jumps": Kind("odometry jumps", "the driver; odometry.max_speed_m_s for a robot as fast as that"),
+    "static": Kind("the robot does not move", "choose another topic with --odom, or drive", True),
+    "units": Kind("distances or speeds are larger than any robot's", _DRIVER, True),
+    "odometry_jumps": Kind(
+        "odometry jumps", "correct the driver; for a robot that is so fast set odometry.max_speed_m_s"
+    ),
     "odometry_reset": Kind("odometry goes back to zero: its driver was restarted", "cut the recording there"),
-    "corrected": Kind("odometry is corrected again and again, as a localiser does", "--odom: the wheels' topic"),
-    "not_planar": Kind("the robot leaves the plane", "world.dimensions=3"),
-    "twist_scale": Kind("the twist is in other units than the pose, or mirrored", _DENSITY),
-    "twist_frame": Kind("the twist is given along the axes of the odometry frame", _DENSITY),
-    "twist_unrelated": Kind("pose and twist do not go together", _DENSITY),
-    "covariance_zero": Kind("the twist has no covariance: the configured densities are used", ""),
-    "covariance_negative": Kind("a variance of the twist is negative or no number", _DENSITY),
-    "covariance_tiny": Kind("the twist's covariance is smaller than any wheels are good", _DENSITY),
-    "covariance_useless": Kind("the twist's covariance is larger than its speed", _DENSITY),
+    "corrected": Kind("odometry jumps again and again, as the output of a localiser does", _WHEELS),
+    "not_planar": Kind("the robot leaves the plane", "set world.dimensions=3"),
+    "twist_scale": Kind("the twist has other units than the pose, or the opposite sign", _DENSITY),
+    "twist_frame": Kind("the twist is given along the axes of the odometry frame, not of the robot", _DENSITY),
+    "twist_unrelated": Kind("the twist does not describe the motion of the pose", _DENSITY),
+    "covariance_zero": Kind("the twist has no covariance, so odometry's noise is that of the parameters", ""),
+    "covariance_negative": Kind("a variance of the twist is negative or not a number", _DENSITY),
+    "covariance_tiny": Kind("the covariance of the twist is smaller than any wheels can be", _DENSITY),
+    "covariance_useless": Kind("the standard deviation of the twist is larger than the speed", _DENSITY),
     # -- sightings and odometry
-    "mirrored": Kind("sightings and odometry turn opposite ways", _DRIVER, True),
-    "axes": Kind("sightings fit odometry with other axes only", "the sensor's transform, or its frame", True),
-    "unrelated": Kind("sightings and odometry do not go together", "the topic, identities, units", True),
-    "id_twice": Kind("a message has an identity twice", "one id for each landmark"),
-    "few_sightings": Kind("there are hardly any sightings", _SEE + "past more landmarks"),
-    "seen_once": Kind("most identities are seen less than three times: of tracks, not of things?", "ids of things"),
-    "no_closure": Kind("no landmark is seen over a long way, or again after it", _SEE + "a loop"),
+    "mirrored": Kind("sightings and odometry turn in opposite directions", _DRIVER, True),
+    "axes": Kind(
+        "sightings agree with odometry only in other axes", "correct the sensor's transform, or its frame", True
+    ),
+    "unrelated": Kind(
+        "sightings do not agree with odometry at all", "check the topic, the ids and the units of both", True
+    ),
+    "id_twice": Kind("one message has the same id twice", _ID),
+    "few_sightings": Kind("there are hardly any sightings", "record a drive past more landmarks"),
+    "seen_once": Kind(
+        "most ids are seen less than three times: are they numbers of tracks, not of landmarks?",
+        "let the detector give each landmark its own id; without ids set landmarks.association=joint",
+    ),
+    "no_closure": Kind("no landmark is seen again later in the drive", "record a drive with a loop"),
     "no_parallax": Kind(
         "landmarks are not seen again after the robot has moved, so neither mount nor clock can be checked",
-        _SEE + "past landmarks, and turn in their sight",
+        "record a drive past landmarks, with turns in sight of them",
     ),
     # -- a replay in memory, and a fit that begins at its estimate
-    "clock_offset": Kind("sightings fit odometry better at other stamps", f"INPUT.offset_s; {_ONE_CLOCK}"),
-    "mount_yaw": Kind("the sensor is turned on the robot", "correct its transform; INPUT.mount_correction"),
+    "clock_offset": Kind("sightings agree with odometry better at other stamps", f"set INPUT.offset_s; {_ONE_CLOCK}"),
+    "mount_yaw": Kind("the sensor is turned on the robot", "correct its transform, or set INPUT.mount_correction"),
     "odometry_scale": Kind(
-        "the robot drives more or less than odometry says", "wheel radius; odometry.distance_factor"
+        "the robot drives more or less than odometry says", "correct the wheel radius, or set odometry.distance_factor"
     ),
-    "turn_scale": Kind("the robot turns more or less than odometry says", "track width; odometry.turn_factor"),
-    "not_observable": Kind("the drive cannot determine a clock, mount or scale", "the manoeuvre that the text names"),
-    "over_confident": Kind("residuals of an input are larger than its noise says", "robust.noise_scale=estimated"),
-    "odometry_over_confident": Kind("odometry is worse than its noise says", "robust.noise_scale=estimated"),
-    "id_reused": Kind("an identity is of two places in turn", "one id for each landmark"),
-    "ids_unsure": Kind("many identities are of more than one place", "the detector; landmarks.association=joint"),
-    "ids_exchanged": Kind("two identities exchange their places", "one id for each landmark"),
-    "landmark_moved": Kind("a landmark stands elsewhere from some time on", "landmarks that nobody moves"),
-    "map_breaks": Kind("many landmarks stand elsewhere from some time on", "was the robot carried?"),
-    "outliers": Kind("many sightings are far from where their landmark is", "the detector; landmarks.loss"),
-    "fit_unsure": Kind("odometry and sightings cannot be brought together", "other findings first"),
-    "silent": Kind("nothing is seen for most of the drive", _SEE + "past landmarks all the way"),
+    "turn_scale": Kind(
+        "the robot turns more or less than odometry says", "correct the track width, or set odometry.turn_factor"
+    ),
+    "not_observable": Kind("the drive does not determine a clock, a mount or a scale", "drive what the text names"),
+    "over_confident": Kind(
+        "the residuals of an input are larger than its noise says", "set robust.noise_scale=estimated"
+    ),
+    "odometry_over_confident": Kind("odometry is worse than its noise says", "set robust.noise_scale=estimated"),
+    "id_reused": Kind("two landmarks have the same id", _ID),
+    "ids_unsure": Kind(
+        "many ids are seen at more than one place", "correct the detector, or set landmarks.association=joint"
+    ),
+    "ids_exchanged": Kind("two landmarks exchange their ids", _ID),
+    "landmark_moved": Kind("a landmark was moved during the drive", "use landmarks that nobody moves"),
+    "map_breaks": Kind(
+        "many landmarks are elsewhere after some time, so the robot's path has a break there",
+        "find out whether the robot was carried or slipped",
+    ),
+    "outliers": Kind("many sightings are far from their landmark", "correct the detector, or set landmarks.loss"),
+    "fit_unsure": Kind("the fit of clock, mount and scale failed", "mend the other findings first"),
+    "silent": Kind("nothing is seen for most of the drive", "record a drive past landmarks all the way"),
 }
 """What ``check`` finds, beyond counters."""
 

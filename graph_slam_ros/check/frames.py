@@ -24,7 +24,7 @@ def check_frames(c: Columns) -> Iterator[Finding]:
                 "static_changes", "warning", link.change, _SAME, "m, rad", text, "/tf_static", count=link.count
             )
     if c.odometry.frame in _FIXED:
-        text = f"{c.odometry.topic} is given in frame {c.odometry.frame}: somebody's estimate, not odometry"
+        text = f"{c.odometry.topic} is given in frame {c.odometry.frame}: it is the output of a localiser, not odometry"
         yield Finding("odometry_in_map", "warning", 1, 0, "topics", text, c.odometry.topic)
     unlinked = set()
     for s in c.sightings:
@@ -68,7 +68,7 @@ def _of_sensor(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     elif key in c.assumed:
         named = next(filter(None, topic.frames), "") or "its sensor"
         text = (
-            f"{s.topic}: no transform has the pose of {named} on {c.config.frames.base}: {c.assumed[key]!r} is assumed"
+            f"{s.topic}: no transform links {named} to {c.config.frames.base}: the pose {c.assumed[key]!r} is assumed"
         )
         yield Finding(
             "frame_unlinked", "error", 1, 0, "frames", text, settings=(assignment(key, c.assumed[key]),), **where
@@ -87,7 +87,7 @@ def _unlinked(c: Columns, known: set[str]) -> Iterator[Finding]:
         if "odom_frame_unknown" in counts:
             key, value = "frames.odom", next(iter(topic.frames), "odom")
         severity: Severity = "error" if times > 0.5 * max(c.counters.received[source], 1) else "warning"
-        text = f"{topic.name}: {times} are refused: nothing links frame {names} to {c.config.frames.base}"
+        text = f"{topic.name}: {times} messages are refused: no transform links frame {names} to {c.config.frames.base}"
         first_ns = int(topic.stamp_ns[0]) if len(topic.stamp_ns) else 0
         setting = assignment(key, value)
         yield Finding("frame_unlinked", severity, times, 0, "messages", text, topic.name, first_ns, times, (setting,))
@@ -114,7 +114,7 @@ def _tf(c: Columns) -> Iterator[Finding]:
     apart = np.stack([np.interp(t, seconds, at[:, k]) for k in range(3)], axis=1) - c.tf_path[inside, :3]
     median_m = float(np.median(np.linalg.norm(apart, axis=1)))
     if median_m > _DIFFER_M:
-        text = f"/tf {o.frame} -> {o.child} and {o.topic} differ by {median_m:.2f} m in the median: two odometries"
+        text = f"/tf {o.frame} -> {o.child} and {o.topic} differ by {median_m:.2f} m (median): these are two odometries"
         yield Finding(
             "tf_differs", "warning", median_m, _DIFFER_M, "m", text, "/tf", int(c.tf_ns[0]), int(inside.sum())
         )

@@ -110,33 +110,31 @@ def _moved(s: SightingColumns, moved: list[TwoPlaces]) -> Iterator[Finding]:
             if max(ends) < _EXCHANGED * one.apart_m:
                 exchanged |= {one.name, other.name}
                 text = (
-                    f"{s.topic}: landmarks {one.name} and {other.name} exchange their places, {one.apart_m:.1f} m apart"
+                    f"{s.topic}: landmarks {one.name} and {other.name}, {one.apart_m:.1f} m apart, exchange their ids"
                 )
                 yield Finding(
                     "ids_exchanged", "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count
                 )
     rest = [one for one in moved if one.name not in exchanged]
     if len(rest) > _MOST_MOVED:
-        text = (
-            f"{s.topic}: {len(rest)} landmarks stand elsewhere from some time on: the robot was carried, or it slipped"
-        )
+        text = f"{s.topic}: {len(rest)} landmarks are elsewhere after some time: the robot was carried, or slipped"
         first_ns = min(one.first_ns for one in rest)
         yield Finding("map_breaks", "note", len(rest), _MOST_MOVED, "landmarks", text, s.topic, first_ns, len(rest))
         return
     for one in rest:
-        text = f"{s.topic}: landmark {one.name} stands {one.apart_m:.1f} m elsewhere from some time on"
+        text = f"{s.topic}: landmark {one.name} was moved: after some time it is {one.apart_m:.1f} m away"
         yield Finding("landmark_moved", "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count)
 
 
 def _reused(s: SightingColumns, reused: list[TwoPlaces], seen: int) -> Iterator[Finding]:
     if len(reused) > _MOST_MOVED:
-        text = f"{s.topic}: {len(reused)} of {seen} identities are of more than one place"
+        text = f"{s.topic}: {len(reused)} of {seen} ids are seen at more than one place"
         first_ns = min(one.first_ns for one in reused)
         yield Finding("ids_unsure", "warning", len(reused), _MOST_MOVED, "identities", text, s.topic, first_ns)
         return
     for one in reused:
         text = (
-            f"{s.topic}: identity {one.name} is of two places {one.apart_m:.1f} m apart "
-            f"({one.share:.0%} of its sightings at the second)"
+            f"{s.topic}: id {one.name} is seen at two places, {one.apart_m:.1f} m apart "
+            f"({one.share:.0%} of its sightings are at the second)"
         )
         yield Finding("id_reused", "warning", one.apart_m, _APART_M, "m", text, s.topic, one.first_ns, one.count)

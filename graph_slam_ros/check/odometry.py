@@ -88,12 +88,12 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
     """The odometry that is used, by its own messages alone."""
     o, steps = c.odometry, steps_of(c.odometry)
     if steps is None:
-        text = f"{o.topic or 'odometry'}: {len(np.unique(o.stamp_ns))} messages that can be used, {LEAST} are needed"
+        text = f"{o.topic or 'odometry'}: {len(np.unique(o.stamp_ns))} usable messages; {LEAST} are needed"
         yield Finding("no_odometry", "error", len(o.stamp_ns), LEAST, "messages", text, o.topic, count=len(o.stamp_ns))
         return
     where: Where = {"topic": o.topic, "first_ns": int(o.stamp_ns[steps.index[0]]), "count": len(steps.index)}
     if steps.fastest_m_s > min(_FASTEST_M_S, c.config.odometry.max_speed_m_s):
-        text = f"{o.topic}: {steps.fastest_m_s:.0f} m/s: millimetres for metres?"
+        text = f"{o.topic}: the robot drives at {steps.fastest_m_s:.0f} m/s: are these millimetres?"
         yield Finding("units", "error", steps.fastest_m_s, _FASTEST_M_S, "m/s", text, **where)
         return
     jumps = steps.jumps
@@ -103,7 +103,7 @@ def check_odometry(c: Columns) -> Iterator[Finding]:
     total_rad = float(np.linalg.norm(steps.turned[smooth], axis=1).sum())
     if total_m < _STILL_M and total_rad < _STILL_RAD:
         span_s = float(steps.dt.sum())
-        text = f"{o.topic}: {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {span_s:.0f} s: it does not move"
+        text = f"{o.topic}: the robot moves {total_m:.2f} m and {np.degrees(total_rad):.0f} degrees in {span_s:.0f} s"
         yield Finding("static", "warning", total_m, _STILL_M, "m", text, **where)
         return
     yield from _plane(c, o)
@@ -126,9 +126,9 @@ def _jumps(o: OdometryColumns, steps: Steps, jumps: Mask) -> Iterator[Finding]:
         by = f"by up to {most_m:.2f} m and {most_deg:.0f} degrees in one step"
         text = f"{o.topic} jumps {count} times, {by}"
         if code == "odometry_reset":
-            text = f"{o.topic} begins anew at zero {count} times: its driver was restarted"
+            text = f"{o.topic} goes back to zero {count} times: its driver was restarted"
         elif count >= _CORRECTED:
-            code, text = "corrected", f"{o.topic} jumps {count} times, {by}: a localiser corrects it?"
+            code, text = "corrected", f"{o.topic} jumps {count} times, {by}: is it the output of a localiser?"
         yield Finding(code, "warning", count, 0, "times", text, o.topic, first_ns, count)
 
 
@@ -138,7 +138,7 @@ def _plane(c: Columns, o: OdometryColumns) -> Iterator[Finding]:
     out = c.counters.as_dict().get(o.input, {}).get("out_of_plane", 0)
     share = out / len(o.poses)
     if share > _OFF_PLANE:
-        text = f"{o.topic}: {share:.0%} of the poses are more than {_LEVEL_M} m off the first's plane, or tilted"
+        text = f"{o.topic}: {share:.0%} of the poses are more than {_LEVEL_M} m above or below the first, or tilted"
         settings = ("world.dimensions=3",)
         yield Finding("not_planar", "warning", share, _OFF_PLANE, "part", text, o.topic, 0, out, settings)
 
@@ -164,7 +164,9 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Itera
         fits.append((ratio(driven, moved), ratio(rotated, turned)))
     speed, rate = min(fits, key=lambda pair: pair[0][1] + pair[1][1])
     if _in_odom(o, steps, jumps, sums, moved, twist[1:]):
-        text = f"{o.topic}: the twist is along the axes of {o.frame}, not of {o.child} (nav_msgs/Odometry)"
+        text = (
+            f"{o.topic}: the twist is given along the axes of {o.frame}; nav_msgs/Odometry defines those of {o.child}"
+        )
         yield Finding("twist_frame", "warning", 1.0, _FITS, "times", text, settings=_DENSITY, **where)
         return
     for what, (factor, left), total in (
@@ -175,10 +177,10 @@ def _twist(o: OdometryColumns, steps: Steps, jumps: Mask, where: Where) -> Itera
             continue
         if abs(factor - 1.0) > _SCALE and left < _EXPLAINED:
             unit = next((why for k, why in _UNITS.items() if abs(factor / k - 1.0) < _SCALE), "another scale")
-            text = f"{o.topic}: the pose moves {factor:.3g} times what the twist's {what} says ({unit})"
+            text = f"{o.topic}: the pose moves {factor:.3g} times as far as the {what} of the twist says ({unit})"
             yield Finding("twist_scale", "warning", factor, _SCALE, "times", text, settings=_DENSITY, **where)
         elif left > _UNEXPLAINED and total > 5.0:
-            text = f"{o.topic}: the twist's {what} leaves {left:.0%} of the pose's motion unexplained"
+            text = f"{o.topic}: the {what} of the twist does not explain {left:.0%} of the motion of the pose"
             yield Finding("twist_unrelated", "warning", left, _UNEXPLAINED, "part", text, settings=_DENSITY, **where)
 
 
@@ -216,20 +218,24 @@ def _covariance(o: OdometryColumns, steps: Steps, where: Where) -> Iterator[Find
     used = o.variances[:, [0, 1, 5]]
     bad = ~np.isfinite(used).all(axis=1) | (used < 0.0).any(axis=1)
     if bad.any():
-        text = f"{o.topic}: {int(bad.sum())} messages have a variance of the twist that is negative or no number"
+        text = f"{o.topic}: {int(bad.sum())} messages have a variance of the twist that is negative or not a number"
         severity: Severity = "error" if bad.mean() > 0.5 else "warning"  # such messages are refused
         yield Finding("covariance_negative", severity, int(bad.sum()), 0, "messages", text, settings=_DENSITY, **where)
         return
     if not used.any() or (np.median(used, axis=0) >= _UNUSED_M_S**2).any():
-        text = f"{o.topic}: the twist has no covariance: the configured densities are used"
+        text = (
+            f"{o.topic}: the twist has no covariance: the noise of odometry is that of the parameters (odometry.noise)"
+        )
         yield Finding("covariance_zero", "note", 0.0, 0.0, "m/s", text, **where)
         return
     sigmas, speed = np.sqrt(np.median(used, axis=0)), max(steps.fastest_m_s, _SLOWEST_M_S)
     if sigmas[0] > _USELESS * speed:
-        text = f"{o.topic}: the twist's sigma is {sigmas[0]:.2g} m/s, the robot's speed at most {speed:.2g} m/s"
+        text = f"{o.topic}: the sigma of the twist is {sigmas[0]:.2g} m/s, but the robot drives at most {speed:.2g} m/s"
         yield Finding(
             "covariance_useless", "warning", sigmas[0] / speed, _USELESS, "times", text, settings=_DENSITY, **where
         )
     elif 0.0 < sigmas[0] < _TINY * speed or 0.0 < sigmas[2] < _TINY_RAD_S:
-        text = f"{o.topic}: the twist's sigmas are {sigmas[0]:.1g} m/s and {sigmas[2]:.1g} rad/s: no wheels are so good"
+        text = (
+            f"{o.topic}: the twist has sigmas of {sigmas[0]:.1g} m/s and {sigmas[2]:.1g} rad/s: no wheels are so good"
+        )
         yield Finding("covariance_tiny", "warning", sigmas[0] / speed, _TINY, "times", text, settings=_DENSITY, **where)

@@ -135,12 +135,12 @@ def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array)
     distance_m = np.linalg.norm(s.points, axis=1)
     far_m = float(np.median(distance_m[use]))
     if far_m > _FAR_M:
-        text = f"{s.topic}: landmarks are {far_m:.0f} m away in the median: millimetres for metres?"
+        text = f"{s.topic}: the median distance of landmarks is {far_m:.0f} m: are these millimetres?"
         yield Finding("units", "error", far_m, _FAR_M, "m", text, **where)
         return
     pairs = pairs_of(s, path_ns, path, c.config.world.dimensions)
     if len(pairs.a) < _LEAST_PAIRS:
-        text = f"{s.topic}: only {len(pairs.a)} times is a landmark seen again within {_LATER_S:.0f} s of motion"
+        text = f"{s.topic}: landmarks are seen again within {_LATER_S:.0f} s of motion only {len(pairs.a)} times"
         yield Finding("no_parallax", "note", len(pairs.a), _LEAST_PAIRS, "pairs", text, **where)
         return
     where["count"] = len(pairs.a)
@@ -156,7 +156,7 @@ def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array)
         if residual_m < _RELATED * _of_others(s, pairs, use):
             yield from noisier(s, pairs)
             return
-        text = f"{s.topic}: {share:.0%} of the motion between two sightings of a landmark is not odometry's"
+        text = f"{s.topic}: odometry does not explain {share:.0%} of the motion between two sightings of a landmark"
         yield Finding("unrelated", "error", share, _UNRELATED, "part", text, **where)
 
 
@@ -177,7 +177,7 @@ def noisier(s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
         sigma_rad = sigma_m / max(float(np.median(np.linalg.norm(s.points[pairs.a], axis=1))), sigma_m)
         numbers = (("sigma_m", round(sigma_m, 3)), ("sigma_rad", round(sigma_rad, 4)))
         settings = ("noise=sigmas", *(f"{key}={number}" for key, number in numbers))
-        text = f"{s.topic}: the same landmark seen twice is {factor:.1f} times as far apart as its noise says"
+        text = f"{s.topic}: two sightings of a landmark differ by {factor:.1f} times what their noise says"
         where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(pairs.a)}
         settings = tuple(f"{s.input}.{setting}" for setting in settings)
         yield Finding("over_confident", "warning", factor, _WORSE, "times", text, settings=settings, **where)
@@ -209,8 +209,8 @@ def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float, wher
         mirror_m = min(mirror_m, float(np.median(turning.residuals(s.points, back))))
     if mirror_m < _HALF * now_m and now_m > _NOISES * noise_m and mirror_m < _NEARLY * min(others.values()):
         text = (
-            f"{s.topic}: where the robot turns, a landmark seen twice is {now_m:.2f} m apart, {mirror_m:.2f} m if y or "
-            f"bearings count to the right, or {c.odometry.topic} turns the other way"
+            f"{s.topic}: in turns, two sightings of a landmark differ by {now_m:.2f} m, but by {mirror_m:.2f} m if y "
+            f"or bearings count to the right, or if {c.odometry.topic} turns the other way"
         )
         return Finding("mirrored", "error", now_m / max(mirror_m, 1e-9), 1.0 / _HALF, "times", text, **where)
     return None
@@ -223,7 +223,8 @@ def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, where: Where) -> Fin
     what = min(others, key=lambda one: others[one])
     if others[what] >= _HALF * now_m or now_m <= _NOISES * noise_m:
         return None
-    text = f"{s.topic}: a landmark seen twice is {now_m:.2f} m apart, {others[what]:.2f} m if its axes are {what}"
+    if_so = f"but by {others[what]:.2f} m if the axes are {what}"
+    text = f"{s.topic}: two sightings of a landmark differ by {now_m:.2f} m, {if_so}"
     settings = () if what == EXCHANGED else turned_mount(s, (0.0, 0.0, 0.0, *TURNS[what]))
     value = now_m / max(others[what], 1e-9)
     return Finding("axes", "error", value, 1.0 / _HALF, "times", text, settings=settings, **where)
@@ -251,7 +252,7 @@ def _identities(c: Columns, s: SightingColumns) -> Iterator[Finding]:
     twice = counts.get("id_merged", 0) + counts.get("id_conflict", 0)
     share = twice / (len(s.stamp_ns) + twice)
     if share > _TWICE:
-        text = f"{s.topic}: {share:.1%} of the sightings have an identity that their message has twice"
+        text = f"{s.topic}: {share:.1%} of the sightings have an id that is twice in their message"
         yield Finding("id_twice", "warning", share, _TWICE, "part", text, s.topic, int(s.stamp_ns[0]), twice)
 
 
@@ -260,7 +261,7 @@ def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Findi
     span_s = float(path_ns[-1] - path_ns[0]) * 1e-9
     inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
     if inside.sum() < _FEW:
-        text = f"{s.topic}: {int(inside.sum())} sightings in {span_s:.0f} s"
+        text = f"{s.topic}: only {int(inside.sum())} sightings in {span_s:.0f} s"
         yield Finding("few_sightings", "note", int(inside.sum()), _FEW, "sightings", text, **where)
     ends = np.concatenate([[path_ns[0]], np.sort(s.stamp_ns[inside]), [path_ns[-1]]])
     silent_s = float(np.diff(ends).max()) * 1e-9
@@ -274,13 +275,15 @@ def _coverage(s: SightingColumns, path_ns: Index, path: Array) -> Iterator[Findi
     times = np.bincount(s.name[chosen])
     seldom = float((times[times > 0] < _SELDOM).mean())
     if seldom > _ONCE:
-        text = f"{s.topic}: {seldom:.0%} of {int((times > 0).sum())} identities are seen less than {_SELDOM} times"
+        text = f"{s.topic}: {seldom:.0%} of {int((times > 0).sum())} ids are seen less than {_SELDOM} times"
         yield Finding("seen_once", "warning", seldom, _ONCE, "part", text, **where)
     driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))])
     seconds = (path_ns - path_ns[0]) * 1e-9
     reach_m = _reach(s, chosen, path_ns[0], seconds, driven)
     if reach_m < _SPAN * driven[-1] and driven[-1] > _AGAIN_M:
-        text = f"{s.topic}: no landmark is seen over more than {reach_m:.1f} of {driven[-1]:.0f} m, or again later"
+        text = (
+            f"{s.topic}: no landmark is seen again later; each is seen over at most {reach_m:.1f} of {driven[-1]:.0f} m"
+        )
         yield Finding("no_closure", "warning", reach_m, _SPAN * float(driven[-1]), "m", text, **where)
 
 

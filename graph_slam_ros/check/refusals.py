@@ -51,7 +51,7 @@ def check_unnamed(c: Columns) -> Iterator[Finding]:
         unnamed = s.name == s.names.index("")
         share = float(np.mean(unnamed))
         severity: Severity = "error" if share > _MOST else "warning" if share > _USUAL_SHARE else "note"
-        text = f"{s.topic}: {share:.1%} of the sightings have no identity, and are not used"
+        text = f"{s.topic}: {share:.1%} of the sightings have no id, and are not used"
         at: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[unnamed][0]), "count": int(unnamed.sum())}
         settings = ("landmarks.association=joint",)
         yield Finding("no_id", severity, share, _USUAL_SHARE, "part", text, settings=settings, **at)

@@ -25,7 +25,9 @@ def check_times(c: Columns) -> Iterator[Finding]:
     for key, value in c.assumed.items():
         if key.endswith(".offset_s"):
             name = key.removesuffix(".offset_s")
-            text = f"{name}: its clock is {-float(value):.3f} s from that of odometry: the difference was assumed"
+            text = (
+                f"{name}: its clock differs from that of odometry by {-float(value):.3f} s, by the times of recording"
+            )
             of = next((t.name for t in c.topics.values() if name in t.inputs), "")
             yield Finding(
                 "clock_domains", "error", -value, _CLOCKS_DIFFER_S, "s", text, of, settings=(assignment(key, value),)
@@ -56,11 +58,11 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
         where: Where = {"topic": topic.name, "first_ns": int(stamp_ns[0]), "count": len(stamp_ns)}
         if abs(apart_s) > _CLOCKS_DIFFER_S:
             settings = (_offset(c, topic, apart_s),) if abs(apart_s) < 3600.0 else ()
-            text = f"{topic.name}: its stamps are {-apart_s:.1f} s from those of {c.odometry.topic}: another clock"
+            text = f"{topic.name}: its stamps are {-apart_s:.1f} s away from those of {c.odometry.topic}: another clock"
             yield Finding("clock_domains", "error", -apart_s, _CLOCKS_DIFFER_S, "s", text, settings=settings, **where)
         elif apart_s < -_EARLY_S:
             text = (
-                f"{topic.name}: recorded {-apart_s * 1e3:.0f} ms earlier than stamped, compared with "
+                f"{topic.name}: recorded {-apart_s * 1e3:.0f} ms before the time in its stamps, compared with "
                 f"{c.odometry.topic}: its clock is ahead"
             )
             setting = _offset(c, topic, apart_s)
@@ -106,7 +108,9 @@ def _order(c: Columns, topic: TopicColumns) -> Iterator[Finding]:
     where: Where = {"topic": topic.name}
     share = float(repeated.mean())
     if topic.use == "odometry" and share > _DUPLICATES:
-        text = f"{topic.name}: {share:.1%} of the messages repeat the stamp before: published or recorded twice"
+        text = (
+            f"{topic.name}: {share:.1%} of the messages have the stamp of the one before: published or recorded twice"
+        )
         at, count = int(stamp_ns[1:][repeated][0]), int(repeated.sum())
         yield Finding("duplicates", "warning", share, _DUPLICATES, "part", text, first_ns=at, count=count, **where)
     if not back.any():
@@ -142,20 +146,24 @@ def _rate(c: Columns) -> Iterator[Finding]:
         worst_s = float(step_s[long].max())
         is_bad = bool((step_s[long][moved | turned] > max(_PERIODS * median_s, _VERY_LONG_S)).any())
         text = (
-            f"{o.topic}: silent {len(long)} times for more than {most_s:.1f} s, at most {worst_s:.1f} s, at "
-            f"{1.0 / median_s:.0f} Hz else{'; the robot moved meanwhile' if is_bad else ''}"
+            f"{o.topic} comes at {1.0 / median_s:.0f} Hz, but is silent for more than {most_s:.1f} s "
+            f"{_often(len(long))} (the longest {worst_s:.2f} s{'; the robot moved meanwhile' if is_bad else ''})"
         )
         at: Where = {"topic": o.topic, "first_ns": int(stamp_ns[long[0]]), "count": len(long)}
         yield Finding("gap", "warning" if is_bad else "note", worst_s, most_s, "s", text, **at)
     if 1.0 / median_s < _SLOW_HZ:
         between = _between(c, stamp_ns)
-        text = f"{o.topic}: {1.0 / median_s:.1f} Hz: the pose at a sighting is interpolated over {median_s:.2f} s"
+        text = f"{o.topic} comes at {1.0 / median_s:.1f} Hz: poses are interpolated over {median_s:.2f} s"
         severity: Severity = "warning" if between > 0.5 else "note"
         yield Finding("slow_odometry", severity, 1.0 / median_s, _SLOW_HZ, "Hz", text, **where)
     spread = float(np.subtract(*np.percentile(step_s, [90.0, 10.0]))) / median_s
     if spread > _JITTER and 1.0 / median_s < _FAST_HZ:
         text = f"{o.topic}: the times between stamps vary by {spread:.1f} times their median: stamped on arrival?"
         yield Finding("jitter", "note", spread, _JITTER, "times", text, **where)
+
+
+def _often(times: int) -> str:
+    return {1: "once", 2: "twice"}.get(times, f"{times} times")
 
 
 def _between(c: Columns, odometry_ns: Index) -> float:

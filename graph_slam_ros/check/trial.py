@@ -83,7 +83,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     if fit.lost > _LOST:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(s, path_ns, path, c.config.world.dimensions))]
         if not found:
-            text = f"{fit.lost:.0%} of the sightings fit nothing: nothing is said of clock, mount and scale"
+            text = f"{fit.lost:.0%} of the sightings do not fit: clock, mount and scale cannot be checked"
             yield Finding("fit_unsure", "warning", fit.lost, _LOST, "part", text)
         yield from found
         return
@@ -112,10 +112,10 @@ def _absurd(c: Columns, factor: float) -> Finding:
     """Odometry that a map would need in other units, or the wrong way round."""
     s = next(s for s in c.sightings if len(s.stamp_ns))
     where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(s.stamp_ns)}
-    text = f"the robot would have to drive {factor:.2f} m where {c.odometry.topic} says 1 m"
+    text = f"the robot would have to drive {factor:.2f} m for each metre of {c.odometry.topic}"
     if abs(factor + 1.0) < _BACKWARDS:
         settings = turned_mount(s, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0))
-        text = f"{s.topic}: {text}: the sensor looks backwards?"
+        text = f"{s.topic}: {text}: does the sensor look backwards?"
         return Finding("axes", "error", factor, -1.0, "times", text, settings=settings, **where)
     return Finding("unrelated", "error", factor, 1.0 + _ABSURD, "times", f"{s.topic}: {text}", **where)
 
@@ -151,7 +151,8 @@ def _mended(c: Columns, one: Fitted) -> tuple[str, tuple[str, ...]]:
     if one.parameter.name == "clock":
         before_s = next(s.offset_s for s in c.config.sources if s.name == source)
         when = "later" if value > 0.0 else "earlier"
-        text = f"fits odometry best {abs(value) * 1e3:.0f} ms {when} than stamped (sigma {sigma * 1e3:.0f} ms)"
+        best = f"{abs(value) * 1e3:.0f} ms {when} than stamped (sigma {sigma * 1e3:.0f} ms)"
+        text = f"sightings agree with odometry best {best}"
         return text, (assignment(f"{source}.offset_s", round(before_s + value, 3)),)
     if one.parameter.name == "yaw":
         degrees = (value / _DEGREE, sigma / _DEGREE)
@@ -164,7 +165,7 @@ def _mended(c: Columns, one: Fitted) -> tuple[str, tuple[str, ...]]:
     what = "drives" if one.parameter.name == "distance" else "turns"
     text = f"the robot {what} {1.0 + value:.3f} times what odometry says (sigma {sigma:.3f})"
     if one.parameter.name == "distance":
-        text += ", or ranges are too long or short by that"
+        text += ", or ranges are wrong by that factor"
     return text, (assignment(f"odometry.{name}", round(factor, 4)),)
 
 
@@ -191,5 +192,5 @@ def _outliers(c: Columns, s: SightingColumns, points: Array, inside: Mask) -> It
         limit = np.maximum(_NEAR_M, _SIGMAS * np.maximum(s.sigmas[chosen], 1.48 * np.median(away)))
         far, used = far + int((away > limit).sum()), used + len(chosen)
     if used and far > _OUTLIERS * used:
-        text = f"{s.topic}: {far / used:.0%} of the sightings are far from where their landmark is"
+        text = f"{s.topic}: {far / used:.0%} of the sightings are far from their landmark"
         yield Finding("outliers", "warning", far / used, _OUTLIERS, "part", text, s.topic, int(s.stamp_ns[0]), far)

@@ -16,7 +16,7 @@ _WIDTH = 100
 
 
 def calibrate(args: argparse.Namespace) -> int:
-    """Calibrate a recording; returns 4 if something is to be corrected, 3 if the data do not determine everything."""
+    """Calibrate a recording; returns 4 if something is to be corrected, 3 if the data determine nothing."""
     from graph_slam_ros.runs.folder import is_run
 
     if is_run(args.bag):
@@ -34,7 +34,7 @@ def calibrate(args: argparse.Namespace) -> int:
     else:
         _show(done)
     lost = console.report_losses(done.losses, done.warnings)
-    if lost or not done.is_complete:
+    if lost or not done.is_complete or not _is_determined(done):
         return console.LOSSES
     return console.FOUND if done.settings else console.DONE
 
@@ -44,11 +44,18 @@ def _show(done: Calibrated) -> None:
         console.show(f"{name}={value}")
     for one in done.parameters:
         console.show(*textwrap.wrap(one["text"], _WIDTH, initial_indent="  ", subsequent_indent="    "))
-    if not done.settings:
+    if not _is_determined(done):
+        console.warn("this recording determines none of these parameters")
+    elif not done.settings:
         console.show("nothing to correct")
     elif not done.is_complete:
         console.warn(f"after {done.rounds} replays something is still left: run it again with these settings")
     console.then(done.command)
+
+
+def _is_determined(done: Calibrated) -> bool:
+    """Return whether anything is known of any parameter, be it that it is right."""
+    return any(one["verdict"] in ("admitted", "nothing_to_correct") for one in done.parameters)
 
 
 def _as_yaml(done: Calibrated) -> str:

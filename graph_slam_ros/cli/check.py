@@ -48,12 +48,17 @@ def lines(one: Finding) -> Iterator[str]:
     """A finding for a person: its name, its value and limit, and its remedy."""
     first = f"[{one.severity}] {one.code}: {one.text}"
     yield from textwrap.wrap(" ".join(first.splitlines()), _WIDTH, subsequent_indent="    ", break_on_hyphens=False)
-    limit = f"    {one.value:.4g} {one.unit}, limit {one.limit:.4g}"
-    yield limit + (f"; {one.count} in {one.topic}" if one.topic and one.count else "")
+    where = f"; {one.count} in {one.topic}" if one.topic and one.count else ""
+    since = f", from {one.first_ns * 1e-9:.3f} s" if where and one.first_ns else ""
+    yield f"    {_amount(one.value, one.unit)}, limit {_amount(one.limit, one.unit)}{where}{since}"
     if one.settings:
-        yield "    mend: " + " ".join(f"--set {shlex.quote(text)}" for text in one.settings)
+        yield "    remedy: " + " ".join(f"--set {shlex.quote(text)}" for text in one.settings)
     else:
         from graph_slam_ros.check.finding import KINDS
 
         if one.code in KINDS and KINDS[one.code].mend:
-            yield f"    mend: {KINDS[one.code].mend.replace('INPUT', 'the input')}"
+            yield f"    remedy: {KINDS[one.code].mend.replace('INPUT', 'the input')}"
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{100.0 * value:.3g} %" if unit == "part" else f"{value:.4g} {unit}"

@@ -68,7 +68,7 @@ def amount(parameter: Parameter, value: float, digits: int = 2) -> str:
 def _void(found: TrialFit, landmarks: int) -> str:
     """Return why a whole fit is not used; empty if it may be."""
     if landmarks < LEAST_LANDMARKS:
-        return f"{landmarks} landmarks were seen, it needs {LEAST_LANDMARKS}"
+        return f"{landmarks} landmark{' was' if landmarks == 1 else 's were'} seen, {LEAST_LANDMARKS} are needed"
     if found.lost > MOST_LOST:
         return f"{found.lost:.0%} of the sightings do not fit, more than {MOST_LOST:.0%}: check their ids and noise"
     return ""
@@ -85,18 +85,19 @@ def _verdict(found: TrialFit, k: int, void: str, is_corrected: bool) -> tuple[Ve
     quantity, (correlation, other) = parameter.quantity, found.worst_correlation(k)
     shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
     if void:
-        return "refused", f"not used ({shown}): {void}"
+        return "refused", f"not determined: {void}"
     if sigma >= quantity.determined_below and not is_corrected:
         needs = f"sigma {amount(parameter, sigma)}, needs {amount(parameter, quantity.determined_below)}"
         return "not_determined", f"not determined ({needs}): {quantity.manoeuvre}"
     least = FOLLOWED * sigma if is_corrected else max(SIGMAS * sigma, quantity.least)
     if abs(value) < least:
-        return "nothing_to_correct", f"nothing to correct ({shown})"
+        why = f": within {SIGMAS:.0f} sigmas of zero" if abs(value) >= quantity.least and not is_corrected else ""
+        return "nothing_to_correct", f"{'not corrected' if why else 'nothing to correct'} ({shown}){why}"
     if correlation > MOST_CORRELATED:
         return "not_separable", f"not separable from {other} (correlation {correlation:.2f}): {quantity.manoeuvre}"
     if abs(value) > PRIOR_SIGMAS * found.priors[k]:
         most = amount(parameter, PRIOR_SIGMAS * float(found.priors[k]))
-        return "refused", f"not used ({shown}): beyond {most}, a wrong configuration is more likely"
+        return "refused", f"not used ({shown}): larger than {most}: correct the configuration first"
     halves = float(found.first[k]), float(found.second[k])
     if not is_corrected and not _agree(*halves):
         first, second = (amount(parameter, half, 3) for half in halves)

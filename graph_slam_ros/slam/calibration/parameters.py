@@ -40,7 +40,7 @@ _LENGTH = ("m", 1.0, 0.05, 0.02, 0.01, 1e-4)
 _NEAR = "turn on the spot between landmarks, some of them to the sides"
 _ANGLE = ("deg", 1.0 / _DEGREE, 0.5, _DEGREE, 0.5 * _DEGREE, 1e-4)
 _AHEAD = "drive 10 m straight past landmarks, twice"
-_SCALE = ("", 1.0, 0.2, 0.03, 0.01, 1e-4)
+_SCALE = ("%", 100.0, 0.2, 0.03, 0.01, 1e-4)
 
 QUANTITIES = {
     "distance": Quantity("factors", *_SCALE, "drive 10 m and back in sight of the same landmarks"),

@@ -89,7 +89,7 @@ def test_the_mistakes_of_a_user_are_one_line_or_a_finding(drive, check, tmp_path
     assert "did you mean 'detections.offset_s'" in err[0]
     alone = write_mcap(tmp_path / "alone.mcap", [m for m in messages if m.topic == "/odom"])
     code, found, _ = check(alone)
-    assert (code, found["no_landmarks"]["severity"]) == (0, "note")
+    assert (code, found["no_landmarks"]["severity"]) == (4, "warning")
     code, found, _ = check(write_mcap(tmp_path / "seen.mcap", [m for m in messages if m.topic == "/landmarks"]))
     assert (code, found["no_odometry"]["severity"]) == (4, "error")
     folder = tmp_path / "folder"

@@ -24,3 +24,16 @@ def test_wrong_settings_of_a_recording_come_back_right(tmp_path, capsys):
     assert written["odometry"]["distance_factor"] == found["settings"]["odometry.distance_factor"]
     assert main(["calibrate", DEMO, "--out", str(file)]) != 0, "a file of somebody's is not replaced"
     assert read_parameters(file) == written
+
+
+def test_a_recording_without_landmarks_determines_nothing_and_says_so(tmp_path, capsys):
+    bag = str(tmp_path / "drive.mcap")
+    assert main(["simulate", "manhattan", "--out", bag, "--poses", "60", "--set", "landmarks=false"]) == 0
+    capsys.readouterr()
+    assert main(["calibrate", bag]) == 3
+    out, err = capsys.readouterr()
+    assert "distance of odom: not determined: 0 landmarks were seen, 3 are needed" in out
+    assert "nothing to correct" not in out
+    assert err == "graph_slam: this recording determines none of these parameters\n"
+    assert main(["check", bag]) == 4, "what a replay calls odometry alone is no clean recording"
+    assert "[warning] no_landmarks" in capsys.readouterr().out

@@ -26,7 +26,7 @@ def only(measurements, names):
 def test_with_one_landmark_nothing_is_corrected():
     slam = driven(list(only(imperfect_drive(Faults(yaw=0.1), seconds=40.0), {"3"})), ON)
     assert not slam.calibration_report["settings"]
-    assert all("1 landmarks were seen, it needs 3" in one["text"] for one in findings(slam).values())
+    assert all("1 landmark was seen, 3 are needed" in one["text"] for one in findings(slam).values())
 
 
 def test_a_drive_without_turns_does_not_determine_the_turn_factor():
@@ -78,7 +78,7 @@ def test_a_prior_that_contradicts_is_named():
     slam = driven(measurements, ON | {"calibrate.yaw_sigma_rad": 0.05})
     one = findings(slam)["yaw"]
     assert one["verdict"] == "refused", one["text"]
-    assert "a wrong configuration is more likely" in one["text"]
+    assert "correct the configuration first" in one["text"]
 
 
 def test_factors_apart_find_what_is_configured_wrong():
