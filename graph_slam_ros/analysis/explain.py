@@ -16,6 +16,7 @@ from graph_slam_ros.formats.strict import integer
 from graph_slam_ros.runs.folder import SUMMARY, summary_of
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.slam import Config
+from graph_slam_ros.slam.edit_tools import HAND_MADE
 from graph_slam_ros.slam.robust.ledger import FINAL, Reason, Verdict, VerdictChange
 
 _STATE = {
@@ -43,7 +44,7 @@ _KIND = {
     "fixes": "a fix",
     "odometry": "odometry",
     "custom": "an edge of a plugin",
-    "by_hand": "an edge that was let in",
+    "by_hand": "an edge that was let in or added",
 }
 _SHOWN = 5
 _WIDTH = 110
@@ -235,7 +236,7 @@ class Numbers(NamedTuple):
 def title(e: Entry, of: str) -> str:
     """An edge's title: its kind, the landmarks that it is ``of``, and the verdict on it."""
     kind = _KIND.get(e.label, e.label) + (f" ({e.tag})" if measurement_text.is_custom(e) else "")
-    by = e.source and f" by {e.source}"
+    by = e.source and (f" {e.source}" if e.source == HAND_MADE else f" by {e.source}")
     return f"edge {e.edge}: {kind}{of and f' of {of}'}{by}: {_state(e.verdict, e.reason)}"
 
 

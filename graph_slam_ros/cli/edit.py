@@ -7,11 +7,18 @@ from graph_slam_ros.cli import console
 from graph_slam_ros.cli.options import add_run
 from graph_slam_ros.cli.usage import CODES, CommandParser
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.measurements.edit_actions import ACTIONS
 
 
 def add_options(sub: CommandParser) -> None:
     """Add the options of ``edit``."""
     sub.codes = f"explain RUN prints the ids of edges and the names of landmarks; so does ledger.csv. {CODES}"
+    sub.more = lambda: "\n".join(
+        [
+            "Kinds of edits, and their keys (docs/edits.md):",
+            *(f"  {do:16s} {action.keys_text}" for do, action in ACTIONS.items()),
+        ]
+    )
     add_run(sub)
     sub.add_argument("--plan", type=Path, metavar="FILE", help="JSON file with the edits")
     sub.add_argument("--out", type=Path, metavar="DIR", help="new run folder for the result: nothing is replaced")
@@ -24,7 +31,7 @@ def edit(args: argparse.Namespace) -> int:
     """Apply a plan of edits to a run, or begin one."""
     from graph_slam_ros.maps.edit import edit as edited
     from graph_slam_ros.maps.edit import read_plan, write_empty_plan
-    from graph_slam_ros.maps.edit import undo as undone
+    from graph_slam_ros.maps.edit import undo_edit as undone
 
     if args.new_plan is not None:
         write_empty_plan(args.run_folder, args.new_plan)
@@ -47,10 +54,11 @@ def edit(args: argparse.Namespace) -> int:
         f"last pose  moves by {done.final_m:.4f} m",
         f"most       keyframe {done.moved[0]}, by {done.moved[1]:.4f} m",
     )
+    console.show(*(fit.text for fit in done.by_hand))
     if args.dry_run:
         console.show("nothing was written")
         console.then(console.command("edit", args.run_folder, "--plan", args.plan, "--out", "NEW"))
     else:
         console.show(f"results in {args.out}; {args.run_folder} is as it was")
         console.then(f"{console.command('diff', args.run_folder, args.out)} (what the edits have changed)")
-    return console.report_losses(done.losses)
+    return console.report_losses(done.losses, done.warnings)

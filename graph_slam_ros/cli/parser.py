@@ -101,7 +101,7 @@ COMMANDS = {
     "edit": Command(
         edit.edit,
         edit.add_options,
-        "edit a run's map by hand with a plan: take out or let in edges; delete, rename or merge landmarks",
+        "edit a run's map by hand with a plan: edges, closures, landmarks, where the map lies, parts of the drive",
         "drive_run --new-plan edits.json",
         "drive_run --plan edits.json --dry-run",
         "drive_run --plan edits.json --out drive_edited",

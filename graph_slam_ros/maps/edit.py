@@ -2,14 +2,17 @@
 
 import hashlib
 import json
+import math
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from reprlib import repr as shortened
 from typing import Any
 
 import numpy as np
 
+from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.formats.files import opened, read_text
@@ -42,6 +45,33 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
+class Fit:
+    """The fit of an edge that is in by hand.
+
+    Attributes
+    ----------
+    innovation, limit : chi2 of the edge against all else before the solve, and what a gate would hold it against;
+        infinite where nothing else determines what it is between
+    chi2, residual : after the solve, which the edge has bent; the second in the units of its type
+    """
+
+    edge: int
+    innovation: float
+    limit: float
+    chi2: float = 0.0
+    residual: tuple[float, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """Return the numbers in words."""
+        numbers = " ".join(f"{number:.3g}" for number in self.residual)
+        after = f"chi2 {self.chi2:.4g} after the solve, residual {numbers}"
+        if math.isinf(self.innovation):
+            return f"edge {self.edge}: nothing else determines what it is between, {after}"
+        return f"edge {self.edge}: chi2 {self.innovation:.4g} against all else, {after}"
+
+
+@dataclass(frozen=True, slots=True)
 class Edited:
     """The outcome of a plan.
 
@@ -51,6 +81,8 @@ class Edited:
     chi2 : of the accepted edges, before and after
     moved : the number of the keyframe that moved farthest, and by how much [m]
     final_m : by how much the last keyframe moved [m]
+    by_hand : edges that are in by hand
+    outvoted : edges that were believed, and are out now
     summary : of the new run; empty where none was written
     losses : parts of the run that could not be read
     """
@@ -59,8 +91,24 @@ class Edited:
     chi2: tuple[float, float]
     moved: tuple[int, float]
     final_m: float
+    by_hand: tuple[Fit, ...]
+    outvoted: tuple[int, ...]
     summary: dict[str, Any]
     losses: list[str]
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences on edges that all else contradicts, and on those that are not believed any more."""
+        out = [
+            f"edge {fit.edge} is in by hand, and all else contradicts it: chi2 {fit.innovation:.4g}, above"
+            f" {fit.limit:.4g}"
+            for fit in self.by_hand
+            if fit.limit < fit.innovation < math.inf
+        ]
+        if self.outvoted:
+            first = " ".join(map(str, self.outvoted[:5]))
+            out.append(f"edges that were believed and are out now: {len(self.outvoted)}, the first are {first}")
+        return out
 
 
 # -- plans -------------------------------------------------------------------------------------------------------------
@@ -203,7 +251,29 @@ def edit(folder: Path, plan: Plan, out: Path | None) -> Edited:
     return edited
 
 
-def undo(folder: Path, name: str, out: Path) -> dict[str, Any]:
+def edit_run(run: Path | str, edits: Sequence[Mapping[str, Any]], out: Path | str | None = None) -> Edited:
+    """Edit the map of a run by hand, as ``graph_slam edit`` does.
+
+    Parameters
+    ----------
+    edits : each with ``name``, ``who``, ``when``, ``why``, ``do`` and the keys of its kind, as in a plan
+    out : the run folder to write, where nothing may be; None: the effect is computed, and nothing is written
+
+    Raises
+    ------
+    GraphSlamError
+        A key of an edit is wrong, or it cannot be applied; the text names it. Nothing was written.
+    """
+    folder, read = Path(run), list[Edit]()
+    for number, values in enumerate(edits, start=1):
+        try:
+            read.append(edit_of(values))
+        except FormatError as error:
+            raise FormatError(f"edit {number}: {error}") from None
+    return edit(folder, Plan(source_hash(folder), tuple(read)), None if out is None else Path(out))
+
+
+def undo_edit(run: Path | str, name: str, out: Path | str) -> dict[str, Any]:
     """Write the run that a run would be without one of its edits, by its name; returns the summary.
 
     Raises
@@ -211,7 +281,7 @@ def undo(folder: Path, name: str, out: Path) -> dict[str, Any]:
     GraphSlamError
         The run has no such edit, a later one depends on it, or the map cannot be solved. Nothing was written.
     """
-    took, losses = stopwatch(), list[str]()
+    folder, out, took, losses = Path(run), Path(out), stopwatch(), list[str]()
     if os.path.lexists(out):
         raise RunError(f"{out}: exists already: an edited map is written to a new folder")
     start, config = read_map(folder, losses, start_only=True), run_config(folder)
@@ -224,12 +294,15 @@ def undo(folder: Path, name: str, out: Path) -> dict[str, Any]:
         raise GraphSlamError(f"{folder}: edit {shortened(name)} {why}")
     gone = [one.name for one in made].index(name)
     for one in made[gone + 1 :]:
-        if int(one.arguments.get("edge", 0)) >= start.graph.edge_count:
+        if any(edge >= start.graph.edge_count for edge in one.named_edges):
             raise GraphSlamError(f"edit {one.name} is of an edge that an edit has added: undo {one.name} first")
     rest = [m for m in events if not (isinstance(m, Control) and ("name", name) in m.values)]
     slam = GraphSlam(config, start=start)
     for m in rest:
-        slam.process(m)
+        try:
+            slam.process(m)
+        except GraphSlamError as error:
+            raise GraphSlamError(f"edit {name} cannot be undone alone: without it {error}") from None
     if not slam.is_solved:
         raise GraphSlamError(f"the map cannot be solved without this edit: {slam.failing}")
     start = read_map(folder, [], start_only=True)
@@ -238,14 +311,41 @@ def undo(folder: Path, name: str, out: Path) -> dict[str, Any]:
 
 def _applied(slam: GraphSlam, measurements: list[Control], losses: list[str]) -> Edited:
     """Apply edits to a map in memory, and compare it with what it was."""
-    known, before, chi2 = len(slam.edits), slam.trajectory(), slam.solver.evaluate().chi2_final
+    known, vertices, before = len(slam.edits), slam.keyframes.ids.copy(), slam.trajectory()
+    chi2, inside = slam.solver.evaluate().chi2_final, slam.ledger.inside
+    fits = list[Fit]()
     for one in measurements:
         slam.process(one)
+        if one.event == "edit" and slam.edits[-1].edit.do in ("add_closure", "let_in_edge"):
+            fits += [_fit(slam, edge) for edge in slam.edits[-1].added]
     if not slam.is_solved:
         raise GraphSlamError(f"the map cannot be solved with these edits: {slam.failing}")
-    n = slam.space.dimensions
+    n, done = slam.space.dimensions, tuple(slam.edits[known:])
+    before = before[np.isin(vertices, slam.keyframes.ids)]  # without those that were cut out
     distances = np.linalg.norm(slam.trajectory()[:, :n] - before[:, :n], axis=1)
     farthest = int(distances.argmax())
-    after = slam.solver.evaluate().chi2_final
-    moved = farthest, float(distances[farthest])
-    return Edited(tuple(slam.edits[known:]), (chi2, after), moved, float(distances[-1]), {}, losses)
+    by_hand = {edge for one in done for edge in one.edges}
+    return Edited(
+        done,
+        (chi2, slam.solver.evaluate().chi2_final),
+        (farthest, float(distances[farthest])),
+        float(distances[-1]),
+        tuple(_solved(slam, fit) for fit in fits if not slam.ledger.is_withdrawn(fit.edge)),
+        tuple(edge for edge in inside.tolist() if not slam.ledger.is_inside(edge) and edge not in by_hand),
+        {},
+        losses,
+    )
+
+
+def _fit(slam: GraphSlam, edge: int) -> Fit:
+    """Compare an edge that is in by hand with all else."""
+    decisions, numbers = slam.backend.decisions, slam.graph.edge(edge).type.residual_size
+    slam.solver.set_weight(edge, 0.0)
+    (innovation,) = decisions.innovations([edge])
+    slam.solver.set_weight(edge, 1.0)
+    return Fit(edge, innovation, decisions.gate_scale * quantile(slam.config.robust.gate, numbers))
+
+
+def _solved(slam: GraphSlam, fit: Fit) -> Fit:
+    chi2, _ = slam.solver.chi2_of([fit.edge])
+    return replace(fit, chi2=float(chi2[0]), residual=tuple(slam.solver.residuals_of([fit.edge]).tolist()))

@@ -16,11 +16,13 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.maps.alignment import Alignment, align, positions
 from graph_slam_ros.maps.diff import refuse_other_space, shared_landmarks
-from graph_slam_ros.measurements.edits import AppliedEdit
+from graph_slam_ros.measurements.edit_actions import ALL_FIELDS
+from graph_slam_ros.measurements.edits import AppliedEdit, Value
 from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.runs.restore import record_run, restored_and_solved, stopwatch
 from graph_slam_ros.slam import Control, GraphSlam
+from graph_slam_ros.slam.edit_tools import HAND_MADE
 from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
 from graph_slam_ros.slam.robust.gating import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
@@ -196,7 +198,7 @@ class _Second:
 
     def _edge(self, edge: list[Any]) -> list[Any]:
         tag, vertices, measured, root, label, source = edge
-        if label == "anchor":
+        if label == "anchor" or (source == HAND_MADE and len(vertices) == 1):
             return self._bridge()
         if label == "initialpose":  # it was told in the axes of the second
             measured = [float(x) for x in self._one.space.group.compose(self._T, tuple(measured))]
@@ -208,9 +210,20 @@ class _Second:
         free = chain([one.edit.name], (f"{one.edit.name}-{k}" for k in count(2)))
         name = next(name for name in free if name not in names)
         edges, added = (tuple(number[e] for e in ids if e in number) for ids in (one.edges, one.added))
-        arguments = {key: number.get(int(x), x) if key == "edge" else x for key, x in one.edit.arguments.items()}
+        arguments = {key: self._argument(key, x, number) for key, x in one.edit.arguments.items()}
         edit = replace(one.edit, name=name, arguments=arguments)
         return AppliedEdit(edit, self._keyframes + one.keyframe, edges, added).record
+
+    def _argument(self, key: str, value: Value, number: Mapping[int, int]) -> Value:
+        """A value of an edit, with the ids and keyframes of the merged map."""
+        match ALL_FIELDS[key].kind, value:
+            case "edge", int():
+                return number.get(value, value)
+            case "edges", tuple():
+                return tuple(number.get(int(edge), int(edge)) for edge in value)
+            case "keyframe", int():
+                return self._keyframes + value
+        return value
 
     def _bridge(self) -> list[Any]:
         """A weak edge from the last keyframe of the first map to the first keyframe of the second."""

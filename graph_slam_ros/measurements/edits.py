@@ -7,18 +7,11 @@ from reprlib import repr as shortened
 from typing import Any, TypeAlias
 
 from graph_slam_ros.errors import FormatError
+from graph_slam_ros.measurements.edit_actions import ACTIONS, Argument, read_arguments
 
-Value: TypeAlias = bool | int | float | str
-ACTIONS: dict[str, dict[str, type]] = {
-    "remove_edge": {"edge": int},
-    "let_in_edge": {"edge": int},
-    "remove_landmark": {"landmark": str},
-    "rename_landmark": {"landmark": str, "to": str},
-    "merge_landmarks": {"landmark": str, "into": str},
-}
-"""The arguments of each kind of edit (``do``), with their types."""
-COMMON: dict[str, type] = {"name": str, "who": str, "when": str, "why": str, "do": str}
-_MOST = {"name": 80, "who": 200, "why": 2000, "landmark": 10_000, "to": 128, "into": 10_000}  # characters
+Value: TypeAlias = Argument
+COMMON = ("name", "who", "when", "why", "do")
+_MOST = {"name": 80, "who": 200, "when": 100, "why": 2000}  # characters
 _DAY, _CLOCK = r"\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])", r"([01]\d|2[0-3]):[0-5]\d(:[0-5]\d(\.\d{1,9})?)?"
 _WHEN = re.compile(_DAY + "[T ]" + _CLOCK + r"(Z|[+-]\d\d:?\d\d)", re.ASCII)
 
@@ -48,16 +41,21 @@ class Edit:
         return {name: getattr(self, name) for name in COMMON} | dict(self.arguments)
 
     @property
+    def named_edges(self) -> tuple[int, ...]:
+        """The edges that the edit names."""
+        edge, edges = self.arguments.get("edge"), self.arguments.get("edges", ())
+        assert isinstance(edges, tuple)
+        return (*map(int, edges), *([edge] if isinstance(edge, int) else []))
+
+    @property
     def text(self) -> str:
         """Return what the edit does, in words."""
-        a = self.arguments
-        return {
-            "remove_edge": "edge {edge} taken out",
-            "let_in_edge": "edge {edge} let in",
-            "remove_landmark": "landmark {landmark} deleted",
-            "rename_landmark": "landmark {landmark} renamed to {to}",
-            "merge_landmarks": "landmark {landmark} merged into {into}",
-        }[self.do].format(**a)
+        a = {key: _ids(value) if isinstance(value, tuple) else value for key, value in self.arguments.items()}
+        if "edges" in a:
+            a["chosen"] = f"edges {a['edges']}"
+        elif "from" in a:
+            a["chosen"] = f"its sightings from keyframe {a['from']} until {a['until']}"
+        return ACTIONS[self.do].done.format(**a)
 
 
 def edit_of(values: Any) -> Edit:
@@ -73,31 +71,21 @@ def edit_of(values: Any) -> Edit:
     do = values.get("do")
     if not isinstance(do, str) or do not in ACTIONS:
         raise FormatError(f"do: {shortened(do)} is none of {', '.join(ACTIONS)}" if "do" in values else "do: missing")
-    known = COMMON | ACTIONS[do]
-    for key in values:
-        if key not in known:
-            raise FormatError(f"{shortened(key)}: unknown key; {do} has {', '.join(known)}")
-    for key, kind in known.items():
+    for key in COMMON:
         if key not in values:
-            raise FormatError(f"{key}: missing; {do} has {', '.join(known)}")
-        _check(key, kind, values[key])
-    for key in ("to", "into"):
-        if key in known and values[key] == values["landmark"]:
-            raise FormatError(f"{key}: {shortened(values[key])} is the landmark itself")
-    arguments = {key: values[key] for key in ACTIONS[do]}
+            raise FormatError(f"{key}: missing; {do} has {', '.join(COMMON)}, {ACTIONS[do].keys_text}")
+    arguments = read_arguments(do, values, COMMON)
+    for key, most in _MOST.items():
+        _check_text(key, values[key], most)
     return Edit(**{key: values[key] for key in COMMON}, arguments=arguments)
 
 
-def _check(key: str, kind: type, value: Any) -> None:
-    if kind is int:
-        if type(value) is not int or not 0 <= value < 2**63:
-            raise FormatError(f"{key}: {shortened(value)} is not a whole number, 0 or more")
-        return
+def _check_text(key: str, value: Any, most: int) -> None:
     if not isinstance(value, str):
         raise FormatError(f"{key}: {shortened(value)} is not a text")
     if not value.strip():
         raise FormatError(f"{key}: empty")
-    if len(value) > (most := _MOST.get(key, 100)):
+    if len(value) > most:
         raise FormatError(f"{key}: {len(value)} characters, at most {most}")
     if key == "when" and not _WHEN.fullmatch(value):
         raise FormatError(f"when: {shortened(value)} is not a time with its zone, such as 2026-05-04T10:30:00Z")
@@ -140,8 +128,8 @@ def applied_edit(record: Any) -> AppliedEdit:
     return AppliedEdit(edit_of(values), keyframe, tuple(edges), tuple(added))
 
 
-def _ids(edges: tuple[int, ...]) -> str:
-    shown = " ".join(map(str, edges[:5]))
+def _ids(edges: tuple[float, ...]) -> str:
+    shown = " ".join(f"{edge:g}" if isinstance(edge, float) else str(edge) for edge in edges[:5])
     return shown if len(edges) <= 5 else f"{shown} and {len(edges) - 5} more"
 
 
@@ -154,6 +142,8 @@ def aliases(edits: list[AppliedEdit]) -> dict[str, str]:
             case "merge_landmarks":
                 out = {name: a["into"] if of == a["landmark"] else of for name, of in out.items()}
                 out[a["landmark"]] = a["into"]
+            case "split_landmark":
+                out.pop(a["to"], None)
             case "rename_landmark":
                 out = {name: a["to"] if of == a["landmark"] else of for name, of in out.items() if name != a["to"]}
             case "remove_landmark":

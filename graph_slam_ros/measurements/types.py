@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeAlias, get_args
 
 from graph_slam_ros.errors import FormatError
-from graph_slam_ros.measurements.edits import edit_of
+from graph_slam_ros.measurements.edits import Value, edit_of
 from graph_slam_ros.typing import Numbers
 
 SIGHTING_KINDS = ("position", "pose", "range_bearing", "bearing", "range")
@@ -223,7 +223,7 @@ class Control:
     """
 
     event: Event
-    values: tuple[tuple[str, bool | int | float | str], ...] = ()
+    values: tuple[tuple[str, Value], ...] = ()
 
     def __post_init__(self) -> None:
         _check_choice(Control, self.event, EVENTS)
@@ -279,7 +279,9 @@ def from_record(record: dict[str, Any]) -> Measurement:
         if cls is Sightings:
             fields["sightings"] = tuple(Sighting(**_tuples(one)) for one in fields["sightings"])
         if cls is Control:
-            fields["values"] = tuple((name, value) for name, value in fields.get("values", ()))
+            fields["values"] = tuple(
+                (name, tuple(value) if isinstance(value, list) else value) for name, value in fields.get("values", ())
+            )
         return cls(**_tuples(fields))
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{record['type']}: {error}") from None

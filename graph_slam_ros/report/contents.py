@@ -139,6 +139,7 @@ def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
         "group": pack.column(texts.group, "i4"),
         "groups": texts.groups,
         "changes": {str(edge): lines for edge, lines in texts.changes.items()},
+        "by_hand": _by_hand(saved),
         "places": [pack.column(end(slot), "i4") for slot in range(2)],
         "label": coded([e.label for e in entries]),
         "source": coded([shown(e.source) for e in entries]),
@@ -150,6 +151,15 @@ def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
         "landmark_lines": pack.texts(_landmark_texts(saved, [name for name in names if name])),
         "landmark_names": pack.texts([shown(name) for name in names if name]),
     }
+
+
+def _by_hand(saved: SavedGraph) -> dict[str, list[str]]:
+    """The edits of each edge, in words."""
+    found: dict[str, list[str]] = {}
+    for one in saved.edits:
+        for edge in (*one.edges, *one.added):
+            found.setdefault(str(edge), []).append(shown(one.text))
+    return found
 
 
 def _step(values: Any) -> float:
@@ -247,12 +257,14 @@ def _drive(out: Contents, saved: SavedGraph) -> dict[str, Any]:
 def _tables(out: Contents, summary: dict[str, Any], saved: Any, scores: Scores | None, known: Truth | None) -> None:
     """The tables below the map."""
     config = out.attempt(lambda: run_config(out.run))
+    edits = [one.edit for one in saved.edits] if saved else []
     out.data["tables"] = {
         "inputs": out.attempt(lambda: verdict.inputs(summary)) or [],
         "configuration": out.attempt(lambda: verdict.configuration(config)) if config else [],
         "versions": out.attempt(lambda: verdict.versions(out.run, summary)) or [],
         "timing": out.attempt(lambda: verdict.timing(summary)) or [],
         "noise": out.attempt(lambda: verdict.noise(summary)) or [],
+        "edits": [[shown(str(e)) for e in (one.name, one.text, one.who, one.when, one.why)] for one in edits],
         "classes": out.attempt(lambda: list(verdict.classes(summary))) or [],
     }
     out.data["waiting"] = [[shown(str(n)), shown(str(why))] for n, why in dict(summary.get("waiting") or {}).items()]

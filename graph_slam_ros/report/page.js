@@ -73,6 +73,7 @@ function explained(k) {
     if (text === "{changes}") for (const one of data.edges.changes[k] || []) lines.push([what, one]);
     else lines.push([what, filled(text, k)]);
   }
+  for (const one of data.edges.by_hand[k] || []) lines.push(["by hand", one]);
   return {title: filled(group.title, k), lines};
 }
 
@@ -541,6 +542,7 @@ function writeText() {
   table("timing", ["what", "value"], t.timing);
   table("classes", ["class", "edges", "numbers", "chi2", "chi2 per number"], t.classes);
   table("noise", ["class, input, part", "degrees of freedom", "chi2 per degree", "alike", "sigmas should be"], t.noise);
+  if (t.edits.length) table("edits", ["edit by hand", "what", "who", "when", "why"], t.edits);
   if (data.waiting.length) table("waiting", ["landmark that waits", "why"], data.waiting);
   byId("chi2-dof").textContent = data.chi2_per_dof === null ? "" : `chi2 per degree of freedom of the whole: ${general(data.chi2_per_dof, 3)}`;
   if (data.scores) { byId("scores-section").hidden = false; byId("scores").textContent = data.scores.join("\n"); }

@@ -17,6 +17,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.report.packing import shown
 from graph_slam_ros.runs.ledger_file import Entry
+from graph_slam_ros.slam.edit_tools import HAND_MADE
 from graph_slam_ros.slam.robust.ledger import FINAL
 from graph_slam_ros.typing import Array
 
@@ -130,7 +131,7 @@ def sentences(run: SavedGraph, found: Effects) -> Sentences:
         kinds = tuple(_kind(run, e, vertex) for vertex in e.vertices)
         bounds = e.threshold < 0.99 * limit, limit < 0.99 * e.threshold
         effect = bool(is_known[k]), bool(found.is_alone[k]), int(found.end[k])
-        about = bool(e.landmark), bool(e.source), k in history
+        about = bool(e.landmark), e.source if e.source in ("", HAND_MADE) else True, k in history
         key = (e.tag, e.label, e.verdict, e.reason, *kinds, *bounds, *effect, *about)
         if key not in known:
             known[key] = len(groups)

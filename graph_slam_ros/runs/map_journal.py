@@ -24,7 +24,8 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
   same while ``map.localize`` is true, zeros when it ends; ``edits``: ``AppliedEdit.record`` of each edit by hand.
 
 Now and then an ``estimate`` tells all values, end to end. A run that goes on in another's map has that first, as one
-``growth`` and one ``estimate``, up to a record ``start``.
+``growth`` and one ``estimate``, up to a record ``start``. After a part of the drive was cut out, ``anew`` ends all
+before it, and a ``growth`` of the whole map follows.
 """
 
 import math
@@ -39,10 +40,11 @@ import numpy as np
 from graph_slam_ros.edge_tags import map_edge_of, tag_of
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.graph import Gaussian, Graph
-from graph_slam_ros.graph.vertices import GROUPS, R1, R2, R3, SE2, SE3
+from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, SE3
 from graph_slam_ros.measurements.edits import applied_edit
 from graph_slam_ros.measurements.types import Sighting
 from graph_slam_ros.runs.journal import MAP, parts_of, read_records
+from graph_slam_ros.runs.map_faults import fault_of, is_index
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.calibration.recalibration import Recalibration, Totals, read_totals, totals_record
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
@@ -70,6 +72,12 @@ class MapGrowth:
     """
 
     def __init__(self, start: MapSnapshot | None = None) -> None:
+        self._begin()
+        self.first: list[Record] = [{"type": "map", "version": VERSION}]
+        if start is not None:
+            self.first += [self.since(start), _estimate(start.values), {"type": "start"}]
+
+    def _begin(self) -> None:
         self._vertices = self._edges = self._judged = self._changes = 0
         self._keyframes = self._segments = self._sightings = self._landmarks = self._offsets = 0
         self._edits = self._frozen = self._drives = self._rescaled = 0
@@ -80,12 +88,12 @@ class MapGrowth:
         self._datum: tuple[float, ...] = ()
         self._settings: dict[str, Any] = {}
         self._estimated = 0  # keyframes at the last estimate
-        self.first: list[Record] = [{"type": "map", "version": VERSION}]
-        if start is not None:
-            self.first += [self.since(start), _estimate(start.values), {"type": "start"}]
 
     def of(self, slam: GraphSlam) -> Iterator[Record]:
         """The growth since the last call, and from time to time the whole estimate."""
+        if any(one.edit.do == "cut" for one in slam.edits[self._edits :]):
+            self._begin()
+            yield {"type": "anew"}
         changed = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
         self._settings = dict(slam.settings)
         used = {"used": [slam.newest_odometry_ns, slam.odometry_source]} if slam.odometry_source else {}
@@ -174,6 +182,8 @@ def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> Ma
                 case "estimate":
                     values = np.array(record["values"], dtype=float)
                     state.values[: len(values)] = values
+                case "anew":
+                    state = MapSnapshot()
                 case "start":
                     has_start = True
                     state.processed = 0
@@ -183,7 +193,7 @@ def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> Ma
             break
     if (start_only and not has_start) or not state.keyframes:
         return None
-    if fault := _fault(state):
+    if fault := fault_of(state):
         raise FormatError(f"{folder.name}/{MAP}.mcap: {fault}")
     _apply_verdicts(state)
     return state
@@ -202,48 +212,6 @@ def extend(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     """Append a ``growth`` to the map."""
     _grow(state, record)
     _apply_verdicts(state)
-
-
-def _fault(state: MapSnapshot) -> str:
-    """Return where the parts contradict one another; empty if they do not."""
-    graph = state.graph
-    kinds = [graph.kinds[code] for code in graph.kind.values.tolist()]
-    pose = next((kind for kind in kinds if kind in GROUPS), None)
-
-    def are_numbers(several: tuple[Any, ...]) -> bool:
-        return all(isinstance(x, int | float) and math.isfinite(x) for x in several)
-
-    def is_instant(stamp_ns: Any, at: tuple[Any, ...]) -> bool:
-        return _is_index(stamp_ns, 2**63) and are_numbers(at) and pose is not None and len(at) == pose.size
-
-    for k, one in enumerate(state.keyframes):
-        fits = _is_index(one.vertex, len(kinds)) and kinds[one.vertex] is pose
-        if not (fits and is_instant(one.stamp_ns, one.T_odom_base)):
-            return f"keyframe {k} is none"
-    for k, seen in enumerate(state.sighting_poses):
-        if not (_is_index(seen.keyframe, len(state.keyframes)) and is_instant(seen.stamp_ns, seen.T_keyframe_base)):
-            return f"sighting {k} is none"
-    for name, mark in state.landmarks.items():
-        if not all(map(_is_index, (mark.vertex, mark.sightings), (len(kinds), 2**31))):
-            return f"landmark {name} is none"
-        if not all(_is_index(stamp_ns, 2**63) for stamp_ns in (mark.first_seen_ns, mark.last_seen_ns)):
-            return f"landmark {name} was never seen"
-    for name, vertex in state.range_offsets.items():
-        if not (_is_index(vertex, len(kinds)) and kinds[vertex] is R1):
-            return f"the offset of {name} is none"
-    if not all(_is_index(one, len(state.keyframes)) for one in (*state.segments, *state.drives)):
-        return "a segment or a drive begins where no keyframe is"
-    if not (state.used_ns is None or _is_index(state.used_ns, 2**63)) or not isinstance(state.source, str):
-        return "the odometry that was used last is none"
-    if state.datum and not (len(state.datum) == 3 and are_numbers(state.datum)):
-        return "its datum is none"
-    if len(state.ledger) > graph.edge_count:
-        return f"{len(state.ledger)} verdicts on {graph.edge_count} edges"
-    return "" if np.isfinite(state.values).all() else "an estimate is not finite"
-
-
-def _is_index(one: Any, count: int) -> bool:
-    return isinstance(one, int) and not isinstance(one, bool) and 0 <= one < count
 
 
 # -- what is written --------------------------------------------------------------------------------------------------
@@ -349,7 +317,7 @@ def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     state.used_ns, state.source = record.get("used", (None, ""))
     for name in ("frozen", "held"):
         vertices, edges = record.get(name, (0, 0))
-        if not (_is_index(vertices, graph.vertex_count + 1) and _is_index(edges, len(ledger) + 1)):
+        if not (is_index(vertices, graph.vertex_count + 1) and is_index(edges, len(ledger) + 1)):
             raise ValueError(f"{name} {record[name]}: more than there is")
     if "frozen" in record:
         state.frozen, edges = record["frozen"]
@@ -358,7 +326,7 @@ def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
 
 
 def _count(value: Any) -> int | None:
-    if value is not None and not _is_index(value, 2**63):
+    if value is not None and not is_index(value, 2**63):
         raise ValueError(f"processed {value!r} is no count")
     return value
 

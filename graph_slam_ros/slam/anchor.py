@@ -15,7 +15,7 @@ from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.motion_compensation import as_matrix, axes_unknown
 from graph_slam_ros.typing import Array, Numbers
 
-_TIGHT = 1e-3  # m, rad: the map begins where odometry begins, which is as good as any other place
+TIGHT = 1e-3  # m, rad: the map begins where odometry begins, which is as good as any other place
 _UNCERTAIN_M, _UNCERTAIN_RAD = 1e3, 3.0
 _TILT_RAD = 0.3  # of odometry in space, whose z axis points up; positions do not tell it before the robot has moved
 
@@ -37,12 +37,14 @@ class Anchor:
     def begin(self, vertex: int, T_map_base: Numbers) -> Array:
         """Add the prior of the first keyframe. Returns its covariance (dof, dof)."""
         settings = self._config.anchor
-        self._sigmas = np.array(self._space.sigmas(settings.sigma_m or _TIGHT, settings.sigma_rad or _TIGHT))
+        self._sigmas = np.array(self._space.sigmas(settings.sigma_m or TIGHT, settings.sigma_rad or TIGHT))
         self._add(vertex, T_map_base, Gaussian.from_sigmas(*self._sigmas))
         return np.diag(np.square(self._sigmas))
 
     def restore(self) -> None:
-        """Continue with the prior of a loaded map, if it can still be loosened."""
+        """Continue with the prior of a loaded map, if it can still be loosened: not with one that was set by hand."""
+        self._edge = self._vertex = -1
+        self._sigmas = np.full(self._space.dof, np.inf)
         for edge in self._graph.edges_of("anchor").tolist():
             one = self._graph.edge(edge)
             (vertex,) = one.vertices
@@ -56,7 +58,7 @@ class Anchor:
     def is_located(self) -> bool:
         """Return whether the map is in the frame of surveys and fixes, by its start or by one of them."""
         is_given = self._config.start_pose is not None or self._config.anchor.sigma_m > 0.0
-        return is_given or bool((self._sigmas[: self._space.dimensions] > _TIGHT).all())
+        return is_given or bool((self._sigmas[: self._space.dimensions] > TIGHT).all())
 
     def align_to_fix(self, m: Fix, T_map_base: Numbers, keyframe: int) -> bool:
         """Loosen the prior for a more precise fix. Returns whether the map has moved.

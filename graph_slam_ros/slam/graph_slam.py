@@ -85,9 +85,9 @@ class GraphSlam(MapView):
         frontend = KeyframeFrontend(config, backend.noise, counters, solution.pose, start.datum if start else ())
         kidnaps = KidnapDetector(config.space, config.odometry, backend, counters, frontend.path.segments)
         super().__init__(config, backend, frontend, landmarks, kidnaps, solution)
-        self.settings: dict[str, Value] = {}
+        self.settings, self._anchor = dict[str, Value](), Anchor(config, backend)
         self._sink, self._faults = sink or (lambda measurement: None), Faults(counters)
-        self._anchor, self._edits = Anchor(config, backend), Edits(backend, landmarks.map, counters)
+        self._edits = Edits(config.space, backend, frontend, landmarks, self._anchor, solution.guard, counters)
         self._custom = CustomEdges(config, backend, frontend, landmarks.map, self._anchor, counters)
         self._calibrator = Calibrator(config, backend, frontend, landmarks.map, counters, executor, start)
         if start is not None and start.keyframes:

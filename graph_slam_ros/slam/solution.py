@@ -100,7 +100,7 @@ class Solution:
 
     def is_due(self, keyframes: int, every_keyframes: int) -> bool:
         """Return whether enough is unsolved."""
-        return keyframes - self._keyframes + self.resting >= every_keyframes
+        return keyframes - min(self._keyframes, keyframes) + self.resting >= every_keyframes
 
     def solve(self, work: Callable[[], Solved], newest: Keyframe, keyframes: int) -> Solved | None:
         """Solve by some work; None if it fails. A failure is counted, and the last estimate stays."""

@@ -121,9 +121,21 @@ WITHIN = {
     "cli": {
         *("progress", "warmup", "graph", "solver", "optimization", "certificate", "formats", "config"),
         *("slam", "messages/inputs", "recordings", "check", "runs", "maps", "analysis", "report", "simulation", "node"),
+        "measurements",
     },
     "__init__.py": {
-        *("graph", "solver", "optimization", "certificate", "formats", "measurements", "config", "slam", "runs"),
+        *(
+            "graph",
+            "solver",
+            "optimization",
+            "certificate",
+            "formats",
+            "measurements",
+            "config",
+            "slam",
+            "runs",
+            "maps",
+        ),
     },
 }
 # What is not the standard library's and not ours.

@@ -129,6 +129,14 @@ class KeyframeFrontend:
         for pose in sighting_poses:
             self.sighting_poses.append(pose.keyframe, pose.stamp_ns, pose.T_keyframe_base)
 
+    def cut(self, first: int, last: int) -> None:
+        """Cut out keyframes, by index, both included, with what was observed from them."""
+        self.path.cut(first, last)
+        of = self.sighting_poses.ids
+        self.sighting_poses = self.sighting_poses.without(np.flatnonzero((of >= first) & (of <= last)))
+        of = self.sighting_poses.ids
+        of[of > last] -= last - first + 1
+
     def forget_time(self) -> None:
         """Stamps begin anew, the map stays: the next odometry begins a segment."""
         self.order.forget()

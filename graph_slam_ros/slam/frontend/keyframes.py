@@ -104,6 +104,15 @@ class KeyframeList:
             IntegratedOdometry(self._noise, self._space, last, self.keyframes[last].stamp_ns, self._rest)
         )
 
+    def cut(self, first: int, last: int) -> None:
+        """Cut out keyframes, by index, both included; motion is not remembered at the time."""
+        count, left = last - first + 1, len(self.keyframes) - (last - first + 1)
+        self.keyframes = self.keyframes.without(np.arange(first, last + 1))
+        for begins in (self.segments, self.drives):
+            moved = [k if k < first else max(k - count, first) for k in begins]
+            begins[:] = [k for k in dict.fromkeys(moved) if k < left]
+        self._epoch = min(self._epoch, left)
+
     def forget_time(self) -> None:
         """Stamps begin anew: none before can be told from them."""
         self._motions.clear()

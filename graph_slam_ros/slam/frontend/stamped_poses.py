@@ -45,6 +45,14 @@ class StampedPoses(Generic[Instant]):
         """Add an instant."""
         Column.extend((self._id, id_, 1), (self._stamp_ns, stamp_ns, 1), (self._pose, pose, 1))
 
+    def without(self, gone: Index) -> "StampedPoses[Instant]":
+        """The same without some instants."""
+        left = np.delete(np.arange(len(self)), gone)
+        out = StampedPoses(self._record, self.poses.shape[1])
+        columns = (out._id, self.ids), (out._stamp_ns, self.stamps_ns), (out._pose, self.poses)
+        Column.extend(*((column, values[left], len(left)) for column, values in columns))
+        return out
+
     def __len__(self) -> int:
         return len(self._id)
 
