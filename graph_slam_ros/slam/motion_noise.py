@@ -19,6 +19,7 @@ from scipy.optimize import nnls
 from graph_slam_ros.slam.frontend.noise_factors import PER_M, PER_RAD, Key, configured_variance, motion_sizes
 from graph_slam_ros.typing import Array, Index
 
+CONFIGURED_COUNT = 50.0  # steps of odometry: its configured noise counts as that of so many
 _ROUNDS = 4  # of the regression, each weighted by the variances of the last
 _LARGEST_SQUARE = 9.0  # variances: an error that is larger counts as that
 _LEAST, _MOST = 0.1, 3.0  # factor of the configured sigma
@@ -70,13 +71,14 @@ class Motions:
         return noise.factor**2 * self.own + noise.per_rad * self.turned + noise.per_m * self.way
 
 
-def fit_growth(motions: Motions, square: Array, left: Array, now: Growth, *, is_rotation: bool) -> Growth:
-    """One step of expectation and maximisation.
+def fit_growth(motions: Motions, square: Array, left: Array, now: Growth, count: float, *, is_rotation: bool) -> Growth:
+    """One step of expectation and maximisation, drawn to what is configured.
 
     Parameters
     ----------
     square : (n,) square of each residual
     left : (n,) the variance that all measurements together leave to its error
+    count : number of residuals, of which these are a sample; what is configured counts as ``CONFIGURED_COUNT`` of them
     is_rotation : turning adds to it; that of a position grows with the way alone
     """
     at, turned = motions.variance(now), motions.turned * is_rotation
@@ -88,7 +90,8 @@ def fit_growth(motions: Motions, square: Array, left: Array, now: Growth, *, is_
         found = nnls(columns / size, expected / at)[0] / size
         now = _bounded(motions, Growth(float(np.sqrt(found[0])), float(found[1]), float(found[2])))
         at = motions.variance(now)
-    return now
+    part = count / (count + CONFIGURED_COUNT)
+    return Growth(float(np.sqrt(part * now.factor**2 + 1.0 - part)), part * now.per_rad, part * now.per_m)
 
 
 def _bounded(motions: Motions, noise: Growth) -> Growth:

@@ -164,7 +164,7 @@ def _grown(one: NoiseScale, errors: "_Errors | None", now: Growth) -> NoiseScale
     if one.reason:
         return replace(one, per_rad=now.per_rad, per_m=now.per_m, per_s=now.factor**2 * errors.own_per_s)
     is_rotation = one.part == "rotation"
-    found = fit_growth(errors.motions, errors.square, errors.left, now, is_rotation=is_rotation)
+    found = fit_growth(errors.motions, errors.square, errors.left, now, one.edges, is_rotation=is_rotation)
     per_s = found.factor**2 * errors.own_per_s
     return replace(one, factor=found.factor, per_rad=found.per_rad, per_m=found.per_m, per_s=per_s)
 
