@@ -50,7 +50,7 @@ setup(
     author_email="maintainers@graph-slam-ros.example",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "report/page.*"]},
+    package_data={NAME: ["py.typed", "report/page.*", "view/edits.*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -75,8 +75,10 @@ setup(
         # Tests compare our scores with its. GPL-3.0: never a requirement of the Apache-2.0 package itself.
         "evaluate": ["evo>=1.31.1"],
         "report": ["plotly>=7.1.0"],  # its JavaScript; of Python nothing is imported
+        "view": ["plotly>=7.1.0", "starlette>=1.0", "uvicorn>=0.40"],
         "jazzy": [f"{line} ; {WHERE_JAZZY_HAS_WHEELS}" for line in JAZZY],
         "test": [
+            "axe-playwright-python>=0.1.4",  # accessibility of the pages
             "hypothesis>=6.82",
             "mypy>=1.8",
             "playwright>=1.65.2",  # with an installed Chromium, for the report

@@ -66,6 +66,7 @@ class SavedGraph:
 
     Attributes
     ----------
+    slam : the pipeline that holds the map
     keyframes, stamps_ns, segments : vertices and stamps of the keyframes; the keyframes at which odometry begins
     edits : by hand, in order
     landmarks : vertex of each landmark that an accepted edge is about, by its name
@@ -81,7 +82,7 @@ class SavedGraph:
         slam = restored(folder, losses)
         if not slam.is_solved:
             raise RunError(f"{folder}: its map cannot be solved: {slam.failing}")
-        self.folder, self.space, self.config = folder, slam.space, slam.config
+        self.slam, self.folder, self.space, self.config = slam, folder, slam.space, slam.config
         self.graph, self.held = slam.graph.copy(), slam.solver.held
         self.restored = slam.solver
         self.graph.initial.values[:] = slam.solver.values

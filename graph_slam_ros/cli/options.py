@@ -235,10 +235,15 @@ def report(sub: CommandParser) -> None:
     """Add the options of ``report``."""
     add_run(sub)
     sub.add_argument("--out", type=Path, metavar="FILE.html", help="file of the report (default: RUN.html)")
+    add_shown(sub)
+    _add_force(sub)
+
+
+def add_shown(sub: CommandParser) -> None:
+    """Add what a page on a run shows of other files."""
     _add_truth(sub, required=False)
     sub.add_argument("--compare", type=Path, metavar="RUN2", help="another run: draw its path and list what differs")
     sub.add_argument("--plan", type=Path, metavar="MAP.yaml", help="floor plan to draw below: a map.yaml of Nav2")
-    _add_force(sub)
 
 
 def _add_truth(sub: CommandParser, *, required: bool) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from importlib import import_module
 
 from graph_slam_ros import __version__
-from graph_slam_ros.cli import audit, edit, graphs, maps, options, recordings, simulate
+from graph_slam_ros.cli import audit, edit, graphs, maps, options, recordings, simulate, view
 from graph_slam_ros.cli.usage import CommandParser
 
 
@@ -121,6 +121,13 @@ COMMANDS = {
         "write one HTML file on a run: map, edges with their reasons, charts and tables",
         "drive_run",
         "drive_run --truth drive.mcap:/ground_truth --out drive.html",
+    ),
+    "view": Command(
+        view.view,
+        view.add_options,
+        "show the report in a browser, solve what-ifs at once, edit the map and save it as another run",
+        "drive_run",
+        "drive_run --port 8080 --no-browser",
     ),
     "explain": Command(
         audit.explain,

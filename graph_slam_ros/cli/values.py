@@ -50,6 +50,13 @@ def method(text: str) -> str:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
+def port(text: str) -> int:
+    """A port, 0 to 65535. Raises ArgumentTypeError."""
+    if not re.fullmatch(r"\d{1,5}", text, re.ASCII) or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{text} is not a port: 0 (a free one) to 65535")
+    return int(text)
+
+
 def loss(text: str) -> "Loss":
     """A robust loss, NAME or NAME:SCALE. Raises ArgumentTypeError."""
     from graph_slam_ros.graph import Loss

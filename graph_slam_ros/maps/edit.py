@@ -1,5 +1,6 @@
 """A plan of edits by hand, and the run that it makes from another run."""
 
+import copy
 import hashlib
 import json
 import math
@@ -162,15 +163,24 @@ def read_plan(file: Path) -> Plan:
     try:
         if file.stat().st_size > _MOST_BYTES:
             raise FormatError(f"{file}: larger than {_MOST_BYTES} bytes: not read")
-        content = json.loads(read_text(file), object_pairs_hook=_without_repeats, parse_constant=_no_number)
+        text = read_text(file)
     except OSError as error:
         raise FormatError(f"{file}: {error.strerror}") from None
-    except (ValueError, RecursionError, FormatError) as error:
-        raise FormatError(str(error) if str(error).startswith(str(file)) else f"{file}: not JSON: {error}") from None
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{file}: not JSON: {error}") from None
     try:
-        return _plan(content)
+        return plan_of(text)
     except FormatError as error:
         raise FormatError(f"{file}: {error}") from None
+
+
+def plan_of(text: str) -> Plan:
+    """The plan of a JSON text. Raises FormatError where it is none; the message names the edit and the key."""
+    try:
+        content = json.loads(text, object_pairs_hook=_without_repeats, parse_constant=_no_number)
+    except (ValueError, RecursionError, FormatError) as error:
+        raise FormatError(f"not JSON: {error}") from None
+    return _plan(content)
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -309,7 +319,26 @@ def undo_edit(run: Path | str, name: str, out: Path | str) -> dict[str, Any]:
     return record_run(out, config, rest, losses, start, took=took, recording=recording_of(folder))[1]
 
 
-def _applied(slam: GraphSlam, measurements: list[Control], losses: list[str]) -> Edited:
+class Rehearsal:
+    """The map of a run in memory, on which plans are applied without being written.
+
+    Parameters
+    ----------
+    slam : the restored run, which stays as it is
+    """
+
+    def __init__(self, slam: GraphSlam) -> None:
+        self._config, self._state = slam.config, state_of(slam)
+
+    def attempt(self, edits: Sequence[Edit]) -> tuple[GraphSlam, Edited]:
+        """Apply edits to a copy of the map; returns it, and what changed. Raises GraphSlamError where one fails."""
+        state = copy.deepcopy(self._state, {id(self._state.graph): self._state.graph.copy()})  # kinds are shared
+        slam = GraphSlam(self._config, start=state)
+        events = [Control("edit", tuple(one.values.items())) for one in edits]
+        return slam, _applied(slam, [*events, Control("optimize")], [])
+
+
+def _applied(slam: GraphSlam, measurements: Sequence[Control], losses: list[str]) -> Edited:
     """Apply edits to a map in memory, and compare it with what it was."""
     known, vertices, before = len(slam.edits), slam.keyframes.ids.copy(), slam.trajectory()
     chi2, inside = slam.solver.evaluate().chi2_final, slam.ledger.inside

@@ -34,6 +34,7 @@ class Contents:
     Attributes
     ----------
     losses : parts that could not be read; beware : what may mislead
+    saved : the graph of the run; None if it cannot be read
     """
 
     run: Path
@@ -41,6 +42,7 @@ class Contents:
     data: dict[str, Any] = field(default_factory=dict)
     losses: list[str] = field(default_factory=list)
     beware: list[str] = field(default_factory=list)
+    saved: SavedGraph | None = None
 
     def attempt(self, part: Callable[[], Any]) -> Any:
         """Make one part; None, and a loss, where its files are damaged."""
@@ -78,7 +80,7 @@ def read_contents(
     out = Contents(run)
     summary = out.attempt(lambda: summary_of(run)) or {}
     known = read_truth(truth, topic, out.attempt(lambda: input_topics(run)) or set()) if truth else None
-    saved = out.attempt(lambda: SavedGraph(run, out.losses))
+    saved = out.saved = out.attempt(lambda: SavedGraph(run, out.losses))
     out.beware += out.attempt(lambda: changed_since(run)) or []
     scores = evaluate(run, known, align=align) if known and saved else None
     out.data["dimensions"] = out.attempt(lambda: dimensions_of(run)) or 2

@@ -19,10 +19,10 @@ _FORMATS = {"f4": np.float32, "f8": np.float64, "i4": np.int32, "u1": np.uint8}
 _HIDDEN = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
 
 
-def shown(text: str) -> str:
+def shown(text: str, most: int = MOST_TEXT) -> str:
     r"""A name as a page shows it: hidden characters as Python writes them (``\x1b``), and not too long."""
     text = _HIDDEN.sub(lambda found: repr(found[0])[1:-1], text)
-    return text if len(text) <= MOST_TEXT else f"{text[: MOST_TEXT - 3]}..."
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 class Packing:

@@ -5,6 +5,7 @@ const UNKNOWN = -(2 ** 31), SIZES = {f4: 4, f8: 8, i4: 4, u1: 1};
 const ARRAYS = {f4: Float32Array, f8: Float64Array, i4: Int32Array, u1: Uint8Array};
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
+const extra = typeof panel === "undefined" ? null : panel;  // of a page that is served
 const unpacked = new Map();
 let bytes = null;
 
@@ -147,21 +148,32 @@ const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["
 // -- the map ---------------------------------------------------------------------------------------------------------
 
 const MOST_SHOWN = 5000, MOST_DRAWN = 20000;  // edges of one class and verdict
-const map = {inSpace: false, points: null, spans: new Map()};
+const map = {inSpace: false, points: null, moved: null};  // moved: {path, landmarks} of another solution
+
+const estimate = () => (map.moved ? map.moved.path : data.map.paths.estimate.map(column));
 
 function points() {
   if (map.points) return map.points;
-  const estimate = data.map.paths.estimate.map(column), marks = landmarkPlaces(), n = data.map.keyframes;
+  const path = estimate(), marks = landmarkPlaces(), n = data.map.keyframes;
   map.points = [0, 1, 2].map((axis) => {
     const out = new Float64Array(n + marks[axis].length);
-    out.set(estimate[axis]);
+    out.set(path[axis]);
     out.set(marks[axis], n);
     return out;
   });
   return map.points;
 }
 
+async function moveTo(moved) {  // another solution, or null: that of the run
+  map.moved = moved;
+  map.points = null;
+  await drawMap(true);
+}
+
+const placedNow = (names) => [0, 1, 2].map((axis) => Float64Array.from(names, (name) => (map.moved.landmarks.get(name) || [])[axis] ?? (map.moved.landmarks.has(name) ? 0 : NaN)));
+
 function landmarkPlaces() {  // in the order in which edges name them
+  if (map.moved) return placedNow(column(data.edges.landmark_names));
   const names = column(data.map.landmarks.names), at = new Map(names.map((name, k) => [name, k]));
   const places = data.map.landmarks.points.map(column), of = column(data.edges.landmark_names);
   return places.map((axis) => Float64Array.from(of, (name) => (at.has(name) ? axis[at.get(name)] : NaN)));
@@ -212,10 +224,11 @@ function edgeTraces() {
 
 function traces() {
   const c = colours(), paths = data.map.paths, every = data.map.every, out = edgeTraces();
-  const names = {odometry: "dead reckoning", truth: "truth", other: "compared run", estimate: "estimate"};
+  const names = {odometry: "dead reckoning", truth: "truth", other: "compared run", estimate: map.moved ? "estimate, with the edits" : "estimate"};
+  if (map.moved) out.push(trace("estimate of the run", thinned(paths.estimate.map(column), every), c.estimate, {line: {color: c.estimate, width: 1, dash: "dot"}}));
   for (const name of ["odometry", "truth", "other", "estimate"]) {
     if (!paths[name]) continue;
-    const step = name === "truth" ? 1 : every, axes = thinned(paths[name].map(column), step);
+    const step = name === "truth" ? 1 : every, axes = thinned(name === "estimate" ? estimate() : paths[name].map(column), step);
     const isPath = name === "estimate", of = isPath ? thinned([Float64Array.from({length: data.map.keyframes}, (_, k) => k)], step)[0] : null;
     out.push(trace(names[name], axes, c[name], isPath ? {
       meta: "keyframe", customdata: of,
@@ -224,8 +237,8 @@ function traces() {
   }
   const marks = data.map.landmarks, labels = column(marks.names);
   if (labels.length) {
-    const axes = marks.points.map(column), text = labels.map((name) => plain(short(name)));
-    if (!map.inSpace) out.push(trace("2 sigma", [...marks.ellipses.map(column), []], c.landmarks, {line: {color: c.landmarks, width: 1}}));
+    const axes = map.moved ? placedNow(labels) : marks.points.map(column), text = labels.map((name) => plain(short(name)));
+    if (!map.inSpace && !map.moved) out.push(trace("2 sigma", [...marks.ellipses.map(column), []], c.landmarks, {line: {color: c.landmarks, width: 1}}));
     out.push(trace("landmarks", axes, c.landmarks, {
       mode: labels.length > 400 ? "markers" : "markers+text", text, textposition: "top center", textfont: {size: 10, color: c.ink}, meta: "landmark",
       marker: {symbol: map.inSpace ? "diamond" : "star", size: map.inSpace ? 4 : 11, color: c.landmarks}, customdata: labels,
@@ -237,7 +250,7 @@ function traces() {
   return out;
 }
 
-async function drawMap() {
+async function drawMap(isSame = false) {  // isSame: as it is zoomed
   map.notes = [];
   if (data.map.every > 1) map.notes.push(`one of ${data.map.every} keyframes is drawn`);
   const several = traces(), image = data.plan && {
@@ -252,14 +265,24 @@ async function drawMap() {
   }));
   const shape = map.inSpace ? {...layout(() => ({})), scene, uirevision: "space"} : flat;
   map.isThen = false;
+  if (isSame) await Plotly.react("map", several, {...shape, ...zoom()}, {...CONFIG, scrollZoom: true});
+  else await newMap(several, shape);
+  byId("map-note").textContent = map.notes.join("; ");
+  if (map.chosen) mark(...map.chosen);
+}
+
+function zoom() {
+  const {xaxis, yaxis, scene} = byId("map").layout;
+  return map.inSpace ? {scene} : {xaxis, yaxis};
+}
+
+async function newMap(several, shape) {
   Plotly.purge("map");
   await Plotly.newPlot("map", several, shape, {...CONFIG, scrollZoom: true});
   byId("map").on("plotly_click", ({points: [one]}) => {
     const kind = one.data.meta;
     if (kind === "edge" || kind === "keyframe" || kind === "landmark") go(kind, one.customdata);
   });
-  byId("map-note").textContent = map.notes.join("; ");
-  if (map.chosen) mark(...map.chosen);
 }
 
 function restyle(meta, axes) {
@@ -328,6 +351,7 @@ function show(kind, which, move = false) {
   const isThere = kind === "landmark" ? column(data.edges.landmark_names).includes(which) : which < known[kind];
   if (!isThere) return body.append(element("p", `there is no ${kind} ${short(String(which))}`));
   ({edge: showEdge, keyframe: showKeyframe, landmark: showLandmark})[kind](which, body);
+  if (extra) extra.show(kind, which, body);
   if (data.map) mark(kind, which, move);
   if (kind === "edge") choose(which);
 }
@@ -456,6 +480,7 @@ function drawRows() {
       cell.append(element("bdi", typeof value === "number" ? (Number.isNaN(value) ? "-" : number(value)) : value));
       row.append(cell);
     }
+    if (extra) extra.decorate(row, k);
     row.addEventListener("click", () => go("edge", k));
     drawn.push(row);
   }
@@ -580,10 +605,11 @@ async function start() {
       await drawMap();
       if (frames.length) setTime();
     });
-    dark.addEventListener("change", drawMap);
+    dark.addEventListener("change", () => drawMap());
   } else byId("map-section").hidden = true;
   if (!data.edges) byId("ledger").hidden = true;
   startCharts();
+  if (extra) extra.start();
   addEventListener("hashchange", () => fromHash(true));
   addEventListener("beforeprint", () => [...undrawn.keys()].forEach(drawNow));
   fromHash(true);

@@ -4,31 +4,52 @@ import base64
 import hashlib
 import html
 import importlib.util
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.report.contents import Contents
 from graph_slam_ros.report.packing import json_for_script, shown
 
 _HERE = Path(__file__).resolve().parent
+_PLACE = "<!-- panel -->"
 _NO_PLOTLY = "the report draws with plotly: pip install 'graph_slam_ros[report]' or pip install 'plotly>=7.1'"
 
 
-def whole_page(made: Contents, script: str) -> str:
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """A further part of the page, which asks the server that the page is from.
+
+    Attributes
+    ----------
+    html, css, script : of the part, which is below the map; the script is run before that of the page
+    data : as JSON, in the element ``panel-data``
+    """
+
+    html: str
+    css: str
+    script: str
+    data: Any
+
+
+def whole_page(made: Contents, script: str, panel: Panel | None = None) -> str:
     """The whole HTML file; ``script`` is that of plotly."""
     own = (_HERE / "page.js").read_text(encoding="utf-8")
+    scripts = [script, *([panel.script] if panel else []), own]
     rules = "; ".join(
         (
             "default-src 'none'",
-            f"script-src 'unsafe-eval' {_hash(script)} {_hash(own)}",  # plotly compiles its shaders' glue
+            f"script-src 'unsafe-eval' {' '.join(map(_hash, scripts))}",  # plotly compiles its shaders' glue
+            "connect-src 'self'" if panel else "connect-src 'none'",
             "style-src 'unsafe-inline'",
             "img-src data: blob:",
             "base-uri 'none'",
             "form-action 'none'",
         )
     )
-    title = html.escape(f"{shown(made.run.resolve().name)}: report")
-    body = (_HERE / "page.html").read_text(encoding="utf-8")
+    title = html.escape(f"{shown(made.run.resolve().name)}: {'view' if panel else 'report'}")
+    body = (_HERE / "page.html").read_text(encoding="utf-8").replace(_PLACE, panel.html if panel else "")
     return "\n".join(
         (
             "<!DOCTYPE html>",
@@ -36,12 +57,12 @@ def whole_page(made: Contents, script: str) -> str:
             f'<meta http-equiv="Content-Security-Policy" content="{html.escape(rules)}">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<title>{title}</title>",
-            f"<style>{(_HERE / 'page.css').read_text(encoding='utf-8')}</style></head>",
+            f"<style>{(_HERE / 'page.css').read_text(encoding='utf-8')}{panel.css if panel else ''}</style></head>",
             body.strip(),
             f'<script type="application/json" id="data">{json_for_script(made.data)}</script>',
             f'<script type="text/plain" id="columns">{made.packing.block()}</script>',
-            f"<script>{script}</script>",
-            f"<script>{own}</script>",
+            f'<script type="application/json" id="panel-data">{json_for_script(panel.data)}</script>' if panel else "",
+            *(f"<script>{one}</script>" for one in scripts),
             "</html>\n",
         )
     )

@@ -103,6 +103,7 @@ WITHIN = {
         *("chi_square", "graph", "lie", "formats", "measurements", "config", "slam", "slam/landmarks", "slam/robust"),
         *("recordings", "runs", "maps", "analysis"),
     },
+    "view": {"graph", "solver", "measurements", "slam", "slam/robust", "maps", "analysis", "report"},
     "simulation": {
         "chi_square",
         "edge_tags",
@@ -121,7 +122,7 @@ WITHIN = {
     "cli": {
         *("progress", "warmup", "graph", "solver", "optimization", "certificate", "formats", "config"),
         *("slam", "messages/inputs", "recordings", "check", "runs", "maps", "analysis", "report", "simulation", "node"),
-        "measurements",
+        *("measurements", "view"),
     },
     "__init__.py": {
         *(

@@ -1,69 +1,31 @@
 """The page of a report in a real browser: it opens offline, asks for nothing, and says what the run says."""
 
 import re
-from contextlib import contextmanager
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from faulty import faulty_run
+from pages import HOSTILE, chromium, drive, pages
 
 from graph_slam_ros import cli
 from graph_slam_ros.analysis.explain import Numbers, explain_edge, statements, title
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.runs.ledger_file import read_ledger
 from graph_slam_ros.runs.recorder import RunRecorder
-from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
-
-CHROMIUM = Path("/usr/bin/chromium")
-SOFTWARE = ["--use-gl=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
-HOSTILE = [
-    "<script>document.title='broken'</script>",
-    "\"'><img src=x onerror=\"document.title='broken'\">",
-    "<a href='http://example.org'>a</a> {edge} %{x} </script>",
-    "\u202eright to left\u200b",
-    "x" * 10_000,
-]
+from graph_slam_ros.slam import Config
 
 
 @pytest.fixture(scope="module")
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="the page is tested with playwright")
-    if not CHROMIUM.exists():
-        pytest.skip(f"the page is tested with {CHROMIUM}: apt install chromium")
-    with playwright.sync_playwright() as one:
-        browser = one.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+    with chromium() as browser:
         yield browser
-        browser.close()
-
-
-@contextmanager
-def pages(browser):
-    """A function that opens a file offline; at the end no page may have asked for anything, and nothing have failed."""
-    contexts, wrong = [], []
-
-    def go(file, place="", **options):
-        context = browser.new_context(offline=True, viewport={"width": 1400, "height": 900}, **options)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("request", lambda r: wrong.append(r.url) if r.url.split("#")[0] != file.as_uri() else None)
-        page.goto(file.as_uri() + place)
-        page.wait_for_selector("body[data-ready=yes]")
-        return page
-
-    yield go
-    for context in contexts:
-        context.close()
-    assert wrong == []
 
 
 @pytest.fixture
 def opened(browser):
     with pages(browser) as go:
-        yield go
+        yield lambda file, *words, **options: go(file.as_uri(), *words, **options)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +33,7 @@ def page(browser, faulty):
     """The page of a drive with false closures, dark, at one of them."""
     false = next(e for e in read_ledger(faulty.run) if e.label == "closures" and not e.is_in)
     with pages(browser) as go:
-        yield go(faulty.html, f"#edge={false.edge}", color_scheme="dark")
+        yield go(faulty.html.as_uri(), f"#edge={false.edge}", color_scheme="dark")
 
 
 @pytest.fixture(scope="module")
@@ -81,26 +43,6 @@ def faulty(tmp_path_factory):
     truth = folder / "drive.mcap"
     assert cli.main(["report", str(run), "--truth", str(truth), "--out", str(folder / "run.html")]) == 0
     return SimpleNamespace(run=run, html=folder / "run.html", saved=SavedGraph(run, []))
-
-
-def drive(folder, names, seconds=0, dimensions=2):
-    """A run of a short drive that sees landmarks with these names, and closes a loop on none."""
-    config = Config.from_mapping({"world.dimensions": dimensions})
-    recorder = RunRecorder(folder, config)
-    slam = GraphSlam(config, sink=recorder.sink)
-    for k in range(20):
-        stamp = (1 + seconds) * 1_000_000_000 + k * 200_000_000
-        pose = (0.3 * k, 0.0, 0.0) if dimensions == 2 else (0.3 * k, 0.0, 0.1 * k, 0.0, 0.0, 0.0, 1.0)
-        recorder.record(slam, slam.process(Odometry(stamp, pose)))
-        at = [(2.0 * n - 0.3 * k, 1.0 + n, 0.5)[:dimensions] for n in range(len(names))]
-        noise = tuple((0.01 * np.eye(dimensions)).ravel())
-        seen = tuple(Sighting(name, "position", where, noise) for name, where in zip(names, at, strict=True))
-        recorder.record(slam, slam.process(Sightings(stamp, "seen", seen)))
-    for control in ("end", "optimize"):
-        recorder.record(slam, slam.process(Control(control)))
-    recorder.save(slam)
-    recorder.close()
-    return folder
 
 
 def reported(run, out, *words):

@@ -1,0 +1,233 @@
+"use strict";
+// The panel of edits. Its server solves; this file keeps the list, draws what comes back, and sends the plan.
+const known = JSON.parse(document.getElementById("panel-data").textContent);
+const edits = {list: [], asked: 0, chosen: null};
+
+// -- the list --------------------------------------------------------------------------------------------------------
+
+function add(what) {  // {do, ...arguments}
+  const names = new Set([...known.names, ...edits.list.map((one) => one.name)]);
+  let name = "", k = edits.list.length;
+  do { k += 1; name = `edit-${k}`; } while (names.has(name));
+  const when = new Date().toISOString().replace(/\.\d+Z$/, "Z");
+  edits.list.push({name, who: "", when, why: "", ...what});
+  changed();
+}
+
+const whyOf = (one) => one.why.trim() || byId("why-text").value.trim();
+const planWith = (who, why) => JSON.stringify({...known.plan, edits: edits.list.map((one) => ({...one, who, why: why(one)}))}, null, 2) + "\n";
+const asPlan = () => planWith(byId("who").value.trim(), whyOf);
+
+function changed() {
+  const list = byId("pending");
+  list.replaceChildren(...edits.list.map((one, at) => {
+    const item = element("li"), out = element("button", "Remove", {type: "button", "aria-label": `Remove the edit: ${textOf(one)}`});
+    out.addEventListener("click", () => { edits.list.splice(at, 1); changed(); });
+    const why = element("input", undefined, {type: "text", maxlength: 2000, placeholder: "why, if not as above", "aria-label": `Why: ${textOf(one)}`});
+    why.value = one.why;
+    why.addEventListener("input", () => { one.why = why.value; });
+    item.append(element("bdi", textOf(one)), " ", why, out);
+    return item;
+  }));
+  byId("no-edits").hidden = edits.list.length > 0;
+  for (const id of ["undo", "download", "save"]) byId(id).disabled = !edits.list.length;
+  drawRows();
+  drawActions();
+  solve();
+}
+
+function textOf(one) {
+  const {do: what, name, who, when, why, ...rest} = one;
+  return [what.replace(/_/g, " "), ...Object.entries(rest).map(([field, value]) => `${field.replace(/_/g, " ")} ${short(JSON.stringify(value))}`)].join(", ");
+}
+
+// -- what the edits do -----------------------------------------------------------------------------------------------
+
+async function ask(path, body) {
+  const answer = await fetch(path, {method: "POST", headers: {"content-type": "application/json"}, body, credentials: "same-origin", cache: "no-store"})
+    .catch(() => { throw new Error("the server has ended: graph_slam view starts it again"); });
+  const text = await answer.text();
+  let found = null;
+  try { found = JSON.parse(text); } catch { /* a line */ }
+  if (!answer.ok) throw new Error(found && found.error ? found.error : text.trim() || `status ${answer.status}`);
+  return found;
+}
+
+const lossText = () => (byId("loss").value && byId("loss").value !== "none" ? `${byId("loss").value}:${byId("scale").value}` : byId("loss").value);
+
+async function solve() {
+  const turn = ++edits.asked, effect = byId("effect"), loss = lossText();
+  document.body.dataset.solved = "no";
+  const quick = edits.list.every((one) => one.do === "remove_edge" || one.do === "let_in_edge");
+  if (!edits.list.length && !loss) {
+    effect.replaceChildren();
+    if (map.moved) await moveTo(null);
+    document.body.dataset.solved = turn;
+    return;
+  }
+  const lines = [];
+  const show = async (found, title) => {
+    if (turn !== edits.asked) return;
+    lines.push(element("p", `${title}: chi2 ${general(found.chi2[0], 6)} → ${general(found.chi2[1], 6)}; the last pose moves by ${found.final_m.toFixed(4)} m; keyframe ${found.most[0]} moves most, by ${found.most[1].toFixed(4)} m`));
+    if (found.changes && found.changes.length) lines.push(changesText(found.changes));
+    effect.replaceChildren(...lines);
+    await moveTo(asMoved(found));
+  };
+  try {
+    if (quick) {
+      const of = (what) => edits.list.filter((one) => one.do === what).map((one) => one.edge);
+      await show(await ask("/solve", JSON.stringify({without: of("remove_edge"), let_in: of("let_in_edge"), loss})), loss ? "With this loss" : "Solved, other decisions as they are");
+    }
+    if (edits.list.length && turn === edits.asked && !loss) await show(await ask("/try", planWith("-", () => "-")), "As it would be saved, all judged again");
+    if (loss && edits.list.length && turn === edits.asked) lines.push(element("p", "A loss is a question only: a saved run has the losses of its configuration.", {class: "quiet"}));
+  } catch (error) {
+    if (turn !== edits.asked) return;
+    lines.push(element("p", error.message, {class: "fault"}));
+  }
+  if (turn !== edits.asked) return;
+  effect.replaceChildren(...lines);
+  document.body.dataset.solved = turn;
+}
+
+function asMoved(found) {
+  return {path: found.places.map((axis) => Float64Array.from(axis, (value) => (value === null ? NaN : value))), landmarks: new Map(Object.entries(found.landmarks))};
+}
+
+function changesText(changes) {
+  const out = element("p", `${changes.length} other decisions change: `);
+  changes.slice(0, 20).forEach(([edge, before, after], at) => out.append(at ? ", " : "", linkTo("edge", edge, `edge ${edge}`), ` ${before} → ${after}`));
+  if (changes.length > 20) out.append(`, and ${changes.length - 20} more`);
+  return out;
+}
+
+// -- saving ----------------------------------------------------------------------------------------------------------
+
+async function save() {
+  const place = byId("saved");
+  for (const [id, name, isMissing] of [["who", "Who", !byId("who").value.trim()], ["why-text", "Why", edits.list.some((one) => !whyOf(one))]]) {
+    if (!isMissing) continue;
+    place.replaceChildren(element("p", `${name} is empty: an edit is kept with who made it, and why`, {class: "fault"}));
+    return byId(id).focus();
+  }
+  byId("save").disabled = true;
+  place.replaceChildren(element("p", "saving ..."));
+  try {
+    const found = await ask("/save", asPlan());
+    place.replaceChildren(
+      element("p", `Saved in ${found.folder}: chi2 ${general(found.chi2[0], 6)} → ${general(found.chi2[1], 6)}, the last pose moved by ${found.final_m.toFixed(4)} m. The run on this page is as it was.`),
+      element("p", `The same by command, with the plan: ${found.command}`), element("p", `Next: ${found.next}`),
+      ...found.losses.map((one) => element("p", `lost: ${one}`, {class: "fault"})),
+    );
+  } catch (error) {
+    place.replaceChildren(element("p", `not saved: ${error.message}`, {class: "fault"}));
+  }
+  byId("save").disabled = !edits.list.length;
+}
+
+function download() {
+  const link = element("a", undefined, {href: URL.createObjectURL(new Blob([asPlan()], {type: "application/json"})), download: "edits.json"});
+  link.click();
+  URL.revokeObjectURL(link.href);
+}
+
+// -- forms -----------------------------------------------------------------------------------------------------------
+
+const kindOf = (what) => known.kinds.find((one) => one.do === what);
+const NUMBERS = new Set(["edge", "int", "float"]);
+
+function drawFields() {
+  const place = byId("fields");
+  place.replaceChildren(...kindOf(byId("kind").value).fields.map(({key, kind}) => {
+    const label = element("label", `${key.replace(/_/g, " ")} `), input = element("input", undefined, {name: key, type: "text", required: ""});
+    input.dataset.kind = kind;
+    if (edits.chosen && edits.chosen[0] === kind && key === kind) input.value = edits.chosen[1];
+    label.append(input, " ");
+    return label;
+  }));
+}
+
+function fromFields() {
+  const out = {do: byId("kind").value};
+  for (const input of byId("fields").querySelectorAll("input")) {
+    const text = input.value.trim();
+    out[input.name] = NUMBERS.has(input.dataset.kind) && /^-?[\d.]+(e-?\d+)?$/i.test(text) ? Number(text) : text;
+  }
+  return out;
+}
+
+const isInside = (k) => ["accepted", "not evaluated", "down weighted"].includes(data.edges.verdicts[column(data.edges.verdict)[k]]);
+const pendingOf = (k) => edits.list.findIndex((one) => one.edge === k);
+const isOdometry = (k) => ["odometry", "prior"].includes(named(data.edges.label, k));
+
+function drawActions() {
+  const place = byId("actions");
+  if (!place || !edits.chosen) return;
+  const [kind, which] = edits.chosen, buttons = [];
+  if (kind === "edge" && !isOdometry(which)) {
+    const box = element("input", undefined, {type: "checkbox", id: "is-in"}), label = element("label"), at = pendingOf(which);
+    box.checked = at < 0 ? isInside(which) : edits.list[at].do === "let_in_edge";
+    box.addEventListener("change", () => toggle(which));
+    label.append(box, " in the map");
+    buttons.push(label);
+  }
+  for (const {do: what, fields} of known.kinds) {
+    if (kind === "edge" || !fields.some((one) => one.kind === kind)) continue;
+    const button = element("button", what.replace(/_/g, " "), {type: "button"});
+    button.addEventListener("click", () => {
+      byId("kind").value = what;
+      drawFields();
+      const rest = [...byId("fields").querySelectorAll("input")].filter((one) => !one.value);
+      if (rest.length) { rest[0].focus(); rest[0].scrollIntoView({block: "center"}); } else add(fromFields());
+    });
+    buttons.push(button);
+  }
+  place.replaceChildren(...buttons);
+}
+
+function toggle(k) {
+  const at = pendingOf(k);
+  if (at >= 0) { edits.list.splice(at, 1); return changed(); }
+  add({do: isInside(k) ? "remove_edge" : "let_in_edge", edge: k});
+}
+
+// -- what the page calls ---------------------------------------------------------------------------------------------
+
+const panel = {
+  start() {
+    history.replaceState(null, "", location.pathname + location.hash);  // the token was for once
+    byId("who").value = known.who;
+    byId("loss").append(element("option", "as in the run", {value: ""}), ...known.losses.map((name) => element("option", name.replace(/_/g, " "), {value: name})));
+    byId("scale").value = known.scale;
+    byId("kind").append(...known.kinds.map((one) => element("option", one.do.replace(/_/g, " "), {value: one.do})));
+    const scaled = () => { byId("scale-label").hidden = !byId("loss").value || byId("loss").value === "none"; };
+    scaled();
+    drawFields();
+    byId("loss").addEventListener("change", () => { scaled(); solve(); });
+    byId("scale").addEventListener("change", solve);
+    byId("kind").addEventListener("change", drawFields);
+    byId("new-edit").addEventListener("submit", (event) => { event.preventDefault(); add(fromFields()); });
+    byId("undo").addEventListener("click", () => { edits.list.pop(); changed(); });
+    byId("download").addEventListener("click", download);
+    byId("save").addEventListener("click", save);
+    byId("rows").addEventListener("keydown", (event) => {
+      if (event.key !== " " || ledger.chosen < 0 || isOdometry(ledger.chosen)) return;
+      event.preventDefault();
+      toggle(ledger.chosen);
+    });
+    if (known.edits.length) {
+      byId("applied").append(element("h3", "Edits that the run has"));
+      const list = element("ul");
+      for (const [name, text, who, when, why] of known.edits) list.append(element("li", `${name}: ${text}, by ${who}, ${when}: ${why}`));
+      byId("applied").append(list, element("p", `graph_slam edit ${known.run} --undo NAME --out NEW takes one of them back`, {class: "note"}));
+    }
+  },
+  show(kind, which, body) {
+    edits.chosen = [kind, which];
+    body.append(element("div", undefined, {class: "actions", id: "actions"}));
+    drawFields();
+    drawActions();
+  },
+  decorate(row, k) {
+    if (pendingOf(k) >= 0) row.classList.add("edited");
+  },
+};

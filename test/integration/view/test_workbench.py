@@ -1,0 +1,153 @@
+"""The work behind the page: what-if is that of ``solve``, what is saved is that of ``edit``, and the run stays."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from faulty import faulty_run
+
+from graph_slam_ros import cli
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.graph import Loss
+from graph_slam_ros.maps.edit import source_hash
+from graph_slam_ros.measurements.edits import ACTIONS
+from graph_slam_ros.report.contents import read_contents
+from graph_slam_ros.runs.trajectory import read_landmarks, read_tum
+from graph_slam_ros.view.workbench import Workbench
+
+WHO = {"who": "Anna", "when": "2026-05-04T10:30:00Z", "why": "it looks wrong"}
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("view")
+    run = faulty_run(folder)[1]
+    work, saved = Workbench(read_contents(run), 3.0), SavedGraph(run, [])
+    inside = [e.edge for e in saved.entries if e.is_in and e.label == "landmarks"]
+    outside = [e.edge for e in saved.entries if not e.is_in and e.label == "closures"]
+    return SimpleNamespace(folder=folder, run=run, work=work, saved=saved, inside=inside, outside=outside)
+
+
+def what_if(without=(), let_in=(), loss=""):
+    return json.dumps({"without": list(without), "let_in": list(let_in), "loss": loss}).encode()
+
+
+def plan(faulty, *edits, **more):
+    several = [{"name": f"edit-{k}", **WHO, **one} for k, one in enumerate(edits)]
+    whole = {"format": "graph_slam_ros edits", "version": 1, "source": source_hash(faulty.run), "edits": several}
+    return json.dumps(whole | more).encode()
+
+
+def places(found):
+    return np.array(found["places"], dtype=float).T
+
+
+@pytest.mark.parametrize("loss", ["", "none", "huber:2.5"])
+def test_a_what_if_is_that_of_solve(faulty, loss, capsys):
+    out, back = faulty.inside[3:8:2], faulty.outside[:1]
+    found = faulty.work.solve(what_if(out, back, loss))
+    name, _, scale = loss.partition(":")
+    solver = faulty.saved.solve(out, back, Loss.named(name, float(scale or 1.0)) if loss else None)
+    expected = solver.estimate(faulty.saved.keyframes)
+    assert places(found)[:, :2] == pytest.approx(expected[:, :2], abs=1e-5)
+    assert np.abs(expected - faulty.saved.solver.estimate(faulty.saved.keyframes)).max() > 0.01, "something moves"
+    for name, place in found["landmarks"].items():
+        assert place == pytest.approx(solver.estimate([faulty.saved.slam.landmarks[name].vertex])[0], abs=1e-5)
+    words = ["solve", str(faulty.run), "--without", *map(str, out), "--with", *map(str, back)]
+    assert cli.main([*words, *(["--loss", loss] if loss else [])]) == 0
+    before, after = found["chi2"]
+    assert f"chi2       {before:14.4f}  ->  {after:14.4f}" in capsys.readouterr().out
+
+
+def test_what_is_tried_is_what_is_saved_and_what_edit_writes(faulty):
+    names = sorted(faulty.saved.landmarks)
+    edits = [
+        {"do": "remove_edge", "edge": faulty.inside[5]},
+        {"do": "let_in_edge", "edge": faulty.outside[0]},
+        {"do": "rename_landmark", "landmark": names[0], "to": "dock"},
+        {"do": "remove_landmark", "landmark": names[1]},
+        {"do": "merge_landmarks", "landmark": names[2], "into": names[3]},
+    ]
+    before = {file.name: file.read_bytes() for file in faulty.run.iterdir()}
+    body = plan(faulty, *edits)
+    attempted = faulty.work.attempt(body)
+    assert faulty.work.attempt(body) == attempted, "on the same map as before"
+    saved = faulty.work.save(body)
+    folder = faulty.run.with_name("run_edited")
+    assert saved["folder"] == str(folder)
+    assert saved["chi2"] == pytest.approx(attempted["chi2"], rel=1e-8), "in the digits that solving again leaves"
+    assert places(attempted) == pytest.approx(read_tum(folder / "path.tum").poses[:, :3], abs=1e-5)
+    marks = read_landmarks(folder / "landmarks.csv")
+    assert set(attempted["landmarks"]) == set(marks) and "dock" in marks and names[1] not in marks
+    for name, place in attempted["landmarks"].items():
+        assert place == pytest.approx(marks[name].position[: len(place)], abs=1e-5)
+    file, other = faulty.folder / "edits.json", faulty.folder / "other"
+    file.write_bytes(body)
+    assert cli.main(["edit", str(faulty.run), "--plan", str(file), "--out", str(other)]) == 0
+    for one in folder.iterdir():
+        if one.name not in ("run.json", "path.png"):
+            assert one.read_bytes() == (other / one.name).read_bytes(), one.name
+    again = faulty.work.save(plan(faulty, edits[0]))
+    assert again["folder"] == f"{folder}_2", "nothing is replaced"
+    assert {file.name: file.read_bytes() for file in faulty.run.iterdir()} == before
+
+
+def test_decisions_that_change_with_an_edit_are_named(faulty):
+    """A closure that contradicts the others is let in: some of them go out."""
+    found = faulty.work.attempt(plan(faulty, {"do": "let_in_edge", "edge": faulty.outside[0]}))
+    after = faulty.work.save(plan(faulty, {"do": "let_in_edge", "edge": faulty.outside[0]}))["folder"]
+    entries = SavedGraph(faulty.run.with_name(after.rpartition("/")[2]), []).entries
+    verdicts = {e.edge: e.verdict.name.lower().replace("_", " ") for e in faulty.saved.entries}
+    now = {e.edge: e.verdict.name.lower().replace("_", " ") for e in entries if e.edge in verdicts}
+    expected = [[edge, verdicts[edge], now[edge]] for edge in verdicts if verdicts[edge] != now[edge]]
+    assert found["changes"] == [one for one in expected if one[0] != faulty.outside[0]]
+
+
+def test_the_page_has_all_kinds_of_edits(faulty):
+    kinds = {one["do"]: [field["key"] for field in one["fields"]] for one in faulty.work.page_data["kinds"]}
+    assert kinds == {do: list(fields) for do, fields in ACTIONS.items()}
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"\xff{}",
+        b"[" * 100_000,
+        b'{"without": [], "let_in": []}',
+        b'{"without": ["1"], "let_in": [], "loss": ""}',
+        b'{"without": [true], "let_in": [], "loss": ""}',
+        b'{"without": [-1], "let_in": [], "loss": ""}',
+        b'{"without": [99999999999999999999], "let_in": [], "loss": ""}',
+        b'{"without": [0], "let_in": [0], "loss": ""}',
+        b'{"without": [], "let_in": [], "loss": "huber:nan"}',
+        b'{"without": [], "let_in": [], "loss": "huber:x"}',
+        b'{"without": [], "let_in": [], "loss": "sharp:1"}',
+        b'{"without": [], "let_in": [], "loss": "", "out": "/tmp/x"}',
+    ],
+)
+def test_what_is_no_what_if_is_refused_in_one_line(faulty, body):
+    with pytest.raises(GraphSlamError) as error:
+        faulty.work.solve(body)
+    assert len(str(error.value)) < 300 and "\n" not in str(error.value)
+
+
+def test_a_plan_with_a_path_or_for_another_run_is_refused_and_nothing_is_written(faulty):
+    before = sorted(faulty.folder.iterdir())
+    one = {"do": "remove_edge", "edge": faulty.inside[0]}
+    for body in (
+        b"",
+        b"[]",
+        plan(faulty, one, out="/tmp/x"),
+        plan(faulty, one | {"out": "/tmp/x"}),
+        plan(faulty, one, source="sha256:0"),
+        plan(faulty),
+        plan(faulty, {"do": "remove_edge", "edge": 10**9}),
+        plan(faulty, one | {"do": "exec"}),
+    ):
+        with pytest.raises(GraphSlamError) as error:
+            faulty.work.save(body)
+        assert "\n" not in str(error.value)
+    assert sorted(faulty.folder.iterdir()) == before

@@ -1,0 +1,429 @@
+"""The page of a run in a real browser, and its server attacked: X4 to X7 of docs/reliability.md."""
+
+import http.client
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager, suppress
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from faulty import faulty_run
+from pages import HOSTILE, chromium, drive, pages
+
+from graph_slam_ros import cli
+from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.graph import Loss
+from graph_slam_ros.maps.edit import edit, read_plan
+from graph_slam_ros.report.contents import read_contents
+from graph_slam_ros.runs.recorder import RunRecorder
+from graph_slam_ros.runs.trajectory import read_tum
+from graph_slam_ros.slam import Config
+
+pytest.importorskip("starlette", reason="view is tested with its extra: pip install 'graph_slam_ros[view]'")
+pytest.importorskip("uvicorn", reason="view is tested with its extra: pip install 'graph_slam_ros[view]'")
+
+from graph_slam_ros.view import guard, server
+from graph_slam_ros.view.guard import Access
+from graph_slam_ros.view.page import page_of
+from graph_slam_ros.view.workbench import Workbench
+
+PATIENCE_S = 0.5
+
+
+@contextmanager
+def served(run, page=None):
+    """A server of a run in this process, as the command starts it."""
+    work = Workbench(read_contents(run), 3.0)
+    bound = server.listening("127.0.0.1", 0)
+    access = Access("127.0.0.1", bound.getsockname()[1])
+    is_ready = threading.Event()
+    one = server.server(server.application(work, page or page_of(read_contents(run), work), access), is_ready.set)
+    thread = threading.Thread(target=one.run, args=([bound],))
+    thread.start()
+    try:
+        assert is_ready.wait(10.0)
+        yield SimpleNamespace(access=access, port=access.port, work=work, run=run)
+    finally:
+        one.should_exit = True
+        thread.join(10.0)
+    assert not thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory):
+    return faulty_run(tmp_path_factory.mktemp("view"))[1]
+
+
+@pytest.fixture(scope="module")
+def patient():
+    """Clients are dropped after less time, in the whole file."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(server, "PATIENCE_S", PATIENCE_S)
+        yield
+
+
+@pytest.fixture(scope="module")
+def attacked(faulty, patient):
+    with served(faulty, "<!DOCTYPE html>the page" + " " * 2**20) as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as browser:
+        yield browser
+
+
+def asked(one, method="GET", path="/", body=None, **headers):
+    """Status, headers and body of an answer; the key of the page is sent, unless another is."""
+    names = {"host": f"127.0.0.1:{one.port}", "cookie": f"{one.access.cookie}={one.access.key}"}
+    if method == "POST":
+        names |= {"origin": f"http://127.0.0.1:{one.port}", "content-type": "application/json"}
+    names |= {name.replace("_", "-"): value for name, value in headers.items()}
+    connection = http.client.HTTPConnection("127.0.0.1", one.port, timeout=10)
+    try:
+        connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
+        for name, value in names.items():
+            if value is not None:
+                connection.putheader(name, value)
+        if body is not None:
+            connection.putheader("content-length", str(len(body)))
+        connection.endheaders()
+        if body is not None:
+            connection.send(body)
+        answer = connection.getresponse()
+        return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
+    finally:
+        connection.close()
+
+
+QUESTION = b'{"without": [], "let_in": [], "loss": "none"}'
+
+
+# -- who may ask -------------------------------------------------------------------------------------------------------
+
+
+def test_X4_it_listens_on_the_loopback_address_alone(attacked):
+    assert asked(attacked)[0] == 200
+    with pytest.raises(ConnectionRefusedError):  # as from another machine: a socket on all addresses has this one, too
+        socket.create_connection(("127.0.0.2", attacked.port), timeout=5)
+    with socket.socket(socket.AF_INET6) as six, pytest.raises(OSError):
+        six.settimeout(5)
+        six.connect(("::1", attacked.port))
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"origin": "http://example.org"},
+        {"origin": "null"},
+        {"origin": None},
+        {"origin": "https://127.0.0.1:{port}"},
+        {"origin": "http://127.0.0.1:1"},
+        {"origin": "http://127.0.0.1:{port}.example.org"},
+        {"origin": "http://user@127.0.0.1:{port}"},
+        {"sec_fetch_site": "cross-site"},
+        {"sec_fetch_site": "same-site"},
+        {"content_type": "text/plain"},
+        {"content_type": None},
+        {"cookie": None},
+        {"cookie": "graph_slam_view_{port}="},
+        {"cookie": "graph_slam_view_{port}=x"},
+        {"cookie": "graph_slam_view_{port}=\xff"},
+        {"cookie": "graph_slam_view_1={key}"},
+    ],
+)
+def test_X5_a_page_that_is_not_its_own_gets_no_answer(attacked, headers):
+    def filled(text):
+        return text and text.format(port=attacked.port, key=attacked.access.key).encode("latin-1")
+
+    status, found, body = asked(attacked, "POST", "/solve", QUESTION, **{k: filled(v) for k, v in headers.items()})
+    assert status in (403, 415)
+    assert not [name for name in found if name.startswith("access-control")]
+    assert len(body) < 200 and b"chi2" not in body
+
+
+def test_X5_what_is_its_own_gets_one_that_no_other_page_may_read(attacked):
+    status, found, body = asked(attacked, "POST", "/solve", QUESTION)
+    assert status == 200 and "chi2" in json.loads(body)
+    assert not [name for name in found if name.startswith("access-control")]
+    assert found["cache-control"] == "no-store" and found["x-frame-options"] == "DENY"
+    assert found["cross-origin-resource-policy"] == "same-origin"
+    for method in ("OPTIONS", "PUT", "DELETE", "TRACE"):
+        assert asked(attacked, method, "/solve", origin="http://example.org")[0] in (403, 405)
+        assert asked(attacked, method, "/solve")[0] == 405
+    upgrade = {"connection": "Upgrade", "upgrade": "websocket", "sec_websocket_key": "x", "sec_websocket_version": "13"}
+    assert asked(attacked, "GET", "/", origin="http://example.org", **upgrade)[0] == 403
+
+
+def test_X5_the_token_opens_the_page_once(faulty, attacked):
+    one = SimpleNamespace(port=attacked.port, access=Access("127.0.0.1", attacked.port))
+    assert asked(one)[0] == 403, "the cookie of another start"
+    for token in ("", "x", one.access.token, "\xe4"):
+        path = f"/?token={token.encode('latin-1').hex() if token == chr(228) else token}"
+        assert asked(attacked, "GET", path, cookie=None)[0] == 403
+    assert asked(attacked, "POST", f"/?token={attacked.access.token}", b"", cookie=None)[0] == 403
+    token = attacked.access.token
+    status, found, body = asked(attacked, "GET", f"/?token={token}", cookie=None)
+    assert status == 200 and body.startswith(b"<!DOCTYPE html>")
+    assert re.fullmatch(rf"graph_slam_view_{one.port}=\S+; Path=/; HttpOnly; SameSite=Strict", found["set-cookie"])
+    status, found, body = asked(attacked, "GET", f"/?token={token}", cookie=None)
+    assert (status, "set-cookie" in found) == (403, False)
+    assert b"graph_slam view" in body
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        *("example.org", "example.org:{port}", "127.0.0.1", "127.0.0.1:1", "localhost", "127.0.0.1.nip.io:{port}"),
+        *("", "[::1", "127.0.0.1:{port}@example.org", "user@127.0.0.1:{port}", "127.0.0.1:{port}/x", "0.0.0.0:{port}"),
+        *("192.168.1.7:{port}", "127.0.0.1:99999", "127.0.0.1:{port}x", None),
+    ],
+)
+def test_X6_a_name_that_was_made_to_point_here_is_refused(attacked, host):
+    host = host and host.format(port=attacked.port)
+    for method, path in (("GET", "/"), ("GET", f"/?token={attacked.access.token}"), ("POST", "/solve")):
+        body = QUESTION if method == "POST" else None
+        assert asked(attacked, method, path, body, host=host)[0] in (400, 403)
+    assert asked(attacked, host=f"localhost:{attacked.port}")[0] == 200
+
+
+def test_no_path_leads_anywhere_else(attacked):
+    for path in ("/etc/passwd", "/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/save", "/x" * 4000):
+        assert asked(attacked, "GET", path)[0] in (404, 405)
+    for path in ("/", "/etc/passwd", "/save/../../x"):
+        assert asked(attacked, "POST", path, QUESTION)[0] in (404, 405)
+
+
+# -- how much ----------------------------------------------------------------------------------------------------------
+
+
+def raw(one, *parts):
+    """What is answered to some bytes, until the connection is closed."""
+    with socket.create_connection(("127.0.0.1", one.port), timeout=10) as client:
+        for part in parts:
+            client.sendall(part)
+        got = b""
+        with suppress(ConnectionResetError):  # it does not read what it has refused
+            while more := client.recv(65536):
+                got += more
+    return got
+
+
+def head(one, *lines):
+    keys = f"host: 127.0.0.1:{one.port}", f"cookie: {one.access.cookie}={one.access.key}"
+    origin = f"origin: http://127.0.0.1:{one.port}"
+    return "\r\n".join(
+        ["POST /solve HTTP/1.1", *keys, origin, "content-type: application/json", *lines, "", ""]
+    ).encode()
+
+
+def test_X7_large_bodies_and_heads_are_refused(attacked):
+    large = b"x" * (guard.MOST_BYTES + 1)
+    assert asked(attacked, "POST", "/solve", large)[0] == 413
+    assert b" 413 " in raw(attacked, head(attacked, "content-length: 999999999999"))
+    chunks = [b"10000\r\n" + 65536 * b"x" + b"\r\n" for _ in range(17)]
+    found = raw(attacked, head(attacked, "transfer-encoding: chunked", "connection: close"), *chunks, b"0\r\n\r\n")
+    assert found == b"" or b" 413 " in found
+    assert b" 400 " in raw(attacked, b"GET / HTTP/1.1\r\nx: " + 40_000 * b"x")
+    assert asked(attacked, "POST", "/solve", b"x" * guard.MOST_BYTES)[0] == 422
+    assert asked(attacked)[0] == 200
+
+
+def test_X7_whoever_is_slow_or_says_nothing_is_dropped(attacked):
+    started = time.monotonic()
+    assert raw(attacked) == b"", "says nothing"
+    assert raw(attacked, b"GET / HT") == b"", "half a head"
+    assert b" 200 " not in raw(attacked, head(attacked, "content-length: 100"), b"{")
+    with socket.socket() as client:  # asks for all of the page, again and again, and reads nothing of it
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        client.connect(("127.0.0.1", attacked.port))
+        client.sendall(20 * head(attacked).replace(b"POST /solve", b"GET /"))
+        deadline = time.monotonic() + 10.0
+        client.settimeout(0.2)
+        with pytest.raises(ConnectionError):
+            while time.monotonic() < deadline:
+                time.sleep(0.05)
+                client.send(b"\r\n")
+    assert time.monotonic() - started < 30.0
+    assert asked(attacked)[0] == 200
+
+
+def test_X7_clients_beyond_eight_are_refused_and_leave_room_when_they_are_dropped(attacked):
+    several = [socket.create_connection(("127.0.0.1", attacked.port), timeout=5) for _ in range(40)]
+    answers = []
+    for client in several[10:14]:
+        try:
+            client.sendall(b"GET / HTTP/1.1\r\nhost: x\r\n\r\n")
+            answers.append(client.recv(100))
+        except ConnectionError:
+            answers.append(b"")
+    assert all(one == b"" or b" 503 " in one for one in answers)
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        try:
+            if asked(attacked)[0] == 200:
+                break
+        except (ConnectionError, http.client.HTTPException):
+            time.sleep(0.05)
+    assert asked(attacked)[0] == 200
+    for client in several:
+        client.close()
+
+
+# -- the page ----------------------------------------------------------------------------------------------------------
+
+
+def estimate(page):
+    return np.array(page.evaluate("() => estimate().map((axis) => [...axis])")).T
+
+
+def solved(page):
+    page.wait_for_function("() => document.body.dataset.solved === String(edits.asked)")
+
+
+def test_an_edge_is_unchecked_solved_undone_and_saved(browser, faulty, tmp_path):
+    saved = SavedGraph(faulty, [])
+    edge = [e.edge for e in saved.entries if e.is_in and e.label == "landmarks"][7]
+    back = next(e.edge for e in saved.entries if not e.is_in and e.label == "closures")
+    with served(faulty) as one, pages(browser, offline=False) as go:
+        page = go(one.access.address, f"#edge={edge}")
+        assert "token" not in page.url
+        before = estimate(page)
+        page.click("#is-in")
+        solved(page)
+        what_if = saved.solve([edge]).estimate(saved.keyframes)
+        assert "Solved, other decisions as they are" in page.inner_text("#effect")
+        page.evaluate("edge => go('edge', edge)", back)
+        page.check("#is-in")
+        solved(page)
+        page.select_option("#loss", "cauchy")
+        solved(page)
+        both = saved.solve([edge], [back], Loss.named("cauchy", 3.0))
+        assert estimate(page)[:, :2] == pytest.approx(both.estimate(saved.keyframes)[:, :2], abs=1e-5)
+        page.select_option("#loss", "")
+        solved(page)
+        page.click("#undo")
+        solved(page)
+        assert np.abs(what_if[:, :2] - before[:, :2]).max() > 5e-4
+        page.click("#save")
+        assert "Why is empty" in page.inner_text("#saved")
+        page.fill("#who", "Anna")
+        page.fill("#why-text", "it looks wrong")
+        with page.expect_download() as download:
+            page.click("#download")
+        download.value.save_as(tmp_path / "edits.json")
+        page.click("#save")
+        page.wait_for_function("() => byId('saved').innerText.startsWith('Saved in')")
+        folder = faulty.with_name("run_edited")
+        assert str(folder) in page.inner_text("#saved")
+        plan = read_plan(tmp_path / "edits.json")
+        edited = edit(faulty, plan, tmp_path / "other")
+        assert (folder / "path.tum").read_bytes() == (tmp_path / "other" / "path.tum").read_bytes()
+        assert (folder / "ledger.csv").read_bytes() == (tmp_path / "other" / "ledger.csv").read_bytes()
+        assert [one.edit.who for one in edited.edits] == ["Anna"]
+        assert estimate(page) == pytest.approx(read_tum(folder / "path.tum").poses[:, :3], abs=1e-5)
+        page.reload()  # by its cookie, without the token; a second view is of its own
+        page.wait_for_selector("body[data-ready=yes]")
+        other = page.context.new_page()
+        other.goto(f"http://127.0.0.1:{one.port}/#edge={edge}")
+        other.wait_for_selector("body[data-ready=yes]")
+        other.click("#is-in")
+        solved(other)
+        assert page.inner_text("#pending") == ""
+        assert estimate(page) == pytest.approx(before, abs=2e-3)
+
+
+def test_forms_make_edits_of_landmarks_and_hostile_names_are_text(browser, tmp_path):
+    run = drive(tmp_path / "<b>&'run", HOSTILE)
+    with served(run) as one, pages(browser, offline=False) as go:
+        page = go(one.access.address, "#landmark=" + "%3Cscript%3Edocument.title%3D%27broken%27%3C%2Fscript%3E")
+        page.click("#actions button:has-text('rename landmark')")
+        page.fill("#fields input[name=to]", "<img src=x onerror=\"document.title='broken'\">")
+        page.click("#new-edit button")
+        solved(page)
+        assert "As it would be saved" in page.inner_text("#effect")
+        page.select_option("#kind", "merge_landmarks")
+        page.fill("#fields input[name=landmark]", HOSTILE[1])
+        page.fill("#fields input[name=into]", HOSTILE[2])
+        page.click("#new-edit button")
+        solved(page)
+        assert page.locator("#pending li").count() == 2
+        page.fill("#who", "<b>Anna</b>")
+        page.fill("#why-text", "<script>document.title='broken'</script>")
+        page.click("#save")
+        page.wait_for_function("() => byId('saved').innerText.startsWith('Saved in')")
+        assert page.title() == "<b>&'run: view"
+        assert page.locator("#edits b, #edits img, #edits script").count() == 0
+    edits = SavedGraph(run.with_name("<b>&'run_edited"), []).edits
+    assert [one.edit.do for one in edits] == ["rename_landmark", "merge_landmarks"]
+    assert [one.edit.arguments["landmark"] for one in edits] == HOSTILE[:2]
+    with served(run.with_name("<b>&'run_edited")) as one, pages(browser, offline=False) as go:
+        page = go(one.access.address)
+        assert "by <b>Anna</b>" in page.inner_text("#applied")
+        page.click("text=Add", timeout=5000)
+        assert page.locator("#pending li").count() == 0, "a field is empty"
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_prints_an_address_and_ends_with_ctrl_c(tmp_path):
+    run = drive(tmp_path / "run", ["a", "b"], dimensions=3)
+    command = [sys.executable, "-m", "graph_slam_ros.cli", "view", str(run), "--no-browser"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        address = process.stdout.readline().strip()
+        port = int(re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=\S{20,}", address)[1])
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        connection.request("GET", address[address.index("/?") :])
+        answer = connection.getresponse()
+        assert (answer.status, b"Edits" in answer.read()) == (200, True)
+        taken = subprocess.run([*command, "--port", str(port)], capture_output=True, text=True, timeout=60)
+        assert (taken.returncode, taken.stdout) == (2, "")
+        assert f"127.0.0.1:{port}" in taken.stderr and taken.stderr.count("\n") == 1
+        process.send_signal(signal.SIGINT)
+        out, error = process.communicate(timeout=10)  # with a client that is still there
+        assert (process.returncode, error) == (0, "")
+        assert out.endswith("ended\n")
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_what_cannot_be_shown_is_one_line_and_opens_no_socket(tmp_path, capsys, monkeypatch):
+    def no_socket(*words):
+        raise AssertionError("a socket")
+
+    monkeypatch.setattr(server, "listening", no_socket)
+    empty = tmp_path / "empty"
+    RunRecorder(empty, Config()).close()
+    damaged = drive(tmp_path / "damaged", ["a", "b"])
+    (damaged / "map.mcap").write_bytes(b"nonsense")
+    (damaged / "ingest.mcap").write_bytes(b"nonsense")
+    for words in ([empty], [damaged], [tmp_path / "none"], [damaged, "--topic", "/x"], [damaged, "--port", "70000"]):
+        try:
+            code = cli.main(["view", *map(str, words), "--no-browser"])
+        except SystemExit as error:
+            code = error.code
+        captured = capsys.readouterr()
+        assert (code, captured.out) == (2, ""), words
+        assert len(captured.err.splitlines()) == 1, captured.err
+
+
+def test_without_the_extra_one_line_names_it(tmp_path, capsys, monkeypatch):
+    import importlib.util
+
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *more: None if name == "uvicorn" else find(name, *more)
+    )
+    assert cli.main(["view", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.rstrip().endswith("pip install 'graph_slam_ros[view]'")
