@@ -47,7 +47,7 @@ def view(args: argparse.Namespace) -> int:
     address = access.address
     code = console.report_losses(made.losses, made.beware)
     if not access.is_local:
-        console.warn(f"beware: other machines can reach {args.host}: whoever has the address can edit the run")
+        console.warn(f"beware: other machines can reach {args.host}; a person with the address can edit the run")
 
     def ready() -> None:
         console.show(address)

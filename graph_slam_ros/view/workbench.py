@@ -55,7 +55,7 @@ class Workbench:
 
     @property
     def page_data(self) -> dict[str, Any]:
-        """What the page has to know: the source of plans, the kinds of edits, and the edits that the run has."""
+        """Return the source of plans, the kinds of edits, and the edits that the run has."""
         kinds = [
             {"do": do, "fields": [{"key": key, "kind": _kind(key, of)} for key, of in fields.items()]}
             for do, fields in ACTIONS.items()
