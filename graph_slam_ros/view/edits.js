@@ -69,6 +69,7 @@ async function solve() {
   const show = async (found, title) => {
     if (turn !== edits.asked) return;
     lines.push(element("p", `${title}: chi2 ${general(found.chi2[0], 6)} → ${general(found.chi2[1], 6)}; the last pose moves by ${found.final_m.toFixed(4)} m; keyframe ${found.most[0]} moves most, by ${found.most[1].toFixed(4)} m`));
+    for (const one of found.notes || []) lines.push(element("p", one));
     if (found.changes && found.changes.length) lines.push(changesText(found.changes));
     effect.replaceChildren(...lines);
     await moveTo(asMoved(found));
@@ -116,6 +117,7 @@ async function save() {
     place.replaceChildren(
       element("p", `Saved in ${found.folder}: chi2 ${general(found.chi2[0], 6)} → ${general(found.chi2[1], 6)}, the last pose moved by ${found.final_m.toFixed(4)} m. The run on this page is as it was.`),
       element("p", `The same by command, with the plan: ${found.command}`), element("p", `Next: ${found.next}`),
+      ...found.notes.map((one) => element("p", one)),
       ...found.losses.map((one) => element("p", `lost: ${one}`, {class: "fault"})),
     );
   } catch (error) {
@@ -133,14 +135,20 @@ function download() {
 // -- forms -----------------------------------------------------------------------------------------------------------
 
 const kindOf = (what) => known.kinds.find((one) => one.do === what);
-const NUMBERS = new Set(["edge", "int", "float"]);
+const numbers = (text) => text.split(/[\s,;[\]]+/).filter(Boolean).map(Number);
+const READ = {  // by the kind of a field; the server judges what comes
+  edge: Number, edges: numbers, pose: numbers, landmark: (text) => text, name: (text) => text,
+  keyframe: (text) => (/^\d+$/.test(text) ? Number(text) : text),
+};
 
 function drawFields() {
-  const place = byId("fields");
-  place.replaceChildren(...kindOf(byId("kind").value).fields.map(({key, kind}) => {
-    const label = element("label", `${key.replace(/_/g, " ")} `), input = element("input", undefined, {name: key, type: "text", required: ""});
+  const {fields, help} = kindOf(byId("kind").value), filled = edits.chosen ? [edits.chosen] : [];
+  byId("kind-help").textContent = help;
+  byId("fields").replaceChildren(...fields.map(({key, kind, text, is_needed}) => {
+    const label = element("label", `${key.replace(/_/g, " ")} `), input = element("input", undefined, {name: key, type: "text", title: text, ...(is_needed ? {required: ""} : {placeholder: "or"})});
     input.dataset.kind = kind;
-    if (edits.chosen && edits.chosen[0] === kind && key === kind) input.value = edits.chosen[1];
+    const at = filled.findIndex(([of]) => of === kind || (of === "edge" && kind === "edges"));
+    if (at >= 0) input.value = filled.splice(at, 1)[0][1];
     label.append(input, " ");
     return label;
   }));
@@ -150,7 +158,7 @@ function fromFields() {
   const out = {do: byId("kind").value};
   for (const input of byId("fields").querySelectorAll("input")) {
     const text = input.value.trim();
-    out[input.name] = NUMBERS.has(input.dataset.kind) && /^-?[\d.]+(e-?\d+)?$/i.test(text) ? Number(text) : text;
+    if (text) out[input.name] = (READ[input.dataset.kind] || Number)(text);
   }
   return out;
 }
@@ -171,13 +179,13 @@ function drawActions() {
     buttons.push(label);
   }
   for (const {do: what, fields} of known.kinds) {
-    if (kind === "edge" || !fields.some((one) => one.kind === kind)) continue;
+    if (!fields.some((one) => one.kind === kind || (kind === "edge" && one.kind === "edges")) || what.endsWith("_edge")) continue;
     const button = element("button", what.replace(/_/g, " "), {type: "button"});
     button.addEventListener("click", () => {
       byId("kind").value = what;
       drawFields();
       const rest = [...byId("fields").querySelectorAll("input")].filter((one) => !one.value);
-      if (rest.length) { rest[0].focus(); rest[0].scrollIntoView({block: "center"}); } else add(fromFields());
+      if (rest.length || fields.some((one) => !one.is_needed)) { (rest[0] || byId("kind")).focus(); byId("new-edit").scrollIntoView({block: "center"}); } else add(fromFields());
     });
     buttons.push(button);
   }

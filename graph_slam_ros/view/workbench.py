@@ -5,7 +5,7 @@ import json
 import os
 import shlex
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Set
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, Singu
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.graph.losses import NAMES
 from graph_slam_ros.maps.edit import FORMAT, VERSION, Edited, Rehearsal, edit, plan_of, source_hash
-from graph_slam_ros.measurements.edits import ACTIONS
+from graph_slam_ros.measurements.edit_actions import ACTIONS
 from graph_slam_ros.report.contents import Contents
 from graph_slam_ros.report.packing import shown
 from graph_slam_ros.slam.map_view import MapView
@@ -57,8 +57,15 @@ class Workbench:
     def page_data(self) -> dict[str, Any]:
         """Return the source of plans, the kinds of edits, and the edits that the run has."""
         kinds = [
-            {"do": do, "fields": [{"key": key, "kind": _kind(key, of)} for key, of in fields.items()]}
-            for do, fields in ACTIONS.items()
+            {
+                "do": do,
+                "help": action.help.replace("`", ""),
+                "fields": [
+                    {"key": key, "kind": field.kind, "text": field.text, "is_needed": key in action.fields}
+                    for key, field in action.known.items()
+                ],
+            }
+            for do, action in ACTIONS.items()
         ]
         edits = [
             [shown(part) for part in (e.name, e.text, e.who, e.when, e.why)]
@@ -93,7 +100,7 @@ class Workbench:
             solver = run.solve(asked["without"], asked["let_in"], _loss(asked["loss"]))
             moved = run.moved(solver)
             return {
-                "places": self._places(solver, run.keyframes, dict(zip(run.stamps_ns, run.keyframes, strict=True))),
+                "places": self._places(solver, set(run.keyframes)),
                 "landmarks": _landmarks(run.slam, solver),
                 "chi2": [moved.before.chi2_final, moved.after.chi2_final],
                 "cost": [moved.before.cost_final, moved.after.cost_final],
@@ -109,9 +116,8 @@ class Workbench:
             if self._rehearsal is None:
                 self._rehearsal = Rehearsal(self._saved.slam)
             slam, edited = self._rehearsal.attempt(plan.edits)
-            vertices = {one.stamp_ns: one.vertex for one in slam.keyframes}
             return {
-                "places": self._places(slam.solver, self._saved.keyframes, vertices),
+                "places": self._places(slam.solver, set(slam.keyframes.ids.tolist())),
                 "landmarks": _landmarks(slam, slam.solver),
                 "changes": self._changes(slam, edited),
                 **_effect(edited),
@@ -143,19 +149,18 @@ class Workbench:
         if source != self._source:
             raise GraphSlamError("the plan is for another run than the one on this page")
 
-    def _places(self, solver: Solver, keyframes: Sequence[int], vertices: Mapping[int, int]) -> list[list[Any]]:
+    def _places(self, solver: Solver, there: Set[int]) -> list[list[Any]]:
         """Positions of the keyframes of the run, by axis; null for one that is not there any more.
 
         Parameters
         ----------
-        vertices : of each keyframe, by its stamp
+        there : vertices that are keyframes in the solution
         """
         run, n = self._saved, self._saved.space.dimensions
-        found = [vertices.get(stamp) for stamp in run.stamps_ns]
-        at = [k for k, vertex in enumerate(found) if vertex is not None]
-        places = np.full((len(keyframes), 3), np.nan)
+        at = [k for k, vertex in enumerate(run.keyframes) if vertex in there]
+        places = np.full((len(run.keyframes), 3), np.nan)
         places[at, 2] = 0.0
-        places[at, :n] = solver.estimate([vertex for vertex in found if vertex is not None])[:, :n]
+        places[at, :n] = solver.estimate([run.keyframes[k] for k in at])[:, :n]
         return _columns(places)
 
     def _changes(self, slam: MapView, edited: Edited) -> list[list[Any]]:
@@ -169,10 +174,6 @@ class Workbench:
         return out[:_MOST_CHANGES]
 
 
-def _kind(key: str, of: Any) -> str:
-    return "edge" if key == "edge" else "landmark" if key in ("landmark", "into") else str(of.__name__)
-
-
 def _named(verdict: Verdict) -> str:
     return verdict.name.lower().replace("_", " ")
 
@@ -183,6 +184,7 @@ def _effect(edited: Edited) -> dict[str, Any]:
         "chi2": list(edited.chi2),
         "final_m": edited.final_m,
         "most": list(edited.moved),
+        "notes": [shown(one) for one in (*(fit.text for fit in edited.by_hand), *edited.warnings)],
     }
 
 

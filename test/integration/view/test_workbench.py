@@ -12,7 +12,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Loss
 from graph_slam_ros.maps.edit import source_hash
-from graph_slam_ros.measurements.edits import ACTIONS
+from graph_slam_ros.measurements.edit_actions import ACTIONS
 from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs.trajectory import read_landmarks, read_tum
 from graph_slam_ros.view.workbench import Workbench
@@ -94,6 +94,32 @@ def test_what_is_tried_is_what_is_saved_and_what_edit_writes(faulty):
     assert {file.name: file.read_bytes() for file in faulty.run.iterdir()} == before
 
 
+def test_edits_of_the_path_are_tried_as_they_are_saved(faulty):
+    seen = [e.edge for e in faulty.saved.entries if e.landmark == faulty.saved.entries[faulty.inside[0]].landmark]
+    edits = [
+        {
+            "do": "add_closure",
+            "from_keyframe": 5,
+            "to_keyframe": 30,
+            "pose": [1.0, 0.5, 0.1],
+            "sigma_m": 1.0,
+            "sigma_rad": 1.0,
+        },
+        {"do": "split_landmark", "landmark": faulty.saved.entries[seen[0]].landmark, "to": "twin", "edges": seen[:2]},
+        {"do": "move_map", "pose": [3.0, 4.0, 0.5], "sigma_m": 0, "sigma_rad": 0},
+        {"do": "cut", "from": 40, "until": 44},
+    ]
+    attempted = faulty.work.attempt(plan(faulty, *edits))
+    folder = faulty.run.with_name(faulty.work.save(plan(faulty, *edits))["folder"].rpartition("/")[2])
+    path, found = read_tum(folder / "path.tum").poses[:, :3], places(attempted)
+    is_there = np.isfinite(found).all(axis=1)
+    assert 0 < (~is_there).sum() < 8 and not is_there[41:44].any()
+    assert found[is_there] == pytest.approx(path, abs=1e-5)
+    assert found[0] == pytest.approx([3.0, 4.0, 0.0], abs=0.01)
+    assert any("against all else" in one for one in attempted["notes"])
+    assert "twin" in attempted["landmarks"]
+
+
 def test_decisions_that_change_with_an_edit_are_named(faulty):
     """A closure that contradicts the others is let in: some of them go out."""
     found = faulty.work.attempt(plan(faulty, {"do": "let_in_edge", "edge": faulty.outside[0]}))
@@ -107,7 +133,7 @@ def test_decisions_that_change_with_an_edit_are_named(faulty):
 
 def test_the_page_has_all_kinds_of_edits(faulty):
     kinds = {one["do"]: [field["key"] for field in one["fields"]] for one in faulty.work.page_data["kinds"]}
-    assert kinds == {do: list(fields) for do, fields in ACTIONS.items()}
+    assert kinds == {do: list(action.known) for do, action in ACTIONS.items()}
 
 
 @pytest.mark.parametrize(

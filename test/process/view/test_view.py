@@ -368,7 +368,7 @@ def test_forms_make_edits_of_landmarks_and_hostile_names_are_text(browser, tmp_p
     with served(run.with_name("<b>&'run_edited")) as one, pages(browser, offline=False) as go:
         page = go(one.access.address)
         assert "by <b>Anna</b>" in page.inner_text("#applied")
-        page.click("text=Add", timeout=5000)
+        page.click("#new-edit button")
         assert page.locator("#pending li").count() == 0, "a field is empty"
 
 
