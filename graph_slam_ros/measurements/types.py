@@ -72,6 +72,7 @@ class Sighting:
     covariance : of ``measured``; of a position in the axes of the base frame, of a pose in its tangent space
     T_base_sensor : pose of the sensor, for kinds that are measured in the sensor frame; None: at the base. Of a
         position or pose it is the place about which ``mount_correction`` turns
+    sort : what it is a landmark of (a tree, a red cone), where the sensor knows it; those of other sorts are others
 
     Raises
     ------
@@ -84,6 +85,7 @@ class Sighting:
     measured: Numbers
     covariance: Numbers
     T_base_sensor: Numbers | None = None
+    sort: str = ""
 
     def __post_init__(self) -> None:
         _check_choice(Sighting, self.kind, SIGHTING_KINDS)

@@ -21,10 +21,11 @@ def detections(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     by_class = source.config.landmarks.id_from == "class_id"
     for one in m.detections:
         first = one.results[0] if len(one.results) else None
-        name = (first.hypothesis.class_id if first else "") if by_class else one.id
+        sort = first.hypothesis.class_id if first else ""
+        name = sort if by_class else one.id
         at, covariance = (first.pose.pose, first.pose.covariance) if first else (one.bbox.center, _NOTHING)
         frame = one.header.frame_id or m.header.frame_id
-        yield ObservedLandmark(m.header.stamp, frame, name, at.position, at.orientation, covariance)
+        yield ObservedLandmark(m.header.stamp, frame, name, at.position, at.orientation, covariance, sort=sort)
 
 
 def pose_stamped(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:

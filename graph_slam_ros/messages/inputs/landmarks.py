@@ -5,7 +5,7 @@ A converter of a type only reads: it yields one ``ObservedLandmark`` for each la
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,7 @@ class ObservedLandmark:
     polar : (kind, measured) in the sensor's frame, kinds as of ``Sighting``
     sigmas : standard deviations of ``polar``, one for each number of it; None or zero where unknown
     T_frame_sensor : where the sensor is in the frame
+    sort : its class, used where ``id`` is empty: sightings of two classes are never of one landmark
 
     Raises
     ------
@@ -55,6 +56,7 @@ class ObservedLandmark:
     polar: tuple[str, Numbers] | None = None
     sigmas: Sequence[float] | None = None
     T_frame_sensor: se3.Pose = se3.IDENTITY
+    sort: str = ""
 
     def __post_init__(self) -> None:
         if self.polar is not None and len(self.polar[1]) not in _POLAR.get(self.polar[0], ()):
@@ -76,7 +78,7 @@ def sightings(source: InputContext, found: Iterable[ObservedLandmark]) -> Iterat
         seen = []
         for one in same:
             try:
-                seen.append(_sighting(source, stamp_ns, one))
+                seen.append(replace(_sighting(source, stamp_ns, one), sort="" if one.id else one.sort))
             except MessageError as reason:
                 source.count(str(reason))
         usable = _agreed(source, seen)
@@ -248,4 +250,4 @@ def _merge(source: InputContext, a: Sighting, b: Sighting) -> Sighting | None:
     at = group.retract(a.measured, tuple(step)) if a.kind == "pose" else np.add(a.measured, step).tolist()
     merged = cov_a - gain @ cov_a
     covariance = tuple((0.5 * (merged + merged.T)).ravel().tolist())
-    return Sighting(a.id, a.kind, tuple(map(float, at)), covariance, a.T_base_sensor)
+    return replace(a, measured=tuple(map(float, at)), covariance=covariance)

@@ -108,7 +108,7 @@ class AnonymousLandmarks:
         out = self.end_scan() if self._builder.is_full(at) else []
         for s in m.sightings:
             point, covariance = self._point(s)
-            self._builder.add(at, point, covariance, Seen(m.topic, self._widened(s, where), where))
+            self._builder.add(at, point, covariance, Seen(m.topic, self._widened(s, where), where), s.sort)
         return out
 
     def identified(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate, Ids, compressed
-from graph_slam_ros.slam.landmarks.moves import TRIAL, merged, reassigned, sorts_of, without_few
+from graph_slam_ros.slam.landmarks.moves import TRIAL, are_others, merged, reassigned, sorts_of, without_few
 from graph_slam_ros.slam.landmarks.rotations import yaw
 from graph_slam_ros.typing import Array
 
@@ -137,7 +137,7 @@ def _candidates(drive: Drive, e: Estimate, inside: Ids, strong: Ids, middle: int
     likely = np.argsort(rough, kind="stable")[:_MOST_SCORED]
     priors = _priors(turns[likely], moves[likely], centre)
     whiten = drive.whiten[inside] @ e.turn[drive.scan[inside]].transpose(0, 2, 1)
-    is_other = drive.sort[inside][:, None] != sorts_of(drive, e)[strong]
+    is_other = are_others(drive.sort[inside][:, None], sorts_of(drive, e)[strong])
     scored = []
     for turn, move, prior in zip(turns[likely], moves[likely], priors.tolist(), strict=True):
         away = (there[None] - (at @ turn.T + move)[:, None]) @ turn  # in the axes before the turn

@@ -1,11 +1,12 @@
 """Moves that correct an association: merge two landmarks, reassign clusters. A move is kept if it costs less."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from graph_slam_ros.slam.landmarks.explanation import UNUSED, Drive, Estimate, Ids, compressed
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Mask
 
 LEAST_SCANS = 3  # of a landmark
 _MERGE_M = 3.0
@@ -58,7 +59,8 @@ def _pairs(landmarks: Array) -> list[tuple[tuple[tuple[float, ...], tuple[float,
 
 def _merged_pair(drive: Drive, e: Estimate, i: int, j: int) -> Estimate | None:
     is_i, is_j = e.which == i, e.which == j
-    if (drive.sort[is_i][0], drive.sort[is_j][0]) != (drive.sort[is_j][0], drive.sort[is_i][0]):
+    sorts = sorts_of(drive, e)
+    if are_others(sorts[i], sorts[j]):
         return None
     both = len(np.intersect1d(drive.scan[is_i], drive.scan[is_j]))
     counts = np.count_nonzero(is_i), np.count_nonzero(is_j)
@@ -74,7 +76,7 @@ def _merged_pair(drive: Drive, e: Estimate, i: int, j: int) -> Estimate | None:
 def reassigned(drive: Drive, e: Estimate) -> tuple[Estimate, bool]:
     """Assign each cluster to the landmark that fits best, one to one in a scan, if the total cost falls."""
     chi2 = drive.chi2_with(e)
-    chi2[drive.sort[:, None] != sorts_of(drive, e)] = np.inf
+    chi2[are_others(drive.sort[:, None], sorts_of(drive, e))] = np.inf
     rows = np.arange(len(chi2))
     which, best = e.which.copy(), chi2.argmin(axis=1)
     mine = np.where(which >= 0, chi2[rows, which], drive.costs.unused)
@@ -91,11 +93,16 @@ def reassigned(drive: Drive, e: Estimate) -> tuple[Estimate, bool]:
 
 
 def sorts_of(drive: Drive, e: Estimate) -> Array:
-    """The sort of each landmark (J,)."""
+    """The sort of each landmark (J,), empty where no cluster has one."""
     out = np.full(len(e.landmarks), "", dtype=drive.sort.dtype)
-    used = e.which >= 0
+    used = (e.which >= 0) & (drive.sort != "")
     out[e.which[used]] = drive.sort[used]
     return out
+
+
+def are_others(a: Any, b: Any) -> Mask:
+    """Return whether two sorts differ, elementwise; one that is not known differs from none."""
+    return np.asarray((a != b) & (a != "") & (b != ""))
 
 
 def without_few(which: Ids) -> Ids:

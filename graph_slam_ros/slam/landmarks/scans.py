@@ -171,7 +171,10 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """Sightings of one landmark: its position relative to the scan, with covariance (n, n)."""
+    """Sightings of one landmark: its position relative to the scan, with covariance (n, n).
+
+    ``sort`` is the class of the landmark, empty where none of them has one.
+    """
 
     point: Array
     covariance: Array
@@ -242,7 +245,8 @@ class ScanBuilder:
             point = np.mean([carried[k][0] for k in members], axis=0)
             covariance = np.mean([carried[k][1] for k in members], axis=0) + self._extent
             seen = tuple(glimpses[k].seen.shared_by(len(members)) for k in members)
-            clusters.append(Cluster(point, covariance, seen, glimpses[members[0]].sort))
+            sort = next((glimpses[k].sort for k in members if glimpses[k].sort), "")
+            clusters.append(Cluster(point, covariance, seen, sort))
         return Scan(middle.at, middle.seen.where, tuple(clusters))
 
     def _carried(self, one: _Glimpse, at: Reckoned) -> tuple[Array, Array]:
@@ -263,7 +267,8 @@ def _clustered(
             first = group[0]
             away = point - np.mean([points[i] for i in group], axis=0)
             is_far = float(np.linalg.norm(away)) > close_m
-            if glimpses[first].sort != glimpses[k].sort or (is_far and _same_message(glimpses, group, k)):
+            is_other = bool(glimpses[k].sort) and any(glimpses[i].sort not in ("", glimpses[k].sort) for i in group)
+            if is_other or (is_far and _same_message(glimpses, group, k)):
                 continue
             chi2 = float(away @ np.linalg.solve(covariances[k] + covariances[first], away))
             if chi2 < least:

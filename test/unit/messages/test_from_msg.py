@@ -106,6 +106,12 @@ def test_class_id_is_the_identity_where_that_is_configured():
     assert counted(b) == {"detections": {"covariance_unknown": 1}}  # of z, which has no result
 
 
+def test_the_class_of_a_detection_without_identity_is_the_sort_of_its_landmark():
+    found = (detection(name="", class_id="tree"), detection(name="x", class_id="tree"), detection(name="", results=0))
+    seen = heard(border(), "detections", detections(*found)).sightings
+    assert [(s.id, s.sort) for s in seen] == [("", "tree"), ("x", ""), ("", "")]
+
+
 def camera():
     """0.3 m ahead of and 0.1 m left of the base, 1 m up; z forward, x right, y down."""
     half = 0.5
