@@ -220,6 +220,7 @@ REPAIRS = {
     "covariance_symmetrized",
     "covariance_floored",
     "covariance_clamped",
+    "covariance_of_some_axes_unknown",
 }
 FUZZ = settings(max_examples=400, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 SEEDS = SimpleNamespace(
