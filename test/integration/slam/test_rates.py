@@ -46,8 +46,8 @@ def parked(seconds, jitter_rad, jitter_m, rng, hz=20):
 def test_a_parked_robot_whose_odometry_jitters_gets_no_keyframes(jitter_rad, jitter_m):
     p = run(slam(), *parked(120, jitter_rad, jitter_m, np.random.default_rng(1)))
     assert len(p.keyframes) <= 2
-    looks = len(p.sighting_poses)
-    assert 115 <= looks <= 180, "one a second, once it rests"
+    seen = len(p.sighting_poses)
+    assert 115 <= seen <= 180, "one a second, once it rests"
     assert p.counters["camera", "thinned"] > 2 * 1000
 
 
@@ -133,7 +133,7 @@ def past_tags(p, speed):
 
 
 @pytest.mark.parametrize("speed, heading, most", [(0.4, 0.02, 7.0), (0.4, 0.05, 15.5), (1.5, 0.05, 4.5)])
-def test_a_camera_that_sees_tags_at_12_hz_makes_no_keyframe_at_each_look(speed, heading, most):
+def test_a_camera_that_sees_tags_at_12_hz_makes_no_keyframe_at_each_sighting(speed, heading, most):
     p = past_tags(slam(**{"odometry.rotation_density": heading}), speed)
     assert len(p.keyframes) / (speed * 12.0) < most
     assert np.abs(p.trajectory()[:, 1]).max() < 0.05

@@ -163,7 +163,7 @@ def test_a_cluster_far_out_of_the_gate_is_never_that_landmark():
     assert far == [0, 1]
 
 
-def test_clusters_of_one_look_are_of_different_landmarks():
+def test_clusters_of_one_scan_are_of_different_landmarks():
     scans = [scan(0.0, (0, 0, 0, 0), [(4.0, 0.0)]), scan(0.5, (0, 0, 0, 0), [(4.0, 0.1), (4.0, -0.1)])]
     which = explained(scans)[1]
     assert len(set(which[1:])) == 2
