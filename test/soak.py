@@ -29,6 +29,7 @@ def guided(name):
 
 
 DRIVES = (
+    *("gyro_drives", "several_odometries"),
     *("advise", "calibration_consistency", "consistency", "displacement", "extreme_fixes", "initialization"),
     *("nees", "simulation", "unnamed"),
 )

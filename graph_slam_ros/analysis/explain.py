@@ -37,12 +37,14 @@ _WHY = {
     Reason.REVOKED: "revoked",
     Reason.FAILED: "plugin failed",
     Reason.BY_HAND: "by hand",
+    Reason.CONTRADICTED: "contradicted",
 }
 _KIND = {
     "closures": "a loop closure",
     "landmarks": "a sighting",
     "fixes": "a fix",
     "odometry": "odometry",
+    "parallel": "another odometry",
     "custom": "an edge of a plugin",
     "by_hand": "an edge that was let in or added",
 }

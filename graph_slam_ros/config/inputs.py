@@ -56,6 +56,13 @@ class InputConfig:
     sigma_rad: float = setting(
         0.0, "noise of an orientation or bearing of the input; 0: unknown", "rad", low=0.0, high=math.pi
     )
+    sigma_factor: float = setting(
+        1.0,
+        "of an odometry: factor of the standard deviations of its motion between keyframes",
+        "times",
+        low=1e-3,
+        high=1e3,
+    )
     correlation_s: float = setting(
         1.0,
         "correlation time of the errors of fixes: one fix is used each twice this long, or each "

@@ -235,8 +235,8 @@ def _faults(facts: Facts, config: Config) -> Iterator[str]:
         yield "where the robot is in the loaded map is not known yet"
     if estimate and estimate.displaced:
         yield estimate.displaced
-    if estimate and estimate.gyro:
-        yield estimate.gyro
+    if estimate and estimate.motion:
+        yield estimate.motion
     if estimate and estimate.rivals:
         yield f"ambiguous: {estimate.rivals} loop closures that are not believed agree with one another as well"
     if estimate and health.chi2_per_dof and estimate.fit > health.chi2_per_dof:

@@ -55,7 +55,7 @@ class Estimate:
     fit : chi2 per degree of freedom; NaN before it was looked at
     rivals : loop closures of other explanations that could not be ruled out
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
-    gyro : why the gyro has no part in odometry; empty where it has, or there is none
+    motion : why the gyro, or an odometry, has no part in the motion; empty where all have
     calibration : settings that calibration has corrected, and a sentence for each parameter that it has fitted
     is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
     """
@@ -78,7 +78,7 @@ class Estimate:
     unseen: UnseenWay
     rivals: int
     displaced: str = ""
-    gyro: str = ""
+    motion: str = ""
     is_resumed: bool = False
     calibration: Mapping[str, str] = field(default_factory=dict)
 
@@ -132,7 +132,7 @@ class Estimate:
             unseen=unseen,
             rivals=sum(len(rival.only_here) for rival in slam.backend.rivals),
             displaced=str(slam.displaced or ""),
-            gyro=slam.gyro.fault if slam.gyro else "",
+            motion="; ".join(filter(None, (slam.gyro.fault if slam.gyro else "", slam.backend.odometries.doubted))),
             is_resumed=is_resumed,
             calibration=_calibration(slam.calibration_report),
         )

@@ -20,7 +20,10 @@ _JUMPY, _MOST_JUMPS = 0.02, 5  # of all messages of an odometry; with more its m
 _MOSTLY = 0.5
 _MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by one
 _DOUBTED = 0.05  # of an input: as many that are not believed are said
-_MENDED = ("displaced", "displacement_taken_back", "jump")  # of what is noted, signs of a wrong setting
+_MENDED = (  # of what is noted, signs of a wrong setting
+    *("displaced", "displacement_taken_back", "jump"),
+    *("turn_slips", "gyro_silent", "gyro_doubted", "odometry_contradicted", "odometry_alike"),
+)
 _CONTRADICT = (
     "graph_slam explain RUN says why. Check of this sensor and of odometry: metres and radians, y and bearings to the "
     "left, where the sensor is (TF or {0}.mount), its clock ({0}.offset_s), ids that are used twice. If only its noise "

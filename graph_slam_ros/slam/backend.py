@@ -21,6 +21,7 @@ from graph_slam_ros.slam.robust.displacement import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
 from graph_slam_ros.slam.robust.hypotheses import Alternative, FrozenGraph, Outcome, search_alternatives
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason
+from graph_slam_ros.slam.robust.odometry_judge import OdometryJudge
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.solver import Report, Settings, Solver
 from graph_slam_ros.typing import Array, Executor, Numbers
@@ -41,6 +42,7 @@ class Backend:
     Attributes
     ----------
     graph, solver, decisions
+    odometries : judges odometries that contradict each other
     noise : adds edges to the graph, with noise in scale
     handed_over : vertices and edges of the graph that the solver has
     frozen, frozen_edges : the first so many vertices, and verdicts on the first so many edges, stay for good
@@ -70,6 +72,7 @@ class Backend:
         self.frozen_edges = start.ledger.final
         self.held = (0, 0)
         self.edits = list(start.edits)
+        self.odometries = OdometryJudge(config.odometry_gate, self.graph, self.solver, self.ledger, self._counters)
         self._background = Background(config, executor)
         self.rivals: tuple[Alternative, ...] = ()
         self.spares_memory = self.holds_back = False
@@ -121,6 +124,7 @@ class Backend:
         for vertex in inside[inside < vertices].tolist():
             self.solver.hold(vertex)
         self.ledger.finish(edges)
+        self.odometries.finish()
 
     def release_map(self) -> None:
         """Undo ``hold_map``. A frozen map stays fixed."""
@@ -142,6 +146,8 @@ class Backend:
         self.hand_over()
         new = self.decisions.gate_new(self.handed_over[1], keyframe, trusts_sightings=self.trusts_sightings)
         self._pending = [*self._pending, *new][-_MAX_PENDING:]
+        if self._config.decide:
+            self.odometries.examine(self.handed_over[1], keyframe)
 
     def update(self, keyframe: int) -> None:
         """Solve with the new accepted edges, then judge the held-back ones."""
@@ -157,6 +163,8 @@ class Backend:
             self.solver.optimize()
         self.solver.update()
         self._admit(keyframe)
+        if self.odometries.decide(keyframe):
+            self.solver.update()
         out = self.ledger.outside_count
         if self._config.decide and not self.spares_memory and self._background.is_due(out):
             self._background.start(self._frozen(keyframe, self.solver.settings), out)
@@ -168,6 +176,8 @@ class Backend:
         if not self._config.decide or self.holds_back:
             return report
         self._admit(keyframe)
+        if self.odometries.decide(keyframe, everything=True):
+            report = self.solver.optimize(settings)
         outcome = self._guarded(lambda: search_alternatives(self._config, self._frozen(keyframe, settings)))
         if outcome is not None:
             self.rivals = self._standing(outcome.rivals)
@@ -284,6 +294,7 @@ class Backend:
         edge = self.graph.add_edge(old.type, old.vertices, motion, noise, "odometry", old.source)
         self.hand_over()
         self.decisions.gate_new(self.handed_over[1], keyframe)
+        self.odometries.displace(old.vertices, keyframe)
         self.decisions.supersede(link, keyframe, found.evidence)
         self.decisions.exchange(found.fitting, (*found.contradicting, *initial_poses), keyframe)
         self.solver.start_at(values)
@@ -299,6 +310,7 @@ class Backend:
         """
         self.decisions.withdraw([replacement], keyframe, Reason.REVOKED)
         self.decisions.reinstate(link, keyframe, found.evidence)
+        self.odometries.return_to(self.graph.edge(link).vertices, keyframe)
         self.solver.start_at(values)
         self.decisions.reclassify(keyframe)
         self.decisions.exchange(found.fitting, found.contradicting, keyframe)

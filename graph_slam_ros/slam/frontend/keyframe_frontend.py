@@ -30,6 +30,7 @@ from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.odometry_integration import IntegratedOdometry, OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector, Step
+from graph_slam_ros.slam.frontend.parallel_odometry import ParallelOdometry
 from graph_slam_ros.slam.frontend.pose_edges import PoseEdges
 from graph_slam_ros.slam.frontend.stamp_order import PendingObservations, StampOrder
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
@@ -79,6 +80,7 @@ class KeyframeFrontend:
         self.config, self._space, self._pose_of = config, config.space, pose_of
         self._edges, self._graph, self._counters = edges, edges.graph, counters
         self._noise = OdometryNoise(config.odometry, self._space)
+        self._parallel = ParallelOdometry(config, self._noise) if config.odometry.fusion == "parallel" else None
         self.odometry = OdometrySelector(config.odometry, config.inputs.names.split(), self._space, counters)
         self.path = KeyframeList(self._noise, self._space)
         self.sighting_poses = StampedPoses(SightingPose, self._space.pose.size)
@@ -96,6 +98,7 @@ class KeyframeFrontend:
         self.edges = PoseEdges(self._space, edges, counters)
         self.covariance = np.zeros((self._space.dof, self._space.dof))
         self.gyro = GyroFusion(config, self._noise, counters) if config.gyro_input else None
+        self._sigma_factors = {one.name: one.sigma_factor for one in config.sources}
         self._T_odom_base = self._space.identity  # of the last step of odometry, as its messages have it
         self.initial_pose: InitialPose | None = None
         self.held_covariance: Array | None = None
@@ -145,17 +148,26 @@ class KeyframeFrontend:
         self._thinning.forget_time()
         if self.gyro:
             self.gyro.forget()
+        if self._parallel:
+            self._parallel.forget()
 
     def accepts(self, m: Measured) -> TypeGuard[Odometry | Observation]:
         """Return whether a measurement may be used when its turn comes; else it is counted, or of the gyro."""
         if isinstance(m, AngularVelocity):
             self._add_to_gyro(m)
             return False
+        if self._parallel and isinstance(m, Odometry):
+            self._parallel.add(m, self.path.keyframes)
+            if m.source != self.source and self.order.is_late(m):  # another than that in use may come late
+                self._counters.used[m.source] += 1
+                self.odometry.sources.add(m.source)
+                return False
         return self.order.accepts(m) and (isinstance(m, Odometry) or self._arrivals.admit(m) is not None)
 
     def steps(self, m: Odometry) -> Iterator[Step]:
         """Yield the steps that a message of odometry leads to, corrected."""
         before_ns = self.odometry.newest_ns
+        self._add_parallel()
         for step in self.odometry.steps(m):
             seconds = 0.0 if before_ns is None else (step.stamp_ns - before_ns) * 1e-9
             before_ns, self._T_odom_base = step.stamp_ns, step.T_odom_base
@@ -164,6 +176,14 @@ class KeyframeFrontend:
                 continue
             fused = self.gyro.fuse(self.corrections.without_bias(step), seconds, m.source)
             yield self.corrections.with_bias(fused, seconds)
+
+    def _add_parallel(self) -> None:
+        """Add the motions of other odometries between keyframes, as far as they have come."""
+        if self._parallel is None:
+            return
+        for one in self._parallel.motions(self.path, self.source):
+            noise = edge_noise(self._counters, one.source, one.covariance, self._space.dimensions)
+            self._edges.add_edge(self._space.relative_pose, one.vertices, one.motion, noise, "parallel", one.source)
 
     def _add_to_gyro(self, m: AngularVelocity) -> None:
         if self.gyro is None or m.topic != self.gyro.name:
@@ -221,6 +241,8 @@ class KeyframeFrontend:
         """Add a keyframe at a step that was integrated."""
         now = self._motion.now
         covariance, held = now.covariance, self.held_covariance
+        if held is not None and self._parallel:
+            self._parallel.unlink(len(self.path.keyframes))
         if held is not None:  # the first that is free in a held map is as uncertain as the pose was then
             covariance, self.held_covariance = self._space.group.propagate(held, now.T_keyframe_base, covariance), None
         self._append(step, now.T_keyframe_base, covariance)
@@ -235,6 +257,8 @@ class KeyframeFrontend:
         else:  # of a loaded map, too: its odometry was that of another drive
             T_last_now = self._space.group.between(keyframes[-1].T_odom_base, step.T_odom_base)
             covariance = np.zeros_like(self.covariance)
+        if self._parallel:
+            self._parallel.unlink(len(keyframes))
         if not is_prior:
             self.path.segments.append(len(keyframes))
         added_sigmas = self._added_sigmas(given, T_last_now, is_prior=is_prior)
@@ -269,6 +293,8 @@ class KeyframeFrontend:
         """A vertex where odometry is now, or where it is said to be, and the motion to it from the last as an edge."""
         group, last = self._space.group, self.path.keyframes[-1].vertex
         vertex = self._graph.add_vertex(self._space.pose, at or group.compose(self._pose_of(last), T_last_now))
+        factor = self._sigma_factors.get(self.source, 1.0)
+        covariance = covariance if factor == 1.0 else covariance * factor**2
         noise = edge_noise(self._counters, "odometry", covariance, self._space.dimensions)
         relative_pose = self._space.relative_pose
         self._edges.add_edge(relative_pose, [last, vertex], T_last_now, noise, "odometry", self.source)

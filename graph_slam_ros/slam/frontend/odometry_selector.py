@@ -94,8 +94,15 @@ class OdometrySelector:
             return [self._follow(used, m)]
         if self._has_failed_over(m, used):
             return self._switched(past, used)
-        self._counters.count(m.source, "not_in_use")
+        self._leave_out(m)
         return []
+
+    def _leave_out(self, m: Odometry) -> None:
+        if self._config.fusion == "parallel":
+            self._counters.used[m.source] += 1
+            self.sources.add(m.source)
+        else:
+            self._counters.count(m.source, "not_in_use")
 
     def _has_failed_over(self, m: Odometry, used: Odometry) -> bool:
         if self._order.index(m.source) < self._order.index(used.source):
@@ -110,7 +117,7 @@ class OdometrySelector:
         source = past[-1].source
         if not older:
             if newer[-1].stamp_ns - used.stamp_ns <= self._silent_ns:
-                self._counters.count(source, "not_in_use")
+                self._leave_out(newer[-1])
                 return []
             self._counters.count(source, "switched_to_unlinked")
             return [self._use(newer[-1], self._space.identity, broken="jump")]

@@ -51,7 +51,7 @@ class StampOrder:
             if reason:
                 self._counters.count(m.topic, reason, size_of(m))
             return not reason
-        if self._released_ns is not None and m.stamp_ns < self._released_ns:
+        if self.is_late(m):
             self._counters.count(m.source, "late")
             return False
         is_newest = self._newest_odometry_ns is None or m.stamp_ns > self._newest_odometry_ns
@@ -59,6 +59,10 @@ class StampOrder:
             self._counters.count(m.source, "overflow")
             return False
         return True
+
+    def is_late(self, m: Odometry) -> bool:
+        """Return whether an odometry message is older than what was released."""
+        return self._released_ns is not None and m.stamp_ns < self._released_ns
 
     def _has_room(self, stamp_ns: int) -> bool:
         """Return whether so many wait only, or what is dated latest of all can make room: its turn may never come."""

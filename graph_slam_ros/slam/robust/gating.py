@@ -354,10 +354,18 @@ class OutlierGate:
         if self.is_calibrated:
             # estimated noise allows for errors that are alike, so residuals are smaller: that says nothing of odometry
             is_stated = self._config.noise_scale == "configured"
-            noise_ratio = self._solver.evaluate().chi2_final / freedom if is_stated else 1.0
+            noise_ratio = self._chi2_per_dof(freedom) if is_stated else 1.0
             self._gate_scale = min(factor, max(_TIGHTEST, factor * noise_ratio))
         edges = np.concatenate((inside, ledger.outside))
         ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
+
+    def _chi2_per_dof(self, freedom: int) -> float:
+        """Chi2 per degree of freedom, without parallel odometries: where these are alike it says nothing of noise."""
+        report = self._solver.evaluate()
+        parallel = report.classes.get("parallel")
+        if parallel is None or freedom - parallel.residuals < _TYPICAL:
+            return report.chi2_final / freedom
+        return (report.chi2_final - parallel.chi2) / (freedom - parallel.residuals)
 
 
 def landmark_of(graph: Graph, edge: int) -> int | None:
