@@ -168,7 +168,10 @@ class OutlierGate:
         return False
 
     def withdraw(self, edges: Sequence[int], keyframe: int, reason: Reason = Reason.WITHDRAWN) -> None:
-        """Remove edges permanently, for a reason other than their fit."""
+        """Remove edges permanently, for a reason other than their fit.
+
+        If only rejected edges are left of a landmark, they are accepted again, because nothing else determines it.
+        """
         for edge in edges:
             if edge >= len(self.ledger):
                 self._solver.set_weight(edge, 0.0)
@@ -177,6 +180,16 @@ class OutlierGate:
                 if self.ledger.verdict.values[edge] == Verdict.NOT_EVALUATED:
                     self._solver.set_weight(edge, 0.0)
                 self._reject(edge, keyframe, reason, float(self.ledger.statistic.values[edge]))
+        landmarks = {landmark for edge in edges if (landmark := landmark_of(self._graph, edge)) is not None}
+        for landmark in sorted(landmarks):
+            if not self._is_determined(landmark):
+                self._readmit_all(self._solver.edges_on(landmark), keyframe)
+
+    def _readmit_all(self, edges: Index, keyframe: int) -> None:
+        """Accept all of these edges that were rejected, but not permanently."""
+        for edge in np.intersect1d(edges, self.ledger.outside).tolist():
+            if self.ledger.reason.values[edge] not in FINAL:
+                self._readmit(edge, keyframe, *_judged(self.ledger, edge))
 
     @property
     def gate_scale(self) -> float:
@@ -315,11 +328,14 @@ class OutlierGate:
         if found is None:
             return False
         landmark, among = found
+        return not self._is_determined(landmark, int(among is self._holds), int(among is self._helps))
+
+    def _is_determined(self, landmark: int, fewer_holds: int = 0, fewer_helps: int = 0) -> bool:
+        """Return whether accepted edges determine a landmark, also with so many fewer."""
         if self._solver.is_held(landmark):
-            return False
-        holds = self._holds.get(landmark, 0) - (among is self._holds)
-        helps = self._helps.get(landmark, 0) - (among is self._helps)
-        return holds < 1 and helps < _TOGETHER
+            return True
+        holds, helps = self._holds.get(landmark, 0) - fewer_holds, self._helps.get(landmark, 0) - fewer_helps
+        return holds >= 1 or helps >= _TOGETHER
 
     # -- what is too much --------------------------------------------------------------------------------------------
 

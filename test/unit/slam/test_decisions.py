@@ -150,6 +150,28 @@ def test_the_last_sighting_of_a_landmark_stays_whatever_it_says():
     assert inside
 
 
+def test_a_landmark_whose_accepted_sightings_are_withdrawn_is_determined_by_the_rejected_ones():
+    """So it happens where sightings are reassigned to another landmark; else nothing would fix the landmark."""
+    drive = Drive().go(40)
+    graph, solver, ledger = drive.backend.graph, drive.backend.solver, drive.backend.ledger
+    here, noise = se2.act(tuple(solver.estimate([35])[0]), (3.0, 2.0)), Gaussian.from_sigmas(0.05, 0.05)
+    landmark = graph.add_vertex(R2, here)
+
+    def see(pose, off_m):
+        seen = np.array(se2.act(se2.inverse(tuple(solver.estimate([pose])[0])), here)) + off_m
+        return graph.add_edge(LANDMARK_POSITION, [pose, landmark], seen.tolist(), noise, "landmarks")
+
+    good = [see(pose, 0.0) for pose in range(33, 38)]
+    drive.backend.update(40)
+    bad = see(38, 3.0)
+    drive.backend.update(41)
+    assert (set(good) <= set(ledger.inside.tolist()), bad in ledger.outside) == (True, True)
+    drive.backend.withdraw(good, 41)
+    solver.update()
+    assert bad in ledger.inside
+    assert np.isfinite(solver.marginal([landmark])[0]).all()
+
+
 def test_a_landmark_that_begins_with_ranges_of_which_none_fits_stays_determined():
     drive = Drive().go(40)
     graph = drive.backend.graph
