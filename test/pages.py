@@ -55,6 +55,13 @@ def pages(browser, *, offline=True):
     assert wrong == []
 
 
+def violations(page):
+    """What axe finds wrong with the accessibility of a page: a line for each kind."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="accessibility is tested with axe")
+    found = axe.Axe().run(page).response["violations"]
+    return [f"{one['id']}: {one['help']}: {[node['html'][:200] for node in one['nodes']]}" for one in found]
+
+
 def is_own(url, origin, offline):
     return url.split("#")[0] == origin if offline else url.startswith((origin, f"blob:{origin}"))
 

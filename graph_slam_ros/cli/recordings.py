@@ -258,5 +258,5 @@ def _print_shortcomings(summary: dict[str, Any]) -> int:
 
 
 def _suggest_next(run: Path) -> None:
-    why, errors = console.command("explain", run), console.command("evaluate", run, "--truth", "TRUTH")
-    console.then(f"{why} (what was believed, and what not), or where there is a truth {errors}")
+    page, errors = console.command("report", run), console.command("evaluate", run, "--truth", "TRUTH")
+    console.then(f"{page} (the map, and why each measurement is in it or not), or where there is a truth {errors}")

@@ -248,6 +248,7 @@ def _drive(out: Contents, saved: SavedGraph) -> dict[str, Any]:
             {
                 "keyframes": one.keyframes,
                 "points": [out.packing.fixed(column, _MM, is_path=True) for column in one.points.T],
+                "landmarks": [out.packing.fixed(column, _MM) for column in one.landmarks.T],
             }
             for one in frames
         ],

@@ -18,7 +18,7 @@ from graph_slam_ros.runs.journal import MAP, parts_of, read_records
 from graph_slam_ros.runs.ledger_file import Entry
 from graph_slam_ros.typing import Array
 
-MOST_FRAMES, MOST_POINTS, MOST_JUMPS = 80, 500, 15
+MOST_FRAMES, MOST_POINTS, MOST_LANDMARKS, MOST_JUMPS = 80, 500, 300, 15
 _RUN = "run"
 
 
@@ -30,10 +30,12 @@ class Frame:
     ----------
     keyframes : how many there were
     points : (m, 3) their positions in map as they were known then, or some of them
+    landmarks : (l, 3) positions of landmarks, as they were known then
     """
 
     keyframes: int
     points: Array
+    landmarks: Array
 
 
 def frames(run: Path, saved: SavedGraph, losses: list[str]) -> list[Frame]:
@@ -42,14 +44,20 @@ def frames(run: Path, saved: SavedGraph, losses: list[str]) -> list[Frame]:
     some = np.unique(np.linspace(0, len(several) - 1, min(len(several), MOST_FRAMES)).astype(int))
     width = saved.space.dimensions
     first = np.array([saved.graph.vertex(vertex).stored.start for vertex in saved.keyframes])
+    vertices = sorted(saved.landmarks.values())[:MOST_LANDMARKS]
+    marks = np.array([saved.graph.vertex(vertex).stored.start for vertex in vertices], dtype=int)
     found = []
+
+    def positions(values: Array, at: Array) -> Array:
+        out = np.zeros((len(at), 3))
+        out[:, :width] = values[at[:, None] + np.arange(width)]
+        return out
+
     for values in (several[k] for k in some.tolist()):
         count = int(np.searchsorted(first + width, len(values), side="right"))
         if count:
             at = first[np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int))]
-            points = np.zeros((len(at), 3))
-            points[:, :width] = values[at[:, None] + np.arange(width)]
-            found.append(Frame(count, points))
+            found.append(Frame(count, positions(values, at), positions(values, marks[marks + width <= len(values)])))
     return found
 
 

@@ -246,6 +246,7 @@ function traces() {
     }));
   }
   out.push(trace("as known then", [[], [], []], c.then, {line: {color: c.then, width: 3}, visible: true, showlegend: false, meta: "then"}));
+  out.push(trace("landmarks as known then", [[], [], []], c.then, {mode: "markers", marker: {symbol: map.inSpace ? "diamond" : "star", size: map.inSpace ? 4 : 11, color: c.then}, showlegend: false, meta: "marks then"}));
   out.push(trace("chosen", [[], [], []], c.mark, {mode: "lines+markers", line: {color: c.mark, width: 5}, marker: {color: c.mark, size: 11}, showlegend: false, meta: "chosen"}));
   return out;
 }
@@ -315,12 +316,12 @@ function setTime() {
   const stamps = column(data.map.stamps), frame = frames[at];
   if (now) {
     byId("when").textContent = "now: the estimate after all of it";
-    return map.isThen ? restyle("then", [[], [], []]) : null;
+    return map.isThen ? Promise.all([restyle("then", [[], [], []]), restyle("marks then", [[], [], []])]) : null;
   }
   map.isThen = true;
   const last = Math.min(frame.keyframes, stamps.length) - 1;
   byId("when").textContent = `as known at keyframe ${last}, ${(stamps[last] - stamps[0]).toFixed(1)} s after the start`;
-  return restyle("then", frame.points.map(column));
+  return Promise.all([restyle("then", frame.points.map(column)), restyle("marks then", frame.landmarks.map(column))]);
 }
 
 // -- why -------------------------------------------------------------------------------------------------------------
@@ -421,9 +422,10 @@ const ledger = {order: null, sort: 0, up: true, chosen: -1};
 
 function startLedger() {
   FIELDS.forEach(([name], at) => {
-    const button = element("button", name, {type: "button", role: "columnheader", "aria-sort": "none"});
+    const button = element("button", name, {type: "button"}), cell = element("div", undefined, {role: "columnheader", "aria-sort": "none"});
     button.addEventListener("click", () => sortBy(at));
-    byId("head").append(button);
+    cell.append(button);
+    byId("head").append(cell);
   });
   byId("filter").addEventListener("input", arrange);
   byId("rows").addEventListener("scroll", () => requestAnimationFrame(drawRows));

@@ -73,6 +73,7 @@ async function solve() {
     if (found.changes && found.changes.length) lines.push(changesText(found.changes));
     effect.replaceChildren(...lines);
     await moveTo(asMoved(found));
+    await drawGhost();
   };
   try {
     if (quick) {
@@ -149,9 +150,11 @@ function drawFields() {
     input.dataset.kind = kind;
     const at = filled.findIndex(([of]) => of === kind || (of === "edge" && kind === "edges"));
     if (at >= 0) input.value = filled.splice(at, 1)[0][1];
+    if (kind === "keyframe") input.addEventListener("input", () => drawGhost());
     label.append(input, " ");
     return label;
   }));
+  if (data.map) drawGhost();
 }
 
 function fromFields() {
@@ -162,6 +165,48 @@ function fromFields() {
   }
   return out;
 }
+
+// -- a closure by dragging: a ring at the second keyframe; where it is dropped is its pose seen from the first ---------
+
+const field = (key) => byId("fields").querySelector(`input[name=${key}]`);
+
+function closureEnds() {
+  if (byId("kind").value !== "add_closure" || map.inSpace || !known.headings.length) return null;
+  const ends = ["from_keyframe", "to_keyframe"].map((key) => field(key).value.trim());
+  return ends.every((text) => /^\d+$/.test(text) && Number(text) < known.headings.length) ? ends.map(Number) : null;
+}
+
+async function drawGhost(place) {  // at a place, or where the second keyframe is
+  const ends = closureEnds(), plot = byId("map"), shapes = [];
+  byId("ghost-hint").hidden = !ends;
+  edits.ghost = ends ? place || points().slice(0, 2).map((axis) => axis[ends[1]]) : null;
+  if (ends) {
+    const [x, y] = edits.ghost, [low, high] = plot.layout.xaxis.range, r = 0.012 * Math.abs(high - low);
+    shapes.push({type: "circle", x0: x - r, x1: x + r, y0: y - r, y1: y + r, fillcolor: colours().mark, opacity: 0.7, line: {color: colours().mark, width: 3}});
+  }
+  if (shapes.length || (plot.layout.shapes || []).length) await Plotly.relayout("map", {shapes});
+}
+
+function dragGhost(event) {  // before plotly, for which it would be a pan
+  if (!edits.ghost || event.button) return;
+  const plot = byId("map"), {xaxis, yaxis} = plot._fullLayout, box = plot.getBoundingClientRect();
+  const left = box.left + xaxis._offset, top = box.top + yaxis._offset;
+  if (Math.hypot(event.clientX - left - xaxis.l2p(edits.ghost[0]), event.clientY - top - yaxis.l2p(edits.ghost[1])) > 16) return;
+  event.preventDefault();
+  event.stopPropagation();
+  const moved = (to) => drawGhost([xaxis.p2l(to.clientX - left), yaxis.p2l(to.clientY - top)]);
+  addEventListener("mousemove", moved);
+  addEventListener("mouseup", () => { removeEventListener("mousemove", moved); fillPose(); }, {once: true});
+}
+
+function fillPose() {
+  const all = points(), [from, to] = closureEnds(), turn = known.headings[from], [dx, dy] = edits.ghost.map((value, axis) => value - all[axis][from]);
+  const ahead = Math.cos(turn) * dx + Math.sin(turn) * dy, left = Math.cos(turn) * dy - Math.sin(turn) * dx;
+  const old = field("pose").value.trim() ? numbers(field("pose").value)[2] : known.headings[to] - turn;
+  field("pose").value = [ahead, left, Math.atan2(Math.sin(old), Math.cos(old))].map((value) => value.toFixed(3)).join(", ");
+}
+
+// -- what can be done with what is chosen -----------------------------------------------------------------------------
 
 const isInside = (k) => ["accepted", "not evaluated", "down weighted"].includes(data.edges.verdicts[column(data.edges.verdict)[k]]);
 const pendingOf = (k) => edits.list.findIndex((one) => one.edge === k);
@@ -214,6 +259,7 @@ const panel = {
     byId("scale").addEventListener("change", solve);
     byId("kind").addEventListener("change", drawFields);
     byId("new-edit").addEventListener("submit", (event) => { event.preventDefault(); add(fromFields()); });
+    byId("map").addEventListener("mousedown", dragGhost, {capture: true});
     byId("undo").addEventListener("click", () => { edits.list.pop(); changed(); });
     byId("download").addEventListener("click", download);
     byId("save").addEventListener("click", save);

@@ -78,9 +78,19 @@ class Workbench:
             "scale": self._scale,
             "who": _user(),
             "edits": edits,
+            "headings": self._headings,
             "run": _path(self._run),
             "names": [one.edit.name for one in self._saved.edits],
         }
+
+    @property
+    def _headings(self) -> list[float]:
+        """The headings of the keyframes [rad]; none in space."""
+        run = self._saved
+        if run.space.dimensions == 3:
+            return []
+        values: list[float] = np.round(run.slam.solver.estimate(run.keyframes)[:, 2], _DECIMALS).tolist()
+        return values
 
     def solve(self, body: bytes) -> dict[str, Any]:
         """Solve the run without some edges, with others, or with another loss, as ``graph_slam solve``.

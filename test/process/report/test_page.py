@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from faulty import faulty_run
-from pages import HOSTILE, chromium, drive, pages
+from pages import HOSTILE, chromium, drive, pages, violations
 
 from graph_slam_ros import cli
 from graph_slam_ros.analysis.explain import Numbers, explain_edge, statements, title
@@ -99,9 +99,13 @@ def test_the_slider_shows_the_estimate_as_it_was_known_then(page, faulty):
     assert page.inner_text("#when").startswith("now")
     then = "() => byId('map').data.find(one => one.meta === 'then').x.length"
     assert page.evaluate(then) == 0
-    page.evaluate("() => { byId('time').value = 1; byId('time').dispatchEvent(new Event('input')); }")
+    page.evaluate("() => { byId('time').value = 20; byId('time').dispatchEvent(new Event('input')); }")
     assert re.match(r"as known at keyframe \d+, [\d.]+ s after the start", page.inner_text("#when"))
     page.wait_for_function(f"({then})() > 1")
+    marks = page.wait_for_function("() => byId('map').data.find(one => one.meta === 'marks then').x.length").json_value()
+    first = page.evaluate("() => data.drive.frames[20].keyframes")
+    seen = {e.landmark for e in faulty.saved.entries if e.landmark and e.keyframe < first}
+    assert 0 < marks <= len(seen)
     page.focus("#time")
     page.keyboard.press("End")
     assert page.inner_text("#when").startswith("now")
@@ -123,6 +127,10 @@ def test_the_ledger_filters_sorts_and_is_walked_with_arrow_keys(page, faulty):
     page.wait_for_function("edge => location.hash === `#edge=${edge}`", arg=rows[0])
     page.keyboard.press("ArrowDown")
     page.wait_for_function("edge => location.hash === `#edge=${edge}`", arg=rows[1])
+
+
+def test_axe_finds_nothing_wrong_with_the_page(page, faulty):
+    assert violations(page) == []
 
 
 def test_space_charts_and_print_draw_without_a_fault(page, faulty):

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from faulty import faulty_run
-from pages import HOSTILE, chromium, drive, pages
+from pages import HOSTILE, chromium, drive, pages, violations
 
 from graph_slam_ros import cli
 from graph_slam_ros.analysis.what_if import SavedGraph
@@ -339,6 +339,40 @@ def test_an_edge_is_unchecked_solved_undone_and_saved(browser, faulty, tmp_path)
         solved(other)
         assert page.inner_text("#pending") == ""
         assert estimate(page) == pytest.approx(before, abs=2e-3)
+
+
+def test_a_closure_is_dragged_and_axe_finds_nothing_wrong(browser, faulty):
+    with served(faulty) as one, pages(browser, offline=False) as go:
+        page = go(one.access.address, "#keyframe=30")
+        page.click("#actions button:has-text('add closure')")
+        page.fill("#fields input[name=from_keyframe]", "5")
+        page.fill("#fields input[name=to_keyframe]", "30")
+        page.wait_for_function("() => (byId('map').layout.shapes || []).length === 1")
+        start, end, place = page.evaluate("""() => {
+            byId('map').scrollIntoView({block: 'center'});
+            const {xaxis, yaxis} = byId('map')._fullLayout, box = byId('map').getBoundingClientRect();
+            const [x, y] = estimate().map((axis) => axis[30]), at = [x + 3, y + 2];
+            const pixel = (a, b) => [box.left + xaxis._offset + xaxis.l2p(a), box.top + yaxis._offset + yaxis.l2p(b)];
+            return [pixel(x, y), pixel(...at), at];
+        }""")
+        page.mouse.move(*start)
+        page.mouse.down()
+        page.mouse.move(*end, steps=5)
+        page.mouse.up()
+        page.wait_for_function("() => field('pose').value")
+        pose = [float(number) for number in page.input_value("#fields input[name=pose]").split(",")]
+        saved = SavedGraph(faulty, [])
+        (x, y, turn), (_, _, other) = saved.slam.solver.estimate([saved.keyframes[5], saved.keyframes[30]])
+        c, s = np.cos(turn), np.sin(turn)
+        assert x + c * pose[0] - s * pose[1] == pytest.approx(place[0], abs=0.3)
+        assert y + s * pose[0] + c * pose[1] == pytest.approx(place[1], abs=0.3)
+        assert np.cos(pose[2] - (other - turn)) == pytest.approx(1.0, abs=1e-5)
+        page.fill("#fields input[name=sigma_m]", "0.1")
+        page.fill("#fields input[name=sigma_rad]", "0.1")
+        page.click("#new-edit button")
+        solved(page)
+        assert "against all else" in page.inner_text("#effect")
+        assert violations(page) == []
 
 
 def test_forms_make_edits_of_landmarks_and_hostile_names_are_text(browser, tmp_path):
