@@ -102,7 +102,9 @@ def test_the_slider_shows_the_estimate_as_it_was_known_then(page, faulty):
     page.evaluate("() => { byId('time').value = 20; byId('time').dispatchEvent(new Event('input')); }")
     assert re.match(r"as known at keyframe \d+, [\d.]+ s after the start", page.inner_text("#when"))
     page.wait_for_function(f"({then})() > 1")
-    marks = page.wait_for_function("() => byId('map').data.find(one => one.meta === 'marks then').x.length").json_value()
+    marks = page.wait_for_function(
+        "() => byId('map').data.find(one => one.meta === 'marks then').x.length"
+    ).json_value()
     first = page.evaluate("() => data.drive.frames[20].keyframes")
     seen = {e.landmark for e in faulty.saved.entries if e.landmark and e.keyframe < first}
     assert 0 < marks <= len(seen)
