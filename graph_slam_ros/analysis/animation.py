@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from graph_slam_ros.analysis.colours import LIGHT
 from graph_slam_ros.analysis.plots import canvas, dress
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
@@ -111,10 +112,10 @@ def _drawn(moments: list[_Moment], title: str) -> Iterator[Any]:
     low, high = everything[:, :2].min(axis=0), everything[:, :2].max(axis=0)
     room = 0.05 * float((high - low).max()) + 0.1
     axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
-    (odometry,) = axes.plot([], [], "--", color="#1a1a1a", linewidth=1.0, label="dead reckoning")
-    (path,) = axes.plot([], [], color="#d62728", linewidth=1.6, label="estimate")
-    (landmarks,) = axes.plot([], [], "*", color="#e08a00", label="landmarks")
-    (robot,) = axes.plot([], [], "o", color="#d62728")
+    (odometry,) = axes.plot([], [], "--", color=LIGHT["odometry"], linewidth=1.0, label="dead reckoning")
+    (path,) = axes.plot([], [], color=LIGHT["estimate"], linewidth=1.6, label="estimate")
+    (landmarks,) = axes.plot([], [], "*", color=LIGHT["landmarks"], label="landmarks")
+    (robot,) = axes.plot([], [], "o", color=LIGHT["estimate"])
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
     for moment in moments:
         for line, points in (

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from graph_slam_ros.analysis.colours import LIGHT, QUIET
 from graph_slam_ros.analysis.evaluation import Drive, dimensions_of, input_topics, scored_drive
 from graph_slam_ros.analysis.path_error import matched
 from graph_slam_ros.analysis.trajectories import Truth, read_truth
@@ -20,8 +21,8 @@ from graph_slam_ros.runs.folder import COVARIANCES, recording_of
 from graph_slam_ros.runs.trajectory import Landmark, Trajectory, read_covariances, read_landmarks, read_tum
 from graph_slam_ros.typing import Array, Index
 
-_TRUTH, _ODOMETRY, _ESTIMATE, _LANDMARK = "#1f6fd6", "#1a1a1a", "#d62728", "#e08a00"
-_CLOSURE, _SIGHTING, _QUIET = "#d62728", "#e08a00", "#9aa0a6"
+_TRUTH, _ODOMETRY, _ESTIMATE = (LIGHT[name] for name in ("truth", "odometry", "estimate"))
+_LANDMARK, _CLOSURE = LIGHT["landmarks"], LIGHT["closures"]
 _TRUTH_STYLE = {"label": "truth", "color": _TRUTH, "linewidth": 2.4, "zorder": 2}
 _ODOMETRY_STYLE = {"label": "dead reckoning", "color": _ODOMETRY, "linewidth": 1.0, "linestyle": "--", "zorder": 3}
 _ESTIMATE_STYLE = {"label": "estimate", "color": _ESTIMATE, "linewidth": 1.3, "zorder": 4}
@@ -135,7 +136,7 @@ def _draw_paths(axes: Any, found: _Placed, whole: Trajectory, drive: Drive, show
     if drive.count > 1:
         others = whole.moved(found.T_world_map).poses
         others[drive.keyframes] = np.nan
-        axes.plot(*others[:, shown].T, color=_QUIET, linewidth=0.8, zorder=1, label="drives before")
+        axes.plot(*others[:, shown].T, color=QUIET, linewidth=0.8, zorder=1, label="drives before")
     paths = ((found.truth, _TRUTH_STYLE), (found.odometry, _ODOMETRY_STYLE), (found.path, _ESTIMATE_STYLE))
     for drawn, style in paths:
         if drawn is not None:
@@ -292,7 +293,7 @@ def _with_gaps(truth: Trajectory) -> Trajectory:
 def _draw_edges(axes: Any, points: Array, ends: Index, label: str) -> None:
     from matplotlib.collections import LineCollection
 
-    style = {"odometry": (_ODOMETRY, 1.0, 0.9, 4), "landmarks": (_SIGHTING, 0.4, 0.25, 2)}
+    style = {"odometry": (_ODOMETRY, 1.0, 0.9, 4), "landmarks": (_LANDMARK, 0.4, 0.25, 2)}
     color, width, alpha, layer = style.get(label, (_CLOSURE, 0.6, 0.45, 3))
     name = "sightings" if label == "landmarks" else label
     lines = LineCollection(list(points[ends]), colors=color, linewidths=width, alpha=alpha, zorder=layer, label=name)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import gammainc
 
+from graph_slam_ros.analysis.colours import DARK, LIGHT
 from graph_slam_ros.analysis.consistency import nees_of_each
 from graph_slam_ros.analysis.evaluation import Scores, dimensions_of, evaluate, input_topics, scored_drive
 from graph_slam_ros.analysis.explain import landmark_lines
@@ -83,6 +84,7 @@ def read_contents(
     saved = out.saved = out.attempt(lambda: SavedGraph(run, out.losses))
     out.beware += out.attempt(lambda: changed_since(run)) or []
     scores = evaluate(run, known, align=align) if known and saved else None
+    out.data["colours"] = {"light": LIGHT, "dark": DARK}
     out.data["dimensions"] = out.attempt(lambda: dimensions_of(run)) or 2
     out.data["map"] = out.attempt(lambda: paths(out.packing, run, known, other, align=align)) if saved else None
     out.data["plan"] = floor_plan(plan) if plan else None

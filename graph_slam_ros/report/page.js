@@ -128,9 +128,9 @@ const dark = matchMedia("(prefers-color-scheme: dark)");
 function colours() {
   const d = dark.matches;
   return {
-    odometry: d ? "#e6e8eb" : "#1a1a1a", estimate: d ? "#ff6b6b" : "#d62728", truth: d ? "#6cb2ff" : "#1f6fd6",
-    landmarks: "#e08a00", other: d ? "#c9a2ff" : "#7b3fb3", then: d ? "#ffd24d" : "#9a6700", mark: d ? "#7ee787" : "#116329",
-    ink: d ? "#e6e8eb" : "#1f2328", grid: d ? "#30363d" : "#e6e8eb", paper: d ? "#16191d" : "#ffffff",
+    ...data.colours[d ? "dark" : "light"],
+    other: d ? "#2bd9b0" : "#00a884", then: d ? "#ffd24d" : "#9a6700", mark: d ? "#7ee787" : "#116329",
+    ink: d ? "#e6e8eb" : "#1f2328", grid: d ? "#30363d" : "#e6e8eb",
     "not evaluated": "#9aa0a6", accepted: d ? "#8b9bab" : "#7a8794", "down weighted": "#56b4e9", pending: "#cc79a7",
     rejected: d ? "#ff9e64" : "#c04000",
   };
@@ -212,7 +212,7 @@ function edgeTraces() {
       return line;
     });
     const middle = axes.map((line) => Float64Array.from(some, (_, at) => (line[3 * at] + line[3 * at + 1]) / 2));
-    const colour = isIn && isSighting ? colours().landmarks : isIn ? "#2e7d32" : colours()[name];
+    const colour = isIn && isSighting ? colours().landmarks : isIn ? colours().closures : colours()[name];
     out.push(trace(plain(key), axes, colour, {visible, isMany: true, opacity: isIn && isSighting ? 0.25 : 0.8, legendgroup: key}));
     out.push(trace("", middle, colour, {
       visible, isMany: true, mode: "markers", marker: {color: colour, size: isIn ? 4 : 7, symbol: "diamond", opacity: isIn ? 0.35 : 0.9}, showlegend: false,
