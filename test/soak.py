@@ -49,6 +49,8 @@ PROGRAMMES = {
     "drives": tests(*(f"test_{name}.py" for name in DRIVES)),
     "odd_files": tests("test_odd_files.py"),
     **{f"guided_{name}": guided(name) for name in ("g2o", "yaml", "cdr", "journal")},
+    "planted_faults": [sys.executable, "test/planted_faults.py"],
+    "clean_recordings": [sys.executable, "test/clean_recordings.py", "--seeds", "7", "--public"],
     "planted_bugs": [sys.executable, "test/planted_bugs.py"],
     "recovery": [sys.executable, "-m", "benchmarks.recovery"],
     "stack": tests(*sorted(file.name for file in HERE.rglob("test_stack*.py"))),

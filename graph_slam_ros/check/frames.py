@@ -7,7 +7,8 @@ import numpy as np
 from graph_slam_ros.check.columns import Columns, SightingColumns
 from graph_slam_ros.check.finding import Finding, Severity, Where, assignment
 
-_FIXED = ("map", "world", "earth", "utm")
+_OF_CAMERAS = "world"  # which visual odometry calls its frame, too
+_FIXED = ("map", _OF_CAMERAS, "earth", "utm")
 _AT_BASE = "0 0 0 0 0 0"
 _UNKNOWN = ("frame_unknown", "child_frame_unknown", "odom_frame_unknown", "map_frame_unknown")
 _SAME = 1e-6
@@ -24,8 +25,13 @@ def check_frames(c: Columns) -> Iterator[Finding]:
                 "static_changes", "warning", link.change, _SAME, "m, rad", text, "/tf_static", count=link.count
             )
     if c.odometry.frame in _FIXED:
-        text = f"{c.odometry.topic} is given in frame {c.odometry.frame}: it is the output of a localiser, not odometry"
-        yield Finding("odometry_in_map", "warning", 1, 0, "topics", text, c.odometry.topic)
+        is_common = c.odometry.frame == _OF_CAMERAS
+        severity: Severity = "note" if is_common else "warning"
+        what = (
+            "visual odometry, or the output of a localiser" if is_common else "the output of a localiser, not odometry"
+        )
+        text = f"{c.odometry.topic} is given in frame {c.odometry.frame}: it is {what}"
+        yield Finding("odometry_in_map", severity, 1, 0, "topics", text, c.odometry.topic)
     unlinked = set()
     for s in c.sightings:
         found = list(_of_sensor(c, s))

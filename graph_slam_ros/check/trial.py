@@ -17,7 +17,8 @@ from graph_slam_ros.typing import Array, Index, Mask
 
 _THIN_NS = 80_000_000
 _COARSE = {"solve.every_keyframes": 20}
-_SIGMAS = 4.0  # each the larger one of curvature's and of the sandwich's
+_SIGMAS = 4.0
+_FITTED_SIGMAS = 6.0  # errors of odometry last longer than sigmas know, be they of the curvature or the sandwich
 _ABSURD, _BACKWARDS, _LATE_S, _SURE = 0.5, 0.35, 0.2, 0.05
 _DEGREE = np.pi / 180.0
 # By parameter: code, unit, limit, and from which sigma on it is not observable.
@@ -130,7 +131,7 @@ def _over_confident(c: Columns, source: str, label: str, part: str, factor: floa
 
 
 def _fitted(c: Columns, one: Fitted) -> Iterator[Finding]:
-    """A parameter that is far off by its limit and by five sigmas, or that the drive does not tell."""
+    """A parameter that is far off by its limit and by six sigmas, or that the drive does not tell."""
     if one.parameter.name not in _LIMITS:
         return
     code, unit, limit, unknown = _LIMITS[one.parameter.name]
@@ -140,7 +141,7 @@ def _fitted(c: Columns, one: Fitted) -> Iterator[Finding]:
     where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
     if one.sigma > unknown:
         yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **where)
-    elif abs(one.value) > max(limit, _SIGMAS * one.sigma) and one.verdict == "admitted":
+    elif abs(one.value) > max(limit, _FITTED_SIGMAS * one.sigma) and one.verdict == "admitted":
         text, settings = _mended(c, one)
         yield Finding(code, "warning", one.value, limit, unit, f"{topic.name}: {text}", settings=settings, **where)
 
@@ -150,9 +151,9 @@ def _mended(c: Columns, one: Fitted) -> tuple[str, tuple[str, ...]]:
     source, value, sigma = one.parameter.source, one.value, one.sigma
     if one.parameter.name == "clock":
         before_s = next(s.offset_s for s in c.config.sources if s.name == source)
-        when = "later" if value > 0.0 else "earlier"
+        when, other = ("later", "late") if value > 0.0 else ("earlier", "early")
         best = f"{abs(value) * 1e3:.0f} ms {when} than stamped (sigma {sigma * 1e3:.0f} ms)"
-        text = f"sightings agree with odometry best {best}"
+        text = f"sightings agree with odometry best {best}, or odometry is stamped as much too {other}"
         return text, (assignment(f"{source}.offset_s", round(before_s + value, 3)),)
     if one.parameter.name == "yaw":
         degrees = (value / _DEGREE, sigma / _DEGREE)

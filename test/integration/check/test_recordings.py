@@ -9,6 +9,7 @@ from graph_slam_ros.cli import main
 from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.messages.to_msg import encode
 from graph_slam_ros.recordings.bag import BagWriter, open_bag
+from graph_slam_ros.runs import check as runs_check
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +77,44 @@ def test_a_frame_that_nothing_links_is_an_error_until_its_mount_is_set(drive, ch
     assert (code, found["frame_unlinked"]["severity"]) == (4, "error")
     code, found, _ = check(bag, *(w for text in found["frame_unlinked"]["settings"] for w in ("--set", text)))
     assert (code, found) == (0, {})
+
+
+@pytest.mark.parametrize("frame, code, severity", [("world", 0, "note"), ("map", 4, "error")])
+def test_odometry_in_the_frame_of_a_map_is_doubted_but_cameras_call_theirs_world(
+    drive, check, tmp_path, frame, code, severity
+):
+    def change(topic, m):
+        if topic == "/odom":
+            m.header.frame_id = frame
+        return m
+
+    answered, found, _ = check(copy(drive, tmp_path / "a.mcap", change), "--quick")
+    assert (answered, found["odometry_in_map"]["severity"]) == (code, severity)
+
+
+def test_of_landmarks_without_identities_the_beginning_is_replayed(drive, check, tmp_path, monkeypatch):
+    """Their association may take minutes; a drive with identities is replayed to its end."""
+
+    def unnamed(topic, m):
+        for one in m.detections if topic == "/landmarks" else ():
+            one.id = ""
+            for result in one.results:
+                result.hypothesis.class_id = ""
+        return m
+
+    ends_ns = []
+
+    def replayed(config, measured):
+        measured = list(measured)
+        ends_ns.append(max(getattr(m, "stamp_ns", 0) for m in measured) - measured[0].stamp_ns)
+        return trial_replayed(config, measured)
+
+    trial_replayed = runs_check.replayed
+    monkeypatch.setattr(runs_check, "replayed", replayed)
+    monkeypatch.setattr(runs_check, "_UNNAMED_NS", 10**9)
+    assert check(copy(drive, tmp_path / "a.mcap", unnamed))[0] == 0
+    assert check(drive)[0] == 0
+    assert ends_ns[0] < 2 * 10**9 < ends_ns[1]
 
 
 def test_the_mistakes_of_a_user_are_one_line_or_a_finding(drive, check, tmp_path, capsys):
