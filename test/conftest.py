@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import reliability
 
-from graph_slam_ros.warmup import warmup
+from graph_slam_ros.warmup import compile_all, warmup
 
 # Where Python is asked to keep no bytecode, each worker and each process would compile all sources and tests anew.
 sys.dont_write_bytecode = False
@@ -72,9 +72,10 @@ def _no_process(event: str, arguments: tuple) -> None:
 sys.addaudithook(_no_process)
 
 
-def pytest_sessionstart() -> None:
-    """Not by the first test that needs one, whose digits would be its own."""
-    warmup()
+def pytest_sessionstart(session) -> None:  # type: ignore[no-untyped-def]
+    """Not by the first test that needs one, whose digits would be its own; what hands tests to others needs none."""
+    is_alone = hasattr(session.config, "workerinput") or not getattr(session.config.option, "numprocesses", None)
+    (warmup if is_alone else compile_all)()
 
 
 @pytest.fixture

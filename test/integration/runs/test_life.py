@@ -161,7 +161,7 @@ def test_T3_whatever_happens_in_whatever_order_nothing_that_was_told_is_lost(mem
     tell("lives", tried=count, steps=count * steps, failed=0)
 
 
-@pytest.mark.parametrize("seed", [363, 377, 1151, 2440, 2950])
+@pytest.mark.parametrize("seed", times([2440], [363, 377, 1151, 2440, 2950]))
 def test_T3_where_much_of_the_path_turns_no_solve_goes_astray(memory, seed):
     live(memory / str(seed), seed, 2 * STEPS)
 
