@@ -1,6 +1,10 @@
 """Faults that are planted into a recording are found under their names; ``planted_faults.py`` has all of them."""
 
+import re
+
+import numpy as np
 import pytest
+from places import ROOT
 from planted_faults import FAULTS, planted
 from recordings import short_drive
 
@@ -9,6 +13,7 @@ from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.check import check
 from graph_slam_ros.simulation import Drive, Fault, simulate, spoil_messages, write_bag
+from graph_slam_ros.simulation.drive import Sightings
 from graph_slam_ros.simulation.message_faults import MESSAGE_KINDS
 
 SELECTED = (
@@ -23,11 +28,40 @@ SELECTED = (
     "mount turned 180 degrees",
     "sensor frame without TF",
     "sensor frame with two parents",
+    "twist in the odom frame",
     "twist sigma 1e-6",
+    "twist variance 1000",
+    "negative variance",
     "identities of tracks",
     "odometry stands",
     "NaN in odometry",
 )
+
+
+def half_unnamed(drive):
+    for m in drive.landmarks:
+        seen = Sightings(m)
+        seen.ids = ["" if k % 2 else name for k, name in enumerate(seen.ids)]
+        seen.store()
+
+
+def ramp(drive):
+    poses = drive.poses
+    poses[:, 2] += np.linspace(0.0, 5.0, len(poses))
+    drive.poses = poses
+
+
+def shaken(drive):
+    rng = np.random.default_rng(1)
+    for m in drive.odometry:
+        m.content.twist.twist.linear.x, m.content.twist.twist.angular.z = map(float, rng.normal(size=2))
+
+
+PLANTED = {name: (FAULTS[name][0], FAULTS[name][1].split(), {}) for name in SELECTED} | {
+    "half of the landmarks without identity": (half_unnamed, ["no_id"], {}),
+    "a ramp": (ramp, ["not_planar"], {"world.dimensions": 2}),
+    "a twist of noise": (shaken, ["twist_unrelated"], {}),
+}
 
 
 @pytest.fixture(scope="module")
@@ -41,16 +75,26 @@ def test_a_drive_without_a_fault_has_no_finding(drive):
     assert check(drive, quick=True).findings == []
 
 
-@pytest.mark.parametrize("name", SELECTED)
+@pytest.mark.parametrize("name", PLANTED)
 def test_a_planted_fault_is_found_and_its_settings_mend_it(drive, tmp_path, name):
-    codes = FAULTS[name][1].split()
-    bag = planted(drive, tmp_path / "faulty.mcap", name)
-    found = [one for one in check(bag, quick=True).findings if one.code in codes]
+    put, codes, settings = PLANTED[name]
+    faulty, bag = Drive(drive), tmp_path / "faulty.mcap"
+    put(faulty)
+    faulty.write(bag)
+    found = [one for one in check(bag, settings, quick=True).findings if one.code in codes]
     assert found
     for one in found:
         if one.settings:
-            mended = check(bag, dict(parse_setting(text) for text in one.settings), quick=True).findings
+            mended = check(bag, settings | dict(parse_setting(text) for text in one.settings), quick=True).findings
             assert one.code not in {other.code for other in mended}
+
+
+def test_each_finding_that_prints_a_setting_is_planted():
+    source = "".join(file.read_text() for file in (ROOT / "graph_slam_ros/check").glob("*.py"))
+    printing = {"frame_unlinked", "axes", "odometry_scale", "turn_scale", "mount_yaw", "clock_offset", "over_confident"}
+    printing |= set(re.findall(r'Finding\(\s*"(\w+)"(?:(?!Finding\().)*?settings=', source, re.DOTALL))
+    mended = {code for _, codes, _ in PLANTED.values() for code in codes} | {code for _, code, *_ in FITTED}
+    assert printing - mended == set()
 
 
 def test_faults_can_be_put_into_a_recording_of_a_user_but_not_those_that_need_the_truth(drive, tmp_path, capsys):
@@ -94,16 +138,17 @@ def laps(tmp_path_factory):
     return file
 
 
-@pytest.mark.parametrize(
-    "name, code, value, within",
-    [
-        ("landmark clock +100 ms", "clock_offset", -0.1, 0.02),
-        ("mount turned 5 degrees", "mount_yaw", 0.0873, 0.01),
-        ("odometry scaled 0.9", "odometry_scale", 0.111, 0.02),
-        ("two landmarks share an identity", "id_reused", None, None),
-        ("noise 8 times its covariance", "over_confident", None, None),
-    ],
+FITTED = (
+    ("landmark clock +100 ms", "clock_offset", -0.1, 0.02),
+    ("mount turned 5 degrees", "mount_yaw", 0.0873, 0.01),
+    ("odometry scaled 0.9", "odometry_scale", 0.111, 0.02),
+    ("two landmarks share an identity", "id_reused", None, None),
+    ("track width 8 % wrong", "turn_scale", -0.074, 0.02),
+    ("noise 8 times its covariance", "over_confident", None, None),
 )
+
+
+@pytest.mark.parametrize("name, code, value, within", FITTED)
 def test_the_fit_finds_what_needs_an_estimate_and_its_settings_mend_it(laps, tmp_path, name, code, value, within):
     bag = planted(laps, tmp_path / "faulty.mcap", name)
     found = {one.code: one for one in check(bag).findings}
