@@ -108,7 +108,7 @@ def check(
 
 
 def _in_time(columns: Columns, measured: list[Measurements]) -> list[Measurements]:
-    """Return what is replayed in memory: the beginning, where most landmarks have no identity and association is slow."""
+    """Return what is replayed in memory: the beginning, where landmarks have no identity and association is slow."""
     seen = [s for s in columns.sightings if len(s.name)]
     unnamed = sum(np.count_nonzero(s.name == s.names.index("")) for s in seen if "" in s.names)
     if unnamed <= 0.5 * sum(len(s.name) for s in seen):
