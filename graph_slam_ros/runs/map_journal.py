@@ -135,7 +135,8 @@ class MapGrowth:
         self._rescaled = len(a.noise_changes)
         if a.calibration != self._calibration:
             out["calibration"], self._calibration = totals_record(a.calibration), dict(a.calibration)
-        out["recalibrated"] = [one.as_record() for one in a.recalibrations[self._recalibrated :] if first_edge]
+        changed = a.recalibrations[self._recalibrated :] if first_edge else ()
+        out["recalibrated"] = [one.present(graph).as_record() for one in changed]  # rescaled since, perhaps
         self._recalibrated = len(a.recalibrations)
         out["edits"] = [one.record for one in a.edits[self._edits :]]
         if a.datum != self._datum:

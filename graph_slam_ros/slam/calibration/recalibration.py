@@ -35,6 +35,11 @@ class Recalibration:
             return None
         return Recalibration(self.table, self.rows[~same], self.measured[~same], self.roots[~same])
 
+    def present(self, graph: Graph) -> "Recalibration":
+        """The same rows as they are in a graph now."""
+        z, roots = self._columns(graph)
+        return replace(self, measured=z[self.rows], roots=roots[self.rows])
+
     def _columns(self, graph: Graph) -> tuple[Array, Array]:
         table = next(one for one in graph.tables.values() if one.type.name == self.table)
         return table.measured.values, table.sqrt_information.values
