@@ -24,10 +24,30 @@ class Faults:
     wrong_ids: float = 0.0
 
 
-def imperfect_drive(
+@dataclass(frozen=True)
+class Truth:
+    """Stamps (n,) and true poses (n, 3)."""
+
+    stamps_ns: np.ndarray
+    poses: np.ndarray
+
+    def at(self, stamp_ns: int) -> tuple[float, ...]:
+        """The pose between two of them."""
+        k = int(np.clip(np.searchsorted(self.stamps_ns, stamp_ns, side="right") - 1, 0, len(self.stamps_ns) - 2))
+        a, b = (tuple(one.tolist()) for one in self.poses[k : k + 2])
+        part = float((stamp_ns - self.stamps_ns[k]) / (self.stamps_ns[k + 1] - self.stamps_ns[k]))
+        return se2.interpolate(a, b, part)
+
+
+def imperfect_drive(faults: Faults, **how) -> list[Odometry | Sightings]:
+    """Measurements of a robot that winds its way among twelve landmarks, as of ``imperfect_drive_and_truth``."""
+    return imperfect_drive_and_truth(faults, **how)[0]
+
+
+def imperfect_drive_and_truth(
     faults: Faults, *, seed: int = 0, seconds: float = 90.0, kind: str = "range_bearing", turns: float = 0.8
-) -> list[Odometry | Sightings]:
-    """Measurements of a robot that winds its way among twelve landmarks.
+) -> tuple[list[Odometry | Sightings], Truth]:
+    """Measurements of a robot that winds its way among twelve landmarks, and where it was.
 
     Parameters
     ----------
@@ -38,7 +58,7 @@ def imperfect_drive(
     landmarks = 6.0 * random.uniform(-1.0, 1.0, (12, 2)) + (1.0, 2.0)
     step_s, pose, odom = 0.05, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     out: list[Odometry | Sightings] = []
-    poses = []
+    poses, stamps_ns = [], []
     for k in range(round(seconds / step_s)):
         t = k * step_s
         v, w = 0.5 + 0.2 * np.sin(0.7 * t), turns * np.sin(0.45 * t) + 0.25 * turns
@@ -48,13 +68,14 @@ def imperfect_drive(
         pose, odom = se2.compose(pose, se2.exp(tuple(true))), se2.compose(odom, se2.exp(tuple(told)))
         poses.append(pose)
         stamp_ns = START_NS + round((k + 1) * step_s * SECOND_NS)
+        stamps_ns.append(stamp_ns)
         out.append(Odometry(stamp_ns, tuple(map(float, odom))))
         if k % 4 == 3:
             seen = tuple(_sighting(n, landmarks, pose, faults, kind, random) for n in range(len(landmarks)))
             stamp_ns -= round(faults.clock_s * SECOND_NS)
             if stamp_ns > START_NS + SECOND_NS:
                 out.append(Sightings(stamp_ns, "detections", tuple(s for s in seen if s is not None)))
-    return sorted(out, key=lambda m: m.stamp_ns)
+    return sorted(out, key=lambda m: m.stamp_ns), Truth(np.array(stamps_ns), np.array(poses))
 
 
 def _sighting(

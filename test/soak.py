@@ -29,8 +29,8 @@ def guided(name):
 
 
 DRIVES = (
-    *("gyro_drives", "several_odometries"),
-    *("advise", "calibration_consistency", "consistency", "displacement", "extreme_fixes", "initialization"),
+    *("advise", "calibration_consistency", "calibration_random", "consistency", "displacement", "extreme_fixes"),
+    *("gyro_drives", "initialization", "several_odometries"),
     *("nees", "simulation", "unnamed"),
 )
 PROGRAMMES = {
