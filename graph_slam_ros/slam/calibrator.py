@@ -62,6 +62,7 @@ class Calibrator:
         self.corrected: list[Finding] = []
         self.trials = 0
         self._admitted: set[Parameter] = set()
+        self._last: TrialFit | None = None
         self._due, self._steady = FIRST_DUE, 0
         self._job: Trial | None = None
         self._apply_at = 0  # the keyframe
@@ -121,7 +122,7 @@ class Calibrator:
         """Apply the findings of a trial; None if there are none."""
         if found is None:
             return None
-        self.trials += 1
+        self.trials, self._last = self.trials + 1, found
         findings = decide(found, self._count_landmarks(), self._admitted)
         values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
         moved = any(one.parameter in values and abs(one.value) > one.sigma for one in findings)
@@ -200,6 +201,22 @@ class Calibrator:
         factors = self._frontend.corrections.factors
         problem = self._backend.trial_problem(self._config.space, path, origins, settings, factors)
         return replace(problem, first_edge=max(problem.first_edge, self._first_edge))
+
+    def widened(self, marginal: Array, vertex: int) -> Array:
+        """The marginal of a vertex with the uncertainty of the parameters; the same where none was corrected.
+
+        A pose after the last trial is as uncertain by them as the last one before. What is found but not used, because
+        it is small, counts as an error.
+        """
+        found, keyframes = self._last, self._frontend.path.keyframes.ids
+        if found is None or not self._admitted:
+            return marginal
+        if vertex >= len(found.column) and len(marginal) == self._config.space.dof:
+            earlier = keyframes[keyframes < len(found.column)]
+            vertex = int(earlier[-1]) if len(earlier) else vertex
+        known = {one: self.findings[one].is_determined for one in found.parameters}
+        left = {one: 0.0 if one in self._admitted else found.value(one) for one in known if known[one]}
+        return marginal + found.adds(vertex, len(marginal), left)
 
     # -- what it says ------------------------------------------------------------------------------------------------
 

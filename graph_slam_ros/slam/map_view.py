@@ -254,7 +254,8 @@ class MapView:
 
         It is the marginal of the last solve, propagated with the odometry since then.
         """
-        return self._frontend.covariance.copy()
+        covariance = self._frontend.covariance.copy()
+        return self._calibrator.widened(covariance, int(self.keyframes.ids[-1])) if self.keyframes else covariance
 
     def landmark_covariances(self) -> list[Array]:
         """Marginal of each landmark: of a point in the map's axes, of a pose in its tangent space; NaN if unknown."""
@@ -271,7 +272,7 @@ class MapView:
         solved = self._solution.vertices if self.is_solved else 0
         known = [k for k, vertex in enumerate(vertices) if vertex < solved]
         for k, marginal in zip(known, self.solver.marginal([vertices[k] for k in known]), strict=True):
-            out[k] = marginal
+            out[k] = self._calibrator.widened(marginal, vertices[k])
         return out
 
     # -- the graph and its solution --------------------------------------------------------------------------------

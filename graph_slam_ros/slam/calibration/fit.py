@@ -44,6 +44,8 @@ class TrialFit:
     first, second : estimates (p,) from the halves of the drive that tell as much of each parameter
     lost : part of the sightings that have less than a tenth of their weight
     path : stored numbers of all vertices
+    sensitivity : (unknowns, p) steps of all unknowns with each parameter
+    column : (vertices,) first row of each vertex in ``sensitivity``, or -1
     """
 
     parameters: tuple[Parameter, ...]
@@ -55,6 +57,22 @@ class TrialFit:
     second: Array
     lost: float
     path: Array
+    sensitivity: Array
+    column: Index
+
+    def adds(self, vertex: int, dof: int, left: Values) -> Array:
+        """The covariance (dof, dof) that parameters add to a vertex whose marginal takes them for known.
+
+        Parameters
+        ----------
+        left : those that the drive determines, and what of each is not corrected
+        """
+        at = int(self.column[vertex]) if vertex < len(self.column) else -1
+        if at < 0:
+            return np.zeros((dof, dof))
+        of = [self.parameters.index(one) for one in left]
+        bias, steps = np.array(list(left.values())), self.sensitivity[at : at + dof, of]
+        return np.asarray(steps @ (self.covariance[np.ix_(of, of)] + np.outer(bias, bias)) @ steps.T)
 
     @property
     def sigmas(self) -> Array:
@@ -160,7 +178,8 @@ class _Fit:
         first, second = self._halves(rest, scores, theta, rows.stamp_ns)
         sightings = rows.landmark >= 0
         lost = float(np.mean(rows.weight[sightings] < _LOST)) if sightings.any() else 0.0
-        return TrialFit(self._parameters, theta, self._priors, covariance, robust, first, second, lost, x)
+        found = self._parameters, theta, self._priors, covariance, robust, first, second, lost, x
+        return TrialFit(*found, -border, self._linear.column)
 
     def _meat(self, scores: Array, rows: Rows) -> Array:
         """The scatter of scores, grouped by landmark or by half a minute, whichever is larger relative to them."""

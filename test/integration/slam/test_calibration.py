@@ -72,6 +72,17 @@ def test_where_nothing_is_wrong_the_graph_is_the_same_to_the_last_bit():
     assert on.calibration_report["trials"] >= 2
     assert not on.calibration_report["settings"]
     assert (off.solver.values == on.solver.values).all()
+    assert (off.keyframe_covariances() == on.keyframe_covariances()).all()
+
+
+def test_covariances_have_the_uncertainty_of_the_parameters(calibrated):
+    (marginal,) = calibrated.solver.marginal([calibrated.keyframes[-1].vertex])
+    for wider in (calibrated.keyframe_covariances()[-1], calibrated.pose_covariance):
+        added = np.linalg.eigvalsh(wider - marginal)
+        assert added[0] > -1e-12
+        assert added[-1] > 0.01 * np.trace(marginal)
+    landmarks = calibrated.solver.marginal([one.vertex for one in calibrated.landmarks.values()])
+    assert np.trace(sum(calibrated.landmark_covariances())) > 1.01 * np.trace(sum(landmarks))
 
 
 def test_odometry_in_its_own_frame_is_not_corrected(wrong, calibrated):

@@ -37,7 +37,7 @@ def pose_errors(slam, truth):
     onto = se2.compose(tuple(estimate[0]), se2.inverse(truth.at(first.stamp_ns)))
     true = np.array([se2.compose(onto, truth.at(int(stamp_ns))) for stamp_ns in slam.keyframes.stamps_ns])
     last = np.array(se2.local(tuple(estimate[-1]), tuple(true[-1])))
-    (covariance,) = slam.solver.marginal([slam.keyframes[-1].vertex])
+    covariance = slam.keyframe_covariances()[-1]
     rms_m = np.sqrt(np.mean(np.sum((estimate - true)[:, :2] ** 2, axis=1)))
     return float(rms_m), float(last @ np.linalg.solve(covariance, last))
 
