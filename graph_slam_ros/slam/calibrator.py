@@ -29,7 +29,7 @@ from graph_slam_ros.typing import Array, Executor, Index
 FIRST_DUE = 50  # keyframes
 _ROUNDS = 3  # when everything is solved
 _STEADY = 3  # trials in a row that move nothing by a sigma end it
-_DIGITS = 12  # of a corrected measurement: the last ones of a sine depend on the machine
+_DIGITS = 12  # of a corrected measurement, and of an added variance: the last ones of a sine depend on the machine
 
 Trial = Callable[[], "TrialFit | None"]
 
@@ -216,7 +216,7 @@ class Calibrator:
             vertex = int(earlier[-1]) if len(earlier) else vertex
         known = {one: self.findings[one].is_determined for one in found.parameters}
         left = {one: 0.0 if one in self._admitted else found.value(one) for one in known if known[one]}
-        return marginal + found.adds(vertex, len(marginal), left)
+        return marginal + _exact(found.adds(vertex, len(marginal), left))
 
     # -- what it says ------------------------------------------------------------------------------------------------
 
