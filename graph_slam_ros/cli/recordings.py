@@ -33,8 +33,9 @@ def replay(args: argparse.Namespace) -> int:
     code = max(code, _print_summary(args.bag, done.summary))
     console.show(f"results in {args.out}")
     _draw(args.out)
-    _suggest_next(args.out)
-    return console.report_losses(done.losses, done.warnings) or code
+    code = console.report_losses(done.losses, done.warnings) or code
+    _suggest_next(args.out, None if is_run(args.bag) or not (code or done.warnings) else args.bag)
+    return code
 
 
 def _replay_live(args: argparse.Namespace, config: "Config") -> int:
@@ -64,9 +65,10 @@ def _replay_live(args: argparse.Namespace, config: "Config") -> int:
         code = _print_summary(args.bag, summary | {"inputs": asked})
         _draw(args.out)
     console.show(f"{played.sent} messages sent, {played.lost} lost; results in {played.saved}")
-    _suggest_next(Path(played.saved))
     losses = bag.losses + ([f"{played.lost} messages did not arrive"] if played.lost else [])
-    return console.report_losses(losses, bag.warnings) or code
+    code = console.report_losses(losses, bag.warnings) or code
+    _suggest_next(Path(played.saved), args.bag if code else None)
+    return code
 
 
 def recover(args: argparse.Namespace) -> int:
@@ -77,8 +79,9 @@ def recover(args: argparse.Namespace) -> int:
     summary = recovered(args.run_folder, args.out, force=args.force) if args.out else complete(args.run_folder)
     code = _print_summary(args.run_folder, summary)
     console.show(f"results in {args.out or args.run_folder}")
+    code = console.report_losses(summary["losses"]) or code
     _suggest_next(args.out or args.run_folder)
-    return console.report_losses(summary["losses"]) or code
+    return code
 
 
 def info(args: argparse.Namespace) -> int:
@@ -109,9 +112,11 @@ def evaluate(args: argparse.Namespace) -> int:
     scores = compared(args.run_folder, truth, args.estimate, align=not args.no_align)
     console.show(*([json.dumps(scores.as_dict())] if args.json else str(scores).split("\n")))
     _draw(args.run_folder, truth, args.plot, align=not args.no_align, quiet=args.json)
+    code = console.report_losses(scores.losses, [*scores.warnings, *changed_since(args.run_folder)])
     if not args.json:
-        console.then(f"{console.command('explain', args.run_folder)} (what the run believed, and what not)")
-    return console.report_losses(scores.losses, [*scores.warnings, *changed_since(args.run_folder)])
+        with_truth = console.command("report", args.run_folder, "--truth", args.truth)
+        console.then(f"{with_truth} (one page: the map, its errors, and why each edge is in or out)")
+    return code
 
 
 def plot(args: argparse.Namespace) -> int:
@@ -230,19 +235,20 @@ def _print_summary(source: Path, summary: dict[str, Any]) -> int:
     """Print the outcome of a run; returns the exit code, 3 if the result is incomplete."""
     from graph_slam_ros.runs import outcome
 
+    code = _print_shortcomings(summary) if summary["keyframes"] else console.LOSSES
     console.show(*outcome.text(summary))
     if not summary["keyframes"]:
         why = f": {summary['losses'][0]}" if summary.get("losses") else ", see what was counted and graph_slam info"
         raise GraphSlamError(f"{source}: no odometry of it could be used{why}")
-    return _print_shortcomings(summary)
+    return code
 
 
 def _print_earlier(folder: Path, summary: dict[str, Any]) -> int:
     """Print the outcome of a run that ended when time jumped back; returns as ``_print_summary``."""
     from graph_slam_ros.runs import outcome
 
-    console.show(*outcome.text(summary))
     code = _print_shortcomings(summary)
+    console.show(*outcome.text(summary))
     console.show(f"odometry went back in time, and time.on_jump is reset: the run until then is in {folder}")
     _draw(folder)
     return code
@@ -257,6 +263,12 @@ def _print_shortcomings(summary: dict[str, Any]) -> int:
     return console.LOSSES if shortcomings else console.DONE
 
 
-def _suggest_next(run: Path) -> None:
-    page, errors = console.command("report", run), console.command("evaluate", run, "--truth", "TRUTH")
-    console.then(f"{page} (the map, and why each measurement is in it or not), or where there is a truth {errors}")
+def _suggest_next(run: Path, doubtful: Path | None = None) -> None:
+    """Name the next command; ``doubtful`` is a recording whose result is incomplete, or comes with a warning."""
+    if doubtful is not None:
+        return console.then(f"{console.command('check', doubtful)} (what is wrong with the recording, and the remedy)")
+    if importlib.util.find_spec("plotly") is None:
+        what = f"{console.command('explain', run)} (which measurements are believed, and why)"
+    else:
+        what = f"{console.command('report', run)} (one page: the map, and why each edge is in or out)"
+    console.then(f"{what}; with a ground truth: {console.command('evaluate', run, '--truth', 'TRUTH')}")
