@@ -134,6 +134,9 @@ KINDS: dict[str, Kind] = {
     "turn_scale": Kind(
         "the robot turns more or less than odometry says", "correct the track width, or set odometry.turn_factor"
     ),
+    "range_scale": Kind(
+        "ranges are longer or shorter than odometry says", "correct the sensor's driver, or set INPUT.range_factor"
+    ),
     "not_observable": Kind("the drive does not determine a clock, a mount or a scale", "drive what the text names"),
     "over_confident": Kind(
         "the residuals of an input are larger than its noise says", "set robust.noise_scale=estimated"

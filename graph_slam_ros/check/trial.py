@@ -27,6 +27,7 @@ _LIMITS = {
     "yaw": ("mount_yaw", "rad", 2.0 * _DEGREE, 3.0 * _DEGREE),
     "distance": ("odometry_scale", "part", 0.03, 0.05),
     "turn": ("turn_scale", "part", 0.03, 0.05),
+    "range_factor": ("range_scale", "part", 0.03, 0.05),
 }
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
 _OUTLIERS, _LOST, _NEAR_M = 0.12, 0.25, 0.5
@@ -70,7 +71,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     if len(slam.keyframes) < 3 or len(path_ns) < 2 or not slam.landmarks:
         return
     try:
-        fit, fitted = slam.trial_fit()
+        fit, fitted = slam.trial_fit(chooses=True)
         scales = slam.noise_scale()
     except GraphSlamError as error:
         text = f"the trial fit failed: {error}"
@@ -161,6 +162,10 @@ def _mended(c: Columns, one: Fitted) -> tuple[str, tuple[str, ...]]:
         before = next(s.numbers("mount_correction", 6) for s in c.config.sources if s.name == source) or (0.0,) * 6
         numbers = (*before[:5], before[5] + value)
         return text, (assignment(f"{source}.mount_correction", " ".join(f"{x:.5g}" for x in numbers)),)
+    if one.parameter.name == "range_factor":
+        factor = next(s.range_factor for s in c.config.sources if s.name == source) * (1.0 + value)
+        text = f"ranges are {1.0 / (1.0 + value):.3f} times the distances that odometry says (sigma {sigma:.3f})"
+        return text, (assignment(f"{source}.range_factor", round(factor, 4)),)
     name = f"{one.parameter.name}_factor"
     factor = getattr(c.config.odometry, name) * (1.0 + value)
     what = "drives" if one.parameter.name == "distance" else "turns"

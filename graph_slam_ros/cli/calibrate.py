@@ -30,7 +30,12 @@ def calibrate(args: argparse.Namespace) -> int:
     if args.out:
         write_whole(args.out, _as_yaml(done).encode())
     if args.json:
-        console.show(json.dumps({"settings": done.settings, "parameters": done.parameters, "rounds": done.rounds}))
+        console.show(
+            json.dumps(
+                {"settings": done.settings, "parameters": done.parameters, "rounds": done.rounds}
+                | {"refused": done.refused}
+            )
+        )
     else:
         _show(done)
     lost = console.report_losses(done.losses, done.warnings)
@@ -44,7 +49,9 @@ def _show(done: Calibrated) -> None:
         console.show(f"{name}={value}")
     for one in done.parameters:
         console.show(*textwrap.wrap(one["text"], _WIDTH, initial_indent="  ", subsequent_indent="    "))
-    if not _is_determined(done):
+    if done.refused:
+        console.warn(done.refused, most=console.SENTENCE)
+    elif not _is_determined(done):
         console.warn("this recording determines none of these parameters")
     elif not done.settings:
         console.show("nothing to correct")

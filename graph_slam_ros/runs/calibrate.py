@@ -11,10 +11,12 @@ from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.recordings.contents import recording_of
 from graph_slam_ros.runs.replay import END, RecordedRuns, choose_inputs
 from graph_slam_ros.runs.suggestion import Suggestion
+from graph_slam_ros.runs.tables import account
 from graph_slam_ros.slam import Config, Counters, GraphSlam
 from graph_slam_ros.warmup import warmup
 
 _ROUNDS = 4  # replays; a large clock needs two or three
+_STILL_ACCEPTED = 0.9  # of the part that was accepted before: with less, what was found does harm
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
@@ -30,6 +32,7 @@ class Calibrated:
     command : the replay with them
     rounds : replays
     is_complete : whether the last replay found nothing more
+    refused : why what was found is not among the settings; empty if it is
     losses, warnings : what could not be read
     """
 
@@ -38,6 +41,7 @@ class Calibrated:
     command: str
     rounds: int
     is_complete: bool
+    refused: str
     losses: list[str]
     warnings: list[str]
 
@@ -75,7 +79,7 @@ def calibrate(
     warmup(dimensions=config.world.dimensions)
     total = sum(bag.topics[topic].count for topic in inputs.by_topic())
     report: Mapping[str, Any] = {"settings": {"": 0.0}}
-    rounds = 0
+    rounds, kept, before, refused = 0, dict[str, float | str](), (0, 0), ""
     while report["settings"] and rounds < _ROUNDS:
         rounds, now = rounds + 1, config.changed(found)
         slam = GraphSlam(now)
@@ -86,8 +90,33 @@ def calibrate(
             slam.process(event)
         if not slam.keyframes:
             raise GraphSlamError(f"{path}: no odometry of it could be used: graph_slam info {path}")
-        report = slam.calibration_report
+        accepted = _accepted(slam)
+        if accepted[0] * before[1] < _STILL_ACCEPTED * before[0] * accepted[1]:
+            refused, found = _harm(found, kept, before, accepted), kept
+            break
+        report, kept, before = slam.calibration_report, dict(found), accepted
         found |= report["settings"]
     losses, warnings = list(dict.fromkeys(bag.losses)), list(dict.fromkeys(bag.warnings))
     command = chosen.command(found | dict(settings or {}) | found)
-    return Calibrated(found, report["parameters"], command, rounds, not report["settings"], losses, warnings)
+    complete = not report["settings"] and not refused
+    return Calibrated(found, report["parameters"], command, rounds, complete, refused, losses, warnings)
+
+
+def _accepted(slam: GraphSlam) -> tuple[int, int]:
+    """Count the measurements that the estimate uses, and all; odometry is in neither."""
+    of_inputs = [one for one in account(slam, slam.counters)["inputs"].values() if one["use"] != "odometry"]
+    return sum(one["believed"] or 0 for one in of_inputs), sum(one["used"] for one in of_inputs)
+
+
+def _harm(
+    found: Mapping[str, float | str],
+    kept: Mapping[str, float | str],
+    before: tuple[int, int],
+    accepted: tuple[int, int],
+) -> str:
+    """Return why settings are not used with which fewer measurements are accepted than without."""
+    lines = ", ".join(f"{name}={value}" for name, value in found.items() if kept.get(name) != value)
+    return (
+        f"not used: {lines}: with it {accepted[0]} of {accepted[1]} measurements are accepted, "
+        f"without it {before[0]} of {before[1]}"
+    )

@@ -189,12 +189,15 @@ class MapView:
         """
         return self.backend.noise_scale(self.keyframes)
 
-    def trial_fit(self, groups: Collection[str] = DEFAULT_GROUPS) -> tuple[TrialFit, list[Finding]]:
+    def trial_fit(
+        self, groups: Collection[str] = DEFAULT_GROUPS, *, chooses: bool = False
+    ) -> tuple[TrialFit, list[Finding]]:
         """Fit the calibration of odometry and sensors with the map, on a copy: nothing is changed.
 
         Parameters
         ----------
         groups : of ``slam.calibration.parameters.GROUPS``
+        chooses : where all landmarks are observed by ranges alone, fit these instead of odometry's distance
 
         Returns
         -------
@@ -208,7 +211,7 @@ class MapView:
         """
         frontend, origins = self._frontend, self._landmarks.map.origins
         problem = self.backend.trial_problem(self.space, frontend.path, origins, factors=frontend.corrections.factors)
-        wanted = parameters_of(problem, groups)
+        wanted = parameters_of(problem, groups, chooses=chooses)
         found = fit(problem, {one: one.quantity.prior for one in wanted})
         return found, decide(found, len(self.landmarks))
 

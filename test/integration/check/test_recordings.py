@@ -150,3 +150,17 @@ def test_a_damaged_recording_is_checked_as_far_as_it_goes(drive, check, tmp_path
     assert code == 4
     assert found["damaged"]["severity"] == "error"
     assert "lost: cut.mcap" in err[0]
+
+
+def test_ranges_alone_that_are_too_long_are_mended_by_their_own_factor(tmp_path, check, capsys):
+    """The distance of odometry would make the map as much too large."""
+    bag = tmp_path / "ranges.mcap"
+    city = ("--poses", "150", "--set", "blocks=4", "--set", "sensor=range", "--seed", "2")
+    assert main(["simulate", "manhattan", "--out", str(bag), *city]) == 0
+    capsys.readouterr()
+    code, found, _ = check(bag, "--set", "ranges.range_factor=1.08")
+    assert code == 4
+    assert "odometry_scale" not in found
+    key, value = found["range_scale"]["settings"][0].split("=")
+    assert key == "ranges.range_factor"
+    assert float(value) == pytest.approx(1.0, abs=0.01)

@@ -7,6 +7,7 @@ from places import ROOT
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.slam import GraphSlam
 
 DEMO = str(ROOT / "data" / "demo.mcap")
 WRONG = ("--set", "detections.mount_correction=0 0 0 0 0 0.1", "--set", "odometry.distance_factor=1.08")
@@ -37,3 +38,13 @@ def test_a_recording_without_landmarks_determines_nothing_and_says_so(tmp_path, 
     assert err == "graph_slam: this recording determines none of these parameters\n"
     assert main(["check", bag]) == 4, "what a replay calls odometry alone is no clean recording"
     assert "[warning] no_landmarks" in capsys.readouterr().out
+
+
+def test_settings_with_which_less_is_believed_are_not_printed(monkeypatch, capsys):
+    """A second replay with what was found shows that it does harm: here a sensor that looks the wrong way."""
+    wrong = {"settings": {"detections.mount_correction": "0 0 0 0 0 2.0"}, "parameters": [], "trials": 1}
+    monkeypatch.setattr(GraphSlam, "calibration_report", wrong)
+    assert main(["calibrate", DEMO]) == 3
+    out, err = capsys.readouterr()
+    assert "mount_correction" not in out
+    assert "not used: detections.mount_correction=0 0 0 0 0 2.0: with it " in err
