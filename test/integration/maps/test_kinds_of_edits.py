@@ -6,6 +6,7 @@ import hashlib
 import numpy as np
 import pytest
 import small_drive
+from driven import without_names
 
 from graph_slam_ros import cli, replay
 from graph_slam_ros.analysis.what_if import SavedGraph
@@ -396,3 +397,21 @@ def test_a_closure_that_all_else_contradicts_is_warned_of(run, capsys, tmp_path)
     good = edit(run, plan(run, values("add_closure", run)), None)
     assert good.warnings == []
     assert good.by_hand[0].innovation < 1.0
+
+
+def test_a_cut_keeps_the_sightings_of_landmarks_without_identity_with_their_keyframes(tmp_path):
+    config = small_drive.config().changed({"landmarks.association": "joint"})
+    record_run(tmp_path / "run", config, without_names(small_drive.drive()), [])
+    before = restored(tmp_path / "run", [])
+    assert all(mark.is_unnamed for mark in before.landmarks.values())
+    edit(tmp_path / "run", plan(tmp_path / "run", values("cut", tmp_path / "run")), tmp_path / "new")
+    slam = restored(tmp_path / "new", [])
+    assert len(slam.keyframes) == 19
+    seen = [(mark, one) for mark in slam.landmarks.values() for one in mark.seen]
+    assert len(seen) > 20
+    for mark, one in seen:
+        assert slam.keyframes[one.where.keyframe].vertex == one.where.vertex
+        assert slam.graph.edge(one.edge).vertices == (one.where.vertex, mark.vertex)
+    assert [len(mark.seen) for mark in slam.landmarks.values()] == [m.sightings for m in slam.landmarks.values()]
+    replay(tmp_path / "new", tmp_path / "again")
+    assert contents(tmp_path / "new") == contents(tmp_path / "again")
