@@ -31,6 +31,7 @@ from graph_slam_ros.runs.trajectory import Point, Trajectory, read_landmarks, re
 
 _KEYFRAMES = ("path.tum", "path_odometry.tum")  # estimate and dead reckoning
 _SIGHTINGS = ("sightings.tum", "odometry.tum")
+_FAR, _FAR_M = 0.5, 0.3  # an error larger than this part of the true path, and than that, is not one of a good map
 _ONE_DRIVE = [{"keyframe": 0, "sighting": 0}]
 
 
@@ -167,13 +168,19 @@ def evaluate(
     drive = scored_drive(run, known.trajectory, estimate)
     landmarks = {name: landmark.position for name, landmark in read_landmarks(run / "landmarks.csv").items()}
     scored = {"truth": known.source, "estimate": _described(drive)}
-    scored["frame"] = "the run lies on the truth as well as can be" if align else "as they are, not aligned"
+    scored["frame"] = "the run is aligned to the truth" if align else "the run is not aligned to the truth"
     warnings = []
     if known.topic in inputs:
         warnings.append(f"{known.topic} was an input of the run: the error says how well it fits, not how true it is")
-    odometry = drive.odometry
+    odometry, error = drive.odometry, path_error(drive.estimate, known.trajectory, dimensions, align=align)
+    extent_m = _extent(associate(drive.estimate, known.trajectory)[1])
+    if error.position_m["rmse"] > max(_FAR * extent_m, _FAR_M):
+        warnings.append(
+            f"the error is {error.position_m['rmse']:.3g} m on a true path of radius {extent_m:.3g} m (RMS): check "
+            "that the truth is of this robot and this drive"
+        )
     return Scores(
-        path_error(drive.estimate, known.trajectory, dimensions, align=align),
+        error,
         None if odometry is None else path_error(odometry, known.trajectory, dimensions),
         _map_rmse(landmarks, known.landmarks, dimensions),
         consistency_of(run, known, drive.keyframes, is_first=drive.number == 1),
@@ -235,6 +242,12 @@ def _drives(run: Path) -> list[dict[str, int]]:
     except (ValueError, KeyError, TypeError):
         return _ONE_DRIVE
     return drives or _ONE_DRIVE
+
+
+def _extent(path: Trajectory) -> float:
+    """RMS distance [m] of the positions of a path from their mean."""
+    positions = path.poses[:, :3] if path.poses.shape[1] == 7 else path.poses[:, :2]
+    return float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def _overlap(path: Trajectory, truth: Trajectory) -> bool:

@@ -68,7 +68,8 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
     """
     entries = run.entries
     judged = [entry for entry in entries if entry.verdict]
-    yield f"{len(entries)} edges, {len(judged)} of them judged; others are odometry and priors"
+    kinds = f"{len(judged)} are measurements that can be rejected, the others are odometry and priors"
+    yield f"{len(entries)} edges; {kinds}"
     if judged:
         yield from _table(judged)
     yield from _worst(e for e in judged if not e.is_in and e.reason not in FINAL)
@@ -119,7 +120,7 @@ def _least(entries: Iterable[Entry]) -> Iterator[str]:
     least = sorted(entries, key=lambda e: -e.chi2 / e.dof)[:_SHOWN]
     if least:
         yield "accepted; the largest chi2 first:"
-    yield from (_row(e, f"chi2 {e.chi2:10.4g} of {e.dof} number{'s' * (e.dof > 1)}") for e in least)
+    yield from (_row(e, f"chi2 {e.chi2:10.4g} with {e.dof} degree{'s' * (e.dof > 1)} of freedom") for e in least)
 
 
 def _row(e: Entry, numbers: str) -> str:

@@ -201,6 +201,14 @@ def test_the_scores_as_plain_values_are_exactly_these(run, tmp_path):
     assert scores["position_m"]["max"] < 1e-6 < scores["odometry"]["position_m"]["rmse"]
 
 
+def test_the_truth_of_another_drive_is_suspected(run, tmp_path):
+    truth = eight()
+    write_truth(tmp_path / "other.mcap", truth.stamps_s, truth.poses[::-1].copy())
+    assert evaluate(run, tmp_path / "truth.mcap").warnings == ()
+    (warning,) = evaluate(run, tmp_path / "other.mcap").warnings
+    assert "check that the truth is of this robot and this drive" in warning
+
+
 def test_a_run_without_dead_reckoning_or_landmarks_is_scored_without(run, tmp_path):
     (run / "odometry.tum").unlink()
     (run / "landmarks.csv").unlink()

@@ -45,7 +45,7 @@ def test_the_summary_counts_what_the_ledger_has(run, capsys):
     code, out, err = told(capsys, run)
     entries = read_ledger(run)
     assert (code, err) == (0, "")
-    assert f"{len(entries)} edges, {sum(e.verdict > 0 for e in entries)} of them judged" in out
+    assert f"{len(entries)} edges; {sum(e.verdict > 0 for e in entries)} are measurements that can be rejected" in out
     in_and_out = [sum(e.label == "closures" and e.is_in is which for e in entries) for which in (True, False)]
     assert re.search(rf"closures {in_and_out[0]} {in_and_out[1]}\b", out)
     worst = max((e for e in entries if not e.is_in), key=lambda e: e.statistic / e.threshold)
