@@ -2,8 +2,7 @@
 
 A candidate that is too unlikely given all earlier measurements is held back: its innovation is compared with the joint
 covariance of its vertices and its own (Neira and Tardos, "Data association in stochastic mapping using the joint
-compatibility test", 2001, eq. 2). One that does not fit after the solve loses weight by its loss, and is removed below
-a limit. No verdict is final: all are judged again, and one that fits later is used.
+compatibility test", 2001, eq. 2). One that fits badly loses weight, then is removed; all are judged again and again.
 """
 
 from collections.abc import Sequence
