@@ -40,11 +40,12 @@ PATIENCE_S = 0.5
 @contextmanager
 def served(run, page=None):
     """A server of a run in this process, as the command starts it."""
-    work = Workbench(read_contents(run), 3.0)
+    made = read_contents(run)
+    work = Workbench(made, 3.0)
     bound = server.listening("127.0.0.1", 0)
     access = Access("127.0.0.1", bound.getsockname()[1])
     is_ready = threading.Event()
-    one = server.server(server.application(work, page or page_of(read_contents(run), work), access), is_ready.set)
+    one = server.server(server.application(work, page or page_of(made, work), access), is_ready.set)
     thread = threading.Thread(target=one.run, args=([bound],))
     thread.start()
     try:
@@ -395,7 +396,7 @@ def test_forms_make_edits_of_landmarks_and_hostile_names_are_text(browser, tmp_p
         page.click("#save")
         page.wait_for_function("() => byId('saved').innerText.startsWith('Saved in')")
         assert page.title() == "<b>&'run: view"
-        assert page.locator("#edits b, #edits img, #edits script").count() == 0
+        assert page.locator("#edit-panel b, #edit-panel img, #edit-panel script").count() == 0
     edits = SavedGraph(run.with_name("<b>&'run_edited"), []).edits
     assert [one.edit.do for one in edits] == ["rename_landmark", "merge_landmarks"]
     assert [one.edit.arguments["landmark"] for one in edits] == HOSTILE[:2]
