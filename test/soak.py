@@ -31,7 +31,7 @@ def guided(name):
 DRIVES = (
     *("advise", "calibration_consistency", "calibration_random", "consistency", "displacement", "extreme_fixes"),
     *("gyro_drives", "initialization", "several_odometries"),
-    *("nees", "simulation", "unnamed"),
+    *("nees", "simulation", "slip", "unnamed"),
 )
 PROGRAMMES = {
     "lives": tests("test_life.py"),

@@ -38,6 +38,7 @@ _WHY = {
     Reason.FAILED: "plugin failed",
     Reason.BY_HAND: "by hand",
     Reason.CONTRADICTED: "contradicted",
+    Reason.SLIP: "slip",
 }
 _KIND = {
     "closures": "a loop closure",
@@ -77,6 +78,7 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
     yield from _gates(judged, run.changes, run.config)
     yield from (f"by hand: {one.text}" for one in run.edits)
     yield from _rivals(run.folder)
+    yield from (one["text"] for one in summary_of(run.folder).get("displacements", ()) if "text" in one)
 
 
 def explain_calibration(folder: Path) -> Iterator[str]:
@@ -295,6 +297,11 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
             return (
                 f"{e.statistic:.0f} sightings more agreed on another pose of the robot than on this motion: it was"
                 " carried, or its wheels slipped; an edge with very large noise replaces it"
+            )
+        case Reason.SLIP:
+            return (
+                f"its stretch slips: the landmarks make that {e.statistic:.1f} likelier than not (twice the logarithm),"
+                f" more than {e.threshold:.1f}, the odds against it; an edge with more noise replaces it"
             )
     if e.verdict is Verdict.DOWN_WEIGHTED:
         return f"it is accepted, but its loss leaves it little weight: {numbers}, above {e.threshold:.4g} ({chance})"

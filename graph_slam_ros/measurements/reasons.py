@@ -313,6 +313,17 @@ REASONS: dict[str, Reason] = {
         "graph_slam explain RUN; if it happens often, correct the odometry, the sensor's place (INPUT.mount or TF) or "
         "its clock (INPUT.offset_s)",
     ),
+    "slip": Reason(
+        _NOTED,
+        "several landmarks contradicted odometry over some seconds: its wheels slipped, so it counts for less there",
+        "graph_slam explain RUN; if it happens often, its noise is larger than stated (odometry.noise) or its scale is "
+        "wrong (graph_slam calibrate)",
+    ),
+    "slip_taken_back": Reason(
+        _NOTED,
+        "a slip was decided, and later sightings agree with odometry: it counts as before",
+        "odometry.doubt_odds",
+    ),
     "displacement_taken_back": Reason(
         _NOTED,
         "a displacement was decided, and later sightings contradict it: landmarks repeat, or ids are used twice",

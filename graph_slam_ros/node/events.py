@@ -6,6 +6,7 @@ from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.slam import GraphSlam, Update
 from graph_slam_ros.slam.kidnap_detector import Alarm
 from graph_slam_ros.slam.robust.ledger import Verdict, VerdictChange
+from graph_slam_ros.slam.slip_detector import Slip
 
 _EDGES = 1000  # of one update that are moved one by one
 
@@ -59,16 +60,17 @@ def _verdict(slam: GraphSlam, change: VerdictChange) -> Status:
     )
 
 
-def _alarm(alarm: Alarm) -> Status:
+def _alarm(alarm: Alarm | Slip) -> Status:
     """An alarm that began, was decided or ended."""
     values: dict[str, object] = {"began_ns": alarm.began_ns, "evidence": alarm.evidence}
-    if alarm.segment is not None:
+    what = "slip" if isinstance(alarm, Slip) else "displaced"
+    if not isinstance(alarm, Slip) and alarm.segment is not None:
         values |= {"segment": alarm.segment, "distance_m": f"{alarm.distance_m:.6f}"}
         values |= {"angle_rad": f"{alarm.angle_rad:.6f}"}
     if alarm.ended_ns is None:
-        return happened("displaced", str(alarm), WARN, **values)
+        return happened(what, str(alarm), WARN, **values)
     agree = "the landmarks and odometry agree again"
-    return happened("displaced", f"{agree}: {alarm}", OK, **values, ended_ns=alarm.ended_ns)
+    return happened(what, f"{agree}: {alarm}", OK, **values, ended_ns=alarm.ended_ns)
 
 
 def correction(slam: GraphSlam, update: Update, level: int = OK) -> Status:

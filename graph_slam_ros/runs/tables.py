@@ -80,7 +80,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
             "failing": slam.failing,
             "classes": {name: asdict(share) for name, share in (last.classes if last else {}).items()},
             "rivals": [asdict(rival) for rival in slam.backend.rivals],
-            "displacements": [asdict(alarm) for alarm in slam.alarms],
+            "displacements": [asdict(alarm) | {"text": str(alarm)} for alarm in slam.alarms],
             "span_s": (slam.keyframes[-1].stamp_ns - slam.keyframes[0].stamp_ns) * 1e-9 if slam.keyframes else 0.0,
         }
         | ({"gyro": asdict(gyro)} if (gyro := slam.gyro) else {})

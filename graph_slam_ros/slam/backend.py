@@ -316,6 +316,12 @@ class Backend:
         self.decisions.exchange(found.fitting, found.contradicting, keyframe)
         self._go_on(found, keyframe)
 
+    def admit(self, edges: Sequence[int], keyframe: int) -> None:
+        """Compare some edges that may be out with all that is known."""
+        self._pending = [*self._pending, *edges][-_MAX_PENDING:]
+        self.solver.update()
+        self._admit(keyframe)
+
     def _go_on(self, found: DisplacementHypothesis, keyframe: int) -> None:
         self._background.cancel(self.ledger.outside_count)
         self.holds_back = False

@@ -219,7 +219,7 @@ class GraphSlam(MapView):
     def _solved(self, keyframe: int, everything: Settings | None) -> Solved:
         self.backend.hand_over()
         now_ns, report = self._frontend.now_ns, None
-        self._kidnaps.add(self.backend.handed_over[1], now_ns)
+        self._kidnaps.add(self.backend.handed_over[1], now_ns, self.keyframes)
         fits = self._solution.fits()
         self._landmarks.review(self.keyframes, everything=everything is not None)
         if everything is None:

@@ -15,9 +15,12 @@ from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, DisplacementHypothesis, DisplacementSearch
 from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
+from graph_slam_ros.slam.slip_detector import Slip, SlipDetector
 from graph_slam_ros.typing import Array, Numbers
 
 _ALARM = 4  # sightings more for another pose than for odometry's
@@ -128,10 +131,21 @@ class KidnapDetector:
         self._history = LandmarkHistory(graph, backend.ledger)
         self._search = DisplacementSearch(space, graph, solver, backend.ledger, self._history)
         self._monitor = InnovationMonitor(solver, backend.decisions, self._history)
+        self._slips = SlipDetector(space, odometry, backend, counters, self._history)
         self._next = graph.edge_count
         self._splits: list[_Split] = []  # of the present frame of odometry
         self._refuted: list[Numbers] = []  # where that frame does not lie: it was decided and taken back
         self.alarms: list[Alarm] = []
+
+    @property
+    def slips(self) -> list[Slip]:
+        """The stretches in which odometry slipped, in order; the last may go on."""
+        return self._slips.slips
+
+    @property
+    def slips_now(self) -> Slip | None:
+        """The slip that goes on."""
+        return self._slips.now
 
     @property
     def now(self) -> Alarm | None:
@@ -142,13 +156,14 @@ class KidnapDetector:
         """A segment begins at a keyframe, by a jump or a given pose: sightings before tell nothing of where it is."""
         self._search.begin(vertex)
         self._monitor.begin(vertex)
+        self._slips.begin(stamp_ns)
         self._splits.clear()
         self._refuted.clear()
         if (now := self.now) is not None and now.segment is None:
             self.alarms[-1] = replace(now, ended_ns=stamp_ns, outcome="then a segment began")
             self._protect()
 
-    def add(self, count: int, stamp_ns: int) -> None:
+    def add(self, count: int, stamp_ns: int, keyframes: StampedPoses[Keyframe]) -> None:
         """Note the edges that are new, up to a count, in order, at the stamp of the newest odometry."""
         graph, search = self._backend.graph, self._search
         edges, self._next = range(self._next, count), count
@@ -158,6 +173,8 @@ class KidnapDetector:
             match one.label:
                 case "odometry":
                     search.add_odometry(edge, vertices, tuple(one.measured.tolist()), stamp_ns)
+                    first, last = keyframes.stamps_ns[np.searchsorted(keyframes.ids, vertices)].tolist()
+                    self._slips.add_odometry(edge, vertices, (first, last), len(keyframes) - 1)
                 case "initialpose":
                     search.add_initial_pose(edge, vertices[0])
                 case "surveyed":
@@ -166,6 +183,11 @@ class KidnapDetector:
                     self._history.add(edge, vertices[0], vertices[1])
                     search.add_sighting(edge, vertices[0], vertices[1])
                     self._monitor.add(edge, vertices[0], vertices[1], stamp_ns)
+                    self._slips.add_seen(edge, vertices[0], vertices[1])
+                case "fixes":
+                    self._slips.add_seen(edge, vertices[0], one.label)
+                case "closures":
+                    self._slips.add_seen(edge, max(vertices), one.label)
 
     def check(self, vertices: NDArray[np.int64], stamp_ns: int) -> None:
         """Look at the evidence after a solve.
@@ -177,6 +199,7 @@ class KidnapDetector:
         """
         if not self._backend.decides:
             return
+        self._slips.check(len(vertices) - 1, stamp_ns)
         found = self._significant(int(vertices[-1]))
         if found is not None and self._is_decided(found):
             last = self._splits[-1] if self._splits else None
@@ -316,7 +339,7 @@ class KidnapDetector:
 
     def _replacement(self, first: int, there: Numbers) -> tuple[int, Numbers, Gaussian]:
         """Odometry's edge to a keyframe, the motion that the landmarks show instead, and next to no trust in it."""
-        link, c = self._search.link(first), self._odometry
+        link, c = self._slips.active(self._search.link(first)), self._odometry
         before = self._estimate(self._backend.graph.edge(link).vertices[0])
         motion = tuple(map(float, self._space.group.between(before, there)))
         return link, motion, Gaussian.from_sigmas(*self._space.sigmas(c.jump_sigma_m, c.jump_sigma_rad))

@@ -26,6 +26,7 @@ from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.robust.ledger import Ledger
+from graph_slam_ros.slam.slip_detector import Slip
 from graph_slam_ros.slam.solution import Correction, Solution
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.typing import Array, Index, Numbers
@@ -348,11 +349,11 @@ class MapView:
         return self._solution.guard.failing
 
     @property
-    def alarms(self) -> tuple[Alarm, ...]:
-        """The displacement alarms in order: the landmarks contradicted odometry. The last one may still be active."""
-        return tuple(self._kidnaps.alarms)
+    def alarms(self) -> tuple[Alarm | Slip, ...]:
+        """The times when the landmarks contradicted odometry, in order: displacements and slips. Some may go on."""
+        return tuple(sorted([*self._kidnaps.alarms, *self._kidnaps.slips], key=lambda one: one.began_ns))
 
     @property
-    def displaced(self) -> Alarm | None:
-        """The active displacement alarm, or None."""
-        return self._kidnaps.now
+    def displaced(self) -> Alarm | Slip | None:
+        """The alarm that goes on, a displacement before a slip; or None."""
+        return self._kidnaps.now or self._kidnaps.slips_now

@@ -6,6 +6,7 @@ from graph_slam_ros.slam.calibration.decision import Finding
 from graph_slam_ros.slam.kidnap_detector import Alarm
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.robust.ledger import VerdictChange
+from graph_slam_ros.slam.slip_detector import Slip
 from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.solver import Report
 
@@ -25,7 +26,7 @@ class Update:
     correction : of the last solve
     changes : of verdicts, since the last update that told any
     calibrated : corrections by calibration
-    alarms : that began, were decided or ended since then: the landmarks say that the robot is elsewhere
+    alarms : that began, were decided or ended since then: the landmarks contradict odometry
     """
 
     keyframes: tuple[int, ...] = ()
@@ -34,7 +35,7 @@ class Update:
     report: Report | None = None
     correction: Correction = _NO_CORRECTION
     changes: tuple[VerdictChange, ...] = ()
-    alarms: tuple[Alarm, ...] = ()
+    alarms: tuple[Alarm | Slip, ...] = ()
     calibrated: tuple[Finding, ...] = ()
 
     def __bool__(self) -> bool:
@@ -100,7 +101,7 @@ class UpdateLog:
         return tuple(self._view.corrected[first:])
 
 
-def _state(alarm: Alarm) -> tuple[int, int | None, int | None, str]:
+def _state(alarm: Alarm | Slip) -> tuple[int, int | None, int | None, str]:
     """The part of an alarm that changes when it begins, is decided or ends."""
     return alarm.began_ns, alarm.segment, alarm.ended_ns, alarm.outcome
 

@@ -56,6 +56,7 @@ WITHIN = {
     },
     "slam/calibration": {"lie", "graph", "solver", "slam/frontend"},
     "slam": {
+        "chi_square",
         *("plugin_edges", "edge_tags", "lie", "graph", "solver", "measurements", "config"),
         *("slam/frontend", "slam/landmarks", "slam/robust", "slam/calibration"),
     },

@@ -385,9 +385,7 @@ class OutlierGate:
 
 def landmark_of(graph: Graph, edge: int) -> int | None:
     """The vertex of an edge's landmark."""
-    if graph.label_of(edge) != "landmarks":
-        return None
-    return graph.edge(edge).vertices[1]
+    return graph.edge(edge).vertices[1] if graph.label_of(edge) == "landmarks" else None
 
 
 def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:
