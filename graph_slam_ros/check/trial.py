@@ -18,7 +18,7 @@ from graph_slam_ros.typing import Array, Index, Mask
 _THIN_NS = 80_000_000
 _EVERY, _APART_S = 20, 1.0
 _SIGMAS = 4.0
-_FITTED_SIGMAS = 6.0  # errors of odometry last longer than sigmas know, be they of the curvature or the sandwich
+_TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
 _ABSURD, _BACKWARDS, _LATE_S, _SURE = 0.5, 0.35, 0.2, 0.05
 _DEGREE = np.pi / 180.0
 # By parameter: code, unit, limit, and from which sigma on it is not observable.
@@ -133,17 +133,18 @@ def _over_confident(c: Columns, source: str, label: str, part: str, factor: floa
 
 
 def _fitted(c: Columns, one: Fitted) -> Iterator[Finding]:
-    """A parameter that is far off by its limit and by six sigmas, or that the drive does not tell."""
+    """A parameter that is far off by its limit and several sigmas, or that the drive does not tell."""
     if one.parameter.name not in _LIMITS:
         return
     code, unit, limit, unknown = _LIMITS[one.parameter.name]
+    sigmas = _TURN_SIGMAS if one.parameter.name == "turn" else _SIGMAS
     topic = next((t for t in c.topics.values() if one.parameter.source in t.inputs), None)
     if topic is None:
         return
     where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
     if one.sigma > unknown:
         yield Finding("not_observable", "note", one.sigma, unknown, unit, one.text, **where)
-    elif abs(one.value) > max(limit, _FITTED_SIGMAS * one.sigma) and one.verdict == "admitted":
+    elif abs(one.value) > max(limit, sigmas * one.sigma) and one.verdict == "admitted":
         text, settings = _mended(c, one)
         yield Finding(code, "warning", one.value, limit, unit, f"{topic.name}: {text}", settings=settings, **where)
 
