@@ -97,13 +97,13 @@ class Consistency:
                 )
         lines += [f"{f'NEES of {name}':30s}left out: {reason}" for name, reason in self.left_out.items()]
         if self.noise:
-            head = f"{'dof':>8s}{'chi2/dof':>10s}{'alike':>8s}"
+            head = f"{'dof':>8s}{'chi2/dof':>10s}{'repeated':>10s}"
             lines.append(f"{'noise of class, input, part':40s}{head}   configured sigmas should be")
         for one in self.noise:
             name = " ".join(filter(None, (one.label, one.source, one.part)))
             per_dof = f"{one.per_dof:.3f}" if np.isfinite(one.per_dof) else "-"
             should = f"not known: {one.reason}" if one.reason else f"{one.factor:.3g} times as large{_growth(one)}"
-            lines.append(f"{name:40s}{one.dof:8.0f}{per_dof:>10s}{one.design_effect:8.2f}   {should}")
+            lines.append(f"{name:40s}{one.dof:8.0f}{per_dof:>10s}{one.design_effect:10.2f}   {should}")
         lines += [self.advice] if self.advice else []
         return "\n".join(lines)
 
@@ -207,7 +207,7 @@ def noise_advice(noise: Sequence[NoiseScale], *, is_applied: bool, config: Confi
         return ""
     out = "the run used these factors" if is_applied else f"replay with --set {_ESTIMATED} to use these factors"
     line = motion_setting([one for one in wrong if one.label == "odometry"], config) if config else ""
-    return f"{out}\nodometry for good: {line}" if line else out
+    return f"{out}\nnoise of this odometry in every run: {line}" if line else out
 
 
 def _is_wrong(one: NoiseScale) -> bool:

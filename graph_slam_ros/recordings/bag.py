@@ -124,11 +124,16 @@ def open_bag(path: Path | str) -> Bag:
     """
     path = Path(path)
     try:
-        return Bag([_part(file) for file in _files(path)])
+        files = _files(path)
+        bag = Bag([_part(file) for file in files])
     except OSError as error:
         raise BagError(f"{path}: {error.strerror}") from None
     except FormatError as error:
         raise BagError(str(error)) from None
+    names = {re.sub(r"[_-]?\d+$", "", file.stem) for file in files}
+    if len(names) > 1 and not (path / "metadata.yaml").is_file():
+        bag.warnings.append(f"{path}: {len(files)} files of different names are read as one recording; name one of them")
+    return bag
 
 
 def _files(path: Path) -> list[Path]:

@@ -212,10 +212,11 @@ function edgeTraces() {
       return line;
     });
     const middle = axes.map((line) => Float64Array.from(some, (_, at) => (line[3 * at] + line[3 * at + 1]) / 2));
+    const faint = Math.max(0.06, Math.min(0.25, 250 / edges.length));  // many sightings would hide the path
     const colour = isIn && isSighting ? colours().landmarks : isIn ? colours().closures : colours()[name];
-    out.push(trace(plain(key), axes, colour, {visible, isMany: true, opacity: isIn && isSighting ? 0.25 : 0.8, legendgroup: key}));
+    out.push(trace(plain(key), axes, colour, {visible, isMany: true, opacity: isIn && isSighting ? faint : 0.8, legendgroup: key}));
     out.push(trace("", middle, colour, {
-      visible, isMany: true, mode: "markers", marker: {color: colour, size: isIn ? 4 : 7, symbol: "diamond", opacity: isIn ? 0.35 : 0.9}, showlegend: false,
+      visible, isMany: true, mode: "markers", marker: {color: colour, size: isIn ? 4 : 7, symbol: "diamond", opacity: isIn ? (isSighting ? faint : 0.35) : 0.9}, showlegend: false,
       legendgroup: key, customdata: some, meta: "edge", hovertemplate: `edge %{customdata}: ${plain(key)}<extra></extra>`, hoverinfo: "all",
     }));
   }
@@ -568,7 +569,7 @@ function writeText() {
   table("versions", ["what", "mark"], t.versions);
   table("timing", ["what", "value"], t.timing);
   table("classes", ["class", "edges", "numbers", "chi2", "chi2 per number"], t.classes);
-  table("noise", ["class, input, part", "degrees of freedom", "chi2 per degree", "alike", "sigmas should be"], t.noise);
+  table("noise", ["class, input, part", "degrees of freedom", "chi2 per degree", "repeated errors", "sigmas should be"], t.noise);
   if (t.edits.length) table("edits", ["edit by hand", "what", "who", "when", "why"], t.edits);
   if (data.waiting.length) table("waiting", ["landmark that waits", "why"], data.waiting);
   byId("chi2-dof").textContent = data.chi2_per_dof === null ? "" : `chi2 per degree of freedom of the whole: ${general(data.chi2_per_dof, 3)}`;

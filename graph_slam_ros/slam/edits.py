@@ -118,7 +118,7 @@ class Edits:
             case "remove_landmark":
                 marks.remove(a["landmark"], keyframe)
             case "rename_landmark":
-                marks.rename(a["landmark"], a["to"])
+                marks.rename_landmark(a["landmark"], a["to"])
             case "merge_landmarks":
                 marks.merge(a["landmark"], a["into"], keyframe)
             case "split_landmark":

@@ -29,7 +29,7 @@ class LandmarkEdits:
         self._landmarks.forget({landmark.vertex})
         self._tools.counters.count("edit", "removed")
 
-    def rename(self, name: str, to: str) -> None:
+    def rename_landmark(self, name: str, to: str) -> None:
         """Give a landmark another name."""
         landmark = self._known(name)
         self._refuse_known(to)

@@ -69,10 +69,10 @@ def angular_velocity(source: InputContext, m: Any) -> Iterator[AngularVelocity]:
     if m.angular_velocity_covariance[0] == -1.0:
         raise MessageError("no_angular_velocity")
     w, plane = m.angular_velocity, source.space.dimensions == 2
-    if not (math.isfinite(w.x) and math.isfinite(w.y) and math.isfinite(w.z)):
-        raise MessageError("nonfinite")
     turn = se3.rotation(source.T_base(source.frame(m.header.frame_id), stamp_ns))
     rate = tuple(map(float, so3.act(turn, (w.x, w.y, w.z))))
+    if not all(map(math.isfinite, rate)):  # a large number may become infinite as it is turned
+        raise MessageError("nonfinite")
     covariance = _rate_covariance(source, turn, m.angular_velocity_covariance)
     yield AngularVelocity(stamp_ns, source.name, rate[2:] if plane else rate, covariance)
 

@@ -242,7 +242,7 @@ class KeyframeFrontend:
         now = self._motion.now
         covariance, held = now.covariance, self.held_covariance
         if held is not None and self._parallel:
-            self._parallel.unlink(len(self.path.keyframes))
+            self._parallel.disconnect(len(self.path.keyframes))
         if held is not None:  # the first that is free in a held map is as uncertain as the pose was then
             covariance, self.held_covariance = self._space.group.propagate(held, now.T_keyframe_base, covariance), None
         self._append(step, now.T_keyframe_base, covariance)
@@ -258,7 +258,7 @@ class KeyframeFrontend:
             T_last_now = self._space.group.between(keyframes[-1].T_odom_base, step.T_odom_base)
             covariance = np.zeros_like(self.covariance)
         if self._parallel:
-            self._parallel.unlink(len(keyframes))
+            self._parallel.disconnect(len(keyframes))
         if not is_prior:
             self.path.segments.append(len(keyframes))
         added_sigmas = self._added_sigmas(given, T_last_now, is_prior=is_prior)

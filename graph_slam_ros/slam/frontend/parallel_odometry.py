@@ -72,7 +72,7 @@ class ParallelOdometry:
         if len(track.messages) > _MOST:
             del track.messages[: _MOST // 2]
 
-    def unlink(self, keyframe: int) -> None:
+    def disconnect(self, keyframe: int) -> None:
         """Give no motion to a keyframe: little is known of how the robot came there, whatever odometries say."""
         self._unlinked.add(keyframe)
 

@@ -22,6 +22,7 @@ S = 1_000_000_000
 FRAMES = {  # those that make sense where a message is used so, and those of what it tells of
     "odometry": (("odom", "odom", "odom", "world"), ("base_link", "base_link", "mast")),
     "fix": (("map", "map", "map", "base_link", "mast"), ("base_link", "mast")),
+    "gyro": (("base_link", "mast", "turret"), ("base_link",)),
     "landmarks": (("base_link", "mast", "turret", "odom"), ("tag1", "tag2", "tag3", "hand")),
     "closure": (("base_link", "mast", "turret"), ("base_link",)),
 }

@@ -106,6 +106,18 @@ def test_reading_writes_nothing_beside_the_recording(tmp_path, recorded):
     assert [p.name for p in tmp_path.iterdir()] == ["b.mcap"]
 
 
+@pytest.mark.parametrize(
+    ("names", "is_warned"),
+    [(("a_0.mcap", "a_1.mcap"), False), (("a.mcap", "b.mcap"), True), (("a.mcap", "b.mcap", "metadata.yaml"), False)],
+)
+def test_a_folder_of_files_with_different_names_is_one_recording_with_a_warning(names, is_warned, tmp_path):
+    recording = simulate("pythonrobotics", seed=1)
+    for name in names:
+        write_bag(recording, tmp_path / name) if name.endswith(".mcap") else (tmp_path / name).write_text("")
+    warned = [line for line in open_bag(tmp_path).warnings if "read as one recording" in line]
+    assert len(warned) == is_warned
+
+
 def test_a_recording_split_by_topic_is_read_in_order_of_time(tmp_path):
     whole = tmp_path / "whole.mcap"
     write_bag(simulate("warehouse", 3, aisles=2, laps=1, aisle_m=6.0), whole)

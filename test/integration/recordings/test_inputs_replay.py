@@ -188,10 +188,12 @@ def test_the_page_of_inputs_has_a_row_for_every_type_with_what_it_becomes_and_it
         package, _, name = type_name.split("/")
         becomes = [row[2] for row in rows if package in row[1] and re.search(rf"\b{name}\b", row[1])]
         assert len(becomes) == 1, f"docs/inputs.md has {len(becomes)} rows for {type_name}"
-        told = dict.fromkeys(re.findall(r"\b(odometry|landmarks|fix|closure)\b", becomes[0]))
+        told = dict.fromkeys(re.findall(r"\b(odometry|gyro|landmarks|fix|closure)\b", becomes[0]))
         assert [use for use in told if use in there] == list(there)
     assert f"| [{len(CONVERTERS)} message types](docs/inputs.md) |" in (ROOT / "README.md").read_text()
-    (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
-    (tmp_path / "example.yaml").write_text(example)
-    config = Config.from_mapping(read_parameters(tmp_path / "example.yaml"))
-    assert uses(config) == {"odom": "odometry", "detections": "landmarks", "gps": "fix", "tags": "landmarks"}
+    configs = []
+    for example in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL):
+        whole = example if "ros__parameters" in example else f"/**:\n  ros__parameters:\n{example}"
+        (tmp_path / "example.yaml").write_text(whole)
+        configs.append(Config.from_mapping(read_parameters(tmp_path / "example.yaml")))
+    assert uses(configs[0]) == {"odom": "odometry", "detections": "landmarks", "gps": "fix", "tags": "landmarks"}

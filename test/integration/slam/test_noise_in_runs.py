@@ -132,7 +132,7 @@ def test_parameters_that_say_the_estimated_noise_of_odometry_are_printed():
     by_twist = noise_advice(found, is_applied=False, config=Config())
     turn, way = "turn_per_rad=0.04 turn_per_m=0.002 turn_per_s=0.0003", "way_per_m=0.0032 way_per_s=0.00016"
     expected = " ".join(f"--set odometry.{one}" for one in f"noise=motion {turn} {way}".split())
-    assert by_twist.endswith(f"odometry for good: {expected}")
+    assert by_twist.endswith(f"noise of this odometry in every run: {expected}")
     by_motion = noise_advice(found, is_applied=False, config=Config.from_mapping({"odometry.noise": "motion"}))
     assert "turn_per_rad=0.045 --set odometry.turn_per_m=0.0025 --set odometry.turn_per_s=5e-05" in by_motion
 

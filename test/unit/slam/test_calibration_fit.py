@@ -75,7 +75,7 @@ def test_a_fit_finds_what_was_wrong(wrong):
         one = by_name[name]
         assert one.verdict == "admitted", one.text
         assert abs(one.value - truth) < 5.0 * one.sigma + 0.003, one.text
-        assert one.sigma < one.parameter.quantity.determined_below / 3.0
+        assert one.sigma < one.parameter.quantity.determined_below / 2.0
     assert np.abs(found.correlation - np.eye(4)).max() < 0.95
 
 
