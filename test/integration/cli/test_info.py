@@ -385,7 +385,9 @@ def test_an_imu_is_offered_where_nothing_else_is(info, capsys, covariance):
     assert run([*words[:-2], *offered, "--out", "b_imu"], capsys)[0]["inputs"]["imu"]["used"] > 0
     _, lines, _ = info(ODOMETRY, ("/imu/raw", IMU, compass(-1.0)), name="c.mcap")
     assert any(line.startswith("not used: /imu/raw: it has no orientation") for line in lines)
-    assert "--set imu.topic=/imu/raw --set 'imu.mount=0 0 0 0 0 0' --set imu.use=gyro" in " ".join(" ".join(lines).split())
+    assert "--set imu.topic=/imu/raw --set 'imu.mount=0 0 0 0 0 0' --set imu.use=gyro" in " ".join(
+        " ".join(lines).split()
+    )
 
 
 def test_poses_are_offered_where_nothing_else_is_but_no_estimates_and_no_truth(info, capsys):
