@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from graph_slam_ros.formats.files import read_text
 from graph_slam_ros.report.contents import Contents
 from graph_slam_ros.report.page import Panel, plotly, whole_page
 from graph_slam_ros.view.workbench import Workbench
@@ -12,5 +11,5 @@ _HERE = Path(__file__).resolve().parent
 
 def page_of(made: Contents, work: Workbench) -> str:
     """The whole HTML of the page. Raises GraphSlamError where plotly is not installed."""
-    html, css, script = (read_text(_HERE / f"edits.{kind}") for kind in ("html", "css", "js"))
+    html, css, script = ((_HERE / f"edits.{kind}").read_text(encoding="utf-8") for kind in ("html", "css", "js"))
     return whole_page(made, plotly(), Panel(html, css, script, work.page_data))

@@ -357,6 +357,7 @@ OF_FILES = {
     "analysis/plots.py": {"figure.savefig"},  # into memory
     "solver/problem.py": {"self._pending.touch"},
     "report/page.py": {f"(_HERE / 'page.{kind}').read_text" for kind in ("css", "html", "js")} | {"file.read_text"},
+    "view/page.py": {"(_HERE / f'edits.{kind}').read_text"},
     "report/places.py": {"Image.open"},  # from memory
 }
 

@@ -102,7 +102,7 @@ def test_a_jump_is_no_motion_nor_one_into_a_segment():
     robot.hears(*messages)
     robot.keyframe(250)
     robot.keyframe(500)
-    robot.parallel.unlink(3)
+    robot.parallel.disconnect(3)
     robot.keyframe(750)
     assert [m.vertices for m in robot.motions()] == [(0, 1)]
 
