@@ -44,7 +44,7 @@ class GyroConfig:
     )
     timeout_s: float = setting(
         0.1,
-        "longest gap between messages of the gyro that is bridged; in a longer one odometry turns alone",
+        "longest gap between messages of the gyro that is bridged; in a longer one odometry is used alone",
         "s",
         low=1e-3,
     )

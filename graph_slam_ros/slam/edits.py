@@ -98,7 +98,8 @@ class Edits:
         try:
             self._apply(edit.do, dict(edit.arguments), keyframe)
         except GraphSlamError as error:
-            raise GraphSlamError(f"edit {edit.name}: {edit.text}: {error}") from None
+            kind = "" if edit.name == edit.do else f" ({edit.do})"
+            raise GraphSlamError(f"edit {edit.name}{kind}: {error}") from None
         decided = [one.edge for one in backend.ledger.history[changes:] if one.reason is Reason.BY_HAND]
         out = tuple(edge for edge in dict.fromkeys(decided) if edge < edges)
         added = tuple(range(edges, backend.graph.edge_count))

@@ -1,4 +1,4 @@
-"""Edges of odometry that are replaced by edges with more noise, and the way back; the ledger has both."""
+"""Replacement of odometry edges by edges with more noise, and its undo. The ledger has both edges."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 def replace_odometry(
     backend: Backend, links: Sequence[int], noises: Sequence[Gaussian], keyframe: int, evidence: float, threshold: float
 ) -> list[int]:
-    """Put edges with other noise in the place of edges of odometry; returns them.
+    """Replace odometry edges by edges with other noise. Returns the new edges.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""Slip: stretches of odometry whose errors are larger than odometry says, by the evidence of the newest views.
+"""Detection of slip: stretches of odometry whose errors are larger than its noise.
 
-A view is what was seen from one keyframe. Where views contradict odometry over the last 1, 4 or 16 of them, each time
-is tested since which odometry may have been wrong, in its way or its turning. The likeliest must pay the odds against
-a slip, and must do so without any one landmark, too. Then edges with more noise replace those of the stretch, and those
-of odometry that comes, until odometry would be likelier with its own noise again for some views. If that holds for all
-of the stretch, it was no slip, and all is as before.
+A view is everything that was measured from one keyframe. If the last 1, 4 or 16 views contradict odometry, each of
+their keyframes is tested as the start of a slip, of translation or of rotation. The best hypothesis must exceed the
+odds against a slip, also without any one landmark. Then edges with more noise replace the odometry edges of the
+stretch, and new odometry gets more noise, too. The slip ends when odometry with its own noise is likelier again for
+some views. If that is true of the whole stretch, the slip is taken back, and everything is as before.
 """
 
 from collections import deque
@@ -31,28 +31,28 @@ _SUMS = (1, 4, 16)  # views whose innovations are summed
 _SURE = 1.0 - 1e-6  # probability with which clean measurements raise no alarm
 _CAP = 0.9999  # no innovation counts for more than this quantile: one alone does not decide
 _EARLIER = (1, 2, 3, 4, 6, 8)  # edges by which a slip may have begun before it was found
-_SURELY = 1.0  # of the logarithm of how much likelier that is
+_SURELY = 1.0  # logarithm of the likelihood ratio that this needs
 _AGAIN = (8, 12, 16)  # views for which odometry must be as likely by its own noise, for a slip to end
 _MOST_EDGES = 60
-_FACTOR = 1.5  # all noise may be so many times larger than it is said
-_LASTS_S = 0.5  # errors of a slip are alike for so long
-_SHARED = 0.5  # of the motion: a part that is lost alike in all of a stretch
-_OTHERS = 1.0 / 3.0  # of the first axis: how far a slip goes along the others
+_FACTOR = 1.5  # all noise may be larger than stated by this factor
+_LASTS_S = 0.5  # correlation time of the errors of a slip
+_SHARED = 0.5  # sigma of the fraction of the motion that is lost in the whole stretch
+_OTHERS = 1.0 / 3.0  # sigma along the other axes, relative to the first
 
 
 @dataclass(frozen=True, slots=True)
 class Slip:
-    """A stretch of odometry in which its errors are larger than it says.
+    """A stretch of odometry in which its errors are larger than its noise.
 
     Attributes
     ----------
-    kind : of its ``way`` or of its ``turning``
+    kind : ``translation`` or ``rotation``
     began_ns, decided_ns, ended_ns : stamps of odometry; the last is None while it goes on
-    evidence : twice the logarithm of how much likelier it is than none
-    landmarks : the number of landmarks that contradict odometry
-    edges : the number of edges of odometry that were replaced
-    outcome : where it was taken back: why
-    segment : None: the path goes on
+    evidence : twice the logarithm of the likelihood ratio of slip to no slip
+    landmarks : the number of landmarks, and of other classes of edges, that contradict odometry
+    edges : the number of odometry edges that were replaced
+    outcome : why it was taken back; empty if it was not
+    segment : always None, because no new segment begins
     """
 
     kind: str
@@ -67,19 +67,17 @@ class Slip:
 
     def __str__(self) -> str:
         since = f"{self.began_ns * 1e-9:.1f} s"
-        why = f"{self.landmarks} landmarks and others agree against it, evidence {self.evidence:.0f}"
+        why = f"{self.landmarks} landmarks or other inputs contradict it, evidence {self.evidence:.0f}"
         if self.ended_ns is None:
-            return (
-                f"odometry in doubt since {since}: its {self.kind} slips ({why}); it counts for less until they agree"
-            )
+            return f"odometry in doubt since {since}: its {self.kind} is wrong ({why}); it counts for less"
         until = f"{self.ended_ns * 1e-9:.1f} s"
         outcome = self.outcome or f"{self.edges} edges of odometry count for less"
-        return f"odometry was in doubt from {since} to {until}: its {self.kind} slipped ({why}); {outcome}"
+        return f"odometry was in doubt from {since} to {until}: its {self.kind} was wrong ({why}); {outcome}"
 
 
 @dataclass(slots=True)
 class _Link:
-    """An edge of odometry that is in the problem: its own, or that with more noise in its place."""
+    """An odometry edge of the problem: the original ``own``, or ``edge`` that replaces it."""
 
     edge: int
     own: int
@@ -93,7 +91,7 @@ class _Link:
 
 @dataclass(slots=True)
 class _View:
-    """Edges of what was seen from one keyframe, their landmarks (or classes), and innovations when they came."""
+    """The edges that were measured from one keyframe, their landmarks or classes, and the sum of their innovations."""
 
     vertex: int
     edges: list[int]
@@ -137,7 +135,7 @@ class SlipDetector:
         return next((link.edge for link in self._links if link.vertices == vertices), edge)
 
     def begin(self, stamp_ns: int) -> None:
-        """A segment begins: odometry before tells nothing any more."""
+        """Begin a segment: earlier odometry is not examined any more."""
         self._links.clear()
         self._views.clear()
         self._new.clear()
@@ -145,7 +143,7 @@ class SlipDetector:
             self.slips[-1] = replace(now, ended_ns=stamp_ns)
 
     def add_odometry(self, edge: int, vertices: Sequence[int], stamps_ns: tuple[int, int], keyframe: int) -> None:
-        """Odometry from one keyframe to the next; it has more noise while a slip goes on."""
+        """Add the odometry edge from one keyframe to the next. During a slip it gets more noise."""
         link = _Link(edge, edge, (vertices[0], vertices[1]), stamps_ns)
         if edge in self._added or (self._links and self._links[-1].vertices == link.vertices):
             self._added.discard(edge)  # it replaces another, or another odometry measured the same motion
@@ -157,7 +155,7 @@ class SlipDetector:
             self._replace([link], now, keyframe)
 
     def add_seen(self, edge: int, vertex: int, what: int | str) -> None:
-        """Something that was measured from a keyframe: a landmark, by its vertex, or of another class."""
+        """Add an edge that was measured from a keyframe: of a landmark, by its vertex, or of another class."""
         if not self._views or self._views[-1].vertex < vertex:
             self._views.append(_View(vertex, [], []))
         view = next((one for one in reversed(self._views) if one.vertex == vertex), None)
@@ -193,7 +191,7 @@ class SlipDetector:
     # -- alarm -----------------------------------------------------------------------------------------------------
 
     def _store_innovations(self) -> None:
-        """Note how far what is new was from what was expected."""
+        """Store the innovations of the new edges."""
         new, ledger = set(self._new), self._backend.ledger
         for view in reversed(self._views):
             for edge, what in zip(view.edges, view.seen, strict=True):
@@ -218,7 +216,7 @@ class SlipDetector:
     # -- evidence --------------------------------------------------------------------------------------------------
 
     def _stretch(self) -> list[_Link]:
-        """Links of the window: since the oldest view."""
+        """The links since the oldest view."""
         return [link for link in self._links if link.vertices[1] > self._views[0].vertex]
 
     def _errors(self, links: Sequence[_Link]) -> OdometryErrors:
@@ -229,7 +227,7 @@ class SlipDetector:
         links = self._stretch()
         errors, best, prior = self._errors(links), (0.0, "", 0), -float(np.log(self._config.doubt_odds))
         firsts = sorted({self._first_of(links, since) for since in range(1, len(self._views))})
-        for kind in ("way", "turning"):
+        for kind in ("translation", "rotation"):
             added = self._added_noise(links, kind)
             for first in firsts:
                 gain = errors.log_ratio(*self._between(added, first)) - prior
@@ -245,17 +243,17 @@ class SlipDetector:
         self._admit_since(links[first].vertices[0], keyframe)
 
     def _first_of(self, links: Sequence[_Link], since: int) -> int:
-        """The first link after the view before so many."""
+        """The first link after the view that precedes the last ``since`` views."""
         before = self._views[-since - 1].vertex
         return next((k for k, link in enumerate(links) if link.vertices[0] >= before), len(links) - 1)
 
     def _added_noise(self, links: Sequence[_Link], kind: str) -> tuple[Array, Array]:
-        """Variances that a slip adds to links, and standard deviations of what is lost alike in all: each (n dof,)."""
+        """Variances (n dof,) that a slip adds to links, and sigmas (n dof,) of the error that all links share."""
         variances = [self._slip_of(link, kind) for link in links]
         return np.concatenate(variances), _SHARED * np.concatenate([self._motion(link, kind) for link in links])
 
     def _between(self, added: tuple[Array, Array], first: int, end: int | None = None) -> tuple[Array, Array]:
-        """Return the part that is added to the links from one of them on, up to another."""
+        """Return the added noise of the links from ``first`` up to ``end``, and zero for the others."""
         dof = self._space.dof
         is_part = np.zeros(len(added[0]), dtype=bool)
         is_part[first * dof : None if end is None else end * dof] = True
@@ -265,7 +263,7 @@ class SlipDetector:
         """Variances (dof,) that a slip adds to a link."""
         n, seconds = self._space.dimensions, link.seconds
         sigmas = np.zeros(self._space.dof)
-        if kind == "way":
+        if kind == "translation":
             sigmas[:n] = self._config.doubt_m_s * seconds * _OTHERS
             sigmas[0] = self._config.doubt_m_s * seconds
         else:
@@ -274,16 +272,16 @@ class SlipDetector:
         return np.asarray(sigmas**2 * max(1.0, _LASTS_S / max(seconds, 1e-9)))
 
     def _motion(self, link: _Link, kind: str) -> Array:
-        """The way or the turn (dof,) of a link."""
+        """The translation or the rotation (dof,) of a link."""
         space, out = self._space, np.zeros(self._space.dof)
         measured = tuple(self._backend.graph.edge(link.edge).measured.tolist())
         motion = np.asarray(space.group.local(space.identity, measured), dtype=float)
-        of_kind = slice(space.dimensions) if kind == "way" else slice(space.dimensions, None)
+        of_kind = slice(space.dimensions) if kind == "translation" else slice(space.dimensions, None)
         out[of_kind] = motion[of_kind]
         return out
 
     def _voters(self, since: int) -> set[int | str]:
-        """Landmarks that were known, and other classes, of which something believed was measured since a keyframe."""
+        """Known landmarks, and other classes, with an accepted edge since a keyframe."""
         ledger = self._backend.ledger
         return {
             what
@@ -294,7 +292,7 @@ class SlipDetector:
         }
 
     def _holds_without_any(self, voters: set[int | str], links: Sequence[_Link], first: int, kind: str) -> bool:
-        """Return whether the evidence is for a slip without any one of those that were measured, too."""
+        """Return whether the evidence is for a slip also without any one landmark or class."""
         added = self._between(self._added_noise(links, kind), first)
         for one in sorted(voters, key=str):
             with self._without(one):
@@ -304,7 +302,7 @@ class SlipDetector:
 
     @contextmanager
     def _without(self, what: int | str) -> Iterator[None]:
-        """Leave out for a while what was measured of one landmark, or of one class, in the window."""
+        """Leave out the edges of one landmark, or of one class, in the window."""
         solver, ledger = self._backend.solver, self._backend.ledger
         edges = [
             edge
@@ -325,7 +323,7 @@ class SlipDetector:
     # -- the end -----------------------------------------------------------------------------------------------------
 
     def _update_slip(self, now: Slip, keyframe: int, stamp_ns: int) -> None:
-        """Find that a slip has begun earlier, or that it has ended."""
+        """Move the start of a slip to an earlier keyframe, or end it."""
         links = self._stretch()
         is_replaced = [link.edge != link.own for link in links]
         if not any(is_replaced):
@@ -356,7 +354,7 @@ class SlipDetector:
         return count > 0
 
     def _end(self, now: Slip, links: Sequence[_Link], gain: float, keyframe: int, stamp_ns: int) -> None:
-        """Have odometry as it was again, from a link on."""
+        """Use odometry with its own noise again, for these links."""
         pairs = [(link.own, link.edge) for link in links if link.edge != link.own]
         restore_odometry(self._backend, pairs, keyframe, -2.0 * gain)
         for link in links:
@@ -377,7 +375,7 @@ class SlipDetector:
     # -- the graph ---------------------------------------------------------------------------------------------------
 
     def _replace(self, links: Sequence[_Link], slip: Slip, keyframe: int) -> None:
-        """Put edges with more noise in the place of odometry's."""
+        """Replace odometry edges by edges with more noise."""
         graph, threshold = self._backend.graph, -2.0 * float(np.log(self._config.doubt_odds))
         own = [link.edge for link in links]
         noises = []
@@ -393,7 +391,7 @@ class SlipDetector:
         self.slips[-1] = replace(slip, edges=slip.edges + len(new))
 
     def _admit_since(self, vertex: int, keyframe: int) -> None:
-        """Compare what was held back since a keyframe with the wider noise of odometry."""
+        """Judge again the edges that were held back since a keyframe, with the wider noise of odometry."""
         ledger = self._backend.ledger
         edges = [edge for view in self._views if view.vertex >= vertex for edge in view.edges]
         self._backend.admit([edge for edge in edges if edge < len(ledger) and not ledger.is_withdrawn(edge)], keyframe)

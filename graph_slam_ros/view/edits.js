@@ -223,8 +223,9 @@ function drawActions() {
     label.append(box, " in the map");
     buttons.push(label);
   }
+  const isSighting = kind === "edge" && named(data.edges.landmark, which) !== "";
   for (const {do: what, fields} of known.kinds) {
-    if (!fields.some((one) => one.kind === kind || (kind === "edge" && one.kind === "edges")) || what.endsWith("_edge")) continue;
+    if (!fields.some((one) => one.kind === kind || (isSighting && one.kind === "edges")) || what.endsWith("_edge")) continue;
     const button = element("button", what.replace(/_/g, " "), {type: "button"});
     button.addEventListener("click", () => {
       byId("kind").value = what;

@@ -1,10 +1,10 @@
-"""A gyro as part of odometry: its turn and that of odometry become one, by their covariances.
+"""Fusion of a gyro with odometry: the two rotations of each step are averaged by their variances.
 
-The bias of the gyro is estimated on the way: while the robot stands, and, where odometry goes nearly straight, from the
-turn that odometry has. Its error is common to all steps, so each counts as if it lasted ``gyro.bias_correlation_s``.
+The bias of the gyro is estimated while the robot stands, and from odometry's rotation while it drives nearly straight.
+The error of the bias is common to all steps, so it counts as if it lasted ``gyro.bias_correlation_s``.
 
-Over each second odometry's turn must agree with the gyro's. Where it does not, wheels slip, and the gyro's is used
-alone. A gyro that most of the time disagrees is itself wrong: in other units, or mounted otherwise.
+Over each second the rotations of odometry and gyro must agree. If they do not, the wheels slip, and the gyro is used
+alone. A gyro that disagrees most of the time is itself wrong: in other units, or with another mount.
 """
 
 import math
@@ -46,13 +46,14 @@ class GyroState:
 
     @property
     def fault(self) -> str:
-        """The reason why it has no part in odometry; empty where it has."""
+        """The reason why the gyro is not used; empty if it is."""
         if self.state == "silent":
-            return f"{self.name}: the gyro is silent, odometry turns alone (gyro.timeout_s)"
+            return f"{self.name}: the gyro is silent; the rotation is that of odometry alone (gyro.timeout_s)"
         if self.state == "doubted":
             return (
-                f"{self.name}: gyro and odometry contradict each other most of the time, odometry turns alone: rad/s, "
-                f"counter-clockwise positive? Its frame and TF or {self.name}.mount? odometry.turn_factor?"
+                f"{self.name}: gyro and odometry contradict each other most of the time; the gyro is not used. It "
+                f"must be in rad/s, counter-clockwise positive. Check its frame, TF or {self.name}.mount, "
+                f"odometry.turn_factor"
             )
         return ""
 
@@ -99,18 +100,18 @@ class GyroFusion:
         self._samples.add(m)
 
     def drop(self) -> None:
-        """No odometry comes any more for the messages that are pending."""
+        """Drop the pending messages, because no odometry will come for them."""
         self._samples.forget()
 
     def forget(self) -> None:
-        """Stamps begin anew: the bias may be another by then."""
+        """Begin anew with the stamps. The bias may be another by then."""
         self.drop()
         self._window.clear()
         self._rest = StationaryDetector(self._noise, self._space)
         self._bias_variance = [self._config.bias_sigma**2] * self._axes
 
     def fuse(self, step: Step, seconds: float, source: str) -> Step:
-        """A step of odometry, with the gyro as part of its turn.
+        """Return a step of odometry, its rotation fused with that of the gyro.
 
         Parameters
         ----------
@@ -183,7 +184,7 @@ class GyroFusion:
         return statistic > self._limit
 
     def _judge(self, seconds: float, slips: bool, *, is_moving: bool) -> None:
-        """Follow how often they disagree: wheels slip now and then, a gyro that is wrong always is."""
+        """Update how often they disagree. Wheels slip now and then, but a wrong gyro always disagrees."""
         if not is_moving:
             return
         self._seen_s = min(self._seen_s + seconds, _MEMORY_S)

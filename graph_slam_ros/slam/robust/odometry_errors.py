@@ -1,11 +1,11 @@
-"""The errors of a stretch of odometry, as all other measurements show them, and how likely they are with other noise.
+"""The errors of a stretch of odometry, as observed by all other measurements, and their likelihood for a given noise.
 
 With Q the covariance of the stretch's edges and C that of their errors given everything, the directions of
 ``Q^-1/2 C Q^-T/2`` with eigenvalue l have been observed by all else with variance ``l / (1 - l)``, in units of Q. Where
-l is near 1 nothing but odometry says anything: such directions are left out, because rounding would decide there. What
-is observed of the others is Gaussian under each hypothesis on the noise, and so is compared: the fixed-lag form of a
-generalized likelihood ratio test (Willsky and Jones, "A generalized likelihood ratio approach to the detection and
-estimation of jumps in linear systems", 1976).
+l is near 1 only odometry observes the direction. Such directions are left out, because rounding would decide there. The
+observations of the others are Gaussian under each hypothesis on the noise. Their likelihoods are compared: the
+fixed-lag form of a generalized likelihood ratio test (Willsky and Jones, "A generalized likelihood ratio approach to
+the detection and estimation of jumps in linear systems", 1976).
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import linearized
 from graph_slam_ros.typing import Array
 
-_OBSERVED = 0.95  # eigenvalue below which more than odometry itself tells of a direction
+_OBSERVED = 0.95  # largest eigenvalue of a direction that other measurements observe
 _LEAST = 1e-6
 
 
@@ -42,7 +42,7 @@ class OdometryErrors:
     noise_factor: float
 
     def log_ratio(self, variances: Array, shared: Array) -> float:
-        """Return the logarithm of how much likelier the errors are with more noise.
+        """Return the logarithm of the likelihood ratio of the errors with added noise.
 
         Parameters
         ----------
@@ -54,7 +54,7 @@ class OdometryErrors:
         return self._log_likelihood(extra) - self._log_likelihood(np.zeros_like(extra))
 
     def log_ratio_of(self, covariance: Array) -> float:
-        """Return the logarithm of how much likelier the errors are with another covariance (n d, n d) of the noise."""
+        """Return the logarithm of the likelihood ratio with another covariance (n d, n d) of the noise."""
         extra = self.axes @ (covariance - self.covariance) @ self.axes.T
         return self._log_likelihood(extra) - self._log_likelihood(np.zeros_like(extra))
 
@@ -66,7 +66,7 @@ class OdometryErrors:
 
 
 def odometry_errors(graph: Graph, solver: Solver, edges: Sequence[int], noise_factor: float) -> OdometryErrors:
-    """Return what all other measurements say of the errors of a chain of odometry edges.
+    """Return the errors of a chain of odometry edges, as observed by all other measurements.
 
     Raises
     ------

@@ -1,9 +1,9 @@
-"""Odometries that measure the same motion: where they contradict each other, and which of them is wrong.
+"""Comparison of several odometries of the same motion: where they contradict each other, and which is wrong.
 
-Two odometries are compared over the last 1, 2, 4, 8 and 16 motions: a slip that is small in each adds up. Where they
-contradict each other, the other odometry than the one in use is left out at first. Then both explanations are solved:
-the one with the odometry in use alone, and the one with the others alone. What is left out costs at most its gate. So
-the landmarks decide, or the majority of odometries. Without either the odometry in use stays.
+Two odometries are compared over the last 1, 2, 4, 8 and 16 motions, because small slips add up. If they contradict
+each other, the odometry in use is believed at first, and the other is left out. Then both explanations are solved: with
+the odometry in use alone, and with the others alone. A rejected edge costs at most its gate. So the landmarks decide,
+or the majority of odometries. Without either, the odometry in use stays.
 """
 
 from collections.abc import Sequence
@@ -100,8 +100,8 @@ class OdometryJudge:
         if now is None or not now.is_open:
             return ""
         wrong = now.sources if now.trusts_used else {self._graph.source_of(now.pairs[-1].used)}
-        others = "another odometry" if now.trusts_used else "and ".join(sorted(now.sources))
-        return f"{' and '.join(sorted(wrong))}: not used, {others} contradicts it (wheels that slip?)"
+        others = "another odometry" if now.trusts_used else " and ".join(sorted(now.sources))
+        return f"{' and '.join(sorted(wrong))}: not used; contradicted by {others} (wheels that slip?)"
 
     def examine(self, count: int, keyframe: int) -> None:
         """Compare the odometries of motions that are new, up to a count of edges; the solver has these."""

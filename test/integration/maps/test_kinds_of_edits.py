@@ -321,7 +321,7 @@ def test_keyframes_of_a_plan_have_the_numbers_of_its_run_also_after_a_cut(run):
     at = slam.keyframes.stamps_ns.tolist().index(1010 * 10**9)
     assert at == 6
     assert slam.trajectory()[at] == pytest.approx(pose, abs=1e-6)
-    with pytest.raises(GraphSlamError, match="edit second: keyframes from 6 until 8 cut out: keyframe 6 was cut out"):
+    with pytest.raises(GraphSlamError, match=r"edit second \(cut\): keyframe 6 was cut out"):
         applied(run, cut, values("cut", run, {"from": 6, "until": 8}, "second"))
     _, twice = applied(run, cut, values("cut", run, {"from": 7, "until": 8}, "second"))
     assert len(twice.keyframes) == 18
@@ -365,7 +365,10 @@ def test_what_cannot_be_done_is_named_and_nothing_is_written(do, change, named, 
 def test_what_a_later_edit_depends_on_is_not_undone(run, tmp_path):
     renamed = values("rename_landmark", run, {"landmark": "3", "to": "gate"}, "first")
     edit(run, plan(run, renamed, values("remove_landmark", run, {"landmark": "gate"}, "second")), tmp_path / "new")
-    with pytest.raises(GraphSlamError, match=r"edit first cannot be undone alone: without it edit second: .*gate"):
+    with pytest.raises(
+        GraphSlamError,
+        match=r"edit first cannot be undone alone: without it edit second \(remove_landmark\): it is not in the map",
+    ):
         undo_edit(tmp_path / "new", "first", tmp_path / "undone")
     assert not (tmp_path / "undone").exists()
 

@@ -64,7 +64,7 @@ def test_a_slip_is_found_ends_and_leaves_the_map_as_good_as_without(seed, tmp_pa
     slips = [one for one in slam.alarms if isinstance(one, Slip)]
     assert slam.alarms[0].began_ns >= begin_ns - 10**9
     assert slips
-    assert {one.kind for one in slips} == {"way"}
+    assert {one.kind for one in slips} == {"translation"}
     assert (slips[0].decided_ns - begin_ns) * 1e-9 < 5.0
     assert slam.displaced is None  # it has ended
     assert (slips[-1].ended_ns - begin_ns) * 1e-9 < seconds + 5.0
@@ -139,7 +139,7 @@ def test_a_slip_that_was_none_is_taken_back_and_leaves_no_trace():
             is_forced = True
             detector = doubted._kidnaps._slips
             links = list(detector._links)[-3:]
-            slip = Slip("way", links[0].stamps_ns[0], m.stamp_ns, 20.0, 2)
+            slip = Slip("translation", links[0].stamps_ns[0], m.stamp_ns, 20.0, 2)
             detector.slips.append(slip)
             detector._replace(links, slip, len(doubted.keyframes) - 1)
             assert "odometry in doubt since" in str(doubted.displaced)
