@@ -25,7 +25,11 @@ _ODOMETRY = {"distance": "distance_factor", "turn": "turn_factor", "turn_bias": 
 
 
 class Corrections:
-    """The corrections in force.
+    """The corrections that apply at present.
+
+    Attributes
+    ----------
+    found : what calibration estimated beyond the configuration: factors less 1, seconds, radians, metres
 
     Attributes
     ----------
@@ -38,7 +42,7 @@ class Corrections:
         self.found: dict[Key, float] = {}
 
     def configured(self, key: Key) -> float:
-        """The configured value of what is corrected."""
+        """Return the configured value of a parameter that calibration corrects."""
         source, name = key
         if name in _ODOMETRY:
             return float(getattr(self._config.odometry, _ODOMETRY[name]))
@@ -50,7 +54,7 @@ class Corrections:
         )
 
     def total(self, key: Key, found: float | None = None) -> float:
-        """The value that the configuration would have with what was found."""
+        """Return the configured value with the estimated correction added."""
         found = self.found.get(key, 0.0) if found is None else found
         is_factor = key[1] in ("distance", "turn", "range_factor")
         if key[1] == "range_offset":  # ranges are scaled by what was found, too, after the configured offset
@@ -58,17 +62,17 @@ class Corrections:
         return self.configured(key) * (1.0 + found) if is_factor else self.configured(key) + found
 
     def restore(self, totals: Mapping[Key, float]) -> None:
-        """Go on with the values of another run, whatever of them is configured now."""
+        """Continue with the values of another run, whatever is configured now."""
         for key, total in totals.items():
             is_factor = key[1] in ("distance", "turn", "range_factor")
             self.found[key] = total / self.configured(key) - 1.0 if is_factor else total - self.configured(key)
 
     def totals(self) -> dict[Key, float]:
-        """The values of all that was found, as ``restore`` takes them."""
+        """Return all corrected values, as ``restore`` expects them."""
         return {key: self.total(key) for key in self.found}
 
     def lines(self) -> dict[str, float | str]:
-        """Parameters of a configuration that has what was found."""
+        """Return the configuration parameters that state the corrected values."""
         out: dict[str, float | str] = {}
         for source, name in self.found:
             total = self.total((source, name))
@@ -129,7 +133,7 @@ class Corrections:
         return (c.distance_factor, c.turn_factor, c.turn_bias_rad_s) != (1.0, 1.0, 0.0)
 
     def uncorrected(self, motion: Numbers) -> Numbers:
-        """A corrected motion as odometry has it, but for its bias."""
+        """Undo the correction of a motion, except for its bias."""
         group, n = self._space.group, self._space.dimensions
         distance, turn = self._of_odometry("distance"), self._of_odometry("turn")
         tangent = group.log(motion)
@@ -144,18 +148,18 @@ class Corrections:
     # -- sightings ---------------------------------------------------------------------------------------------------
 
     def stamp_ns(self, m: Odometry | Observation) -> int:
-        """The stamp of a measurement, corrected."""
+        """Return the corrected stamp of a measurement."""
         return m.stamp_ns + (round(self.found.get((m.topic, "clock"), 0.0) * 1e9) if isinstance(m, Sightings) else 0)
 
     def lag_ns(self) -> int:
-        """Return how much later than odometry of their stamp sightings come whose clock is corrected."""
+        """Return how long after odometry of the same stamp the sightings with a corrected clock arrive."""
         clocks = {(one.name, "clock") for one in self._inputs.values() if one.offset_s}
         clocks |= {key for key in self.found if key[1] == "clock"}
         lags = (-self.total(key) for key in clocks)
         return round(1e9 * max((lag for lag in lags if 0.0 < lag <= _LONGEST_LAG_S), default=0.0))
 
     def observation(self, m: Observation) -> Observation:
-        """An observation, corrected."""
+        """Return an observation with its corrections."""
         if not isinstance(m, Sightings):
             return m
         mount = [self.total((m.topic, axis)) for axis in AXES]

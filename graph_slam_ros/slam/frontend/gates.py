@@ -1,4 +1,4 @@
-"""Gates: each refuses a part of what arrives, counted under its reason, and passes the rest on to the next."""
+"""Gates: each refuses a part of the measurements, counts it under its reason, and passes the rest to the next."""
 
 from collections.abc import Callable, Sequence
 from typing import Generic, Protocol, TypeVar
@@ -10,7 +10,7 @@ from graph_slam_ros.slam.frontend.odometry_selector import OdometrySelector
 
 
 class Arrival(Protocol):
-    """Anything that arrives on a topic."""
+    """A measurement with a topic: a gate decides on it."""
 
     @property
     def topic(self) -> str:
@@ -21,18 +21,18 @@ Item = TypeVar("Item", bound=Arrival)
 
 
 class Gate(Protocol[Item]):
-    """One check of what arrives."""
+    """A check of what arrives."""
 
     @property
     def reason(self) -> str:
-        """The reason under which the refused is counted."""
+        """The reason under which refused measurements are counted."""
 
     def admit(self, m: Item) -> Item | None:
-        """The part that passes; None where nothing of it does."""
+        """Return the part that passes, or None."""
 
 
 class GateChain(Generic[Item]):
-    """Gates one after the other.
+    """Several gates, applied in order.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class GateChain(Generic[Item]):
         self._gates, self._size, self._counters = gates, size, counters
 
     def admit(self, m: Item) -> Item | None:
-        """The part that passes all gates; None where nothing of it does."""
+        """Return the part that passes all gates, or None."""
         for gate in self._gates:
             passed = gate.admit(m)
             refused = self._size(m) - (self._size(passed) if passed is not None else 0)
@@ -57,7 +57,7 @@ class GateChain(Generic[Item]):
 
 
 class DatumGate:
-    """Refuses fixes whose numbers are from elsewhere on earth than all others of the map.
+    """Refuses fixes that are far away on earth from all other fixes of the map.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class DatumGate:
         self.datum = datum
 
     def admit(self, m: Observation) -> Observation | None:
-        """The observation, unless it is such a fix."""
+        """Return the observation, or None for such a fix."""
         if isinstance(m, Fix):
             self.datum = self.datum or m.datum
             if m.datum and m.datum != self.datum:
@@ -79,7 +79,7 @@ class DatumGate:
 
 
 class ClosureStart:
-    """Refuses a loop closure or a custom edge of which another stamp lies before or after all odometry."""
+    """Refuses a loop closure or a custom edge if one of its stamps is outside the time that odometry covers."""
 
     reason = "from_where_there_was_no_odometry"
 
@@ -87,7 +87,7 @@ class ClosureStart:
         self._path, self._odometry = path, odometry
 
     def admit(self, m: Observation) -> Observation | None:
-        """The observation, unless it is such a one."""
+        """Return the observation, or None for such a closure or edge."""
         stamps_ns = (m.from_stamp_ns,) if isinstance(m, Closure) else m.stamps_ns if isinstance(m, CustomEdge) else ()
         newest_ns = self._odometry.newest_ns or 0
         return m if all(self._path.oldest_ns <= stamp_ns <= newest_ns for stamp_ns in stamps_ns) else None

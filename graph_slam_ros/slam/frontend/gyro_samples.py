@@ -44,7 +44,7 @@ class GyroSamples:
         self._held: tuple[int, Numbers] | None = None  # since when a rate was held, and the turn by it
 
     def add(self, m: AngularVelocity) -> None:
-        """Add a message; one from before what was used is counted and left out."""
+        """Add a message. A message from before the last used stamp is counted and not used."""
         at = bisect_left(self._samples, m.stamp_ns, key=_stamp)
         if at < len(self._samples) and self._samples[at].stamp_ns == m.stamp_ns:
             self._counters.count(m.topic, "duplicate" if self._samples[at] == m else "duplicate_stamp")
@@ -56,14 +56,14 @@ class GyroSamples:
             insort(self._samples, m, key=_stamp)
 
     def forget(self) -> None:
-        """Begin anew with stamps of another time; what odometry has not reached is counted."""
+        """Start over, for stamps of another time. Messages that odometry has not reached are counted as unused."""
         for m in self._samples[bisect_right(self._samples, self._until_ns, key=_stamp) :]:
             self._counters.count(m.topic, "after_odometry")
         self._samples.clear()
         self._until_ns, self._held = 0, None
 
     def begin(self, stamp_ns: int) -> None:
-        """Leave out what came before a stamp, but for the newest of it."""
+        """Drop the messages before a stamp, except the newest of them."""
         first = max(0, bisect_right(self._samples, stamp_ns, key=_stamp) - 1)
         for m in self._samples[:first]:
             self._counters.count(m.topic, "before_odometry")
@@ -71,7 +71,7 @@ class GyroSamples:
         self._until_ns, self._held = stamp_ns, None
 
     def turn(self, start_ns: int, end_ns: int) -> Turn | None:
-        """The turn between two stamps, each later than all before; None where messages are missing."""
+        """Return the turn between two stamps; None if messages are missing. Stamps increase from call to call."""
         held, self._held = self._held, None
         since_ns = held[0] if held else start_ns
         found = self._integrated(since_ns, end_ns)
@@ -87,13 +87,13 @@ class GyroSamples:
         return found
 
     def _drop(self, newest: int) -> None:
-        """Forget what is before the newest that was used, which the next turn begins with."""
+        """Drop the messages before the newest used one; the next turn begins with that one."""
         for m in self._samples[: max(0, newest)]:
             self._counters.used[m.topic] += 1
         del self._samples[: max(0, newest)]
 
     def _is_followed(self, k: int) -> bool:
-        """Return whether the message after one is near enough to interpolate."""
+        """Return whether the next message is near enough to interpolate."""
         return k + 1 < len(self._samples) and self._are_near(k)
 
     def _are_near(self, k: int) -> bool:
@@ -126,7 +126,7 @@ class GyroSamples:
         return Turn(whole, tuple(variance), spread)
 
     def _rate(self, k: int, stamp_ns: int) -> Numbers:
-        """The rate at a stamp from a message on."""
+        """Return the rate at a stamp, interpolated from message ``k`` on."""
         a = self._samples[k]
         if a.stamp_ns >= stamp_ns or not self._is_followed(k):
             return a.rate
@@ -146,7 +146,7 @@ class GyroSamples:
         return tuple(m.covariance[axis * (self._axes + 1)] * period_ns * 1e-9 for axis in range(self._axes))
 
     def _less(self, before: Numbers, whole: Numbers) -> Numbers:
-        """The rest of a turn whose beginning was given out."""
+        """Return the part of a turn that was not returned before."""
         if self._axes == 1:
             return (whole[0] - before[0],)
         rest = so3.log(so3.compose(so3.inverse(so3.exp(before)), so3.exp(whole)))

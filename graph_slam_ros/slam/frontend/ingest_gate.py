@@ -1,6 +1,6 @@
-"""The gate in front of the pipeline: what a jump of time, a pause, a stop and a full queue mean for what arrives.
+"""The gate in front of the pipeline: it decides after a jump of time, a pause, a stop, or with a full queue.
 
-The node and a replay ask the same gate, so that both make the same run of the same messages.
+The node and a replay use the same gate, so that both make the same run of the same messages.
 """
 
 from collections import deque
@@ -16,7 +16,13 @@ _AGAIN_NS = 10_000_000_000  # what has been told not longer ago is told again wh
 
 @dataclass(frozen=True, slots=True)
 class Passage:
-    """The decision of the gate on one message.
+    """The gate's decision on one message.
+
+    Attributes
+    ----------
+    jump : the value of ``time.on_jump`` (segment, reset or stop) if time jumped back with this message, else empty
+    events : what the pipeline processes before the measurements
+    measured : the measurements that pass to the pipeline; empty if they were refused
 
     Attributes
     ----------
@@ -31,7 +37,7 @@ class Passage:
 
 
 class IngestGate:
-    """Decides which measurements go on to the pipeline, and counts what it refuses.
+    """Decides which measurements pass to the pipeline, and counts the others.
 
     Parameters
     ----------
@@ -67,35 +73,35 @@ class IngestGate:
         return Passage(jump.jump, jump.events, measured)
 
     def begin_anew(self, on_jump: str) -> Passage:
-        """Decide on a jump of time: what comes from now on is of another time."""
+        """Decide on a jump of time: the stamps that follow belong to another time."""
         self._detector.forget()
         self.is_stopped = on_jump == "stop" or (self.is_stopped and on_jump != "reset")
         return Passage(on_jump, (Control("time_jump"),) if on_jump == "segment" else ())
 
     def begin_run(self) -> None:
-        """Another run begins: it takes measurements, whatever stopped the one before."""
+        """Start a run. It accepts measurements even if the run before was stopped."""
         self.is_stopped = False
 
     def clock_jumped(self, by_ns: int) -> None:
-        """Refuse from now on what was on its way when the clock jumped (``is_from_before``)."""
+        """Start to refuse messages that were sent before the clock jumped (``is_from_before``)."""
         self._jumped_ns = self._now_ns() - by_ns // 2
 
     def is_from_before(self, measured: Sequence[Measured]) -> bool:
-        """Return whether measurements were under way when the clock jumped back: they are dated nearer to then."""
+        """Return whether measurements were sent before the clock jumped back: their stamps are nearer to that time."""
         if self._jumped_ns and self._now_ns() >= self._jumped_ns:
             self._jumped_ns = 0
         return 0 < self._jumped_ns < max((m.stamp_ns for m in measured), default=0)
 
     def refuse(self, reason: str, measured: Sequence[Measured]) -> None:
-        """Count measurements that go no further; each sighting counts."""
+        """Count refused measurements, each sighting as one."""
         for m in measured:
             self._counters.count(input_of(m), reason, size_of(m))
 
 
 class TimeJumpDetector:
-    """Detects stamps that begin anew though no clock jumps: a time server, a recording played again without /clock.
+    """Detects stamps that jump back although no clock does: a time server, or a recording played again without /clock.
 
-    Odometry goes on from an earlier stamp then, and nothing of any odometry from where it was.
+    Odometry then continues from an earlier stamp, and no odometry continues from the last one.
 
     Parameters
     ----------
@@ -109,14 +115,14 @@ class TimeJumpDetector:
         self._anew: dict[str, list[int]] = {}  # ascending stamps from which it may go on: the first, the last, how many
 
     def is_jump(self, measured: Iterable[Measured]) -> bool:
-        """Return whether stamps jumped back with one of these, in the order they came."""
+        """Return whether stamps jumped back with one of these measurements, in their order of arrival."""
         jumped = [
             self._has_jumped(m) for m in measured if isinstance(m, Odometry)
         ]  # all of them, whatever the first tells
         return any(jumped)
 
     def forget(self) -> None:
-        """Forget all stamps: what comes next is of another time."""
+        """Forget all stamps, because the next belong to another time."""
         self._newest_ns.clear()
         self._recent_ns.clear()
         self._anew.clear()
@@ -144,10 +150,10 @@ class TimeJumpDetector:
 
 
 def input_of(m: Measured) -> str:
-    """The input or topic that a measurement is of."""
+    """Return the input or topic of a measurement."""
     return m.source.partition("#")[0] if isinstance(m, Odometry) else m.topic
 
 
 def size_of(m: Measured) -> int:
-    """The number of things in a measurement: its sightings, or one."""
+    """Return how many a measurement counts as: its number of sightings, or one."""
     return len(m.sightings) if isinstance(m, Sightings) else 1

@@ -107,12 +107,12 @@ class KeyframeFrontend:
 
     @property
     def source(self) -> str:
-        """The odometry in use, by the name of its input; empty before the first."""
+        """The name of the odometry input in use; empty before its first message."""
         return self.odometry.used.source if self.odometry.used else ""
 
     @property
     def now_ns(self) -> int:
-        """Stamp of the newest odometry, or keyframe."""
+        """Stamp of the newest odometry or keyframe."""
         return max(self.odometry.newest_ns or 0, self.path.keyframes[-1].stamp_ns)
 
     def restore(
@@ -123,7 +123,7 @@ class KeyframeFrontend:
         sighting_poses: Sequence[SightingPose],
         continues_with: str,
     ) -> None:
-        """Go on after the keyframes of a map; in their drive, where its odometry goes on with an input."""
+        """Continue after the keyframes of a map. If an input is given, its odometry continues the drive."""
         self.path.restore(keyframes, segments, drives)
         if continues_with:
             newest = keyframes[-1]
@@ -133,7 +133,7 @@ class KeyframeFrontend:
             self.sighting_poses.append(pose.keyframe, pose.stamp_ns, pose.T_keyframe_base)
 
     def cut(self, first: int, last: int) -> None:
-        """Cut out keyframes, by index, both included, with what was observed from them."""
+        """Cut out the keyframes between two indices, both included, and what was observed from them."""
         self.path.cut(first, last)
         of = self.sighting_poses.ids
         self.sighting_poses = self.sighting_poses.without(np.flatnonzero((of >= first) & (of <= last)))
@@ -141,7 +141,7 @@ class KeyframeFrontend:
         of[of > last] -= last - first + 1
 
     def forget_time(self) -> None:
-        """Stamps begin anew, the map stays: the next odometry begins a segment."""
+        """Keep the map and start over with the stamps: the next odometry begins a segment."""
         self.order.forget()
         self.odometry.forget()
         self.path.forget_time()
@@ -152,7 +152,7 @@ class KeyframeFrontend:
             self._parallel.forget()
 
     def accepts(self, m: Measured) -> TypeGuard[Odometry | Observation]:
-        """Return whether a measurement may be used when its turn comes; else it is counted, or of the gyro."""
+        """Return whether a measurement may be queued. If not, it is counted, or it was a gyro's and is used up."""
         if isinstance(m, AngularVelocity):
             self._add_to_gyro(m)
             return False
@@ -165,7 +165,7 @@ class KeyframeFrontend:
         return self.order.accepts(m) and (isinstance(m, Odometry) or self._arrivals.admit(m) is not None)
 
     def steps(self, m: Odometry) -> Iterator[Step]:
-        """Yield the steps that a message of odometry leads to, corrected."""
+        """Yield the corrected steps that an odometry message completes."""
         before_ns = self.odometry.newest_ns
         self._add_parallel()
         for step in self.odometry.steps(m):
@@ -178,7 +178,7 @@ class KeyframeFrontend:
             yield self.corrections.with_bias(fused, seconds)
 
     def _add_parallel(self) -> None:
-        """Add the motions of other odometries between keyframes, as far as they have come."""
+        """Add the complete motions of the other odometries as edges between keyframes."""
         if self._parallel is None:
             return
         for one in self._parallel.motions(self.path, self.source):
@@ -192,7 +192,7 @@ class KeyframeFrontend:
             self.gyro.add(m)
 
     def drop_pending(self) -> None:
-        """No odometry comes any more for what is pending."""
+        """Drop what is pending, because no odometry follows."""
         self.pending.drop()
         if self.gyro:
             self.gyro.drop()
@@ -200,11 +200,11 @@ class KeyframeFrontend:
     # -- the motion since the last keyframe ------------------------------------------------------------------------
 
     def begins_segment(self, step: Step) -> bool:
-        """Return whether little is known of the motion up to a step: odometry or time jumped, or a pose is given."""
+        """Return whether a step begins a segment: odometry or time jumped, or a pose was given."""
         return self.path.motion is None or step.broken or self.initial_pose is not None
 
     def integrate(self, step: Step) -> int:
-        """Add a step to the motion since the last keyframe, unless it is no motion; returns how far that reaches."""
+        """Add a step to the motion since the last keyframe, unless it is no motion; return the stamp it reaches."""
         motion = self.path.motion
         if motion is None:
             return step.stamp_ns
@@ -214,7 +214,7 @@ class KeyframeFrontend:
         return motion.now.stamp_ns
 
     def is_due(self) -> bool:
-        """Return whether the motion since the last keyframe deserves another."""
+        """Return whether the motion since the last keyframe is large enough for another."""
         motion, due, n = self.path.motion, self.config.keyframes, self._space.dimensions
         if motion is None or self.held_covariance is not None:
             return motion is not None
@@ -225,7 +225,7 @@ class KeyframeFrontend:
     # -- keyframes -------------------------------------------------------------------------------------------------
 
     def begin(self, step: Step, anchor: Callable[[int, Numbers], Array]) -> None:
-        """Add the first keyframe: the map begins where odometry begins, or the robot where it is said to.
+        """Add the first keyframe: at the pose of odometry, or at the initial pose that was given.
 
         Parameters
         ----------
@@ -238,7 +238,7 @@ class KeyframeFrontend:
         self.path.append(vertex, step, self.config.ordering.late_s)
 
     def add(self, step: Step) -> None:
-        """Add a keyframe at a step that was integrated."""
+        """Add a keyframe at a step that was integrated before."""
         now = self._motion.now
         covariance, held = now.covariance, self.held_covariance
         if held is not None and self._parallel:
@@ -248,7 +248,7 @@ class KeyframeFrontend:
         self._append(step, now.T_keyframe_base, covariance)
 
     def begin_segment(self, step: Step) -> bool:
-        """Add a keyframe across a jump of odometry or time, or at a pose that is given; returns whether one is."""
+        """Add a keyframe after a jump of odometry or time, or at a given pose; return whether one was added."""
         given, self.initial_pose, self.held_covariance = self.initial_pose, None, None
         motion, keyframes = self.path.motion, self.path.keyframes
         is_prior = given is not None and motion is not None and self.config.initialpose.use == "prior"
@@ -269,11 +269,11 @@ class KeyframeFrontend:
         return given is not None
 
     def add_closure(self, m: Closure, where: PoseAtStamp) -> None:
-        """Add a loop closure from an earlier pose to that of its stamp."""
+        """Add a loop closure from an earlier pose to the pose at its stamp."""
         self.edges.closure(m, self.path.where(m.from_stamp_ns), where)
 
     def where(self, m: Observation) -> PoseAtStamp:
-        """The pose at an observation, from a keyframe there if odometry's noise since the last one would matter."""
+        """Return the pose at an observation; add a keyframe there if odometry's noise since the last one matters."""
         where, motion = self.path.where(m.stamp_ns), self.path.motion
         if motion is not None and self._deserves_keyframe(m, where, motion):
             where = self._keyframe_at(where, motion)
@@ -290,7 +290,7 @@ class KeyframeFrontend:
         return motion
 
     def _append(self, step: Step, T_last_now: Numbers, covariance: Array, at: Numbers | None = None) -> None:
-        """A vertex where odometry is now, or where it is said to be, and the motion to it from the last as an edge."""
+        """Add a vertex at odometry's pose, or at the given pose, and the edge from the vertex before."""
         group, last = self._space.group, self.path.keyframes[-1].vertex
         vertex = self._graph.add_vertex(self._space.pose, at or group.compose(self._pose_of(last), T_last_now))
         factor = self._sigma_factors.get(self.source, 1.0)
@@ -302,9 +302,9 @@ class KeyframeFrontend:
         self.path.append(vertex, step, self.config.ordering.late_s)
 
     def _added_sigmas(self, given: InitialPose | None, T_last_now: Numbers, *, is_prior: bool) -> tuple[float, float]:
-        """The noise added to the motion into a new segment: sigmas in metres and in radians.
+        """Return the sigmas in metres and radians that are added to the motion into a new segment.
 
-        A pose that is given far away must not pull on the path before: it may be wrong.
+        A given pose that is far away must not pull on the path before it: it may be wrong.
         """
         jump_m, jump_rad = self.config.odometry.jump_sigma_m, self.config.odometry.jump_sigma_rad
         if given is None:
@@ -317,7 +317,7 @@ class KeyframeFrontend:
         return max(jump_m, min(_UNCERTAIN * far_m, _MAX_UNCERTAIN_M)), max(jump_rad, _UNCERTAIN * math.pi)
 
     def _deserves_keyframe(self, m: Observation, where: PoseAtStamp, newest: IntegratedOdometry) -> bool:
-        """Return whether the motion since the keyframe would be too much of the noise of what was measured."""
+        """Return whether the noise of the motion since the keyframe is too large beside that of the measurement."""
         if where.keyframe != newest.keyframe or not newest.before_last_ns < where.stamp_ns:
             return False
         if self._noise.is_jitter(where.T_keyframe_base):
@@ -336,7 +336,7 @@ class KeyframeFrontend:
         )
 
     def _is_repeated(self, m: Observation, where: PoseAtStamp) -> bool:
-        """Return whether the same was observed since the keyframe, from nearly there; without ids it may be new."""
+        """Return whether the same was observed since the keyframe from nearly there. Without ids it may be new."""
         if not isinstance(m, Sightings) or where.keyframe != self._observed_from:
             return False
         moved, names = where.T_keyframe_base, {s.id for s in m.sightings}
@@ -344,7 +344,7 @@ class KeyframeFrontend:
         return is_near and "" not in names and names <= self._observed
 
     def _keyframe_at(self, where: PoseAtStamp, motion: IntegratedOdometry) -> PoseAtStamp:
-        """A keyframe at a stamp within the last step of odometry, which is cut in two."""
+        """Add a keyframe at a stamp within the last step of odometry; the step is cut in two."""
         group, size, keyframes = self._space.group, self._space.dof, self.path.keyframes
         stood = motion.now.stands
         rest = motion.cut(where.stamp_ns)

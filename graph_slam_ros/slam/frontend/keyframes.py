@@ -17,7 +17,7 @@ from graph_slam_ros.typing import Numbers
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """A selected instant: its vertex, its stamp, and where odometry put it. No estimate: the solver owns that."""
+    """A selected instant: its vertex, its stamp, and its pose by odometry. The solver owns the estimate."""
 
     vertex: int
     stamp_ns: int
@@ -26,7 +26,7 @@ class Keyframe:
 
 @dataclass(frozen=True, slots=True)
 class SightingPose:
-    """The pose of an observation: a keyframe, by its index, and the motion since."""
+    """The pose of an observation: the index of a keyframe, and the motion since."""
 
     keyframe: int
     stamp_ns: int
@@ -34,7 +34,13 @@ class SightingPose:
 
 
 class KeyframeList:
-    """Keyframes in order of time, and the motion since each of the last.
+    """Keyframes in order of time, and the motion since each of the last ones.
+
+    Attributes
+    ----------
+    segments : the keyframes at which odometry began or began again
+    drives : the first keyframe of each drive; there is more than one after a map was loaded
+    samples : odometry between the keyframes
 
     Attributes
     ----------
@@ -56,26 +62,26 @@ class KeyframeList:
 
     @property
     def motion(self) -> IntegratedOdometry | None:
-        """The motion since the newest keyframe; none where stamps have begun anew since."""
+        """The motion since the newest keyframe; None after stamps have jumped back."""
         return self._motions[-1] if self._motions else None
 
     @property
     def rests(self) -> bool:
-        """Return whether the robot has stood for a second or more."""
+        """Whether the robot has stood for a second or more."""
         return self._rest.is_on
 
     @property
     def oldest_ns(self) -> int:
-        """Stamp of the first keyframe, of those whose stamps are of the present time."""
+        """Stamp of the first keyframe since stamps last jumped back."""
         return int(self.keyframes.stamps_ns[self._epoch])
 
     @property
     def remembered_ns(self) -> int:
-        """The stamp from which on odometry is remembered, message by message."""
+        """The stamp from which on each odometry message is remembered."""
         return self._motions[0].start_ns
 
     def append(self, vertex: int, step: Step, late_s: float) -> None:
-        """Add a keyframe where odometry is; motions are forgotten that ended more than ``late_s`` ago."""
+        """Add a keyframe at odometry's pose; forget motions that ended more than ``late_s`` ago."""
         if self._is_new_drive:
             self.drives.append(len(self.keyframes))
             self._is_new_drive = False
@@ -87,7 +93,7 @@ class KeyframeList:
             self._motions.popleft()
 
     def restore(self, keyframes: Sequence[Keyframe], segments: Sequence[int], drives: Sequence[int]) -> None:
-        """Go on after these; how the robot came from the last of them to where it is, nobody knows."""
+        """Continue after these keyframes. The motion from the last of them to the present is unknown."""
         for one in keyframes:
             self.keyframes.append(one.vertex, one.stamp_ns, one.T_odom_base)
         self.segments += segments
@@ -95,7 +101,7 @@ class KeyframeList:
         self.forget_time()
 
     def continue_drive(self) -> None:
-        """Continue the drive after ``restore``: odometry has the motion since the last keyframe."""
+        """Continue the drive after ``restore``: odometry knows the motion since the last keyframe."""
         last = len(self.keyframes) - 1
         backwards = np.flatnonzero(np.diff(self.keyframes.stamps_ns) < 0)
         self._epoch = max(self.drives[-1], int(backwards[-1]) + 1 if len(backwards) else 0)
@@ -105,7 +111,7 @@ class KeyframeList:
         )
 
     def cut(self, first: int, last: int) -> None:
-        """Cut out keyframes, by index, both included; motion is not remembered at the time."""
+        """Cut out the keyframes between two indices, both included. No motion may be remembered then."""
         count, left = last - first + 1, len(self.keyframes) - (last - first + 1)
         self.keyframes = self.keyframes.without(np.arange(first, last + 1))
         for begins in (self.segments, self.drives):
@@ -114,14 +120,14 @@ class KeyframeList:
         self._epoch = min(self._epoch, left)
 
     def forget_time(self) -> None:
-        """Stamps begin anew: none before can be told from them."""
+        """Start over with the stamps: they cannot be compared with those before."""
         self._motions.clear()
         self.samples.forget()
         self._rest = StationaryDetector(self._noise, self._space)
         self._epoch = len(self.keyframes)
 
     def where(self, stamp_ns: int) -> PoseAtStamp:
-        """Return where the robot was, by the keyframe before and the odometry in between."""
+        """Return the robot's pose at a stamp: the keyframe before it and the odometry in between."""
         motion = next((m for m in reversed(self._motions) if m.start_ns <= stamp_ns), None)
         if motion is None:
             return self._where_long_ago(stamp_ns)
@@ -130,7 +136,7 @@ class KeyframeList:
         return PoseAtStamp(motion.keyframe, vertex, stamp_ns, moved.T_keyframe_base, moved.covariance)
 
     def _where_long_ago(self, stamp_ns: int) -> PoseAtStamp:
-        """Interpolate between two keyframes whose odometry is forgotten: evenly from one to the next."""
+        """Interpolate between two keyframes whose odometry is no longer remembered."""
         present = self.keyframes.stamps_ns[self._epoch :]
         k = self._epoch + int(np.searchsorted(present, stamp_ns, side="right")) - 1
         group, (a, b) = self._space.group, (self.keyframes[k], self.keyframes[k + 1])

@@ -21,17 +21,17 @@ _STEEP = 0.2  # cosine of an elevation: at 78.5 degrees and above the azimuth is
 
 @dataclass(slots=True)
 class _Shown:
-    """The distances of one input so far: how many distances, and the farthest of them, the least first."""
+    """The distances of one input so far: their number, and the largest of them in ascending order."""
 
     count: int = 0
     farthest: list[float] = field(default_factory=lambda: [0.0] * _FARTHEST)
 
 
 class MaxDistance:
-    """Gate for the distance [m] that each input may measure at most: its ``max_distance_m``, or learned from it.
+    """Gate for the largest distance [m] of each input: its ``max_distance_m``, or a learned limit.
 
-    A limit is learned from the accepted measurements alone, in their order, so a replay refuses what the live run
-    refused. A bearing has no distance; a fix has one from the map's origin, which may be anywhere.
+    The limit is learned only from accepted measurements in their order, so a replay refuses what the live run refused.
+    A bearing has no distance. A fix has one only from the map's origin, which may be anywhere.
     """
 
     reason = "beyond_max_distance"
@@ -42,7 +42,7 @@ class MaxDistance:
         self._shown: dict[str, _Shown] = {}
 
     def limit_m(self, topic: str) -> float:
-        """The present limit of an input."""
+        """Return the present limit of an input."""
         if topic in self._configured:
             return self._configured[topic]
         shown = self._shown.get(topic)
@@ -51,7 +51,7 @@ class MaxDistance:
         return min(_MOST_M, max(_ALWAYS_M, _TIMES_FARTHEST * shown.farthest[0]))
 
     def admit(self, m: Observation) -> Observation | None:
-        """The part of an observation that is within reach; None where nothing of it is."""
+        """Return the part of an observation within the limit, or None."""
         match m:
             case Sightings():
                 within = tuple(s for s in m.sightings if self._is_within(m.topic, self._distance(s)))
@@ -64,7 +64,7 @@ class MaxDistance:
                 return m
 
     def _distance(self, s: Sighting) -> float | None:
-        """The distance from the sensor or, of a position or pose, from the base."""
+        """Return the distance from the sensor; of a position or pose, from the base."""
         if s.kind in ("position", "pose"):
             return math.hypot(*s.measured[: self._space.dimensions])
         return None if s.kind == "bearing" else abs(s.measured[0])
@@ -82,11 +82,11 @@ class MaxDistance:
 
 
 def off_the_pole(space: Geometry, s: Sighting) -> Sighting:
-    """The same sighting; a steep direction in space is told in axes where it is straight ahead.
+    """Return the same sighting; a steep direction in space is expressed in a sensor frame that looks along it.
 
-    At the zenith and the nadir azimuth is undefined and its derivative infinite. There the sensor's frame is turned so
-    that its x axis points along what was measured: azimuth and elevation are both 0. Across, the direction is known as
-    well as its elevation, or worse: ``sigma_azimuth cos(elevation)``.
+    At the zenith and the nadir azimuth is undefined and its derivative infinite. So the sensor's frame is rotated until
+    its x axis points along the measured direction: azimuth and elevation are both 0. The sigma across the direction is
+    that of the elevation, or ``sigma_azimuth cos(elevation)`` if that is larger.
     """
     if space.dimensions == 2 or s.kind not in ("bearing", "range_bearing"):
         return s

@@ -32,14 +32,14 @@ class PoseAtStamp:
 
 @dataclass(frozen=True, slots=True)
 class KeyframeMeasurement:
-    """A measurement as an edge takes it: what was measured from the keyframe, and its covariance."""
+    """A measurement as its edge needs it: expressed from the keyframe, and its covariance."""
 
     measured: Numbers
     covariance: Array
 
 
 def point_jacobian(space: Geometry, point: Array) -> Array:
-    """``B`` (n, dof) of a point (n,) in the base frame."""
+    """Return ``B`` (n, dof) of a point (n,) in the base frame."""
     n = space.dimensions
     if n == 2:
         return np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]])
@@ -47,7 +47,7 @@ def point_jacobian(space: Geometry, point: Array) -> Array:
 
 
 def position(space: Geometry, s: Sighting, where: PoseAtStamp) -> KeyframeMeasurement:
-    """A landmark's position, from the sighting of a position or of a pose: ``p_a = T_a_b p_b``."""
+    """Return a landmark's position, seen as a position or a pose: ``p_a = T_a_b p_b``."""
     n = space.dimensions
     point = np.array(s.measured[:n])
     own = as_matrix(s.covariance)
@@ -59,7 +59,7 @@ def position(space: Geometry, s: Sighting, where: PoseAtStamp) -> KeyframeMeasur
 
 
 def pose(space: Geometry, s: Sighting, where: PoseAtStamp) -> KeyframeMeasurement:
-    """A landmark's pose: ``T_a_c = T_a_b T_b_c``."""
+    """Return a landmark's pose: ``T_a_c = T_a_b T_b_c``."""
     measured = space.group.compose(where.T_keyframe_base, s.measured)
     return KeyframeMeasurement(
         _floats(measured), space.group.propagate(where.covariance, s.measured, as_matrix(s.covariance))
@@ -67,7 +67,7 @@ def pose(space: Geometry, s: Sighting, where: PoseAtStamp) -> KeyframeMeasuremen
 
 
 def seen_from_sensor(space: Geometry, s: Sighting, where: PoseAtStamp, p_keyframe: Array) -> KeyframeMeasurement:
-    """Range, bearing or both, by a sensor whose place goes with it.
+    """Return range, bearing or both, with the sensor's position relative to the keyframe.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def motion_noise_dominates(
     added_sigma_m: float,
     sharpest: bool = False,
 ) -> bool:
-    """Return whether the motion adds more to the variance than a part of it, common to the whole message.
+    """Return whether the motion's noise, which is common to a whole message, is too large a part of the variance.
 
     Parameters
     ----------
@@ -129,13 +129,13 @@ def _adds(space: Geometry, s: Sighting, moved: float, turned: float, most: float
 
 
 def as_matrix(flat: Numbers) -> Array:
-    """A covariance as a matrix."""
+    """Return a covariance as a matrix."""
     size = round(len(flat) ** 0.5)
     return np.array(flat).reshape(size, size)
 
 
 def gradient(space: Geometry, kind: str, p: Array) -> Array:
-    """Derivative (..., m, n) of range, bearing or both with respect to points p (..., n) in the sensor's frame."""
+    """Return the derivative (..., m, n) of range, bearing or both at points p (..., n) in the sensor's frame."""
     flat = np.maximum(np.hypot(p[..., 0], p[..., 1]), _NEAREST_M)
     far = np.maximum(np.linalg.norm(p, axis=-1), _NEAREST_M)
     rows = []
@@ -152,7 +152,7 @@ def gradient(space: Geometry, kind: str, p: Array) -> Array:
 
 
 def predict(space: Geometry, kind: str, p: Array) -> Array:
-    """The measurement (..., m) of a sensor of points p (..., n) in its frame."""
+    """Return the measurement (..., m) that a sensor makes of points p (..., n) in its frame."""
     predicted = []
     if kind in ("range", "range_bearing"):
         predicted.append(np.linalg.norm(p, axis=-1))
@@ -164,7 +164,7 @@ def predict(space: Geometry, kind: str, p: Array) -> Array:
 
 
 def point_of(space: Geometry, measured: Numbers) -> Array:
-    """The point (n,) in the sensor's frame that a range and bearing say."""
+    """Return the point (n,) in the sensor's frame for a range and bearing."""
     far, azimuth = measured[0], measured[1]
     if space.dimensions == 2:
         return far * np.array([np.cos(azimuth), np.sin(azimuth)])
@@ -173,7 +173,7 @@ def point_of(space: Geometry, measured: Numbers) -> Array:
 
 
 def polar_derivative(space: Geometry, measured: Numbers) -> Array:
-    """Derivative (n, n) of that point with respect to range and angles."""
+    """Return the derivative (n, n) of that point with respect to range and angles."""
     far, azimuth = measured[0], measured[1]
     c, s = np.cos(azimuth), np.sin(azimuth)
     if space.dimensions == 2:
@@ -189,7 +189,7 @@ def polar_derivative(space: Geometry, measured: Numbers) -> Array:
 
 
 def fix(space: Geometry, m: Fix, where: PoseAtStamp, T_map_keyframe: Numbers) -> KeyframeMeasurement:
-    """An absolute measurement of the robot, as one of its keyframe.
+    """Return an absolute measurement of the robot as one of its keyframe.
 
     Parameters
     ----------
@@ -218,13 +218,13 @@ def fix(space: Geometry, m: Fix, where: PoseAtStamp, T_map_keyframe: Numbers) ->
 
 
 def axes_unknown(covariance: Array) -> NDArray[np.bool_]:
-    """Return which axes (n,) a position (n, n) says nothing of."""
+    """Return the axes (n,) along which a covariance (n, n) of a position states nothing."""
     unknown: NDArray[np.bool_] = np.diag(covariance) >= 0.5 * _UNKNOWN_M2
     return unknown
 
 
 def axes_known(covariance: Array) -> list[tuple[Array, float]]:
-    """Directions (n,) in which a position was measured, and their variances, where some axis was not; else none."""
+    """Return the directions (n,) along which a position was measured and their variances; None if all axes were."""
     if np.diag(covariance).max() < _UNKNOWN_M2:
         return []
     values, vectors = np.linalg.eigh(covariance)
@@ -233,7 +233,7 @@ def axes_known(covariance: Array) -> list[tuple[Array, float]]:
 
 
 def closure(space: Geometry, m: Closure, earlier: PoseAtStamp, later: PoseAtStamp) -> KeyframeMeasurement:
-    """A closure of keyframes: ``T_a_d = T_a_b T_b_c T_d_c^-1``, the base is b at the earlier stamp, c at the later."""
+    """Return a closure of keyframes, ``T_a_d = T_a_b T_b_c T_d_c^-1``: base b at the earlier stamp, c at the later."""
     group = space.group
     to_c = group.propagate(earlier.covariance, m.T_from_base, as_matrix(m.covariance))
     into = group.adjoint(later.T_keyframe_base)

@@ -26,12 +26,12 @@ Key = tuple[str, str, str]
 
 
 def grows(edge: EdgeType, label: str) -> bool:
-    """Return whether the noise of edges grows with the motion that they measured."""
+    """Return whether the noise of these edges grows with the measured motion."""
     return label in ("odometry", "parallel") and edge.name.removesuffix(" 3D") == "relative pose"
 
 
 def motion_sizes(measured: Array) -> tuple[Array, Array]:
-    """Radians turned and metres driven by motions (n, 3) or (n, 7): each (n,)."""
+    """Return radians turned and metres driven, each (n,), by motions (n, 3) or (n, 7)."""
     if measured.shape[1] == 3:
         return np.abs(measured[:, 2]), np.hypot(measured[:, 0], measured[:, 1])
     turned = 2.0 * np.arctan2(np.linalg.norm(measured[:, 3:6], axis=1), np.abs(measured[:, 6]))
@@ -39,13 +39,13 @@ def motion_sizes(measured: Array) -> tuple[Array, Array]:
 
 
 def added_variance(part: str, of_group: Mapping[str, float], measured: Array) -> Array:
-    """The variance that motions add to a part of odometry's, summed over its directions: (n,)."""
+    """Return the variance (n,) that motions add to a part of odometry, summed over its directions."""
     turned, way = motion_sizes(measured)
     return of_group.get(part + PER_RAD, 0.0) * turned + of_group.get(part + PER_M, 0.0) * way
 
 
 def configured_variance(now: Array, part: str, of_group: Mapping[str, float], measured: Array) -> Array:
-    """The configured variance (n,) of a part of odometry, from that which is scaled and added to."""
+    """Return the configured variance (n,) of a part of odometry, from the variance that is scaled and increased."""
     own = now - added_variance(part, of_group, measured)
     return np.maximum(own, _LEAST_OWN * now) / of_group.get(part, 1.0) ** 2
 
@@ -75,7 +75,7 @@ def parts_of(edge: EdgeType, label: str, measured: Array) -> dict[str, Array]:
 
 
 def _sight_parts(position: Array) -> dict[str, Array]:
-    """Along the line of sight, and across it."""
+    """Return the directions along the line of sight, and across it."""
     n, m = position.shape
     along = np.zeros((n, m))
     along[:, 0] = 1.0
@@ -93,7 +93,12 @@ def _sight_parts(position: Array) -> dict[str, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Rescaling:
-    """A change of the noise of edges that were there.
+    """A change of the noise of existing edges.
+
+    Attributes
+    ----------
+    first, last : range of edge ids; ``last`` is excluded
+    before, after : the factors of each group that changed
 
     Attributes
     ----------
@@ -107,17 +112,17 @@ class Rescaling:
     after: dict[Key, float]
 
     def as_record(self) -> list[Any]:
-        """Plain values."""
+        """Return plain values."""
         return [self.first, self.last, factors_record(self.before), factors_record(self.after)]
 
     @classmethod
     def from_record(cls, record: Sequence[Any]) -> "Rescaling":
-        """Inverse of ``as_record``. Raises ValueError where a factor is not above 0."""
+        """Undo ``as_record``. Raises ValueError if a factor is not positive."""
         first, last, before, after = record
         return cls(first, last, read_factors(before), read_factors(after))
 
     def apply(self, graph: Graph) -> None:
-        """Rescale those of its edges that are there; whoever has solved with them must begin anew."""
+        """Rescale the edges of its range. A solver that has used them must start over."""
         for table, rows, label, source in groups(graph, range(self.first, self.last)):
             before, after = _of(self.before, label, source), _of(self.after, label, source)
             if after:
@@ -127,7 +132,13 @@ class Rescaling:
 
 
 class NoiseScales:
-    """The factors by which configured sigmas are multiplied, and the edges of a graph in step with them.
+    """The factors of configured sigmas, and the graph whose edges agree with them.
+
+    Attributes
+    ----------
+    graph
+    factors : by group; a missing factor is 1
+    history : all changes of existing edges, in order
 
     Attributes
     ----------
@@ -143,7 +154,7 @@ class NoiseScales:
         self._due = FIRST_DUE
 
     def is_due(self, keyframes: int) -> bool:
-        """Return whether there are twice the keyframes of the last estimate."""
+        """Return whether the number of keyframes has doubled since the last estimate."""
         is_due = keyframes >= self._due
         while keyframes >= self._due:
             self._due *= 2
@@ -152,7 +163,7 @@ class NoiseScales:
     def add_edge(
         self, edge: EdgeType, vertices: Sequence[int], measured: Sequence[float] | Array, noise: Gaussian, *names: str
     ) -> int:
-        """Add an edge to the graph, as ``Graph.add_edge``, its noise scaled from what is configured."""
+        """Add an edge to the graph as ``Graph.add_edge`` does, its configured noise scaled."""
         label, source = (*names, "")[:2]
         factors = _of(self.factors, label, source)
         if factors:
@@ -161,7 +172,7 @@ class NoiseScales:
         return self.graph.add_edge(edge, vertices, measured, noise, label, source)
 
     def change(self, factors: Mapping[Key, float], first_edge: int) -> bool:
-        """Have all edges from a number on, and all that come, scaled by these factors; whether that changed them."""
+        """Scale the edges from a number on, and all later ones, by these factors; return whether an edge changed."""
         before = {key: self.factors.get(key, neutral(key)) for key in factors}
         if all(_is_same(before[key], factor) for key, factor in factors.items()):
             return False
@@ -172,7 +183,7 @@ class NoiseScales:
         return True
 
     def neutral(self) -> dict[Key, float]:
-        """Factors of all groups that change nothing."""
+        """Return factors of all groups that change nothing."""
         return {key: neutral(key) for key in self.factors}
 
 
@@ -204,13 +215,13 @@ def _rescaled(
 
 
 def variance_of(roots: Array, axes: Array) -> Array:
-    """The variance along directions (n, m, k), summed over these: (n,)."""
+    """Return the variance (n,) along directions (n, m, k), summed over them."""
     spread = np.linalg.solve(np.swapaxes(roots, 1, 2), axes)
     return np.einsum("nij,nij->n", spread, spread)
 
 
 def groups(graph: Graph, edges: range) -> Iterator[tuple[EdgeTable, Index, str, str]]:
-    """Yield table, rows, class and input of the edges of a range, group by group."""
+    """Yield table, rows, class and input of each group of a range of edges."""
     for table in graph.tables.values():
         ids = table.id.values
         here = (ids >= edges.start) & (ids < edges.stop)
@@ -224,12 +235,12 @@ def groups(graph: Graph, edges: range) -> Iterator[tuple[EdgeTable, Index, str, 
 
 
 def factors_record(factors: Mapping[Key, float]) -> list[list[Any]]:
-    """Plain lists of factors by group, for JSON."""
+    """Return factors by group as plain lists, for JSON."""
     return [[*key, factor] for key, factor in factors.items()]
 
 
 def read_factors(factors: Sequence[Any]) -> dict[Key, float]:
-    """Inverse of ``factors_record``. Raises ValueError where a factor is not above 0."""
+    """Undo ``factors_record``. Raises ValueError if a factor is not positive."""
     out = {(str(label), str(source), str(part)): float(factor) for label, source, part, factor in factors}
     if not all(np.isfinite(factor) and (factor > 0.0 or factor == neutral(key)) for key, factor in out.items()):
         raise ValueError(f"a factor of the noise is not above 0: {factors}")

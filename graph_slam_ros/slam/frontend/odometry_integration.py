@@ -28,11 +28,11 @@ class OdometrySample:
 
 
 class OdometryNoise:
-    """Noise of a motion from its duration, or from its size.
+    """Noise of a motion, from its duration or from its size.
 
-    A step of dt seconds adds density^2 dt. From a twist covariance C a step adds C dt max(dt, tau), since errors of
-    velocity last for about tau. With ``odometry.noise: motion`` variances grow with what was turned and driven, step
-    by step. A robot that stands gathers none.
+    A step of dt seconds adds density^2 dt. A twist covariance C adds C dt max(dt, tau) in a step, because errors of
+    velocity last for about tau. With ``odometry.noise: motion`` the variance grows with the angle and the distance of
+    each step. A robot at rest adds none.
     """
 
     __slots__ = ("_by_motion", "_by_twist", "_config", "_density", "_flat", "_heading", "_space", "_square", "_way")
@@ -54,7 +54,7 @@ class OdometryNoise:
         self._square: Array = self._density
 
     def stands(self, step: Numbers, dt: float) -> bool:
-        """Return whether a step in dt seconds is too slow to be one."""
+        """Return whether a step of dt seconds is too slow to be a motion."""
         c = self._config
         slow_m, slow_rad = c.still_m_s * dt, c.still_rad_s * dt
         if self._space.dimensions == 2:
@@ -63,14 +63,14 @@ class OdometryNoise:
         return step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < slow_m**2 and turn < slow_rad
 
     def is_jitter(self, moved: Numbers) -> bool:
-        """Return whether a motion is so small that it may be odometry's jitter, however long it took."""
+        """Return whether a motion is small enough to be odometry's jitter, whatever its duration."""
         c, n = self._config, self._space.dimensions
         return bool(sum(x * x for x in moved[:n]) < c.still_m**2 and self._space.angle(moved) < c.still_rad)
 
     def of(
         self, step: Numbers, dt: float, twist_covariance: Numbers | None, turn_variance: Numbers | None = None
     ) -> Array:
-        """Covariance (dof, dof) of the velocities' integral over a step in dt seconds of motion.
+        """Return the covariance (dof, dof) that a step of dt seconds adds.
 
         Parameters
         ----------
@@ -113,7 +113,7 @@ class StationaryDetector:
         self.is_on = False
 
     def update(self, step: Step, dt: float) -> bool:
-        """Add a step of dt seconds; returns whether the robot stood."""
+        """Add a step of dt seconds; return whether the robot stands."""
         stands = self._noise.stands(step.T_last_base, dt)
         if self._T_odom_base is None or step.broken or step.slips:
             self._begin(step)
@@ -135,7 +135,7 @@ class StationaryDetector:
 
 
 class IntegratedOdometry:
-    """The motion since a keyframe, remembered odometry by odometry.
+    """The motion since a keyframe, and each odometry message of it.
 
     Parameters
     ----------
@@ -163,11 +163,11 @@ class IntegratedOdometry:
         return self._moved[0].stamp_ns
 
     def step(self, step: Step) -> None:
-        """Go on by one step of odometry."""
+        """Append one step of odometry."""
         self._extend(step, self._rest.update(step, (step.stamp_ns - self.now.stamp_ns) * 1e-9))
 
     def resume_after_cut(self, rest: Step, stood: bool) -> None:
-        """Go on by what ``cut`` has left over of the motion before, in which the robot stood or not."""
+        """Append what ``cut`` left over of the motion before, in which the robot stood or not."""
         self._extend(rest, stood)
 
     def _extend(self, step: Step, stands: bool) -> None:
@@ -179,7 +179,7 @@ class IntegratedOdometry:
             self._moved.append(moved)
 
     def at(self, stamp_ns: int) -> OdometrySample:
-        """The motion at a stamp since the keyframe, interpolated between two odometry messages."""
+        """Return the motion since the keyframe at a stamp, interpolated between two odometry messages."""
         k = bisect_right(self._moved, stamp_ns, key=_stamp) - 1
         a = self._moved[k]
         if a.stamp_ns == stamp_ns or k + 1 == len(self._moved):
@@ -191,7 +191,7 @@ class IntegratedOdometry:
         return self._extended(a, group.compose(a.T_keyframe_base, step), rest, b.stands)
 
     def cut(self, stamp_ns: int) -> Step | None:
-        """End the motion at a stamp after the last odometry but one; returns the step that is left over, if any."""
+        """End the motion at a stamp after the last odometry but one; return the step that is left over, if any."""
         last, group = self.now, self._space.group
         if stamp_ns == last.stamp_ns:
             return None
@@ -203,7 +203,7 @@ class IntegratedOdometry:
 
     @property
     def is_long(self) -> bool:
-        """Return whether it is time to begin another, for what is remembered grows."""
+        """Return whether too many messages are remembered, so that another keyframe is needed."""
         return len(self._moved) >= _MOST
 
     @property

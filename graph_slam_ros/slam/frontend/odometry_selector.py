@@ -1,4 +1,4 @@
-"""Chooses one odometry of several, the first in priority that is alive. It returns steps, and marks where it jumps."""
+"""Selects one odometry of several: the first in priority that sends. It returns steps, and marks jumps."""
 
 import math
 from collections import deque
@@ -22,6 +22,13 @@ class Step:
     ----------
     T_odom_base : the pose in the frame of the odometry in use
     broken : whether odometry jumped here, so that ``T_last_base`` is no motion of the robot
+    turn_variance : of the rotation about each axis per second, if a gyro contributed to it [rad^2/s]
+    slips : whether a gyro contradicts odometry, so that the robot may turn although odometry stands
+
+    Attributes
+    ----------
+    T_odom_base : the pose in the frame of the odometry in use
+    broken : whether odometry jumped here, so that ``T_last_base`` is no motion of the robot
     turn_variance : of the rotation about each axis, for each second, where a gyro is part of it [rad^2/s]
     slips : whether a gyro contradicts odometry, so that the robot may turn where odometry stands
     """
@@ -36,7 +43,7 @@ class Step:
 
 
 class OdometrySelector:
-    """Chooses by stamps alone: what is used follows from what was accepted, not from when it came.
+    """Selects by stamps alone: the selection follows from what was accepted, not from when it arrived.
 
     Parameters
     ----------
@@ -58,28 +65,28 @@ class OdometrySelector:
 
     @property
     def used(self) -> Odometry | None:
-        """The last odometry that was used."""
+        """The last odometry message that was used."""
         return self._used
 
     @property
     def newest_ns(self) -> int | None:
-        """Stamp of the last odometry that was used."""
+        """Stamp of the last odometry message that was used."""
         return None if self._used is None else self._used.stamp_ns
 
     def forget(self) -> None:
-        """Begin anew with stamps of another time."""
+        """Start over, for stamps of another time."""
         self._past.clear()
         self._used = None
         self._last_step = self._space.identity
 
     def continue_drive(self, stamp_ns: int, T_odom_base: Numbers, source: str) -> None:
-        """Begin as if an odometry message of this source had been used last."""
+        """Start as if an odometry message of this source had been used last."""
         self._used = Odometry(stamp_ns, T_odom_base, None, source)
         if source not in self._order:
             self._order.append(source)
 
     def steps(self, m: Odometry) -> list[Step]:
-        """The steps that a message leads to: none where it is not the odometry in use."""
+        """Return the steps that a message completes: none if its odometry is not in use."""
         if m.source not in self._order:
             self._order.append(m.source)
         self._past.setdefault(m.source, deque(maxlen=_REMEMBERED))
@@ -110,7 +117,7 @@ class OdometrySelector:
         return m.stamp_ns - used.stamp_ns > self._silent_ns
 
     def _switched(self, past: "deque[Odometry]", used: Odometry) -> list[Step]:
-        """The steps from where the other was used last, by interpolation; none before this one reaches back so far."""
+        """Return the interpolated steps since the other odometry was last used; none until this one reaches so far."""
         group = self._space.group
         newer = [m for m in past if m.stamp_ns > used.stamp_ns]
         older = [m for m in past if m.stamp_ns <= used.stamp_ns]
@@ -149,9 +156,9 @@ class OdometrySelector:
         return Step(m.stamp_ns, step, m.T_odom_base, m.twist_covariance, bool(broken))
 
     def _is_reset(self, step: Numbers, to: Odometry) -> bool:
-        """Return whether its driver began anew: at the origin, and farther away than robots move between messages.
+        """Return whether the driver restarted: odometry is at the origin, farther away than robots move in a step.
 
-        However long it took: while a driver starts, nothing comes.
+        The pause may have any length, because nothing arrives while a driver starts.
         """
         if max(self._size(to.T_odom_base)) > _AT_ZERO:
             return False
@@ -159,11 +166,11 @@ class OdometrySelector:
         return far_m > max(_RESET_M, _UNUSUAL * usual_m) or far_rad > max(_RESET_RAD, _UNUSUAL * usual_rad)
 
     def _size(self, pose: Numbers) -> tuple[float, float]:
-        """The size of a motion in metres and radians."""
+        """Return the size of a motion in metres and radians."""
         return math.hypot(*pose[: self._space.dimensions]), self._space.angle(pose)
 
     def _jumps(self, step: Numbers, dt: float) -> bool:
-        """No robot moves like this: odometry was set anew, or has slipped by a lap."""
+        """Return whether no robot moves like this: odometry was reset, or is wrong by a lap."""
         n = self._space.dimensions
         return sum(x * x for x in step[:n]) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
 

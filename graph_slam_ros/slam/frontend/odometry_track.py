@@ -13,7 +13,13 @@ Sample = tuple[int, int, Numbers]
 
 @dataclass(frozen=True, slots=True)
 class OdometryTrack:
-    """Odometry in its own frame, as its driver has it.
+    """Odometry in its own frame, as its driver reports it.
+
+    Attributes
+    ----------
+    keyframes : (n, size) at each keyframe
+    stamps_ns, poses : (m,), (m, size) samples between them
+    distance, turn : the factors that correct it
 
     Attributes
     ----------
@@ -30,19 +36,19 @@ class OdometryTrack:
 
 
 class OdometrySamples:
-    """Samples of odometry: at most twenty a second, none while it stands still."""
+    """Samples of odometry: at most twenty a second, none at rest."""
 
     def __init__(self, space: Geometry) -> None:
         self._space = space
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew with stamps of another time."""
+        """Start over, for stamps of another time."""
         self._kept = StampedPoses[Sample](lambda *sample: sample, self._space.pose.size)
         self._last: Step | None = None
 
     def add(self, step: Step) -> None:
-        """Keep a step where it is time for it, and the one before where the robot begins to move."""
+        """Keep a step if the next sample is due, and the one before where the robot begins to move."""
         kept, last, self._last = self._kept, self._last, step
         if len(kept) and last is not None:
             kept_ns, there = int(kept.stamps_ns[-1]), tuple(kept.poses[-1].tolist())
@@ -53,5 +59,5 @@ class OdometrySamples:
         kept.append(0, step.stamp_ns, step.T_odom_base)
 
     def track(self, keyframes: Array, factors: tuple[float, float]) -> OdometryTrack:
-        """Copies of all samples, with odometry at the keyframes and the factors of distance and turn."""
+        """Return copies of all samples, with odometry at the keyframes and the factors of distance and turn."""
         return OdometryTrack(keyframes.copy(), self._kept.stamps_ns.copy(), self._kept.poses.copy(), *factors)

@@ -39,14 +39,14 @@ class ParallelMotion:
 
 @dataclass(slots=True)
 class _Track:
-    """The messages of an odometry that are still needed, and the keyframe that its next motion begins at."""
+    """The messages of an odometry that are still needed, and the keyframe at which its next motion begins."""
 
     messages: list[Odometry]
     keyframe: int
 
 
 class ParallelOdometry:
-    """Collects the messages of all odometries, and gives the motions that are complete.
+    """Collects the messages of all odometries, and returns the motions that are complete.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class ParallelOdometry:
         self._unlinked: set[int] = set()
 
     def add(self, m: Odometry, keyframes: StampedPoses[Keyframe]) -> None:
-        """Add a message of any odometry, in any order; its motions begin at the newest keyframe there is."""
+        """Add a message of any odometry, in any order. Its motions begin at the newest keyframe."""
         track = self._tracks.get(m.source)
         if track is None:
             track = self._tracks[m.source] = _Track([], max(0, len(keyframes) - 1))
@@ -73,15 +73,15 @@ class ParallelOdometry:
             del track.messages[: _MOST // 2]
 
     def disconnect(self, keyframe: int) -> None:
-        """Give no motion to a keyframe: little is known of how the robot came there, whatever odometries say."""
+        """Give no motion into a keyframe, because the way there is not known."""
         self._unlinked.add(keyframe)
 
     def forget(self) -> None:
-        """Begin anew with stamps of another time."""
+        """Start over, for stamps of another time."""
         self._tracks.clear()
 
     def motions(self, path: KeyframeList, used: str) -> Iterator[ParallelMotion]:
-        """Yield the motions that are complete, of all odometries but the one in use."""
+        """Yield the complete motions of all odometries except the one in use."""
         newest_ns = path.keyframes[-1].stamp_ns if len(path.keyframes) else 0
         for source, track in self._tracks.items():
             while track.keyframe + 1 < len(path.keyframes):
@@ -99,7 +99,7 @@ class ParallelOdometry:
                 del track.messages[: max(0, first)]
 
     def _motion(self, messages: list[Odometry], start_ns: int, end_ns: int) -> tuple[Numbers, Array] | None:
-        """The motion between two stamps and its covariance; None where messages are missing, or where it jumped."""
+        """Return the motion between two stamps and its covariance; None if messages are missing, or if it jumped."""
         first = bisect_right(messages, start_ns, key=_stamp) - 1
         last = bisect_left(messages, end_ns, key=_stamp)
         if first < 0 or end_ns <= start_ns:

@@ -14,18 +14,18 @@ from graph_slam_ros.typing import Array, Numbers
 
 
 class PoseEdges:
-    """Adds such edges to a graph; what had to be repaired of their noise is counted."""
+    """Adds fixes, loop closures and given poses to a graph. Repaired noise is counted."""
 
     def __init__(self, space: Geometry, edges: NoiseScales, counters: Counters) -> None:
         self._space, self._edges, self._counters = space, edges, counters
 
     def initial_pose(self, vertex: int, pose: InitialPose) -> None:
-        """Add a prior for a pose that somebody gives."""
+        """Add a prior for a pose that a user gave."""
         noise = self._noise("initialpose", motion_compensation.as_matrix(pose.covariance))
         self._edges.add_edge(self._space.pose_prior, [vertex], pose.T_map_base, noise, "initialpose")
 
     def fix(self, m: Fix, where: PoseAtStamp, T_map_keyframe: Numbers) -> None:
-        """A prior on a keyframe; of a position that lacks some axes, one on each principal axis that is known."""
+        """Add a prior to a keyframe. A position without some axes gives one prior per known principal axis."""
         space, vertices, topic = self._space, [where.vertex], m.topic
         if m.kind not in space.fixes:
             self._counters.count(topic, "not_in_this_space")

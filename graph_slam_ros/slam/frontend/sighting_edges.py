@@ -13,7 +13,13 @@ from graph_slam_ros.typing import Array, Index
 
 
 class SightingEdges:
-    """The origin of each edge of a sighting, in columns, in order of edges; it grows at its end.
+    """The origin of each sighting edge, in columns that grow, in order of edges.
+
+    Attributes
+    ----------
+    edge, stamp_ns : (n,)
+    T_keyframe_base : (n, size)
+    sensor : (n, dimensions) position of the sensor in the base frame; zeros if the message does not state it
 
     Attributes
     ----------
@@ -62,14 +68,14 @@ class SightingEdges:
         self.stamp_ns[rows], self.T_keyframe_base[rows] = stamp_ns, T_keyframe_base
 
     def copy(self) -> "SightingEdges":
-        """Another with the same rows."""
+        """Return a copy."""
         return deepcopy(self, {id(self._space): self._space})
 
     def __len__(self) -> int:
         return len(self._edge)
 
     def places(self, edges: Index) -> Index:
-        """The row of each edge; -1 where it has none."""
+        """Return the row of each edge; -1 if it has none."""
         if not len(self):
             return np.full(len(edges), -1)
         at = np.minimum(np.searchsorted(self.edge, edges), len(self) - 1)

@@ -42,9 +42,10 @@ class StampOrder:
         self._released_ns: int | None = None
 
     def accepts(self, m: Odometry | Observation) -> bool:
-        """Return whether there is room, odometry is not older than what was released, and all else is new; or count it.
+        """Return whether a measurement may be queued; if not, count it.
 
-        Odometry newer than all before always has room: it is what makes others leave.
+        There must be room. Odometry must not be older than what was released; all else must be new. Odometry that is
+        newer than all before always has room: it releases others.
         """
         if not isinstance(m, Odometry):
             reason = "duplicate" if self._is_repeated(m) else "" if self._has_room(m.stamp_ns) else "overflow"
@@ -65,7 +66,7 @@ class StampOrder:
         return self._released_ns is not None and m.stamp_ns < self._released_ns
 
     def _has_room(self, stamp_ns: int) -> bool:
-        """Return whether so many wait only, or what is dated latest of all can make room: its turn may never come."""
+        """Return whether the queue has room, or the measurement with the latest stamp of all can make room."""
         if len(self._heap) < self._max_pending:
             return True
         latest = max(range(len(self._heap)), key=self._heap.__getitem__)
@@ -79,7 +80,7 @@ class StampOrder:
         return True
 
     def _is_repeated(self, m: Observation) -> bool:
-        """Return whether the very same has come before; what comes for the first time is remembered."""
+        """Return whether the same message has arrived before; if not, remember it."""
         recent = self._recent.setdefault(m.topic, {})
         if m in recent:
             return True
@@ -89,7 +90,7 @@ class StampOrder:
         return False
 
     def push(self, m: Odometry | Observation) -> list[Odometry | Observation]:
-        """Take one measurement; returns those whose turn has come."""
+        """Queue one measurement; return those that are released."""
         rank, topic = (0, "") if isinstance(m, Odometry) else (1, m.topic)
         heapq.heappush(self._heap, (self._corrections.stamp_ns(m), rank, topic, self._arrivals, m))
         self._arrivals += 1
@@ -100,11 +101,11 @@ class StampOrder:
         return self._release(self._newest_odometry_ns - self._window_ns - self._corrections.lag_ns())
 
     def flush(self) -> list[Odometry | Observation]:
-        """Release everything that waits for its turn."""
+        """Release all that is queued."""
         return self._release(max((entry[0] for entry in self._heap), default=0))
 
     def forget(self) -> None:
-        """Begin anew with stamps of another time."""
+        """Start over, for stamps of another time."""
         self._heap.clear()
         self._recent.clear()
         self._newest_odometry_ns = self._released_ns = None
@@ -120,7 +121,7 @@ class StampOrder:
 
 
 class PendingObservations:
-    """Observations that are newer than all odometry: each is pending until odometry has reached its stamp.
+    """Observations newer than all odometry. Each is pending until odometry reaches its stamp.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ class PendingObservations:
         self._pending: list[Observation] = []
 
     def is_reached(self, m: Observation) -> bool:
-        """Return whether odometry surrounds an observation; else it waits for the next, or is counted."""
+        """Return whether there is odometry before and after an observation. If not, it is pending, or it is counted."""
         newest_ns, reason = self._odometry.newest_ns, ""
         if newest_ns is None or m.stamp_ns < self._path.oldest_ns:
             reason = "before_odometry"
@@ -153,7 +154,7 @@ class PendingObservations:
         return False
 
     def reached(self, until_ns: int) -> list[Observation]:
-        """The observations that waited for odometry to come so far."""
+        """Return the pending observations that odometry has reached."""
         if not self._pending:
             return []
         reached = [m for m in self._pending if m.stamp_ns <= until_ns]
@@ -161,7 +162,7 @@ class PendingObservations:
         return reached
 
     def drop(self) -> None:
-        """No odometry comes any more for those that wait."""
+        """Drop the pending observations, because no odometry follows."""
         for m in self._pending:
             self._counters.count(m.topic, "after_odometry", size_of(m))
         self._pending.clear()

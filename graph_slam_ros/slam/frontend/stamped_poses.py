@@ -12,7 +12,7 @@ Instant = TypeVar("Instant")
 
 
 class StampedPoses(Generic[Instant]):
-    """Instants, each with the id of what it belongs to, a stamp and a pose; it grows at its end.
+    """Rows of an id, a stamp and a pose, in columns that grow.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class StampedPoses(Generic[Instant]):
 
     @property
     def ids(self) -> Index:
-        """Return what each belongs to, a view: the vertex of a keyframe, the keyframe of a sighting."""
+        """Id of each row: the vertex of a keyframe, or the keyframe of a sighting. A view."""
         return self._id.values
 
     @property
@@ -42,11 +42,11 @@ class StampedPoses(Generic[Instant]):
         return self._pose.values
 
     def append(self, id_: int, stamp_ns: int, pose: Numbers) -> None:
-        """Add an instant."""
+        """Add a row."""
         Column.extend((self._id, id_, 1), (self._stamp_ns, stamp_ns, 1), (self._pose, pose, 1))
 
     def without(self, gone: Index) -> "StampedPoses[Instant]":
-        """The same without some instants."""
+        """Return the same without some rows."""
         left = np.delete(np.arange(len(self)), gone)
         out = StampedPoses(self._record, self.poses.shape[1])
         columns = (out._id, self.ids), (out._stamp_ns, self.stamps_ns), (out._pose, self.poses)

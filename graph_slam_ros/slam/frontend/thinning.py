@@ -8,11 +8,11 @@ from graph_slam_ros.slam.frontend.keyframes import KeyframeList
 
 
 class ObservationThinning:
-    """Gate that chooses fixes, and what a robot sees while it rests, by their stamps, input by input.
+    """Gate that thins out fixes, and what a robot at rest sees, by their stamps, for each input.
 
-    An error that lasts tau (exponentially correlated) leaves of n fixes over a long time T the information of
-    T / (2 tau) independent ones. One fix each 2 tau therefore says as much as all; fixes d < 2 tau apart say as much
-    where each has 2 tau / d times the variance.
+    Errors that are correlated over tau (exponentially) leave n fixes over a long time T with the information of
+    T / (2 tau) independent ones. So one fix every 2 tau has as much information as all. Fixes d < 2 tau apart have as
+    much if each has 2 tau / d times the variance.
 
     Parameters
     ----------
@@ -29,12 +29,12 @@ class ObservationThinning:
         self._observed_ns: dict[str, int] = {}
 
     def forget_time(self) -> None:
-        """Stamps begin anew."""
+        """Start over with the stamps."""
         self._used_ns.clear()
         self._observed_ns.clear()
 
     def admit(self, m: Observation) -> Observation | None:
-        """The observation as it is to be used; None where one before says all that it does."""
+        """Return the observation as it is to be used; None if an earlier one has its information."""
         match m:
             case Sightings():
                 return None if self._is_repeated(m) else m
@@ -46,7 +46,7 @@ class ObservationThinning:
                 return m
 
     def _is_repeated(self, m: Sightings | CustomEdge) -> bool:
-        """Return whether the robot rests and has just observed: it would see the same with the same errors.
+        """Return whether the robot rests and has just observed: another observation would have the same errors.
 
         A message may have several custom edges of one stamp.
         """
