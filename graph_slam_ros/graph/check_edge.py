@@ -1,4 +1,4 @@
-"""A check that an edge type is what the solver takes it for: for those who write one of their own."""
+"""A check of an edge type that a user has written: the solver's assumptions about it must hold."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ _TRIALS = 50
 def check_edge(
     edge: EdgeType, measured: Callable[[np.random.Generator], ArrayLike] | None = None, tolerance: float = 1e-5
 ) -> None:
-    """Try an edge type at random values of its vertices.
+    """Check an edge type at random values of its vertices.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def _measured(
 
 
 def _linearized(edge: EdgeType, trials: list[tuple[tuple[Array, ...], Array]]) -> tuple[Array, Array]:
-    """Residuals and Jacobians of all in one call, the numbers of their vertices end to end."""
+    """Return residuals and Jacobians of all edges in one call, the numbers of their vertices one after the other."""
     x = np.concatenate([value for values, _ in trials for value in values])
     ends = np.cumsum([value.size for values, _ in trials for value in values])
     at = np.concatenate(([0], ends[:-1])).reshape(len(trials), -1)

@@ -59,7 +59,7 @@ class EdgeType:
         return tuple(kinds[0].dof for kinds in self.accepts)
 
     def whole(self, measured: ArrayLike) -> Array:
-        """Measurements (p,) or (n, p), completed by ``tail`` where it was left out."""
+        """Return measurements (p,) or (n, p), with ``tail`` appended where it is missing."""
         given = np.asarray(measured, dtype=np.float64)
         if self.tail and given.shape and given.shape[-1] == self.measured_size - len(self.tail):
             return np.concatenate([given, np.broadcast_to(self.tail, (*given.shape[:-1], len(self.tail)))], axis=-1)
@@ -77,7 +77,7 @@ def edge_from_residual(
     residual: Residual,
     jacobian: Residual | None = None,
 ) -> EdgeType:
-    """An edge type of one's own, from a function of one edge in plain Python.
+    """Make an edge type from a function of one edge in plain Python.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def edge_from_residual(
 
 
 def numeric_jacobian(edge: EdgeType, values: tuple[Array, ...], measured: Array, step: float = 1e-6) -> Array:
-    """Jacobian (m, D) of one edge by central differences through ``retract``: the check of every analytic one.
+    """Return the Jacobian (m, D) of one edge by central differences through ``retract``, to check analytic ones.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def _differences(
     residual: Callable[[tuple[Array, ...]], ArrayLike],
     step: float = 1e-6,
 ) -> Array:
-    """Derivative (m, D) over the right perturbations, also where an angle goes over the cut between them."""
+    """Return the derivative (m, D) over the right perturbations, also where an angle crosses the cut."""
 
     def at(slot: int, d: Array) -> Array:
         moved = [np.asarray(v, dtype=float) for v in values]

@@ -2,7 +2,7 @@
 
 Derivatives used throughout, with J = [[0, -1], [1, 0]]:  R(theta) Exp([w]) = R(theta) (I + w J).
 
-Kernels write numbers, not slices: for a slice Numba compiles how to say that its shape does not fit, for two seconds.
+Kernels write numbers, not slices: for a slice Numba compiles an error message about its shape, which takes two seconds.
 """
 
 import numpy as np
@@ -93,7 +93,7 @@ def _landmark_position(x: Array, at: Index, measured: Array) -> tuple[Array, Arr
 
 @kernel
 def _tag_position(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
-    """The same as a point landmark, for one whose orientation is a part of the state but was not seen this time."""
+    """The same as a point landmark, for a landmark with an orientation that this sighting did not measure."""
     residual, of_point = _landmark_position(x, at, measured)
     n = at.shape[0]
     jacobian = np.zeros((n, 2, 6))

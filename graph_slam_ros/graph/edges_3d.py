@@ -91,7 +91,7 @@ def _landmark_position(x: Array, at: Index, measured: Array) -> tuple[Array, Arr
 
 @kernel
 def _tag_position(x: Array, at: Index, measured: Array) -> tuple[Array, Array]:
-    """The same as a point landmark, for one whose orientation is a part of the state but was not seen this time."""
+    """The same as a point landmark, for a landmark with an orientation that this sighting did not measure."""
     residual, of_point = _landmark_position(x, at, measured)
     n = at.shape[0]
     jacobian = np.zeros((n, 3, 12))

@@ -16,7 +16,7 @@ from graph_slam_ros.typing import Array, Index
 
 
 def whole_numbers(ids: ArrayLike, what: str) -> Index:
-    """Ids as an array; what is not a whole number is refused, not cut off."""
+    """Return ids as an array. Numbers with a fraction are refused."""
     given = np.asarray(ids)
     if given.dtype.kind not in "iu" and given.size:
         raise GraphSlamError(f"{what}: ids must be whole numbers, got {given.ravel()[:5].tolist()}")

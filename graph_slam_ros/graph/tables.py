@@ -30,16 +30,16 @@ class Column:
 
     @staticmethod
     def extend(*parts: tuple["Column", ArrayLike, int]) -> None:
-        """Append to columns, each so many rows (one row, or a scalar, is repeated): to all of them, or to none.
+        """Append rows to columns, as many to each (one row, or a scalar, is repeated): to all columns, or to none.
 
-        Half a record would put all later ones out of step.
+        Half a record would shift all later ones.
         """
         ends = [column._put(rows, count) for column, rows, count in parts]
         for (column, _, _), end in zip(parts, ends, strict=True):
             column._length = end
 
     def _put(self, rows: ArrayLike, count: int) -> int:
-        """Write beyond the end, where nobody sees it; returns where that ends."""
+        """Write beyond the end, where nothing is visible yet; return the new end."""
         end = self._length + count
         if end > len(self._buffer):
             grown = np.empty((max(end, 2 * len(self._buffer)), *self._buffer.shape[1:]), dtype=self._buffer.dtype)

@@ -78,9 +78,10 @@ def _cache_dir() -> Path:
 
 
 def _is_private(folder: Path) -> bool:
-    """Return whether nobody else can have put anything into the folder: Numba unpickles and runs what it caches.
+    """Return whether nobody else can have written to the folder: Numba unpickles and runs what it caches.
 
-    A folder of ours that others may write to, as a lax umask leaves it, is closed to them; what is in it must be ours.
+    If the folder is ours but others may write to it, as a lax umask leaves it, that is forbidden. All in it must be
+    ours.
     """
     about = folder.lstat()
     if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid():
@@ -95,7 +96,7 @@ numba.config.CACHE_DIR = str(CACHE_DIR)  # type: ignore[attr-defined]
 
 
 class _Locator(UserProvidedCacheLocator):
-    """Keeps kernels of this package by their place in it; the folder's digest stands for their sources."""
+    """Stores kernels of this package by their path in it; the folder's digest stands for their sources."""
 
     def __init__(self, py_func: Callable[..., Any], py_file: str) -> None:
         super().__init__(py_func, py_file)  # type: ignore[no-untyped-call]
@@ -124,7 +125,7 @@ class _Cache(FunctionCache):
 def kernel(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """Compile a loop over arrays; it runs on one thread, without unsafe maths.
 
-    Where it calls BLAS (wide fronts) that library may take more: for the same bytes every time it must have one.
+    A kernel that calls BLAS (wide fronts) may use more threads there. The same bytes every time need one.
 
     Parameters
     ----------

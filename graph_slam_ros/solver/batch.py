@@ -97,18 +97,18 @@ class Settings:
         return [{name: s[min(k, len(s) - 1)] for name, s in self.losses.items()} for k in range(count)]
 
     def until_still(self) -> "Settings":
-        """Settings for an estimate that is near: the last stage alone, until nothing moves."""
+        """Return settings for an estimate near the optimum: the last stage alone, until no vertex moves."""
         last = {label: stages[-1:] for label, stages in self.losses.items()}
         return replace(self, losses=last, step_tolerance=_STILL, cost_tolerance=0.0)
 
     def on_the_way(self) -> "Settings":
-        """Settings for a stage that another follows."""
+        """Return settings for a stage that is followed by another."""
         return replace(self, cost_tolerance=max(self.cost_tolerance, _ON_THE_WAY))
 
 
 @dataclass(frozen=True, slots=True)
 class _Saved:
-    """Linearisation points of a problem, and what is linearised there."""
+    """Linearisation points of a problem, and the linearisation there."""
 
     value: Array
     blocks: Array
@@ -166,20 +166,20 @@ class BatchProblem:
         accept_steps(self.tree, self.unknowns)
 
     def here(self) -> Array:
-        """The linearisation points, to come back to."""
+        """Return the linearisation points, for ``back_to``."""
         return self.tree.value[: self._size].copy()
 
     def back_to(self, here: Array) -> None:
-        """Come back to linearisation points, without a step; what is linearised is left as it is."""
+        """Restore linearisation points, without a step. The linearisation is not restored."""
         self.tree.value[: self._size] = self.tree.estimate[: self._size] = here
         self.tree.step[:] = 0.0
 
     def saved(self) -> _Saved:
-        """Linearisation points, and what is linearised there, to come back to."""
+        """Return linearisation points and the linearisation there, for ``restore``."""
         return _Saved(self.here(), self.tree.blocks.copy(), self.tree.diagonal.copy(), self.chi2, self.cost)
 
     def restore(self, saved: _Saved) -> None:
-        """Come back to what was saved."""
+        """Restore what ``saved`` returned."""
         self.back_to(saved.value)
         self.tree.blocks[:], self.tree.diagonal[:] = saved.blocks, saved.diagonal
         self.chi2, self.cost = saved.chi2, saved.cost
@@ -254,7 +254,7 @@ def _gauss_newton(problem: BatchProblem, losses: Losses, settings: Settings) -> 
 
 
 def _levenberg_marquardt(problem: BatchProblem, losses: Losses, settings: Settings) -> _Descent:
-    """Marquardt 1963: the diagonal is enlarged until the cost falls."""
+    """Enlarge the diagonal of H until the cost falls (Marquardt 1963)."""
     damping = _DAMPING_FIRST
     iterations: list[Iteration] = []
     while len(iterations) < settings.max_iterations:
@@ -278,7 +278,7 @@ def _levenberg_marquardt(problem: BatchProblem, losses: Losses, settings: Settin
 
 
 def _dogleg(problem: BatchProblem, losses: Losses, settings: Settings) -> _Descent:
-    """Powell 1970: within a radius, from steepest descent's minimum towards the Gauss-Newton step."""
+    """Step from the minimum along the gradient towards the Gauss-Newton step, in a trust radius (Powell 1970)."""
     radius = _RADIUS_FIRST
     iterations: list[Iteration] = []
     while len(iterations) < settings.max_iterations:

@@ -29,9 +29,9 @@ from graph_slam_ros.typing import Array, Index
 
 @kernel
 def marginals(t: Tree, vertices: Index) -> Array:
-    """Covariances of vertices, (dof, dof) each, end to end.
+    """Return the covariances of vertices, (dof, dof) each, one after the other.
 
-    From the root down to their cliques: each clique's own given its parent's, once for all of them.
+    Each clique's covariance follows from its parent's, from the root down, once for all vertices.
     """
     vertex, clique, members = t.vertex, t.clique, t.members
     cliques = mark(t, vertices)[::-1]
@@ -114,10 +114,10 @@ def _complete(front: Array, frontal: int, covariance: Array) -> None:
 
 @kernel
 def joint(t: Tree, vertices: Index) -> Array:
-    """Covariance (D, D) of some vertices together: ``Y'Y`` with ``U'Y = E``, E the unit vectors of theirs.
+    """Return the joint covariance (D, D) of some vertices: ``Y'Y`` with ``U'Y = E``, E the unit vectors of theirs.
 
-    Each column of Y goes from its vertex up to the root; all are taken up together. They are in order of elimination,
-    so that of each row those between its first and its last that are not zero are few.
+    Each column of Y goes from its vertex up to the root; all go up together. They are in order of elimination, so few
+    of each row's entries between the first and the last are not zero.
     """
     vertex, clique, members = t.vertex, t.clique, t.members
     cliques = mark(t, vertices)
@@ -162,7 +162,7 @@ def joint(t: Tree, vertices: Index) -> Array:
 
 @kernel
 def _by_key(vertex: Index, vertices: Index) -> Index:
-    """The places of vertices in order of elimination."""
+    """Return the indices that sort vertices by their order of elimination."""
     key = np.empty(len(vertices), np.int64)
     for k in range(len(vertices)):
         key[k] = vertex[vertices[k], KEY]
@@ -171,7 +171,7 @@ def _by_key(vertex: Index, vertices: Index) -> Index:
 
 @kernel
 def _in_order_asked_for(vertex: Index, vertices: Index, ordered: Array) -> Array:
-    """A symmetric matrix over vertices in order of elimination, in the order of ``vertices``."""
+    """Return a symmetric matrix in the order of ``vertices``, from one in order of elimination."""
     begin = np.empty(len(vertices), np.int64)
     at = 0
     for k in _by_key(vertex, vertices):

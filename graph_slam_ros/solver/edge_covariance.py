@@ -47,7 +47,7 @@ class EdgeCovariances:
         self._fill()
 
     def _rows(self, c: int) -> tuple[Index, Index]:
-        """The members of a clique, and the places of their numbers among all."""
+        """Return the members of a clique, and the rows of their numbers among all."""
         at, size = self._tree.clique[c, [MEMBERS, SIZE]]
         members = self._tree.members[at : at + size]
         dof = self._dof[members]
@@ -93,7 +93,7 @@ class EdgeCovariances:
         return self._pool[self._start[c] : self._start[c] + wide**2].reshape(wide, wide)
 
     def among(self, ends: Index) -> Array:
-        """Joint covariances (n, D, D) of the vertices (n, k) of edges; zero for held vertices.
+        """Return joint covariances (n, D, D) of the vertices (n, k) of edges; zero for held vertices.
 
         All edges have the same kinds of vertices, and are in the problem.
         """

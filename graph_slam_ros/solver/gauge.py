@@ -18,7 +18,7 @@ _LEAST_EIGENVALUE = 1e-9  # of correlations: less is no information
 
 
 def undetermined(vertex: int) -> SingularError:
-    """The error for a vertex that the edges do not determine."""
+    """Return the error for a vertex that the edges do not determine."""
     return SingularError(f"a pivot cannot be told from rounding: the edges do not determine vertex {vertex}")
 
 
@@ -52,7 +52,7 @@ def check_gauge(graph: Graph, free: Index, held: Index, rows: Mapping[EdgeTable,
 def fix_the_whole(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index]) -> bool:
     """Return whether edges on one vertex alone together resist every rigid motion of the whole, at stored values x.
 
-    One position leaves the heading open, and so does one heading the position; several may fix both. In a graph without
+    One position leaves the heading undetermined, and one heading the position; several may fix both. In a graph without
     poses any such edge is enough.
     """
     alone = {table: chosen for table, chosen in rows.items() if len(table.type.accepts) == 1}
@@ -78,7 +78,7 @@ def fix_the_whole(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index]) -> bo
 
 
 def _motions(kind: VertexKind, values: Array, centre: Array) -> Array:
-    """Steps (n, dof, 3 or 6) of vertices when the whole moves along each axis, and turns about each at the centre."""
+    """Return steps (n, dof, 3 or 6) of vertices as the whole moves along each axis and turns about it at the centre."""
     axes = len(centre)
     arm = values[:, :axes] - centre
     along = np.broadcast_to(np.eye(axes), (len(values), axes, axes))

@@ -1,4 +1,4 @@
-"""Initial values by driving through the graph again: where a solver that sees everything at once ends elsewhere.
+"""Initial values by an incremental solution, for graphs where batch solvers end in a local minimum.
 
 Pose after pose, each predicted from the estimate so far, the incremental solver corrects the graph before the next
 closure arrives; so it often reaches the optimum where batch solvers, from any start, do not.
@@ -22,7 +22,7 @@ def replayed_values(
     relative: Sequence[EdgeType],
     sighting: EdgeType,
 ) -> Array:
-    """Stored numbers of all vertices after a drive along some poses.
+    """Return the stored numbers of all vertices after an incremental solution along some poses.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def replayed_values(
 
 
 class _Drive:
-    """A solver on its way through a graph."""
+    """A solver that goes through a graph pose by pose."""
 
     def __init__(self, graph: Graph, values: Array, kind: VertexKind) -> None:
         self.graph, self.values, self.kind = graph, values.copy(), kind
@@ -63,7 +63,7 @@ class _Drive:
         self.known: set[int] = set()
 
     def to(self, pose: int, edges: Sequence[tuple[int, EdgeType, int]], rank: Index, sighting: EdgeType) -> None:
-        """Add a pose, what is seen from it for the first time, and its edges."""
+        """Add a pose, the landmarks that are first seen from it, and its edges."""
         new = [pose]
         if self.known:
             self.solver.place(pose, self._predicted(pose, edges, rank, sighting))
@@ -81,7 +81,7 @@ class _Drive:
         self.solver.update()
 
     def finish(self) -> Array:
-        """Stored numbers of all vertices: the estimate where it came by."""
+        """Return the stored numbers of all vertices: the estimate where it has one."""
         for vertex in sorted(self.known):
             value, at = self.solver.estimate([vertex])[0], self.graph.offset.values[vertex]
             self.values[at : at + len(value)] = value
@@ -90,7 +90,7 @@ class _Drive:
     def _predicted(
         self, pose: int, edges: Sequence[tuple[int, EdgeType, int]], rank: Index, sighting: EdgeType
     ) -> Array:
-        """Compose the latest earlier pose that an edge joins it to with that edge."""
+        """Predict a pose from the latest earlier pose that an edge joins it to."""
         best, value = -1, None
         for _, edge, row in edges:
             i, j = self._ends(edge, row)

@@ -44,7 +44,7 @@ _RELATIVE: dict[VertexKind, tuple[EdgeType, ...]] = {
 
 
 def initial_values(graph: Graph, method: str, root: int, in_time: Sequence[int] | None = None) -> Array:
-    """Stored numbers of all vertices, as ``Graph.initial``.
+    """Return the stored numbers of all vertices, as ``Graph.initial``.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def initial_values(graph: Graph, method: str, root: int, in_time: Sequence[int] 
 
 
 def _relative_edges(graph: Graph, kind: VertexKind) -> tuple[Index, Array]:
-    """Vertices and measurements of the relative poses that have a weight, in order of id."""
+    """Return vertices and measurements of the weighted relative poses, in order of id."""
     tables = [(graph.tables[edge], _weighted(graph.tables[edge])) for edge in _RELATIVE[kind] if edge in graph.tables]
     if not tables:
         return np.empty((0, 2), dtype=np.int64), np.empty((0, kind.size))
@@ -92,7 +92,7 @@ def _relative_edges(graph: Graph, kind: VertexKind) -> tuple[Index, Array]:
 
 
 def _weighted(table: EdgeTable) -> Index:
-    """The rows that count."""
+    """Return the rows with a weight."""
     return np.flatnonzero(table.weight.values)
 
 
@@ -103,7 +103,7 @@ def _slots(graph: Graph, vertices: Index, size: int) -> Index:
 def _along_tree(
     graph: Graph, values: Array, kind: VertexKind, root: int, poses: Index, ends: Index, measured: Array
 ) -> None:
-    """Breadth first: each pose is as few relative poses from the root as can be."""
+    """Compose poses breadth first: each is as few relative poses from the root as possible."""
     group = GROUPS[kind]
     neighbours: dict[int, list[tuple[int, int, bool]]] = {}
     for row, (i, j) in enumerate(ends.tolist()):

@@ -55,14 +55,14 @@ class Losses:
         self._sources = len(sources) if sources != [""] else 0
 
     def codes(self, table: EdgeTable, rows: Index) -> Index:
-        """Places (n,) of the losses of some edges in ``kind`` and ``scale``."""
+        """Return the indices (n,) of the losses of some edges in ``kind`` and ``scale``."""
         label: Index = table.label.values[rows]
         return label * self._sources + table.source.values[rows] if self._sources else label
 
 
 @kernel
 def _gather(rows: Index, vertices: Index, offset: Index, measured: Array) -> tuple[Index, Array]:
-    """Offsets (n, k) of the vertices of some edges, and their measurements (n, p)."""
+    """Return offsets (n, k) of the vertices of some edges, and their measurements (n, p)."""
     n, ends = len(rows), vertices.shape[1]
     at, z = np.empty((n, ends), np.int64), np.empty((n, measured.shape[1]))
     for k in range(n):
@@ -159,7 +159,7 @@ def chi2_of(graph: Graph, x: Array, edges: Index) -> tuple[Array, Index]:
 
 @kernel
 def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) -> None:
-    """Put the shares of whitened edges into the tree: J'J and J'r, and the diagonal of H."""
+    """Add whitened edges to the tree: J'J and J'r, and the diagonal of H."""
     vertex, edge, blocks, diagonal = t.vertex, t.edge, t.blocks, t.diagonal
     n, m, width = jacobian.shape
     for k in range(n):
@@ -200,7 +200,7 @@ def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:
 
 
 def refuse_nonfinite(block: Block) -> None:
-    """Raise where numbers are so large that a cost overflows, naming the first such edge."""
+    """Raise GraphSlamError if numbers are so large that a cost overflows; it names the first such edge."""
     if np.isfinite(block.cost.sum()):
         return
     bad = np.flatnonzero(~np.isfinite(block.cost))

@@ -11,7 +11,11 @@ from graph_slam_ros.typing import Array, Index
 
 
 class LossStages:
-    """The stage of the loss that each edge has at present.
+    """The present stage of each edge's loss.
+
+    Attributes
+    ----------
+    young : edges that have had only one update
 
     Attributes
     ----------
@@ -33,7 +37,7 @@ class LossStages:
         return self._losses
 
     def of(self, edges: Index, settings: Settings) -> list[tuple[Index, Losses]]:
-        """Edges by the loss that they have."""
+        """Return the edges grouped by their present loss."""
         stages = self.losses(settings)
         if not len(self.young):
             return [(edges, stages[-1])]
@@ -41,7 +45,7 @@ class LossStages:
         return [(edges[young], stages[0]), (edges[~young], stages[-1])]
 
     def begin(self, edges: Index, settings: Settings) -> None:
-        """Begin the first stage of edges that arrive; those that were young are so no more."""
+        """Begin the first stage of new edges; earlier young edges are no longer young."""
         self.young = edges if len(self.losses(settings)) > 1 else NONE
 
     def mature(self, values: Array, settings: Settings) -> None:

@@ -43,11 +43,11 @@ class PendingChanges:
         self.vertices, self.new = all_vertices, all_new  # both, or where memory lacks neither
 
     def again(self, edges: Index) -> None:
-        """Append edges to be linearised again, also those that are pending already."""
+        """Append edges to be linearised again, even if they are pending already."""
         self.back.append(edges)
 
     def edges(self) -> Index:
-        """All edges to be linearised, each once."""
+        """Return all edges to be linearised, each once."""
         return np.unique(np.concatenate((self.new, *self.back))) if self.back else self.new
 
     def touch(self, vertices: Index) -> None:

@@ -37,9 +37,9 @@ _KINDS = {SE2: SE2_KIND, SE3: SE3_KIND}
 
 
 class Problem:
-    """Vertices and edges of a graph that are solved for, which of them are held, and the edits since the last update.
+    """The vertices and edges of a graph that are solved for, the held vertices, and the edits since the last update.
 
-    Edits are pending until an update integrates them; one that fails leaves them pending.
+    Edits are pending until an update integrates them. An update that fails leaves them pending.
     """
 
     def __init__(self, graph: Graph) -> None:
@@ -71,7 +71,7 @@ class Problem:
         self._inside[new], self._edge_inside[new_edges] = True, True
 
     def start_at(self, values: Array) -> None:
-        """Begin from other values than the graph's initial ones: the stored numbers of all vertices, end to end."""
+        """Start from other values than the graph's initial ones: the stored numbers of all vertices in one array."""
         self._grow()
         size = len(self.graph.initial)
         if values.shape != (size,) or not np.isfinite(values).all():
@@ -80,7 +80,7 @@ class Problem:
         self._pending.broken = True
 
     def place(self, vertex: int, value: ArrayLike) -> None:
-        """Begin with another value than the graph's initial one for a vertex that is not in the problem yet."""
+        """Start a vertex that is not in the problem yet from another value than the graph's initial one."""
         self._grow()
         existing([vertex], self._vertices, "vertex")
         if self._inside[vertex]:
@@ -127,11 +127,11 @@ class Problem:
 
     @property
     def held(self) -> Index:
-        """Ids of the vertices that are kept where they are."""
+        """Ids of the vertices that stay at their values."""
         return np.flatnonzero(self._held)
 
     def is_held(self, vertex: int) -> bool:
-        """Return whether a vertex is kept where it is."""
+        """Return whether a vertex stays at its value."""
         return vertex < len(self._held) and bool(self._held[vertex])
 
     def remove(self, vertex: int) -> None:
@@ -161,7 +161,7 @@ class Problem:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Numbers measured, without edges of weight 0, less numbers to be estimated."""
+        """The measured numbers, without edges of weight 0, less the estimated numbers."""
         self._grow()
         graph, tables = self.graph, self.graph.tables.values()
         measured = sum(table.type.residual_size * int(np.count_nonzero(table.weight.values)) for table in tables)
@@ -184,7 +184,7 @@ class Problem:
 
     @property
     def values(self) -> Array:
-        """The estimates of all vertices, as ``Graph.initial`` has them: what ``start_at`` takes."""
+        """The estimates of all vertices, in the layout of ``Graph.initial``; ``start_at`` accepts them."""
         self._grow()
         return self._tree.estimate[: len(self.graph.initial)].copy()
 
@@ -236,7 +236,12 @@ class Problem:
         return edges
 
     def _arriving(self, *, surely: bool = False) -> tuple[Index, Index]:
-        """The unknowns and edges that will be part of the problem; all is as it was.
+        """Return the unknowns and edges that enter the problem; nothing is changed.
+
+        Raises
+        ------
+        GaugeError
+            Nothing would fix a part of the problem. This is checked if it may be so, or if ``surely``.
 
         Raises
         ------
@@ -262,7 +267,7 @@ class Problem:
     def _entering(self, vertices: Index, edges: Index) -> Iterator[None]:
         """Let vertices and edges enter; an error undoes it: they are pending again, and the estimate stays.
 
-        The tree is then made anew at the next update: its numbers are half old and half new.
+        After an error the tree is rebuilt at the next update, because its numbers are half old and half new.
         """
         pending, tree = self._pending, self._tree
         try:
@@ -277,7 +282,7 @@ class Problem:
         self._pending = PendingChanges()
 
     def _fix_at_estimate(self, one: Index) -> None:
-        """Make a vertex no unknown any more; it stays at its estimate."""
+        """Remove a vertex from the unknowns; it stays at its estimate."""
         accept_steps(self._tree, one)
         if self._tree.vertex[one[0], FREE]:
             self._pending.touch(incremental.leave(self._tree, one, NONE))
@@ -288,7 +293,7 @@ class Problem:
         self._tree.step[:] = 0.0
 
     def _refuse_floating(self) -> None:
-        """Raise GaugeError where nothing fixes a part of the problem, with all that is pending."""
+        """Raise GaugeError if nothing fixes a part of the problem, with all pending changes."""
         rows = rows_of(self.graph, self.edges)
         check_gauge(
             self.graph, np.flatnonzero(self._inside & ~self._held), np.flatnonzero(self._inside & self._held), rows
@@ -305,7 +310,7 @@ def existing(ids: ArrayLike, count: int, what: str) -> Index:
 
 
 def _refuse_unfit(ids: Index, inside: NDArray[np.bool_], count: int, what: str) -> None:
-    """Raise where an id does not exist, is inside or is given twice."""
+    """Raise GraphSlamError if an id does not exist, is in the problem already or is repeated."""
     unfit = incremental.unfit(ids, inside, count)
     if unfit != NOTHING:
         existing(ids[unfit], count, what)

@@ -10,7 +10,7 @@ BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
 
 
 class RelinearizationSchedule:
-    """Counts updates, and keeps the vertices that moved until all of them are searched for large steps."""
+    """Counts updates, and collects the vertices that moved until all are searched for large steps."""
 
     def __init__(self) -> None:
         self._moved: list[Index] = []
@@ -18,18 +18,19 @@ class RelinearizationSchedule:
         self._updates = 0
 
     def note(self, moved: Index) -> None:
-        """Note vertices that moved after the last search of an update: the next searches them."""
+        """Note vertices that moved after an update's last search; the next update searches them."""
         self._moved.append(moved)
         self._unseen = moved
 
     def hasten(self, every: int) -> None:
-        """Have the present update search all of them."""
+        """Let the present update search all collected vertices."""
         self._updates = every
 
     def after_update(self, moved: Index, every: int) -> tuple[Index, float]:
-        """The vertices to search for large steps now, and the multiple of the threshold that a step must exceed.
+        """Return the vertices to search for large steps, and the multiple of the threshold that a step must exceed.
 
-        After so many updates among all that moved since, sooner if much moved anyway; else among what this one moved.
+        After a number of updates, or sooner if many moved, these are all that moved since; else those that this update
+        moved.
         """
         self._moved.append(moved)
         self._updates += 1

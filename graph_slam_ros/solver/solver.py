@@ -54,14 +54,14 @@ class Solver(Problem):
         self._solved_with: Settings | None = None
 
     def release(self, vertices: ArrayLike) -> None:
-        """Estimate held vertices again. It makes the whole structure anew."""
+        """Estimate held vertices again. The whole structure is rebuilt."""
         self._grow()
         self._held[existing(vertices, self._vertices, "vertex")] = False
         self.rebuild()
 
     @property
     def is_current(self) -> bool:
-        """Return whether nothing is pending: then covariances are of all there is, and change nothing."""
+        """Return whether nothing is pending: covariances then include all edges, and reading them changes nothing."""
         return self._numbers_current and not self._pending
 
     def update(self) -> Change:
@@ -214,16 +214,16 @@ class Solver(Problem):
         return information(self.graph, self._tree.estimate, rows_of(self.graph, self.edges), free, losses)
 
     def compact(self) -> None:
-        """Move the fronts in use together, so that what is free lies behind them; memory is not given back.
+        """Move the fronts in use together in memory; memory is not returned to the system.
 
-        It is done by itself before more memory is asked for.
+        The solver does so itself before it asks for more memory.
         """
         compact(self._tree)
 
     def rebuild(self) -> None:
-        """Make everything anew from the graph, at the present estimate; what fails leaves all as it was.
+        """Rebuild everything from the graph, at the present estimate; a failure leaves all as it was.
 
-        It is for an unforeseen fault: whatever that left behind in the tree is gone.
+        It is for an unforeseen fault: it removes whatever that left in the tree.
         """
         values, vertices, edges = self.values, self.vertices, np.flatnonzero(self._edge_inside)
         fresh = Solver(self.graph, self.settings)
@@ -255,7 +255,7 @@ class Solver(Problem):
 
     @contextmanager
     def _transaction(self, vertices: Index, edges: Index) -> Iterator[None]:
-        """Solve with vertices and edges that arrive; an error undoes it, and the estimate stays."""
+        """Solve with vertices and edges that enter; an error undoes it, and the estimate stays."""
         try:
             with self._entering(vertices, edges):
                 yield
@@ -265,7 +265,7 @@ class Solver(Problem):
 
     @contextmanager
     def _tree_remade_after_error(self) -> Iterator[None]:
-        """Have the tree made anew at the next update after an error, which leaves scratch in it."""
+        """Mark the tree to be rebuilt at the next update if an error occurs, which leaves scratch in it."""
         try:
             yield
         except BaseException:
@@ -273,12 +273,12 @@ class Solver(Problem):
             raise
 
     def _keep(self, moved: Index) -> None:
-        """Keep the estimates of vertices, to come back to them after an error."""
+        """Return the estimates of vertices, to restore them after an error."""
         if len(moved):
             keep(self._tree.vertex, self._tree.estimate, self._kept, moved)
 
     def _integrate(self, vertices: Index, edges: Index) -> tuple[Index, int]:
-        """Solve with what arrives; returns the vertices that moved, and how many edges were linearised."""
+        """Solve with all that enters; return the vertices that moved, and how many edges were linearised."""
         pending, settings = self._pending, self.settings
         if not self._numbers_current and not pending.broken:
             self._renumber_after_batch()
@@ -301,7 +301,7 @@ class Solver(Problem):
         return moved, len(fresh)
 
     def _continue_batch(self) -> Index:
-        """Step from where a batch stopped before the optimum; returns the vertices that moved."""
+        """Step on from where a batch stopped before the optimum; return the vertices that moved."""
         settings, self._unfinished = self.settings, False
         failed, moved = incremental.renumber(self._tree, self._active(), settings.tolerance, settings.tolerance_sigmas)
         if failed != NOTHING:
@@ -328,12 +328,12 @@ class Solver(Problem):
             yield len(edges), moved
 
     def _forget_numbers(self) -> None:
-        """Zero the sums: all edges are about to be linearised."""
+        """Set the sums to zero, because all edges are about to be linearised."""
         self._tree.blocks[:] = 0.0
         self._tree.diagonal[:] = 0.0
 
     def _restructure(self, vertices: Index, edges: Index) -> Index:
-        """Order and group what new vertices and edges touch; returns the cliques whose numbers are to be made."""
+        """Order and group what new vertices and edges touch; return the cliques whose numbers are to be computed."""
         if self._pending.broken:
             vertices = self._unknowns()
             incremental.reset(self._tree, vertices)
@@ -341,7 +341,7 @@ class Solver(Problem):
         return cliques
 
     def _renumber_after_batch(self) -> None:
-        """Make the numbers of the tree at the result of a batch, which stays."""
+        """Compute the numbers of the tree at the result of a batch. The result stays."""
         self._linearize(self._active())
         failed, _ = incremental.renumber(self._tree, self._active(), np.inf, 0.0)
         if failed != NOTHING:

@@ -67,7 +67,7 @@ class KeyframeList:
 
     @property
     def rests(self) -> bool:
-        """Whether the robot has stood for a second or more."""
+        """Return whether the robot has stood for a second or more."""
         return self._rest.is_on
 
     @property

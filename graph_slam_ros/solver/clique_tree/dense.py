@@ -22,7 +22,7 @@ dense = partial(kernel, fastmath={"reassoc", "contract", "nsz"})
 
 
 def _subtract_product(front: Array, low: int, high: int, first: int, last: int) -> None:
-    """Take the share of the pivot rows [low, high) out of the rows [first, last)."""
+    """Subtract the product of the pivot rows [low, high) from the rows [first, last)."""
     front[first:last, first:] -= front[low:high, first:last].T @ front[low:high, first:]
 
 
@@ -70,7 +70,7 @@ def partial_cholesky(front: Array, frontal: int, diagonal: Array) -> int:
 
 @dense
 def _eliminate_panel(front: Array, low: int, high: int, below: int, diagonal: Array) -> int:
-    """Eliminate some rows, and take their share out of those before ``below``; returns a row without a pivot."""
+    """Eliminate some rows and subtract their product from those before ``below``; return a row without a pivot."""
     for a in range(low, high, 4):
         last = min(a + 4, high)
         for p in range(a, last):
@@ -93,7 +93,7 @@ def _eliminate_panel(front: Array, low: int, high: int, below: int, diagonal: Ar
 
 @dense
 def _subtract(front: Array, row: int, column: int, pivot: int) -> None:
-    """Take a pivot row's share out of a row, from a column on."""
+    """Subtract a multiple of a pivot row from a row, from a column on."""
     share = front[pivot, row]
     for j in range(column, front.shape[1]):
         front[row, j] -= share * front[pivot, j]
@@ -101,7 +101,7 @@ def _subtract(front: Array, row: int, column: int, pivot: int) -> None:
 
 @dense
 def _subtract_four(front: Array, low: int, high: int, pivot: int) -> None:
-    """Take four pivot rows' shares out of rows: each number is loaded and stored once for four."""
+    """Subtract multiples of four pivot rows from rows: each number is loaded and stored once for four."""
     one, two, three, four = front[pivot], front[pivot + 1], front[pivot + 2], front[pivot + 3]
     for i in range(low, high):
         row = front[i]

@@ -1,4 +1,4 @@
-"""One update of the clique tree: what changed goes in, the steps of what it moves come out."""
+"""One update of the clique tree: from changes of the graph to the steps of the vertices that they move."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ FEW = 64  # new vertices whose anchorage is looked for; more are said to be loos
 
 @kernel
 def append_vertices(t: Tree, first: int, offset: Index, initial: Array, shapes: Index) -> None:
-    """Write the records of new vertices, not yet unknowns, with their initial values."""
+    """Append the records of new vertices with their initial values. They are not unknowns yet."""
     vertex, t_step, value, estimate = t.vertex, t.step, t.value, t.estimate
     step = 0 if first == 0 else vertex[first - 1, STEP] + vertex[first - 1, DOF]
     for k in range(len(offset)):
@@ -86,7 +86,7 @@ def append_vertices(t: Tree, first: int, offset: Index, initial: Array, shapes: 
 
 @kernel
 def unfit(ids: Index, inside: NDArray[np.bool_], count: int) -> int:
-    """The place in ``ids`` of one that is not below ``count``, is inside or is there twice, or NOTHING."""
+    """Return the index in ``ids`` of an id that is too large, already in the problem or repeated; or NOTHING."""
     found, marked = NOTHING, 0
     for k in range(len(ids)):
         if ids[k] < 0 or ids[k] >= count or inside[ids[k]]:
@@ -101,7 +101,7 @@ def unfit(ids: Index, inside: NDArray[np.bool_], count: int) -> int:
 
 @kernel
 def outside(rows: Index, ends: Index, weight: Array, inside: NDArray[np.bool_], new: Index) -> int:
-    """A vertex that edges with a weight, rows of a table, need and that is neither inside nor new, or NOTHING."""
+    """Return a vertex that weighted edges need and that is neither in the problem nor new; or NOTHING."""
     found = NOTHING
     for v in new:
         inside[v] = True
@@ -116,7 +116,7 @@ def outside(rows: Index, ends: Index, weight: Array, inside: NDArray[np.bool_], 
 
 @kernel
 def gather(estimate: Array, kind: Index, offset: Index, ids: Index, size: int) -> tuple[int, Array]:
-    """Stored numbers (n, size) of vertices of the first one's kind; a place in ``ids`` that is unfit, or NOTHING."""
+    """Return stored numbers (n, size) of vertices of the first one's kind, and the index of an unfit id or NOTHING."""
     out = np.empty((len(ids), size))
     for k in range(len(ids)):
         if ids[k] < 0 or ids[k] >= len(kind) or kind[ids[k]] != kind[ids[0]]:
@@ -129,7 +129,7 @@ def gather(estimate: Array, kind: Index, offset: Index, ids: Index, size: int) -
 
 @kernel
 def append_edges(t: Tree, rows: Index, all_ids: Index, all_ends: Index) -> None:
-    """Write the records of edges, rows of a table, not yet in the structure, and link them to their vertices."""
+    """Append the records of edges, and link them to their vertices. They are not in the structure yet."""
     vertex, edge, t_link, state, blocks = t.vertex, t.edge, t.link, t.state, t.blocks
     for row in rows:
         e = all_ids[row]
@@ -153,7 +153,7 @@ def append_edges(t: Tree, rows: Index, all_ids: Index, all_ends: Index) -> None:
 
 @kernel
 def enter(t: Tree, vertices: Index, edges: Index) -> None:
-    """Make vertices unknowns, the newest, and put edges, whose blocks are still to be made, into the structure."""
+    """Make vertices the newest unknowns, and put edges into the structure; their blocks are not computed yet."""
     vertex, tail, state = t.vertex, t.tail, t.state
     for v in vertices:
         vertex[v, FREE] = 1
@@ -172,7 +172,7 @@ def enter(t: Tree, vertices: Index, edges: Index) -> None:
 
 @kernel
 def leave(t: Tree, vertices: Index, edges: Index) -> Index:
-    """Take vertices and edges out again; returns the vertices whose cliques must be made anew."""
+    """Remove vertices and edges again; return the vertices whose cliques must be rebuilt."""
     deactivate(t, edges)
     touched = neighbourhood(t, vertices)
     for v in vertices:
@@ -182,7 +182,7 @@ def leave(t: Tree, vertices: Index, edges: Index) -> Index:
 
 @kernel
 def deactivate(t: Tree, edges: Index) -> None:
-    """Take edges, and what they add to the diagonal of H, out of the structure."""
+    """Remove edges from the structure and from the diagonal of H."""
     edge = t.edge
     for e in edges:
         edge[e, ACTIVE], edge[e, OWNER] = 0, NOTHING
@@ -191,7 +191,7 @@ def deactivate(t: Tree, edges: Index) -> None:
 
 @kernel
 def reset(t: Tree, unknowns: Index) -> None:
-    """Forget order and cliques, and what a call that failed left in the scratch: all unknowns are new."""
+    """Forget order and cliques, and the scratch of a failed call: all unknowns are new."""
     vertex, region, state = t.vertex, t.region, t.state
     vertex[:, LOCAL] = NOTHING
     t.edge[:, MARKED] = 0
@@ -254,7 +254,7 @@ def edges_of(vertex: Index, link: Index, v: int) -> Index:
 
 @kernel
 def _regroup(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
-    """Put changes of the structure into the tree: eliminate again what they touch, and group it into cliques.
+    """Apply changes of the structure to the tree: eliminate what they touch again, and group it into cliques.
 
     Parameters
     ----------
@@ -288,7 +288,7 @@ def _regroup(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
 
 
 def restructure(tree: Tree, edges: Index, touched: Index, new: Index) -> tuple[Tree, Index]:
-    """The tree with changes of the structure in it, and its new cliques, whose numbers are to be made.
+    """Return the tree after changes of the structure, and its new cliques, whose numbers are not computed yet.
 
     Parameters
     ----------
@@ -312,7 +312,7 @@ def restructure(tree: Tree, edges: Index, touched: Index, new: Index) -> tuple[T
 
 @kernel
 def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float) -> tuple[int, Index]:
-    """Make the numbers of cliques, children before parents, and step.
+    """Compute the numbers of cliques, children before parents, and the step.
 
     Returns a vertex that has no pivot, or NOTHING, and the vertices that moved.
     """
@@ -326,16 +326,16 @@ def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float) -> tuple[int
 
 
 def renumber(t: Tree, edges: Index, tolerance: float, sigmas: float) -> tuple[int, Index]:
-    """``solve`` where only the numbers of edges have changed."""
+    """Solve after a change of the edges' numbers alone."""
     return solve(t, mark(t, ends_of(t, edges)), tolerance, sigmas)
 
 
 @kernel
 def relinearize(t: Tree, moved: Index, threshold: float, error: float) -> Index:
-    """Move the linearisation points of vertices whose step is too large; returns all edges on them.
+    """Move the linearisation points of vertices whose step is too large; return all edges on them.
 
-    It is above the threshold, or what a linearisation neglects (the square of the step) is above ``error`` standard
-    deviations of the strongest measurement.
+    A step is too large above the threshold. It also is where the neglected term of the linearisation (the square of the
+    step) exceeds ``error`` standard deviations of the strongest measurement.
     """
     vertex, edge, link, t_step, t_diagonal = t.vertex, t.edge, t.link, t.step, t.diagonal
     edges, moving = np.empty(64, np.int64), np.empty(len(moved), np.int64)

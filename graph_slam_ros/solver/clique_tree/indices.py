@@ -14,7 +14,7 @@ RUN = 16  # numbers that are sorted by insertion
 
 @kernel
 def ascending(numbers: Index) -> Index:
-    """The places of some numbers in ascending order; equal ones keep their order. Short runs are merged."""
+    """Return the indices that sort some numbers; equal ones keep their order. Short runs are merged."""
     n, width = len(numbers), RUN
     order, merged = np.empty(n, np.int64), np.empty(n, np.int64)
     for low in range(0, n, width):
@@ -42,13 +42,13 @@ def ascending(numbers: Index) -> Index:
 
 @kernel
 def in_order(numbers: Index) -> Index:
-    """The numbers in ascending order."""
+    """Return the numbers in ascending order."""
     return chosen(numbers, ascending(numbers))
 
 
 @kernel
 def chosen(numbers: Index, places: Index) -> Index:
-    """The numbers at some places."""
+    """Return the numbers at some indices."""
     out = np.empty(len(places), np.int64)
     for k in range(len(places)):
         out[k] = numbers[places[k]]
@@ -57,7 +57,7 @@ def chosen(numbers: Index, places: Index) -> Index:
 
 @kernel
 def joined(first: Index, then: Index) -> Index:
-    """Numbers, and behind them others."""
+    """Return two arrays joined into one."""
     out = np.empty(len(first) + len(then), np.int64)
     for k in range(len(first)):
         out[k] = first[k]
@@ -68,7 +68,7 @@ def joined(first: Index, then: Index) -> Index:
 
 @kernel
 def lengthened(numbers: Index, count: int) -> Index:
-    """Numbers, and room for so many more."""
+    """Return the numbers followed by free room for more."""
     out = np.empty(len(numbers) + count, np.int64)
     for k in range(len(numbers)):
         out[k] = numbers[k]

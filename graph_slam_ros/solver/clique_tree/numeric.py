@@ -50,7 +50,7 @@ CANCELLED = 1e-4  # of what is taken off a sum: less than that left has lost dig
 
 @kernel
 def eliminate(t: Tree, cliques: Index, damping: float) -> int:
-    """Factor the fronts of cliques, children before parents; returns a vertex whose pivot is rounding, or NOTHING.
+    """Factor the fronts of cliques, children before parents; return a vertex whose pivot is rounding, or NOTHING.
 
     ``damping`` enlarges the diagonal of H by the factor 1 + damping (Marquardt).
     """
@@ -133,7 +133,7 @@ def _add_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, f
 
 @kernel
 def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Array, child: int, front: Array) -> None:
-    """Add what a child's subtree says of its separator."""
+    """Add a child's contribution to its separator."""
     of_child = front_of(clique, fronts, child)
     right, of_right = front.shape[0], of_child.shape[0]
     low, high = clique[child, MEMBERS] + clique[child, FRONTALS], clique[child, MEMBERS] + clique[child, SIZE]
@@ -161,11 +161,11 @@ def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Arra
 
 @kernel
 def back_substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float) -> Index:
-    """Steps from the root down, through the given cliques (children before parents) and below where they matter.
+    """Compute steps from the root down, through given cliques (children before parents) and below where they matter.
 
-    A step that changes by no more than the tolerance [m, rad], or so many standard deviations of the vertex given its
-    neighbours, is left as it was, and so is what depends on it alone; so errors do not add up. Returns the vertices
-    whose step has changed; their estimates follow.
+    A step is kept if it changes by no more than the tolerance [m, rad], or by so many standard deviations of the vertex
+    given its neighbours. Then all that depends on it alone is kept, so errors do not add up. Returns the vertices whose
+    step changed; their estimates are updated.
     """
     vertex, clique, members, fronts, step = t.vertex, t.clique, t.members, t.fronts, t.step
     value, estimate, diagonal = t.value, t.estimate, t.diagonal
@@ -229,7 +229,7 @@ def _move(
     moved: Index,
     count: int,
 ) -> int:
-    """Give vertices the steps x, but where the change is within the tolerances; returns how many have moved now."""
+    """Set the steps x of vertices unless the change is within the tolerances; return how many have moved so far."""
     at = 0
     for v in frontals:
         first, dof = vertex[v, STEP], vertex[v, DOF]
@@ -278,9 +278,9 @@ def add_to_diagonal(vertex: Index, edge: Index, e: int, block: Array, diagonal: 
 
 @kernel
 def clear_block(t: Tree, e: int) -> None:
-    """Forget an edge's block, and what it adds to the diagonal of H.
+    """Clear an edge's block, and its part of the diagonal of H.
 
-    Where that was nearly all of it, what would be left is rounding: then it is added up anew.
+    If that was nearly all of the diagonal, the difference would be rounding. Then the diagonal is summed again.
     """
     vertex, edge, blocks, diagonal = t.vertex, t.edge, t.blocks, t.diagonal
     width = edge[e, WIDTH]

@@ -68,7 +68,7 @@ INSIDE = 0.9  # share of the recent closures that a longer tail must hold
 
 @kernel
 def key_of(depth: int, region: int, vertex: int) -> int:
-    """Deeper regions are eliminated first, then as they came; the tail (depth -1) last."""
+    """Return the sorting key: deeper regions are eliminated first, then the older vertex; the tail (depth -1) last."""
     return ((DEEPEST - depth) << 54) | (region << 31) | vertex
 
 
@@ -126,11 +126,11 @@ def move_tail(t: Tree, edges: Index, touched: Index) -> tuple[Index, int]:
 
 @kernel
 def _decide_length(t: Tree, back: int) -> None:
-    """Decide how many vertices the tail keeps, now that a closure reaches back so far.
+    """Decide how many vertices the tail keeps after a closure that reaches further back.
 
-    They are in the root, so a closure among them touches nothing else, but every update pays for them. So there are
-    more than a few only where most recent closures reach no further, and where a root of that size costs less than
-    updates cost while there were few. That is so where a robot sweeps row beside row.
+    The tail is in the root. A closure within it touches nothing else, but every update pays for its size. So it is
+    longer than a few vertices only if most recent closures reach no further, and if a root of that size costs less than
+    updates cost while the graph was small. That is so where a robot sweeps row beside row.
     """
     state, reach = t.state, t.reach
     for k in range(len(reach) - 1):
@@ -151,7 +151,7 @@ def _decide_length(t: Tree, back: int) -> None:
 
 @kernel
 def ends_of(t: Tree, edges: Index) -> Index:
-    """The vertices of edges; some more than once."""
+    """Return the vertices of edges; some occur more than once."""
     edge = t.edge
     out = np.empty(MOST_SLOTS * len(edges), np.int64)
     count = 0
@@ -164,7 +164,7 @@ def ends_of(t: Tree, edges: Index) -> Index:
 
 @kernel
 def neighbourhood(t: Tree, vertices: Index) -> Index:
-    """The vertices and all that share an edge with one of them; some more than once."""
+    """Return the vertices and their neighbours; some occur more than once."""
     vertex, edge, link = t.vertex, t.edge, t.link
     count = 0
     for v in vertices:
@@ -203,7 +203,7 @@ def _enter(t: Tree, v: int, region: int) -> None:
 
 @kernel
 def _deepest_place(t: Tree, v: int) -> int:
-    """The deepest region that has each region of v's neighbours above, at or below it, never beside it."""
+    """Return the deepest region that is on one path to the root with the region of each neighbour of v."""
     vertex, region = t.vertex, t.region
     deepest = NOTHING
     around = neighbourhood(t, np.full(1, v, np.int64))
@@ -250,7 +250,7 @@ def _new_region(t: Tree, parent: int) -> int:
 
 @kernel
 def _clear(t: Tree, region: int) -> Index:
-    """Take all vertices out of a subtree of regions, and its inner regions away; returns the vertices by id."""
+    """Remove all vertices from a subtree of regions, and its inner regions; return the vertices by id."""
     vertex, t_region, state = t.vertex, t.region, t.state
     out = np.empty(t_region[region, R_COUNT], np.int64)
     count = 0
@@ -282,7 +282,7 @@ def _clear(t: Tree, region: int) -> Index:
 
 @kernel
 def dissect(t: Tree, region: int) -> Index:
-    """Divide a subtree anew, from its vertices and the edges among them; returns the vertices."""
+    """Dissect a subtree again, by its vertices and the edges among them; return the vertices."""
     t_region = t.region
     vertices = _clear(t, region)
     if region == ROOT:
@@ -317,7 +317,7 @@ def dissect(t: Tree, region: int) -> Index:
 
 @kernel
 def _parted(mine: Index, side: Index, part: Index, low: int) -> tuple[int, int]:
-    """Write those of side 0 into ``part`` from ``low`` on, behind them those of side 1; returns where each end."""
+    """Write the vertices of side 0 into ``part`` from ``low`` on, then those of side 1; return where each ends."""
     at = low
     for k in range(len(mine)):
         if side[k] == 0:
@@ -333,7 +333,7 @@ def _parted(mine: Index, side: Index, part: Index, low: int) -> tuple[int, int]:
 
 @kernel
 def _graph_of(t: Tree, vertices: Index) -> tuple[Index, Index, Index, Index]:
-    """The graph that active edges make of some vertices, numbered as they come (see ``separator``)."""
+    """Return the graph of the active edges among some vertices, numbered in their order (see ``separator``)."""
     vertex, edge, link = t.vertex, t.edge, t.link
     n = len(vertices)
     most = 0
@@ -373,7 +373,7 @@ def _graph_of(t: Tree, vertices: Index) -> tuple[Index, Index, Index, Index]:
 def _induced(
     part: Index, start: Index, neighbour: Index, strength: Index, weight: Index, place: Index
 ) -> tuple[Index, Index, Index, Index]:
-    """The graph of a part of its vertices; ``place`` is scratch, NOTHING everywhere before and after."""
+    """Return the graph of a part of its vertices; ``place`` is scratch, NOTHING everywhere before and after."""
     n = len(part)
     most = 0
     for k in range(n):

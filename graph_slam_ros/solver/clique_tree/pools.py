@@ -1,6 +1,6 @@
-"""The pools that cliques, their members and their fronts lie in, by size class.
+"""Memory pools of cliques, their members and their fronts, by size class.
 
-A clique that leaves gives its place to the next one of the same class, which is then still in the processor's cache.
+The place of a clique that leaves is reused by the next one of its class. It is then still in the processor's cache.
 """
 
 import numpy as np
@@ -48,9 +48,9 @@ def numbers_of(size_class: int) -> int:
 
 @kernel
 def room_for(t: Tree, size: Index, leaving: Index) -> tuple[int, int, int]:
-    """Count what new cliques of these sizes add to the pools: cliques, members, numbers of fronts.
+    """Return how much new cliques of these sizes add to the pools: cliques, members, numbers of fronts.
 
-    They take the places of those that leave, and vacant ones, first.
+    They first reuse the places of cliques that leave, and vacant ones.
     """
     clique, vacant = t.clique, t.vacant
     wanted = np.zeros(len(CAPACITIES), np.int64)
@@ -73,7 +73,7 @@ def room_for(t: Tree, size: Index, leaving: Index) -> tuple[int, int, int]:
 
 @kernel
 def release(t: Tree, cliques: Index) -> None:
-    """Give cliques back: the next ones of the same size class use their places again."""
+    """Release cliques: the next ones of the same size class reuse their places."""
     vertex, clique, vacant, members = t.vertex, t.clique, t.vacant, t.members
     for c in cliques:
         for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
@@ -87,7 +87,7 @@ def release(t: Tree, cliques: Index) -> None:
 
 @kernel
 def allocate(t: Tree, size: int) -> int:
-    """Give a clique of that many degrees of freedom its place in the pools."""
+    """Allocate the place of a clique of that many degrees of freedom."""
     clique, vacant, state = t.clique, t.vacant, t.state
     k = capacity_class(size)
     c = vacant[k]
@@ -112,7 +112,7 @@ def allocate(t: Tree, size: int) -> int:
 
 @kernel
 def compact(t: Tree) -> None:
-    """Move all cliques together in memory; those that are vacant keep none."""
+    """Move all cliques together in memory; vacant ones keep none."""
     clique, vacant, members, fronts, state = t.clique, t.vacant, t.members, t.fronts, t.state
     live = np.ones(state[CLIQUES], np.bool_)
     c = state[FREE_CLIQUE]

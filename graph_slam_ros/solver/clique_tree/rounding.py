@@ -49,16 +49,16 @@ def suspect_row(front: Array, frontal: int, diagonal: Array) -> int:
 
 @kernel
 def is_rounding(t: Tree, c: int, row: int) -> bool:
-    """Return whether the pivot in a row of a clique's front cannot be told from rounding."""
+    """Return whether the pivot in a row of a clique's front may be rounding alone."""
     front = front_of(t.clique, t.fronts, c)
     return 1.0 / front[row, row] ** 2 <= ROUNDING * magnitude_of(t, c, row)
 
 
 @kernel
 def magnitude_of(t: Tree, c: int, row: int) -> float:
-    """The magnitude ``sum of H_jj x_j^2`` of what cancelled in the pivot of a row.
+    """Return the magnitude ``sum of H_jj x_j^2`` of what cancelled in the pivot of a row.
 
-    Subtrees older than the present elimination keep their forms from then on, and are not walked again.
+    Subtrees older than this elimination store their forms afterwards, and are not walked again.
     """
     vertex, clique, members, fronts, diagonal = t.vertex, t.clique, t.members, t.fronts, t.diagonal
     x_of, x = np.empty(len(t.step)), np.empty(256)  # by unknown; of one front
@@ -110,7 +110,7 @@ def magnitude_of(t: Tree, c: int, row: int) -> float:
 
 @kernel
 def _follow(front: Array, first: int, x: Array) -> None:
-    """Move the unknowns of the rows before ``first`` as those behind them ask, where no residual pulls at them."""
+    """Move the unknowns of the rows before ``first`` to where they have no residual, given those behind them."""
     for a in range(first - 1, -1, -1):
         s = 0.0
         for i in range(a + 1, front.shape[0]):
@@ -120,7 +120,7 @@ def _follow(front: Array, first: int, x: Array) -> None:
 
 @kernel
 def _kept_magnitude(front: Array, frontal: int, x: Array) -> float:
-    """``s'Ms`` of a clique that keeps it: M below the diagonal of the separator's block, M's diagonal before it."""
+    """Return ``s'Ms`` of a clique that stores it: M below the diagonal of the separator's block, its diagonal first."""
     total = 0.0
     for i in range(frontal, front.shape[0]):
         s = 0.5 * front[i, 0] * x[i]
@@ -134,7 +134,7 @@ def _kept_magnitude(front: Array, frontal: int, x: Array) -> float:
 def _keep_magnitudes(
     vertex: Index, clique: Index, members: Index, fronts: Array, diagonal: Array, c: int, place: Index
 ) -> None:
-    """Put M of a clique, whose children keep theirs, into its front; ``place`` is scratch, by unknown."""
+    """Store M of a clique, whose children store theirs, in its front; ``place`` is scratch, by unknown."""
     front, frontal = front_of(clique, fronts, c), clique[c, FRONT_DOF]
     full, low = front.shape[0], clique[c, MEMBERS]
     own, at = np.zeros((full, full)), 0  # the same form over all of the front
@@ -170,7 +170,7 @@ def _keep_magnitudes(
 def _add_kept(
     vertex: Index, clique: Index, members: Index, fronts: Array, child: int, place: Index, form: Array
 ) -> None:
-    """Add the form that a child keeps to one over its parent's front."""
+    """Add a child's stored form to one over its parent's front."""
     front, frontal = front_of(clique, fronts, child), clique[child, FRONT_DOF]
     to, at = np.empty(front.shape[0] - frontal, np.int64), 0
     for m in range(clique[child, MEMBERS] + clique[child, FRONTALS], clique[child, MEMBERS] + clique[child, SIZE]):

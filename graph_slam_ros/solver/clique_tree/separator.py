@@ -49,7 +49,7 @@ def separate(start: Index, neighbour: Index, strength: Index, weight: Index) -> 
 
 @kernel
 def _match(start: Index, neighbour: Index, strength: Index, weight: Index) -> tuple[Index, int]:
-    """Pair each vertex with the neighbour it is joined to most strongly; returns its pair's number, and their count."""
+    """Pair each vertex with the neighbour that most edges join it to; return each vertex's pair, and their count."""
     n = len(weight)
     pair = np.full(n, NOTHING, np.int64)
     neighbours, whole = np.empty(n, np.int64), 0
@@ -110,7 +110,7 @@ def _contract(
 
 @kernel
 def _first(start: Index, neighbour: Index, weight: Index) -> Index:
-    """The lightest of several separators: of the order as it is, and of the distances from several vertices."""
+    """Return the lightest of several separators: by the given order, and by the distances from several vertices."""
     n = len(weight)
     best, lightest = np.inf, np.zeros(n, np.int64)
     order = np.arange(n)
@@ -130,7 +130,7 @@ def _first(start: Index, neighbour: Index, weight: Index) -> Index:
 
 @kernel
 def _by_distance(first: int, start: Index, neighbour: Index) -> Index:
-    """Breadth-first order from a vertex; what it does not reach follows, piece by piece."""
+    """Return a breadth-first order from a vertex; parts that it does not reach follow, one by one."""
     n = len(start) - 1
     order = np.empty(n, np.int64)
     seen = np.zeros(n, np.uint8)
@@ -253,7 +253,7 @@ def _best_move(
     neighbour: Index,
     weight: Index,
 ) -> tuple[int, int, int]:
-    """The vertex of the separator that lightens it most by moving, and where to; those that left it are dropped."""
+    """Return the vertex whose move lightens the separator most, and its side; drop those that have left it."""
     pick, to, best = NOTHING, 0, -np.inf
     live = 0
     for m in range(count):

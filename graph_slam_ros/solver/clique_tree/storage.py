@@ -1,4 +1,4 @@
-"""The clique tree (Bayes tree): what is known of each vertex, edge, clique and region, in flat arrays.
+"""The clique tree (Bayes tree): the records of vertices, edges, cliques and regions, in flat arrays.
 
 Eliminating the information matrix H vertex after vertex leaves cliques: *frontal* vertices that were eliminated
 together, given a *separator* of later ones, which the parent clique contains. Each clique keeps one dense front::
@@ -156,13 +156,13 @@ def empty_tree() -> Tree:
 
 
 def with_room(tree: Tree, **lengths: int) -> Tree:
-    """The tree with arrays of at least so many rows."""
+    """Return the tree with arrays of at least so many rows."""
     short = {name: count for name, count in lengths.items() if len(getattr(tree, name)) < count}
     return tree._replace(**{name: longer(getattr(tree, name), n) for name, n in short.items()}) if short else tree
 
 
 def longer(array: NDArray[Any], count: int) -> NDArray[Any]:
-    """The array with so many rows at least, and room for more to come; those added are zero."""
+    """Return the array with at least so many rows and room for more; added rows are zero."""
     if count <= len(array):
         return array
     shape = (max(count, len(array) + len(array) // 16, 64), *array.shape[1:])

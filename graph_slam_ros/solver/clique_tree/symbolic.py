@@ -40,9 +40,9 @@ SHARE = 0.12  # or this share of a large one
 
 @kernel
 def mark(t: Tree, touched: Index) -> Index:
-    """The cliques of the touched vertices and all their ancestors, children before parents.
+    """Return the cliques of the touched vertices and all their ancestors, children before parents.
 
-    By the tree, not by the keys: where a region was ordered anew, what hangs below it may have later ones.
+    Ancestors are found by the tree, not by the keys: below a region that was ordered again, keys may be later.
     """
     vertex, clique = t.vertex, t.clique
     count, ways = ZERO, 0
@@ -113,10 +113,10 @@ def collect(t: Tree, marked: Index, new: Index) -> tuple[Index, Index]:
 
 @kernel
 def structure(t: Tree, order: Index, orphans: Index) -> tuple[Index, Index]:
-    """Find what each eliminated vertex leaves connected: of the k-th, numbers in ``order``, later ones, nearest first.
+    """Find what each eliminated vertex leaves connected: of the k-th, indices in ``order``, later ones, nearest first.
 
-    It is joined by edges, by the separators of orphans, and by what earlier vertices left (its children in the
-    elimination tree). Returns where each begins (n + 1) and the numbers.
+    It is connected by edges, by the separators of orphans, and by what earlier vertices left (its children in the
+    elimination tree). Returns where each begins (n + 1) and the indices.
     """
     vertex = t.vertex
     n = len(order)
@@ -174,7 +174,7 @@ def _by_first(t: Tree, orphans: Index, n: int) -> tuple[Index, Index]:
 
 @kernel
 def _note(u: int, k: int, seen: Index, later: Index, top: int) -> int:
-    """Note u as connected to k, once, if it is later; returns how many are noted."""
+    """Note u as connected to k, once, if it is later; return how many are noted."""
     if u > k and seen[u] != k:
         seen[u] = k
         later[top] = u
@@ -184,7 +184,7 @@ def _note(u: int, k: int, seen: Index, later: Index, top: int) -> int:
 
 @kernel
 def _joined_by_edges(t: Tree, v: int, k: int, seen: Index, later: Index, top: int) -> int:
-    """Note what edges join to v; it owns those of which it is eliminated first."""
+    """Note the vertices that edges connect to v; v owns those edges of which it is eliminated first."""
     vertex, edge, link = t.vertex, t.edge, t.link
     a = vertex[v, LINK]
     while a != NOTHING:
@@ -205,7 +205,7 @@ def _joined_by_edges(t: Tree, v: int, k: int, seen: Index, later: Index, top: in
 
 @kernel
 def _joined_by_orphan(t: Tree, c: int, k: int, seen: Index, later: Index, top: int) -> int:
-    """Note what an orphan's separator joins."""
+    """Note the vertices that an orphan's separator connects."""
     vertex, clique, members = t.vertex, t.clique, t.members
     for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
         top = _note(vertex[members[m], LOCAL], k, seen, later, top)
@@ -216,8 +216,8 @@ def _joined_by_orphan(t: Tree, c: int, k: int, seen: Index, later: Index, top: i
 def cliques_of(t: Tree, order: Index, start: Index, later: Index) -> tuple[Index, Index, Index]:
     """Group vertices into cliques, parents before children.
 
-    A vertex joins its parent's clique where that gains few zeros. Returns the clique of each vertex, and of each
-    clique its last vertex and its size in degrees of freedom.
+    A vertex joins its parent's clique if that adds few zeros. Returns the clique of each vertex, and of each clique its
+    last vertex and its size in degrees of freedom.
     """
     vertex = t.vertex
     n = len(order)
