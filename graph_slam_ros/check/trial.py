@@ -16,7 +16,8 @@ from graph_slam_ros.slam.calibration.decision import Finding as Fitted
 from graph_slam_ros.typing import Array, Index, Mask
 
 _THIN_NS = 80_000_000
-_EVERY, _APART_S = 20, 1.0
+_APART_S = 1.0
+_COARSE = {"solve.every_keyframes": 20, "robust.second_look_after": 0, "robust.rounds": 3}
 _SIGMAS = 4.0
 _TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
 _ABSURD, _BACKWARDS, _LATE_S, _SURE = 0.5, 0.35, 0.2, 0.05
@@ -34,9 +35,12 @@ _OUTLIERS, _LOST, _NEAR_M = 0.12, 0.25, 0.5
 
 
 def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
-    """The pipeline after all measurements, with fewer odometry, keyframes and solves: the estimate a fit begins at."""
+    """The pipeline after all measurements, with fewer odometry, keyframes, solves and searches for other hypotheses.
+
+    Its estimate is where a fit begins.
+    """
     apart_s = max(config.keyframes.min_interval_s, _APART_S)
-    slam = GraphSlam(config.changed({"solve.every_keyframes": _EVERY, "keyframes.min_interval_s": apart_s}))
+    slam = GraphSlam(config.changed(_COARSE | {"keyframes.min_interval_s": apart_s}))
     last_ns = 0
     for m in measured:
         if isinstance(m, Odometry):
