@@ -43,6 +43,9 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.solver import LossKey, Settings
 from graph_slam_ros.typing import Numbers
 
+REMOVED = {"landmarks.follow_s": "observations without identity are compared with all landmarks around"}
+"""Parameters of earlier versions, which had no effect any more. Saved runs have them."""
+
 
 @dataclass(frozen=True, slots=True)
 class Config:
@@ -104,6 +107,8 @@ class Config:
         known = {p.name: p for p in parameters(names)}
         sections: dict[str, dict[str, Any]] = {}
         for name, value in given.items():
+            if name in REMOVED:
+                raise ConfigError(f"parameter {name!r} was removed: {REMOVED[name]}; leave it out")
             if name not in known:
                 near = difflib.get_close_matches(name, known, 1, 0.0)
                 raise ConfigError(f"unknown parameter {name!r}; did you mean {near[0]!r}?{_unlisted(name, names)}")

@@ -75,12 +75,6 @@ class LandmarksConfig:
     confirm_s: float = setting(
         2.0, "time over which a new landmark without identity must be observed before it is confirmed", "s", low=0.0
     )
-    follow_s: float = setting(
-        10.0,
-        "not used any more: observations without identity are compared with all landmarks around",
-        "s",
-        low=0.0,
-    )
     give_up_s: float = setting(
         60.0, "a landmark that is not confirmed is removed when it was not observed for this long", "s", low=0.0
     )

@@ -265,6 +265,8 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
         if calibration := facts.estimate.calibration:
             corrected = ", ".join(name for name in calibration if name.startswith("corrected "))
             yield Status(OK, f"{node}: calibration", corrected or "nothing corrected", node, dict(calibration))
+        if gyro := facts.estimate.gyro:
+            yield Status(OK, f"{node}: gyro", gyro, node, {"gyro": gyro})
         yield Status(OK, f"{node}: graph", f"{facts.estimate.keyframes} keyframes", node, values)
 
 

@@ -56,6 +56,7 @@ class Estimate:
     rivals : loop closures of other explanations that could not be ruled out
     displaced : that the landmarks say that the robot is elsewhere than odometry; empty where they do not
     motion : why the gyro, or an odometry, has no part in the motion; empty where all have
+    gyro : its state and its bias; empty where no input is one
     calibration : settings that calibration has corrected, and a sentence for each parameter that it has fitted
     is_resumed : whether a drive that was cut off goes on by odometry alone: nothing was recognised since
     """
@@ -79,6 +80,7 @@ class Estimate:
     rivals: int
     displaced: str = ""
     motion: str = ""
+    gyro: str = ""
     is_resumed: bool = False
     calibration: Mapping[str, str] = field(default_factory=dict)
 
@@ -133,6 +135,7 @@ class Estimate:
             rivals=sum(len(rival.only_here) for rival in slam.backend.rivals),
             displaced=str(slam.displaced or ""),
             motion="; ".join(filter(None, (slam.gyro.fault if slam.gyro else "", slam.backend.odometries.doubted))),
+            gyro=str(slam.gyro or ""),
             is_resumed=is_resumed,
             calibration=_calibration(slam.calibration_report),
         )

@@ -19,6 +19,7 @@ from typing import Any
 from mcap.records import Channel, Schema
 
 from graph_slam_ros import __version__
+from graph_slam_ros.config.config import REMOVED, flatten
 from graph_slam_ros.errors import ConfigError, FormatError, GraphSlamError
 from graph_slam_ros.formats.durable import NEW, claimed, sync_folder, write_whole
 from graph_slam_ros.formats.files import is_regular, opened, read_bytes, read_text
@@ -157,7 +158,7 @@ def run_config(folder: Path) -> Config:
         raise ConfigError(f"{folder}: not a run: no {CONFIG} in it")
     values = read_parameters(folder / CONFIG, follow=False)
     try:
-        return Config.from_mapping(values)
+        return Config.from_mapping({name: value for name, value in flatten(values) if name not in REMOVED})
     except GraphSlamError as error:
         raise ConfigError(f"{folder / CONFIG}: {error}") from None
 

@@ -42,6 +42,10 @@ def fault_of(state: MapSnapshot) -> str:
         return "the odometry that was used last is none"
     if state.datum and not (len(state.datum) == 3 and are_numbers(state.datum)):
         return "its datum is none"
+    if (gyro := state.gyro_bias) is not None:
+        is_one = len(gyro.bias) == len(gyro.variance) and are_numbers((*gyro.bias, *gyro.variance))
+        if not is_one or min(gyro.variance, default=-1.0) < 0.0 or not is_index(gyro.stamp_ns, 2**63):
+            return "the bias of its gyro is none"
     if len(state.ledger) > graph.edge_count:
         return f"{len(state.ledger)} verdicts on {graph.edge_count} edges"
     return "" if np.isfinite(state.values).all() else "an estimate is not finite"

@@ -18,6 +18,7 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 * ``noise``: factors of the configured sigmas that the edges have from now on, ``[class, input, part, factor]`` each;
   ``rescaled``: changes of edges of earlier records, in order: first edge, the first that is not among them, and the
   factors of the groups that changed, before and after, as in ``noise``;
+* ``gyro``: its input, the bias about each axis and the variance of that, stamp of the newest odometry by then;
 * ``calibration``: corrections with those configured, ``[input, name, value]`` each; ``recalibrated``: edges of
   earlier records as they are by these: edge type, rows of its table, numbers measured, square roots of the information;
 * ``frozen``: so many vertices, the first, stay where they are, and verdicts on so many edges as they are; ``held``: the
@@ -30,7 +31,7 @@ before it, and a ``growth`` of the whole map follows.
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,7 @@ from graph_slam_ros.runs.journal import MAP, parts_of, read_records
 from graph_slam_ros.runs.map_faults import fault_of, is_index
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.calibration.recalibration import Recalibration, Totals, read_totals, totals_record
+from graph_slam_ros.slam.frontend.gyro import SavedBias
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling, factors_record, read_factors
@@ -86,6 +88,7 @@ class MapGrowth:
         self._recalibrated = 0
         self._held = (0, 0)
         self._datum: tuple[float, ...] = ()
+        self._gyro: SavedBias | None = None
         self._settings: dict[str, Any] = {}
         self._estimated = 0  # keyframes at the last estimate
 
@@ -141,6 +144,8 @@ class MapGrowth:
         out["edits"] = [one.record for one in a.edits[self._edits :]]
         if a.datum != self._datum:
             out["datum"] = self._datum = a.datum
+        if a.gyro_bias is not None and a.gyro_bias != self._gyro:
+            out["gyro"], self._gyro = list(astuple(a.gyro_bias)), a.gyro_bias
         if keyframes:
             out["stamp_ns"] = keyframes[-1].stamp_ns
         self._vertices, self._edges, self._judged = graph.vertex_count, graph.edge_count, len(a.ledger)
@@ -312,6 +317,9 @@ def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     _know(state, record)
     state.range_offsets.update(record.get("offsets", {}))
     state.datum = tuple(record.get("datum", state.datum))
+    if "gyro" in record:
+        name, bias, variance, stamp_ns = record["gyro"]
+        state.gyro_bias = SavedBias(name, tuple(bias), tuple(variance), stamp_ns)
     state.settings.update(record.get("settings", {}))
     state.edits += map(applied_edit, record.get("edits", ()))
     state.processed = _count(record.get("processed"))

@@ -289,7 +289,7 @@ class GraphSlam(MapView):
         frontend, localizes = self._frontend, self.config.map.localize
         if self.graph.kind_of(start.keyframes[0].vertex) is not self.space.pose:
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
-        frontend.restore(start.keyframes, start.segments, start.drives, start.sighting_poses, start.continues_with)
+        frontend.restore(*start.path, start.continues_with, start.gyro_bias)
         self._anchor.restore()
         self._landmarks.restore(start.landmarks, start.range_offsets)
         report = self.backend.restore(start.vertices, start.values, start.held if localizes else (0, 0))

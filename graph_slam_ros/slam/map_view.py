@@ -16,7 +16,7 @@ from graph_slam_ros.slam.calibration.fit import TrialFit, fit
 from graph_slam_ros.slam.calibration.parameters import DEFAULT_GROUPS
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
 from graph_slam_ros.slam.calibrator import Calibrator
-from graph_slam_ros.slam.frontend.gyro import GyroState
+from graph_slam_ros.slam.frontend.gyro import GyroState, SavedBias
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
@@ -152,6 +152,11 @@ class MapView:
     def gyro(self) -> GyroState | None:
         """The present estimate of the gyro; None where no input is one."""
         return self._frontend.gyro.state if self._frontend.gyro else None
+
+    @property
+    def gyro_bias(self) -> SavedBias | None:
+        """The bias of the gyro that a map keeps; None without a gyro, and before the first odometry."""
+        return self._frontend.gyro.saved if self._frontend.gyro else None
 
     # -- landmarks -------------------------------------------------------------------------------------------------
 

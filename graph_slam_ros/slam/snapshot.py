@@ -8,6 +8,7 @@ import numpy as np
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.measurements.edits import AppliedEdit
 from graph_slam_ros.slam.calibration.recalibration import Recalibration
+from graph_slam_ros.slam.frontend.gyro import SavedBias
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark
@@ -32,6 +33,7 @@ class MapSnapshot:
     noise_factors : of the configured sigmas, that the edges have, as ``NoiseScales.factors``
     calibration : corrections that were found, with those that were configured, by input and name
     edits : by hand, in order
+    gyro_bias : of the gyro, as far as it was learnt; None without a gyro
     continues_with : the odometry whose next message belongs to the same drive; empty where a new drive begins
     """
 
@@ -55,6 +57,7 @@ class MapSnapshot:
     noise_factors: dict[Key, float] = field(default_factory=dict)
     edits: list[AppliedEdit] = field(default_factory=list)
     calibration: dict[tuple[str, str], float] = field(default_factory=dict)
+    gyro_bias: SavedBias | None = None
 
     @property
     def noise_changes(self) -> tuple[Rescaling, ...]:
@@ -65,6 +68,11 @@ class MapSnapshot:
     def recalibrations(self) -> tuple[Recalibration, ...]:
         """None, because the edges are as they were read."""
         return ()
+
+    @property
+    def path(self) -> tuple[list[Keyframe], list[int], list[int], list[SightingPose]]:
+        """Keyframes, segments, drives and poses of sightings."""
+        return self.keyframes, self.segments, self.drives, self.sighting_poses
 
     @property
     def frozen_edges(self) -> int:

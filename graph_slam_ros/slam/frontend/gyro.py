@@ -57,6 +57,29 @@ class GyroState:
             )
         return ""
 
+    def __str__(self) -> str:
+        """The state and the bias, for a person."""
+        bias = ", ".join(f"{b:.5f} +- {s:.5f}" for b, s in zip(self.bias, self.sigma, strict=True))
+        return f"{self.state}; bias {bias} rad/s"
+
+
+@dataclass(frozen=True, slots=True)
+class SavedBias:
+    """The bias of a gyro as a map keeps it.
+
+    Attributes
+    ----------
+    name : of the input
+    bias : about each axis [rad/s]
+    variance : of it [rad^2/s^2]
+    stamp_ns : of the newest odometry by then
+    """
+
+    name: str
+    bias: Numbers
+    variance: Numbers
+    stamp_ns: int
+
 
 @dataclass(frozen=True, slots=True)
 class _Step:
@@ -89,11 +112,27 @@ class GyroFusion:
         self._seen_s = self._disagrees = 0.0
         self._is_doubted = False
         self._state = "waiting"
+        self._newest_ns: int | None = None  # of the last step
+        self._is_restored = False  # from a map, before the first step
 
     @property
     def state(self) -> GyroState:
         """The present estimate of it."""
         return GyroState(self.name, tuple(self._bias), tuple(map(math.sqrt, self._bias_variance)), self._state)
+
+    @property
+    def saved(self) -> SavedBias | None:
+        """The bias for a map; None before the first step of odometry."""
+        if self._newest_ns is None:
+            return None
+        return SavedBias(self.name, tuple(self._bias), tuple(self._bias_variance), self._newest_ns)
+
+    def restore(self, saved: SavedBias) -> None:
+        """Go on with the bias of a map, if it is that of this gyro. It walks until the next odometry."""
+        if saved.name == self.name and len(saved.bias) == self._axes:
+            self._bias, self._bias_variance = list(saved.bias), list(saved.variance)
+            self._newest_ns = saved.stamp_ns
+            self._is_restored = True
 
     def add(self, m: AngularVelocity) -> None:
         """Add a message of the gyro, in any order."""
@@ -109,6 +148,7 @@ class GyroFusion:
         self._window.clear()
         self._rest = StationaryDetector(self._noise, self._space)
         self._bias_variance = [self._config.bias_sigma**2] * self._axes
+        self._is_restored = False
 
     def fuse(self, step: Step, seconds: float, source: str) -> Step:
         """Return a step of odometry, its rotation fused with that of the gyro.
@@ -118,14 +158,17 @@ class GyroFusion:
         seconds : since the step before
         source : the odometry, for what is counted
         """
+        if self._is_restored:
+            self._age_restored(step.stamp_ns)
+        elif seconds > 0.0 and not step.broken:
+            self._bias_variance = [v + self._config.bias_walk**2 * seconds for v in self._bias_variance]
+        self._newest_ns = step.stamp_ns
         if seconds <= 0.0 or step.broken:
             self._rest.update(step, max(seconds, 0.0))
             self._samples.begin(step.stamp_ns)
             self._window.clear()
             return step
         stood = self._rest.update(step, seconds)
-        walked = self._config.bias_walk**2 * seconds
-        self._bias_variance = [v + walked for v in self._bias_variance]
         turn = self._samples.turn(step.stamp_ns - round(seconds * 1e9), step.stamp_ns)
         if turn is None:
             self._counters.count(self.name, "gyro_silent")
@@ -133,6 +176,14 @@ class GyroFusion:
             self._window.clear()
             return step
         return self._fused(step, seconds, turn, stood, source)
+
+    def _age_restored(self, stamp_ns: int) -> None:
+        """Let the bias of a map walk until now. It is not known less than that of a gyro that was never used."""
+        gone_s = (stamp_ns - (self._newest_ns or 0)) * 1e-9
+        walked = self._config.bias_walk**2 * gone_s if gone_s >= 0.0 else math.inf  # of another clock
+        most = self._config.bias_sigma**2
+        self._bias_variance = [min(v + walked, max(v, most)) for v in self._bias_variance]
+        self._is_restored = False
 
     def _fused(self, step: Step, seconds: float, turn: Turn, stood: bool, source: str) -> Step:
         n, group = self._space.dimensions, self._space.group

@@ -22,7 +22,7 @@ from graph_slam_ros.measurements.types import (
 from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.frontend.corrections import Corrections
 from graph_slam_ros.slam.frontend.gates import ClosureStart, DatumGate, GateChain
-from graph_slam_ros.slam.frontend.gyro import GyroFusion
+from graph_slam_ros.slam.frontend.gyro import GyroFusion, SavedBias
 from graph_slam_ros.slam.frontend.ingest_gate import size_of
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, KeyframeList, SightingPose
 from graph_slam_ros.slam.frontend.max_distance import MaxDistance
@@ -122,9 +122,12 @@ class KeyframeFrontend:
         drives: Sequence[int],
         sighting_poses: Sequence[SightingPose],
         continues_with: str,
+        gyro_bias: SavedBias | None,
     ) -> None:
         """Continue after the keyframes of a map. If an input is given, its odometry continues the drive."""
         self.path.restore(keyframes, segments, drives)
+        if self.gyro and gyro_bias:
+            self.gyro.restore(gyro_bias)
         if continues_with:
             newest = keyframes[-1]
             self.path.continue_drive()

@@ -10,6 +10,7 @@ from graph_slam_ros.config.config import notes, parameters
 from graph_slam_ros.config.solve import SolveConfig
 from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.parameters import parameters_text, parse_setting, read_parameters
+from graph_slam_ros.runs.folder import run_config
 from graph_slam_ros.slam import Config
 from graph_slam_ros.solver import Settings
 
@@ -92,6 +93,14 @@ def test_a_file_may_be_flat_dotted_or_wrapped_as_ros_does(tmp_path):
 def test_an_empty_file_is_the_defaults_and_whole_numbers_do_for_floats(tmp_path):
     assert read(tmp_path, "") == Config()
     assert read(tmp_path, "tf:\n  transform_tolerance: 1\n").tf.transform_tolerance == 1.0
+
+
+def test_a_parameter_that_was_removed_is_refused_by_name_and_read_in_runs_that_have_it():
+    with pytest.raises(ConfigError, match=r"parameter 'landmarks.follow_s' was removed: .*; leave it out"):
+        Config.from_mapping({"landmarks.follow_s": 10.0})
+    (golden,) = (CONFIG.parent / "test" / "golden").iterdir()
+    assert "follow_s" in (golden / "config.yaml").read_text()
+    assert run_config(golden).landmarks.give_up_s == Config().landmarks.give_up_s
 
 
 @pytest.mark.parametrize(

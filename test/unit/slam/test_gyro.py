@@ -1,6 +1,7 @@
 """A gyro as part of odometry: what its messages add up to, its bias, and whom to believe."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -122,7 +123,8 @@ class Robot:
         names = {"inputs.names": "odom imu", "imu.type": "sensor_msgs/msg/Imu", "imu.use": "gyro"}
         config = Config.from_mapping({"world.dimensions": dimensions, **names, **settings})
         self.space, self.counters = config.space, Counters()
-        self.gyro = GyroFusion(config, OdometryNoise(config.odometry, config.space), self.counters)
+        self.config, self.noise = config, OdometryNoise(config.odometry, config.space)
+        self.gyro = GyroFusion(config, self.noise, self.counters)
         self.axes = 1 if dimensions == 2 else 3
         self.ms, self.pose, self.fused = 0, self.space.identity, self.space.identity
         self.gyro.fuse(Step(T0, self.pose, self.pose), 0.0, "odom")
@@ -245,3 +247,30 @@ def test_the_motion_and_not_its_turn_is_that_of_the_wheels():
     robot.drive(5.0)
     step = robot.drive(1.0, speed=1.0, wheels=0.5, gyro=0.5)
     assert se3.log(step.T_last_base)[:3] == pytest.approx((0.02, 0.0, 0.0), abs=1e-9)
+
+
+# -- a bias that a map keeps ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_the_bias_of_a_map_is_gone_on_with_and_less_certain_by_the_time_that_has_passed(dimensions):
+    before = Robot(dimensions)
+    assert before.gyro.saved.variance == pytest.approx((0.02**2,) * before.axes)
+    before.drive(5.0, gyro=0.012)
+    saved = before.gyro.saved
+    assert (saved.name, saved.stamp_ns) == ("imu", T0 + 5_000 * MS)
+
+    def resumed(gone_s, **changed):
+        gyro = GyroFusion(before.config, before.noise, Counters())
+        gyro.restore(replace(saved, **changed))
+        at_ns = saved.stamp_ns + round(gone_s * 1e9)
+        gyro.fuse(Step(at_ns, before.space.identity, before.space.identity, "gap"), gone_s, "odom")
+        return gyro.state
+
+    soon = resumed(100.0)
+    assert soon.bias == saved.bias
+    assert soon.sigma[-1] == pytest.approx(math.sqrt(saved.variance[-1] + 1e-8 * 100.0))
+    assert resumed(1e7).sigma[-1] == 0.02, "not less certain than one that was never used"
+    assert resumed(-100.0).sigma[-1] == 0.02, "by another clock"
+    assert resumed(100.0, name="other").bias[-1] == 0.0, "that of another gyro"
+    assert resumed(100.0, bias=(0.1, 0.1)).bias[-1] == 0.0, "that of another number of axes"
