@@ -40,6 +40,7 @@ _READ: dict[Opcode, Any] = {
 }
 _MOST_PADDING = 64  # a later version may add fields; after a damaged length there is more
 _BLOCK, _FIRST_BLOCK = 2**20, 2**12
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, times of logging and publishing; then the data
 # A chunk's head: opcode, length, two times, size, checksum, codec; then the length of its data.
 _CHUNK = re.compile(rb"\x06(?=(.{8}).{28}(\0{4}|\x04\0{3}zstd|\x03\0{3}lz4)(.{8}))", re.DOTALL)
 _CHUNK_HEAD = 57
@@ -193,15 +194,19 @@ def _inside(chunk: Chunk) -> Iterator[McapRecord]:
     plain = decompressed(chunk.data, chunk.compression, chunk.uncompressed_size)
     if chunk.uncompressed_crc not in (0, zlib.crc32(plain)):
         raise FormatError("its checksum is another")
-    stream = ReadDataStream(io.BytesIO(plain))
-    while stream.count < len(plain):
-        opcode, length = _HEAD.unpack(stream.read(_HEAD.size))
-        if length > len(plain) - stream.count:
+    at, size = 0, len(plain)
+    while at < size:
+        opcode, length = _HEAD.unpack_from(plain, at)
+        at += _HEAD.size
+        after = at + length
+        if after > size:
             raise EndOfFile()
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-            yield _parsed(opcode, stream, length)
-        else:
-            stream.read(length)
+        if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:  # the library reads number by number
+            channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(plain, at)
+            yield Message(channel, log_ns, plain[at + _MESSAGE.size : after], publish_ns, sequence)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            yield _parsed(opcode, ReadDataStream(io.BytesIO(plain[at:])), length)
+        at = after
 
 
 def _next_chunk(stream: _Stream, at: int) -> int | None:

@@ -40,6 +40,8 @@ class Corrections:
         self._config, self._space = config, config.space
         self._inputs = {one.name: one for one in config.sources}
         self.found: dict[Key, float] = {}
+        self._of: dict[Key, float] | None = None  # what was found when these two were computed
+        self._factors, self._lag_ns = (1.0, 1.0, 0.0), 0
 
     def configured(self, key: Key) -> float:
         """Return the configured value of a parameter that calibration corrects."""
@@ -105,8 +107,8 @@ class Corrections:
 
     def motion(self, motion: Numbers, seconds: float = 0.0) -> Numbers:
         """A motion by odometry, corrected; its numbers may be arrays."""
-        distance, turn, bias = (self._of_odometry(name) for name in _ODOMETRY)
-        return self._corrected(motion, seconds, (distance, turn, bias))
+        self._refresh()
+        return self._corrected(motion, seconds, self._factors)
 
     def _corrected(self, motion: Numbers, seconds: float, factors: tuple[float, float, float]) -> Numbers:
         """A motion, its distance and turn multiplied, and turned at a rate besides."""
@@ -140,6 +142,13 @@ class Corrections:
         out: Numbers = group.exp(tuple(x / (distance if k < n else turn) for k, x in enumerate(tangent)))
         return out
 
+    def _refresh(self) -> None:
+        """Compute anew what each message needs, where something else was found since."""
+        if self.found != self._of:
+            self._of = dict(self.found)
+            distance, turn, bias = (self._of_odometry(name) for name in _ODOMETRY)
+            self._factors, self._lag_ns = (distance, turn, bias), self._lag()
+
     def _of_odometry(self, name: str) -> float:
         found = next((value for (_, other), value in self.found.items() if other == name), 0.0)
         value = float(getattr(self._config.odometry, _ODOMETRY[name]))
@@ -153,6 +162,10 @@ class Corrections:
 
     def lag_ns(self) -> int:
         """Return how long after odometry of the same stamp the sightings with a corrected clock arrive."""
+        self._refresh()
+        return self._lag_ns
+
+    def _lag(self) -> int:
         clocks = {(one.name, "clock") for one in self._inputs.values() if one.offset_s}
         clocks |= {key for key in self.found if key[1] == "clock"}
         lags = (-self.total(key) for key in clocks)

@@ -46,17 +46,18 @@ class OdometrySamples:
         """Start over, for stamps of another time."""
         self._kept = StampedPoses[Sample](lambda *sample: sample, self._space.pose.size)
         self._last: Step | None = None
+        self._kept_ns, self._there = 0, self._space.identity  # of the newest that is kept
 
     def add(self, step: Step) -> None:
         """Keep a step if the next sample is due, and the one before where the robot begins to move."""
-        kept, last, self._last = self._kept, self._last, step
-        if len(kept) and last is not None:
-            kept_ns, there = int(kept.stamps_ns[-1]), tuple(kept.poses[-1].tolist())
-            if step.stamp_ns - kept_ns < _SAMPLED_NS or step.T_odom_base == there:
+        last, self._last = self._last, step
+        if last is not None:
+            if step.stamp_ns - self._kept_ns < _SAMPLED_NS or step.T_odom_base == self._there:
                 return
-            if last.stamp_ns > kept_ns and last.T_odom_base == there:
-                kept.append(0, last.stamp_ns, there)
-        kept.append(0, step.stamp_ns, step.T_odom_base)
+            if last.stamp_ns > self._kept_ns and last.T_odom_base == self._there:
+                self._kept.append(0, last.stamp_ns, self._there)
+        self._kept.append(0, step.stamp_ns, step.T_odom_base)
+        self._kept_ns, self._there = step.stamp_ns, step.T_odom_base
 
     def track(self, keyframes: Array, factors: tuple[float, float]) -> OdometryTrack:
         """Return copies of all samples, with odometry at the keyframes and the factors of distance and turn."""

@@ -205,9 +205,9 @@ class DisplacementSearch:
         """The number of the newest sightings of well known landmarks that are held back."""
         known_from = cache(self._known_from)  # many are of the same landmark
         known = [one for one in self._standing() if known_from(one.landmark) < one.keyframe]
-        held_back = [not self._ledger.is_inside(one.edge) for one in known]
-        self._is_supported |= not all(held_back)
-        return sum(held_back)
+        are_inside = self._ledger.are_inside(one.edge for one in known)
+        self._is_supported |= any(are_inside)
+        return len(known) - sum(are_inside)
 
     def hypothesis(self) -> DisplacementHypothesis | None:
         """The other pose for which the evidence is greatest; None where there is none."""
@@ -232,7 +232,8 @@ class DisplacementSearch:
 
     def _standing(self) -> list[_Seen]:
         ledger = self._ledger
-        return [one for one in self._seen if one.edge < len(ledger) and not ledger.is_withdrawn(one.edge)]
+        count = len(ledger)
+        return [one for one in self._seen if one.edge < count and not ledger.is_withdrawn(one.edge)]
 
     def _window(self) -> _Window | None:
         seen = self._standing()

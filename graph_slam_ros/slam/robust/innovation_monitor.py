@@ -112,7 +112,7 @@ class InnovationMonitor:
             return None
         edges = np.array([one.edge for one in window])
         fits, numbers = self._solver.chi2_of(edges)
-        is_out = np.array([not ledger.is_inside(edge) for edge in edges.tolist()])
+        is_out = ~np.array(ledger.are_inside(edges.tolist()), dtype=bool)
         innovations = np.where(is_out, ledger.statistic.values[edges], fits)
         order = np.argsort(innovations / numbers, kind="stable")
         counted = order[: max(0, len(order) - self._by_chance(len(order)))]
@@ -130,7 +130,7 @@ class InnovationMonitor:
         if not len(newest):
             return False
         innovations, numbers = self._solver.chi2_of(newest)
-        is_out = np.array([not self._ledger.is_inside(edge) for edge in newest.tolist()])
+        is_out = ~np.array(self._ledger.are_inside(newest.tolist()), dtype=bool)
         innovations[is_out] = self._decisions.innovations(newest[is_out].tolist())
         counted = np.argsort(innovations / numbers, kind="stable")[: -(-3 * len(newest) // 4)]
         limit = self._decisions.gate_scale * quantile(_CALM_SURE, int(numbers[counted].sum()))

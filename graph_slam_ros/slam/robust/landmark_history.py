@@ -40,9 +40,10 @@ class LandmarkHistory:
         """
         if landmark < self._start or landmark in self._surveyed:
             return -1
-        ledger, earliest = self._ledger, self._earliest[landmark]
-        accepted = [k for edge, k in earliest if edge < len(ledger) and ledger.is_inside(edge)]
-        doubted = sum(edge < newest and not ledger.is_inside(edge) for edge, _ in earliest)
+        judged = [(edge, k) for edge, k in self._earliest[landmark] if edge < len(self._ledger)]
+        are_inside = self._ledger.are_inside(edge for edge, _ in judged)
+        accepted = [k for (_, k), is_inside in zip(judged, are_inside, strict=True) if is_inside]
+        doubted = sum(edge < newest and not is_inside for (edge, _), is_inside in zip(judged, are_inside, strict=True))
         if doubted > _DOUBTED * (doubted + len(accepted)):
             return self._graph.vertex_count
         return accepted[_SUPPORT - 1] if len(accepted) >= _SUPPORT else self._graph.vertex_count

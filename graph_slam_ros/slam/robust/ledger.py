@@ -1,5 +1,6 @@
 """The ledger: all decisions on every measurement that may be wrong, with keyframe and reason."""
 
+from collections.abc import Iterable
 from copy import copy, deepcopy
 from dataclasses import dataclass
 from enum import IntEnum
@@ -45,6 +46,7 @@ FINAL = (  # it is out for good
 )
 INSIDE = (Verdict.ACCEPTED, Verdict.DOWN_WEIGHTED)
 _ACCEPTED, _DOWN_WEIGHTED = _INSIDE = tuple(map(int, INSIDE))  # comparing with members of an enumeration is slow
+_FINAL = frozenset(map(int, FINAL))
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,9 +172,14 @@ class Ledger:
         """Return whether an edge has a weight."""
         return self.verdict.values.item(edge) in _INSIDE
 
+    def are_inside(self, edges: Iterable[int]) -> list[bool]:
+        """Return whether each of some edges has a weight."""
+        verdict = self.verdict.values
+        return [verdict.item(edge) in _INSIDE for edge in edges]
+
     def is_withdrawn(self, edge: int) -> bool:
         """Return whether an edge was removed permanently."""
-        return edge < len(self) and self.reason.values.item(edge) in FINAL and self.verdict.values.item(edge) != 0
+        return edge < len(self) and self.reason.values.item(edge) in _FINAL and self.verdict.values.item(edge) != 0
 
     @property
     def inside(self) -> Index:
