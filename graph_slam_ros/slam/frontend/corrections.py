@@ -30,10 +30,6 @@ class Corrections:
     Attributes
     ----------
     found : what calibration estimated beyond the configuration: factors less 1, seconds, radians, metres
-
-    Attributes
-    ----------
-    found : what was found besides the configuration: factors less 1, seconds, radians, metres
     """
 
     def __init__(self, config: Config) -> None:

@@ -23,12 +23,6 @@ class Passage:
     jump : the value of ``time.on_jump`` (segment, reset or stop) if time jumped back with this message, else empty
     events : what the pipeline processes before the measurements
     measured : the measurements that pass to the pipeline; empty if they were refused
-
-    Attributes
-    ----------
-    jump : ``time.on_jump`` where time jumped back with this message: segment, reset or stop; empty: it did not
-    events : what the pipeline processes before the measurements
-    measured : the measurements that go on to the pipeline; empty where they were refused
     """
 
     jump: str = ""

@@ -41,12 +41,6 @@ class KeyframeList:
     segments : the keyframes at which odometry began or began again
     drives : the first keyframe of each drive; there is more than one after a map was loaded
     samples : odometry between the keyframes
-
-    Attributes
-    ----------
-    segments : keyframes at which odometry began, or began anew
-    drives : the first keyframe of each drive: more than one where the map was loaded
-    samples : odometry between the keyframes
     """
 
     def __init__(self, noise: OdometryNoise, space: Geometry) -> None:

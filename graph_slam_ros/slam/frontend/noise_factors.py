@@ -99,11 +99,6 @@ class Rescaling:
     ----------
     first, last : range of edge ids; ``last`` is excluded
     before, after : the factors of each group that changed
-
-    Attributes
-    ----------
-    first, last : of the edges; ``last`` is the first that is not among them
-    before, after : the factors of each group that changed
     """
 
     first: int
@@ -139,12 +134,6 @@ class NoiseScales:
     graph
     factors : by group; a missing factor is 1
     history : all changes of existing edges, in order
-
-    Attributes
-    ----------
-    graph
-    factors : by group; what is missing is 1
-    history : all changes of edges that were there, in order
     """
 
     def __init__(self, graph: Graph, factors: Mapping[Key, float] | None = None) -> None:

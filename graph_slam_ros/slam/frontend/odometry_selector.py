@@ -24,13 +24,6 @@ class Step:
     broken : whether odometry jumped here, so that ``T_last_base`` is no motion of the robot
     turn_variance : of the rotation about each axis per second, if a gyro contributed to it [rad^2/s]
     slips : whether a gyro contradicts odometry, so that the robot may turn although odometry stands
-
-    Attributes
-    ----------
-    T_odom_base : the pose in the frame of the odometry in use
-    broken : whether odometry jumped here, so that ``T_last_base`` is no motion of the robot
-    turn_variance : of the rotation about each axis, for each second, where a gyro is part of it [rad^2/s]
-    slips : whether a gyro contradicts odometry, so that the robot may turn where odometry stands
     """
 
     stamp_ns: int

@@ -20,12 +20,6 @@ class OdometryTrack:
     keyframes : (n, size) at each keyframe
     stamps_ns, poses : (m,), (m, size) samples between them
     distance, turn : the factors that correct it
-
-    Attributes
-    ----------
-    keyframes : (n, size) at each keyframe
-    stamps_ns, poses : (m,), (m, size) samples between them
-    distance, turn : factors by which it is corrected
     """
 
     keyframes: Array

@@ -20,12 +20,6 @@ class SightingEdges:
     edge, stamp_ns : (n,)
     T_keyframe_base : (n, size)
     sensor : (n, dimensions) position of the sensor in the base frame; zeros if the message does not state it
-
-    Attributes
-    ----------
-    edge, stamp_ns : (n,)
-    T_keyframe_base : (n, size)
-    sensor : (n, dimensions) position of the sensor in the base frame; zeros where a message does not tell it
     """
 
     def __init__(self, space: Geometry) -> None:
