@@ -198,12 +198,14 @@ class OutlierGate:
         """
         return self._gate_scale
 
-    def are_beyond_noise(self, edges: Sequence[int]) -> bool:
-        """Return whether most of some rejected edges are farther off than odometry's noise explains.
+    @property
+    def stated_scale(self) -> float:
+        """The same by noise as it is stated, ``robust.noise_factor`` squared, however accurate odometry has been."""
+        return self._config.noise_factor**2
 
-        That noise is ``robust.noise_factor`` times the configured one, however accurate odometry has been.
-        """
-        factor, numbers = self._config.noise_factor**2, self.ledger.numbers.values
+    def are_beyond_noise(self, edges: Sequence[int]) -> bool:
+        """Return whether most of some rejected edges are farther off than odometry's noise as stated explains."""
+        factor, numbers = self.stated_scale, self.ledger.numbers.values
         far = [self._innovation(edge) > factor * quantile(self._config.gate, int(numbers[edge])) for edge in edges]
         return 2 * sum(far) > len(far)
 

@@ -118,7 +118,7 @@ class InnovationMonitor:
         counted = order[: max(0, len(order) - self._by_chance(len(order)))]
         if not len(counted):  # all may be wrong by chance
             return None
-        limit = self._decisions.gate_scale * quantile(_SURE, int(numbers[counted].sum()))
+        limit = self._decisions.stated_scale * quantile(_SURE, int(numbers[counted].sum()))
         landmarks = {window[k].landmark for k in np.flatnonzero(is_out).tolist()}
         count = int(np.count_nonzero(is_out))
         return Contradiction(count, len(window), len(landmarks), float(innovations[counted].sum()), limit)
@@ -133,7 +133,7 @@ class InnovationMonitor:
         is_out = ~np.array(self._ledger.are_inside(newest.tolist()), dtype=bool)
         innovations[is_out] = self._decisions.innovations(newest[is_out].tolist())
         counted = np.argsort(innovations / numbers, kind="stable")[: -(-3 * len(newest) // 4)]
-        limit = self._decisions.gate_scale * quantile(_CALM_SURE, int(numbers[counted].sum()))
+        limit = self._decisions.stated_scale * quantile(_CALM_SURE, int(numbers[counted].sum()))
         return float(innovations[counted].sum()) <= limit
 
     def _by_chance(self, count: int) -> int:

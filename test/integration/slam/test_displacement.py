@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from imperfect import START_NS, Faults, driven, imperfect_drive
 from reliability import times
 
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import InitialPose
 from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
-from graph_slam_ros.slam import Config, Control, GraphSlam
+from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
@@ -216,3 +217,29 @@ def test_a_displacement_that_later_sightings_contradict_is_taken_back(recording)
     reasons = {Reason(int(slam.ledger.reason.values[edge])) for edge in edges}
     assert reasons == {Reason.NONE, Reason.REVOKED}
     assert errors(slam, recording).max() < 0.5
+
+
+def turned_unseen(turned, begin_s=25.0, end_s=50.0):
+    """A drive whose odometry turns by an angle while nothing is seen, and that says more noise than it had so far."""
+    drive, chain, seen = imperfect_drive(Faults(), seconds=60.0), None, []
+    for m in drive:
+        since_s = (m.stamp_ns - START_NS) * 1e-9
+        if isinstance(m, Odometry):
+            before, T_odom_base = chain or (m.T_odom_base, m.T_odom_base)
+            x, y, angle = se2.log(se2.between(before, m.T_odom_base))
+            extra = turned * 0.05 / (end_s - begin_s) if begin_s < since_s <= end_s else 0.0
+            chain = m.T_odom_base, se2.compose(T_odom_base, se2.exp((x, y, angle + extra)))
+            seen.append(replace(m, T_odom_base=tuple(map(float, chain[1]))))
+        elif not begin_s < since_s < end_s:
+            wide = (replace(s, covariance=tuple(9.0 * c for c in s.covariance)) for s in m.sightings)
+            seen.append(replace(m, sightings=tuple(wide)))
+    return seen
+
+
+def test_drift_that_the_stated_noise_explains_is_no_displacement_though_odometry_was_better_so_far():
+    """Else an alarm without another pose begins, which nothing ends: all that is seen from then on is held back."""
+    noise = {"odometry.translation_density": 0.05, "odometry.rotation_density": 0.05}
+    slam = driven(turned_unseen(0.9), {**noise, "odometry.lateral_density": 0.03})
+    assert slam.backend.decisions.gate_scale < 0.2 * slam.backend.decisions.stated_scale
+    assert not slam.alarms
+    assert not slam.ledger.outside_count
