@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
-from graph_slam_ros.graph.tables import EdgeRows
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import Block, Losses, linearize, rows_of
 from graph_slam_ros.typing import Array, Index
@@ -78,22 +77,27 @@ class InfluenceModel:
 
     def _bend(self, block: Block) -> None:
         """Give edges the curvature of their loss, where it is another than their weight."""
+        some = np.flatnonzero(block.cost < (1.0 - _SAME) * block.chi2)
+        if not len(some):
+            return
         rows = block.table.at(block.rows)
-        for k in np.flatnonzero(block.cost < (1.0 - _SAME) * block.chi2).tolist():
-            loss = self._loss(rows, k)
-            s = float(block.chi2[k])
-            slope = weight_and_cost(loss.kind, loss.scale, s)[0]
-            ahead, behind = (weight_and_cost(loss.kind, loss.scale, s * (1.0 + h))[0] for h in (_STEP, -_STEP))
-            along = max(1.0 + (ahead - behind) / (_STEP * slope), _FLATTEST) ** 0.5
-            unit = block.residual[k] / np.linalg.norm(block.residual[k])
-            row, table = int(block.rows[k]), self._curved.tables[block.table.type]
-            root = table.sqrt_information.values[row]
-            table.sqrt_information.values[row] = slope**0.5 * (root - (1.0 - along) * np.outer(unit, unit @ root))
-            self._along[rows.ids[k]] = along
+        losses = [self._loss(*codes) for codes in zip(rows.label[some], rows.source[some], strict=True)]
+        of = [(loss.kind, loss.scale, s) for loss, s in zip(losses, block.chi2[some].tolist(), strict=True)]
+        slope, ahead, behind = (
+            np.array([weight_and_cost(kind, scale, s * factor)[0] for kind, scale, s in of])
+            for factor in (1.0, 1.0 + _STEP, 1.0 - _STEP)
+        )
+        along = np.sqrt(np.maximum(1.0 + (ahead - behind) / (_STEP * slope), _FLATTEST))
+        unit = block.residual[some] / np.linalg.norm(block.residual[some], axis=1, keepdims=True)
+        roots = self._curved.tables[block.table.type].sqrt_information.values
+        root = roots[block.rows[some]]
+        across = unit[:, :, None] * (unit[:, None, :] @ root)
+        roots[block.rows[some]] = np.sqrt(slope)[:, None, None] * (root - (1.0 - along)[:, None, None] * across)
+        self._along[rows.ids[some]] = along
 
-    def _loss(self, rows: EdgeRows, k: int) -> Loss:
-        label = self._graph.labels[int(rows.label[k])]
-        return self._losses.get((label, self._graph.sources[int(rows.source[k])])) or self._losses[label]
+    def _loss(self, label_code: int, source_code: int) -> Loss:
+        label = self._graph.labels[label_code]
+        return self._losses.get((label, self._graph.sources[source_code])) or self._losses[label]
 
     def without(self, edges: Sequence[int]) -> Influences:
         """The influence of edges of the problem: what changes without each of them."""

@@ -75,7 +75,7 @@ def _vertex_lines(file: G2oFile, values: Values) -> list[str]:
     tag_of_kind = {kind: tag for tag, kind in VERTEX_TAGS.items()}
     rows: list[tuple[int, str]] = []
     for code, kind in enumerate(graph.kinds):
-        members = np.flatnonzero(graph.kind.values == code).tolist()
+        members = [v for v in np.flatnonzero(graph.kind.values == code).tolist() if v not in file.absent]
         if kind not in tag_of_kind:
             raise FormatError(f"g2o has no tag for a vertex {kind.name}")
         for vertex, value in zip(members, values(members).tolist(), strict=True):

@@ -32,6 +32,7 @@ class G2oFile:
     skipped : in lenient reading, what was wrong with each line left out
     raw : whether the information of rotations in space was, and is to be written, unscaled
     has_values : whether the file gave initial values; without, all are at the origin
+    absent : vertices that are not written
     """
 
     graph: Graph
@@ -44,6 +45,7 @@ class G2oFile:
     raw: bool = False
     has_values: bool = True
     notes: list[str] = field(default_factory=list)
+    absent: frozenset[int] = frozenset()
 
 
 def moved(points: Array, root: Array, offsets: Sequence[se3.Pose]) -> tuple[Array, Gaussian]:

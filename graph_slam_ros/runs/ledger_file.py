@@ -21,6 +21,7 @@ from graph_slam_ros.edge_tags import map_edge_of, tag_of
 from graph_slam_ros.errors import ConfigError, FormatError
 from graph_slam_ros.formats.strict import integer, lines, numbers, stamp
 from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict, VerdictChange
 from graph_slam_ros.typing import Numbers
@@ -30,6 +31,7 @@ Ids = tuple[int, ...]
 Stamp = NewType("Stamp", int)
 Row = TypeVar("Row")
 _ROUNDING = 1e-6  # of a statistic, which is then below 0
+_VERDICTS, _REASONS = tuple(Verdict), tuple(Reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,37 +162,46 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
     """Each edge of the solver; ``ids`` are the numbers of its vertices in the file."""
     graph, ledger = slam.graph, slam.ledger
     names = {mark.vertex: name for name, mark in slam.landmarks.items()}
-    chi2, _ = slam.solver.chi2_of(np.arange(len(ledger)))
-    settings = slam.solver.settings
     keyframe_of = {vertex: k for k, vertex in enumerate(slam.keyframes.ids.tolist())}
-    stamps_ns = slam.keyframes.stamps_ns
+    stamps_ns: list[int] = slam.keyframes.stamps_ns.tolist()
     judged = {change.edge: change.threshold for change in ledger.history}
-    for edge in range(len(ledger)):
-        one = graph.edge(edge)
-        label, vertices = one.label, one.vertices
-        root, keyframe = one.sqrt_information, int(ledger.keyframe.values[edge])
-        loss = settings.last_loss(label, one.source)
-        left = weight_and_cost(loss.kind, loss.scale, float(chi2[edge]))[0]
+    last_loss, tables = cache(slam.solver.settings.last_loss), cache(_columns)
+    chi2, _ = slam.solver.chi2_of(np.arange(len(ledger)))
+    columns = (ledger.keyframe, ledger.statistic, ledger.numbers, ledger.threshold, ledger.verdict, ledger.reason)
+    numbered = enumerate(zip(chi2.tolist(), *(column.values.tolist() for column in columns), strict=True))
+    for edge, (now, keyframe, statistic, dof, threshold, verdict, reason) in numbered:
+        table, row = graph.row(edge)
+        tag, of_row = tables(table)
+        vertices, measured, label_code, source_code, factor = (column[row] for column in of_row)
+        label, source = graph.labels[label_code], graph.sources[source_code]
+        loss, root = last_loss(label, source), table.sqrt_information.values[row]
+        newest = max((keyframe_of[v] for v in vertices if v in keyframe_of), default=keyframe)
         yield Entry(
             edge,
             label,
-            tag_of(one.type),
-            one.source,
+            tag,
+            source,
             next((names[v] for v in vertices if v in names), ""),
             tuple(ids[v] for v in vertices),
             keyframe,
-            Stamp(int(stamps_ns[max((keyframe_of[v] for v in vertices if v in keyframe_of), default=keyframe)])),
-            tuple(one.measured.tolist()),
+            Stamp(stamps_ns[newest]),
+            tuple(measured),
             tuple((root.T @ root)[_upper(len(root))].tolist()),
             tuple(ledger.residual(edge).tolist()),
-            float(ledger.statistic.values[edge]),
-            int(ledger.numbers.values[edge]),
-            judged.get(edge, float(ledger.threshold.values[edge])),
-            float(chi2[edge]),
-            float(left * one.weight),
-            Verdict(int(ledger.verdict.values[edge])),
-            Reason(int(ledger.reason.values[edge])),
+            statistic,
+            dof,
+            judged.get(edge, threshold),
+            now,
+            float(weight_and_cost(loss.kind, loss.scale, now)[0] * factor),
+            _VERDICTS[verdict],
+            _REASONS[reason],
         )
+
+
+def _columns(table: EdgeTable) -> tuple[str, tuple[list[Any], ...]]:
+    """The tag of a table, and by row: vertices, what was measured, codes of class and input, weight."""
+    columns = (table.vertices, table.measured, table.label, table.source, table.weight)
+    return tag_of(table.type), tuple(column.values.tolist() for column in columns)
 
 
 # -- rows of a dataclass -----------------------------------------------------------------------------------------------

@@ -26,39 +26,33 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 
 Now and then an ``estimate`` tells all values, end to end. A run that goes on in another's map has that first, as one
 ``growth`` and one ``estimate``, up to a record ``start``. After a part of the drive was cut out, ``anew`` ends all
-before it, and a ``growth`` of the whole map follows.
+before it, and a ``growth`` of the whole map follows. Programs of version 1 do not know ``anew``: a second ``map`` with
+version 2 stands before it, which they refuse.
 """
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from graph_slam_ros.edge_tags import map_edge_of, tag_of
+from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import FormatError, GraphSlamError
-from graph_slam_ros.graph import Gaussian, Graph
-from graph_slam_ros.graph.vertices import R1, R2, R3, SE2, SE3
-from graph_slam_ros.measurements.edits import applied_edit
-from graph_slam_ros.measurements.types import Sighting
+from graph_slam_ros.graph import Graph
 from graph_slam_ros.runs.journal import MAP, parts_of, read_records
-from graph_slam_ros.runs.map_faults import fault_of, is_index
+from graph_slam_ros.runs.map_faults import fault_of
+from graph_slam_ros.runs.map_growth import AT_ONCE, Growing, apply_verdicts, grow
 from graph_slam_ros.slam import GraphSlam
-from graph_slam_ros.slam.calibration.recalibration import Recalibration, Totals, read_totals, totals_record
+from graph_slam_ros.slam.calibration.recalibration import Totals, totals_record
 from graph_slam_ros.slam.frontend.gyro import SavedBias
-from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
-from graph_slam_ros.slam.frontend.motion_compensation import PoseAtStamp
-from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling, factors_record, read_factors
+from graph_slam_ros.slam.frontend.noise_factors import Key, factors_record
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark, LandmarkEdge
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict, VerdictChange
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
 GROWTH = "graph_slam_ros.Map"
-VERSION = 1
-_KINDS = {kind.name: kind for kind in (SE2, SE3, R1, R2, R3)}
+VERSION = 2
+_FIRST = 1  # what every program reads: a map from which nothing was cut out
 _MORE = 1.1  # an estimate is written when there are so many times the keyframes: in total it stays linear
 _JUMP_M = 0.5  # or when a solve moved the newest that far, and there are a hundredth more
 
@@ -75,7 +69,7 @@ class MapGrowth:
 
     def __init__(self, start: MapSnapshot | None = None) -> None:
         self._begin()
-        self.first: list[Record] = [{"type": "map", "version": VERSION}]
+        self.first: list[Record] = [{"type": "map", "version": _FIRST}]
         if start is not None:
             self.first += [self.since(start), _estimate(start.values), {"type": "start"}]
 
@@ -96,7 +90,7 @@ class MapGrowth:
         """The growth since the last call, and from time to time the whole estimate."""
         if any(one.edit.do == "cut" for one in slam.edits[self._edits :]):
             self._begin()
-            yield {"type": "anew"}
+            yield from ({"type": "map", "version": VERSION}, {"type": "anew"})
         changed = {"settings": dict(slam.settings)} if slam.settings != self._settings else {}
         self._settings = dict(slam.settings)
         used = {"used": [slam.newest_odometry_ns, slam.odometry_source]} if slam.odometry_source else {}
@@ -177,31 +171,39 @@ def read_map(folder: Path, losses: list[str], *, start_only: bool = False) -> Ma
     FormatError
         It is of a later version, or no map.
     """
-    state, has_start = MapSnapshot(), False
-    for count, record in enumerate(read_records(folder, MAP, losses)):
-        try:
+    try:
+        return _read(folder, losses, AT_ONCE, start_only=start_only)
+    except FormatError:
+        return _read(folder, [], 1, start_only=start_only)  # it names the record
+
+
+def _read(folder: Path, losses: list[str], at_once: int, *, start_only: bool) -> MapSnapshot | None:
+    growing, has_start = Growing(at_once), False
+    count, file = 0, f"{folder.name}/{MAP}.mcap"
+    try:
+        for count, record in enumerate(read_records(folder, MAP, losses)):  # noqa: B007, named below
             match record["type"]:
                 case "map" if record["version"] > VERSION:
                     raise FormatError(f"its version is {record['version']}; this program knows up to {VERSION}")
                 case "growth":
-                    _grow(state, record)
+                    growing.append(record)
                 case "estimate":
-                    values = np.array(record["values"], dtype=float)
-                    state.values[: len(values)] = values
+                    growing.estimate(record["values"])
                 case "anew":
-                    state = MapSnapshot()
+                    growing = Growing(at_once)
                 case "start":
                     has_start = True
-                    state.processed = 0
-        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, GraphSlamError) as error:
-            raise FormatError(f"{folder.name}/{MAP}.mcap: record {count}: {error}") from None
-        if start_only and has_start:
-            break
+                    growing.finish().processed = 0
+            if start_only and has_start:
+                break
+        state = growing.finish()
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, GraphSlamError) as error:
+        raise FormatError(f"{file}: record {count}: {error}") from None
     if (start_only and not has_start) or not state.keyframes:
         return None
     if fault := fault_of(state):
-        raise FormatError(f"{folder.name}/{MAP}.mcap: {fault}")
-    _apply_verdicts(state)
+        raise FormatError(f"{file}: {fault}")
+    apply_verdicts(state)
     return state
 
 
@@ -216,8 +218,8 @@ def state_of(slam: GraphSlam) -> MapSnapshot:
 
 def extend(state: MapSnapshot, record: Mapping[str, Any]) -> None:
     """Append a ``growth`` to the map."""
-    _grow(state, record)
-    _apply_verdicts(state)
+    grow(state, [record])
+    apply_verdicts(state)
 
 
 # -- what is written --------------------------------------------------------------------------------------------------
@@ -276,102 +278,3 @@ def _seen(one: LandmarkEdge) -> list[Any]:
     where = one.where
     at = [where.keyframe, where.vertex, where.stamp_ns, where.T_keyframe_base, where.covariance.tolist()]
     return [one.edge, one.topic, asdict(one.sighting), *at]
-
-
-# -- what is read -----------------------------------------------------------------------------------------------------
-
-
-def _apply_verdicts(state: MapSnapshot) -> None:
-    """Apply verdicts: a rejected edge has weight zero; an edge that moved to another landmark is withdrawn."""
-    out = np.flatnonzero(np.isin(state.ledger.verdict.values, (Verdict.PENDING, Verdict.REJECTED)))
-    state.graph.set_weights(out, 0.0)
-    for mark in state.landmarks.values():
-        mark.seen = [one for one in mark.seen if not state.ledger.is_withdrawn(one.edge)]
-        mark.stamps = {one.where.stamp_ns for one in mark.seen}
-
-
-def _grow(state: MapSnapshot, record: Mapping[str, Any]) -> None:
-    graph, ledger = state.graph, state.ledger
-    for one in record.get("rescaled", ()):
-        Rescaling.from_record(one).apply(graph)
-    for one in record.get("recalibrated", ()):
-        Recalibration.from_record(one).apply(graph)
-    state.calibration |= read_totals(record.get("calibration", ()))
-    if "noise" in record:
-        state.noise_factors = read_factors(record["noise"])
-    for name, several in groupby(record.get("vertices", ()), key=lambda vertex: vertex[0]):
-        graph.add_vertices(_KINDS[name], [values for _, values in several])
-    state.values = np.concatenate((state.values, graph.initial.values[len(state.values) :]))
-    for (tag, label, source), several in groupby(record.get("edges", ()), key=lambda edge: (edge[0], *edge[4:])):
-        _, vertices, measured, roots, *_ = zip(*several, strict=True)
-        edge = map_edge_of(tag)
-        noise = Gaussian(np.array(roots, dtype=float).reshape(-1, edge.residual_size, edge.residual_size))
-        graph.add_edges(edge, vertices, measured, noise, label, source)
-    _judge(ledger, record.get("judged", ()))
-    for edge, keyframe, verdict, reason, statistic, threshold in record.get("changes", ()):
-        ledger.note(edge, keyframe, *_verdict(verdict, reason), float(statistic), float(threshold))
-    state.keyframes += [Keyframe(vertex, stamp, tuple(pose)) for vertex, stamp, pose in record.get("keyframes", ())]
-    state.segments += record.get("segments", ())
-    state.drives += record.get("drives", ())
-    state.sighting_poses += [SightingPose(k, stamp, tuple(pose)) for k, stamp, pose in record.get("sightings", ())]
-    _know(state, record)
-    state.range_offsets.update(record.get("offsets", {}))
-    state.datum = tuple(record.get("datum", state.datum))
-    if "gyro" in record:
-        name, bias, variance, stamp_ns = record["gyro"]
-        state.gyro_bias = SavedBias(name, tuple(bias), tuple(variance), stamp_ns)
-    state.settings.update(record.get("settings", {}))
-    state.edits += map(applied_edit, record.get("edits", ()))
-    state.processed = _count(record.get("processed"))
-    state.used_ns, state.source = record.get("used", (None, ""))
-    for name in ("frozen", "held"):
-        vertices, edges = record.get(name, (0, 0))
-        if not (is_index(vertices, graph.vertex_count + 1) and is_index(edges, len(ledger) + 1)):
-            raise ValueError(f"{name} {record[name]}: more than there is")
-    if "frozen" in record:
-        state.frozen, edges = record["frozen"]
-        ledger.finish(edges)
-    state.held = tuple(record.get("held", state.held))
-
-
-def _count(value: Any) -> int | None:
-    if value is not None and not is_index(value, 2**63):
-        raise ValueError(f"processed {value!r} is no count")
-    return value
-
-
-def _judge(ledger: Ledger, judged: Sequence[Any]) -> None:
-    if not judged:
-        return
-    keyframes, statistics, thresholds, numbers, residuals, *named = zip(*judged, strict=True)
-    verdicts = [_verdict(*names) for names in zip(*named, strict=True)]
-    is_judged = np.array([verdict is not Verdict.NOT_EVALUATED for verdict, _ in verdicts])
-    flat = np.array([number for residual in residuals for number in residual])
-    limits = np.array(list(map(float, thresholds)))
-    ids = ledger.enter(
-        np.array(keyframes), np.array(list(map(float, statistics))), np.array(numbers), limits, flat, is_judged
-    )
-    for edge, (verdict, reason) in zip(ids.tolist(), verdicts, strict=True):
-        ledger.put(edge, verdict, reason)
-
-
-def _verdict(verdict: str, reason: str) -> tuple[Verdict, Reason]:
-    return Verdict[verdict.upper()], Reason[reason.upper()]
-
-
-def _know(state: MapSnapshot, record: Mapping[str, Any]) -> None:
-    renamed: dict[int, Landmark] = {}
-    for name, fields in record.get("landmarks", {}).items():
-        before = state.landmarks.get(name)
-        if before is not None and (fields is None or fields[0] != before.vertex):  # it was given up: another comes last
-            renamed[before.vertex] = state.landmarks.pop(name)
-        if fields is not None:
-            before = state.landmarks.get(name) or renamed.get(fields[0])
-            now = state.landmarks[name] = Landmark(name, *fields)
-            now.seen = before.seen if before is not None else []
-    by_vertex = {mark.vertex: mark for mark in state.landmarks.values()} if record.get("seen") else {}
-    for edge, topic, sighting, keyframe, vertex, stamp, pose, covariance in record.get("seen", ()):
-        lists = {name: tuple(value) for name, value in sighting.items() if isinstance(value, list)}
-        where = PoseAtStamp(keyframe, vertex, stamp, tuple(pose), np.array(covariance))
-        mark = by_vertex[state.graph.edge(edge).vertices[1]]
-        mark.seen.append(LandmarkEdge(edge, topic, Sighting(**sighting | lists), where))

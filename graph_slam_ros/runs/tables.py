@@ -171,7 +171,8 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
     """The number of each vertex, and the table of all vertices.
 
     Poses are numbered from 0 in order of time, landmarks after them, because other tools read odometry from that order.
-    Any other vertex is an offset that the ranges of a sensor share.
+    A vertex that is not part of the map any more is ``unused``: a cut keyframe, a deleted landmark. Any other one is an
+    offset that the ranges of a sensor share.
     """
     names: list[tuple[int, str, int | str, str]] = []
     for k, keyframe in enumerate(slam.keyframes):
@@ -179,7 +180,8 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
     for name, landmark in slam.landmarks.items():
         names.append((landmark.vertex, "landmark", "", name))
     named = {vertex for vertex, *_ in names}
-    names += [(vertex, "offset", "", "") for vertex in range(slam.graph.vertex_count) if vertex not in named]
+    offsets, rest = set(slam.range_offsets.values()), sorted(set(range(slam.graph.vertex_count)) - named)
+    names += [(vertex, "offset" if vertex in offsets else "unused", "", "") for vertex in rest]
     ids = [0] * slam.graph.vertex_count
     rows = ["id,vertex,stamp_ns,name"]
     for file_id, (vertex, what, stamp, name) in enumerate(names):
@@ -189,8 +191,10 @@ def numbered(slam: GraphSlam) -> tuple[list[int], str]:
 
 
 def graph_file(slam: GraphSlam, ids: list[int]) -> G2oFile:
-    """The graph, with the vertices of a frozen map fixed."""
-    return G2oFile(slam.graph, ids, slam.solver.held.tolist())
+    """The graph, with the vertices of a frozen map fixed, and without those that are not part of the map any more."""
+    named = {*slam.keyframes.ids.tolist(), *(mark.vertex for mark in slam.landmarks.values())}
+    absent = frozenset(range(slam.graph.vertex_count)) - named - set(slam.range_offsets.values())
+    return G2oFile(slam.graph, ids, slam.solver.held.tolist(), absent=absent)
 
 
 def _covariance_table(slam: GraphSlam) -> str:

@@ -214,8 +214,8 @@ BULK = {  # the stored numbers of many vertices, or the noise of many edges, at 
     *("slam/frontend/noise_factors.py", "slam/noise_scale.py"),
     *("slam/calibrator.py", "slam/calibration/fit.py"),
     *("slam/calibration/model.py", "slam/calibration/rows.py"),
-    *("slam/backend.py", "slam/robust/pairwise_consistency.py"),
-    *("runs/map_journal.py", "analysis/what_if.py", "analysis/influence.py", "simulation/pose_graph.py"),
+    *("slam/backend.py", "slam/robust/pairwise_consistency.py", "slam/robust/gating.py"),
+    *("runs/map_growth.py", "runs/ledger_file.py", "analysis/what_if.py", "simulation/pose_graph.py"),
 }
 
 

@@ -314,22 +314,20 @@ class OutlierGate:
         landmark = landmark_of(self._graph, edge)
         if landmark is None:
             return None
-        alone = self._graph.edge(edge).type.residual_size >= self._graph.kind_of(landmark).dof
-        return landmark, self._holds if alone else self._helps
+        numbers = self._graph.row(edge)[0].type.residual_size
+        return landmark, self._holds if numbers >= self._graph.kind_of(landmark).dof else self._helps
 
     def _count(self, edge: int, more: int) -> None:
-        found = self._landmark(edge)
-        if found is not None:
-            landmark, among = found
-            among[landmark] = among.get(landmark, 0) + more
+        if found := self._landmark(edge):
+            found[1][found[0]] = found[1].get(found[0], 0) + more
 
     def _is_needed(self, edge: int) -> bool:
         """Return whether a landmark may be undetermined without the edge: it is the last, or one of very few."""
         found = self._landmark(edge)
         if found is None:
             return False
-        landmark, among = found
-        return not self._is_determined(landmark, int(among is self._holds), int(among is self._helps))
+        landmark, of = found
+        return not self._is_determined(landmark, int(of is self._holds), int(of is self._helps))
 
     def _is_determined(self, landmark: int, fewer_holds: int = 0, fewer_helps: int = 0) -> bool:
         """Return whether accepted edges determine a landmark, also with so many fewer."""
@@ -387,7 +385,8 @@ class OutlierGate:
 
 def landmark_of(graph: Graph, edge: int) -> int | None:
     """The vertex of an edge's landmark."""
-    return graph.edge(edge).vertices[1] if graph.label_of(edge) == "landmarks" else None
+    table, row = graph.row(edge)
+    return table.vertices.values.item(row, 1) if graph.label_of(edge) == "landmarks" else None
 
 
 def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:

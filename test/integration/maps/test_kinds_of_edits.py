@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 import small_drive
 from driven import without_names
+from mcap.records import Message
 
 from graph_slam_ros import cli, replay
 from graph_slam_ros.analysis.what_if import SavedGraph
-from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.errors import FormatError, GraphSlamError
+from graph_slam_ros.formats.g2o import read_g2o
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.maps.edit import Plan, edit, plan_text, source_hash, undo_edit
 from graph_slam_ros.measurements.edit_actions import ACTIONS
 from graph_slam_ros.measurements.edits import edit_of
+from graph_slam_ros.recordings.mcap_records import records
 from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs.map_journal import read_map, state_of
 from graph_slam_ros.runs.restore import map_of, record_run, restored
@@ -131,6 +134,17 @@ def test_an_edit_is_undone_to_the_bytes_of_a_plan_without_it(do, run, tmp_path):
 
 
 @pytest.mark.parametrize("do", CASES)
+def test_a_program_of_the_first_version_refuses_a_map_that_it_would_misread(do, edited, monkeypatch):
+    new = edited(do)
+    monkeypatch.setattr("graph_slam_ros.runs.map_journal.VERSION", 1)
+    if do == "cut":
+        with pytest.raises(FormatError, match=r"map\.mcap: record \d+: its version is 2; this program knows up to 1"):
+            read_map(new, [])
+    else:
+        assert read_map(new, []).edits
+
+
+@pytest.mark.parametrize("do", CASES)
 def test_commands_on_maps_know_an_edit(do, run, edited, second, said, capsys, tmp_path):
     new, slam = edited(do), restored(edited(do), [])
     text = f"by hand: {slam.edits[0].text}"
@@ -144,6 +158,16 @@ def test_commands_on_maps_know_an_edit(do, run, edited, second, said, capsys, tm
     assert said(capsys, "export", new, "--to", "tum", "--out", tmp_path / "path.tum")[0] == 0
     assert len(np.loadtxt(tmp_path / "path.tum")) == len(slam.keyframes)
     assert said(capsys, "export", new, "--to", "g2o", "--out", tmp_path / "graph.g2o")[0] == 0
+    file = read_g2o(tmp_path / "graph.g2o")
+    assert file.graph.edge_count == sum(e.is_in for e in saved.entries)
+    assert said(capsys, "optimize", tmp_path / "graph.g2o")[0] == 0
+    poses = [file.graph.vertex(v).initial for v in range(file.graph.vertex_count) if file.graph.kind_of(v).size == 3]
+    assert np.array(poses)[:, :2] == pytest.approx(slam.trajectory()[:, :2], abs=1e-4)
+    assert said(capsys, "export", new, "--to", "mcap", "--out", tmp_path / "map.mcap")[0] == 0
+    assert len([m for m in records(tmp_path / "map.mcap", []) if isinstance(m, Message)]) == len(slam.keyframes) + 3
+    last = max(e.edge for e in saved.entries if e.is_in and e.verdict)
+    chi2 = [solver.evaluate().chi2_final for solver in (saved.solver, saved.solve([last]))]
+    assert "chi2 {:.4f} -> {:.4f}".format(*chi2) in said(capsys, "solve", new, "--without", last)[1]
     page = read_contents(new)
     assert page.losses == []
     assert page.data["tables"]["edits"] == [[do, slam.edits[0].edit.text, *WHO.values()]]
