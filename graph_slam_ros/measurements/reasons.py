@@ -137,7 +137,11 @@ REASONS: dict[str, Reason] = {
     "covariance_not_positive_definite": Reason(_REFUSED, "the covariance is not positive definite", _COVARIANCE),
     "nonfinite_covariance": Reason(_REFUSED, "the covariance has NaN, infinite or negative numbers", _COVARIANCE),
     # -- odometry
-    "not_in_use": Reason(_NOTED, "another odometry is used, the first of inputs.names that is alive"),
+    "not_in_use": Reason(
+        _NOTED,
+        "another odometry is used, the first of inputs.names that is alive",
+        "odometry.fusion=parallel uses all of them at once",
+    ),
     "switched_to": Reason(_NOTED, "this odometry took over from one that fell silent, or is of higher priority"),
     "switched_to_unlinked": Reason(
         _NOTED, "this odometry took over, but had not come before: the motion between is unknown"
@@ -161,7 +165,7 @@ REASONS: dict[str, Reason] = {
     "gyro_silent": Reason(
         _NOTED,
         "a step of odometry turned without the gyro: it has no message for longer than gyro.timeout_s",
-        "the driver's rate and stamps; gyro.timeout_s, INPUT.offset_s",
+        "a gyro has 10 messages a second or more; gyro.timeout_s for a slower one, INPUT.offset_s for its clock",
     ),
     "gyro_doubted": Reason(
         _NOTED,

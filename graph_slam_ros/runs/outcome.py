@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from graph_slam_ros.measurements.reasons import Effect, Reason, explain, remedy
+from graph_slam_ros.slam.frontend.gyro import GyroState
 
 Summary = Mapping[str, Any]
 
@@ -22,7 +23,7 @@ _MOTION = ("odometry", "gyro")  # uses whose measurements nobody doubts one by o
 _DOUBTED = 0.05  # of an input: as many that are not believed are said
 _MENDED = (  # of what is noted, signs of a wrong setting
     *("displaced", "displacement_taken_back", "jump"),
-    *("turn_slips", "gyro_silent", "gyro_doubted", "odometry_contradicted", "odometry_alike"),
+    *("not_in_use", "turn_slips", "gyro_silent", "gyro_doubted", "odometry_contradicted", "odometry_alike"),
 )
 _CONTRADICT = (
     "graph_slam explain RUN says why. Check of this sensor and of odometry: metres and radians, y and bearings to the "
@@ -67,6 +68,20 @@ def _gyro(summary: Summary) -> Iterator[str]:
         yield f"gyro       bias {bias} rad/s; {gyro['state']}"
 
 
+def _gyro_faults(summary: Summary) -> Iterator[str]:
+    """Yield why the gyro has no part in odometry, or in most of it; empty if it has."""
+    gyro, inputs = summary.get("gyro"), summary.get("inputs", {})
+    if not gyro:
+        return
+    name, counted = gyro["name"], summary["counters"].get(gyro["name"], {})
+    steps = max((counts["used"] for counts in inputs.values() if counts["use"] == "odometry"), default=0)
+    silent = counted.get("gyro_silent", 0)
+    if gyro["state"] == "doubted":
+        yield GyroState(**gyro).fault
+    elif silent > _MOSTLY * steps and inputs.get(name, {}).get("used"):
+        yield f"{name}: in {silent} of {steps} steps odometry turned without the gyro: {remedy(name, 'gyro_silent')}"
+
+
 def calibration(summary: Summary) -> Iterator[str]:
     """Yield the corrections of the calibration with their settings, and what it could not determine."""
     report = summary.get("calibration")
@@ -91,7 +106,7 @@ def _solves(summary: Summary) -> str:
 def _counted_lines(source: str, reason: str, times: int) -> Iterator[str]:
     """Return what was repaired or noted, with the remedy if it was frequent."""
     yield from _wrapped(f"counted    {source}: {reason} {times} ({explain(reason).meaning})", 11)
-    if times > 1 and reason in _MENDED and (mend := explain(reason).remedy):
+    if times > 1 and reason in _MENDED and (mend := remedy(source, reason)):
         yield from textwrap.wrap(f"-> {mend}", _WIDTH, initial_indent=" " * 11, subsequent_indent=" " * 14)
 
 
@@ -149,9 +164,7 @@ def shortcomings(summary: Summary) -> Iterator[str]:
                 f"{name}: {jumps} jumps, each begins a segment, and the motion across it is not used: odometry in "
                 "metres and radians? A robot as fast as that: --set odometry.max_speed_m_s=..."
             )
-    if (gyro := summary.get("gyro")) and gyro["state"] == "doubted":
-        counted = summary["counters"].get(gyro["name"], {})
-        yield f"{gyro['name']}: {_because(gyro['name'], {'gyro_doubted': counted.get('gyro_doubted', 0)})}"
+    yield from _gyro_faults(summary)
     if not sum(counts["believed"] or 0 for counts in inputs.values()):
         yield (
             "this is odometry alone: no landmark, fix or closure is in the result; "
@@ -162,8 +175,11 @@ def shortcomings(summary: Summary) -> Iterator[str]:
 
 
 def doubts(summary: Summary) -> Iterator[str]:
-    """Return a sentence for each input of which many measurements are rejected, but fewer than half."""
+    """Return a sentence for each input of which many measurements are rejected, or all motions left out."""
     for name, counts in summary.get("inputs", {}).items():
+        counted = summary["counters"].get(name, {})
+        if alike := counted.get("odometry_alike", 0):
+            yield f"{name}: {_because(name, {'odometry_alike': alike})}"
         if counts["use"] in _MOTION or not counts["used"]:
             continue
         accepted = (counts["believed"] or 0) / counts["used"]

@@ -14,7 +14,7 @@ from graph_slam_ros.config.inputs import InputConfig, default_input
 from graph_slam_ros.measurements.reasons import warnings as mendable
 from graph_slam_ros.measurements.types import Measured
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC, TRANSFORMS, MessageConverter
-from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.messages.inputs import check_topics, uses
 from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.recordings.bag import Bag, BagError, BagMessage, open_bag
 from graph_slam_ros.recordings.definitions import recorded_decoder
@@ -96,6 +96,7 @@ def choose_inputs(bag: Bag, config: Config, odometry: str | None = None, landmar
         found = _choose(bag, by_name[name], topic, option or f"--set {name}.topic=")
         if found:
             topics[name] = found
+    check_topics(config, uses(config), topics)
     if named.get("landmarks"):
         raise BagError(f"no input is used as landmarks: {landmarks} cannot be one")
     if TF_STATIC_TOPIC in bag.topics:
@@ -106,7 +107,8 @@ def choose_inputs(bag: Bag, config: Config, odometry: str | None = None, landmar
 
 
 def _choose(bag: Bag, settings: InputConfig, named: str | None, option: str) -> str:
-    there = ", ".join(f"{t.name} ({t.type or 'no type'})" for t in bag.topics.values())
+    listed = sorted(bag.topics.values(), key=lambda t: t.type != settings.type)  # what may be meant comes first
+    there = ", ".join(f"{t.name} ({t.type or 'no type'})" for t in listed)
     usual = f"/{settings.topic.lstrip('/')}"
     if named is None and settings.topic != default_input(settings.name).topic:
         named = usual

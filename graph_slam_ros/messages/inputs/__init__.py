@@ -28,6 +28,7 @@ __all__ = [
     "MessageError",
     "NotYet",
     "ObservedLandmark",
+    "check_topics",
     "converters",
     "known_types",
     "recorded_uses",
@@ -90,9 +91,33 @@ def uses(config: Config) -> dict[str, str]:
         odometry has a loss.
     """
     out = {settings.name: _use(settings) for settings in config.sources if settings.use != "none"}
+    check_topics(config, out, {one.name: one.topic for one in config.sources})
     if "odometry" not in out.values():
         raise ConfigError(f"inputs.names: none of {config.inputs.names!r} is used as odometry")
     return out
+
+
+def check_topics(config: Config, uses: Mapping[str, str], topics: Mapping[str, str]) -> None:
+    """Check that no odometry is read twice. A topic of transforms may have several.
+
+    Parameters
+    ----------
+    uses, topics : by the name of the input
+
+    Raises
+    ------
+    ConfigError
+        Two inputs read one topic as odometry.
+    """
+    reads: dict[str, str] = {}
+    for one in config.sources:
+        if uses.get(one.name) == "odometry" and one.name in topics and one.type != "tf2_msgs/msg/TFMessage":
+            other = reads.setdefault(topics[one.name].strip("/"), one.name)
+            if other != one.name:
+                raise ConfigError(
+                    f"{one.name}.topic: {topics[one.name]} is odometry by {other} already: name the topic of another "
+                    f"odometry, or {one.name}.use=none"
+                )
 
 
 def recorded_uses(config: Config) -> dict[str, str]:
@@ -106,6 +131,10 @@ def recorded_uses(config: Config) -> dict[str, str]:
 
 def _use(settings: InputConfig) -> str:
     there = converters(settings.type)
+    if not settings.type:
+        of_use = [name for name, row in CONVERTERS.items() if settings.use in row]
+        mend = of_use[0] if len(of_use) == 1 else "package/msg/Name"
+        raise ConfigError(f"{settings.name}.type: it has none: {settings.name}.type={mend} (docs/inputs.md lists them)")
     if there is None:
         close = " or ".join(get_close_matches(settings.type, sorted(known_types()), 2, _CLOSE))
         remedy = f"is it {close}?" if close else "docs/inputs.md has a row for each, and no plugin reads it"

@@ -4,7 +4,8 @@ The bias of the gyro is estimated while the robot stands, and from odometry's ro
 The error of the bias is common to all steps, so it counts as if it lasted ``gyro.bias_correlation_s``.
 
 Over each second the rotations of odometry and gyro must agree. If they do not, the wheels slip, and the gyro is used
-alone. A gyro that disagrees most of the time is itself wrong: in other units, or with another mount.
+alone. A gyro that disagrees most of the time in motion, or grossly in most of the turns, is itself wrong: in other
+units, or with another mount.
 """
 
 import math
@@ -24,7 +25,10 @@ _WINDOW_S = 1.0
 _STRAIGHT_RAD_S = 0.1  # above, errors of odometry's turn factor would pass for a bias
 _QUIET, _QUIET_RAD_S = 10.0, 0.02  # times its noise, and rate, by which a gyro at rest may vary
 _DOUBTED_AFTER_S, _MEMORY_S = 10.0, 60.0
-_DOUBTED, _TRUSTED = 0.5, 0.25  # part of the time in motion in which they disagree
+_DOUBTED, _TRUSTED = 0.5, 0.25  # part of the time in motion, or of that in turns, in which they disagree
+_TURNING_RAD_S = 0.1  # a second with a faster turn is one in which both must turn
+_GROSS = 0.6  # of the larger of both turns: a difference that wheels do not make. A slip by a factor of 2 is 0.5
+_TURNED_S, _EXPLAINED = 5.0, 3.0  # in turns, and chi2 per axis of their difference, above which a gyro may be doubted
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +41,14 @@ class GyroState:
     bias, sigma : about each axis [rad/s]
     state : ``used``; ``silent``: no message for longer than ``gyro.timeout_s``; ``doubted``: it disagrees with odometry
         most of the time; ``waiting``: no odometry yet. Only while it is ``used`` it has a part in odometry
+    ratio : of its turn to that of odometry, over the turns of late; None before there are any
     """
 
     name: str
     bias: Numbers
     sigma: Numbers
     state: str
+    ratio: float | None = None
 
     @property
     def fault(self) -> str:
@@ -50,10 +56,10 @@ class GyroState:
         if self.state == "silent":
             return f"{self.name}: the gyro is silent; the rotation is that of odometry alone (gyro.timeout_s)"
         if self.state == "doubted":
+            turns = "" if self.ratio is None else f", it turns {self.ratio:.3g} times as much as odometry"
             return (
-                f"{self.name}: gyro and odometry contradict each other most of the time; the gyro is not used. It "
-                f"must be in rad/s, counter-clockwise positive. Check its frame, TF or {self.name}.mount, "
-                f"odometry.turn_factor"
+                f"{self.name}: gyro and odometry contradict each other{turns}; the gyro is not used. "
+                f"{_cause(self.ratio, self.name)}"
             )
         return ""
 
@@ -61,6 +67,18 @@ class GyroState:
         """The state and the bias, for a person."""
         bias = ", ".join(f"{b:.5f} +- {s:.5f}" for b, s in zip(self.bias, self.sigma, strict=True))
         return f"{self.state}; bias {bias} rad/s"
+
+
+def _cause(ratio: float | None, name: str) -> str:
+    """The likely cause of a ratio of turns, and what mends it."""
+    mount = f"its TF, or {name}.mount where there is none"
+    if ratio is not None and abs(ratio) > 1.0 / _GROSS:
+        return "It must be in rad/s: are these degrees? Correct its driver"
+    if ratio is not None and -1.0 / _GROSS < ratio < -_GROSS:
+        return f"It must be counter-clockwise positive. Correct {mount}: roll pi turns it over"
+    if ratio is not None and abs(ratio) < 1.0 - _GROSS:
+        return f"Its axis is not that of the robot, or its driver sends zeros. Correct {mount}"
+    return f"It must be in rad/s, counter-clockwise positive. Check {mount}, and odometry.turn_factor"
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +101,10 @@ class SavedBias:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """One step of a window: seconds, the gyro's turn less odometry's, and the variance of that."""
+    """One step of a window: seconds, odometry's turn, the gyro's less that, and the variance of the difference."""
 
     seconds: float
+    odometry: Numbers
     difference: Numbers
     variance: Numbers
 
@@ -109,7 +128,9 @@ class GyroFusion:
         self._bias_variance = [self._config.bias_sigma**2] * self._axes
         self._window: deque[_Step] = deque()
         self._limit = quantile(self._config.gate, self._axes)
-        self._seen_s = self._disagrees = 0.0
+        self._seen_s = self._disagrees = self._turning_s = self._grossly = 0.0
+        self._statistic = self._turn_chi2 = 0.0  # of this window, and the mean of those in turns
+        self._products = [0.0, 0.0]  # of odometry's turn with the gyro's and with itself, over turns of late
         self._is_doubted = False
         self._state = "waiting"
         self._newest_ns: int | None = None  # of the last step
@@ -118,7 +139,9 @@ class GyroFusion:
     @property
     def state(self) -> GyroState:
         """The present estimate of it."""
-        return GyroState(self.name, tuple(self._bias), tuple(map(math.sqrt, self._bias_variance)), self._state)
+        both, square = self._products
+        sigma = tuple(map(math.sqrt, self._bias_variance))
+        return GyroState(self.name, tuple(self._bias), sigma, self._state, both / square if square else None)
 
     @property
     def saved(self) -> SavedBias | None:
@@ -195,7 +218,7 @@ class GyroFusion:
         measured = tuple(a - b * seconds for a, b in zip(turn.angle, self._bias, strict=True))
         difference = tuple(self._wrapped(a - b) for a, b in zip(measured, odometry, strict=True))
         white = tuple(a + b for a, b in zip(of_odometry, own, strict=True))
-        slips = self._contradicts(_Step(seconds, difference, white), stood)
+        slips = self._contradicts(_Step(seconds, odometry, difference, white), stood)
         self._judge(seconds, slips, is_moving=slips or not stood)
         if self._is_doubted:
             self._counters.count(self.name, "gyro_doubted")
@@ -232,6 +255,7 @@ class GyroFusion:
             variance = sum(one.variance[axis] for one in window) + self._bias_variance[axis] * seconds**2
             variance += self._still_rad**2 * stood
             statistic += apart**2 / variance
+        self._statistic = statistic
         return statistic > self._limit
 
     def _judge(self, seconds: float, slips: bool, *, is_moving: bool) -> None:
@@ -240,8 +264,29 @@ class GyroFusion:
             return
         self._seen_s = min(self._seen_s + seconds, _MEMORY_S)
         self._disagrees += (slips - self._disagrees) * min(1.0, seconds / self._seen_s)
-        if self._seen_s >= _DOUBTED_AFTER_S:
-            self._is_doubted = self._disagrees > (_TRUSTED if self._is_doubted else _DOUBTED)
+        self._judge_turn(seconds)
+        most = _TRUSTED if self._is_doubted else _DOUBTED
+        in_motion = self._seen_s >= _DOUBTED_AFTER_S and self._disagrees > most
+        in_turns = self._turning_s >= _TURNED_S and self._turn_chi2 > _EXPLAINED * self._axes and self._grossly > most
+        self._is_doubted = in_motion or in_turns
+
+    def _judge_turn(self, seconds: float) -> None:
+        """Update in how much of the turns the difference is larger than wheels make it. Straight on nothing shows."""
+        over_s = sum(one.seconds for one in self._window)
+        o, d = (
+            tuple(map(sum, zip(*turns, strict=True)))
+            for turns in ([one.odometry for one in self._window], [one.difference for one in self._window])
+        )
+        g = tuple(a + b for a, b in zip(o, d, strict=True))
+        largest = max(math.hypot(*o), math.hypot(*g))
+        if largest < _TURNING_RAD_S * over_s:
+            return
+        self._turning_s = min(self._turning_s + seconds, _MEMORY_S)
+        part = min(1.0, seconds / self._turning_s)
+        self._grossly += ((math.hypot(*d) > _GROSS * largest) - self._grossly) * part
+        self._turn_chi2 += (self._statistic - self._turn_chi2) * part
+        for k, one in enumerate((g, o)):
+            self._products[k] += (sum(a * b for a, b in zip(o, one, strict=True)) - self._products[k]) * part
 
     def _shows_bias(self, turn: Turn, seconds: float, odometry: Numbers, stood: bool) -> bool:
         """Return whether the difference to odometry is the bias, and not a turn of one of them."""

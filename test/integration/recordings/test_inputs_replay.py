@@ -11,6 +11,7 @@ from messages import DATUM, LANDMARKS, STAMP_NS, odometry, pose, quaternion, rec
 from places import ROOT
 
 from graph_slam_ros.cli import main
+from graph_slam_ros.errors import ConfigError
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.lie import se2
 from graph_slam_ros.measurements.types import from_record
@@ -94,6 +95,13 @@ def test_an_input_without_its_topic_takes_the_only_one_of_its_type_and_else_is_r
         choose_inputs(bag, Config.from_mapping(gps | {"gps.topic": "gnss"}))
     with pytest.raises(BagError, match="no topic of type sensor_msgs/msg/Imu in the recording"):
         choose_inputs(bag, Config.from_mapping({"inputs.names": "odom imu", "imu.type": "sensor_msgs/msg/Imu"}))
+    with pytest.raises(
+        BagError, match=r"no topic /wheels in the recording; there are /odom \(nav_msgs/msg/Odometry\), "
+    ):
+        choose_inputs(bag, Config.from_mapping({"odom.topic": "wheels"}))
+    vo = {"inputs.names": "odom vo", "vo.type": "nav_msgs/msg/Odometry"}
+    with pytest.raises(ConfigError, match=r"vo\.topic: /odom is odometry by odom already"):
+        choose_inputs(bag, Config.from_mapping(vo))
     with pytest.raises(BagError, match="no input is used as landmarks: /landmarks cannot be one"):
         choose_inputs(bag, Config.from_mapping(gps), landmarks="/landmarks")
 

@@ -141,6 +141,14 @@ def test_what_cannot_be_an_input_is_refused_by_name():
             {"odom": {"type": "nav_msgs/msg/Path"}},
             "odom.type: 'nav_msgs/msg/Path' is no type of an input: docs/inputs.md has a row for each",
         ),
+        (
+            {"inputs": {"names": "odom imu"}, "imu": {"use": "gyro"}},
+            "imu.type: it has none: imu.type=sensor_msgs/msg/Imu ",
+        ),
+        (
+            {"inputs": {"names": "odom vo"}, "vo": {"type": "nav_msgs/msg/Odometry", "topic": "/odom"}},
+            "vo.topic: /odom is odometry by odom already: name the topic of another odometry, or vo.use=none",
+        ),
         ({"odom": {"use": "landmarks"}}, "odom.use: nav_msgs/msg/Odometry can be odometry or fix, not landmarks"),
         ({"odom": {"use": "none"}}, "inputs.names: none of 'odom detections' is used as odometry"),
         ({"odom": {"mount": "1 2 3"}}, "odom.mount: '1 2 3' is not 6 numbers"),

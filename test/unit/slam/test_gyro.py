@@ -1,7 +1,7 @@
 """A gyro as part of odometry: what its messages add up to, its bias, and whom to believe."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ import pytest
 from graph_slam_ros.config.gyro import GyroConfig
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.slam import AngularVelocity, Config, Counters
-from graph_slam_ros.slam.frontend.gyro import GyroFusion
+from graph_slam_ros.slam.frontend.gyro import GyroFusion, GyroState
 from graph_slam_ros.slam.frontend.gyro_samples import GyroSamples
 from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import Step
@@ -205,7 +205,7 @@ def test_a_gyro_that_most_of_the_time_contradicts_is_not_used(wrong):
         rate = 0.5 if k % 2 else -0.5
         robot.drive(1.0, speed=0.5, wheels=rate, gyro=factor * rate)
     assert robot.gyro.state.state == "doubted"
-    assert "rad/s" in robot.gyro.state.fault
+    assert {"degrees": "rad/s", "sign": "counter-clockwise"}[wrong] in robot.gyro.state.fault
     assert robot.counters["imu", "gyro_doubted"] > 1000
     step = robot.drive(1.0, speed=0.5, wheels=0.5, gyro=factor * 0.5)
     assert step.turn_variance is None
@@ -274,3 +274,44 @@ def test_the_bias_of_a_map_is_gone_on_with_and_less_certain_by_the_time_that_has
     assert resumed(-100.0).sigma[-1] == 0.02, "by another clock"
     assert resumed(100.0, name="other").bias[-1] == 0.0, "that of another gyro"
     assert resumed(100.0, bias=(0.1, 0.1)).bias[-1] == 0.0, "that of another number of axes"
+
+
+# -- a gyro that is wrong, where the robot turns now and then ------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("factor", "cause"),
+    [
+        (
+            180.0 / math.pi,
+            "it turns 57.3 times as much as odometry; the gyro is not used. It must be in rad/s: are these",
+        ),
+        (-1.0, "it turns -1 times as much as odometry; the gyro is not used. It must be counter-clockwise positive"),
+        (0.0, "it turns 0 times as much as odometry; the gyro is not used. Its axis is not that of the robot"),
+    ],
+)
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_a_gyro_that_is_wrong_in_turns_is_not_used_though_the_robot_mostly_goes_straight(dimensions, factor, cause):
+    robot = Robot(dimensions)
+    for rate in (0.5, -0.5, 0.5, -0.5):
+        robot.drive(10.0, speed=0.5)
+        robot.drive(2.0, speed=0.5, wheels=rate, gyro=factor * rate)
+    robot.drive(5.0, speed=0.5)
+    assert robot.gyro.state.state == "doubted"
+    assert cause in robot.gyro.state.fault
+    assert GyroState(**asdict(robot.gyro.state)) == robot.gyro.state
+    for rate in (0.5, -0.5) * 12:  # it is mended
+        robot.drive(2.0, speed=0.5, wheels=rate, gyro=rate)
+    assert robot.gyro.state.state == "used"
+
+
+@pytest.mark.parametrize("wheels", [1.8, 0.6])
+def test_wheels_that_slip_in_every_turn_are_no_fault_of_the_gyro(wheels):
+    robot = Robot(**{"odometry.turn_per_rad": 1e-3})
+    robot.drive(5.0)
+    for rate in (0.5, -0.5) * 6:
+        robot.drive(10.0, speed=0.5)
+        robot.drive(2.0, speed=0.5, wheels=wheels * rate, gyro=rate)
+    assert robot.gyro.state.state == "used"
+    assert robot.counters["odom", "turn_slips"] > 100
+    assert robot.gyro.state.ratio == pytest.approx(1.0 / wheels, abs=0.05)

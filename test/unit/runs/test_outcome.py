@@ -1,0 +1,52 @@
+"""What the end of a run says of its odometries and its gyro."""
+
+from graph_slam_ros.runs.outcome import doubts, shortcomings, text
+
+LANDMARKS = {"use": "landmarks", "received": 90, "used": 90, "believed": 90}
+ODOMETRY = {"use": "odometry", "received": 100, "used": 100, "believed": None}
+GYRO = {"name": "imu", "bias": [0.01], "sigma": [0.001], "state": "used", "ratio": 1.0}
+
+
+def summary(counters, gyro=None, **inputs):
+    """A run whose landmarks are well."""
+    out = {"counters": counters, "inputs": {"odom": ODOMETRY, "tags": LANDMARKS, **inputs}, "landmarks": 9}
+    out |= {"sightings": 90, "failing": "", "waiting": {}, "keyframes": 50, "span_s": 10.0, "edges": 140, "chi2": 1.0}
+    return out | {"solves": 3} | ({"gyro": gyro} if gyro else {})
+
+
+def used(count, use="gyro"):
+    return {"use": use, "received": 200, "used": count, "believed": None}
+
+
+def test_a_gyro_that_is_well_is_no_shortcoming():
+    assert not [*shortcomings(summary({}, GYRO, imu=used(200)))]
+
+
+def test_a_gyro_that_is_wrong_is_one_with_its_likely_cause():
+    wrong = GYRO | {"state": "doubted", "ratio": 57.3}
+    (said,) = shortcomings(summary({"imu": {"gyro_doubted": 80}}, wrong, imu=used(200)))
+    assert said.startswith("imu: gyro and odometry contradict each other, it turns 57.3 times as much as odometry")
+    assert "degrees" in said
+
+
+def test_a_gyro_without_messages_most_of_the_time_is_one_with_the_parameter():
+    (said,) = shortcomings(summary({"imu": {"gyro_silent": 51}}, GYRO, imu=used(20)))
+    assert said.startswith("imu: in 51 of 100 steps odometry turned without the gyro: ")
+    assert "gyro.timeout_s" in said
+    assert "imu.offset_s" in said
+    assert not [*shortcomings(summary({"imu": {"gyro_silent": 50}}, GYRO, imu=used(20)))]
+    (said,) = shortcomings(summary({"imu": {"gyro_silent": 100}}, GYRO, imu=used(0)))
+    assert said == "imu: nothing of 200 messages was used: gyro_silent 100 (" + said.partition("(")[2]
+
+
+def test_an_odometry_that_has_no_part_is_doubted_with_the_parameter():
+    (said,) = doubts(summary({"vo": {"odometry_alike": 60}}, vo=used(200, "odometry")))
+    assert said.startswith("vo: odometry_alike 60 (")
+    assert "vo.sigma_factor" in said
+
+
+def test_what_is_counted_is_said_with_the_input_in_its_remedy():
+    lines = " ".join(" ".join(text(summary({"vo": {"odometry_alike": 60}}, vo=used(200, "odometry")))).split())
+    assert "vo.sigma_factor below 1" in lines
+    lines = " ".join(" ".join(text(summary({"vo": {"not_in_use": 200}}, vo=used(0, "odometry")))).split())
+    assert "-> odometry.fusion=parallel uses all of them at once" in lines
