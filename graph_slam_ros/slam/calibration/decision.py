@@ -5,6 +5,9 @@
 3. Is it reproducible? Fitted on either half of the drive, it must lower the cost of the other.
 4. Is it this parameter, not another? Its correlation with any other must be below 0.95, and it must lie within three
    sigmas of its prior.
+
+The direction in which odometry moves is what a yaw (in space a pitch, too) is measured against. So it is refused where
+odometry may slide across that direction.
 """
 
 from collections.abc import Collection
@@ -19,6 +22,7 @@ MOST_CORRELATED = 0.95
 PRIOR_SIGMAS = 3.0
 MOST_LOST = 0.2
 LEAST_LANDMARKS = 3
+MOST_SLIDING = 0.3  # of odometry's sigma ahead, sideways: with more a turned sensor and a robot that slides are one
 FOLLOWED = 0.1  # of a sigma: what is left of a correction that is used is followed from there on
 
 Verdict = Literal["admitted", "nothing_to_correct", "not_determined", "not_reproducible", "not_separable", "refused"]
@@ -93,6 +97,12 @@ def _verdict(found: TrialFit, k: int, void: str, is_corrected: bool) -> tuple[Ve
     if abs(value) < least:
         why = f": within {SIGMAS:.0f} sigmas of zero" if abs(value) >= quantity.least and not is_corrected else ""
         return "nothing_to_correct", f"{'not corrected' if why else 'nothing to correct'} ({shown}){why}"
+    if (slides := _slides(found, parameter)) > MOST_SLIDING:
+        across, density = ("sideways", "lateral") if parameter.name == "yaw" else ("upwards", "vertical")
+        return "refused", (
+            f"not used ({shown}): odometry may slide, its sigma {across} is {slides:.1f} of that ahead, more than "
+            f"{MOST_SLIDING}: {quantity.manoeuvre}, without sliding, and say so (odometry.{density}_density)"
+        )
     if correlation > MOST_CORRELATED:
         return "not_separable", f"not separable from {other} (correlation {correlation:.2f}): {quantity.manoeuvre}"
     if abs(value) > PRIOR_SIGMAS * found.priors[k]:
@@ -103,6 +113,12 @@ def _verdict(found: TrialFit, k: int, void: str, is_corrected: bool) -> tuple[Ve
         first, second = (amount(parameter, half, 3) for half in halves)
         return "not_reproducible", f"not used ({shown}): {first} in one half of the drive, {second} in the other"
     return "admitted", shown
+
+
+def _slides(found: TrialFit, parameter: Parameter) -> float:
+    """The sigma of a slide across the direction that an angle is measured against, over that ahead; else 0."""
+    axis = {"yaw": 0, "pitch": 1}.get(parameter.name)
+    return 0.0 if axis is None or axis >= len(found.slides) else found.slides[axis]
 
 
 def _agree(first: float, second: float) -> bool:

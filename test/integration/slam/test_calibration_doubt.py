@@ -86,3 +86,15 @@ def test_factors_apart_find_what_is_configured_wrong():
     slam = driven(imperfect_drive(Faults(), seconds=50.0), ON | {"odometry.distance_factor": 1.06})
     assert slam.calibration_report["settings"]["odometry.distance_factor"] == pytest.approx(1.0, abs=0.01)
     assert np.isfinite(slam.solver.values).all()
+
+
+def test_a_robot_that_may_slide_does_not_tell_the_yaw_of_its_sensor():
+    """Its direction of motion, against which a yaw is measured, may be that in which it slides."""
+    measurements = imperfect_drive(Faults(yaw=0.08), seconds=30.0)
+    slam = driven(measurements, ON | {"odometry.lateral_density": 0.006})
+    one = findings(slam)["yaw"]
+    assert not slam.calibration_report["settings"]
+    assert one["verdict"] == "refused"
+    assert "its sigma sideways is 0.6 of that ahead, more than 0.3: drive 10 m straight past" in one["text"]
+    assert one["text"].endswith("without sliding, and say so (odometry.lateral_density)")
+    assert findings(driven(measurements, ON))["yaw"]["verdict"] != "refused"
