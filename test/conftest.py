@@ -1,6 +1,7 @@
 """What kind of test a file has, and before any test: kernels are compiled and loaded in one order, as for users."""
 
 import functools
+import gc
 import os
 import re
 import sys
@@ -47,6 +48,12 @@ def pytest_ignore_collect(collection_path, config):  # type: ignore[no-untyped-d
 def pytest_collection_modifyitems(items) -> None:  # type: ignore[no-untyped-def]
     """Begin with the longest: where they came last, one process would work while the others wait for it."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
+def pytest_collection_finish() -> None:
+    """Modules and tests live to the end: no collection of garbage looks at them again."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_itemcollected(item) -> None:  # type: ignore[no-untyped-def]

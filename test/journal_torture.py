@@ -40,7 +40,7 @@ STATES = ("empty folder", "earlier run there", "after one save", "after a disk-f
 STEPS, SAVES = 34, (20,)  # measurements, and after which of them is saved; once more at the end
 UPDATED, SAVED, WRONG = b"u", b"s", b"!"
 IS_LONG = times(False, True)
-EVERY = times(3, 1)
+EVERY = times(6, 1)
 """Of the calls that reach the disk, which."""
 
 

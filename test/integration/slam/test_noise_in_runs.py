@@ -24,7 +24,7 @@ ESTIMATED = Config.from_mapping({"robust.noise_scale": "estimated"})
 def drive(tmp_path_factory):
     """A drive whose sightings are better than the default noise says, replayed with either noise."""
     folder = tmp_path_factory.mktemp("noise")
-    write_bag(simulate("warehouse", 1, laps=3), folder / "bag.mcap")
+    write_bag(simulate("warehouse", 1, laps=2), folder / "bag.mcap")
     configured = replay(folder / "bag.mcap", folder / "configured")
     estimated = replay(folder / "bag.mcap", folder / "estimated", ESTIMATED)
     return folder, configured.slam, estimated.slam

@@ -167,13 +167,19 @@ def slipped(slam):
     return slam
 
 
-def test_where_the_leader_changes_sightings_change_hands_and_a_replay_has_the_same_bytes():
+@functools.cache
+def changed_hands():
+    """The pipeline after such a drive, and what it was given."""
     taken = []
     config = Config.from_mapping({"landmarks.association": "joint", "odometry.rotation_density": 0.3})
-    slam = slipped(GraphSlam(config, sink=taken.append))
+    return slipped(GraphSlam(config, sink=taken.append)), taken
+
+
+def test_where_the_leader_changes_sightings_change_hands_and_a_replay_has_the_same_bytes():
+    slam, taken = changed_hands()
     assert slam.counters["landmarks", "reassigned"] > 0
     assert np.sort(places(slam), axis=0) == pytest.approx(np.array([[4.0, -2.2], [4.0, 0.0], [4.0, 2.2]]), abs=0.1)
-    again = GraphSlam(config)
+    again = GraphSlam(slam.config)
     for m in taken:
         again.process(m)
     assert again.solver.values.tobytes() == slam.solver.values.tobytes()
@@ -196,7 +202,7 @@ def test_where_all_scans_cannot_be_explained_at_once_it_is_counted_and_the_rest_
 
 def test_the_graph_is_that_of_the_last_decisions():
     """Each sighting has one edge that is not withdrawn, to the landmark that its cluster is of."""
-    slam = slipped(pipeline("joint"))
+    slam, _ = changed_hands()
     clusters, known = slam._landmarks.anonymous.clusters, slam._landmarks.map.known
     wanted = {}
     for cluster, landmark in enumerate(clusters.given):

@@ -20,7 +20,7 @@ from graph_slam_ros.slam import Config
 MOST, MOST_WITH_LOSS = 1.2, 2.0  # times the error of the recording as it was
 LONG_S = 300.0  # of a public recording
 WORLDS = {
-    "tags": ("warehouse", {"aisles": 2, "laps": 2, "aisle_m": 6.0}, {}),
+    "tags": ("warehouse", {"aisles": 2, "laps": times(1, 2), "aisle_m": 6.0}, {}),
     "ranges": (
         "warehouse",
         {"aisles": 2, "laps": 2, "aisle_m": 6.0, "sensor": "range_bearing"},
