@@ -152,6 +152,10 @@ KINDS: dict[str, Kind] = {
         "many landmarks are elsewhere after some time, so the robot's path has a break there",
         "find out whether the robot was carried or slipped",
     ),
+    "ids_wrong": Kind(
+        "some sightings have the id of another landmark",
+        "correct the detector; robust.decide leaves out those that contradict the map, a few fit by chance",
+    ),
     "outliers": Kind("many sightings are far from their landmark", "correct the detector, or set landmarks.loss"),
     "fit_unsure": Kind("the fit of clock, mount and scale failed", "mend the other findings first"),
     "silent": Kind("nothing is seen for most of the drive", "record a drive past landmarks all the way"),

@@ -48,7 +48,7 @@ def points_in_map(s: SightingColumns, poses: Array) -> Array:
     return np.stack(se3.act(tuple(poses.T), tuple(s.points.T)), axis=1)
 
 
-def check_identities(s: SightingColumns, points: Array, path_ns: Index, dimensions: int) -> Iterator[Finding]:
+def at_two_places(s: SightingColumns, points: Array, path_ns: Index, dimensions: int) -> list[TwoPlaces]:
     """Identities that are of two places, by turns or one after the other."""
     points = points[:, :dimensions]
     use = usable(s, path_ns) & np.isfinite(points).all(axis=1)
@@ -57,6 +57,11 @@ def check_identities(s: SightingColumns, points: Array, path_ns: Index, dimensio
         chosen = np.flatnonzero(use & (s.name == number))
         if len(chosen) >= _LEAST and (two := _two_places(name, chosen, s, points)) is not None:
             found.append(two)
+    return found
+
+
+def check_identities(s: SightingColumns, found: list[TwoPlaces]) -> Iterator[Finding]:
+    """Findings of identities that are of two places."""
     seen = sum(bool(name) for name in s.names)
     yield from _moved(s, [one for one in found if one.since_ns is not None])
     yield from _reused(s, [one for one in found if one.since_ns is None], seen)

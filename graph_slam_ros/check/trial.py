@@ -1,19 +1,20 @@
 """A trial of a recording: a replay in memory, then a fit of clock, mount and scales that starts at its estimate."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from graph_slam_ros.check.columns import Columns, SightingColumns
+from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.finding import Finding, Where, assignment
-from graph_slam_ros.check.identities import check_identities, points_in_map
+from graph_slam_ros.check.identities import at_two_places, check_identities, points_in_map
+from graph_slam_ros.check.outliers import check_outliers
 from graph_slam_ros.check.pairs import noisier, pairs_of, path_of, poses_at, turned_mount
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
-from graph_slam_ros.typing import Array, Index, Mask
+from graph_slam_ros.typing import Array, Index
 
 _THIN_NS = 80_000_000
 _APART_S = 1.0
@@ -31,7 +32,7 @@ _LIMITS = {
     "range_factor": ("range_scale", "part", 0.03, 0.05),
 }
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
-_OUTLIERS, _LOST, _NEAR_M = 0.12, 0.25, 0.5
+_LOST = 0.25
 
 
 def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
@@ -86,7 +87,8 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     if scale is not None and _has_points(c) and scale.sigma < _SURE and abs(scale.value - 0.1) > _ABSURD:
         yield _absurd(c, 1.0 + scale.value)
         return
-    found = [] if _goes_back(c) else list(_places(c, slam, path_ns, path))
+    late_s = {} if fit.lost > _LOST else {f.parameter.source: f.value for f in fitted if _is_late(f)}
+    found = [] if _goes_back(c) else _places(c, slam, path_ns, path, late_s)
     if fit.lost > _LOST:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(s, path_ns, path, c.config.world.dimensions))]
         if not found:
@@ -94,15 +96,18 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
             yield Finding("fit_unsure", "warning", fit.lost, _LOST, "part", text)
         yield from found
         return
-    offsets = [finding for one in fitted for finding in _fitted(c, one)]
-    yield from offsets
-    if not any(one.code == "clock_offset" and abs(one.value) > _LATE_S for one in offsets):
-        yield from found  # else it is the clock that puts landmarks elsewhere
-    for noise in scales:
+    for one in fitted:
+        yield from _fitted(c, one)
+    yield from found
+    for noise in scales if c.config.robust.noise_scale != "estimated" else ():
         limit = _ODOMETRY_OVER_CONFIDENT if noise.label == "odometry" else _OVER_CONFIDENT
         factor = float(np.sqrt(noise.per_dof))
         if factor > limit and noise.dof > _LEAST_DOF and not noise.reason:
             yield _over_confident(c, noise.source, noise.label, noise.part, factor, limit)
+
+
+def _is_late(one: Fitted) -> bool:
+    return one.parameter.name == "clock" and one.verdict == "admitted" and abs(one.value) > _LATE_S
 
 
 def _goes_back(c: Columns) -> bool:
@@ -181,28 +186,24 @@ def _mended(c: Columns, one: Fitted) -> tuple[str, tuple[str, ...]]:
     return text, (assignment(f"odometry.{name}", round(factor, 4)),)
 
 
-def _places(c: Columns, slam: GraphSlam, path_ns: Index, path: Array) -> Iterator[Finding]:
-    """Identities by where the estimate puts them, and sightings that are far from their landmark."""
+def _places(c: Columns, slam: GraphSlam, path_ns: Index, path: Array, late_s: Mapping[str, float]) -> list[Finding]:
+    """Identities by where the estimate puts them, and sightings that are far from their landmark.
+
+    Parameters
+    ----------
+    late_s : by input: clocks that are off by so much that identities seem to be of two places
+    """
+    found: list[Finding] = []
     for s in c.sightings:
-        inside = (s.stamp_ns >= path_ns[0]) & (s.stamp_ns <= path_ns[-1])
+        stamp_ns = s.stamp_ns + round(late_s.get(s.input, 0.0) * 1e9)
+        inside = (stamp_ns >= path_ns[0]) & (stamp_ns <= path_ns[-1])
         if not inside.any():
             continue
-        poses = poses_in_map(slam, np.clip(s.stamp_ns, path_ns[0], path_ns[-1]), path_ns, path)
+        poses = poses_in_map(slam, np.clip(stamp_ns, path_ns[0], path_ns[-1]), path_ns, path)
         points = points_in_map(s, poses)
-        yield from check_identities(s, points, path_ns, c.config.world.dimensions)
-        yield from _outliers(c, s, points, inside)
-
-
-def _outliers(c: Columns, s: SightingColumns, points: Array, inside: Mask) -> Iterator[Finding]:
-    """Sightings that are far from the median of their identity, by their noise and by that of the others."""
-    n, far, used = c.config.world.dimensions, 0, 0
-    for number, name in enumerate(s.names):
-        chosen = np.flatnonzero((s.name == number) & inside & np.isfinite(points).all(axis=1))
-        if not name or len(chosen) < 5:
-            continue
-        away = np.linalg.norm(points[chosen, :n] - np.median(points[chosen, :n], axis=0), axis=1)
-        limit = np.maximum(_NEAR_M, _SIGMAS * np.maximum(s.sigmas[chosen], 1.48 * np.median(away)))
-        far, used = far + int((away > limit).sum()), used + len(chosen)
-    if used and far > _OUTLIERS * used:
-        text = f"{s.topic}: {far / used:.0%} of the sightings are far from their landmark"
-        yield Finding("outliers", "warning", far / used, _OUTLIERS, "part", text, s.topic, int(s.stamp_ns[0]), far)
+        two = at_two_places(s, points, path_ns, c.config.world.dimensions)
+        if not late_s:  # else it is the clock that puts landmarks elsewhere
+            found += check_identities(s, two)
+        elsewhere = {one.name for one in two}
+        found += check_outliers(s, points, inside, c.config, elsewhere)
+    return found

@@ -92,8 +92,9 @@ def test_a_planted_fault_is_found_and_its_settings_mend_it(drive, tmp_path, name
 def test_each_finding_that_prints_a_setting_is_planted():
     source = "".join(file.read_text() for file in (ROOT / "graph_slam_ros/check").glob("*.py"))
     printing = {"frame_unlinked", "axes", "odometry_scale", "turn_scale", "mount_yaw", "clock_offset", "over_confident"}
+    printing.add("odometry_over_confident")
     printing |= set(re.findall(r'Finding\(\s*"(\w+)"(?:(?!Finding\().)*?settings=', source, re.DOTALL))
-    mended = {code for _, codes, _ in PLANTED.values() for code in codes} | {code for _, code, *_ in FITTED}
+    mended = {code for _, codes, _ in PLANTED.values() for code in codes} | {code for _, code, *_ in FITTED} | {ROUGH}
     assert printing - mended == set()
 
 
@@ -139,25 +140,55 @@ def laps(tmp_path_factory):
 
 
 FITTED = (
-    ("landmark clock +100 ms", "clock_offset", -0.1, 0.02),
-    ("mount turned 5 degrees", "mount_yaw", 0.0873, 0.01),
-    ("odometry scaled 0.9", "odometry_scale", 0.111, 0.02),
-    ("two landmarks share an identity", "id_reused", None, None),
-    ("track width 8 % wrong", "turn_scale", -0.074, 0.02),
-    ("noise 8 times its covariance", "over_confident", None, None),
+    ("landmark clock +100 ms", "clock_offset", -0.1, 0.02, {}),
+    ("mount turned 5 degrees", "mount_yaw", 0.0873, 0.01, {}),
+    ("odometry scaled 0.9", "odometry_scale", 0.111, 0.02, {}),
+    ("two landmarks share an identity", "id_reused", None, None, {}),
+    ("track width 8 % wrong", "turn_scale", -0.074, 0.02, {}),
+    ("noise 8 times its covariance", "over_confident", None, None, {}),
+    ("3 % of ids wrong", "ids_wrong", 0.03, 0.01, {"robust.decide": False}),
 )
 
 
-@pytest.mark.parametrize("name, code, value, within", FITTED)
-def test_the_fit_finds_what_needs_an_estimate_and_its_settings_mend_it(laps, tmp_path, name, code, value, within):
-    bag = planted(laps, tmp_path / "faulty.mcap", name)
-    found = {one.code: one for one in check(bag).findings}
+def found_and_mended(bag, code, settings):
+    """The finding, and the errors and warnings with the settings that it prints."""
+    found = {one.code: one for one in check(bag, settings).findings}
     assert code in found
+    printed = dict(parse_setting(text) for text in found[code].settings)
+    mended = check(bag, settings | printed).findings if printed else []
+    return found[code], {one.code for one in mended if one.severity != "note"}
+
+
+@pytest.mark.parametrize("name, code, value, within, settings", FITTED)
+def test_the_fit_finds_what_needs_an_estimate_and_its_settings_mend_it(
+    laps, tmp_path, name, code, value, within, settings
+):
+    found, mended = found_and_mended(planted(laps, tmp_path / "faulty.mcap", name), code, settings)
     if value is not None:
-        assert found[code].value == pytest.approx(value, abs=within)
-    if found[code].settings:
-        mended = check(bag, dict(parse_setting(text) for text in found[code].settings)).findings
-        assert code not in {one.code for one in mended}
+        assert found.value == pytest.approx(value, abs=within)
+    assert code not in mended
+
+
+ROUGH = "odometry_over_confident"
+
+
+def test_odometry_that_is_rougher_than_it_says_is_found_and_its_setting_mends_it(tmp_path):
+    bag = tmp_path / "rough.mcap"
+    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=5), bag)
+    drive = Drive(bag)
+    poses = drive.poses
+    poses[:, :2] += np.random.default_rng(1).normal(0.0, 0.015, (len(poses), 2)).cumsum(axis=0)
+    drive.poses = poses
+    drive.write(bag)
+    found, mended = found_and_mended(bag, ROUGH, {"odometry.doubt": False})
+    assert found.settings == ("robust.noise_scale=estimated",)
+    assert ROUGH not in mended
+
+
+def test_a_few_wrong_ids_are_a_note_where_what_contradicts_is_left_out(laps, tmp_path):
+    bag = planted(laps, tmp_path / "faulty.mcap", "3 % of ids wrong")
+    (one,) = (one for one in check(bag).findings if one.code == "ids_wrong")
+    assert (one.severity, one.settings) == ("note", ())
 
 
 def test_a_replay_ends_with_the_worst_finding_and_only_its_summary_differs(drive, tmp_path, capsys):
