@@ -107,3 +107,12 @@ def driven(measurements: list[Odometry | Sightings], settings: dict[str, object]
     for one in (*measurements, Control("end"), Control("optimize")):
         slam.process(one)
     return slam
+
+
+def error_m(slam: GraphSlam, truth: Truth) -> float:
+    """RMSE of the keyframes, moved onto the truth as well as a rigid motion can."""
+    poses, true = slam.trajectory()[:, :2], np.array([truth.at(int(s))[:2] for s in slam.keyframes.stamps_ns])
+    a, b = poses - poses.mean(axis=0), true - true.mean(axis=0)
+    angle = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    moved = np.stack(se2.act((0.0, 0.0, float(angle)), tuple(a.T)), axis=-1)
+    return float(np.sqrt(np.mean(np.sum((moved - b) ** 2, axis=1))))

@@ -95,6 +95,9 @@ def explain_calibration(folder: Path) -> Iterator[str]:
     yield f"{report['trials']} trial fits; what is left after the corrections:"
     for one in report["parameters"]:
         yield from textwrap.wrap(one["text"], _WIDTH, initial_indent="  ", subsequent_indent="    ")
+    for window in report.get("windows", ()):
+        lines = ", ".join(f"{name}={value}" for name, value in window["settings"].items())
+        yield f"corrected from keyframe {window['first_keyframe']} on: {lines or 'nothing'}"
     for name, value in report["settings"].items():
         yield f"corrected: {name}={value}"
 

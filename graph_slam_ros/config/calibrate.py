@@ -29,6 +29,14 @@ class CalibrateConfig:
     range_offset_sigma_m: float = setting(0.5, "prior of the offset of an input's ranges", "m", low=1e-4, high=100.0)
     range_factor_sigma: float = setting(0.2, "prior of the factor of an input's ranges", "times", low=1e-4, high=1.0)
     turn_bias_sigma: float = setting(0.05, "prior of odometry's constant turn rate error", "rad/s", low=1e-5, high=1.0)
+    drift: float = setting(
+        0.0,
+        "change of the parameters in an hour, in parts of the sigma of their prior (a random walk over windows of 200 "
+        "keyframes); 0: they are constant",
+        "parts/sqrt(h)",
+        low=0.0,
+        high=1000.0,
+    )
 
     def __post_init__(self) -> None:
         unknown = [word for word in self.groups.split() if word not in (*GROUPS, "auto", "none")]

@@ -75,6 +75,8 @@ def calibrate(
         given = chosen.settings | given
         odometry, landmarks = odometry or chosen.topics.get("odom"), landmarks or chosen.topics.get("detections")
     config = with_survey(Config.from_mapping(given))
+    if config.calibrate.drift:
+        raise GraphSlamError("calibrate.drift: settings are constant; graph_slam replay with it corrects what changes")
     inputs = choose_inputs(bag, config, odometry, landmarks)
     warmup(dimensions=config.world.dimensions)
     total = sum(bag.topics[topic].count for topic in inputs.by_topic())

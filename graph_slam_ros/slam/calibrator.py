@@ -15,6 +15,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.calibration.choice import parameters_of
 from graph_slam_ros.slam.calibration.decision import Finding, decide
+from graph_slam_ros.slam.calibration.drift import DriftWindows
 from graph_slam_ros.slam.calibration.fit import TrialFit, fit
 from graph_slam_ros.slam.calibration.model import Values
 from graph_slam_ros.slam.calibration.parameters import Parameter
@@ -66,7 +67,7 @@ class Calibrator:
         self._due, self._steady = FIRST_DUE, 0
         self._job: Trial | None = None
         self._apply_at = 0  # the keyframe
-        self._first_edge = backend.graph.edge_count  # those of a loaded map are of another drive
+        self._windows = DriftWindows(config.calibrate.drift, backend.graph.edge_count)
         if start is not None:
             frontend.corrections.restore(start.calibration)
             self._admitted = {Parameter(*key) for key in start.calibration}
@@ -82,8 +83,8 @@ class Calibrator:
             self._adopt(self._guarded(job), keyframe, None)
         if keyframe + 1 >= self._due and self._job is None:
             while keyframe + 1 >= self._due:
-                self._due *= 2
-            if self._steady < _STEADY and not self._backend.spares_memory:
+                self._due = self._windows.next_trial(self._due)
+            if (self._steady < _STEADY or self._windows.drifts) and not self._backend.spares_memory:
                 self._job = self._executor(self._trial(self._backend.solver.settings))
                 self._apply_at = keyframe + self._config.robust.apply_after_keyframes
         return None
@@ -99,13 +100,14 @@ class Calibrator:
 
     def _trial(self, settings: Settings) -> Trial:
         problem, calibrate = self._problem(settings), self._config.calibrate
-        has_gyro = bool(self._config.gyro_input)
+        has_gyro, windows, now_ns = bool(self._config.gyro_input), self._windows, int(problem.stamps_ns[-1])
 
         def run() -> TrialFit | None:
             wanted = parameters_of(problem, calibrate.asked, chooses=calibrate.chooses)
             if has_gyro:  # odometry's turn is mostly that of the gyro
                 wanted = [one for one in wanted if one.name != "turn"]
-            return fit(problem, {one: calibrate.prior(one.name) for one in wanted}) if wanted else None
+            priors = {one: windows.prior(one, calibrate.prior(one.name), now_ns) for one in wanted}
+            return fit(problem, priors) if wanted else None
 
         return run
 
@@ -123,7 +125,7 @@ class Calibrator:
         if found is None:
             return None
         self.trials, self._last = self.trials + 1, found
-        findings = decide(found, self._count_landmarks(), self._admitted)
+        findings = decide(found, self._count_landmarks(), self._admitted, drifts=self._windows.drifts)
         values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
         moved = any(one.parameter in values and abs(one.value) > one.sigma for one in findings)
         self._steady = 0 if moved else self._steady + bool(self._admitted)
@@ -134,6 +136,8 @@ class Calibrator:
             self.corrected += [one for one in findings if one.parameter in values]
         for one in findings:
             self.findings[one.parameter] = one
+        edges, stamps_ns = self._backend.graph.edge_count, self._frontend.path.keyframes.stamps_ns
+        self._windows.close_if_full(keyframe, stamps_ns, edges, findings, self._frontend.corrections.lines())
         return report
 
     def _count_landmarks(self) -> int:
@@ -200,7 +204,7 @@ class Calibrator:
         path, origins = self._frontend.path, self._landmarks.origins
         factors = self._frontend.corrections.factors
         problem = self._backend.trial_problem(self._config.space, path, origins, settings, factors)
-        return replace(problem, first_edge=max(problem.first_edge, self._first_edge))
+        return replace(problem, first_edge=max(problem.first_edge, self._windows.first_edge))
 
     def widened(self, marginal: Array, vertex: int) -> Array:
         """The marginal of a vertex with the uncertainty of the parameters; the same where none was corrected.
@@ -232,7 +236,10 @@ class Calibrator:
             of_one["total"] = corrections.total(key)
             del of_one["parameter"]
             parameters.append({name: value for name, value in of_one.items() if value != float("inf")})
-        return {"trials": self.trials, "parameters": parameters, "settings": corrections.lines()}
+        report: dict[str, Any] = {"trials": self.trials, "parameters": parameters, "settings": corrections.lines()}
+        if self._windows.drifts:
+            report["windows"] = [{"first_keyframe": k, "settings": lines} for k, lines in self._windows.closed]
+        return report
 
 
 def _add(found: dict[tuple[str, str], float], key: tuple[str, str], value: float) -> None:

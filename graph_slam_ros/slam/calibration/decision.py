@@ -51,16 +51,19 @@ class Finding:
         return self.verdict in ("admitted", "nothing_to_correct")
 
 
-def decide(found: TrialFit, landmarks: int, corrected: Collection[Parameter] = ()) -> list[Finding]:
+def decide(
+    found: TrialFit, landmarks: int, corrected: Collection[Parameter] = (), *, drifts: bool = False
+) -> list[Finding]:
     """Answer the four questions for each parameter of a trial fit.
 
     Parameters
     ----------
     landmarks : how many were seen
     corrected : parameters that were let in before: what is left of them is followed
+    drifts : whether parameters may change on the way
     """
-    void = _void(found, landmarks)
-    return [_finding(found, k, void, one in corrected) for k, one in enumerate(found.parameters)]
+    void, remedy = _void(found, landmarks), "raise calibrate.drift, or " * drifts + "correct the configuration first"
+    return [_finding(found, k, void, remedy, one in corrected) for k, one in enumerate(found.parameters)]
 
 
 def amount(parameter: Parameter, value: float, digits: int = 2) -> str:
@@ -78,13 +81,13 @@ def _void(found: TrialFit, landmarks: int) -> str:
     return ""
 
 
-def _finding(found: TrialFit, k: int, void: str, is_corrected: bool) -> Finding:
+def _finding(found: TrialFit, k: int, void: str, remedy: str, is_corrected: bool) -> Finding:
     parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
-    verdict, why = _verdict(found, k, void, is_corrected)
+    verdict, why = _verdict(found, k, void, remedy, is_corrected)
     return Finding(parameter, value, sigma, verdict, f"{parameter}: {why}")
 
 
-def _verdict(found: TrialFit, k: int, void: str, is_corrected: bool) -> tuple[Verdict, str]:
+def _verdict(found: TrialFit, k: int, void: str, remedy: str, is_corrected: bool) -> tuple[Verdict, str]:
     parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
     quantity, (correlation, other) = parameter.quantity, found.worst_correlation(k)
     shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
@@ -107,7 +110,7 @@ def _verdict(found: TrialFit, k: int, void: str, is_corrected: bool) -> tuple[Ve
         return "not_separable", f"not separable from {other} (correlation {correlation:.2f}): {quantity.manoeuvre}"
     if abs(value) > PRIOR_SIGMAS * found.priors[k]:
         most = amount(parameter, PRIOR_SIGMAS * float(found.priors[k]))
-        return "refused", f"not used ({shown}): larger than {most}: correct the configuration first"
+        return "refused", f"not used ({shown}): larger than {most}: {remedy}"
     halves = float(found.first[k]), float(found.second[k])
     if not is_corrected and not _agree(*halves):
         first, second = (amount(parameter, half, 3) for half in halves)

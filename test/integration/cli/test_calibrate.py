@@ -48,3 +48,8 @@ def test_settings_with_which_less_is_believed_are_not_printed(monkeypatch, capsy
     out, err = capsys.readouterr()
     assert "mount_correction" not in out
     assert "not used: detections.mount_correction=0 0 0 0 0 2.0: with it " in err
+
+
+def test_constant_settings_of_what_changes_are_refused(capsys):
+    assert main(["calibrate", DEMO, "--set", "calibrate.drift=1"]) == 2
+    assert "calibrate.drift: settings are constant; graph_slam replay with it" in capsys.readouterr().err

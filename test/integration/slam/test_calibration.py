@@ -1,15 +1,17 @@
 """Calibration on the way: what was wrong is corrected, and where nothing is, nothing changes."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from imperfect import Faults, driven, imperfect_drive
+from imperfect import Faults, driven, error_m, imperfect_drive, imperfect_drive_and_truth
 
 from graph_slam_ros import Config
 from graph_slam_ros.errors import ConfigError
+from graph_slam_ros.lie import se2
 from graph_slam_ros.runs.map_journal import MapGrowth, extend, state_of
-from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam import GraphSlam, Odometry
 from graph_slam_ros.slam.robust.background import run_when_asked
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
@@ -59,8 +61,6 @@ def _without_clock(slam):
 
 def _earlier(measurements, slam):
     """``offset_s`` is applied where messages are read."""
-    from dataclasses import replace
-
     shift_ns = round(slam.calibration_report["settings"]["detections.offset_s"] * 1e9)
     out = [replace(m, stamp_ns=m.stamp_ns + shift_ns) if hasattr(m, "sightings") else m for m in measurements]
     return sorted(out, key=lambda m: m.stamp_ns)
@@ -161,3 +161,29 @@ def assert_same_edges(slam, state):
     for mine, read in zip(slam.graph.tables.values(), state.graph.tables.values(), strict=True):
         np.testing.assert_array_equal(read.measured.values, mine.measured.values)
         np.testing.assert_array_equal(read.sqrt_information.values, mine.sqrt_information.values)
+
+
+def with_distance_that_changes(measurements, factor):
+    """The same drive, whose odometry says less by a factor from the middle on."""
+    middle_ns = (measurements[0].stamp_ns + measurements[-1].stamp_ns) // 2
+    before = at = None
+    for m in measurements:
+        if not isinstance(m, Odometry):
+            yield m
+            continue
+        x, y, turned = se2.log(se2.between(before or m.T_odom_base, m.T_odom_base))
+        now = factor if m.stamp_ns > middle_ns else 1.0
+        at = se2.compose(at or m.T_odom_base, se2.exp((x / now, y / now, turned)))
+        before = m.T_odom_base
+        yield replace(m, T_odom_base=tuple(map(float, at)))
+
+
+def test_a_factor_that_changes_on_the_way_is_followed_where_that_is_asked_for():
+    drive, truth = imperfect_drive_and_truth(Faults(), seconds=110.0)
+    changed = list(with_distance_that_changes(drive, 0.9))
+    constant, drifting = (driven(changed, ON | {"calibrate.drift": rate}) for rate in (0.0, 3.0))
+    assert "odometry.distance_factor" not in constant.calibration_report["settings"], "no one value is right"
+    report = drifting.calibration_report
+    assert report["settings"] == {"odometry.distance_factor": pytest.approx(0.9, abs=0.01)}
+    assert report["windows"] == [{"first_keyframe": 0, "settings": {}}]
+    assert error_m(drifting, truth) < 0.6 * error_m(constant, truth)

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from imperfect import START_NS, Faults, driven, imperfect_drive_and_truth
+from imperfect import START_NS, Faults, driven, error_m, imperfect_drive_and_truth
 from reliability import tell, times
 
-from graph_slam_ros.lie import se2
 from graph_slam_ros.slam import Odometry, Sightings
 
 ON = {"calibrate.groups": "auto"}
@@ -109,15 +108,6 @@ def _stopped(m, random):
         return replace(s, measured=tuple(map(float, polar)))
 
     return _of_sightings(m, change)
-
-
-def error_m(slam, truth):
-    """RMSE of the keyframes, moved onto the truth as well as a rigid motion can."""
-    poses, true = slam.trajectory()[:, :2], np.array([truth.at(int(s))[:2] for s in slam.keyframes.stamps_ns])
-    a, b = poses - poses.mean(axis=0), true - true.mean(axis=0)
-    angle = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
-    moved = np.stack(se2.act((0.0, 0.0, float(angle)), tuple(a.T)), axis=-1)
-    return float(np.sqrt(np.mean(np.sum((moved - b) ** 2, axis=1))))
 
 
 @pytest.mark.parametrize("name", CLASSES if times(0, 1) else ["many wrong ids"])

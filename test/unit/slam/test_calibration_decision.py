@@ -1,8 +1,10 @@
 """The four questions, on made-up outcomes of a trial fit."""
 
 import numpy as np
+import pytest
 
 from graph_slam_ros.slam.calibration.decision import decide
+from graph_slam_ros.slam.calibration.drift import WINDOW, DriftWindows
 from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.slam.calibration.parameters import Parameter
 
@@ -28,3 +30,28 @@ def test_what_was_corrected_is_followed_although_it_is_known_to_be_less_certain(
     """More of the drive shows that errors are alike: sigma grows, the estimate is better than the one before."""
     assert verdict(0.05, 0.035, (CLOCK,)) == "admitted"
     assert verdict(0.003, 0.035, (CLOCK,)) == "nothing_to_correct"
+
+
+def test_a_window_goes_on_from_the_one_before():
+    windows, stamps_ns = DriftWindows(0.2, 7), np.arange(3 * WINDOW) * 10**9
+    assert windows.prior(CLOCK, 0.5, 10**9) == 0.5
+    (found,) = decide(fitted(0.003, 0.004), 10)
+    windows.close_if_full(WINDOW - 2, stamps_ns, 90, [found], {})
+    assert (windows.first_edge, windows.closed) == (7, []), "it is not full"
+    windows.close_if_full(WINDOW + 19, stamps_ns, 100, [found], {"detections.offset_s": 0.1})
+    assert (windows.first_edge, windows.closed) == (100, [(0, {"detections.offset_s": 0.1})])
+    at_once, later = (windows.prior(CLOCK, 0.5, seconds * 10**9) for seconds in (0, 1800))
+    assert at_once == pytest.approx(0.005)
+    assert later == pytest.approx(np.hypot(0.005, 0.2 * 0.5 * 0.5))
+    assert windows.prior(CLOCK, 0.01, 10**16) == 0.01, "never vaguer than the configuration"
+
+
+def test_without_drift_all_of_the_drive_is_one_window():
+    windows = DriftWindows(0.0, 7)
+    windows.close_if_full(5 * WINDOW, np.arange(6 * WINDOW), 100, [], {})
+    assert (windows.first_edge, windows.next_trial(400)) == (7, 800)
+
+
+def test_a_change_beyond_the_prior_names_what_mends_it():
+    (one,) = decide(fitted(2.0, 0.01), 10, drifts=True)
+    assert one.text.endswith("raise calibrate.drift, or correct the configuration first")
