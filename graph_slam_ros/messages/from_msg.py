@@ -183,11 +183,11 @@ class MessageConverter:
         source.hurried = before
         return out
 
+    @np.errstate(invalid="ignore")  # a signalling NaN warns where it is compared; it is refused by name
     def _converted(self, source: InputContext, message: Any) -> list[Measured]:
         out: list[Measured] = []
         try:
-            with np.errstate(invalid="ignore"):  # a signalling NaN warns where it is compared; it is refused by name
-                out += self._convert[source.name](message)
+            out += self._convert[source.name](message)
         except NotYet:
             source.tally.clear()
             self._pending.append((source, message))
@@ -198,9 +198,10 @@ class MessageConverter:
                 self.on_fault(f"{source.name}: {fault}")
         except MessageError as reason:
             source.count(str(reason))
-        for why, times in source.tally.items():
-            self._counters.count(source.name, why, times)
-        source.tally.clear()
+        if source.tally:
+            for why, times in source.tally.items():
+                self._counters.count(source.name, why, times)
+            source.tally.clear()
         return out
 
     def _add_initial_pose(self) -> None:

@@ -92,6 +92,9 @@ class Bag:
 
     def _merged(self, topics: Collection[str]) -> Iterator[BagMessage]:
         """The messages of several parts, split by time or topic. A part is opened when its time has come."""
+        if len(self._parts) == 1:
+            yield from self._of(self._parts[0], topics)
+            return
         pending = deque(enumerate(self._parts))
         heads: list[tuple[int, int, BagMessage, Iterator[BagMessage]]] = []
         while pending or heads:
@@ -301,16 +304,20 @@ def _push(heads: list[Any], number: int, messages: Iterator[BagMessage]) -> None
 
 def _in_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
     heap: list[tuple[int, int, BagMessage]] = []
-    held = 0
+    held, add = 0, list[tuple[int, int, BagMessage]].append  # sorted once: nearly in order, that is cheaper than a heap
     for number, message in enumerate(messages):
-        heapq.heappush(heap, (message.log_ns, number, message))
+        add(heap, (message.log_ns, number, message))
         held += len(message.cdr) + _OVERHEAD
+        if held > _WINDOW_BYTES and add is not heapq.heappush:
+            heap.sort()
+            add = heapq.heappush
         while held > _WINDOW_BYTES:
             first = heapq.heappop(heap)[2]
             held -= len(first.cdr) + _OVERHEAD
             yield first
+    heap.sort(reverse=True)
     while heap:
-        yield heapq.heappop(heap)[2]
+        yield heap.pop()[2]
 
 
 def _plain(message: BagMessage) -> BagMessage:

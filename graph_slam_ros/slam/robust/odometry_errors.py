@@ -10,6 +10,7 @@ the detection and estimation of jumps in linear systems", 1976).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -22,7 +23,7 @@ _OBSERVED = 0.95  # largest eigenvalue of a direction that other measurements ob
 _LEAST = 1e-6
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class OdometryErrors:
     """Errors of n edges of odometry, of d numbers each, in the directions (k) that all else observes.
 
@@ -51,12 +52,16 @@ class OdometryErrors:
         """
         alike = self.axes @ shared
         extra = ((self.axes * variances) @ self.axes.T + np.outer(alike, alike)) / self.noise_factor**2
-        return self._log_likelihood(extra) - self._log_likelihood(np.zeros_like(extra))
+        return self._log_likelihood(extra) - self._log_likelihood_as_stated
 
     def log_ratio_of(self, covariance: Array) -> float:
         """Return the logarithm of the likelihood ratio with another covariance (n d, n d) of the noise."""
         extra = self.axes @ (covariance - self.covariance) @ self.axes.T
-        return self._log_likelihood(extra) - self._log_likelihood(np.zeros_like(extra))
+        return self._log_likelihood(extra) - self._log_likelihood_as_stated
+
+    @cached_property
+    def _log_likelihood_as_stated(self) -> float:
+        return self._log_likelihood(np.zeros((len(self.errors), len(self.errors))))
 
     def _log_likelihood(self, extra: Array) -> float:
         spread = np.diag(1.0 + self.variances) + extra

@@ -7,6 +7,7 @@ from places import ROOT
 
 from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import read_parameters
+from graph_slam_ros.simulation import simulate, write_bag
 from graph_slam_ros.slam import GraphSlam
 
 DEMO = str(ROOT / "data" / "demo.mcap")
@@ -40,11 +41,13 @@ def test_a_recording_without_landmarks_determines_nothing_and_says_so(tmp_path, 
     assert "[warning] no_landmarks" in capsys.readouterr().out
 
 
-def test_settings_with_which_less_is_believed_are_not_printed(monkeypatch, capsys):
+def test_settings_with_which_less_is_believed_are_not_printed(tmp_path, monkeypatch, capsys):
     """A second replay with what was found shows that it does harm: here a sensor that looks the wrong way."""
     wrong = {"settings": {"detections.mount_correction": "0 0 0 0 0 2.0"}, "parameters": [], "trials": 1}
     monkeypatch.setattr(GraphSlam, "calibration_report", wrong)
-    assert main(["calibrate", DEMO]) == 3
+    bag = str(tmp_path / "drive.mcap")
+    write_bag(simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=1), bag)
+    assert main(["calibrate", bag]) == 3
     out, err = capsys.readouterr()
     assert "mount_correction" not in out
     assert "not used: detections.mount_correction=0 0 0 0 0 2.0: with it " in err

@@ -10,6 +10,7 @@ from mcap.stream_reader import StreamReader
 from recordings import DETECTIONS, ODOMETRY, TOPICS, read, short_drive, write_mcap
 
 from graph_slam_ros.formats.g2o import read_g2o
+from graph_slam_ros.recordings import bag
 from graph_slam_ros.recordings.bag import BagError, BagWriter, open_bag
 from graph_slam_ros.runs.replay import choose_inputs, replay
 from graph_slam_ros.simulation import simulate, write_bag
@@ -142,3 +143,18 @@ def test_a_run_s_graph_keeps_the_classes_of_its_edges(tmp_path):
         for code, label in enumerate(graph.labels):
             count[label] = count.get(label, 0) + int((table.label.values == code).sum())
     assert count == {name: part["edges"] for name, part in done.summary["classes"].items()}
+
+
+@pytest.mark.parametrize("window", [0, 5_000, 20_000, 10**9])
+def test_messages_are_put_in_order_within_a_window_and_ties_stay_as_they_were(monkeypatch, window):
+    rng = np.random.default_rng(window)
+    at, sizes = rng.integers(0, 50, 300), rng.integers(0, 100, 300)
+    messages = [bag.BagMessage(str(k), int(ns), bytes(int(n))) for k, (ns, n) in enumerate(zip(at, sizes, strict=True))]
+    monkeypatch.setattr(bag, "_WINDOW_BYTES", window)
+    expected, kept = [], []
+    for m in messages:
+        kept.append(m)
+        while sum(len(one.cdr) + bag._OVERHEAD for one in kept) > window:
+            expected.append(kept.pop(min(range(len(kept)), key=lambda k: kept[k].log_ns)))
+    expected += sorted(kept, key=lambda one: one.log_ns)
+    assert [m.topic for m in bag._in_order(messages)] == [m.topic for m in expected]

@@ -456,7 +456,7 @@ def test_the_noise_of_a_landmark_graphs_odometry_explains_the_true_motion():
 
 def test_slam_halves_the_position_error_of_dead_reckoning_on_every_seed():
     ratios = []
-    for seed in range(times(6, 20)):
+    for seed in range(times(3, 20)):
         recording = simulate("pythonrobotics", seed)
         slam = GraphSlam()
         for measurement in [*measurements(recording), Control("end"), Control("optimize")]:

@@ -12,7 +12,7 @@ from mcap.writer import CompressionType
 from reliability import times
 from rosbags.highlevel import AnyReader
 
-COUNT = times(50, 5000)
+COUNT = times(25, 5000)
 
 
 @pytest.mark.parametrize("name", fuzzing.FORMATS)
