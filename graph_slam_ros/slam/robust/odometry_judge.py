@@ -2,8 +2,9 @@
 
 Two odometries are compared over the last 1, 2, 4, 8 and 16 motions, because small slips add up. If they contradict
 each other, the odometry in use is believed at first, and the other is left out. Then both explanations are solved: with
-the odometry in use alone, and with the others alone. A rejected edge costs at most its gate. So the landmarks decide,
-or the majority of odometries. Without either, the odometry in use stays.
+the odometry in use alone, and with the others alone. Each odometry that is left out costs its gate. Observations that
+were rejected since are in, with their loss. So the landmarks decide, or the majority of odometries. Without either,
+the odometry in use stays until landmarks are seen again.
 """
 
 from collections.abc import Sequence
@@ -16,12 +17,13 @@ from graph_slam_ros.graph import GROUPS, Graph
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.robust.ledger import Ledger, Reason, Verdict
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.typing import Array
+from graph_slam_ros.typing import Array, Index
 
 _LONGEST = 16  # motions that are compared at once
 _GOES_ON, _GOES_ON_GATE = 8, 0.99  # a contradiction lasts while so many motions differ by more than this
 _LAG = 20  # keyframes after its end in which it is decided
 _EVERY, _MOST = 4, 10  # keyframes from one decision to the next, and contradictions that are decided anew
+_LATER_EVERY, _LATER = 12, 1000  # the same after the lag, for as many keyframes while no landmark has decided it
 _DECIDED = 10.0  # chi2 by which an explanation must be better
 _UPDATES = 3
 _LEAST_ALIKE, _ALIKE = 50, 0.05  # motions, and chi2 per degree of freedom: less is no chance
@@ -135,10 +137,15 @@ class OdometryJudge:
         """Solve both explanations of what is contradictory; returns whether another one is believed now."""
         changed = False
         for one in self.contradictions[-_MOST:]:
-            is_due = everything or (keyframe % _EVERY == 0 and keyframe - one.last <= _LAG)
-            if is_due and one.pairs:
+            if one.pairs and (everything or self._is_due(one, keyframe)):
                 changed |= self._decide(one, keyframe)
         return changed
+
+    def _is_due(self, one: Contradiction, keyframe: int) -> bool:
+        if keyframe - one.last <= _LAG:
+            return keyframe % _EVERY == 0
+        is_open = abs(one.evidence) < _DECIDED and keyframe - one.last <= _LATER
+        return is_open and keyframe % _LATER_EVERY == 0
 
     def finish(self) -> None:
         """Leave everything as it was decided: the map is held."""
@@ -247,13 +254,7 @@ class OdometryJudge:
     # -- which of them is wrong --------------------------------------------------------------------------------------
 
     def _decide(self, one: Contradiction, keyframe: int) -> bool:
-        costs = []
-        for trusts_used in (not one.trusts_used, one.trusts_used):  # that of now last: its estimate stays
-            self._weigh(one, trusts_used=trusts_used)
-            for _ in range(_UPDATES):
-                self._solver.update()
-            costs.append(self._cost(one, trusts_used=trusts_used))
-        other, present = costs
+        other, present = self._costs(one)
         one.evidence = (present - other) if one.trusts_used else (other - present)
         if present - other < _DECIDED:
             return False
@@ -261,17 +262,36 @@ class OdometryJudge:
         self._apply(one, keyframe)
         return True
 
+    def _costs(self, one: Contradiction) -> list[float]:
+        """The costs of the explanation that is not believed, and of the one that is. Its estimate stays.
+
+        Observations since then that were rejected are in, because the wrong explanation rejects the right ones.
+        """
+        costs = []
+        rejected = self._ledger.outside
+        rejected = rejected[rejected > one.pairs[0].used]
+        self._set_weights(rejected, 1.0)
+        try:
+            for trusts_used in (not one.trusts_used, one.trusts_used):
+                self._weigh(one, trusts_used=trusts_used)
+                for _ in range(_UPDATES):
+                    self._solver.update()
+                costs.append(self._cost(one, trusts_used=trusts_used))
+        finally:
+            self._weigh(one, trusts_used=one.trusts_used)
+            self._set_weights(rejected, 0.0)
+        self._solver.update()
+        return costs
+
     def _cost(self, one: Contradiction, *, trusts_used: bool) -> float:
-        """Chi2 of all that is in, and of what is out what it would cost at most."""
-        out = sorted({pair.other if trusts_used else pair.used for pair in one.pairs})
-        limit = quantile(self._gate, len(self._graph.edge(out[0]).sqrt_information))
-        left_out, _ = self._solver.chi2_of(np.array(out))
-        pending = self._ledger.outside
-        pending = pending[pending > one.pairs[0].used]
-        of_pending, _ = self._solver.chi2_of(pending)
-        most = self._ledger.threshold.values[pending]
-        doubted = np.minimum(left_out, limit).sum() + np.minimum(of_pending, most).sum()
-        return self._solver.evaluate().cost_final + float(doubted)
+        """The cost of all that is in, and the gate for each motion of an odometry that is left out."""
+        out = {pair.other if trusts_used else pair.used for pair in one.pairs}
+        limit = quantile(self._gate, len(self._graph.edge(min(out)).sqrt_information))
+        return self._solver.evaluate().cost_final + limit * len(out)
+
+    def _set_weights(self, edges: Index, weight: float) -> None:
+        for edge in edges.tolist():
+            self._solver.set_weight(edge, weight)
 
     def _weigh(self, one: Contradiction, *, trusts_used: bool) -> None:
         for pair in one.pairs:

@@ -67,8 +67,6 @@ def test_one_that_slips_for_20_s_leaves_the_motion_to_the_other(which):
     alone, together = np.mean(found, axis=0)
     print(f"{which} slips: error {alone[0]:.3f} the other alone, {together[0]:.3f} m together; NEES {together[1]:.1f}")
     tell(f"odometry_{which}_slips", tried=SEEDS, failed=SEEDS - right)
-    if which == "first" and SEEDS > 1 and together[0] > MOST * alone[0]:
-        pytest.xfail("in 2 of 8 drives the first is believed: see docs/inputs.md")
     assert together[0] < MOST * alone[0]
     assert SEEDS == 1 or BAND[0] < together[1] < BAND[1]
 
