@@ -28,7 +28,7 @@ WORLDS = {
     "flight, tags in space": ("flight", {}),
 }
 TRUE = {  # docs/check.md says why
-    "plaza2": {"odometry_scale"},
+    "plaza2": {"range_scale"},
     "reference": {"odometry_in_map", "no_odometry"},
     "tag_detections": {"twist_frame", "no_landmarks"},
     "nav2_turtlebot": {"no_landmarks"},

@@ -7,6 +7,7 @@ on TF) or its position alone (PointStamped; NavSatFix, then east, north and up o
 import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,9 @@ _POSE_TYPES = (
     _FIX,
     _ODOMETRY,
 )
+_LOCALISERS = ("amcl_pose", "pcl_pose", "ndt_pose", "slam_pose", "localization_pose", "estimated_pose")
+_CAPTURED_M, _UNKNOWN_M = 0.005, 1e3  # below the first it may be motion capture; the second stands for unknown
+_FIRST = 100
 _BENT = 0.05  # size of a path across its longest direction, as a part of that: a line has less
 Row = tuple[int, tuple[float, ...]]  # stamp [ns] and pose (7,)
 
@@ -48,6 +52,7 @@ class Truth:
     landmarks : positions in metres by id, where they are known
     losses : what of the recording could not be read
     source : the file, or the topic with its type
+    doubt : why it may be an estimate and not the truth; empty where nothing says so
     """
 
     trajectory: Trajectory
@@ -55,6 +60,7 @@ class Truth:
     losses: tuple[str, ...] = ()
     source: str = ""
     topic: str = ""
+    doubt: str = ""
 
 
 def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = ()) -> Truth:
@@ -96,7 +102,22 @@ def read_truth(truth: str | Path, topic: str = "", not_these: Collection[str] = 
     found = trajectory(stamps_s, np.array([pose for _, pose in rows], dtype=float), f"{path}, {name}")
     found = replace(found, has_orientation=kind not in (_FIX, _POINT) and not _is_empty_heading(found.poses))
     landmarks = _recorded_landmarks(bag)
-    return Truth(found, landmarks, tuple(bag.losses), f"{topic or name} ({kind})", name)
+    source = f"{topic or name} ({kind})"
+    return Truth(found, landmarks, tuple(bag.losses), source, name, _doubt(bag, source, name, frames))
+
+
+def _doubt(bag: Bag, source: str, topic: str, frames: str) -> str:
+    """Return why poses are those of a localiser: by the covariance that they have, the name, or the frames."""
+    sigma_m = _stated_sigma(bag, topic)
+    if _CAPTURED_M < sigma_m < _UNKNOWN_M:
+        why = f"its poses have a covariance (a standard deviation of {sigma_m:.3g} m)"
+    elif topic.rpartition("/")[2] in _LOCALISERS or "filtered" in topic:
+        why = "by its name it is the output of a localiser or filter"
+    elif frames and {one.lstrip("/") for one in frames.split(":")} & {"map", "odom"}:
+        why = "map and odom are frames of a localiser"
+    else:
+        return ""
+    return f"{source} is called the truth, but {why}: then the errors are differences between two estimates"
 
 
 def _is_empty_heading(poses: Array) -> bool:
@@ -136,6 +157,14 @@ def _listed(bag: Bag) -> str:
     names = sorted(t.name for t in bag.topics.values() if t.type in _POSE_TYPES)
     names += [f"{t.name}:PARENT:CHILD" for t in bag.topics.values() if t.type == _TF and t.name != "/tf_static"]
     return f"with poses there are {', '.join(names)}" if names else "but no topic has poses"
+
+
+def _stated_sigma(bag: Bag, topic: str) -> float:
+    """The largest standard deviation in x or y that the first poses of a topic have; 0 if they have none."""
+    poses = [getattr(message, "pose", None) for message in islice(_decoded(bag, topic), _FIRST)]
+    covariances = [getattr(pose, "covariance", (0.0,) * 36) for pose in poses]
+    variances = [float(covariance[k]) for covariance in covariances for k in (0, 7)]
+    return math.sqrt(max((v for v in variances if v > 0.0), default=0.0))
 
 
 def _rows(bag: Bag, topic: str, kind: str) -> Iterator[Row]:

@@ -13,6 +13,7 @@ from graph_slam_ros.measurements.reasons import explain, remedy
 from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.node.estimate import Estimate
 from graph_slam_ros.node.recent import WINDOW_S, Recent
+from graph_slam_ros.runs.tables import INPUT_COLUMNS
 
 _LEVELS = {"WAITING": WARN, "DEGRADED": WARN, "ERROR": ERROR}  # the others are as somebody wants them
 _TF_BEHIND_S = 1.0
@@ -252,13 +253,20 @@ def statuses(facts: Facts, verdict: Health, node: str) -> Iterator[Status]:
     load |= {"faults in 10 s": str(facts.faults)}
     yield Status(verdict.level, f"{node}: health", message, node, healthy | reasons | load)
     for one in facts.inputs:
-        values = {"topic": one.topic, "use": one.use, "received": str(one.received), "used": str(one.used)}
+        values = {"topic": one.topic, "use": one.use}
+        values |= {INPUT_COLUMNS["received"]: str(one.received), INPUT_COLUMNS["used"]: str(one.used)}
         values |= {"came in 10 s": str(one.recent.came), "refused in 10 s": str(one.recent.times)}
         values |= {"silent [s]": f"{one.silent_s:.1f}", "publishers": ", ".join(one.publishers)}
         values |= {f"counted: {reason}": str(times) for reason, times in sorted(one.counts.items())}
         is_wrong = one.mismatch or one.is_contested or one.recent.is_bad
         level = WARN if is_wrong or (one.use == "odometry" and not one.received) else OK
-        yield Status(level, f"{node}: input {one.name}", one.mismatch or f"{one.received} received", node, values)
+        yield Status(
+            level,
+            f"{node}: input {one.name}",
+            one.mismatch or f"{one.received} {INPUT_COLUMNS['received']}",
+            node,
+            values,
+        )
     if facts.estimate:
         values = _graph(facts.estimate) | {"path updates sent": str(facts.path_version)}
         yield Status(OK, f"{node}: weak directions", _weakness(facts, facts.estimate), node, facts.weakest)

@@ -21,6 +21,7 @@ from graph_slam_ros.report.packing import Packing, shown
 from graph_slam_ros.report.places import floor_plan, paths
 from graph_slam_ros.report.sentences import effects, sentences
 from graph_slam_ros.runs.folder import COVARIANCES, RunError, changed_since, is_run, run_config, summary_of
+from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.runs.trajectory import read_covariances, read_tum
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 
@@ -265,6 +266,7 @@ def _tables(out: Contents, summary: dict[str, Any], saved: Any, scores: Scores |
     edits = [one.edit for one in saved.edits] if saved else []
     out.data["tables"] = {
         "inputs": out.attempt(lambda: verdict.inputs(summary)) or [],
+        "input_columns": list(INPUT_COLUMNS.values()),
         "configuration": out.attempt(lambda: verdict.configuration(config)) if config else [],
         "versions": out.attempt(lambda: verdict.versions(out.run, summary)) or [],
         "timing": out.attempt(lambda: verdict.timing(summary)) or [],

@@ -564,7 +564,7 @@ function writeText() {
   notes.forEach((one) => byId("notes").append(element("li", one)));
   byId("notes").hidden = !notes.length;
   const t = data.tables;
-  table("inputs", ["input", "use", "received", "used", "believed", "refused", "why", "remedy"], t.inputs);
+  table("inputs", ["input", "use", ...t.input_columns, "why", "remedy"], t.inputs);
   table("configuration", ["parameter", "value", "default", "meaning"], t.configuration);
   table("versions", ["what", "mark"], t.versions);
   table("timing", ["what", "value"], t.timing);

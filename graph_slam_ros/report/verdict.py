@@ -13,6 +13,7 @@ from graph_slam_ros.config.config import Config, flatten, parameters
 from graph_slam_ros.measurements.reasons import Effect, explain, remedy
 from graph_slam_ros.report.packing import shown
 from graph_slam_ros.runs import outcome
+from graph_slam_ros.runs.tables import INPUT_COLUMNS
 
 Row = list[Any]
 _FINE = 0.5, 2.0  # chi2 per degree of freedom
@@ -130,8 +131,8 @@ def inputs(summary: Mapping[str, Any]) -> list[Row]:
         of = of_inputs.get(name, {})
         counts = counters.get(name, {})
         refused = sum(times for reason, times in counts.items() if explain(reason).effect is Effect.REFUSED)
-        numbers = [of.get(column) for column in ("received", "used", "believed")]
-        rows.append([shown(name), of.get("use", ""), *numbers, refused, "", ""])
+        numbers = [(of | {"refused": refused}).get(column) for column in INPUT_COLUMNS]
+        rows.append([shown(name), of.get("use", ""), *numbers, "", ""])
         for reason, times in sorted(counts.items(), key=lambda one: -one[1]):
             row = explain(reason)
             why = f"{reason}: {row.meaning}"

@@ -9,13 +9,13 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from graph_slam_ros.measurements.reasons import Effect, Reason, explain, remedy
+from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.slam.frontend.gyro import GyroState
 
 Summary = Mapping[str, Any]
 
-_WIDTH = 100
+_WIDTH, _COLUMN = 100, 14
 _MOST_REASONS, _MAX_UNDETERMINED = 5, 10  # that are listed
-_COLUMNS = ("received", "used", "believed")
 _OUT_OF_PLANE = 0.05  # of all poses of an odometry: with more, the robot does not move in a plane
 _JUMPY, _MOST_JUMPS = 0.02, 5  # of all messages of an odometry; with more its motion is hardly used
 _MOSTLY = 0.5
@@ -118,18 +118,20 @@ def _wrapped(line: str, indent: int) -> list[str]:
 def table(summary: Summary) -> list[str]:
     """A row for each input, with the reasons of refusals and their remedies.
 
-    ``received`` counts messages. The other columns count odometry, sightings, fixes and closures in them. ``believed``
-    counts those that the estimate uses.
+    Measurements are the odometry, sightings, fixes and closures in messages. Those are believed that the estimate uses.
+    A message that is refused as a whole counts once.
     """
     inputs: Mapping[str, Any] = summary.get("inputs", {})
     if not inputs:
         return []
     wide = max(5, *map(len, inputs))
-    lines = [f"{'input':{wide}s}" + "".join(f"{name:>10s}" for name in (*_COLUMNS, "refused"))]
+    units, names = zip(*(title.rpartition(" ")[::2] for title in INPUT_COLUMNS.values()), strict=True)
+    lines = [f"{'':{wide}s}" + "".join(f"{unit:>{_COLUMN}s}" for unit in units)]
+    lines.append(f"{'input':{wide}s}" + "".join(f"{name:>{_COLUMN}s}" for name in names))
     for name, counts in inputs.items():
         refused = _counted(summary, name, Effect.REFUSED)
-        numbers = (*(counts[column] for column in _COLUMNS), sum(refused.values()))
-        lines.append(f"{name:{wide}s}" + "".join(f"{'-' if n is None else n:>10}" for n in numbers))
+        numbers = ((counts | {"refused": sum(refused.values())})[column] for column in INPUT_COLUMNS)
+        lines.append(f"{name:{wide}s}" + "".join(f"{'-' if n is None else n:>{_COLUMN}}" for n in numbers))
         for reason, times in list(refused.items())[:_MOST_REASONS]:
             lines += textwrap.wrap(f"{reason} {times}: {explain(reason).meaning}", _WIDTH - 2, initial_indent="  ")
             if mend := remedy(name, reason):

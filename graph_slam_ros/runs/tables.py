@@ -89,6 +89,15 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
     )
 
 
+INPUT_COLUMNS = {
+    "received": "messages received",
+    "used": "measurements used",
+    "believed": "measurements believed",
+    "refused": "refused",
+}
+"""The columns of an input and their titles, wherever its numbers are shown: one message may hold many measurements."""
+
+
 def account(slam: GraphSlam, counters: Counters) -> dict[str, Any]:
     """Return all counters, and the outcome of each input.
 

@@ -8,10 +8,21 @@ import pytest
 from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.path_error import alignment, associate, path_error
 from graph_slam_ros.analysis.trajectories import read_truth
+from graph_slam_ros.cli import main
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.tum import tum_text
 from graph_slam_ros.lie import se2, se3
-from graph_slam_ros.messages.to_msg import encode, header, heading, make, point, pose, pose_stamped, vector
+from graph_slam_ros.messages.to_msg import (
+    encode,
+    header,
+    heading,
+    make,
+    point,
+    pose,
+    pose_stamped,
+    pose_with_covariance_stamped,
+    vector,
+)
 from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.runs.restore import map_of, record_run
@@ -557,3 +568,38 @@ def test_why_there_is_no_nees_is_told(run, tmp_path):
     assert scores.consistency.left_out == {"landmarks": "the truth has none (/landmarks_ground_truth)"}
     write_fixes(tmp_path / "fixes.mcap", truth.stamps_s, truth.poses)
     assert "of positions" in str(evaluate(tmp_path / "replayed", tmp_path / "fixes.mcap"))
+
+
+def write_estimate(file, name, sigma_m):
+    """Poses of ``eight`` as a localiser publishes them."""
+    truth = eight()
+    with BagWriter(file) as bag:
+        for stamp_s, pose in zip(truth.stamps_s, truth.poses, strict=True):
+            stamp_ns = round(stamp_s * 1e9)
+            at = (*pose[:2].tolist(), 0.0)
+            message = pose_with_covariance_stamped(stamp_ns, "map", at, sigma_m**2 * np.eye(3), 0.0)
+            bag.write(name, "geometry_msgs/msg/PoseWithCovarianceStamped", stamp_ns, message)
+    return file
+
+
+@pytest.mark.parametrize(
+    "name, sigma_m, why",
+    [
+        ("/pose", 0.2, "its poses have a covariance (a standard deviation of 0.2 m)"),
+        ("/robot/amcl_pose", 0.0, "by its name it is the output of a localiser"),
+        ("/vicon", 0.001, ""),
+        ("/vicon", 0.0, ""),
+    ],
+)
+def test_a_truth_that_is_an_estimate_is_doubted(tmp_path, capsys, run, name, sigma_m, why):
+    assert main(["evaluate", str(run), "--truth", f"{write_estimate(tmp_path / 'e.mcap', name, sigma_m)}:{name}"]) == 0
+    out, err = capsys.readouterr()
+    assert f"{name} (geometry_msgs/msg/PoseWithCovarianceStamped)" in out
+    assert ("differences between two estimates" in err) == bool(why)
+    assert why in " ".join(err.split())
+
+
+def test_a_localiser_is_known_by_the_frames_of_its_transform(tmp_path):
+    write_transforms(tmp_path / "tf.mcap", ("vicon", "robot"), ("map", "base_link"))
+    assert read_truth(tmp_path / "tf.mcap", "/tf:vicon:robot").doubt == ""
+    assert "map and odom" in read_truth(tmp_path / "tf.mcap", "/tf:map:base_link").doubt

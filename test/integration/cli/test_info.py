@@ -443,6 +443,7 @@ def test_a_replay_ends_with_a_table_of_its_inputs_and_the_lines_that_mend_them(i
     (head,) = [
         k for k, line in enumerate(lines) if line.split() == ["input", "received", "used", "believed", "refused"]
     ]
+    assert lines[head - 1].split() == ["messages", "measurements", "measurements"], "the unit of each column"
     assert lines[head + 1].split() == ["odom", str(STEPS), str(STEPS), "-", "0"]
     assert lines[head + 2].split() == ["detections", str(STEPS), "0", "-", str(3 * STEPS)]
     assert len({len(line) for line in lines[head : head + 3]}) == 1, "aligned"

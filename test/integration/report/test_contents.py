@@ -126,6 +126,12 @@ def test_the_sentences_on_top_say_what_is_out_and_what_to_do(made, run):
     assert after.startswith("Why, and what to do: ")
 
 
+def test_the_table_of_inputs_names_the_units_of_its_columns(made):
+    tables = made.data["tables"]
+    assert tables["input_columns"][:2] == ["messages received", "measurements used"]
+    assert all(len(row) == len(tables["input_columns"]) + 4 for row in tables["inputs"])
+
+
 def test_a_run_of_odometry_alone_has_a_report(tmp_path, capsys):
     bag, run = tmp_path / "drive.mcap", tmp_path / "run"
     assert cli.main(["simulate", "manhattan", "--out", str(bag), "--poses", "60", "--set", "landmarks=false"]) == 0

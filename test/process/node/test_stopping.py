@@ -30,7 +30,7 @@ def parameters(folder):
 def used(r):
     """Messages of odometry that were handed on, by the last of /diagnostics."""
     said = r.said("input odom")
-    return int(said[-1][1]["used"]) if said else 0
+    return int(said[-1][1]["measurements used"]) if said else 0
 
 
 def behind_s(r):
