@@ -3,8 +3,11 @@
 A plugin is imported when its name is first used. A built-in name is never looked up.
 """
 
+import os
+import sys
 from collections.abc import Callable
-from importlib.metadata import EntryPoint, entry_points
+from functools import lru_cache
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from typing import Any
 
 from graph_slam_ros.errors import ConfigError
@@ -15,7 +18,24 @@ EDGES = "graph_slam_ros.edges"  # of edge types: their tags in g2o files
 
 def names(group: str) -> dict[str, str]:
     """Return the names in a group with the distribution of each; nothing is imported."""
-    return {entry.name: _distribution(entry) for entry in entry_points(group=group)}
+    return {entry.name: _distribution(entry) for entry in _installed(group)}
+
+
+def _installed(group: str) -> EntryPoints:
+    """The entry points of a group; the files of all packages are read again if a folder of ``sys.path`` has changed."""
+    return _read(group, tuple((folder, _changed_ns(folder)) for folder in sys.path))
+
+
+@lru_cache(2)
+def _read(group: str, folders: tuple[tuple[str, int], ...]) -> EntryPoints:
+    return entry_points(group=group)
+
+
+def _changed_ns(folder: str) -> int:
+    try:
+        return os.stat(folder or ".").st_mtime_ns
+    except OSError:  # not there, or no folder
+        return 0
 
 
 def load(group: str, name: str, check: Callable[[Any], str]) -> tuple[Any, str] | None:
@@ -35,7 +55,7 @@ def load(group: str, name: str, check: Callable[[Any], str]) -> tuple[Any, str] 
     ConfigError
         It cannot be imported, is not what the group is for, or two distributions have the name.
     """
-    found = sorted(set(entry_points(group=group, name=name)), key=_distribution)
+    found = sorted(set(_installed(group).select(name=name)), key=_distribution)
     if not found:
         return None
     if len(found) > 1:
