@@ -224,7 +224,7 @@ class GraphSlam(MapView):
         self._landmarks.review(self.keyframes, everything=everything is not None)
         if everything is None:
             self.backend.update(keyframe)
-            self._kidnaps.check(self.keyframes.ids, now_ns)
+            self._kidnaps.check(self.keyframes, now_ns)
         else:
             report = self.backend.optimize(keyframe, everything)
         report = self.backend.scale_noise(self.keyframes, everything) or report

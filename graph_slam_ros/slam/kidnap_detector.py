@@ -20,6 +20,7 @@ from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, DisplacementHypothesis, DisplacementSearch
 from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
+from graph_slam_ros.slam.robust.odometry_hypotheses import Moved
 from graph_slam_ros.slam.slip_detector import Slip, SlipDetector
 from graph_slam_ros.typing import Array, Numbers
 
@@ -189,19 +190,21 @@ class KidnapDetector:
                 case "closures":
                     self._slips.add_seen(edge, max(vertices), one.label)
 
-    def check(self, vertices: NDArray[np.int64], stamp_ns: int) -> None:
+    def check(self, keyframes: StampedPoses[Keyframe], stamp_ns: int) -> None:
         """Look at the evidence after a solve.
 
         Parameters
         ----------
-        vertices : of all keyframes
         stamp_ns : of the newest odometry
         """
+        vertices = keyframes.ids
         if not self._backend.decides:
             return
-        self._slips.check(len(vertices) - 1, stamp_ns)
         found = self._significant(int(vertices[-1]))
-        if found is not None and self._is_decided(found):
+        is_decided = found is not None and self._is_decided(found)
+        if self._slips.check(keyframes, stamp_ns, self._moved_to(found), is_decided=is_decided):
+            found = None
+        if found is not None and is_decided:
             last = self._splits[-1] if self._splits else None
             if last and self._is_refuted(last, found, int(vertices[-1])):
                 self._revoke(last, found, vertices, stamp_ns)
@@ -210,6 +213,13 @@ class KidnapDetector:
             found = None
         self._note(found, stamp_ns)
         self._protect()
+
+    def _moved_to(self, found: DisplacementHypothesis | None) -> Moved | None:
+        """The place to which the robot was moved, if it was."""
+        if found is None:
+            return None
+        T_map_chain = found.T_map_chain
+        return Moved(found.first, lambda vertex: self._space.group.compose(T_map_chain, self._search.chain(vertex)))
 
     def _is_refuted(self, split: _Split, found: DisplacementHypothesis, newest: int) -> bool:
         """Return whether the robot is where it would be without a segment, but for odometry's drift since it began."""
@@ -294,6 +304,7 @@ class KidnapDetector:
             self._segments.append(index)
         self._search.begin(found.first)
         self._monitor.begin(found.first)
+        self._slips.begin(stamp_ns, found.first)
         now, alarm = self.now, Alarm(stamp_ns, found.evidence, None, index, distance_m, angle_rad)
         if now is not None and now.segment is None:
             self.alarms[-1] = replace(alarm, began_ns=now.began_ns)
@@ -326,6 +337,7 @@ class KidnapDetector:
             self._segments.remove(split.index)
         self._search.begin(found.first)
         self._monitor.begin(found.first)
+        self._slips.begin(stamp_ns, found.first)
         wrong = self.alarms[split.alarm]
         if self.now is not None and self.now != wrong:
             self.alarms[-1] = replace(self.now, ended_ns=stamp_ns, outcome="the displacement before is taken back")

@@ -1,15 +1,15 @@
 """Detection of slip: stretches of odometry whose errors are larger than its noise.
 
-A view is everything that was measured from one keyframe. If the last 1, 4 or 16 views contradict odometry, each of
-their keyframes is tested as the start of a slip, of translation or of rotation. The best hypothesis must exceed the
-odds against a slip, also without any one landmark. Then edges with more noise replace the odometry edges of the
-stretch, and new odometry gets more noise, too. The slip ends when odometry with its own noise is likelier again for
-some views. If that is true of the whole stretch, the slip is taken back, and everything is as before.
+A view is everything that was measured from one keyframe. If the last 1 to 16 views contradict odometry, some of their
+keyframes are tested as the start of a slip, of translation or of rotation, beside the hypothesis that the robot was
+moved. The best must be a slip, exceed the odds against it, and be likelier than none also without any one landmark.
+Then edges with more noise replace the odometry edges of the stretch, and new odometry gets more noise, too. The slip
+ends when odometry with its own noise is likelier again for some views. If that is true of the whole stretch, the slip
+is taken back, and everything is as before.
 """
 
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,23 +21,35 @@ from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
+from graph_slam_ros.slam.frontend.keyframes import Keyframe
+from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.measured_noise import MeasuredNoise
 from graph_slam_ros.slam.odometry_edges import replace_odometry, restore_odometry
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.odometry_errors import OdometryErrors, odometry_errors
+from graph_slam_ros.slam.robust.odometry_hypotheses import (
+    CARRIED,
+    SLIPS,
+    Choice,
+    HypothesisTest,
+    Moved,
+    OdometryFilter,
+    Stretch,
+)
+from graph_slam_ros.slam.slip_noise import SlipNoise
+from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array
 
 _VIEWS = 16
-_SUMS = (1, 4, 16)  # views whose innovations are summed
-_SURE = 1.0 - 1e-6  # probability with which clean measurements raise no alarm
+_SUMS = (1, 2, 4, 8, 16)  # views whose innovations are summed
+_SURE = 1.0 - 1e-6  # probability with which clean measurements cause no comparison
 _CAP = 0.9999  # no innovation counts for more than this quantile: one alone does not decide
+_SINCE = (1, 2, 4, 6, 8, 12, 16)  # views before which a slip may have begun
 _EARLIER = (1, 2, 3, 4, 6, 8)  # edges by which a slip may have begun before it was found
 _SURELY = 1.0  # logarithm of the likelihood ratio that this needs
 _AGAIN = (8, 12, 16)  # views for which odometry must be as likely by its own noise, for a slip to end
 _MOST_EDGES = 60
 _FACTOR = 1.5  # all noise may be larger than stated by this factor
-_LASTS_S = 0.5  # correlation time of the errors of a slip
-_SHARED = 0.5  # sigma of the fraction of the motion that is lost in the whole stretch
-_OTHERS = 1.0 / 3.0  # sigma along the other axes, relative to the first
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +132,9 @@ class SlipDetector:
         self._links: deque[_Link] = deque(maxlen=_MOST_EDGES)
         self._views: deque[_View] = deque(maxlen=_VIEWS + 1)
         self._new: list[int] = []  # edges that came since the last check, whose innovation is not known yet
-        self._added: set[int] = set()  # edges that replace others
+        self._replacing: set[int] = set()  # edges that replace others
         self._checked = -1
+        self._noise, self._added = MeasuredNoise(space, backend), SlipNoise(space, odometry)
         self.slips: list[Slip] = []
 
     @property
@@ -134,19 +147,21 @@ class SlipDetector:
         vertices = tuple(self._backend.graph.edge(edge).vertices)
         return next((link.edge for link in self._links if link.vertices == vertices), edge)
 
-    def begin(self, stamp_ns: int) -> None:
-        """Begin a segment: earlier odometry is not examined any more."""
-        self._links.clear()
-        self._views.clear()
-        self._new.clear()
+    def begin(self, stamp_ns: int, vertex: int | None = None) -> None:
+        """Begin a segment, by default at the next keyframe: earlier odometry is not examined any more."""
+        self._links = deque(
+            (one for one in self._links if vertex is not None and one.vertices[0] >= vertex), _MOST_EDGES
+        )
+        self._views = deque((one for one in self._views if vertex is not None and one.vertex >= vertex), _VIEWS + 1)
+        self._new = [edge for edge in self._new if any(edge in view.edges for view in self._views)]
         if (now := self.now) is not None:
             self.slips[-1] = replace(now, ended_ns=stamp_ns)
 
     def add_odometry(self, edge: int, vertices: Sequence[int], stamps_ns: tuple[int, int], keyframe: int) -> None:
         """Add the odometry edge from one keyframe to the next. During a slip it gets more noise."""
         link = _Link(edge, edge, (vertices[0], vertices[1]), stamps_ns)
-        if edge in self._added or (self._links and self._links[-1].vertices == link.vertices):
-            self._added.discard(edge)  # it replaces another, or another odometry measured the same motion
+        if edge in self._replacing or (self._links and self._links[-1].vertices == link.vertices):
+            self._replacing.discard(edge)  # it replaces another, or another odometry measured the same motion
             return
         if self._links and self._links[-1].vertices[1] != link.vertices[0]:
             self.begin(stamps_ns[0])
@@ -164,29 +179,37 @@ class SlipDetector:
             view.seen.append(what)
             self._new.append(edge)
 
-    def check(self, keyframe: int, stamp_ns: int) -> None:
-        """Examine the evidence after a solve.
+    def check(
+        self, keyframes: StampedPoses[Keyframe], stamp_ns: int, moved: Moved | None = None, *, is_decided: bool = False
+    ) -> bool:
+        """Examine the evidence after a solve. Returns whether a slip explains it better than that the robot was moved.
 
         Parameters
         ----------
-        keyframe : index of the newest
         stamp_ns : of the newest odometry
+        moved : where the robot may have been moved to
+        is_decided : whether it is decided now, if a slip does not explain it better
         """
         self._store_innovations()
         newest = self._views[-1].vertex if self._views else -1
-        if not self._config.doubt or newest == self._checked or len(self._views) < 2 or not self._stretch():
-            return
-        self._checked = newest
-        now = self.now
-        if now is None and not self._is_alarmed():
-            return
+        if not self._config.doubt or len(self._views) < 2 or not self._stretch():
+            return False
+        keyframe = len(keyframes) - 1
+        is_new, self._checked = newest != self._checked, newest
         try:
-            if now is None:
-                self._search_slip(keyframe, stamp_ns)
-            else:
-                self._update_slip(now, keyframe, stamp_ns)
+            if self.now is None and (is_decided or (is_new and self._is_alarmed())):
+                choice = self._compare(moved, keyframes)
+                if choice.is_slip:
+                    self._begin_slip(choice, keyframe, stamp_ns)
+                return choice.is_slip
+            if self.now is None or not is_new:
+                return False
+            explains = is_decided and self._compare(moved, keyframes).kind != CARRIED
+            self._update_slip(self.now, keyframe, stamp_ns)
+            return explains
         except (GraphSlamError, np.linalg.LinAlgError) as error:
             self._counters.count("odometry", type(error).__name__)
+            return False
 
     # -- alarm -----------------------------------------------------------------------------------------------------
 
@@ -223,24 +246,52 @@ class SlipDetector:
         backend = self._backend
         return odometry_errors(backend.graph, backend.solver, [link.edge for link in links], _FACTOR)
 
-    def _search_slip(self, keyframe: int, stamp_ns: int) -> None:
-        links = self._stretch()
-        errors, best, prior = self._errors(links), (0.0, "", 0), -float(np.log(self._config.doubt_odds))
-        firsts = sorted({self._first_of(links, since) for since in range(1, len(self._views))})
-        for kind in ("translation", "rotation"):
-            added = self._added_noise(links, kind)
-            for first in firsts:
-                gain = errors.log_ratio(*self._between(added, first)) - prior
-                best = max(best, (gain, kind, first), key=lambda one: one[0])
-        gain, kind, first = best
-        voters = self._voters(links[first].vertices[0]) if kind else set()
-        if len(voters) < 2 or not self._holds_without_any(voters, links, first, kind):
-            return
-        slip = Slip(kind, links[first].stamps_ns[0], stamp_ns, 2.0 * (gain + prior), len(voters))
+    def _begin_slip(self, choice: Choice, keyframe: int, stamp_ns: int) -> None:
+        links = self._stretch()[choice.first :]
+        began_ns, vertex = links[0].stamps_ns[0], links[0].vertices[0]
+        slip = Slip(choice.kind, began_ns, stamp_ns, 2.0 * choice.log_ratio, len(choice.voters))
         self.slips.append(slip)
         self._counters.count("odometry", "slip")
-        self._replace(links[first:], slip, keyframe)
-        self._admit_since(links[first].vertices[0], keyframe)
+        self._replace(links, slip, keyframe)
+        self._admit_since(vertex, keyframe)
+
+    def _compare(self, moved: Moved | None, keyframes: StampedPoses[Keyframe]) -> Choice:
+        """Compare the hypotheses on the window: odometry's noise, a slip from each view on, and that it was moved."""
+        links = self._stretch()
+        first = links[0].vertices[0]
+        seen = {view.vertex: self._known_seen(view, first) for view in self._views if view.vertex > first}
+        self._noise.measure(keyframes)
+        stretch = Stretch([link.edge for link in links], seen, self._noise.of_odometry, self._noise.of_all)
+        without = self._without(edge for of_view in seen.values() for edge, _ in of_view)
+        filtered = OdometryFilter(self._space, self._backend.graph, without, stretch)
+        compared = HypothesisTest(filtered, self._space, self._config.doubt_odds)
+        firsts = sorted({self._first_of(links, since) for since in _SINCE if since < len(self._views)})
+        for kind in SLIPS:
+            variances, shared = (numbers.reshape(len(links), -1) for numbers in self._added_noise(links, kind))
+            for k in firsts:
+                compared.add_slip(kind, k, variances, shared)
+        if moved is not None:
+            k = next((k for k, link in enumerate(links) if link.vertices[1] >= moved.first), len(links) - 1)
+            there = moved.pose_of(links[k].vertices[1])
+            compared.add_moved(k, there, self._config.jump_sigma_m, self._config.jump_sigma_rad)
+        return compared.choice()
+
+    def _known_seen(self, view: _View, first: int) -> list[tuple[int, int | str]]:
+        """Edges of a view of what was known at a keyframe, held back or not, and what they are of."""
+        ledger = self._backend.ledger
+        return [
+            (edge, what)
+            for edge, what in zip(view.edges, view.seen, strict=True)
+            if edge < len(ledger) and not ledger.is_withdrawn(edge) and self._is_determined(what, first)
+        ]
+
+    def _is_determined(self, what: int | str, first: int) -> bool:
+        """Return whether one observation up to a keyframe determines a landmark: then the rest can be left out."""
+        if isinstance(what, str) or not self._is_known(what, first):
+            return isinstance(what, str)
+        backend, dof = self._backend, self._backend.graph.kind_of(what).dof
+        edges = [backend.graph.edge(edge) for edge in backend.solver.edges_on(what) if backend.ledger.is_inside(edge)]
+        return any(one.vertices[0] <= first and one.type.residual_size >= dof for one in edges)
 
     def _first_of(self, links: Sequence[_Link], since: int) -> int:
         """The first link after the view that precedes the last ``since`` views."""
@@ -249,8 +300,9 @@ class SlipDetector:
 
     def _added_noise(self, links: Sequence[_Link], kind: str) -> tuple[Array, Array]:
         """Variances (n dof,) that a slip adds to links, and sigmas (n dof,) of the error that all links share."""
-        variances = [self._slip_of(link, kind) for link in links]
-        return np.concatenate(variances), _SHARED * np.concatenate([self._motion(link, kind) for link in links])
+        variances = [self._added.variances(kind, link.seconds) for link in links]
+        measured = [self._backend.graph.edge(link.edge).measured for link in links]
+        return np.concatenate(variances), np.concatenate([self._added.shared(kind, one) for one in measured])
 
     def _between(self, added: tuple[Array, Array], first: int, end: int | None = None) -> tuple[Array, Array]:
         """Return the added noise of the links from ``first`` up to ``end``, and zero for the others."""
@@ -259,66 +311,17 @@ class SlipDetector:
         is_part[first * dof : None if end is None else end * dof] = True
         return added[0] * is_part, added[1] * is_part
 
-    def _slip_of(self, link: _Link, kind: str) -> Array:
-        """Variances (dof,) that a slip adds to a link."""
-        n, seconds = self._space.dimensions, link.seconds
-        sigmas = np.zeros(self._space.dof)
-        if kind == "translation":
-            sigmas[:n] = self._config.doubt_m_s * seconds * _OTHERS
-            sigmas[0] = self._config.doubt_m_s * seconds
-        else:
-            sigmas[n:] = self._config.doubt_rad_s * seconds * _OTHERS
-            sigmas[-1] = self._config.doubt_rad_s * seconds
-        return np.asarray(sigmas**2 * max(1.0, _LASTS_S / max(seconds, 1e-9)))
-
-    def _motion(self, link: _Link, kind: str) -> Array:
-        """The translation or the rotation (dof,) of a link."""
-        space, out = self._space, np.zeros(self._space.dof)
-        measured = tuple(self._backend.graph.edge(link.edge).measured.tolist())
-        motion = np.asarray(space.group.local(space.identity, measured), dtype=float)
-        of_kind = slice(space.dimensions) if kind == "translation" else slice(space.dimensions, None)
-        out[of_kind] = motion[of_kind]
+    def _without(self, edges: Iterable[int]) -> Solver:
+        """A copy of the problem without some edges; so an alarm alone changes nothing."""
+        solver, ledger, graph = self._backend.solver, self._backend.ledger, self._backend.graph.copy()
+        graph.set_weights(np.array([edge for edge in edges if ledger.is_inside(edge)], dtype=np.int64), 0.0)
+        out = Solver(graph, solver.settings)
+        out.add(solver.vertices, range(self._backend.handed_over[1]))
+        out.start_at(solver.values)
+        for vertex in solver.held.tolist():
+            out.hold(vertex)
+        out.update()
         return out
-
-    def _voters(self, since: int) -> set[int | str]:
-        """Known landmarks, and other classes, with an accepted edge since a keyframe."""
-        ledger = self._backend.ledger
-        return {
-            what
-            for view in self._views
-            if view.vertex >= since
-            for edge, what in zip(view.edges, view.seen, strict=True)
-            if edge < len(ledger) and ledger.is_inside(edge) and self._is_known(what, self._views[0].vertex)
-        }
-
-    def _holds_without_any(self, voters: set[int | str], links: Sequence[_Link], first: int, kind: str) -> bool:
-        """Return whether the evidence is for a slip also without any one landmark or class."""
-        added = self._between(self._added_noise(links, kind), first)
-        for one in sorted(voters, key=str):
-            with self._without(one):
-                if self._errors(links).log_ratio(*added) <= 0.0:
-                    return False
-        return True
-
-    @contextmanager
-    def _without(self, what: int | str) -> Iterator[None]:
-        """Leave out the edges of one landmark, or of one class, in the window."""
-        solver, ledger = self._backend.solver, self._backend.ledger
-        edges = [
-            edge
-            for view in self._views
-            for edge, other in zip(view.edges, view.seen, strict=True)
-            if other == what and edge < len(ledger) and ledger.is_inside(edge)
-        ]
-        for edge in edges:
-            solver.set_weight(edge, 0.0)
-        try:
-            solver.update()
-            yield
-        finally:
-            for edge in edges:
-                solver.set_weight(edge, 1.0)
-            solver.update()
 
     # -- the end -----------------------------------------------------------------------------------------------------
 
@@ -380,12 +383,10 @@ class SlipDetector:
         own = [link.edge for link in links]
         noises = []
         for link in links:
-            root = graph.edge(link.edge).sqrt_information
-            noises.append(
-                Gaussian.from_covariance(np.linalg.inv(root.T @ root) + np.diag(self._slip_of(link, slip.kind)))
-            )
+            root, added = graph.edge(link.edge).sqrt_information, self._added.variances(slip.kind, link.seconds)
+            noises.append(Gaussian.from_covariance(np.linalg.inv(root.T @ root) + np.diag(added)))
         new = replace_odometry(self._backend, own, noises, keyframe, slip.evidence, threshold)
-        self._added.update(new)
+        self._replacing.update(new)
         for link, edge in zip(links, new, strict=True):
             link.edge = edge
         self.slips[-1] = replace(slip, edges=slip.edges + len(new))

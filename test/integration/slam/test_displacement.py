@@ -15,7 +15,7 @@ from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
-DISPLACED = ("odometry", "displaced")
+DISPLACED, SLIP = ("odometry", "displaced"), ("odometry", "slip")
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,8 @@ class Driven:
             alarm = self.slam.displaced
             if alarm is not None:
                 self.alarmed_s = self.alarmed_s or (alarm.began_ns - event_ns) * 1e-9
-            if m.stamp_ns > event_ns > 0 and not (alarm and alarm.segment) and not self.slam.counters[DISPLACED]:
+            is_decided = (alarm and alarm.segment) or self.slam.counters[DISPLACED] or self.slam.counters[SLIP]
+            if m.stamp_ns > event_ns > 0 and not is_decided:
                 before = self.slam.trajectory()[self.slam.keyframes.stamps_ns <= event_ns, :2]
                 reference = before if reference is None else reference
                 self.moved_m = max(self.moved_m, float(np.linalg.norm(before - reference, axis=1).max()))
@@ -89,6 +90,7 @@ def test_G23_a_robot_that_was_carried_is_found_and_the_path_before_stays(recordi
     assert alarm.distance_m == pytest.approx(10.0, abs=0.6)
     assert slam.segments == [0, alarm.segment]
     assert slam.counters[DISPLACED] == 1
+    assert not slam.counters[SLIP]
     found, was_before = errors(slam, faulty), slam.keyframes.stamps_ns <= event_ns
     assert found[was_before].max() < clean.max() + 0.1
     assert found[~was_before].max() < clean.max() + 0.1
@@ -107,6 +109,8 @@ def test_G23_slipping_wheels_are_found_and_the_path_before_stays(recording):
     driven = Driven(faulty, event_ns)
     assert 0.0 < driven.alarmed_s < 5.0
     assert driven.moved_m < 0.05
+    assert driven.slam.counters[SLIP]
+    assert driven.slam.segments == [0]  # nobody carried it
     found, was_before = errors(driven.slam, faulty), driven.slam.keyframes.stamps_ns <= event_ns
     assert found[was_before].max() < 0.6  # more than a metre where nobody doubts odometry
     assert found.max() < 3.0
@@ -119,6 +123,8 @@ def test_G23_a_robot_that_is_carried_while_it_looks_is_found_and_the_path_before
     assert 0.0 < driven.alarmed_s < 5.0  # while odometry stands still
     assert driven.moved_m < 0.05
     assert errors(driven.slam, faulty)[-1] < 0.5
+    assert driven.slam.counters[DISPLACED]
+    assert not driven.slam.counters[SLIP]
 
 
 @pytest.mark.parametrize("sensor", times(["bearing"], ["range", "bearing"]))

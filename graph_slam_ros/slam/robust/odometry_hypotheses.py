@@ -1,0 +1,297 @@
+"""Hypotheses on a stretch of odometry, compared by the likelihood of what was seen along it.
+
+Odometry has its own noise there (tight), its errors are larger from a keyframe on (slip), or the robot was moved at one
+(carried). Under each the stretch is filtered anew: an extended Kalman filter of the newest pose and of all that was
+seen, which begins with the joint covariance that the solver has without these observations. An observation that does
+not fit costs the same under each hypothesis and changes nothing. So observations that the pipeline holds back are
+evidence, too, and wrong ones decide nothing. This is the generalized likelihood ratio test of Willsky and Jones ("A
+generalized likelihood ratio approach to the detection and estimation of jumps in linear systems", 1976).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_solve
+
+from graph_slam_ros.chi_square import quantile
+from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.solver import Solver
+from graph_slam_ros.solver.linearization import linearized
+from graph_slam_ros.typing import Array, Numbers
+
+TIGHT, CARRIED = "tight", "carried"
+SLIPS = ("translation", "rotation")
+_LOG_ODDS_MOVED = float(np.log(1e-2))  # of a robot that was moved, relative to one that slipped
+_LEAST_FITTING = 0.6  # part of what was seen since then that a slip must explain
+_CAP = 0.9999  # an observation beyond this quantile does not fit
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Errors of n edges of odometry that are added to their own noise.
+
+    Attributes
+    ----------
+    variances : (n, dof) of errors that differ from edge to edge
+    shared : (n, dof) sigmas of one error that is the same in all
+    jump : the edge, by its place, across which the robot was moved
+    there : pose in map of the keyframe after that edge
+    jump_variances : (dof,) of that pose
+    """
+
+    variances: Array
+    shared: Array
+    jump: int | None = None
+    there: Numbers = ()
+    jump_variances: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """A chain of odometry edges, and what was seen from its keyframes.
+
+    Attributes
+    ----------
+    links : the edges, in order
+    seen : of each keyframe, by its vertex, edges and what they are of
+    factors : (dof,) by which odometry's sigmas are larger than stated
+    noise_factor : all noise may be so many times larger
+    """
+
+    links: Sequence[int]
+    seen: Mapping[int, Sequence[tuple[int, int | str]]]
+    factors: Array
+    noise_factor: float
+
+
+@dataclass(slots=True)
+class _State:
+    """The newest pose, the shared error and all that was seen: stored values, and the joint covariance of errors.
+
+    The cost is minus twice the logarithm of the likelihood so far; observations that do not fit are counted.
+    """
+
+    x: Array
+    pose: int
+    shared: float
+    covariance: Array
+    cost: float = 0.0
+    unfit: int = 0
+
+
+class OdometryFilter:
+    """Likelihood of a stretch under hypotheses on its odometry.
+
+    Parameters
+    ----------
+    solver : without the observations of the stretch
+
+    Raises
+    ------
+    GaugeError, SingularError
+        As for ``Solver.joint_marginal``.
+    """
+
+    def __init__(self, space: Geometry, graph: Graph, solver: Solver, stretch: Stretch) -> None:
+        self._space, self._graph, self._stretch = space, graph, stretch
+        self._steps = [graph.edge(link) for link in stretch.links]
+        chain = {vertex for step in self._steps for vertex in step.vertices}
+        first = self._steps[0].vertices[0]
+        edges = [edge for seen in stretch.seen.values() for edge, _ in seen]
+        self._others = sorted({vertex for edge in edges for vertex in graph.edge(edge).vertices} - chain)
+        joint = solver.joint_marginal([first, *self._others])
+        dof = space.dof
+        self._columns, at = dict[int, slice](), dof + 1
+        for vertex in self._others:
+            self._columns[vertex] = slice(at, at + graph.kind_of(vertex).dof)
+            at += graph.kind_of(vertex).dof
+        covariance = np.zeros((at, at))
+        kept = np.r_[0:dof, dof + 1 : at]
+        covariance[np.ix_(kept, kept)] = joint
+        covariance[dof, dof] = 1.0 / stretch.noise_factor**2
+        self._start = _State(solver.values, first, 0.0, covariance)
+        self._tight = list[_State]()  # before each edge, with odometry's own noise
+
+    @property
+    def size(self) -> int:
+        """The number of edges."""
+        return len(self._steps)
+
+    def seen_since(self, first: int) -> list[int | str]:
+        """Landmarks, by vertex, and other classes that were seen after an edge, by its place."""
+        vertices = [step.vertices[1] for step in self._steps[first:]]
+        return sorted({what for v in vertices for _, what in self._stretch.seen.get(v, ())}, key=str)
+
+    def log_likelihood(self, errors: Errors, first: int, without: int | str | None = None) -> float:
+        """Return the logarithm of the likelihood of what was seen, but for a constant.
+
+        Parameters
+        ----------
+        first : the first edge that has more errors than its noise, by its place
+        without : what is left out
+        """
+        state, begin = self._start, 0
+        if without is None and len(self._tight) > first:
+            state, begin = self._tight[first], first
+        return -0.5 * self._filtered(state, begin, errors, first, without).cost
+
+    def fitting(self, errors: Errors, first: int) -> float:
+        """Return the part of what was seen after an edge that fits."""
+        begin = self._tight[first]
+        end = self._filtered(begin, first, errors, first)
+        count = sum(len(self._stretch.seen.get(step.vertices[1], ())) for step in self._steps[first:])
+        return 1.0 - (end.unfit - begin.unfit) / max(1, count)
+
+    def _filtered(
+        self, state: _State, begin: int, errors: Errors, first: int, without: int | str | None = None
+    ) -> _State:
+        """Filter what was seen from an edge on."""
+        for k in range(begin, len(self._steps)):
+            if without is None and first == len(self._steps):
+                self._tight.append(state)
+            state = replace(state, x=state.x.copy(), covariance=state.covariance.copy())
+            self._move(state, k, errors)
+            for edge, what in self._stretch.seen.get(self._steps[k].vertices[1], ()):
+                if what != without:
+                    self._observe(state, edge)
+        return state
+
+    def _move(self, state: _State, k: int, errors: Errors) -> None:
+        """Move the pose along one edge of odometry."""
+        space, step, dof, scale = self._space, self._steps[k], self._space.dof, self._stretch.noise_factor**2
+        group, x = space.group, state.x
+        before = tuple(x[self._graph.vertex(state.pose).stored].tolist())
+        slid = tuple((errors.shared[k] * state.shared).tolist())
+        motion = group.retract(tuple(step.measured.tolist()), slid)
+        pose = group.compose(before, motion)
+        root = step.sqrt_information
+        added = np.linalg.inv(root.T @ root) * np.outer(self._stretch.factors, self._stretch.factors)
+        added += np.diag(errors.variances[k]) / scale
+        if errors.jump == k and errors.jump_variances is not None:
+            pose = errors.there
+            added += np.diag(errors.jump_variances) / scale
+        transition = np.eye(len(state.covariance))
+        transition[:dof, :dof] = group.adjoint(group.inverse(motion))
+        transition[:dof, dof] = errors.shared[k]
+        state.covariance = transition @ state.covariance @ transition.T
+        state.covariance[:dof, :dof] += added
+        state.pose = step.vertices[1]
+        x[self._graph.vertex(state.pose).stored] = pose
+
+    def _observe(self, state: _State, edge: int) -> None:
+        """Add an observation. The state follows it if it fits."""
+        one, dof = self._graph.edge(edge), self._space.dof
+        if any(vertex != state.pose and vertex not in self._columns for vertex in one.vertices):
+            return  # it is between two keyframes of the stretch
+        columns = np.concatenate([np.r_[slice(0, dof) if v == state.pose else self._columns[v]] for v in one.vertices])
+        residual, jacobian = linearized(self._graph, state.x, one.type, one.vertices, one.measured)
+        root = one.sqrt_information
+        noise = np.linalg.inv(root.T @ root)
+        gain = state.covariance[:, columns] @ jacobian.T
+        spread = jacobian @ gain[columns] + noise
+        factor = np.linalg.cholesky(spread)
+        solved = cho_solve((factor, True), residual)
+        statistic, cap = float(residual @ solved) / self._stretch.noise_factor**2, quantile(_CAP, len(residual))
+        if statistic > cap:
+            state.cost += cap
+            state.unfit += 1
+            return
+        self._correct(state, -gain @ solved)
+        state.covariance -= gain @ cho_solve((factor, True), gain.T)
+        state.cost += statistic + 2.0 * float(np.log(np.diag(factor)).sum() + np.linalg.slogdet(root)[1])
+
+    def _correct(self, state: _State, step: Array) -> None:
+        x, dof = state.x, self._space.dof
+        state.shared += float(step[dof])
+        for vertex, columns in ((state.pose, slice(0, dof)), *self._columns.items()):
+            one = self._graph.vertex(vertex)
+            x[one.stored] = one.kind.retract(x[one.stored][None], step[columns][None])[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """A place to which the robot may have been moved.
+
+    Attributes
+    ----------
+    first : vertex of the first keyframe there
+    pose_of : pose in map of such a keyframe, by its vertex
+    """
+
+    first: int
+    pose_of: Callable[[int], Numbers]
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The hypothesis of highest probability.
+
+    Attributes
+    ----------
+    kind : ``tight``, ``translation`` or ``rotation`` (a slip), or ``carried``
+    first : place of the first edge of odometry that it concerns
+    log_ratio : logarithm of the likelihood ratio to ``tight``
+    voters : landmarks, and other classes of edges, without which that is less
+    is_sure : whether it is above 0 also without any one of them
+    fitting : the part of what was seen since then that fits
+    """
+
+    kind: str
+    first: int = 0
+    log_ratio: float = 0.0
+    voters: tuple[int | str, ...] = ()
+    is_sure: bool = False
+    fitting: float = 1.0
+
+    @property
+    def is_slip(self) -> bool:
+        """Return whether at least two landmarks or classes say that odometry slipped, and that explains most of it."""
+        return self.kind in SLIPS and self.is_sure and len(self.voters) >= 2 and self.fitting >= _LEAST_FITTING
+
+
+class HypothesisTest:
+    """Compares hypotheses on a stretch of odometry with the one that its noise is as stated.
+
+    Parameters
+    ----------
+    odds : of a slip, before anything is seen
+    """
+
+    def __init__(self, filtered: OdometryFilter, space: Geometry, odds: float) -> None:
+        self._filter, self._space = filtered, space
+        self._log_odds = float(np.log(odds))
+        self._none = np.zeros((filtered.size, space.dof))
+        self._tight = Errors(self._none, self._none)
+        self._best = (0.0, TIGHT, 0, self._tight)
+        self._likelihood = filtered.log_likelihood(self._tight, filtered.size)
+
+    def add_slip(self, kind: str, first: int, variances: Array, shared: Array) -> None:
+        """Consider a slip from an edge on, with variances (n, dof) and shared sigmas (n, dof) of all edges."""
+        is_part = (np.arange(len(variances)) >= first)[:, None]
+        self._add(kind, first, Errors(variances * is_part, shared * is_part), self._log_odds)
+
+    def add_moved(self, first: int, there: Numbers, sigma_m: float, sigma_rad: float) -> None:
+        """Consider that the robot was moved across an edge."""
+        variances = np.square(self._space.sigmas(sigma_m, sigma_rad))
+        errors = Errors(self._none, self._none, first, there, variances)
+        self._add(CARRIED, first, errors, self._log_odds + _LOG_ODDS_MOVED)
+
+    def _add(self, kind: str, first: int, errors: Errors, log_odds: float) -> None:
+        gain = self._filter.log_likelihood(errors, first) - self._likelihood + log_odds
+        self._best = max(self._best, (gain, kind, first, errors), key=lambda one: one[0])
+
+    def choice(self) -> Choice:
+        """Return the best."""
+        gain, kind, first, errors = self._best
+        if kind not in SLIPS:
+            return Choice(kind, first)
+        ratio, voters, is_sure = gain - self._log_odds, list[int | str](), True
+        for one in self._filter.seen_since(first):
+            tight = self._filter.log_likelihood(self._tight, self._filter.size, one)
+            without = self._filter.log_likelihood(errors, first, one) - tight
+            is_sure &= without > 0.0
+            if without < ratio:
+                voters.append(one)
+        return Choice(kind, first, ratio, tuple(voters), is_sure, self._filter.fitting(errors, first))
