@@ -4,6 +4,7 @@
 are revisited. The path is not read: what is measured is the update and the newest pose.
 """
 
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,8 +20,10 @@ from benchmarks.contenders import ONLINE_PEERS, OURS
 from benchmarks.drive import Drive, drive
 from benchmarks.fresh import ROOT
 from benchmarks.problem import Problem, city_problem
+from graph_slam_ros.colours import LIGHT
 
 PICTURE = ROOT / "docs/growth.png"
+COLOURS = [LIGHT[name] for name in ("estimate", "odometry", "truth", "landmarks", "closures")]  # ours is the first
 _WINDOWS_PER_DECADE = 6
 _SMALLEST = 300
 
@@ -62,26 +65,42 @@ def draw(rows: Sequence[table.Row], picture: Path = PICTURE) -> None:
     """Time per update over the size of the graph."""
     figure = Figure(figsize=(7.0, 4.0), layout="constrained")
     axes = figure.add_subplot()
-    for color, name in enumerate(dict.fromkeys(row["who"] for row in rows)):
+    for colour, name in zip(COLOURS, dict.fromkeys(row["who"] for row in rows), strict=False):
         for key, style, about in (("closure_s", "o-", "with a closure"), ("odometry_s", "o:", "odometry alone")):
             mine = [row for row in rows if row["who"] == name and row[key] is not None]
             size = [np.sqrt(row["from"] * row["to"]) for row in mine]
             time_ms = [1e3 * row[key] for row in mine]
-            axes.loglog(size, time_ms, style, color=f"C{color}", markersize=3, label=f"{name}, {about}")
+            axes.loglog(size, time_ms, style, color=colour, markersize=3, label=f"{name}, {about}")
     axes.set(xlabel="poses", ylabel="CPU time per update [ms]")
     axes.grid(which="both", alpha=0.3)
     axes.legend()
     figure.savefig(picture, dpi=120)
 
 
+def recorded() -> list[table.Row]:
+    """The rows of the table in docs/benchmarks.md."""
+    lines = re.findall(r"^\| (\d+) to (\d+) \| (\S+) \| (\S+) \| (\S+) \|$", table.DOCUMENT.read_text("utf-8"), re.M)
+
+    def seconds(text: str) -> float | None:
+        return None if text == "-" else 1e-6 * float(text)
+
+    return [
+        {"who": who, "from": int(low), "to": int(high), "odometry_s": seconds(plain), "closure_s": seconds(closure)}
+        for low, high, who, plain, closure in lines
+    ]
+
+
 def main() -> None:
     """The programme."""
     parser = options.parser(__doc__, ONLINE_PEERS, ("isam2-10",))
+    parser.add_argument("--redraw", action="store_true", help="only draw the table of docs/benchmarks.md again")
     options.add_patience(parser)
     parser.add_argument("--poses", type=int, default=100_000, metavar="N", help="for ours")
     parser.add_argument("--peer-poses", type=int, default=20_000, metavar="N", help="for the peers")
     parser.add_argument("--picture", type=Path, default=PICTURE, metavar="FILE.png")
     args = parser.parse_args()
+    if args.redraw:
+        return draw(recorded(), args.picture)
     rows = measure(args.poses, args.peer_poses, args.peers, args.patience)
     draw(rows, args.picture)
     table.finish(table.results("growth", rows), args.json)

@@ -8,15 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.analysis.colours import LIGHT
+from graph_slam_ros.analysis.evaluation import dimensions_of, input_topics, scored_drive
+from graph_slam_ros.analysis.path_error import matched
 from graph_slam_ros.analysis.plots import canvas, dress
+from graph_slam_ros.analysis.trajectories import read_truth
+from graph_slam_ros.colours import LIGHT
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.lie import se3
 from graph_slam_ros.runs.folder import recording_of, run_config
 from graph_slam_ros.runs.journal import read_measurements
 from graph_slam_ros.runs.map_journal import read_map
-from graph_slam_ros.runs.trajectory import read_tum
+from graph_slam_ros.runs.trajectory import Trajectory, read_tum
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.typing import Array
 
@@ -27,23 +30,32 @@ _COLOURS = 64
 
 @dataclass(frozen=True, slots=True)
 class _Moment:
-    """Positions (n, 3) in the map, as they were estimated at one moment: keyframes, dead reckoning, landmarks."""
+    """Positions (n, 3) in the map, as they were estimated at one moment: keyframes, dead reckoning, landmarks.
 
+    Attributes
+    ----------
+    stamp_s : of the newest keyframe
+    """
+
+    stamp_s: float
     path: Array
     odometry: Array
     landmarks: Array
 
 
-def animate_run(run: Path, out_gif: Path, frames: int = 80) -> list[str]:
+def animate_run(
+    run: Path, out_gif: Path, frames: int = 80, truth: str | None = None, topic: str = "", *, align: bool = True
+) -> list[str]:
     """Repeat a run's drive and draw the estimate of each moment into a GIF, from above.
 
-    Dead reckoning is black and begins where the estimate does; the estimate is red. A loop closure is seen as the
-    moment at which the red path moves. The last frame is the solved graph.
+    Dead reckoning is black and begins where the estimate does; the estimate is red; truth is blue, laid on the whole
+    path. A loop closure is seen as the moment at which the red path moves. The last frame is the solved graph.
 
     Parameters
     ----------
     run : folder of a run, with its ``ingest.mcap``
     frames : at equal steps of time
+    truth, topic, align : as ``plots.draw_run`` takes them
 
     Returns
     -------
@@ -56,12 +68,12 @@ def animate_run(run: Path, out_gif: Path, frames: int = 80) -> list[str]:
     """
     if out_gif.suffix != ".gif":
         raise GraphSlamError(f"{out_gif}: an animation is a .gif file")
-    losses: list[str] = []
+    known, losses = _truth(run, truth, topic, align=align) if truth else None, list[str]()
     moments = list(_moments(run, frames, losses))
     if not moments:
         raise GraphSlamError(f"{run}: nothing of the drive can be repeated: it has no ingest.mcap, or an empty one")
     drawn = io.BytesIO()
-    images = list(_drawn(moments, recording_of(run)))
+    images = list(_drawn(moments, recording_of(run), known))
     durations = [_FRAME_MS] * (len(images) - 1) + [_LAST_MS]
     images[0].save(
         drawn, format="GIF", save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True
@@ -71,6 +83,13 @@ def animate_run(run: Path, out_gif: Path, frames: int = 80) -> list[str]:
     except OSError as error:
         raise GraphSlamError(f"{out_gif}: {error.strerror or error}") from None
     return losses
+
+
+def _truth(run: Path, truth: str, topic: str, *, align: bool) -> Trajectory:
+    """The true path in the frame map."""
+    known = read_truth(truth, topic, input_topics(run)).trajectory
+    found = matched(scored_drive(run, known).estimate, known, dimensions_of(run), align=align)
+    return known.moved(se3.inverse(found.T_truth_path))
 
 
 def _moments(run: Path, frames: int, losses: list[str]) -> Iterator[_Moment]:
@@ -96,10 +115,11 @@ def _now(slam: GraphSlam) -> _Moment:
     moved = np.stack(se3.compose(T_map_odom, tuple(odometry.T))[:3], axis=-1)
     points = [slam.solver.estimate([mark.vertex])[0] for mark in slam.landmarks.values()]
     in_space = [[*point[:2], point[2] if slam.space.dimensions == 3 else 0.0] for point in points]
-    return _Moment(poses[:, :3], moved, np.array(in_space).reshape(-1, 3))
+    stamp_s = 1e-9 * slam.keyframes[-1].stamp_ns
+    return _Moment(stamp_s, poses[:, :3], moved, np.array(in_space).reshape(-1, 3))
 
 
-def _drawn(moments: list[_Moment], title: str) -> Iterator[Any]:
+def _drawn(moments: list[_Moment], title: str, truth: Trajectory | None) -> Iterator[Any]:
     """Pillow images, one for each moment, all with the same limits."""
     from PIL import Image
 
@@ -108,17 +128,21 @@ def _drawn(moments: list[_Moment], title: str) -> Iterator[Any]:
     dress(axes)
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title=title)
     last = moments[-1]
-    everything = np.vstack([last.path, last.odometry, last.landmarks])
+    true = np.zeros((0, 3)) if truth is None else truth.poses[:, :3]
+    everything = np.vstack([last.path, last.odometry, last.landmarks, true])
     low, high = everything[:, :2].min(axis=0), everything[:, :2].max(axis=0)
     room = 0.05 * float((high - low).max()) + 0.1
     axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
+    (known,) = axes.plot([], [], color=LIGHT["truth"], linewidth=2.4, label="truth" if truth else None)
     (odometry,) = axes.plot([], [], "--", color=LIGHT["odometry"], linewidth=1.0, label="dead reckoning")
     (path,) = axes.plot([], [], color=LIGHT["estimate"], linewidth=1.6, label="estimate")
     (landmarks,) = axes.plot([], [], "*", color=LIGHT["landmarks"], label="landmarks")
     (robot,) = axes.plot([], [], "o", color=LIGHT["estimate"])
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
     for moment in moments:
+        so_far = 0 if truth is None else int(np.searchsorted(truth.stamps_s, moment.stamp_s, side="right"))
         for line, points in (
+            (known, true[:so_far]),
             (odometry, moment.odometry),
             (path, moment.path),
             (landmarks, moment.landmarks),

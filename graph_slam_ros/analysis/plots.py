@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from graph_slam_ros.analysis.colours import LIGHT, QUIET
 from graph_slam_ros.analysis.evaluation import Drive, dimensions_of, input_topics, scored_drive
 from graph_slam_ros.analysis.path_error import matched
 from graph_slam_ros.analysis.trajectories import Truth, read_truth
+from graph_slam_ros.colours import LIGHT, QUIET
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.lie import se3

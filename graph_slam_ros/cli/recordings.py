@@ -144,11 +144,12 @@ def _animate(args: argparse.Namespace) -> int:
     from graph_slam_ros.runs.folder import changed_since
     from graph_slam_ros.warmup import compile_all
 
-    if args.truth or args.out:
-        raise GraphSlamError("plot: --animate has no use for --truth or --out")
+    if args.out:
+        raise GraphSlamError("plot: --animate has no use for --out")
     console.check_file(args.animate, force=args.force)
     compile_all()
-    losses = animate_run(args.run_folder, args.animate)
+    options = {"truth": args.truth, "topic": args.topic, "align": not args.no_align}
+    losses = animate_run(args.run_folder, args.animate, **options)
     console.show(f"animation in {args.animate}")
     _suggest_next(args.run_folder)
     return console.report_losses(losses, changed_since(args.run_folder))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from graph_slam_ros.colours import DARK, rgba
 from graph_slam_ros.formats.cdr import CdrWriter
 from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array, Numbers
@@ -19,7 +20,9 @@ _ARROW, _SPHERE, _CYLINDER, _LINE_LIST, _POINTS, _TEXT = 0, 2, 3, 5, 8, 9
 _NONE = np.empty((0, 3))
 _PLAIN = np.empty((0, 4), dtype=np.float32)  # colours, where points have none of their own
 
-_OF_LANDMARKS, _OF_POSES, _OF_REJECTED = (0.9, 0.5, 0.1, 0.8), (0.3, 0.6, 1.0, 1.0), (0.8, 0.1, 0.1, 0.6)
+# RViz is dark unless it is set otherwise.
+_OF_LANDMARKS, _OF_POSES = rgba(DARK["landmarks"], 0.8), rgba(DARK["estimate"], 1.0)
+_OF_REJECTED = rgba(DARK["closures"], 0.8)
 # Green over yellow to red in even steps of hue in OKLCH and ever a little darker, for those to whom they are alike.
 _RAMP = np.array([[0.38, 0.90, 0.42], [0.69, 0.75, 0.03], [0.80, 0.60, 0.0], [0.85, 0.44, 0.0], [0.87, 0.23, 0.24]])
 _DASHES = 5

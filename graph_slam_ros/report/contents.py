@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from scipy.special import gammainc
 
-from graph_slam_ros.analysis.colours import DARK, LIGHT
 from graph_slam_ros.analysis.consistency import nees_of_each
 from graph_slam_ros.analysis.evaluation import Scores, dimensions_of, evaluate, input_topics, scored_drive
 from graph_slam_ros.analysis.explain import landmark_lines
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.analysis.what_if import SavedGraph
+from graph_slam_ros.colours import DARK, LIGHT
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.report import drive, verdict
 from graph_slam_ros.report.packing import Packing, shown

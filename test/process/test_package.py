@@ -33,6 +33,7 @@ WITHIN = {
     "graph": {"lie"},
     "plugin_edges.py": {"plugins", "graph"},
     "chi_square.py": set(),
+    "colours.py": set(),
     "edge_tags.py": {"plugins", "plugin_edges", "graph"},
     "solver/clique_tree": {"lie", "graph"},
     "solver": {"lie", "graph", "solver/clique_tree"},
@@ -61,7 +62,7 @@ WITHIN = {
         *("slam/frontend", "slam/landmarks", "slam/robust", "slam/calibration"),
     },
     "messages/inputs": {"plugins", "edge_tags", "lie", "graph", "formats", "measurements", "config"},
-    "messages": {"lie", "graph", "formats", "measurements", "config", "slam", "messages/inputs"},
+    "messages": {"colours", "lie", "graph", "formats", "measurements", "config", "slam", "messages/inputs"},
     "recordings": {"lie", "formats", "messages", "messages/inputs"},
     "check": {
         *("lie", "formats", "measurements", "config", "slam", "slam/calibration", "messages", "messages/inputs"),
@@ -87,6 +88,7 @@ WITHIN = {
         *("messages", "recordings", "runs"),
     },
     "analysis": {
+        "colours",
         *(
             "chi_square",
             "edge_tags",
@@ -102,6 +104,7 @@ WITHIN = {
         *("messages/inputs", "recordings", "runs", "maps"),
     },
     "report": {
+        "colours",
         *("chi_square", "graph", "lie", "formats", "measurements", "config", "slam", "slam/landmarks", "slam/robust"),
         *("recordings", "runs", "maps", "analysis"),
     },
@@ -146,6 +149,7 @@ THIRD_PARTY = {
     "errors.py": set(),
     "typing.py": {"numpy"},
     "chi_square.py": {"scipy"},
+    "colours.py": set(),
     "lie": {"numpy", "numba"},
     "lie/jit.py": {"numpy", "numba", "llvmlite"},  # the compiler, and its version
     "graph": {"numpy", "numba"},

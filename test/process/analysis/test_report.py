@@ -252,8 +252,8 @@ def test_the_animation_repeats_the_drive_and_ends_with_the_solved_path(tmp_path,
     assert main(["replay", str(tmp_path / "world.mcap"), "--out", str(run)]) == 0
     seen = []
     drawn = animation._drawn
-    monkeypatch.setattr(animation, "_drawn", lambda moments, title: drawn(seen.append(moments) or moments, title))
-    assert main(["plot", str(run), "--animate", str(gif)]) == 0
+    monkeypatch.setattr(animation, "_drawn", lambda moments, *rest: drawn(seen.append(moments) or moments, *rest))
+    assert main(["plot", str(run), "--animate", str(gif), "--truth", str(tmp_path / "world.mcap")]) == 0
     (moments,) = seen
     lengths = [len(moment.path) for moment in moments]
     assert lengths == sorted(lengths) and lengths[0] < 0.1 * lengths[-1]
@@ -261,10 +261,12 @@ def test_the_animation_repeats_the_drive_and_ends_with_the_solved_path(tmp_path,
     with Image.open(gif) as image:
         assert image.n_frames == len(moments)
         assert image.size == (480, 480)
+        image.seek(image.n_frames - 1)
+        assert b"\x1f\x6f\xd6" in image.convert("RGB").tobytes(), "truth is blue"
     capsys.readouterr()
     assert main(["plot", str(run), "--animate", str(gif)]) == 2, "it is there"
     assert main(["plot", str(run), "--animate", str(tmp_path / "drive.png")]) == 2
-    monkeypatch.setattr(animation, "_drawn", lambda moments, title: drawn(moments[-1:], title))  # each takes a while
+    monkeypatch.setattr(animation, "_drawn", lambda moments, *rest: drawn(moments[-1:], *rest))  # each takes a while
     journal = (run / "ingest.mcap").read_bytes()
     (run / "ingest.mcap").write_bytes(journal[: len(journal) * 9 // 10])
     assert main(["plot", str(run), "--animate", str(gif), "--force"]) == 3, "a part of the drive is lost"

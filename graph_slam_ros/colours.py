@@ -1,4 +1,4 @@
-"""Colours of all pictures and of the report: the same thing has the same colour everywhere.
+"""Colours of all pictures, of the report and of RViz: the same thing has the same colour everywhere.
 
 Truth is blue, dead reckoning black (white on a dark page), the estimate red; landmarks are amber stars, closures plum.
 A test simulates colour blindness of three kinds: every two of them, and the paper, stay apart.
@@ -24,3 +24,9 @@ DARK = {
 """On a dark page."""
 QUIET = "#9aa0a6"
 """Things in the background: drives before."""
+
+
+def rgba(colour: str, alpha: float) -> tuple[float, float, float, float]:
+    """A colour as numbers from 0 to 1, as messages have it."""
+    red, green, blue = (int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
+    return red, green, blue, alpha

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from places import ROOT
 
-from graph_slam_ros.analysis.colours import DARK, LIGHT
+from graph_slam_ros.colours import DARK, LIGHT
 
 APART = 30.0  # of CIE 1976, where 2.3 is just noticeable
 # Machado, Oliveira, Fernandes, "A physiologically-based model for simulation of color vision deficiency", 2009.
