@@ -17,6 +17,7 @@ from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.colours import DARK, LIGHT
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.report import drive, verdict
+from graph_slam_ros.report.groups import closure_groups
 from graph_slam_ros.report.packing import Packing, shown
 from graph_slam_ros.report.places import floor_plan, paths
 from graph_slam_ros.report.sentences import effects, sentences
@@ -85,6 +86,7 @@ def read_contents(
     saved = out.saved = out.attempt(lambda: SavedGraph(run, out.losses))
     out.beware += out.attempt(lambda: changed_since(run)) or []
     scores = evaluate(run, known, align=align) if known and saved else None
+    out.data["run"] = shown(run.resolve().name)
     out.data["colours"] = {"light": LIGHT, "dark": DARK}
     out.data["dimensions"] = out.attempt(lambda: dimensions_of(run)) or 2
     out.data["map"] = out.attempt(lambda: paths(out.packing, run, known, other, align=align)) if saved else None
@@ -93,6 +95,7 @@ def read_contents(
         out.data["edges"] = _edges(out, saved)
         out.data["charts"] = _charts(out, saved)
         out.data["drive"] = out.attempt(lambda: _drive(out, saved))
+        out.data["groups"] = out.attempt(lambda: closure_groups(saved)) or []
     _tables(out, summary, saved, scores, known)
     out.data["compared"] = _compared(run, other, out) if other else None
     out.losses = list(dict.fromkeys(out.losses))

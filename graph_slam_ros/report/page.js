@@ -140,7 +140,7 @@ function layout(more) {
   const c = colours(), axis = {gridcolor: c.grid, zerolinecolor: c.grid, linecolor: c.grid};
   return {
     paper_bgcolor: c.paper, plot_bgcolor: c.paper, font: {color: c.ink, size: 12}, margin: {l: 55, r: 10, t: 10, b: 40},
-    legend: {orientation: "h", y: 1.02, yanchor: "bottom"}, xaxis: axis, yaxis: axis, ...more(axis),
+    legend: {orientation: "h", y: 1.02, yanchor: "bottom"}, modebar: {orientation: "v"}, xaxis: axis, yaxis: axis, ...more(axis),
   };
 }
 const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["toImage", "sendDataToCloud"]};
@@ -560,6 +560,11 @@ function startCharts() {
 function writeText() {
   byId("title").textContent = document.title;
   for (const one of data.sentences || []) byId("verdict").append(element("p", one));
+  if ((data.groups || []).length) {
+    const hint = element("p", "Some closures contradict others. To find the wrong ones: ");
+    hint.append(Object.assign(element("a", "the groups of closures that are in", {href: "#groups-section"})), ".");
+    byId("verdict").append(hint);
+  }
   const notes = [...data.losses.map((one) => `lost: ${one}`), ...data.beware.map((one) => `beware: ${one}`)];
   notes.forEach((one) => byId("notes").append(element("li", one)));
   byId("notes").hidden = !notes.length;
@@ -581,6 +586,16 @@ function writeText() {
   }
 }
 
+function writeGroups() {
+  if (!(data.groups || []).length) return;
+  byId("groups-section").hidden = false;
+  byId("groups-how").textContent = extra ? extra.groupsHow : `graph_slam view ${data.run} shows the map without a group, and saves it so.`;
+  const span = ([first, last]) => (first === last ? String(first) : `${first} to ${last}`);
+  table("groups", ["closures", "join keyframes", "with", "chi2 with them", "without", "without them moves most", "by m", ...(extra ? ["what if"] : [])],
+    data.groups.map((one) => [edgeLinks(one.edges), span(one.ends[0]), span(one.ends[1]), ...(one.chi2 ? one.chi2 : ["-", "-"]),
+      one.most ? linkTo("keyframe", one.most[0], `keyframe ${one.most[0]}`) : "nothing else holds the map together", one.most ? one.most[1] : "-", ...(extra ? [extra.group(one.edges)] : [])]));
+}
+
 function writeEdges() {
   const rows = (edges, judged) => edges.map((k) => [linkTo("edge", k, String(k)), named(data.edges.label, k), named(data.edges.landmark, k), values("keyframe")(k),
     values(judged ? "statistic" : "chi2")(k), judged ? values("threshold")(k) : values("dof")(k), verdictOf(k)]);
@@ -591,7 +606,7 @@ function writeEdges() {
 async function start() {
   writeText();
   await readColumns();
-  if (data.edges) { writeEdges(); startLedger(); }
+  if (data.edges) { writeGroups(); writeEdges(); startLedger(); }
   if (data.map && data.edges) {
     map.inSpace = data.dimensions === 3;
     await drawMap();

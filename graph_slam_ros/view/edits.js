@@ -5,13 +5,17 @@ const edits = {list: [], asked: 0, chosen: null};
 
 // -- the list --------------------------------------------------------------------------------------------------------
 
-function add(what) {  // {do, ...arguments}
+function add(what) {
+  put(what);
+  changed();
+}
+
+function put(what) {  // {do, ...arguments}
   const names = new Set([...known.names, ...edits.list.map((one) => one.name)]);
   let name = "", k = edits.list.length;
   do { k += 1; name = `edit-${k}`; } while (names.has(name));
   const when = new Date().toISOString().replace(/\.\d+Z$/, "Z");
   edits.list.push({name, who: "", when, why: "", ...what});
-  changed();
 }
 
 const whyOf = (one) => one.why.trim() || byId("why-text").value.trim();
@@ -30,6 +34,7 @@ function changed() {
     return item;
   }));
   byId("no-edits").hidden = edits.list.length > 0;
+  for (const box of document.querySelectorAll("#groups input")) box.checked = box.dataset.edges.split(" ").every((k) => edits.list.some((one) => one.do === "remove_edge" && String(one.edge) === k));
   for (const id of ["undo", "download", "save"]) byId(id).disabled = !edits.list.length;
   drawRows();
   drawActions();
@@ -244,6 +249,14 @@ function toggle(k) {
   add({do: isInside(k) ? "remove_edge" : "let_in_edge", edge: k});
 }
 
+function toggleAll(edges, isOut) {
+  edits.list = edits.list.filter((one) => !(one.do === "remove_edge" && edges.includes(one.edge)));
+  if (!isOut) return changed();
+  const names = (edge) => ({do: "remove_edge", edge});
+  edges.slice(0, -1).forEach((edge) => put(names(edge)));
+  return add(names(edges[edges.length - 1]));
+}
+
 // -- what the page calls ---------------------------------------------------------------------------------------------
 
 const panel = {
@@ -281,6 +294,14 @@ const panel = {
     body.append(element("div", undefined, {class: "actions", id: "actions"}));
     drawFields();
     drawActions();
+  },
+  groupsHow: "Take a group out: the map shows at once how it is without. To keep that, say who and why under Edits, and save.",
+  group(edges) {
+    const box = element("input", undefined, {type: "checkbox"}), label = element("label");
+    box.dataset.edges = edges.join(" ");
+    box.addEventListener("change", () => { toggleAll(edges, box.checked); byId("map-section").scrollIntoView(); });
+    label.append(box, " take out");
+    return label;
   },
   decorate(row, k) {
     if (pendingOf(k) >= 0) row.classList.add("edited");

@@ -1,6 +1,5 @@
-"""A map with wrong closures that are believed is repaired with what the page shows (docs/edits.md, Repair a map)."""
+"""A map with wrong closures that are believed is repaired with what the page shows (docs/repair.md)."""
 
-import numpy as np
 import planted_closures
 import pytest
 
@@ -10,22 +9,6 @@ from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs.restore import restored
 
 WHO = {"who": "Anna", "when": "2026-05-04T10:30:00Z", "why": "the aisles look alike"}
-NEAR = 12  # keyframes between closures of one group
-
-
-def groups(run):
-    """Accepted closures as the page lists them, those together that join the same two parts of the drive."""
-    saved = restored(run, [])
-    number = {vertex: k for k, vertex in enumerate(saved.keyframes.ids.tolist())}
-    found = []
-    for edge in read_contents(run).data["charts"]["worst"]:
-        ends = np.array([number[vertex] for vertex in saved.graph.edge(edge).vertices])
-        of = next((one for one in found if np.abs(one[-1][1] - ends).max() <= NEAR), None)
-        if of is None:
-            found.append(of := [])
-        of.append((edge, ends))
-        of.sort(key=lambda one: one[1][0])
-    return sorted(sorted(edge for edge, _ in of) for of in found)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -42,7 +25,8 @@ def test_the_page_leads_to_every_wrong_closure_and_the_edited_map_is_as_good_as_
     page = read_contents(run).data
     assert set(others) == set(page["charts"]["farthest"])
     true = [edge for edge in planted_closures.ends_of(run) if edge not in wrong]
-    assert groups(run) == sorted([sorted(believed), true])
+    assert sorted(one["edges"] for one in page["groups"]) == sorted([sorted(believed), true])
+    assert all(one["chi2"][1] < 0.5 * one["chi2"][0] and one["most"][1] > 1.0 for one in page["groups"])
     edits = [{"name": f"aisle-{edge}", **WHO, "do": "remove_edge", "edge": edge} for edge in wrong]
     effect = edit_run(run, edits[:4])
     assert effect.chi2[1] < 0.5 * effect.chi2[0]

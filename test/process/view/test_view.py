@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from types import SimpleNamespace
 
 import numpy as np
+import planted_closures
 import pytest
 from faulty import faulty_run
 from pages import HOSTILE, chromium, drive, pages, violations
@@ -23,6 +24,7 @@ from graph_slam_ros.graph import Loss
 from graph_slam_ros.maps.edit import edit, read_plan
 from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs.recorder import RunRecorder
+from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.runs.trajectory import read_tum
 from graph_slam_ros.slam import Config
 
@@ -340,6 +342,30 @@ def test_an_edge_is_unchecked_solved_undone_and_saved(browser, faulty, tmp_path)
         solved(other)
         assert page.inner_text("#pending") == ""
         assert estimate(page) == pytest.approx(before, abs=2e-3)
+
+
+def test_a_map_is_repaired_by_what_the_page_says(browser, tmp_path):
+    """A group of closures that agree with one another is taken out as docs/repair.md shows it."""
+    wrong = planted_closures.run(tmp_path / "run")
+    planted_closures.run(tmp_path / "clean", with_wrong=False)
+    with served(tmp_path / "run") as one, pages(browser, offline=False) as go:
+        page = go(one.access.address)
+        page.click("#verdict a")
+        boxes = page.locator("#groups input")
+        assert boxes.count() == 2
+        for k in (0, 0, 1):  # as a person who looks at the map without either
+            boxes.nth(k).click()
+            page.wait_for_selector("body:not([data-solved=no])")
+        assert [boxes.nth(k).is_checked() for k in (0, 1)] == [False, True]
+        assert "keyframe 54 moves most, by 4.03" in page.inner_text("#effect")
+        page.fill("#who", "Anna")
+        page.fill("#why-text", "the fourth aisle was taken for the second")
+        page.click("#save")
+        page.wait_for_function("document.getElementById('saved').innerText.startsWith('Saved')")
+    edited = tmp_path / "run_edited"
+    assert sorted(e.edit.values["edge"] for e in restored(edited, []).edits) == sorted(wrong[:4])
+    clean_m = planted_closures.error_m(tmp_path / "clean")
+    assert planted_closures.error_m(edited) <= 1.05 * clean_m < 0.5 * planted_closures.error_m(tmp_path / "run")
 
 
 def test_a_closure_is_dragged_and_axe_finds_nothing_wrong(browser, faulty):
