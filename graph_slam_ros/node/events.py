@@ -6,7 +6,7 @@ from graph_slam_ros.messages.to_msg import ERROR, OK, WARN, Status
 from graph_slam_ros.slam import GraphSlam, Update
 from graph_slam_ros.slam.kidnap_detector import Alarm
 from graph_slam_ros.slam.robust.ledger import Verdict, VerdictChange
-from graph_slam_ros.slam.slip_detector import Slip
+from graph_slam_ros.slam.slip_review import Slip
 
 _EDGES = 1000  # of one update that are moved one by one
 

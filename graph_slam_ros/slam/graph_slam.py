@@ -226,7 +226,7 @@ class GraphSlam(MapView):
             self.backend.update(keyframe)
             self._kidnaps.check(self.keyframes, now_ns)
         else:
-            report = self.backend.optimize(keyframe, everything)
+            report = self._kidnaps.optimize(self.keyframes, everything)
         report = self.backend.scale_noise(self.keyframes, everything) or report
         report = self._calibrator.after_solve(keyframe, everything) or report
         (covariance,) = self.solver.marginal([self.keyframes[keyframe].vertex])

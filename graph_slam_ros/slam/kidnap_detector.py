@@ -21,7 +21,9 @@ from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, Displaceme
 from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.odometry_hypotheses import Moved
-from graph_slam_ros.slam.slip_detector import Slip, SlipDetector
+from graph_slam_ros.slam.slip_detector import SlipDetector
+from graph_slam_ros.slam.slip_review import Slip
+from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Array, Numbers
 
 _ALARM = 4  # sightings more for another pose than for odometry's
@@ -213,6 +215,13 @@ class KidnapDetector:
             found = None
         self._note(found, stamp_ns)
         self._protect()
+
+    def optimize(self, keyframes: StampedPoses[Keyframe], settings: Settings) -> Report:
+        """Solve everything, and take back the slips that this contradicts."""
+        report = self._backend.optimize(len(keyframes) - 1, settings)
+        if self._slips.slips and self._slips.review(keyframes):
+            report = self._backend.optimize(len(keyframes) - 1, settings)
+        return report
 
     def _moved_to(self, found: DisplacementHypothesis | None) -> Moved | None:
         """The place to which the robot was moved, if it was."""

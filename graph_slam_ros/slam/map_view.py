@@ -26,7 +26,7 @@ from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.robust.ledger import Ledger
-from graph_slam_ros.slam.slip_detector import Slip
+from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.solution import Correction, Solution
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.typing import Array, Index, Numbers

@@ -37,6 +37,7 @@ from graph_slam_ros.slam.robust.odometry_hypotheses import (
     Stretch,
 )
 from graph_slam_ros.slam.slip_noise import SlipNoise
+from graph_slam_ros.slam.slip_review import Slip, covariance_of, revoke_slip, slipped_pairs
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array
 
@@ -50,41 +51,6 @@ _SURELY = 1.0  # logarithm of the likelihood ratio that this needs
 _AGAIN = (8, 12, 16)  # views for which odometry must be as likely by its own noise, for a slip to end
 _MOST_EDGES = 60
 _FACTOR = 1.5  # all noise may be larger than stated by this factor
-
-
-@dataclass(frozen=True, slots=True)
-class Slip:
-    """A stretch of odometry in which its errors are larger than its noise.
-
-    Attributes
-    ----------
-    kind : ``translation`` or ``rotation``
-    began_ns, decided_ns, ended_ns : stamps of odometry; the last is None while it goes on
-    evidence : twice the logarithm of the likelihood ratio of slip to no slip
-    landmarks : the number of landmarks, and of other classes of edges, that contradict odometry
-    edges : the number of odometry edges that were replaced
-    outcome : why it was taken back; empty if it was not
-    segment : always None, because no new segment begins
-    """
-
-    kind: str
-    began_ns: int
-    decided_ns: int
-    evidence: float
-    landmarks: int
-    edges: int = 0
-    ended_ns: int | None = None
-    outcome: str = ""
-    segment: None = None
-
-    def __str__(self) -> str:
-        since = f"{self.began_ns * 1e-9:.1f} s"
-        why = f"{self.landmarks} landmarks or other inputs contradict it, evidence {self.evidence:.0f}"
-        if self.ended_ns is None:
-            return f"odometry in doubt since {since}: its {self.kind} is wrong ({why}); it counts for less"
-        until = f"{self.ended_ns * 1e-9:.1f} s"
-        outcome = self.outcome or f"{self.edges} edges of odometry count for less"
-        return f"odometry was in doubt from {since} to {until}: its {self.kind} was wrong ({why}); {outcome}"
 
 
 @dataclass(slots=True)
@@ -335,9 +301,8 @@ class SlipDetector:
         if self._began_earlier(now, links, begin, errors, keyframe):
             return
         firsts = sorted({self._first_of(links, since) for since in _AGAIN if since < len(self._views)})
-        gains = [
-            (errors.log_ratio_of(self._with_own_noise(links, first, errors.covariance)), first) for first in firsts
-        ]
+        graph, own = self._backend.graph, [link.own for link in links]
+        gains = [(errors.log_ratio_of(covariance_of(graph, own, first, errors.covariance)), first) for first in firsts]
         gain, first = max(gains, default=(0.0, 0))
         if gain > 0.0:
             self._end(now, links[first:], gain, keyframe, stamp_ns)
@@ -368,12 +333,19 @@ class SlipDetector:
         outcome = "" if left else "taken back: later views agree with odometry"
         self.slips[-1] = replace(now, edges=left, ended_ns=stamp_ns, outcome=outcome)
 
-    def _with_own_noise(self, links: Sequence[_Link], first: int, covariance: Array) -> Array:
-        dof, out = self._space.dof, covariance.copy()
-        for k, link in enumerate(links[first:], start=first):
-            rows, root = slice(k * dof, (k + 1) * dof), self._backend.graph.edge(link.own).sqrt_information
-            out[rows, rows] = np.linalg.inv(root.T @ root)
-        return out
+    def review(self, keyframes: StampedPoses[Keyframe]) -> bool:
+        """Take back the slips that all measurements together contradict. Returns whether there were any."""
+        changed, restored = False, set[int]()
+        for k, slip in enumerate(self.slips):
+            pairs = slipped_pairs(self._backend, keyframes, slip.began_ns, slip.ended_ns) if slip.ended_ns else []
+            if revoke_slip(self._backend, pairs, len(keyframes) - 1, _FACTOR):
+                changed, outcome = True, "taken back: all measurements together agree with odometry"
+                restored |= {edge for _, edge in pairs}
+                self._counters.count("odometry", "slip_taken_back")
+                self.slips[k] = replace(slip, edges=max(0, slip.edges - len(pairs)), outcome=outcome)
+        for link in self._links:
+            link.edge = link.own if link.edge in restored else link.edge
+        return changed
 
     # -- the graph ---------------------------------------------------------------------------------------------------
 

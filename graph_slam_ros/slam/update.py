@@ -6,7 +6,7 @@ from graph_slam_ros.slam.calibration.decision import Finding
 from graph_slam_ros.slam.kidnap_detector import Alarm
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.robust.ledger import VerdictChange
-from graph_slam_ros.slam.slip_detector import Slip
+from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.slam.solution import Correction
 from graph_slam_ros.solver import Report
 

@@ -12,7 +12,7 @@ from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
-from graph_slam_ros.slam.slip_detector import Slip
+from graph_slam_ros.slam.slip_review import Slip
 
 LONG = times(False, True)
 SLIP = ("odometry", "slip")
@@ -155,3 +155,42 @@ def test_a_slip_that_was_none_is_taken_back_and_leaves_no_trace():
     assert np.abs(plain.trajectory() - doubted.trajectory()).max() < 1e-6
     reasons = doubted.ledger.reason.values[doubted.graph.edges_of("odometry")]
     assert set(reasons.tolist()) == {Reason.NONE, Reason.REVOKED}
+
+
+def test_a_slip_that_has_ended_is_taken_back_when_everything_is_solved():
+    recording, slam = world(3), GraphSlam(Config())
+    half = int(recording.stamps_ns[len(recording.stamps_ns) // 2])
+    for m in measurements(recording):
+        if m.stamp_ns > half + 20 * 10**9:
+            break
+        slam.process(m)
+        detector = slam._kidnaps._slips
+        if not detector.slips and isinstance(m, Odometry) and m.stamp_ns > half:
+            links = list(detector._links)[-5:]
+            began_ns = links[0].stamps_ns[0]
+            detector.slips.append(Slip("translation", began_ns, m.stamp_ns, 20.0, 2, ended_ns=m.stamp_ns + 1))
+            detector._replace(links, detector.slips[-1], len(slam.keyframes) - 1)
+    assert slam.counters[TAKEN_BACK] == 0
+    slam.process(Control("optimize"))
+    assert slam.counters[TAKEN_BACK] == 1
+    (slip,) = slam.alarms
+    assert slip.edges == 0
+    assert "taken back: all measurements together agree with odometry" in str(slip)
+    edges = slam.graph.edges_of("odometry")
+    reasons = slam.ledger.reason.values[edges].tolist()
+    assert set(reasons) == {Reason.NONE, Reason.REVOKED}
+    assert reasons.count(Reason.REVOKED) == len(links)
+
+
+def test_a_true_slip_stays_when_everything_is_solved():
+    recording, begin_ns = slipping(world(1), at=0.5)
+    slam = GraphSlam(Config())
+    for m in measurements(recording):
+        if m.stamp_ns > begin_ns + 20 * 10**9:
+            break
+        slam.process(m)
+    edges = sum(one.edges for one in slam.alarms)
+    assert edges
+    slam.process(Control("optimize"))
+    assert slam.counters[TAKEN_BACK] == 0
+    assert sum(one.edges for one in slam.alarms) == edges
