@@ -48,7 +48,7 @@ def odometry(at=None, frame="odom", child="base_link", stamp_ns=STAMP_NS, twist=
     )
 
 
-def detection(at=None, covariance=None, name="a", frame="", class_id="kind", results=1, bbox=None):
+def detection(at=None, covariance=None, name="a", frame="", class_id="kind", results=1, bbox=None, size=(0, 0)):
     if covariance is None:
         covariance = np.diag([0.01, 0.04, 0.09])
     full = np.zeros((6, 6))
@@ -59,7 +59,7 @@ def detection(at=None, covariance=None, name="a", frame="", class_id="kind", res
         "vision_msgs/msg/Detection3D",
         header=header(STAMP_NS, frame),
         results=[make("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=posed)] * results,
-        bbox=make("vision_msgs/msg/BoundingBox3D", center=bbox or pose(), size=vector(0, 0)),
+        bbox=make("vision_msgs/msg/BoundingBox3D", center=bbox or pose(), size=vector(*size)),
         id=name,
     )
 

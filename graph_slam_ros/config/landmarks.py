@@ -58,6 +58,14 @@ class LandmarksConfig:
         "m",
         low=0.0,
     )
+    size_sigma_m: float = setting(
+        0.0,
+        "standard deviation of the size that a message states of a landmark without identity (the box of a "
+        "Detection3D; the field size, diameter or radius of a point): a landmark of another size is another one; 0: "
+        "sizes are not compared",
+        "m",
+        low=0.0,
+    )
     density_per_m: float = setting(
         0.03,
         "prior density of landmarks per metre along each axis: an observation must fit a known "

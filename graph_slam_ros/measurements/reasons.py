@@ -127,6 +127,7 @@ REASONS: dict[str, Reason] = {
     # -- noise
     "noise_unknown": Reason(_REFUSED, "neither the message nor the parameters have its noise", _SIGMAS),
     "covariance_unknown": Reason(_REPAIRED, "the covariance is zero: the configured noise is used"),
+    "size_unknown": Reason(_NOTED, "the size of a landmark is negative, above 1 km or no number: it is unknown"),
     "covariance_of_some_axes_unknown": Reason(
         _REPAIRED, "the twist's covariance lacks some axes: the configured noise is used"
     ),

@@ -73,6 +73,7 @@ class Sighting:
     T_base_sensor : pose of the sensor, for kinds that are measured in the sensor frame; None: at the base. Of a
         position or pose it is the place about which ``mount_correction`` turns
     sort : what it is a landmark of (a tree, a red cone), where the sensor knows it; those of other sorts are others
+    size : of the landmark [m]; zero where unknown
 
     Raises
     ------
@@ -86,6 +87,7 @@ class Sighting:
     covariance: Numbers
     T_base_sensor: Numbers | None = None
     sort: str = ""
+    size: float = 0.0
 
     def __post_init__(self) -> None:
         _check_choice(Sighting, self.kind, SIGHTING_KINDS)
@@ -267,8 +269,19 @@ def to_record(measurement: Measurement) -> dict[str, Any]:
         case AngularVelocity(stamp_ns, topic, rate, covariance):
             out = {"type": "angular_velocity", "stamp_ns": stamp_ns, "topic": topic}
             return out | {"rate": rate, "covariance": covariance}
+        case Sightings(stamp_ns, topic, sightings):
+            out = {"type": "sightings", "stamp_ns": stamp_ns, "topic": topic}
+            return out | {"sightings": tuple(map(sighting_record, sightings))}
         case _:
             return {"type": _NAMES[type(measurement)], **asdict(measurement)}
+
+
+def sighting_record(one: Sighting) -> dict[str, Any]:
+    """Plain dictionary of a sighting. It has a size only where that is known."""
+    out = asdict(one)
+    if not one.size:
+        del out["size"]
+    return out
 
 
 def from_record(record: dict[str, Any]) -> Measurement:

@@ -32,13 +32,14 @@ version 2 stands before it, which they refuse.
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, astuple
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.edge_tags import tag_of
 from graph_slam_ros.errors import FormatError, GraphSlamError
 from graph_slam_ros.graph import Graph
+from graph_slam_ros.measurements.types import sighting_record
 from graph_slam_ros.runs.journal import MAP, parts_of, read_records
 from graph_slam_ros.runs.map_faults import fault_of
 from graph_slam_ros.runs.map_growth import AT_ONCE, Growing, apply_verdicts, grow
@@ -277,4 +278,4 @@ def _newer(seen: Sequence[LandmarkEdge], first_edge: int) -> Iterable[LandmarkEd
 def _seen(one: LandmarkEdge) -> list[Any]:
     where = one.where
     at = [where.keyframe, where.vertex, where.stamp_ns, where.T_keyframe_base, where.covariance.tolist()]
-    return [one.edge, one.topic, asdict(one.sighting), *at]
+    return [one.edge, one.topic, sighting_record(one.sighting), *at]

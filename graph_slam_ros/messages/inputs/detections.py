@@ -1,5 +1,6 @@
 """Reading of landmark messages with positions or poses; ``landmarks`` judges what they contain."""
 
+import math
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +26,18 @@ def detections(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
         name = sort if by_class else one.id
         at, covariance = (first.pose.pose, first.pose.covariance) if first else (one.bbox.center, _NOTHING)
         frame = one.header.frame_id or m.header.frame_id
-        yield ObservedLandmark(m.header.stamp, frame, name, at.position, at.orientation, covariance, sort=sort)
+        size = _size(one.bbox.size)
+        yield ObservedLandmark(
+            m.header.stamp, frame, name, at.position, at.orientation, covariance, sort=sort, size=size
+        )
+
+
+def _size(box: Any) -> float:
+    """The geometric mean of the sides of a box that are not zero [m]; zero where all are, negative where one is."""
+    sides = [side for side in (box.x, box.y, box.z) if side != 0.0]
+    if not sides:
+        return 0.0
+    return -1.0 if min(sides) < 0.0 else math.prod(sides) ** (1.0 / len(sides))
 
 
 def pose_stamped(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:

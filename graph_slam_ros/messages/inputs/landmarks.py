@@ -22,6 +22,7 @@ from graph_slam_ros.typing import Numbers
 _AGREE_SIGMA = 3.0
 _LONGEST_ID = 128  # bytes
 _UPRIGHT = 1e-6
+_LARGEST_M = 1e3  # no landmark is larger
 _POLAR = {"range": (1,), "bearing": (1, 2), "range_bearing": (2, 3)}  # numbers of each kind, by SIGHTING_KINDS
 
 
@@ -40,6 +41,7 @@ class ObservedLandmark:
     sigmas : standard deviations of ``polar``, one for each number of it; None or zero where unknown
     T_frame_sensor : where the sensor is in the frame
     sort : its class, used where ``id`` is empty: sightings of two classes are never of one landmark
+    size : of the landmark [m], used where ``id`` is empty; zero where unknown
 
     Raises
     ------
@@ -57,6 +59,7 @@ class ObservedLandmark:
     sigmas: Sequence[float] | None = None
     T_frame_sensor: se3.Pose = se3.IDENTITY
     sort: str = ""
+    size: float = 0.0
 
     def __post_init__(self) -> None:
         if self.polar is not None and len(self.polar[1]) not in _POLAR.get(self.polar[0], ()):
@@ -78,12 +81,21 @@ def sightings(source: InputContext, found: Iterable[ObservedLandmark]) -> Iterat
         seen = []
         for one in same:
             try:
-                seen.append(replace(_sighting(source, stamp_ns, one), sort="" if one.id else one.sort))
+                what = _sighting(source, stamp_ns, one)
+                seen.append(what if what.id else replace(what, sort=one.sort, size=_size(source, one.size)))
             except MessageError as reason:
                 source.count(str(reason))
         usable = _agreed(source, seen)
         if usable:
             yield Sightings(stamp_ns, source.name, tuple(usable))
+
+
+def _size(source: InputContext, size: float) -> float:
+    """The size of a landmark; zero where it is no length."""
+    if 0.0 <= size <= _LARGEST_M:
+        return float(size)
+    source.count("size_unknown")
+    return 0.0
 
 
 def _nearest(source: InputContext, found: list[ObservedLandmark]) -> list[ObservedLandmark]:

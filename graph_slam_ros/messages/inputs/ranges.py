@@ -15,7 +15,7 @@ from graph_slam_ros.messages.inputs.source import InputContext
 from graph_slam_ros.messages.inputs.transforms import pose
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
-_FIELDS = ("x", "y", "z", "range", "bearing", "elevation", "id", "sigma", "sigma_bearing")
+_FIELDS = ("x", "y", "z", "range", "bearing", "elevation", "id", "sigma", "sigma_bearing", "size", "diameter", "radius")
 _MOST_POINTS = 100_000  # landmarks in one message: a scan is no list of landmarks
 _UNKNOWN_ID = -1
 
@@ -24,7 +24,8 @@ def point_cloud(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     """sensor_msgs/PointCloud2 by the names of its fields.
 
     ``x``, ``y`` and perhaps ``z``; or ``range``, ``bearing`` (and ``elevation``), or some of these, in the sensor's
-    frame; ``id`` where it is known; ``sigma`` (m, or rad of bearings alone) and ``sigma_bearing`` (rad).
+    frame; ``id`` where it is known; ``sigma`` (m, or rad of bearings alone) and ``sigma_bearing``
+    (rad); ``size``, ``diameter`` or ``radius`` (m) of the landmark.
     """
     there = {f.name for f in m.fields} & set(_FIELDS)
     angles = [name for name in ("bearing", "elevation") if name in there]
@@ -39,10 +40,11 @@ def point_cloud(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
     for one in _points(m):
         row = {name: one[name].item() for name in there}
         name, sigma = _identity(row.get("id")), row.get("sigma", 0.0)
+        size = row.get("size", row.get("diameter", 2.0 * row.get("radius", 0.0)))
         if kind == "position":
             at = SimpleNamespace(x=row["x"], y=row["y"], z=row.get("z", 0.0))
             covariance = np.diag([sigma * sigma] * 3 + [0.0] * 3).ravel() if "sigma" in there else None
-            yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, at, covariance=covariance)
+            yield ObservedLandmark(m.header.stamp, m.header.frame_id, name, at, covariance=covariance, size=size)
             continue
         sigma_rad = row.get("sigma_bearing", sigma if kind == "bearing" else 0.0)
         measured = [
@@ -55,6 +57,7 @@ def point_cloud(source: InputContext, m: Any) -> Iterator[ObservedLandmark]:
             name,
             polar=(kind, tuple(measured)),
             sigmas=sigmas if there & {"sigma", "sigma_bearing"} else None,
+            size=size,
         )
 
 

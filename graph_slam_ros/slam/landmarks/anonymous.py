@@ -70,16 +70,18 @@ class AnonymousLandmarks:
         self._jump = np.diag(np.square(space.sigmas(config.odometry.jump_sigma_m, config.odometry.jump_sigma_rad)))
         self._reckoning = DeadReckoning(space, config.ordering.late_s + 2.0)
         extent = max(c.added_sigma_m**2 + c.unnamed_sigma_m**2, LEAST_M2) * np.eye(space.dimensions)
-        self._builder = ScanBuilder(space, extent, c.close_m)
+        self._builder = ScanBuilder(space, extent, c.close_m, c.size_sigma_m)
         self._settings = BeamSettings(
             quantile(c.gate_same, space.dimensions),
             space.dimensions * float(np.log(c.density_per_m)),
             hypotheses=1 if c.association == "nearest" else 40,
+            size_sigma_m=c.size_sigma_m,
         )
         self._belief = SolverBelief(space, solver, landmarks)
         self._hindsight = Hindsight(config, self._settings, executor)
         self.clusters = Assignments(c, landmarks, counters, hand_over)
         self._beam: Beam | None = None
+        self._sorts, self._sizes = dict[int, str](), dict[int, float]()  # of landmarks, whatever beam began them
         self._leader: Decision | None = None
         self._scans: list[Scan] = []
         self._motions: list[Motion] = []
@@ -177,6 +179,7 @@ class AnonymousLandmarks:
             scales, sigma = self._hindsight.scales
             seed = self._belief.seed(scan, names, scales if beam is None else beam.scales[0], sigma)
             beam, self._leader = Beam(self._settings, seed), None
+            beam.sorts, beam.sizes = self._sorts, self._sizes
         else:
             beam.advance(self._motions[-1])
             self._belief.recall(beam, scan, names)

@@ -138,10 +138,11 @@ def _candidates(drive: Drive, e: Estimate, inside: Ids, strong: Ids, middle: int
     priors = _priors(turns[likely], moves[likely], centre)
     whiten = drive.whiten[inside] @ e.turn[drive.scan[inside]].transpose(0, 2, 1)
     is_other = are_others(drive.sort[inside][:, None], sorts_of(drive, e)[strong])
+    of_size = drive.size_chi2(e, inside)[:, strong]
     scored = []
     for turn, move, prior in zip(turns[likely], moves[likely], priors.tolist(), strict=True):
         away = (there[None] - (at @ turn.T + move)[:, None]) @ turn  # in the axes before the turn
-        chi2 = np.square(away @ whiten.transpose(0, 2, 1)).sum(axis=-1)
+        chi2 = np.square(away @ whiten.transpose(0, 2, 1)).sum(axis=-1) + of_size
         chi2[is_other] = np.inf
         least = chi2.min(axis=1)
         score = float(np.minimum(least / 4.0, _MOST_COST).sum()) + prior

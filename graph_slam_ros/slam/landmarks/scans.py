@@ -20,6 +20,7 @@ from graph_slam_ros.slam.landmarks.rotations import lever, turn_of
 from graph_slam_ros.typing import Array, Numbers
 
 SCAN_NS, _SCAN_RAD = 500_000_000, 0.15
+_OTHER_SIZE = 6.0  # sigmas by which sizes of two sightings of one thing do not differ
 _SAME = 0.9973  # probability with which two sightings of one thing fall into one cluster
 
 
@@ -173,13 +174,15 @@ class Seen:
 class Cluster:
     """Sightings of one landmark: its position relative to the scan, with covariance (n, n).
 
-    ``sort`` is the class of the landmark, empty where none of them has one.
+    ``sort`` is the class of the landmark, empty where none of them has one; ``size`` is the mean of its sizes [m], zero
+    where none of them has one.
     """
 
     point: Array
     covariance: Array
     seen: tuple[Seen, ...]
     sort: str = ""
+    size: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,10 +210,11 @@ class ScanBuilder:
     ----------
     extent : (n, n) covariance of where on a thing it is seen
     close_m : things this close to one another are one
+    size_sigma_m : of a size; zero: sizes are not compared
     """
 
-    def __init__(self, space: Geometry, extent: Array, close_m: float) -> None:
-        self._space, self._extent, self._close_m = space, extent, close_m
+    def __init__(self, space: Geometry, extent: Array, close_m: float, size_sigma_m: float = 0.0) -> None:
+        self._space, self._extent, self._close_m, self._size_sigma_m = space, extent, close_m, size_sigma_m
         self._glimpses: list[_Glimpse] = []
 
     @property
@@ -238,7 +242,11 @@ class ScanBuilder:
         middle = glimpses[(len(glimpses) - 1) // 2]
         carried = [self._carried(one, middle.at) for one in glimpses]
         groups = _clustered(
-            [point for point, _ in carried], [c + self._extent for _, c in carried], glimpses, self._close_m
+            [point for point, _ in carried],
+            [c + self._extent for _, c in carried],
+            glimpses,
+            self._close_m,
+            self._size_sigma_m,
         )
         clusters = []
         for members in groups:
@@ -246,7 +254,8 @@ class ScanBuilder:
             covariance = np.mean([carried[k][1] for k in members], axis=0) + self._extent
             seen = tuple(glimpses[k].seen.shared_by(len(members)) for k in members)
             sort = next((glimpses[k].sort for k in members if glimpses[k].sort), "")
-            clusters.append(Cluster(point, covariance, seen, sort))
+            sizes = [one.sighting.size for one in seen if one.sighting.size]
+            clusters.append(Cluster(point, covariance, seen, sort, float(np.mean(sizes)) if sizes else 0.0))
         return Scan(middle.at, middle.seen.where, tuple(clusters))
 
     def _carried(self, one: _Glimpse, at: Reckoned) -> tuple[Array, Array]:
@@ -256,7 +265,11 @@ class ScanBuilder:
 
 
 def _clustered(
-    points: Sequence[Array], covariances: Sequence[Array], glimpses: Sequence[_Glimpse], close_m: float
+    points: Sequence[Array],
+    covariances: Sequence[Array],
+    glimpses: Sequence[_Glimpse],
+    close_m: float,
+    size_sigma_m: float,
 ) -> list[list[int]]:
     """Indices of the sightings of each landmark. Those of one message are of one landmark only if they are close."""
     groups: list[list[int]] = []
@@ -268,6 +281,7 @@ def _clustered(
             away = point - np.mean([points[i] for i in group], axis=0)
             is_far = float(np.linalg.norm(away)) > close_m
             is_other = bool(glimpses[k].sort) and any(glimpses[i].sort not in ("", glimpses[k].sort) for i in group)
+            is_other |= any(_differ_in_size(glimpses[i], glimpses[k], size_sigma_m) for i in group)
             if is_other or (is_far and _same_message(glimpses, group, k)):
                 continue
             chi2 = float(away @ np.linalg.solve(covariances[k] + covariances[first], away))
@@ -278,6 +292,11 @@ def _clustered(
         else:
             best.append(k)
     return groups
+
+
+def _differ_in_size(a: _Glimpse, b: _Glimpse, sigma_m: float) -> bool:
+    one, other = a.seen.sighting.size, b.seen.sighting.size
+    return sigma_m > 0.0 and one > 0.0 and other > 0.0 and abs(one - other) > _OTHER_SIZE * sigma_m
 
 
 def _same_message(glimpses: Sequence[_Glimpse], group: Sequence[int], k: int) -> bool:

@@ -1,5 +1,6 @@
 """The border: real CDR bytes in, measurements out; every refusal and every repair is counted by (source, reason)."""
 
+import json
 import math
 import struct
 from types import SimpleNamespace
@@ -23,6 +24,7 @@ from messages import (
 )
 
 from graph_slam_ros.lie import se2
+from graph_slam_ros.measurements.types import from_record, to_record
 from graph_slam_ros.messages.interfaces import typestore
 from graph_slam_ros.messages.to_msg import covariance6, make
 from graph_slam_ros.slam import Config, GraphSlam, Odometry, Sightings
@@ -110,6 +112,18 @@ def test_the_class_of_a_detection_without_identity_is_the_sort_of_its_landmark()
     found = (detection(name="", class_id="tree"), detection(name="x", class_id="tree"), detection(name="", results=0))
     seen = heard(border(), "detections", detections(*found)).sightings
     assert [(s.id, s.sort) for s in seen] == [("", "tree"), ("x", ""), ("", "")]
+
+
+def test_the_size_of_a_detection_without_identity_is_that_of_its_box():
+    boxes = (0.2, 0.4, 0.1), (0.3, 0.3, 0.0), (0.0, 0.0, 0.0), (-0.2, 0.4, 0.1), (math.nan, 0.4, 0.1), (1e12, 1.0, 1.0)
+    b = border()
+    found = [detection(name="", size=box) for box in boxes]
+    seen = heard(b, "detections", detections(*found, detection(name="x", size=boxes[0]))).sightings
+    assert [s.size for s in seen] == pytest.approx([0.2, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert counted(b) == {"detections": {"size_unknown": 3}}
+    record = json.loads(json.dumps(to_record(heard(border(), "detections", detections(*found[:1], found[2])))))
+    assert [one.get("size") for one in record["sightings"]] == [pytest.approx(0.2), None]
+    assert [s.size for s in from_record(record).sightings] == [pytest.approx(0.2), 0.0]
 
 
 def camera():

@@ -55,6 +55,14 @@ def test_points_in_the_plane_need_no_height_and_without_sigma_take_the_configure
     assert only(m).covariance == pytest.approx((0.09, 0, 0, 0.09))
 
 
+@pytest.mark.parametrize(("name", "size"), [("size", 0.3), ("diameter", 0.3), ("radius", 0.6)])
+def test_the_size_of_a_point_without_identity_is_that_of_its_field(name, size):
+    at = cloud([("x", "f8"), ("y", "f8"), (name, "f8")], (1.0, 2.0, 0.3))
+    assert only(heard(scanner(sigma_m=0.3), "scan", at)).size == size
+    polar = cloud([("range", "f8"), ("bearing", "f8"), ("sigma", "f8"), (name, "f8")], (1.0, 0.1, 0.1, 0.3))
+    assert only(heard(scanner(sigma_rad=0.1), "scan", polar)).size == size
+
+
 def test_a_range_and_a_bearing_are_those_of_a_sensor_that_may_be_turned():
     eye = ("base_link", "eye", (1.0, 2.0, 0.5), quaternion(yaw=0.5))
     layout = [("id", "u4"), ("range", "f8"), ("bearing", "f8"), ("sigma", "f8"), ("sigma_bearing", "f8")]

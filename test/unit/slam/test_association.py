@@ -345,3 +345,23 @@ def test_which_of_two_halls_alike_it_is_stays_open(halls):
     laid, undecided = laid_on_the_map(drive, e)
     assert len(laid.landmarks) == (5 if halls == 1 else 15)
     assert (undecided > 0) == (halls == 2)
+
+
+# -- sizes ---------------------------------------------------------------------------------------------------------
+
+
+def sized(second, points, sizes):
+    one = scan(second, (0, 0, 0, 0), points)
+    return replace(one, clusters=tuple(replace(c, size=s) for c, s in zip(one.clusters, sizes, strict=True)))
+
+
+def test_what_has_another_size_is_another_landmark_and_of_two_the_one_of_its_size():
+    settings = replace(SETTINGS, size_sigma_m=0.05)
+    first = sized(0.0, [(4.0, 0.0)], [0.2])
+    assert explained([first, sized(0.5, [(4.0, 0.0)], [0.6])], settings)[1] == [0, 1]
+    assert explained([first, sized(0.5, [(4.0, 0.0)], [0.22])], settings)[1] == [0, 0]
+    assert explained([first, sized(0.5, [(4.0, 0.0)], [0.0])], settings)[1] == [0, 0], "not known"
+    assert explained([first, sized(0.5, [(4.0, 0.0)], [0.6])])[1] == [0, 0], "sizes are not compared by default"
+    both = sized(0.0, [(4.0, 0.1), (4.0, -0.1)], [0.2, 0.6])
+    names = explained([both, sized(0.5, [(4.0, 0.0)], [0.6])], settings)[1]
+    assert names[2] == names[1], "the second is as near"
