@@ -14,9 +14,11 @@ from places import ROOT
 from graph_slam_ros.formats.parameters import read_parameters
 from graph_slam_ros.measurements.reasons import REASONS
 from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.slam import Config
 
 PAGE = ROOT / "docs/troubleshooting.md"
+USED = INPUT_COLUMNS["used"]
 HEAD = "| counter | effect | what it means | remedy |\n|---|---|---|---|\n"
 
 
@@ -99,7 +101,7 @@ def test_the_publisher_of_detections_works_with_a_node_as_it_stands(tmp_path):
                 r.spin(seconds)
 
             def is_seen():
-                return told(r, "input detections", "used") > 8 and told(r, "input odom", "used") > 20
+                return told(r, "input detections", USED) > 8 and told(r, "input odom", USED) > 20
 
             live.until(is_seen, stand, "detections that are used")
             assert r.save().success
