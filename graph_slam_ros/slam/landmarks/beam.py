@@ -24,7 +24,7 @@ _MORE_SLOTS = 8
 SIZE_CHI2 = 25.0
 """No size counts for more against a landmark: of a thing that is half hidden it is wrong."""
 LOG_SIZES = float(np.log(10.0))
-"""Log of the number of sizes that can be told apart: so much less likely is the size of something new."""
+"""Log of the number of different sizes: the size of something new is less likely by this."""
 
 Ids = NDArray[np.int64]
 
