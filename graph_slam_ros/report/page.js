@@ -89,11 +89,11 @@ function element(tag, text, attributes = {}) {
 
 const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
 const short = (text) => (text.length > 40 ? `${text.slice(0, 37)}...` : text);
-const number = (value) => (value === null || value === undefined ? "-" : Number.isInteger(value) ? String(value) : general(value, 4));
+const number = (value) => (value === null || value === undefined ? "-" : Math.abs(value) < 1e-12 ? "0" : Number.isInteger(value) ? String(value) : general(value, 4));
 
-function table(id, head, rows) {
+function table(id, head, rows, none = "none") {
   const place = byId(id);
-  if (!rows || !rows.length) return place.append(element("p", "nothing", {class: "quiet"}));
+  if (!rows || !rows.length) return place.append(element("p", none, {class: "quiet"}));
   const out = element("table"), isNumber = head.map((_, c) => rows.some((row) => typeof row[c] === "number"));
   const top = out.createTHead().insertRow();
   head.forEach((name, c) => top.append(element("th", name, {scope: "col", ...(isNumber[c] ? {class: "number"} : {})})));
@@ -212,9 +212,11 @@ function edgeTraces() {
       return line;
     });
     const middle = axes.map((line) => Float64Array.from(some, (_, at) => (line[3 * at] + line[3 * at + 1]) / 2));
-    const faint = Math.max(0.06, Math.min(0.25, 250 / edges.length));  // many sightings would hide the path
+    const faint = Math.max(0.02, Math.min(0.25, 80 / edges.length));  // many sightings would hide the path
     const colour = isIn && isSighting ? colours().landmarks : isIn ? colours().closures : colours()[name];
-    out.push(trace(plain(key), axes, colour, {visible, isMany: true, opacity: isIn && isSighting ? faint : 0.8, legendgroup: key}));
+    const isFaint = isIn && isSighting;
+    if (isFaint) out.push(trace(plain(key), [[null], [null], [null]], colour, {visible, legendgroup: key}));  // what the legend shows
+    out.push(trace(plain(key), axes, colour, {visible, isMany: true, opacity: isFaint ? faint : 0.8, legendgroup: key, showlegend: !isFaint}));
     out.push(trace("", middle, colour, {
       visible, isMany: true, mode: "markers", marker: {color: colour, size: isIn ? 4 : 7, symbol: "diamond", opacity: isIn ? (isSighting ? faint : 0.35) : 0.9}, showlegend: false,
       legendgroup: key, customdata: some, meta: "edge", hovertemplate: `edge %{customdata}: ${plain(key)}<extra></extra>`, hoverinfo: "all",
@@ -259,7 +261,7 @@ async function drawMap(isSame = false) {  // isSame: as it is zoomed
     source: data.plan.url, xref: "x", yref: "y", x: data.plan.x, y: data.plan.y, sizex: data.plan.width, sizey: data.plan.height,
     xanchor: "left", yanchor: "bottom", sizing: "stretch", layer: "below", opacity: 0.6,
   };
-  const c = colours(), scene = {aspectmode: "data", bgcolor: c.paper};
+  const c = colours(), scene = {aspectmode: "data", bgcolor: c.paper, camera: {eye: {x: 1.2, y: -2.3, z: 1.8}}};
   for (const axis of ["xaxis", "yaxis", "zaxis"]) scene[axis] = {title: {text: `${axis[0]} [m]`}, gridcolor: c.grid, color: c.ink};
   const flat = layout((axis) => ({
     xaxis: {...axis, title: {text: "x [m]"}}, yaxis: {...axis, title: {text: "y [m]"}, scaleanchor: "x", scaleratio: 1},
@@ -574,7 +576,7 @@ function writeText() {
   table("versions", ["what", "mark"], t.versions);
   table("timing", ["what", "value"], t.timing);
   table("classes", ["class", "edges", "numbers", "chi2", "chi2 per number"], t.classes);
-  table("noise", ["class, input, part", "degrees of freedom", "chi2 per degree", "repeated errors", "sigmas should be"], t.noise);
+  table("noise", ["class, input, part", "degrees of freedom", "chi2 per degree", "repeated errors", "sigmas should be"], t.noise, "the run has no record of what its sigmas should be");
   if (t.edits.length) table("edits", ["edit by hand", "what", "who", "when", "why"], t.edits);
   if (data.waiting.length) table("waiting", ["landmark that waits", "why"], data.waiting);
   byId("chi2-dof").textContent = data.chi2_per_dof === null ? "" : `chi2 per degree of freedom of the whole: ${general(data.chi2_per_dof, 3)}`;

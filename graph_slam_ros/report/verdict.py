@@ -17,6 +17,8 @@ from graph_slam_ros.runs.tables import INPUT_COLUMNS
 
 Row = list[Any]
 _FINE = 0.5, 2.0  # chi2 per degree of freedom
+_MOST_NEES = 2.0  # times what is expected
+_TOO_SMALL = "its covariances are too small"
 _MOST_REASONS = 3  # that the sentence on rejected measurements names
 
 
@@ -34,7 +36,8 @@ def verdict(
     doubts = [*outcome.doubts(summary)] if _is_complete(summary) else []
     gates = [line for line in explain_run(saved) if line.startswith("warning: ")] if saved else []
     first = _state(summary, saved, scores, short, [*doubts, *gates], losses)
-    last = _next(run, (short, doubts, gates), losses, has_truth=scores is not None)
+    covariances = _covariances(saved, scores)
+    last = _next(run, (short, doubts, gates, covariances), losses, has_truth=scores is not None)
     return [first, _judged(saved), last]
 
 
@@ -59,6 +62,7 @@ def _state(
         error = f", {scores.estimate.position_m['rmse']:.3f} m from the truth (RMSE)"
         if scores.odometry is not None:
             error += f", dead reckoning {scores.odometry.position_m['rmse']:.3f} m"
+        error += f"; {_TOO_SMALL}" if _covariances(saved, scores) else ""
     if short:
         return f"Do not rely on this map yet: {size}{error}."
     if not summary.get("converged", True):
@@ -66,6 +70,15 @@ def _state(
     if doubts or losses:
         return f"Use this map with care: {size}{error}{fit}."
     return f"The run shows nothing wrong with this map: {size}{error}{fit}."
+
+
+def _covariances(saved: SavedGraph | None, scores: Any) -> list[str]:
+    """A sentence where errors against the truth are far larger than the covariances say; else none."""
+    poses = scores.consistency.poses if scores is not None and scores.consistency else None
+    if saved is None or poses is None or poses.mean < _MOST_NEES * poses.dof:
+        return []
+    estimated = "" if saved.config.robust.noise_scale == "estimated" else "; try --set robust.noise_scale=estimated"
+    return [f"{_TOO_SMALL}: NEES of poses {poses.mean:.1f}, where {poses.dof} is expected{estimated}"]
 
 
 def _fit(saved: SavedGraph) -> str:
@@ -85,7 +98,9 @@ def chi2_per_dof(saved: SavedGraph) -> float | None:
 
 
 def _judged(saved: SavedGraph | None) -> str:
-    judged = [e for e in saved.entries if e.verdict] if saved else []
+    if saved is None:
+        return "What was measured cannot be shown without the map."
+    judged = [e for e in saved.entries if e.verdict]
     if not judged:
         return "The map is odometry alone: no landmark, fix or closure is in it."
     out = [e for e in judged if not e.is_in]

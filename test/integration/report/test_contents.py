@@ -5,6 +5,7 @@ import io
 import json
 import shutil
 import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,10 +17,11 @@ from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.explain import Numbers, remedy, statements, title
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.report import page
+from graph_slam_ros.report import page, verdict
 from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.report.packing import UNKNOWN, Packing, json_for_script, shown
 from graph_slam_ros.report.sentences import effects, sentences
+from graph_slam_ros.slam import Config
 
 
 @pytest.fixture(scope="module")
@@ -224,3 +226,14 @@ def test_without_plotly_the_command_that_installs_it_is_named(run, tmp_path, mon
     monkeypatch.setattr(page.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(GraphSlamError, match=r"pip install 'graph_slam_ros\[report\]'"):
         page.plotly()
+
+
+def test_covariances_that_the_truth_contradicts_are_named():
+    poses = SimpleNamespace(mean=11.0, dof=3)
+    scores = SimpleNamespace(consistency=SimpleNamespace(poses=poses))
+    saved = SimpleNamespace(config=Config())
+    (said,) = verdict._covariances(saved, scores)
+    assert "NEES of poses 11.0, where 3 is expected; try --set robust.noise_scale=estimated" in said
+    poses.mean = 5.9
+    assert verdict._covariances(saved, scores) == []
+    assert "odometry" not in verdict._judged(None)

@@ -124,6 +124,8 @@ def test_the_ledger_filters_sorts_and_is_walked_with_arrow_keys(page, faulty):
     statistic = [e.statistic for e in entries]
     rows = page.evaluate("() => [...document.querySelectorAll('.row')].map(row => Number(row.dataset.edge))")
     assert rows == sorted(pending, key=lambda edge: statistic[edge])[: len(rows)]
+    page.evaluate("() => { location.hash = '#edge=1'; }")  # odometry, which is not among them
+    page.wait_for_function("() => ledger.chosen === 1")
     page.focus("#rows")
     page.keyboard.press("ArrowDown")
     page.wait_for_function("edge => location.hash === `#edge=${edge}`", arg=rows[0])
