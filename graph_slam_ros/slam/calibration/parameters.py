@@ -52,7 +52,7 @@ QUANTITIES = {
     "yaw": Quantity("yaw", *_ANGLE, _AHEAD),
     "x": Quantity("mount", *_LENGTH, _NEAR),
     "y": Quantity("mount", *_LENGTH, _NEAR),
-    "z": Quantity("mount", *_LENGTH, _NEAR),
+    "z": Quantity("mount", *_LENGTH, "drive up a ramp and down, so that the robot tilts in sight of landmarks"),
     "range_offset": Quantity(
         "range_offset", "m", 1.0, 0.5, 0.1, 0.02, 1e-4, "pass landmarks near and far, within one drive"
     ),
