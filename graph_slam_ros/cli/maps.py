@@ -55,7 +55,7 @@ def merge(args: argparse.Namespace) -> int:
         f"landmark {name} is {metres:.2f} m ({sigmas:.0f} sigmas) elsewhere in B: what B saw of it is left out"
         for name, (metres, sigmas) in done.left_out.items()
     ]
-    return console.report_losses(done.losses, moved)
+    return console.report_losses(done.losses, [*moved, *done.calibrations])
 
 
 def freeze(args: argparse.Namespace) -> int:

@@ -3,7 +3,7 @@
 The drive of the second follows as a new segment, as after a jump of time. Only landmarks link it to the first drive.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain, count
 from pathlib import Path
@@ -22,6 +22,7 @@ from graph_slam_ros.runs.folder import check_room
 from graph_slam_ros.runs.map_journal import MapGrowth, Record, extend, state_of
 from graph_slam_ros.runs.restore import record_run, restored_and_solved, stopwatch
 from graph_slam_ros.slam import Control, GraphSlam
+from graph_slam_ros.slam.calibration.parameters import QUANTITIES, Parameter
 from graph_slam_ros.slam.edit_tools import HAND_MADE
 from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
 from graph_slam_ros.slam.robust.gating import landmark_of
@@ -41,12 +42,14 @@ class Merged:
     ----------
     shared : landmarks that both know
     left_out : what B saw of those of them that have moved, by name in metres and standard deviations
+    calibrations : sentences on parameters that are not the same in both
     """
 
     summary: dict[str, Any]
     losses: list[str]
     shared: int
     left_out: dict[str, tuple[float, float]]
+    calibrations: list[str]
 
 
 def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
@@ -74,7 +77,16 @@ def merge(a: Path, b: Path, out: Path, *, force: bool = False) -> Merged:
     chi2 = {one.landmarks[name].vertex: float(aligned.chi2[k]) for k, name in enumerate(shared) if name in left_out}
     _leave_out(state, first_edge, chi2, aligned.limit)
     _, summary = record_run(out, one.config, [Control("optimize")], losses, state, took=took, force=force)
-    return Merged(summary, summary["losses"], len(shared), left_out)
+    return Merged(summary, summary["losses"], len(shared), left_out, list(_calibrations(one, two)))
+
+
+def _calibrations(one: GraphSlam, two: GraphSlam) -> Iterator[str]:
+    """Yield a sentence on each corrected parameter that differs by more than what is worth a correction."""
+    for source, name in dict.fromkeys((*one.calibration, *two.calibration)):
+        a, b = (slam.calibrated(source, name) for slam in (one, two))
+        if abs(a - b) >= QUANTITIES[name].least:
+            what = Parameter(source, name)
+            yield f"{what} is {a:.4g} in A and {b:.4g} in B: the merged map goes on with that of A"
 
 
 def _refuse_other_datum(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None:

@@ -231,6 +231,10 @@ class MapView:
         """The corrections that were found, with those that were configured, by input and name."""
         return self._frontend.corrections.totals()
 
+    def calibrated(self, source: str, name: str) -> float:
+        """The value of a parameter of an input: what is configured, with what was found."""
+        return self._frontend.corrections.total((source, name))
+
     @property
     def corrected(self) -> Sequence[Finding]:
         """The findings that calibration has taken over, in order."""

@@ -82,6 +82,7 @@ WITHIN = {
             "formats",
             "measurements",
             "slam",
+            "slam/calibration",
             "slam/landmarks",
             "slam/robust",
         ),
