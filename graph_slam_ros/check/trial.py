@@ -21,7 +21,7 @@ _APART_S = 1.0
 _COARSE = {"solve.every_keyframes": 20, "robust.second_look_after": 0, "robust.rounds": 3}
 _SIGMAS = 4.0
 _TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
-_ABSURD, _BACKWARDS, _LATE_S, _SURE = 0.5, 0.35, 0.2, 0.05
+_ABSURD, _BACKWARDS, _SURE = 0.5, 0.35, 0.05
 _DEGREE = np.pi / 180.0
 # By parameter: code, unit, limit, and from which sigma on it is not observable.
 _LIMITS = {
@@ -33,6 +33,7 @@ _LIMITS = {
 }
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
 _LOST = 0.25
+_MOST, _SHIFTS = 0.9, 2.0
 
 
 def replayed(config: Config, measured: Iterable[Measurement]) -> GraphSlam:
@@ -87,7 +88,8 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     if scale is not None and _has_points(c) and scale.sigma < _SURE and abs(scale.value - 0.1) > _ABSURD:
         yield _absurd(c, 1.0 + scale.value)
         return
-    late_s = {} if fit.lost > _LOST else {f.parameter.source: f.value for f in fitted if _is_late(f)}
+    clocks = [one for one in fitted if one.parameter.name == "clock" and one.verdict == "admitted"]
+    late_s = {} if fit.lost > _LOST else {one.parameter.source: one.value for one in clocks}
     found = [] if _goes_back(c) else _places(c, slam, path_ns, path, late_s)
     if fit.lost > _LOST:
         found += [one for s in c.sightings for one in noisier(s, pairs_of(s, path_ns, path, c.config.world.dimensions))]
@@ -104,10 +106,6 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         factor = float(np.sqrt(noise.per_dof))
         if factor > limit and noise.dof > _LEAST_DOF and not noise.reason:
             yield _over_confident(c, noise.source, noise.label, noise.part, factor, limit)
-
-
-def _is_late(one: Fitted) -> bool:
-    return one.parameter.name == "clock" and one.verdict == "admitted" and abs(one.value) > _LATE_S
 
 
 def _goes_back(c: Columns) -> bool:
@@ -191,19 +189,19 @@ def _places(c: Columns, slam: GraphSlam, path_ns: Index, path: Array, late_s: Ma
 
     Parameters
     ----------
-    late_s : by input: clocks that are off by so much that identities seem to be of two places
+    late_s : by input: what its stamps are corrected by, since a wrong clock puts landmarks elsewhere in turns
     """
     found: list[Finding] = []
     for s in c.sightings:
-        stamp_ns = s.stamp_ns + round(late_s.get(s.input, 0.0) * 1e9)
-        inside = (stamp_ns >= path_ns[0]) & (stamp_ns <= path_ns[-1])
+        late = round(late_s.get(s.input, 0.0) * 1e9)
+        inside = (s.stamp_ns + late >= path_ns[0]) & (s.stamp_ns + late <= path_ns[-1])
         if not inside.any():
             continue
-        poses = poses_in_map(slam, np.clip(stamp_ns, path_ns[0], path_ns[-1]), path_ns, path)
-        points = points_in_map(s, poses)
+        stamps = (np.clip(stamp_ns, path_ns[0], path_ns[-1]) for stamp_ns in (s.stamp_ns, s.stamp_ns + late))
+        before, points = (points_in_map(s, poses_in_map(slam, one, path_ns, path)) for one in stamps)
         two = at_two_places(s, points, path_ns, c.config.world.dimensions)
-        if not late_s:  # else it is the clock that puts landmarks elsewhere
-            found += check_identities(s, two)
+        shift_m = float(np.nanquantile(np.linalg.norm(points - before, axis=1), _MOST)) if late else 0.0
+        found += check_identities(s, [one for one in two if one.apart_m > _SHIFTS * shift_m])
         elsewhere = {one.name for one in two}
         found += check_outliers(s, points, inside, c.config, elsewhere)
     return found
