@@ -273,12 +273,13 @@ def _clustered(
 ) -> list[list[int]]:
     """Indices of the sightings of each landmark. Those of one message are of one landmark only if they are close."""
     groups: list[list[int]] = []
+    means: list[Array] = []
     limit = quantile(_SAME, len(points[0]))
     for k, point in enumerate(points):
-        best, least = None, limit
-        for group in groups:
+        best, least = -1, limit
+        for at, (group, mean) in enumerate(zip(groups, means, strict=True)):
             first = group[0]
-            away = point - np.mean([points[i] for i in group], axis=0)
+            away = point - mean
             is_far = float(np.linalg.norm(away)) > close_m
             is_other = bool(glimpses[k].sort) and any(glimpses[i].sort not in ("", glimpses[k].sort) for i in group)
             is_other |= any(_differ_in_size(glimpses[i], glimpses[k], size_sigma_m) for i in group)
@@ -286,11 +287,13 @@ def _clustered(
                 continue
             chi2 = float(away @ np.linalg.solve(covariances[k] + covariances[first], away))
             if chi2 < least:
-                best, least = group, chi2
-        if best is None:
+                best, least = at, chi2
+        if best < 0:
             groups.append([k])
+            means.append(point)
         else:
-            best.append(k)
+            groups[best].append(k)
+            means[best] = np.mean([points[i] for i in groups[best]], axis=0)
     return groups
 
 

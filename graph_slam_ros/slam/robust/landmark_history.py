@@ -40,7 +40,8 @@ class LandmarkHistory:
         """
         if landmark < self._start or landmark in self._surveyed:
             return -1
-        judged = [(edge, k) for edge, k in self._earliest[landmark] if edge < len(self._ledger)]
+        count = len(self._ledger)
+        judged = [(edge, k) for edge, k in self._earliest[landmark] if edge < count]
         are_inside = self._ledger.are_inside(edge for edge, _ in judged)
         accepted = [k for (_, k), is_inside in zip(judged, are_inside, strict=True) if is_inside]
         doubted = sum(edge < newest and not is_inside for (edge, _), is_inside in zip(judged, are_inside, strict=True))
