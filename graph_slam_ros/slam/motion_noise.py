@@ -6,11 +6,11 @@ likelihood from incomplete data via the EM algorithm", 1977). The expected squar
 plus the variance that all measurements together leave to it. The components are the regression of these squares, none
 below zero.
 
-An edge that says little of its own noise hardly moves it, and steps are few. That is wanted: errors of a sensor that
-are alike within a pass look like those of odometry, and longer steps take them for such.
+Errors and motions are those of edges, or sums over windows of a few. One that says little of its own noise hardly moves
+it, and rounds are few. That is wanted: errors of a sensor that are alike within a pass look like those of odometry.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,7 +50,13 @@ def growth_of(factors: Mapping[Key, float], key: Key) -> Growth:
 
 @dataclass(frozen=True, slots=True)
 class Motions:
-    """Motions that odometry measured, each (n,): configured variance, radians turned, metres driven."""
+    """Motions that odometry measured, or sums over windows of them, each (n,).
+
+    Attributes
+    ----------
+    own : configured variance
+    turned, way : radians turned and metres driven
+    """
 
     own: Array
     turned: Array
@@ -66,6 +72,11 @@ class Motions:
         """Some of them."""
         return Motions(self.own[rows], self.turned[rows], self.way[rows])
 
+    def summed(self, windows: Sequence[Index]) -> "Motions":
+        """Sums over windows of motions, which follow one another."""
+        columns = self.own, self.turned, self.way
+        return Motions(*(np.array([column[rows].sum() for rows in windows]) for column in columns))
+
     def variance(self, noise: Growth) -> Array:
         """The variance of each."""
         return noise.factor**2 * self.own + noise.per_rad * self.turned + noise.per_m * self.way
@@ -76,9 +87,10 @@ def fit_growth(motions: Motions, square: Array, left: Array, now: Growth, count:
 
     Parameters
     ----------
-    square : (n,) square of each residual
+    square : (n,) square of each residual, or sum of residuals
     left : (n,) the variance that all measurements together leave to its error
-    count : number of residuals, of which these are a sample; what is configured counts as ``CONFIGURED_COUNT`` of them
+    count : number of edges or windows, of which these are a sample; what is configured counts as
+        ``CONFIGURED_COUNT`` of them
     is_rotation : turning adds to it; that of a position grows with the way alone
     """
     at, turned = motions.variance(now), motions.turned * is_rotation

@@ -8,16 +8,21 @@ Thompson, "Recovery of inter-block information when block sizes are unequal", 19
 Errors within one pass by a landmark are alike: a bias of the range is the same in all of them. They are worth less than
 independent ones. The variance of a sighting is therefore multiplied by the design effect of cluster samples, too (Kish,
 "Survey sampling", 1965): the variance of a pass's mean against that of independent errors.
+
+Errors of odometry may last, too, which edges cannot say. Errors of its rotation are therefore also summed over windows
+of two seconds, as for an Allan variance. Where they add up to more than single errors say, the noise is that of the
+sums. Sums of positions are not used: what the ranges of a pass have in common is also in them.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.slam.frontend.noise_factors import PER_M, PER_RAD, Key, groups, grows, parts_of
@@ -26,13 +31,14 @@ from graph_slam_ros.solver import Solver
 from graph_slam_ros.solver.linearization import Losses
 from graph_slam_ros.typing import Array, Index
 
-PASS_ENDS_NS = 2_000_000_000  # a landmark that is not seen for so long is passed again
+ALIKE_NS = 2_000_000_000  # errors that are alike last less: a landmark not seen for so long is passed again
 LEAST_IN_PASS, LEAST_PASSES = 3, 10
 LEAST_DOF = 200.0  # of a group: below it says too little
 LEAST_DOF_OF_MOTION = 20.0  # of odometry, whose estimate changes the less the less is known
 MOST_OUTLIERS = 0.05
 LEAST_WEIGHT = 0.1  # by the loss: an edge with less is an outlier
 SMALLEST, LARGEST = 0.3, 3.0  # factor of a sigma
+_MOST_WINDOWS = 100  # the same of windows
 _MOST_SAMPLED = 200  # edges of a group whose leverage is computed: their joint covariances cost most of all
 
 
@@ -93,17 +99,17 @@ def factors_of(scales: Sequence[NoiseScale]) -> dict[Key, float]:
 
 @dataclass(frozen=True, slots=True)
 class _Errors:
-    """Errors of a part of odometry, of the edges that are sampled: as for ``fit_growth``.
+    """Errors of a part of odometry, of edges or of windows: as for ``fit_growth``.
 
     Attributes
     ----------
-    own_per_s : variance for each second as configured, of all edges
+    count : number of edges or windows, of which these are a sample
     """
 
     motions: Motions
     square: Array
     left: Array
-    own_per_s: float
+    count: int
 
 
 @dataclass(slots=True)
@@ -118,7 +124,8 @@ class _Sums:
     passes: int = 0
     of_means: float = 0.0
     of_singles: float = 0.0
-    errors: _Errors | None = None
+    own_per_s: float = 0.0  # of odometry: configured variance for each second
+    errors: list[_Errors] = field(default_factory=list)
 
 
 def estimate_noise(
@@ -150,22 +157,23 @@ def estimate_noise(
                 key, total = (label, source, part), sums.setdefault((label, source, part), _Sums())
                 if grows(table.type, label):
                     now = growth_of(factors, key)
-                    block.add_odometry(total, axes, now, stamp_of)
+                    block.add_odometry(total, axes, now, stamp_of, is_rotation=part == "rotation")
                 else:
                     block.add_to(total, axes, factors.get(key, 1.0), passes)
     scales = [_scale(key, total, factors.get(key, 1.0)) for key, total in sums.items()]
-    return [_grown(one, sums[one.key].errors, growth_of(factors, one.key)) for one in scales]
+    return [_grown(one, sums[one.key], growth_of(factors, one.key)) for one in scales]
 
 
-def _grown(one: NoiseScale, errors: "_Errors | None", now: Growth) -> NoiseScale:
+def _grown(one: NoiseScale, total: _Sums, now: Growth) -> NoiseScale:
     """The scale of a part of odometry, with how it grows; any other is as it was."""
-    if errors is None:
+    if not total.errors:
         return one
-    if one.reason:
-        return replace(one, per_rad=now.per_rad, per_m=now.per_m, per_s=now.factor**2 * errors.own_per_s)
-    is_rotation = one.part == "rotation"
-    found = fit_growth(errors.motions, errors.square, errors.left, now, one.edges, is_rotation=is_rotation)
-    per_s = found.factor**2 * errors.own_per_s
+    found = now
+    if not one.reason:
+        every, is_rotation = total.errors[0].motions, one.part == "rotation"
+        fits = [fit_growth(e.motions, e.square, e.left, now, e.count, is_rotation=is_rotation) for e in total.errors]
+        found = max(fits, key=lambda fit: float(every.variance(fit).sum()))
+    per_s = found.factor**2 * total.own_per_s
     return replace(one, factor=found.factor, per_rad=found.per_rad, per_m=found.per_m, per_s=per_s)
 
 
@@ -177,14 +185,16 @@ class _Block:
     ) -> None:
         self.ends, self.measured = table.vertices.values[rows], table.measured.values[rows]
         offset, code = solver.graph.offset.values, int(losses.codes(table, rows[:1])[0])
-        self.residual, jacobian = table.type.linearize(values, offset[self.ends], self.measured)
+        self.residual, self._jacobian = table.type.linearize(values, offset[self.ends], self.measured)
         roots = table.sqrt_information.values[rows]
         chi2 = np.sum(np.einsum("nij,nj->ni", roots, self.residual) ** 2, axis=1)
+        self._solver, self._dof = solver, table.type.dofs[0]
         self.weight = np.array([weight_and_cost(losses.kind[code], losses.scale[code], one)[0] for one in chi2])
         self.covariance = np.linalg.inv(np.swapaxes(roots, 1, 2) @ roots)
         self.sampled = np.arange(0, len(rows), max(1, -(-len(rows) // _MOST_SAMPLED)))
         joint = [solver.joint_marginal(self.ends[k]) for k in self.sampled]
-        self.hat = np.stack([jacobian[k] @ cov @ jacobian[k].T for k, cov in zip(self.sampled, joint, strict=True)])
+        of = self._jacobian
+        self.hat = np.stack([of[k] @ cov @ of[k].T for k, cov in zip(self.sampled, joint, strict=True)])
 
     def add_to(self, total: "_Sums", axes: Array, factor: float, passes: Sequence[Index]) -> None:
         """Add a part of the residuals: chi2 with the configured noise, the rest with the noise as it is scaled now."""
@@ -208,21 +218,52 @@ class _Block:
         """The time between the vertices of its edges, in all."""
         return float(np.sum(np.abs(np.diff(stamp_of[self.ends[:, :2]], axis=1)))) * 1e-9
 
-    def add_odometry(self, total: "_Sums", axes: Array, now: Growth, stamp_of: Index) -> None:
+    def add_odometry(self, total: "_Sums", axes: Array, now: Growth, stamp_of: Index, *, is_rotation: bool) -> None:
         """Add a part of odometry's residuals, and how its noise grows."""
         count, kinds = len(self.residual), axes.shape[2]
         variance = np.einsum("nij,nik,nkj->n", axes, self.covariance, axes)
         square = np.sum(np.einsum("nij,ni->nj", axes, self.residual) ** 2, axis=1)
         known = np.einsum("nij,nik,nkj->n", axes[self.sampled], self.hat, axes[self.sampled])
         motions = Motions.of(self.measured, variance, now)
-        share = known / variance[self.sampled]
         total.edges += count
         total.residuals += float(kinds * count)
-        total.leverage += float(share.mean()) * kinds * count
+        total.leverage += float((known / variance[self.sampled]).mean()) * kinds * count
         total.chi2 += kinds * float(np.sum(square / motions.own))
-        own_per_s = float(motions.own.sum()) / max(1e-9, self._seconds(stamp_of))
-        sampled = motions.at(self.sampled), square[self.sampled], known
-        total.errors = _Errors(*sampled, own_per_s)
+        total.own_per_s = float(motions.own.sum()) / max(1e-9, self._seconds(stamp_of))
+        total.errors = [_Errors(motions.at(self.sampled), square[self.sampled], known, count)]
+        if is_rotation:
+            total.errors.append(self._turns(motions, stamp_of))
+
+    def _turns(self, motions: Motions, stamp_of: Index) -> _Errors:
+        """Errors of rotation, summed over windows in the axes of the last pose of each."""
+        every, dof = _windows(self.ends, stamp_of), self._dof
+        space = PLANAR if dof == PLANAR.dof else SPATIAL
+        n, axes, square, left = space.dimensions, np.eye(dof - space.dimensions), [], []
+        sample = every[:: max(1, -(-len(every) // _MOST_WINDOWS))]
+        for rows in sample:
+            vertices = [self.ends[rows[0], 0], *self.ends[rows, 1]]
+            turns = [space.turn(tuple(one)) for one in self._solver.estimate(vertices[1:])]
+            residual, jacobian = np.zeros(len(axes)), np.zeros((len(axes), dof * len(vertices)))
+            for k, (row, turn) in enumerate(zip(rows, turns, strict=True)):
+                into = turns[-1].T @ turn if len(axes) == n else axes
+                residual += into @ self.residual[row, n:]
+                jacobian[:, dof * k : dof * (k + 2)] += into @ self._jacobian[row, n:]
+            square.append(residual @ residual)
+            left.append(np.trace(jacobian @ self._solver.joint_marginal(vertices) @ jacobian.T))
+        return _Errors(motions.summed(sample), np.array(square), np.array(left), len(every))
+
+
+def _windows(ends: Index, stamp_of: Index) -> list[Index]:
+    """Odometry's edges, one after another from pose to pose, in windows that end after two seconds."""
+    order = np.argsort(stamp_of[ends[:, 0]], kind="stable")
+    out, begin = [], 0
+    for k in range(1, len(order) + 1):
+        last = ends[order[k - 1], 1]
+        is_over = stamp_of[last] - stamp_of[ends[order[begin], 0]] >= ALIKE_NS
+        if is_over or k == len(order) or ends[order[k], 0] != last:
+            out.append(order[begin:k])
+            begin = k
+    return out
 
 
 def _passes(ends: Index, stamp_of: Index) -> list[Index]:
@@ -230,7 +271,7 @@ def _passes(ends: Index, stamp_of: Index) -> list[Index]:
     stamps = stamp_of[ends[:, 0]]
     order = np.lexsort((stamps, ends[:, 1]))
     landmark, when = ends[order, 1], stamps[order]
-    cuts = np.flatnonzero((np.diff(landmark) != 0) | (np.diff(when) > PASS_ENDS_NS)) + 1
+    cuts = np.flatnonzero((np.diff(landmark) != 0) | (np.diff(when) > ALIKE_NS)) + 1
     return [those for those in np.split(order, cuts) if len(those) >= LEAST_IN_PASS]
 
 
@@ -246,7 +287,7 @@ def _scale(key: Key, total: _Sums, factor_now: float) -> NoiseScale:
         return replace(scale, reason=f"{dof:.0f} degrees of freedom, fewer than {least:.0f}")
     if total.outliers > MOST_OUTLIERS * total.edges:
         return replace(scale, reason=f"{total.outliers / total.edges:.0%} outliers, more than {MOST_OUTLIERS:.0%}")
-    if total.errors is not None:
+    if total.errors:
         return scale
     factor = float(np.sqrt(per_dof * design_effect))
     if factor < 1.0 and key[0] == "landmarks" and total.passes < LEAST_PASSES:

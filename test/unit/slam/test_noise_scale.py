@@ -29,8 +29,11 @@ SIGMAS = {"odometry": (0.02, 0.02, 0.01), "position": (0.1, 0.05)}  # along and 
 MANY = 1e9  # residuals: the configuration counts as nothing
 
 
-def drive(rng, factors, pass_bias=0.0, poses=1500, laps=4):
-    """A drive in a circle past 12 landmarks, with noise that is so many times as large as its edges say."""
+def drive(rng, factors, pass_bias=0.0, poses=1500, laps=4, lasting=0.0):
+    """A drive in a circle past 12 landmarks, with noise that is so many times as large as its edges say.
+
+    ``lasting`` is the correlation of odometry's error with the one before.
+    """
     graph = Graph()
     angles = np.arange(poses) * 2 * np.pi * laps / poses
     true = np.stack([10 * np.cos(angles), 10 * np.sin(angles), angles + np.pi / 2], axis=1)
@@ -40,9 +43,11 @@ def drive(rng, factors, pass_bias=0.0, poses=1500, laps=4):
     marks = graph.add_vertices(R2, points)
     graph.add_edge(POSE_PRIOR, [vertices[0]], true[0], Gaussian.from_sigmas(1e-3, 1e-3, 1e-3), "anchor")
     step = np.array(SIGMAS["odometry"])
+    last = np.zeros(3)
     for k in range(poses - 1):
+        last = lasting * last + np.sqrt(1.0 - lasting**2) * rng.normal(size=3)
         motion = np.array(se2.between(tuple(true[k]), tuple(true[k + 1])))
-        error = factors["odometry"] * step * rng.normal(size=3)
+        error = factors["odometry"] * step * last
         graph.add_edge(RELATIVE_POSE, vertices[k : k + 2], motion + error, Gaussian.from_sigmas(*step), *ODOMETRY[:2])
     bias = {}
     for k in range(poses):
@@ -97,6 +102,15 @@ def test_errors_that_are_alike_within_a_pass_make_sigmas_larger_and_others_not()
     assert found[RANGE].factor > 3.0 / 1.2  # sqrt(1 + 2^2) alone would be 2.2
     assert found[BEARING].design_effect < 1.3
     assert found[BEARING].factor == pytest.approx(1.0, rel=0.12)
+
+
+def test_odometry_whose_errors_last_has_the_noise_of_their_sums():
+    precise = {"odometry": 2.0, "range": 0.3, "bearing": 0.3}
+    lasting = converged(*drive(np.random.default_rng(4), precise, lasting=0.6))
+    white = converged(*drive(np.random.default_rng(4), precise))
+    of_sums = np.sqrt(1.0 + 2.0 * (0.75 * 0.6 + 0.5 * 0.6**2 + 0.25 * 0.6**3))  # windows of four steps
+    ratio = sigma_factor(lasting[ODOMETRY]) / sigma_factor(white[ODOMETRY])
+    assert ratio == pytest.approx(of_sums, rel=0.15)
 
 
 def test_what_says_too_little_keeps_its_noise_and_says_why():
