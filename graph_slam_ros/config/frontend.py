@@ -146,6 +146,11 @@ class OdometryConfig:
     )
 
     @property
+    def slides(self) -> tuple[float, float]:
+        """The noise sideways and upwards, relative to that ahead."""
+        return self.lateral_density / self.translation_density, self.vertical_density / self.translation_density
+
+    @property
     def has_densities(self) -> bool:
         """Return whether a density differs from its default."""
         return any(getattr(self, one.name) != one.default for one in fields(self) if one.name.endswith("_density"))

@@ -125,7 +125,13 @@ class Calibrator:
         if found is None:
             return None
         self.trials, self._last = self.trials + 1, found
-        findings = decide(found, self._count_landmarks(), self._admitted, drifts=self._windows.drifts)
+        findings = decide(
+            found,
+            self._count_landmarks(),
+            self._admitted,
+            slides=self._config.odometry.slides,
+            drifts=self._windows.drifts,
+        )
         values = {one.parameter: _rounded(one.value) for one in findings if one.verdict == "admitted"}
         moved = any(one.parameter in values and abs(one.value) > one.sigma for one in findings)
         self._steady = 0 if moved else self._steady + bool(self._admitted)

@@ -219,7 +219,7 @@ class MapView:
         problem = self.backend.trial_problem(self.space, frontend.path, origins, factors=frontend.corrections.factors)
         wanted = parameters_of(problem, groups, chooses=chooses)
         found = fit(problem, {one: one.quantity.prior for one in wanted})
-        return found, decide(found, len(self.landmarks))
+        return found, decide(found, len(self.landmarks), slides=self.config.odometry.slides)
 
     @property
     def calibration_report(self) -> dict[str, Any]:

@@ -6,8 +6,8 @@
 4. Is it this parameter, not another? Its correlation with any other must be below 0.95, and it must lie within three
    sigmas of its prior.
 
-The direction in which odometry moves is what a yaw (in space a pitch, too) is measured against. So it is refused where
-odometry may slide across that direction.
+A yaw (in space a pitch, too) is measured against the direction in which odometry moves. So it is refused for a robot
+that is configured to slide across that direction.
 """
 
 from collections.abc import Collection
@@ -22,7 +22,7 @@ MOST_CORRELATED = 0.95
 PRIOR_SIGMAS = 3.0
 MOST_LOST = 0.2
 LEAST_LANDMARKS = 3
-MOST_SLIDING = 0.3  # of odometry's sigma ahead, sideways: with more a turned sensor and a robot that slides are one
+MOST_SLIDING = 0.3  # of odometry's noise ahead: with more sideways, a turned sensor and a robot that slides are one
 FOLLOWED = 0.1  # of a sigma: what is left of a correction that is used is followed from there on
 
 Verdict = Literal["admitted", "nothing_to_correct", "not_determined", "not_reproducible", "not_separable", "refused"]
@@ -52,7 +52,12 @@ class Finding:
 
 
 def decide(
-    found: TrialFit, landmarks: int, corrected: Collection[Parameter] = (), *, drifts: bool = False
+    found: TrialFit,
+    landmarks: int,
+    corrected: Collection[Parameter] = (),
+    *,
+    slides: tuple[float, float] = (0.0, 0.0),
+    drifts: bool = False,
 ) -> list[Finding]:
     """Answer the four questions for each parameter of a trial fit.
 
@@ -60,10 +65,14 @@ def decide(
     ----------
     landmarks : how many were seen
     corrected : parameters that were let in before: what is left of them is followed
+    slides : configured noise of odometry sideways and upwards, relative to that ahead
     drifts : whether parameters may change on the way
     """
     void, remedy = _void(found, landmarks), "raise calibrate.drift, or " * drifts + "correct the configuration first"
-    return [_finding(found, k, void, remedy, one in corrected) for k, one in enumerate(found.parameters)]
+    return [
+        _finding(found, k, void, remedy, _slides(one, slides), one in corrected)
+        for k, one in enumerate(found.parameters)
+    ]
 
 
 def amount(parameter: Parameter, value: float, digits: int = 2) -> str:
@@ -81,13 +90,13 @@ def _void(found: TrialFit, landmarks: int) -> str:
     return ""
 
 
-def _finding(found: TrialFit, k: int, void: str, remedy: str, is_corrected: bool) -> Finding:
+def _finding(found: TrialFit, k: int, void: str, remedy: str, slides: str, is_corrected: bool) -> Finding:
     parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
-    verdict, why = _verdict(found, k, void, remedy, is_corrected)
+    verdict, why = _verdict(found, k, void, remedy, slides, is_corrected)
     return Finding(parameter, value, sigma, verdict, f"{parameter}: {why}")
 
 
-def _verdict(found: TrialFit, k: int, void: str, remedy: str, is_corrected: bool) -> tuple[Verdict, str]:
+def _verdict(found: TrialFit, k: int, void: str, remedy: str, slides: str, is_corrected: bool) -> tuple[Verdict, str]:
     parameter, value, sigma = found.parameters[k], float(found.values[k]), float(found.sigmas[k])
     quantity, (correlation, other) = parameter.quantity, found.worst_correlation(k)
     shown = f"{amount(parameter, value, 3)}, sigma {amount(parameter, sigma)}"
@@ -100,12 +109,8 @@ def _verdict(found: TrialFit, k: int, void: str, remedy: str, is_corrected: bool
     if abs(value) < least:
         why = f": within {SIGMAS:.0f} sigmas of zero" if abs(value) >= quantity.least and not is_corrected else ""
         return "nothing_to_correct", f"{'not corrected' if why else 'nothing to correct'} ({shown}){why}"
-    if (slides := _slides(found, parameter)) > MOST_SLIDING:
-        across, density = ("sideways", "lateral") if parameter.name == "yaw" else ("upwards", "vertical")
-        return "refused", (
-            f"not used ({shown}): odometry may slide, its sigma {across} is {slides:.1f} of that ahead, more than "
-            f"{MOST_SLIDING}: {quantity.manoeuvre}, without sliding, and say so (odometry.{density}_density)"
-        )
+    if slides:
+        return "refused", f"not used ({shown}): {slides}"
     if correlation > MOST_CORRELATED:
         return "not_separable", f"not separable from {other} (correlation {correlation:.2f}): {quantity.manoeuvre}"
     if abs(value) > PRIOR_SIGMAS * found.priors[k]:
@@ -118,10 +123,17 @@ def _verdict(found: TrialFit, k: int, void: str, remedy: str, is_corrected: bool
     return "admitted", shown
 
 
-def _slides(found: TrialFit, parameter: Parameter) -> float:
-    """The sigma of a slide across the direction that an angle is measured against, over that ahead; else 0."""
+def _slides(parameter: Parameter, slides: tuple[float, float]) -> str:
+    """Return why an angle cannot be told from a slide across the direction of motion; empty if it can."""
     axis = {"yaw": 0, "pitch": 1}.get(parameter.name)
-    return 0.0 if axis is None or axis >= len(found.slides) else found.slides[axis]
+    if axis is None or slides[axis] <= MOST_SLIDING:
+        return ""
+    across, density = ("sideways", "lateral") if axis == 0 else ("upwards", "vertical")
+    return (
+        f"the robot may slide: odometry.{density}_density ({across}) is {slides[axis]:.1f} of "
+        f"odometry.translation_density, more than {MOST_SLIDING}. If it does not slide, lower it; "
+        f"{parameter.quantity.manoeuvre}"
+    )
 
 
 def _agree(first: float, second: float) -> bool:

@@ -46,7 +46,6 @@ class TrialFit:
     path : stored numbers of all vertices
     sensitivity : (unknowns, p) steps of all unknowns with each parameter
     column : (vertices,) first row of each vertex in ``sensitivity``, or -1
-    slides : how far odometry may be off sideways (and upwards) for each metre that it may be off ahead
     """
 
     parameters: tuple[Parameter, ...]
@@ -60,7 +59,6 @@ class TrialFit:
     path: Array
     sensitivity: Array
     column: Index
-    slides: tuple[float, ...] = ()
 
     def adds(self, vertex: int, dof: int, left: Values) -> Array:
         """The covariance (dof, dof) that parameters add to a vertex whose marginal takes them for known.
@@ -181,16 +179,7 @@ class _Fit:
         sightings = rows.landmark >= 0
         lost = float(np.mean(rows.weight[sightings] < _LOST)) if sightings.any() else 0.0
         found = self._parameters, theta, self._priors, covariance, robust, first, second, lost, x
-        return TrialFit(*found, -border, self._linear.column, self._slides())
-
-    def _slides(self) -> tuple[float, ...]:
-        """The sigmas of odometry's edges across the direction of motion, over those along it, without turns."""
-        ratios, n = [], self._p.space.dimensions
-        for edges in self._p.model().odometry:
-            roots = edges.table.sqrt_information.values[edges.rows][:, :, :n]
-            variances = np.diagonal(np.linalg.inv(roots.swapaxes(1, 2) @ roots), axis1=1, axis2=2)
-            ratios.append(np.sqrt(variances[:, 1:] / variances[:, :1]))
-        return tuple(np.median(np.concatenate(ratios), axis=0).tolist()) if ratios else ()
+        return TrialFit(*found, -border, self._linear.column)
 
     def _meat(self, scores: Array, rows: Rows) -> Array:
         """The scatter of scores, grouped by landmark or by half a minute, whichever is larger relative to them."""

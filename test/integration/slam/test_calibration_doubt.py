@@ -95,6 +95,6 @@ def test_a_robot_that_may_slide_does_not_tell_the_yaw_of_its_sensor():
     one = findings(slam)["yaw"]
     assert not slam.calibration_report["settings"]
     assert one["verdict"] == "refused"
-    assert "its sigma sideways is 0.6 of that ahead, more than 0.3: drive 10 m straight past" in one["text"]
-    assert one["text"].endswith("without sliding, and say so (odometry.lateral_density)")
+    assert "odometry.lateral_density (sideways) is 0.6 of odometry.translation_density" in one["text"]
+    assert "drive 10 m straight past" in one["text"]
     assert findings(driven(measurements, ON))["yaw"]["verdict"] != "refused"

@@ -81,7 +81,7 @@ def test_a_level_drive_does_not_tell_the_height_of_a_sensor():
 def test_a_robot_that_may_drift_upwards_does_not_tell_the_pitch_of_its_sensor(wrong):
     _, findings = found(wrong[: len(wrong) * 2 // 3], {"odometry.vertical_density": 0.006})
     assert findings["pitch"]["verdict"] == "refused"
-    assert "its sigma upwards is 0.6 of that ahead" in findings["pitch"]["text"]
+    assert "odometry.vertical_density (upwards) is 0.6 of odometry.translation_density" in findings["pitch"]["text"]
     assert findings["yaw"]["verdict"] != "refused"
 
 
