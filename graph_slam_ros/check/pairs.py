@@ -169,6 +169,8 @@ def _of_others(s: SightingColumns, pairs: Pairs, use: Mask) -> float:
 
 def noisier(s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
     """Sightings that are far worse than their noise says, by the smaller residuals of pairs, which no outlier has."""
+    if not len(pairs.a):  # ranges or bearings alone
+        return
     sigmas = np.hypot(s.sigmas[pairs.a], _TYPICAL_M) * 2.0**0.5
     residuals = pairs.residuals(s.points)
     factor = float(np.quantile(residuals / sigmas, _QUARTILE)) / _OF_RAYLEIGH

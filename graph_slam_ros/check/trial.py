@@ -18,7 +18,7 @@ from graph_slam_ros.typing import Array, Index
 
 _THIN_NS = 80_000_000
 _APART_S = 1.0
-_COARSE = {"solve.every_keyframes": 20, "robust.second_look_after": 0, "robust.rounds": 3, "odometry.doubt": False}
+_COARSE = {"solve.every_keyframes": 20, "robust.rounds": 3, "odometry.doubt": False}
 _SIGMAS = 4.0
 _TURN_SIGMAS = 6.0  # a wheel's noise that lasts adds up in heading, which neither sigma of a fit knows
 _ABSURD, _BACKWARDS, _SURE = 0.5, 0.35, 0.05
@@ -200,7 +200,9 @@ def _places(c: Columns, slam: GraphSlam, path_ns: Index, path: Array, late_s: Ma
         stamps = (np.clip(stamp_ns, path_ns[0], path_ns[-1]) for stamp_ns in (s.stamp_ns, s.stamp_ns + late))
         before, points = (points_in_map(s, poses_in_map(slam, one, path_ns, path)) for one in stamps)
         two = at_two_places(s, points, path_ns, c.config.world.dimensions)
-        shift_m = float(np.nanquantile(np.linalg.norm(points - before, axis=1), _MOST)) if late else 0.0
+        shift = np.linalg.norm(points - before, axis=1)
+        shift = shift[np.isfinite(shift)]  # ranges and bearings alone have no point
+        shift_m = float(np.quantile(shift, _MOST)) if len(shift) else 0.0
         found += check_identities(s, [one for one in two if one.apart_m > _SHIFTS * shift_m])
         elsewhere = {one.name for one in two}
         found += check_outliers(s, points, inside, c.config, elsewhere)

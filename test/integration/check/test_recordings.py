@@ -164,3 +164,11 @@ def test_ranges_alone_that_are_too_long_are_mended_by_their_own_factor(tmp_path,
     key, value = found["range_scale"]["settings"][0].split("=")
     assert key == "ranges.range_factor"
     assert float(value) == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_clean_drive_of_ranges_alone_needs_the_search_for_other_hypotheses(tmp_path, check, capsys):
+    bag = tmp_path / "ranges.mcap"
+    city = ("--poses", "300", "--set", "blocks=10", "--set", "sensor=range", "--seed", "501")
+    assert main(["simulate", "manhattan", "--out", str(bag), *city]) == 0
+    capsys.readouterr()
+    assert check(bag)[0] == 0
