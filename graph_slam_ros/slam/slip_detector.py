@@ -50,6 +50,8 @@ _EARLIER = (1, 2, 3, 4, 6, 8)  # edges by which a slip may have begun before it 
 _SURELY = 1.0  # logarithm of the likelihood ratio that this needs
 _AGAIN = (8, 12, 16)  # views for which odometry must be as likely by its own noise, for a slip to end
 _MOST_EDGES = 60
+_PART = 0.05  # of the views cause a comparison at most, but for so many that follow one another:
+_BURST = 20.0
 _FACTOR = 1.5  # all noise may be larger than stated by this factor
 
 
@@ -99,7 +101,7 @@ class SlipDetector:
         self._views: deque[_View] = deque(maxlen=_VIEWS + 1)
         self._new: list[int] = []  # edges that came since the last check, whose innovation is not known yet
         self._replacing: set[int] = set()  # edges that replace others
-        self._checked = -1
+        self._checked, self._allowed = -1, _BURST
         self._noise, self._added = MeasuredNoise(space, backend), SlipNoise(space, odometry)
         self.slips: list[Slip] = []
 
@@ -162,8 +164,10 @@ class SlipDetector:
             return False
         keyframe = len(keyframes) - 1
         is_new, self._checked = newest != self._checked, newest
+        self._allowed = min(_BURST, self._allowed + _PART * is_new)
         try:
-            if self.now is None and (is_decided or (is_new and self._is_alarmed())):
+            if self.now is None and (is_decided or (is_new and self._allowed >= 1.0 and self._is_alarmed())):
+                self._allowed = max(0.0, self._allowed - 1.0)
                 choice = self._compare(moved, keyframes)
                 if choice.is_slip:
                     self._begin_slip(choice, keyframe, stamp_ns)
@@ -255,9 +259,9 @@ class SlipDetector:
         """Return whether one observation up to a keyframe determines a landmark: then the rest can be left out."""
         if isinstance(what, str) or not self._is_known(what, first):
             return isinstance(what, str)
-        backend, dof = self._backend, self._backend.graph.kind_of(what).dof
-        edges = [backend.graph.edge(edge) for edge in backend.solver.edges_on(what) if backend.ledger.is_inside(edge)]
-        return any(one.vertices[0] <= first and one.type.residual_size >= dof for one in edges)
+        graph, ledger, dof = self._backend.graph, self._backend.ledger, self._backend.graph.kind_of(what).dof
+        inside = (edge for edge in self._backend.solver.edges_on(what).tolist() if ledger.is_inside(edge))
+        return any(one.vertices[0] <= first and one.type.residual_size >= dof for one in map(graph.edge, inside))
 
     def _first_of(self, links: Sequence[_Link], since: int) -> int:
         """The first link after the view that precedes the last ``since`` views."""
@@ -281,7 +285,7 @@ class SlipDetector:
         """A copy of the problem without some edges; so an alarm alone changes nothing."""
         solver, ledger, graph = self._backend.solver, self._backend.ledger, self._backend.graph.copy()
         graph.set_weights(np.array([edge for edge in edges if ledger.is_inside(edge)], dtype=np.int64), 0.0)
-        out = Solver(graph, solver.settings)
+        out = Solver(graph, solver.settings.until_still())
         out.add(solver.vertices, range(self._backend.handed_over[1]))
         out.start_at(solver.values)
         for vertex in solver.held.tolist():
