@@ -105,8 +105,8 @@ def test_a_gyro_in_degrees_is_said_at_the_end(bag, tmp_path, capsys, monkeypatch
     monkeypatch.setattr(odometry.so3, "act", lambda q, v: tuple(57.3 * x for x in usual(q, v)))
     replayed(bag, tmp_path / "run", ("odometry.noise", "motion"), ("odometry.turn_per_rad", 0.001))
     said = " ".join(capsys.readouterr().err.split())
-    assert "imu: gyro_doubted" in said
-    assert "counter-clockwise positive" in said
+    assert "imu: gyro and odometry contradict each other" in said
+    assert "are these degrees?" in said
 
 
 def test_one_input_can_be_the_gyro():
