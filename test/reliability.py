@@ -19,7 +19,8 @@ def tell(name, *, worst=None, **numbers):
     """Add to the numbers of a line; of ``worst`` the largest is told."""
     _TOLD[name].update(numbers)
     for key, value in (worst or {}).items():
-        _WORST[name][key] = max(value, _WORST[name].get(key, value))
+        number = float(value)  # of NumPy it could not go to another process
+        _WORST[name][key] = max(number, _WORST[name].get(key, number))
 
 
 def told():

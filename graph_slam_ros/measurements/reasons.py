@@ -321,8 +321,8 @@ REASONS: dict[str, Reason] = {
     "slip": Reason(
         _NOTED,
         "several landmarks contradicted odometry over some seconds: its wheels slipped, so it counts for less there",
-        "graph_slam explain RUN; if it happens often, its noise is larger than stated (odometry.noise), or its scale, a "
-        "clock or a mount is wrong (graph_slam check, graph_slam calibrate)",
+        "graph_slam explain RUN; if it happens often, its noise is larger than stated (odometry.noise), or its scale, "
+        "a clock or a mount is wrong (graph_slam check, graph_slam calibrate)",
     ),
     "slip_taken_back": Reason(
         _NOTED,

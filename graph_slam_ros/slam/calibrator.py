@@ -72,6 +72,11 @@ class Calibrator:
             frontend.corrections.restore(start.calibration)
             self._admitted = {Parameter(*key) for key in start.calibration}
 
+    @property
+    def is_first_trial_ahead(self) -> bool:
+        """Return whether no trial was used yet: until then a wrong calibration would pass for slips."""
+        return self._config.calibrate.is_on and not self.trials
+
     def after_solve(self, keyframe: int, everything: Settings | None) -> Report | None:
         """Start a trial if it is due, and apply the outcome of an earlier one. Returns the report of a solve."""
         if not self._config.calibrate.is_on or self._backend.holds_back:

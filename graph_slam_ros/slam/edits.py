@@ -98,8 +98,10 @@ class Edits:
         try:
             self._apply(edit.do, dict(edit.arguments), keyframe)
         except GraphSlamError as error:
-            kind = "" if edit.name == edit.do else f" ({edit.do})"
-            raise GraphSlamError(f"edit {edit.name}{kind}: {error}") from None
+            of = [edit.do] * (edit.name != edit.do)
+            of += [f"{key} {edit.arguments[key]}" for key in ("edge", "landmark") if key in edit.arguments]
+            name = f"{edit.name} ({', '.join(of)})" if of else edit.name
+            raise GraphSlamError(f"edit {name}: {error}") from None
         decided = [one.edge for one in backend.ledger.history[changes:] if one.reason is Reason.BY_HAND]
         out = tuple(edge for edge in dict.fromkeys(decided) if edge < edges)
         added = tuple(range(edges, backend.graph.edge_count))

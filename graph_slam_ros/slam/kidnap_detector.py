@@ -192,19 +192,20 @@ class KidnapDetector:
                 case "closures":
                     self._slips.add_seen(edge, max(vertices), one.label)
 
-    def check(self, keyframes: StampedPoses[Keyframe], stamp_ns: int) -> None:
+    def check(self, keyframes: StampedPoses[Keyframe], stamp_ns: int, *, doubts: bool = True) -> None:
         """Look at the evidence after a solve.
 
         Parameters
         ----------
         stamp_ns : of the newest odometry
+        doubts : whether odometry may be found to slip
         """
         vertices = keyframes.ids
         if not self._backend.decides:
             return
         found = self._significant(int(vertices[-1]))
         is_decided = found is not None and self._is_decided(found)
-        if self._slips.check(keyframes, stamp_ns, self._moved_to(found), is_decided=is_decided):
+        if doubts and self._slips.check(keyframes, stamp_ns, self._moved_to(found), is_decided=is_decided):
             found = None
         if found is not None and is_decided:
             last = self._splits[-1] if self._splits else None

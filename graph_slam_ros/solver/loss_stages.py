@@ -16,10 +16,6 @@ class LossStages:
     Attributes
     ----------
     young : edges that have had only one update
-
-    Attributes
-    ----------
-    young : edges that have had but one update
     """
 
     def __init__(self, graph: Graph) -> None:

@@ -242,11 +242,6 @@ class Problem:
         ------
         GaugeError
             Nothing would fix a part of the problem. This is checked if it may be so, or if ``surely``.
-
-        Raises
-        ------
-        GaugeError
-            With them, nothing fixes a part of it; that is checked where it may be so, or ``surely``.
         """
         self._grow()
         pending, tree = self._pending, self._tree

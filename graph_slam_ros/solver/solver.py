@@ -273,7 +273,7 @@ class Solver(Problem):
             raise
 
     def _keep(self, moved: Index) -> None:
-        """Return the estimates of vertices, to restore them after an error."""
+        """Save the estimates of vertices, to restore them after an error."""
         if len(moved):
             keep(self._tree.vertex, self._tree.estimate, self._kept, moved)
 

@@ -194,11 +194,11 @@ def test_explain_ledger_diff_solve_and_freeze_know_the_edits(run, edits, edited,
 def test_what_cannot_be_applied_is_refused_in_one_line_and_nothing_is_written(run, edits, entries, tmp_path, capsys):
     odometry = next(e.edge for e in entries if e.label == "odometry")
     cases = [
-        ({"do": "remove_edge", "edge": 999999}, "edge 999999 taken out: it is not in the graph"),
-        ({"do": "let_in_edge", "edge": 999999}, "edge 999999 let in: it is not in the graph"),
+        ({"do": "remove_edge", "edge": 999999}, "(remove_edge, edge 999999): it is not in the graph"),
+        ({"do": "let_in_edge", "edge": 999999}, "(let_in_edge, edge 999999): it is not in the graph"),
         ({"do": "remove_edge", "edge": odometry}, "it is odometry or a prior"),
         ({"do": "let_in_edge", "edge": odometry}, "it is odometry or a prior"),
-        ({"do": "remove_landmark", "landmark": "none"}, "landmark none deleted: it is not in the map"),
+        ({"do": "remove_landmark", "landmark": "none"}, "(remove_landmark, landmark none): it is not in the map"),
         ({"do": "rename_landmark", "landmark": "none", "to": "x"}, "it is not in the map"),
         ({"do": "merge_landmarks", "landmark": entries[-1].landmark or "1", "into": "none"}, "none is not in the map"),
         (edits["rename_landmark"] | {"to": edits["remove_landmark"]["landmark"]}, "another landmark is named"),
@@ -208,7 +208,7 @@ def test_what_cannot_be_applied_is_refused_in_one_line_and_nothing_is_written(ru
         capsys.readouterr()
         assert edit(run, plan, "--out", tmp_path / "new") == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert f"edit case-{number}: " in line
+        assert f"edit case-{number} (" in line
         assert named in line
         assert not (tmp_path / "new").exists()
 

@@ -384,7 +384,7 @@ def test_what_cannot_be_done_is_named_and_nothing_is_written(do, change, named, 
     arguments = CASES[do] | ({"pose": [1.0, 0.0, 0.0]} if "pose" in CASES[do] else {}) | change
     with pytest.raises(GraphSlamError) as raised:
         edit(run, plan(run, values(do, run, arguments)), tmp_path / "new")
-    assert str(raised.value).startswith(f"edit {do}: ")
+    assert str(raised.value).startswith((f"edit {do}: ", f"edit {do} ("))
     assert named in str(raised.value)
     assert "\n" not in str(raised.value)
     assert not (tmp_path / "new").exists()
@@ -396,7 +396,7 @@ def test_what_a_later_edit_depends_on_is_not_undone(run, tmp_path):
     edit(run, plan(run, renamed, values("remove_landmark", run, {"landmark": "gate"}, "second")), tmp_path / "new")
     with pytest.raises(
         GraphSlamError,
-        match=r"edit first cannot be undone alone: without it edit second \(remove_landmark\): it is not in the map",
+        match=r"edit first cannot be undone alone: without it edit second \(remove_landmark, landmark gate\): it is",
     ):
         undo_edit(tmp_path / "new", "first", tmp_path / "undone")
     assert not (tmp_path / "undone").exists()
