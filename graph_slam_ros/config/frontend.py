@@ -128,7 +128,7 @@ class OdometryConfig:
         True, "true: where several landmarks contradict odometry over some seconds, it counts for less while it slips"
     )
     doubt_odds: float = setting(
-        1e-3, "odds that a stretch of odometry slips, before anything is seen", "odds", low=1e-12, high=1.0
+        1e-6, "odds that a stretch of odometry slips, before anything is seen", "odds", low=1e-12, high=1.0
     )
     doubt_m_s: float = setting(
         0.35,
