@@ -17,9 +17,9 @@ def times(quick, long):
 
 def tell(name, *, worst=None, **numbers):
     """Add to the numbers of a line; of ``worst`` the largest is told."""
-    _TOLD[name].update(numbers)
+    _TOLD[name].update({key: number.item() if hasattr(number, "item") else number for key, number in numbers.items()})
     for key, value in (worst or {}).items():
-        number = float(value)  # of NumPy it could not go to another process
+        number = float(value)  # numbers of NumPy could not go to another process
         _WORST[name][key] = max(number, _WORST[name].get(key, number))
 
 

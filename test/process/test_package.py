@@ -213,7 +213,10 @@ def rule(table, name):
 
 
 COLUMNS = {
-    name for of in (Graph(), EdgeTable(RELATIVE_POSE, 0)) for name in dir(of) if isinstance(getattr(of, name), Column)
+    name
+    for of in (Graph(), EdgeTable(RELATIVE_POSE, 0))
+    for name in dir(of)
+    if not name.startswith("__") and isinstance(getattr(of, name), Column)
 }
 BULK = {  # the stored numbers of many vertices, or the noise of many edges, at once
     *("slam/frontend/noise_factors.py", "slam/noise_scale.py"),
