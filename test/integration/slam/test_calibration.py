@@ -89,7 +89,7 @@ def test_odometry_in_its_own_frame_is_not_corrected(wrong, calibrated):
     """Whoever publishes odom -> base publishes it uncorrected: map -> odom has to fit that."""
     odometry = {m.stamp_ns: m.T_odom_base for m in wrong if not hasattr(m, "sightings")}
     keyframes = [k for k in calibrated.keyframes if k.stamp_ns in odometry]
-    assert len(keyframes) >= 20
+    assert len(keyframes) > 20
     for one in keyframes[-20:]:
         np.testing.assert_allclose(one.T_odom_base[:2], odometry[one.stamp_ns][:2], atol=2e-3)
 
@@ -186,4 +186,4 @@ def test_a_factor_that_changes_on_the_way_is_followed_where_that_is_asked_for():
     report = drifting.calibration_report
     assert report["settings"] == {"odometry.distance_factor": pytest.approx(0.9, abs=0.01)}
     assert report["windows"] == [{"first_keyframe": 0, "settings": {}}]
-    assert error_m(drifting, truth) < 0.75 * error_m(constant, truth)
+    assert error_m(drifting, truth) < 0.6 * error_m(constant, truth)

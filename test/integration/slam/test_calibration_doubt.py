@@ -75,7 +75,7 @@ def test_wrong_identities_do_not_make_calibration_worse_than_none(wrong):
 
 def test_a_prior_that_contradicts_is_named():
     measurements = imperfect_drive(Faults(yaw=0.3), seconds=40.0)
-    slam = driven(measurements, ON | {"calibrate.yaw_sigma_rad": 0.05, "odometry.doubt": False})
+    slam = driven(measurements, ON | {"calibrate.yaw_sigma_rad": 0.05})
     one = findings(slam)["yaw"]
     assert one["verdict"] == "refused", one["text"]
     assert "correct the configuration first" in one["text"]

@@ -73,6 +73,7 @@ def test_killed_between_a_trial_and_its_use_the_journal_gives_the_bytes_of_an_un
     assert restarted.slam.keyframes.stamps_ns.tolist() == stamps_ns
     restarted.ingest(done[count:])
     restarted.finish()
+    # A drive of 24 s determines some of its four faults only: which, depends on where its trials fall.
     assert "yaw" in {name for _, name in restarted.slam.calibration}, "it is found anew"
     replay(run, tmp_path / "restarted")
     assert results(tmp_path / "restarted") == results(run)

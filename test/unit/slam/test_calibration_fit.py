@@ -21,7 +21,9 @@ def trial_problem(slam):
 @pytest.fixture(scope="module", params=["range_bearing", "position"])
 def wrong(request):
     drive = imperfect_drive(FAULTS, kind=request.param, seconds=60.0)
-    return driven(drive, {"odometry.doubt": False})  # derivatives of one model of odometry
+    # Beside a slip the vertices bend by 0.2 rad from one keyframe to the next. The derivatives are of the first
+    # order in that motion: they differ from the numeric ones by 5 % there.
+    return driven(drive, {"odometry.doubt": False})
 
 
 def test_columns_of_the_parameters_are_the_derivatives_of_the_residuals(wrong):
