@@ -19,10 +19,10 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
-from graph_slam_ros.slam.frontend import motion_compensation
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.slam.robust.rigid_alignment import aligned, are_spread
+from graph_slam_ros.slam.robust.seen_point import seen_heading, seen_point, seen_variance
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
 
@@ -158,45 +158,21 @@ class DisplacementSearch:
 
     def add_sighting(self, edge: int, keyframe: int, landmark: int) -> None:
         """A sighting of a landmark; of use is one that tells a position."""
-        base, point = self._chain.get(keyframe), self._point(edge)
+        base, one = self._chain.get(keyframe), self._graph.edge(edge)
+        point = seen_point(self._space, one)
         if base is None or point is None or keyframe < self._first:
             return
         n = self._space.dimensions
         in_chain = np.array(self._space.group.act(base, tuple(point.tolist())))
-        stamp_ns, variance, drift = self._stamps_ns[keyframe], self._variance(edge, point), self._drift[keyframe]
-        heading = self._heading(edge, base)
+        stamp_ns, variance, drift = (
+            self._stamps_ns[keyframe],
+            seen_variance(self._space, one, point),
+            self._drift[keyframe],
+        )
+        heading = seen_heading(self._space, one, base)
         self._seen.append(
             _Seen(edge, keyframe, landmark, stamp_ns, in_chain, np.array(base[:n]), variance, drift, *heading)
         )
-
-    def _heading(self, edge: int, base: Numbers) -> tuple[float, float]:
-        """The heading of a landmark seen as a pose in the plane, and its variance."""
-        one = self._graph.edge(edge)
-        if one.type is not self._space.relative_pose or self._space.dimensions != 2:
-            return np.nan, 0.0
-        variance = float(np.linalg.inv(one.sqrt_information.T @ one.sqrt_information)[2, 2])
-        return base[2] + float(one.measured[2]), variance
-
-    def _point(self, edge: int) -> Array | None:
-        """A landmark's position in the keyframe's frame, by one sighting; None where it does not tell one."""
-        one, space = self._graph.edge(edge), self._space
-        measured = one.measured
-        if one.type in (space.relative_pose, space.tag_position, space.sightings["position"]):
-            return np.array(measured[: space.dimensions])
-        if one.type is space.sightings["range_bearing"]:
-            n = space.dimensions
-            point = motion_compensation.point_of(space, tuple(measured[:n].tolist()))
-            return np.array(space.group.act(tuple(measured[n:].tolist()), tuple(point.tolist())))
-        return None
-
-    def _variance(self, edge: int, point: Array) -> float:
-        """The variance of that position, the largest of any direction."""
-        one, n = self._graph.edge(edge), self._space.dimensions
-        root = one.sqrt_information
-        covariance = np.linalg.inv(root.T @ root)
-        if one.type is self._space.sightings["range_bearing"]:
-            return float(max(covariance[0, 0], point @ point * np.diag(covariance)[1:].max()))
-        return float(np.linalg.eigvalsh(covariance[:n, :n])[-1])
 
     # -- what it tells -------------------------------------------------------------------------------------------
 
@@ -330,6 +306,8 @@ class DisplacementSearch:
         is_all = len(self._seen) < WINDOW
         if not self._is_supported or (is_all and not window.is_in[window.keyframes < first].any()):
             first = self._first  # nothing supports what came before in this segment
+        else:
+            first = self._after_the_longest_link(first)
         agreeing, both = since[best] & known[best] & for_it, since[best] & known[best]
         return DisplacementHypothesis(
             first,
@@ -341,6 +319,27 @@ class DisplacementSearch:
             tuple(window.edges[both & fits].tolist()),
             tuple(window.edges[both & ~fits].tolist()),
         )
+
+    def _after_the_longest_link(self, first: int) -> int:
+        """Return a keyframe, or that after the longest of the links before it between which nothing was seen.
+
+        Nothing tells in which of these links the robot was moved: most probably in the one that took longest.
+        """
+        seen = {one.keyframe for one in self._seen}
+        vertices = list(self._chain)
+        k = vertices.index(first)
+        stamps_ns, best = self._stamps_ns, k
+        while k > 1 and vertices[k - 1] not in seen and not self._is_measured(vertices[k - 1]):
+            k -= 1
+            longest_ns = stamps_ns[vertices[best]] - stamps_ns[vertices[best - 1]]
+            if stamps_ns[vertices[k]] - stamps_ns[vertices[k - 1]] > longest_ns:
+                best = k
+        return vertices[best]
+
+    def _is_measured(self, keyframe: int) -> bool:
+        """Return whether more than odometry is believed of a keyframe."""
+        edges = self._solver.edges_on(keyframe).tolist()
+        return any(self._ledger.is_inside(one) for one in edges if self._graph.edge(one).label != "odometry")
 
     def _pose(self, motion: tuple[Array, Array]) -> Numbers:
         turn, shift = motion

@@ -17,9 +17,6 @@ from graph_slam_ros.slam.slip_review import Slip
 LONG = times(False, True)
 SLIP = ("odometry", "slip")
 TAKEN_BACK = ("odometry", "slip_taken_back")
-ALSO_SLIP = (
-    "a robot that is carried 30 m is told to slip as well in 1 of 3 drives, and the end is worse: docs/robustness.md"
-)
 
 
 def world(seed, **options):
@@ -104,7 +101,7 @@ def assert_replaced(slam, slips, tmp_path):
 
 
 @pytest.mark.parametrize("seed", times([], range(1, 21)))
-@pytest.mark.parametrize("kind", ["slip", pytest.param("carried", marks=pytest.mark.xfail(reason=ALSO_SLIP))])
+@pytest.mark.parametrize("kind", ["slip", "carried"])
 def test_slip_and_carried_are_told_apart_within_five_seconds(kind, seed):
     clean = world(seed, aisle_m=40.0, aisles=3)
     recording, begin_ns = slipping(clean, seconds=20.0)
@@ -125,8 +122,7 @@ def test_slip_and_carried_are_told_apart_within_five_seconds(kind, seed):
     assert told_s < 5.0
     assert (slam.counters[SLIP] > 0, slam.counters["odometry", "displaced"] > 0) == (kind == "slip", kind == "carried")
     assert bend_m < 0.1
-    if kind == "slip":
-        assert after[0] < 1.5 * after[1] + 0.05
+    assert after[0] < (1.5 if kind == "slip" else 1.2) * after[1] + 0.05
 
 
 @pytest.mark.parametrize("seed", times([], range(100)))
