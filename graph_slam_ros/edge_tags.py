@@ -40,7 +40,9 @@ from graph_slam_ros.graph import (
     TAG_POSITION_3D,
     EdgeType,
     VertexKind,
+    place_edge,
 )
+from graph_slam_ros.graph.place import MOST_MEMBERS
 from graph_slam_ros.plugin_edges import fault_of, isolated, measured_at_stamps, named
 from graph_slam_ros.plugins import EDGES, load, names
 
@@ -81,10 +83,19 @@ EDGE_TAGS: dict[str, EdgeType] = {
     "EDGE_HEADING_SE3": HEADING_PRIOR_3D,
 }
 OFFSET = "PARAMS_SE3OFFSET"
+PLACE_TAGS = {"EDGE_PLACE_SE2_XY": SE2, "EDGE_PLACE_SE3_XYZ": SE3}  # ours; ":" and the number of points follow
 _BUILT_IN = {edge: tag for tag, edge in EDGE_TAGS.items()} | {INVERSE_RELATIVE_POSE: "EDGE_SE2"}
 _RESERVED = frozenset({*EDGE_TAGS, *VERTEX_TAGS, OFFSET, "FIX"})
 _loaded: dict[str, tuple[EdgeType, EdgeType, EdgeType]] = {}  # of plugins: as given, for files, and for maps
 _tags: dict[EdgeType, str] = {}
+
+
+def built_in(tag: str) -> EdgeType | None:
+    """Return the edge type of a tag that is built in; None for others."""
+    base, _, members = tag.partition(":")
+    if base in PLACE_TAGS and re.fullmatch(r"[1-9][0-9]{0,2}", members, re.ASCII):
+        return place_edge(PLACE_TAGS[base], int(members))
+    return EDGE_TAGS.get(tag)
 
 
 def plugin_tags() -> frozenset[str]:
@@ -100,7 +111,7 @@ def edge_of(tag: str) -> EdgeType:
     ConfigError
         The plugin cannot be used, or there is none.
     """
-    return EDGE_TAGS[tag] if tag in EDGE_TAGS else _plugin(tag)[1]
+    return built_in(tag) or _plugin(tag)[1]
 
 
 def map_edge_of(tag: str) -> EdgeType:
@@ -108,7 +119,7 @@ def map_edge_of(tag: str) -> EdgeType:
 
     Those edges are in ``plugin_edges.failed_edges``. Raises ConfigError as ``edge_of``.
     """
-    return EDGE_TAGS[tag] if tag in EDGE_TAGS else _plugin(tag)[2]
+    return built_in(tag) or _plugin(tag)[2]
 
 
 def plugin_edge(tag: str) -> EdgeType:
@@ -124,6 +135,10 @@ def tag_of(edge: EdgeType) -> str:
     FormatError
         It is not built in, and no plugin has it; those that cannot be used are named.
     """
+    for base, pose in PLACE_TAGS.items():
+        members = len(edge.accepts) - 1
+        if pose in edge.accepts[0] and 1 <= members <= MOST_MEMBERS and edge is place_edge(pose, members):
+            return f"{base}:{members}"
     faults = []
     if edge not in _BUILT_IN and edge not in _tags:
         for tag in sorted(plugin_tags()):
@@ -140,7 +155,7 @@ def tag_of(edge: EdgeType) -> str:
 def measured_sizes(tag: str) -> tuple[int, ...]:
     """Return how many numbers a measurement may have in a file: all, or without those that have defaults."""
     edge = edge_of(tag)
-    of_plugin = () if tag in EDGE_TAGS else (_plugin(tag)[0].measured_size,)  # without the motion from a keyframe
+    of_plugin = () if built_in(tag) else (_plugin(tag)[0].measured_size,)  # without the motion from a keyframe
     return edge.measured_size, edge.measured_size - len(edge.tail), *of_plugin
 
 

@@ -86,7 +86,8 @@ def check_tree(solver, *, regions_separate=False):
     assert sorted([*in_use, *(c for group in vacant for c in group), *free_records]) == list(range(state[t.CLIQUES]))
     _check_memory(tree, in_use, [c for group in vacant for c in group])
     for e in np.flatnonzero(tree.edge[:, t.ACTIVE] == 1):
-        ends = tree.edge[e, t.END : t.END + tree.edge[e, t.COUNT]]
+        first = tree.edge[e, t.LINKED]
+        ends = tree.link[first : first + tree.edge[e, t.COUNT], t.LINK_END]
         ends = [int(v) for v in ends if vertex[v, t.FREE] == 1]
         if ends:
             owner = int(tree.edge[e, t.OWNER])
@@ -142,7 +143,8 @@ def _check_regions(solver, free, *, separate):
 
     above = {r: set(upwards(r)) for r in set(place.values())}
     for e in np.flatnonzero(tree.edge[:, t.ACTIVE] == 1):
-        ends = tree.edge[e, t.END : t.END + tree.edge[e, t.COUNT]]
+        first = tree.edge[e, t.LINKED]
+        ends = tree.link[first : first + tree.edge[e, t.COUNT], t.LINK_END]
         there = [place[v] for v in ends.tolist() if v in place]
         for a in there:
             for b in there:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.edge_tags import EDGE_TAGS
+from graph_slam_ros.edge_tags import built_in
 from graph_slam_ros.lie import se2, se3, so3
 from graph_slam_ros.runs.ledger_file import Entry
 
@@ -56,7 +56,7 @@ def with_units(entry: Entry, numbers: Sequence[float]) -> str:
 
 def is_custom(entry: Entry) -> bool:
     """Return whether its edge type is a plugin's: nobody knows what its numbers are."""
-    return entry.tag not in EDGE_TAGS
+    return not built_in(entry.tag)
 
 
 def measured(entry: Entry) -> tuple[float, ...]:

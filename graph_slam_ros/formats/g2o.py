@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graph_slam_ros.edge_tags import EDGE_TAGS, OFFSET, VERTEX_TAGS, edge_of, measured_sizes, plugin_tags
+from graph_slam_ros.edge_tags import EDGE_TAGS, OFFSET, VERTEX_TAGS, built_in, edge_of, measured_sizes, plugin_tags
 from graph_slam_ros.errors import FormatError, NoiseError
 from graph_slam_ros.formats.dialects import DIALECTS, LANDMARK_IDS_FROM, Text, in_g2o_words, may_be_roots
 from graph_slam_ros.formats.graph_file import AT_OFFSET, HALVED, G2oFile, moved
@@ -94,8 +94,8 @@ class _Reader:
             tag = words[0]
             if tag in VERTEX_TAGS:
                 self._vertex(tag, words)
-            elif tag in EDGE_TAGS:
-                self.edges[tag].append(self._edge(line, tag, words))
+            elif built_in(tag):
+                self.edges.setdefault(tag, []).append(self._edge(line, tag, words))
             elif tag == OFFSET:
                 self._offset(words)
             elif tag == "FIX":

@@ -15,6 +15,7 @@ from graph_slam_ros.graph.edges_3d import LANDMARK_POSITION_3D, POSE_PRIOR_3D, R
 from graph_slam_ros.graph.graph import Graph
 from graph_slam_ros.graph.losses import CAUCHY, HUBER, NONE, Loss
 from graph_slam_ros.graph.noise import Gaussian
+from graph_slam_ros.graph.place import PLACE_OF_ONE, place_edge
 from graph_slam_ros.graph.priors import (
     ATTITUDE_PRIOR_3D,
     COORDINATE_PRIOR,
@@ -56,6 +57,7 @@ __all__ = [
     "LANDMARK_POSITION",
     "LANDMARK_POSITION_3D",
     "NONE",
+    "PLACE_OF_ONE",
     "POINT_PRIOR",
     "POINT_SEEN_FROM",
     "POSE_PRIOR",
@@ -87,4 +89,5 @@ __all__ = [
     "check_edge",
     "edge_from_residual",
     "numeric_jacobian",
+    "place_edge",
 ]

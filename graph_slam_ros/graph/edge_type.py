@@ -20,8 +20,6 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph.vertices import VertexKind
 from graph_slam_ros.typing import Array, Index
 
-MOST_SLOTS = 3  # vertices of one edge: what the solver's records have room for
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeType:
@@ -29,7 +27,7 @@ class EdgeType:
 
     Attributes
     ----------
-    accepts : for each of one to three slots the vertex kinds it takes, all of the same dof
+    accepts : for each slot, one or more, the vertex kinds it takes, all of the same dof
     tail : what the last numbers of ``measured`` are where they are left out: a sensor's place on the robot
     """
 
@@ -41,8 +39,8 @@ class EdgeType:
     tail: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.accepts) <= MOST_SLOTS:
-            raise GraphSlamError(f"{self.name}: {len(self.accepts)} vertices; an edge has 1 to {MOST_SLOTS}")
+        if not self.accepts:
+            raise GraphSlamError(f"{self.name}: 0 vertices; an edge has at least one")
         for slot, kinds in enumerate(self.accepts):
             if len({kind.dof for kind in kinds}) != 1:
                 names = ", ".join(kind.name for kind in kinds) or "nothing"

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 
-from graph_slam_ros.edge_tags import EDGE_TAGS, map_edge_of, plugin_edge
+from graph_slam_ros.edge_tags import built_in, map_edge_of, plugin_edge
 from graph_slam_ros.errors import ConfigError, FormatError, NoiseError
 from graph_slam_ros.graph import SE2, SE3, EdgeType, Gaussian
 from graph_slam_ros.measurements.types import CustomEdge
@@ -18,7 +18,7 @@ _LONGEST_NAME = 128  # bytes, of a landmark
 
 def refuse_unusable(tag: str) -> None:
     """Raise ConfigError if a custom edge cannot have this edge type: it is built in, or its plugin cannot be used."""
-    if tag in EDGE_TAGS:
+    if built_in(tag):
         raise ConfigError(f"{tag}: a built-in edge type: choose another tag, or give a Sighting, Fix or Closure")
     map_edge_of(tag)
 

@@ -160,7 +160,7 @@ def chi2_of(graph: Graph, x: Array, edges: Index) -> tuple[Array, Index]:
 @kernel
 def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) -> None:
     """Add whitened edges to the tree: J'J and J'r, and the diagonal of H."""
-    vertex, edge, blocks, diagonal = t.vertex, t.edge, t.blocks, t.diagonal
+    vertex, edge, link, blocks, diagonal = t.vertex, t.edge, t.link, t.blocks, t.diagonal
     n, m, width = jacobian.shape
     for k in range(n):
         e = ids[rows[k]]
@@ -172,7 +172,7 @@ def store(t: Tree, rows: Index, ids: Index, residual: Array, jacobian: Array) ->
                 for c in range(width):
                     block[p, c] += x * jacobian[k, a, c]
                 block[p, width] += x * residual[k, a]
-        add_to_diagonal(vertex, edge, e, block, diagonal)
+        add_to_diagonal(vertex, edge, link, e, block, diagonal)
 
 
 def information(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], free: Index, losses: Losses) -> Array:

@@ -18,7 +18,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUES_WANTED,
     COUNT,
     DOF,
-    END,
     FLOPS,
     FREE,
     FREE_CLIQUE,
@@ -31,7 +30,9 @@ from graph_slam_ros.solver.clique_tree.storage import (
     KIND,
     LINK,
     LINK_EDGE,
+    LINK_END,
     LINK_NEXT,
+    LINKED,
     LINKS,
     LIVE,
     LIVE_MADE,
@@ -136,14 +137,13 @@ def append_edges(t: Tree, rows: Index, all_ids: Index, all_ends: Index) -> None:
         if edge[e, COUNT] > 0:  # by a call that was interrupted
             continue
         width = 0
-        edge[e, COUNT] = all_ends.shape[1]
+        edge[e, COUNT], edge[e, LINKED] = all_ends.shape[1], state[LINKS]
         for s in range(all_ends.shape[1]):
             v = all_ends[row, s]
-            edge[e, END + s] = v
             width += vertex[v, DOF]
             link = state[LINKS]
             state[LINKS] += 1
-            t_link[link, LINK_EDGE], t_link[link, LINK_NEXT] = e, vertex[v, LINK]
+            t_link[link, LINK_EDGE], t_link[link, LINK_END], t_link[link, LINK_NEXT] = e, v, vertex[v, LINK]
             vertex[v, LINK] = link
         edge[e, BLOCK] = state[BLOCKS_TOP]
         state[BLOCKS_TOP] += width * (width + 1)
@@ -226,7 +226,7 @@ def anchored(vertex: Index, edge: Index, link: Index, new: Index, edges: Index) 
                     continue
                 fixed = edge[e, COUNT] == 1
                 for s in range(edge[e, COUNT]):
-                    fixed = fixed or vertex[edge[e, END + s], LOCAL] != 0
+                    fixed = fixed or vertex[link[edge[e, LINKED] + s, LINK_END], LOCAL] != 0
                 if fixed:
                     vertex[v, LOCAL] = 1
                     count += 1

@@ -15,7 +15,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     CHILD,
     COUNT,
     DOF,
-    END,
     FREE,
     FRONT_DOF,
     FRONTALS,
@@ -23,7 +22,9 @@ from graph_slam_ros.solver.clique_tree.storage import (
     KIND,
     LINK,
     LINK_EDGE,
+    LINK_END,
     LINK_NEXT,
+    LINKED,
     LOCAL,
     MAGNITUDES,
     MARK,
@@ -114,12 +115,12 @@ def _add_edges(vertex: Index, edge: Index, link: Index, blocks: Array, v: int, f
         width = edge[e, WIDTH]
         row = edge[e, BLOCK]  # of the block, where the rows of one end begin
         for s in range(edge[e, COUNT]):
-            u = edge[e, END + s]
+            u = link[edge[e, LINKED] + s, LINK_END]
             dof, at = vertex[u, DOF], vertex[u, LOCAL]
             if vertex[u, FREE] == 1:
                 column = row
                 for z in range(edge[e, COUNT]):
-                    w = edge[e, END + z]
+                    w = link[edge[e, LINKED] + z, LINK_END]
                     to = vertex[w, LOCAL]
                     if to >= at and vertex[w, FREE] == 1:
                         for i in range(dof):
@@ -266,11 +267,11 @@ def _retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) 
 
 
 @kernel
-def add_to_diagonal(vertex: Index, edge: Index, e: int, block: Array, diagonal: Array) -> None:
+def add_to_diagonal(vertex: Index, edge: Index, link: Index, e: int, block: Array, diagonal: Array) -> None:
     """Add the diagonal of an edge's block to that of the information matrix."""
     p = 0
     for s in range(edge[e, COUNT]):
-        v = edge[e, END + s]
+        v = link[edge[e, LINKED] + s, LINK_END]
         for i in range(vertex[v, DOF]):
             diagonal[vertex[v, STEP] + i] += block[p, p]
             p += 1
@@ -282,13 +283,13 @@ def clear_block(t: Tree, e: int) -> None:
 
     If that was nearly all of the diagonal, the difference would be rounding. Then the diagonal is summed again.
     """
-    vertex, edge, blocks, diagonal = t.vertex, t.edge, t.blocks, t.diagonal
+    vertex, edge, link, blocks, diagonal = t.vertex, t.edge, t.link, t.blocks, t.diagonal
     width = edge[e, WIDTH]
     block = blocks[edge[e, BLOCK] : edge[e, BLOCK] + width * (width + 1)].reshape(width, width + 1)
     p = 0
     cancelled = False
     for s in range(edge[e, COUNT]):
-        v = edge[e, END + s]
+        v = link[edge[e, LINKED] + s, LINK_END]
         for i in range(vertex[v, DOF]):
             diagonal[vertex[v, STEP] + i] -= block[p, p]
             cancelled = cancelled or diagonal[vertex[v, STEP] + i] < CANCELLED * block[p, p]
@@ -296,7 +297,7 @@ def clear_block(t: Tree, e: int) -> None:
     block[:] = 0.0
     if cancelled:
         for s in range(edge[e, COUNT]):
-            _add_up_diagonal(t, edge[e, END + s])
+            _add_up_diagonal(t, link[edge[e, LINKED] + s, LINK_END])
 
 
 @kernel
@@ -310,7 +311,7 @@ def _add_up_diagonal(t: Tree, v: int) -> None:
         a = link[a, LINK_NEXT]
         at, across = edge[e, BLOCK], edge[e, WIDTH] + 2  # from one number of a diagonal to the next
         for s in range(edge[e, COUNT]):
-            u = edge[e, END + s]
+            u = link[edge[e, LINKED] + s, LINK_END]
             if u == v:
                 for i in range(vertex[v, DOF]):
                     own[i] += blocks[at + i * across]
@@ -350,13 +351,13 @@ def step_by(t: Tree, vertices: Index, step: Array) -> None:
 @kernel
 def gradient(t: Tree, edges: Index) -> Array:
     """J'r over the unknowns, numbered as ``step``."""
-    vertex, edge, blocks = t.vertex, t.edge, t.blocks
+    vertex, edge, link, blocks = t.vertex, t.edge, t.link, t.blocks
     out = np.zeros(len(t.step))
     for e in edges:
         width = edge[e, WIDTH]
         at = edge[e, BLOCK] + width
         for s in range(edge[e, COUNT]):
-            v = edge[e, END + s]
+            v = link[edge[e, LINKED] + s, LINK_END]
             for i in range(vertex[v, DOF]):
                 if vertex[v, FREE] == 1:
                     out[vertex[v, STEP] + i] += blocks[at]
@@ -367,7 +368,7 @@ def gradient(t: Tree, edges: Index) -> Array:
 @kernel
 def curvature(t: Tree, edges: Index, d: Array) -> float:
     """``d' J'J d`` for a direction over the unknowns, numbered as ``step``."""
-    vertex, edge, blocks = t.vertex, t.edge, t.blocks
+    vertex, edge, link, blocks = t.vertex, t.edge, t.link, t.blocks
     mine = np.empty(64)
     out = 0.0
     for e in edges:
@@ -376,7 +377,7 @@ def curvature(t: Tree, edges: Index, d: Array) -> float:
             mine = np.empty(width)
         k = 0
         for s in range(edge[e, COUNT]):
-            v = edge[e, END + s]
+            v = link[edge[e, LINKED] + s, LINK_END]
             for i in range(vertex[v, DOF]):
                 mine[k] = d[vertex[v, STEP] + i] if vertex[v, FREE] == 1 else 0.0
                 k += 1

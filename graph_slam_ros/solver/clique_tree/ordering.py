@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from graph_slam_ros.graph.edge_type import MOST_SLOTS
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.solver.clique_tree.indices import in_order, joined
 from graph_slam_ros.solver.clique_tree.separator import separate
@@ -20,7 +19,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     ACTIVE,
     COUNT,
     DOF,
-    END,
     FLOPS,
     FLOPS_SEEN,
     FLOPS_USUAL,
@@ -29,7 +27,9 @@ from graph_slam_ros.solver.clique_tree.storage import (
     KEY,
     LINK,
     LINK_EDGE,
+    LINK_END,
     LINK_NEXT,
+    LINKED,
     LIVE,
     LIVE_MADE,
     LOCAL,
@@ -152,14 +152,17 @@ def _decide_length(t: Tree, back: int) -> None:
 @kernel
 def ends_of(t: Tree, edges: Index) -> Index:
     """Return the vertices of edges; some occur more than once."""
-    edge = t.edge
-    out = np.empty(MOST_SLOTS * len(edges), np.int64)
+    edge, link = t.edge, t.link
+    count = 0
+    for e in edges:
+        count += edge[e, COUNT]
+    out = np.empty(count, np.int64)
     count = 0
     for e in edges:
         for s in range(edge[e, COUNT]):
-            out[count] = edge[e, END + s]
+            out[count] = link[edge[e, LINKED] + s, LINK_END]
             count += 1
-    return out[:count]
+    return out
 
 
 @kernel
@@ -182,7 +185,7 @@ def neighbourhood(t: Tree, vertices: Index) -> Index:
         while a != NOTHING:
             e = link[a, LINK_EDGE]
             for s in range(edge[e, COUNT]):
-                out[count] = edge[e, END + s]
+                out[count] = link[edge[e, LINKED] + s, LINK_END]
                 count += 1
             a = link[a, LINK_NEXT]
     return out
@@ -355,7 +358,7 @@ def _graph_of(t: Tree, vertices: Index) -> tuple[Index, Index, Index, Index]:
             e = link[a, LINK_EDGE]
             a = link[a, LINK_NEXT]
             for s in range(edge[e, COUNT] if edge[e, ACTIVE] else 0):
-                u = vertex[edge[e, END + s], LOCAL]
+                u = vertex[link[edge[e, LINKED] + s, LINK_END], LOCAL]
                 if u in (NOTHING, k):
                     continue
                 if place[u] < start[k]:

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.graph.edge_type import MOST_SLOTS
 from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.typing import Array, Index
 
@@ -30,13 +29,13 @@ ZERO: Any = np.int64(0)  # no literal: a kernel that is called with one is compi
 # scratch, NOTHING between uses
 DOF, STEP, VALUE, KIND, KEY, CLIQUE, LINK, REGION, NEXT, FREE, LOCAL, VERTEX_COLUMNS = range(12)
 
-# edge: how many vertices, 0 where it is not known yet; these; their degrees of freedom; where its block begins; 1 where
-# it is in the structure; which of its vertices is eliminated first; scratch
-COUNT, END = range(2)
-WIDTH, BLOCK, ACTIVE, OWNER, MARKED, EDGE_COLUMNS = range(END + MOST_SLOTS, END + MOST_SLOTS + 6)
+# edge: how many vertices, 0 where it is not known yet; its first link, the others follow, one for each vertex in the
+# order of its slots; degrees of freedom of the vertices; where its block begins; 1 where it is in the structure; which
+# of its vertices is eliminated first; scratch
+COUNT, LINKED, WIDTH, BLOCK, ACTIVE, OWNER, MARKED, EDGE_COLUMNS = range(8)
 
-# link: an edge of a vertex, and the vertex's next link
-LINK_EDGE, LINK_NEXT, LINK_COLUMNS = range(3)
+# link: an edge, one of its vertices, and that vertex's next link
+LINK_EDGE, LINK_END, LINK_NEXT, LINK_COLUMNS = range(4)
 
 # clique: its place in the tree; where its members begin, how many are frontal, how many there are; the same in
 # degrees of freedom; where its front begins; its size class; 1 where an update has marked it; whether the magnitudes of

@@ -11,7 +11,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     CLIQUE,
     COUNT,
     DOF,
-    END,
     FREE,
     FRONT_DOF,
     FRONTALS,
@@ -19,7 +18,9 @@ from graph_slam_ros.solver.clique_tree.storage import (
     KEY,
     LINK,
     LINK_EDGE,
+    LINK_END,
     LINK_NEXT,
+    LINKED,
     LOCAL,
     MARK,
     MEMBERS,
@@ -194,7 +195,7 @@ def _joined_by_edges(t: Tree, v: int, k: int, seen: Index, later: Index, top: in
             continue
         first = True
         for s in range(edge[e, COUNT]):
-            w = edge[e, END + s]
+            w = link[edge[e, LINKED] + s, LINK_END]
             u = vertex[w, LOCAL]
             first = first and not (u < k and vertex[w, FREE] == 1)
             top = _note(u, k, seen, later, top)
