@@ -17,6 +17,7 @@ def report(args: argparse.Namespace) -> int:
     console.check_file(out, force=args.force)
     gc.disable()  # a map is a million small objects that all stay: to look through them is a sixth of the time
     made = write_report(args.run_folder, out, args.truth, args.compare, args.plan, args.topic, align=not args.no_align)
+    gc.freeze()  # nor at the end of the process
     console.show(*made.data["sentences"] or (), f"report in {out}")
     console.then(f"open {out} in a browser: it needs no network")
     return console.report_losses(made.losses, made.beware)

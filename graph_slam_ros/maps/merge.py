@@ -25,7 +25,7 @@ from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES, Parameter
 from graph_slam_ros.slam.edit_tools import HAND_MADE
 from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
-from graph_slam_ros.slam.robust.gating import landmark_of
+from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
 

@@ -88,8 +88,11 @@ def read_contents(
     scores = evaluate(run, known, align=align) if known and saved else None
     out.data["run"] = shown(run.resolve().name)
     out.data["colours"] = {"light": LIGHT, "dark": DARK}
-    out.data["dimensions"] = out.attempt(lambda: dimensions_of(run)) or 2
-    out.data["map"] = out.attempt(lambda: paths(out.packing, run, known, other, align=align)) if saved else None
+    dimensions = saved.space.dimensions if saved else out.attempt(lambda: dimensions_of(run)) or 2
+    out.data["dimensions"] = dimensions
+    out.data["map"] = (
+        out.attempt(lambda: paths(out.packing, run, dimensions, known, other, align=align)) if saved else None
+    )
     out.data["plan"] = floor_plan(plan) if plan else None
     if saved:
         out.data["edges"] = _edges(out, saved)

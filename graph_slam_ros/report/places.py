@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from graph_slam_ros.analysis.evaluation import dimensions_of, scored_drive
+from graph_slam_ros.analysis.evaluation import scored_drive
 from graph_slam_ros.analysis.path_error import matched
 from graph_slam_ros.analysis.trajectories import Truth
 from graph_slam_ros.errors import GraphSlamError
@@ -25,7 +25,9 @@ _SIGMAS, _CORNERS, _MOST_ELLIPSES = 2.0, 24, 2_000
 _MOST_PIXELS = 16_000_000
 
 
-def paths(pack: Packing, run: Path, known: Truth | None, other: Path | None, *, align: bool = True) -> dict[str, Any]:
+def paths(
+    pack: Packing, run: Path, dimensions: int, known: Truth | None, other: Path | None, *, align: bool = True
+) -> dict[str, Any]:
     """The paths and landmarks of a run, in the frame map; the truth is laid on them.
 
     Raises
@@ -34,7 +36,6 @@ def paths(pack: Packing, run: Path, known: Truth | None, other: Path | None, *, 
         A file that is missing or damaged.
     """
     path, reckoned = read_tum(run / "path.tum"), read_tum(run / "path_odometry.tum")
-    dimensions = dimensions_of(run)
     T_map_odom = se3.compose(tuple(path.poses[0].tolist()), se3.inverse(tuple(reckoned.poses[0].tolist())))
     drawn = {"odometry": reckoned.moved(T_map_odom), "estimate": path}
     out: dict[str, Any] = {"keyframes": len(path.stamps_s), "stamps": pack.column(path.stamps_s, "f8")}

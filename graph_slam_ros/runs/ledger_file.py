@@ -24,7 +24,7 @@ from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.slam import GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict, VerdictChange
-from graph_slam_ros.typing import Numbers
+from graph_slam_ros.typing import Index, Numbers
 
 LEDGER, CHANGES = "ledger.csv", "ledger_changes.csv"
 Ids = tuple[int, ...]
@@ -152,42 +152,35 @@ def _fault(entry: Entry) -> str:
     return next((f"{name}: {n} is too small" for name, low in least.items() if (n := getattr(entry, name)) < low), "")
 
 
-@cache
-def _upper(size: int) -> tuple[Any, Any]:
-    """Indices of an upper triangle."""
-    return np.triu_indices(size)
-
-
 def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
     """Each edge of the solver; ``ids`` are the numbers of its vertices in the file."""
     graph, ledger = slam.graph, slam.ledger
-    names = {mark.vertex: name for name, mark in slam.landmarks.items()}
-    keyframe_of = {vertex: k for k, vertex in enumerate(slam.keyframes.ids.tolist())}
     stamps_ns: list[int] = slam.keyframes.stamps_ns.tolist()
     judged = {change.edge: change.threshold for change in ledger.history}
-    last_loss, tables = cache(slam.solver.settings.last_loss), cache(_columns)
-    chi2, _ = slam.solver.chi2_of(np.arange(len(ledger)))
+    last_loss, count = cache(slam.solver.settings.last_loss), len(ledger)
+    rows_of = {table.code: _rows(slam, table, np.asarray(ids, dtype=np.int64)) for table in graph.tables.values()}
+    residuals, ends = ledger.residuals.tolist(), np.cumsum(ledger.numbers.values).tolist()
+    chi2, _ = slam.solver.chi2_of(np.arange(count))
     columns = (ledger.keyframe, ledger.statistic, ledger.numbers, ledger.threshold, ledger.verdict, ledger.reason)
-    numbered = enumerate(zip(chi2.tolist(), *(column.values.tolist() for column in columns), strict=True))
-    for edge, (now, keyframe, statistic, dof, threshold, verdict, reason) in numbered:
-        table, row = graph.row(edge)
-        tag, of_row = tables(table)
-        vertices, measured, label_code, source_code, factor = (column[row] for column in of_row)
+    of_graph = (graph.table_of_edge.values[:count], graph.row_of_edge.values[:count], chi2)
+    numbered = zip(*(column.tolist() for column in of_graph), *(c.values.tolist() for c in columns), strict=True)
+    for edge, (code, row, now, keyframe, statistic, dof, threshold, verdict, reason) in enumerate(numbered):
+        tag, rows = rows_of[code]
+        vertices, landmark, newest, measured, information, label_code, source_code, factor = rows[row]
         label, source = graph.labels[label_code], graph.sources[source_code]
-        loss, root = last_loss(label, source), table.sqrt_information.values[row]
-        newest = max((keyframe_of[v] for v in vertices if v in keyframe_of), default=keyframe)
+        loss = last_loss(label, source)
         yield Entry(
             edge,
             label,
             tag,
             source,
-            next((names[v] for v in vertices if v in names), ""),
-            tuple(ids[v] for v in vertices),
+            landmark,
+            vertices,
             keyframe,
-            Stamp(stamps_ns[newest]),
-            tuple(measured),
-            tuple((root.T @ root)[_upper(len(root))].tolist()),
-            tuple(ledger.residual(edge).tolist()),
+            Stamp(stamps_ns[newest if newest >= 0 else keyframe]),
+            measured,
+            information,
+            tuple(residuals[ends[edge] - dof : ends[edge]]),
             statistic,
             dof,
             judged.get(edge, threshold),
@@ -198,10 +191,24 @@ def ledger_entries(slam: GraphSlam, ids: Sequence[int]) -> Iterator[Entry]:
         )
 
 
-def _columns(table: EdgeTable) -> tuple[str, tuple[list[Any], ...]]:
-    """The tag of a table, and by row: vertices, what was measured, codes of class and input, weight."""
-    columns = (table.vertices, table.measured, table.label, table.source, table.weight)
-    return tag_of(table.type), tuple(column.values.tolist() for column in columns)
+def _rows(slam: GraphSlam, table: EdgeTable, ids: Index) -> tuple[str, list[Any]]:
+    """The tag of a table, and what an entry has of each row: all rows at once, as one by one is slow."""
+    keyframe_of, names = np.full(slam.graph.vertex_count, -1), [""] * slam.graph.vertex_count
+    keyframe_of[slam.keyframes.ids] = np.arange(len(slam.keyframes.ids))
+    for name, mark in slam.landmarks.items():
+        names[mark.vertex] = name
+    vertices, roots = table.vertices.values, table.sqrt_information.values
+    upper = np.triu_indices(roots.shape[1])
+    rows = zip(
+        map(tuple, ids[vertices].tolist()),
+        [next((names[v] for v in several if names[v]), "") for several in vertices.tolist()],
+        keyframe_of[vertices].max(axis=1).tolist(),
+        map(tuple, table.measured.values.tolist()),
+        map(tuple, (roots.transpose(0, 2, 1) @ roots)[:, upper[0], upper[1]].tolist()),
+        *(column.values.tolist() for column in (table.label, table.source, table.weight)),
+        strict=True,
+    )
+    return tag_of(table.type), list(rows)
 
 
 # -- rows of a dataclass -----------------------------------------------------------------------------------------------

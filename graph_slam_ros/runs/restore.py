@@ -43,7 +43,8 @@ def map_of(folder: Path, losses: list[str], counters: Counters | None = None) ->
     RunError, FormatError
         There is none, or it cannot be read.
     """
-    warmup(dimensions=run_config(folder).space.dimensions)
+    space = run_config(folder).space
+    warmup(dimensions=space.dimensions)
     losses += missing(folder)
     counters = Counters() if counters is None else counters
     try:
@@ -54,7 +55,6 @@ def map_of(folder: Path, losses: list[str], counters: Counters | None = None) ->
     state = _repeated(folder, losses, counters) if state is None else _with_rest(folder, state, losses, counters)
     if not state.keyframes:
         raise RunError(f"{folder}: no keyframe, so there is no map")
-    space = run_config(folder).space
     if state.graph.kind_of(state.keyframes[0].vertex) is not space.pose:
         raise RunError(f"{folder}: its map is not in {space.dimensions} dimensions, as its configuration says")
     return state

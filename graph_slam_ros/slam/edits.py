@@ -21,7 +21,8 @@ from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.landmark_edits import LandmarkEdits
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.path_edits import PathEdits
-from graph_slam_ros.slam.robust.gating import CANDIDATES, landmark_of
+from graph_slam_ros.slam.robust.gating import CANDIDATES
+from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason
 
 SOURCE = "edit"

@@ -14,7 +14,8 @@ from graph_slam_ros.errors import DivergedError, message_of
 from graph_slam_ros.graph import GROUPS
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
-from graph_slam_ros.slam.robust.gating import CANDIDATES, landmark_of
+from graph_slam_ros.slam.robust.gating import CANDIDATES
+from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason
 from graph_slam_ros.typing import Array
 

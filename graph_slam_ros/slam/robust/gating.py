@@ -16,6 +16,7 @@ from graph_slam_ros.config.robust import RobustConfig
 from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.robust.innovation import innovation
+from graph_slam_ros.slam.robust.landmark_support import LandmarkSupport, landmark_of
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason, Verdict
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
@@ -24,7 +25,6 @@ CANDIDATES = ("landmarks", "fixes", "closures", "initialpose", "custom")
 _TYPICAL = 30  # residuals tell what all are like
 _SLACK = 10.0  # times the residuals that are typical of a class its gate may be, where they are small
 _TIGHTEST = 0.1  # part of a gate that is left
-_TOGETHER = 8  # sightings that tell but a part each determine a landmark, wherever they are from
 _READMISSIONS = 50  # edges that are out and are tried again after everything was solved
 _REVIEWED_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
 
@@ -35,10 +35,7 @@ class OutlierGate:
     def __init__(self, config: RobustConfig, graph: Graph, solver: Solver, ledger: Ledger | None = None) -> None:
         self._config, self._graph, self._solver = config, graph, solver
         self.ledger = Ledger() if ledger is None else ledger
-        self._holds: dict[int, int] = {}  # of each landmark, edges that are in of which one alone determines it
-        self._helps: dict[int, int] = {}  # and those that do so only with others
-        for edge in self.ledger.inside.tolist():
-            self._count(edge, 1)
+        self._support = LandmarkSupport(graph, solver, self.ledger.inside)
         self._tightness: dict[str, float] = {}  # of each class, by what its gate is smaller
         self.is_calibrated = False  # whether enough was measured twice to tell how good odometry is
         self._gate_scale = config.noise_factor**2  # of the gate of what all else predicts
@@ -60,13 +57,13 @@ class OutlierGate:
         judged &= ~np.isin(ids, list(self._withdrawn))
         self.ledger.enter(keyframe, chi2, numbers, limit, self._solver.residuals_of(ids), judged)
         for edge in ids[judged].tolist():
-            self._count(edge, 1)
+            self._support.count(edge, 1)
         for edge, reason in self._withdrawn.items():
             self.ledger.note(edge, keyframe, Verdict.REJECTED, reason, self.ledger.statistic.values[edge])
         self._withdrawn.clear()
         pending, unfit = list[int](), set(ids[chi2 > limit].tolist())
         for edge in ids[judged & self._config.decide].tolist():
-            is_unfit = edge in unfit and not self._is_needed(edge)  # by what is left of those before it
+            is_unfit = edge in unfit and not self._support.is_needed(edge)  # by what is left of those before it
             if is_unfit or (not trusts_sightings and self._is_of_known(edge)):
                 self._exclude(edge)
                 self.ledger.hold_back(edge)
@@ -148,7 +145,7 @@ class OutlierGate:
             for edge, fit in zip(edges[other].tolist(), chi2[other].tolist(), strict=True):
                 if not out:
                     self._readmit(edge, keyframe, fit)
-                elif self._is_needed(edge):
+                elif self._support.is_needed(edge):
                     continue
                 else:
                     self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
@@ -181,7 +178,7 @@ class OutlierGate:
                 self._reject(edge, keyframe, reason, float(self.ledger.statistic.values[edge]))
         landmarks = {landmark for edge in edges if (landmark := landmark_of(self._graph, edge)) is not None}
         for landmark in sorted(landmarks):
-            if not self._is_determined(landmark):
+            if not self._support.is_determined(landmark):
                 self._readmit_all(self._solver.edges_on(landmark), keyframe)
 
     def _readmit_all(self, edges: Index, keyframe: int) -> None:
@@ -229,7 +226,7 @@ class OutlierGate:
             if not self.ledger.is_inside(edge):
                 self._readmit(edge, keyframe, float(self.ledger.statistic.values[edge]))
         for edge in excluded:
-            if self.ledger.is_inside(edge) and not self._is_needed(edge):
+            if self.ledger.is_inside(edge) and not self._support.is_needed(edge):
                 self._reject(edge, keyframe, Reason.DOES_NOT_FIT, float(self.ledger.statistic.values[edge]))
 
     def adopt_verdicts(self, other: Ledger, keyframe: int) -> bool:
@@ -252,7 +249,7 @@ class OutlierGate:
             self._readmit(edge, keyframe, *_judged(judge, edge))
             changed += 1
         for edge in edges[~wanted & inside].tolist():
-            if not self._is_needed(edge):
+            if not self._support.is_needed(edge):
                 statistic, threshold = _judged(judge, edge)
                 self._reject(edge, keyframe, Reason.OUTVOTED, statistic, threshold)
                 changed += 1
@@ -269,7 +266,7 @@ class OutlierGate:
         for edge, fit in zip(edges[unfit].tolist(), chi2[unfit].tolist(), strict=True):
             loss = self._solver.settings.last_loss(self._graph.label_of(edge), self._graph.source_of(edge))
             weight, _ = weight_and_cost(loss.kind, loss.scale, fit)
-            if weight < self._config.out_below and not self._is_needed(edge):
+            if weight < self._config.out_below and not self._support.is_needed(edge):
                 self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
             elif weight < 1.0 and ledger.verdict.values[edge] == Verdict.ACCEPTED:
                 ledger.note(edge, keyframe, Verdict.DOWN_WEIGHTED, Reason.NONE, fit)
@@ -303,38 +300,11 @@ class OutlierGate:
 
     def _include(self, edge: int) -> None:
         self._solver.set_weight(edge, 1.0)
-        self._count(edge, 1)
+        self._support.count(edge, 1)
 
     def _exclude(self, edge: int) -> None:
         self._solver.set_weight(edge, 0.0)
-        self._count(edge, -1)
-
-    def _landmark(self, edge: int) -> tuple[int, dict[int, int]] | None:
-        """The landmark of an edge, and the edges among which it counts."""
-        landmark = landmark_of(self._graph, edge)
-        if landmark is None:
-            return None
-        numbers = self._graph.row(edge)[0].type.residual_size
-        return landmark, self._holds if numbers >= self._graph.kind_of(landmark).dof else self._helps
-
-    def _count(self, edge: int, more: int) -> None:
-        if found := self._landmark(edge):
-            found[1][found[0]] = found[1].get(found[0], 0) + more
-
-    def _is_needed(self, edge: int) -> bool:
-        """Return whether a landmark may be undetermined without the edge: it is the last, or one of very few."""
-        found = self._landmark(edge)
-        if found is None:
-            return False
-        landmark, of = found
-        return not self._is_determined(landmark, int(of is self._holds), int(of is self._helps))
-
-    def _is_determined(self, landmark: int, fewer_holds: int = 0, fewer_helps: int = 0) -> bool:
-        """Return whether accepted edges determine a landmark, also with so many fewer."""
-        if self._solver.is_held(landmark):
-            return True
-        holds, helps = self._holds.get(landmark, 0) - fewer_holds, self._helps.get(landmark, 0) - fewer_helps
-        return holds >= 1 or helps >= _TOGETHER
+        self._support.count(edge, -1)
 
     # -- what is too much --------------------------------------------------------------------------------------------
 
@@ -381,12 +351,6 @@ class OutlierGate:
         if parallel is None or freedom - parallel.residuals < _TYPICAL:
             return report.chi2_final / freedom
         return (report.chi2_final - parallel.chi2) / (freedom - parallel.residuals)
-
-
-def landmark_of(graph: Graph, edge: int) -> int | None:
-    """The vertex of an edge's landmark."""
-    table, row = graph.row(edge)
-    return table.vertices.values.item(row, 1) if graph.label_of(edge) == "landmarks" else None
 
 
 def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:

@@ -158,6 +158,11 @@ class Ledger:
         limit = float(self.threshold.values[edge]) if threshold is None else threshold
         self.history.append(VerdictChange(edge, keyframe, verdict, reason, float(statistic), limit))
 
+    @property
+    def residuals(self) -> Array:
+        """The residuals of all edges, end to end: as many numbers of each as it measured."""
+        return self._residual.values
+
     def residual(self, edge: int) -> Array:
         """Return the difference between the measurement and its prediction when it came, in its units."""
         first = int(self._residual_at.values[edge])
