@@ -5,6 +5,7 @@ another pose of the robot, and not with odometry. Sightings with wrong identitie
 evidence is a count: held-back sightings that fit the other pose, minus believed ones that do not.
 """
 
+from bisect import insort
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -112,7 +113,7 @@ class DisplacementSearch:
     def __init__(self, space: Geometry, graph: Graph, solver: Solver, ledger: Ledger, history: LandmarkHistory) -> None:
         self._space, self._history = space, history
         self._graph, self._solver, self._ledger = graph, solver, ledger
-        self._seen: deque[_Seen] = deque(maxlen=WINDOW)
+        self._seen: deque[_Seen] = deque()  # in order of keyframes; they may come in another
         self._chain: dict[int, Numbers] = {}  # of each keyframe since the segment began
         self._stamps_ns: dict[int, int] = {}
         self._drift: dict[int, Array] = {}
@@ -164,15 +165,12 @@ class DisplacementSearch:
             return
         n = self._space.dimensions
         in_chain = np.array(self._space.group.act(base, tuple(point.tolist())))
-        stamp_ns, variance, drift = (
-            self._stamps_ns[keyframe],
-            seen_variance(self._space, one, point),
-            self._drift[keyframe],
-        )
-        heading = seen_heading(self._space, one, base)
-        self._seen.append(
-            _Seen(edge, keyframe, landmark, stamp_ns, in_chain, np.array(base[:n]), variance, drift, *heading)
-        )
+        stamp_ns, variance = self._stamps_ns[keyframe], seen_variance(self._space, one, point)
+        drift, heading = self._drift[keyframe], seen_heading(self._space, one, base)
+        seen = _Seen(edge, keyframe, landmark, stamp_ns, in_chain, np.array(base[:n]), variance, drift, *heading)
+        insort(self._seen, seen, key=lambda other: other.keyframe)
+        if len(self._seen) > WINDOW:
+            self._seen.popleft()
 
     # -- what it tells -------------------------------------------------------------------------------------------
 
@@ -290,7 +288,7 @@ class DisplacementSearch:
         return np.asarray(fits & ~(off**2 > quantile(_FIT, 1) * spread))
 
     def _known_from(self, landmark: int) -> int:
-        return self._history.known_from(landmark, self._seen[0].edge)
+        return self._history.known_from(landmark, min(one.edge for one in self._seen))
 
     def _evidence(self, window: _Window, fits: Flags, motion: tuple[Array, Array]) -> DisplacementHypothesis | None:
         """The evidence from the keyframe on that has most: landmarks that are newer than it tell nothing."""
