@@ -56,6 +56,7 @@ WITHIN = {
         "slam/landmarks",
     },
     "slam/calibration": {"lie", "graph", "solver", "slam/frontend"},
+    "slam/lifelong": {"chi_square", "lie", "graph", "solver", "solver/clique_tree"},
     "slam": {
         "chi_square",
         *("plugin_edges", "edge_tags", "lie", "graph", "solver", "measurements", "config"),

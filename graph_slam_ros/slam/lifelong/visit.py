@@ -1,0 +1,105 @@
+"""A visit: a stretch of keyframes at one place, and what it measured of the landmarks, as one joint Gaussian."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from graph_slam_ros.errors import SingularError
+from graph_slam_ros.graph import Gaussian, Graph
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.lifelong.elimination import marginal_information
+from graph_slam_ros.solver import Settings, Solver
+from graph_slam_ros.typing import Array
+
+_SETTINGS = replace(Settings(), step_tolerance=1e-10, cost_tolerance=0.0)
+_LEAST = 1e-6  # eigenvalue of the correlations of a landmark's position, given the poses: less is no position
+Estimate = Callable[[ArrayLike], Array]
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """The joint Gaussian of landmarks by some edges alone.
+
+    Attributes
+    ----------
+    members : vertices of the landmarks, ascending
+    points : (m, d) their positions in the axes of one pose of the visit [m]
+    information : (m d, m d) of these, given that pose; all other poses are marginalised out
+    chi2, degrees : of the edges at their own optimum
+    """
+
+    members: tuple[int, ...]
+    points: Array
+    information: Array
+    chi2: float
+    degrees: int
+
+
+def visit_of(
+    space: Geometry, graph: Graph, estimate: Estimate, poses: Sequence[int], base: int, edges: Mapping[int, float]
+) -> Visit:
+    """Return what some edges say of the landmarks on them, in the axes of one pose.
+
+    They are brought to their own optimum: no other edge has a say in it. Landmarks whose position these edges alone do
+    not determine are left out, with their sightings.
+
+    Parameters
+    ----------
+    estimate : stored numbers of vertices: where the optimum is looked for
+    poses : vertices of the visit; base : one of them
+    edges : between these and landmarks, with the factor by which each counts, above 0
+
+    Raises
+    ------
+    SingularError
+        The edges do not determine the poses, or no landmark.
+    """
+    ends = {edge: graph.edge(edge).vertices for edge in sorted(edges)}
+    marks = sorted({v for vertices in ends.values() for v in vertices} - set(poses))
+    while marks:
+        order = [base, *(v for v in poses if v != base), *marks]
+        inside = [edge for edge in ends if set(ends[edge]) <= set(order)]
+        local, at = _local_graph(space, graph, estimate, order, len(marks), {edge: edges[edge] for edge in inside})
+        solver = Solver(local, _SETTINGS)
+        solver.add(range(local.vertex_count), range(local.edge_count))
+        solver.hold(at[base])
+        information = solver.information_matrix()
+        size = space.dimensions
+        blocks = [len(information) - size * (len(marks) - k) for k in range(len(marks))]
+        sure = [_is_sure(information[low : low + size, low : low + size]) for low in blocks]
+        if not all(sure):
+            marks = [mark for mark, is_sure in zip(marks, sure, strict=True) if is_sure]
+            continue
+        report = solver.optimize()
+        information = solver.information_matrix()
+        kept = np.arange(blocks[0], len(information))
+        points = solver.estimate([at[mark] for mark in marks])
+        marginal = marginal_information(information, kept)
+        return Visit(tuple(marks), points, marginal, report.chi2_final, solver.degrees_of_freedom)
+    raise SingularError("the visit determines no landmark")
+
+
+def _is_sure(information: Array) -> bool:
+    """Return whether the information (d, d) of a point is of full rank."""
+    scale = np.sqrt(np.diag(information))
+    return bool(scale.all()) and float(np.linalg.eigvalsh(information / np.outer(scale, scale))[0]) > _LEAST
+
+
+def _local_graph(
+    space: Geometry, graph: Graph, estimate: Estimate, order: Sequence[int], marks: int, edges: Mapping[int, float]
+) -> tuple[Graph, dict[int, int]]:
+    """Copy some vertices, the base first and landmarks last, and edges, in the axes of the base."""
+    poses, points = order[: len(order) - marks], order[len(order) - marks :]
+    at_poses, at_points = estimate(poses), estimate(points)
+    local, group = Graph(), space.group
+    base = tuple(at_poses[0].tolist())
+    local.add_vertices(space.pose, np.stack(group.between(base, tuple(at_poses.T)), axis=-1))
+    local.add_vertices(space.point, np.stack(group.act(group.inverse(base), tuple(at_points.T)), axis=-1))
+    at = {vertex: k for k, vertex in enumerate(order)}
+    for edge, factor in edges.items():
+        one = graph.edge(edge)
+        noise = Gaussian(np.sqrt(factor) * one.sqrt_information)
+        local.add_edge(one.type, [at[v] for v in one.vertices], one.measured, noise, one.label)
+    return local, at

@@ -1,0 +1,227 @@
+"""Visits to a place condensed to one Gaussian, compared with everything solved at once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graph_slam_ros.chi_square import quantile
+from graph_slam_ros.errors import SingularError
+from graph_slam_ros.graph import Gaussian, Graph
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
+from graph_slam_ros.slam.lifelong.elimination import marginal_information, square_root, without
+from graph_slam_ros.slam.lifelong.place import Place, fused, rigid_motions, visit_without
+from graph_slam_ros.slam.lifelong.visit import visit_of
+from graph_slam_ros.solver import Settings, Solver
+
+POSES, SIGMA_ODOMETRY, SIGMA_SIGHTING = 5, 0.02, 0.05
+STILL = Settings(step_tolerance=1e-11, cost_tolerance=0.0)
+
+
+@pytest.fixture(params=[PLANAR, SPATIAL], ids=["plane", "space"])
+def space(request):
+    return request.param
+
+
+class World:
+    """Landmarks, and visits that see some of them: in one graph, where the visits are joined by landmarks alone."""
+
+    def __init__(self, space, noise, seed=0, landmarks=6):
+        self.space, self.noise, self.rng = space, noise, np.random.default_rng(seed)
+        self.points = 4.0 * self.rng.standard_normal((landmarks, space.dimensions))
+        self.graph = Graph()
+        self.marks = self.graph.add_vertices(space.point, self.points).tolist()
+        self.poses, self.edges = [], []
+
+    def visit(self, sees, moved=None, sighting="position"):
+        """Add a visit from another direction; returns its number."""
+        space, group, rng = self.space, self.space.group, self.rng
+        pose = group.exp(tuple(rng.standard_normal(space.dof)))
+        step = group.exp((0.5, *[0.05] * (space.dof - 2), 0.3))
+        sigmas = space.sigmas(SIGMA_ODOMETRY, SIGMA_ODOMETRY)
+        poses, edges = [], []
+        for k in range(POSES):
+            poses.append(self.graph.add_vertex(space.pose, np.array(pose)))
+            if k:
+                error = tuple(self.noise * np.array(sigmas) * rng.standard_normal(space.dof))
+                measured = group.compose(step, group.exp(error))
+                noise = Gaussian.from_sigmas(*sigmas)
+                edges.append(self.graph.add_edge(space.relative_pose, poses[-2:], measured, noise, "odometry"))
+            for m in sees:
+                sigma = SIGMA_SIGHTING * (1 + 0.1 * m)
+                there = self.points[m] + (moved[1] if moved and moved[0] == m else 0.0)
+                seen = np.array(group.act(group.inverse(pose), tuple(there)))
+                seen = seen + self.noise * sigma * rng.standard_normal(len(seen))
+                noise = Gaussian.from_sigmas(*[sigma] * len(seen))
+                if sighting == "bearing":
+                    seen, noise = [np.arctan2(seen[1], seen[0])], Gaussian.from_sigmas(0.01)
+                vertices = [poses[-1], self.marks[m]]
+                edge_type = space.sightings[sighting]
+                edges.append(self.graph.add_edge(edge_type, vertices, edge_type.whole([seen])[0], noise, "landmarks"))
+            pose = group.compose(pose, step)
+        self.poses.append(poses)
+        self.edges.append(edges)
+        return len(self.poses) - 1
+
+    def estimate(self, ids):
+        graph = self.graph
+        return np.array([graph.vertex(int(v)).initial for v in ids])
+
+    def base(self, number):
+        return self.poses[number][POSES // 2]
+
+    def condensed(self, number):
+        edges = dict.fromkeys(self.edges[number], 1.0)
+        return visit_of(self.space, self.graph, self.estimate, self.poses[number], self.base(number), edges)
+
+    def place(self, *numbers):
+        """The place of some visits in this order; the statistics of all but the first."""
+        place, told = Place.begun_by(self.condensed(numbers[0])), []
+        for number in numbers[1:]:
+            one, other = self.estimate([self.base(numbers[0]), self.base(number)])
+            guess = self.space.group.between(tuple(one), tuple(other))
+            done = fused(self.space, place, self.condensed(number), guess)
+            place = done.place
+            told.append((done.statistic, done.degrees))
+        return place, told
+
+    def batch(self, *numbers):
+        """Positions of the landmarks in the axes of the first base, and their information, of all edges at once."""
+        graph, group = self.graph.copy(), self.space.group
+        solver = Solver(graph, STILL)
+        poses = [v for n in numbers for v in self.poses[n]]
+        edges = [edge for n in numbers for edge in self.edges[n]]
+        marks = sorted({v for edge in edges for v in graph.edge(edge).vertices} - set(poses))
+        solver.add(sorted([*poses, *marks]), edges)
+        solver.hold(self.base(numbers[0]))
+        solver.optimize()
+        size = self.space.dimensions
+        covariance = np.linalg.inv(solver.information_matrix())[: size * len(marks), : size * len(marks)]
+        base = tuple(self.estimate([self.base(numbers[0])])[0])
+        turn = np.kron(np.eye(len(marks)), self.space.turn(base))
+        points = np.stack(group.act(group.inverse(base), tuple(solver.estimate(marks).T)), axis=-1)
+        return points, turn.T @ np.linalg.inv(covariance) @ turn
+
+
+def test_two_visits_are_what_all_their_edges_say_at_once(space):
+    world = World(space, noise=1e-6)
+    world.visit(range(5))
+    world.visit(range(1, 6))
+    place, _ = world.place(0, 1)
+    points, information = world.batch(0, 1)
+    assert place.members == tuple(world.marks)
+    assert place.points == pytest.approx(points, abs=1e-9)
+    assert place.information == pytest.approx(information, rel=1e-5, abs=1e-5 * np.abs(information).max())
+    exact = World(space, noise=0.0)
+    exact.visit(range(5))
+    exact.visit(range(1, 6))
+    information = exact.batch(0, 1)[1]
+    assert exact.place(0, 1)[0].information == pytest.approx(information, abs=1e-9 * np.abs(information).max())
+
+
+def test_with_the_noise_of_sensors_it_is_nearly_so(space):
+    world = World(space, noise=1.0, seed=3)
+    for sees in (range(5), range(1, 6), range(6)):
+        world.visit(sees)
+    place, _ = world.place(0, 1, 2)
+    points, information = world.batch(0, 1, 2)
+    sigmas = np.sqrt(np.diag(np.linalg.inv(information))).reshape(points.shape)
+    assert (np.abs(place.points - points) < 0.2 * sigmas).all()
+    root = np.linalg.inv(np.linalg.cholesky(information))
+    ratios = np.linalg.eigvalsh(root @ place.information @ root.T)
+    assert ratios[0] > 0.9 and ratios[-1] < 1.1
+
+
+def test_a_later_visit_says_nothing_of_where_it_is_seen_from(space):
+    world = World(space, noise=1.0)
+    visit = world.condensed(world.visit(range(6)))
+    columns = rigid_motions(visit.points)
+    shape = without(visit.information, columns)
+    assert np.abs(shape @ columns).max() < 1e-9 * np.abs(visit.information).max()
+    assert np.linalg.eigvalsh(shape)[columns.shape[1]] > 0.0
+
+
+def test_the_order_of_later_visits_does_not_matter(space):
+    world = World(space, noise=1e-5)
+    for sees in (range(5), range(1, 6), (0, 2, 3, 5), range(2, 6)):
+        world.visit(sees)
+    one, other = world.place(0, 1, 2, 3)[0], world.place(0, 3, 2, 1)[0]
+    assert one.members == other.members
+    assert one.points == pytest.approx(other.points, abs=1e-6)
+    assert one.information == pytest.approx(other.information, abs=1e-6 * np.abs(one.information).max())
+
+
+def test_right_visits_pass_the_gate_and_a_landmark_that_moved_does_not(space):
+    statistics = np.zeros(2)
+    for seed in range(24):
+        world = World(space, noise=1.0, seed=seed)
+        statistics += world.place(world.visit(range(6)), world.visit(range(6)))[1][0]
+    assert quantile(1e-4, int(statistics[1])) < statistics[0] < quantile(1 - 1e-4, int(statistics[1]))
+    wrong = world.visit(range(6), moved=(2, 0.5))
+    ((statistic, degrees),) = world.place(0, wrong)[1]
+    assert statistic > quantile(0.9999, degrees)
+    place, visit = world.place(0)[0], world.condensed(wrong)
+    guess = space.group.between(*(tuple(world.estimate([world.base(n)])[0]) for n in (0, wrong)))
+    left = {mark: fused(space, place, visit_without(visit, mark), guess).statistic for mark in visit.members}
+    assert min(left, key=left.get) == world.marks[2]
+    assert left[world.marks[2]] < quantile(0.9999, degrees - space.dimensions)
+
+
+def test_the_motion_is_found_from_a_poor_guess(space):
+    world = World(space, noise=1.0)
+    world.visit(range(6))
+    world.visit(range(6))
+    place, visit = Place.begun_by(world.condensed(0)), world.condensed(1)
+    group = space.group
+    right = group.between(*(tuple(world.estimate([world.base(n)])[0]) for n in (0, 1)))
+    off = group.compose(right, group.exp((0.5, *[-0.2] * (space.dof - 2), 0.3)))
+    one, other = (fused(space, place, visit, guess).place for guess in (right, off))
+    assert one.points == pytest.approx(other.points, abs=1e-9)
+
+
+def test_half_of_each_measurement_and_the_other_half_are_the_whole(space):
+    world = World(space, noise=0.0)
+    world.visit(range(6))
+    whole = world.condensed(0)
+    edges = dict.fromkeys(world.edges[0], 0.5)
+    half = visit_of(space, world.graph, world.estimate, world.poses[0], world.base(0), edges)
+    assert 2.0 * half.information == pytest.approx(whole.information, rel=1e-9, abs=1e-6)
+
+
+def test_landmarks_that_a_visit_cannot_place_are_left_out():
+    world = World(PLANAR, noise=1.0)
+    first = world.visit(range(3))
+    poses, only = world.poses[first], world.marks[5]
+    world.edges[first].append(
+        world.graph.add_edge(
+            PLANAR.sightings["bearing"], [poses[0], only], [0.1, 0.0, 0.0, 0.0], Gaussian.from_sigmas(0.01), "landmarks"
+        )
+    )
+    assert world.condensed(first).members == tuple(world.marks[:3])
+    bearings = world.visit(range(4), sighting="bearing")
+    assert world.condensed(bearings).members == tuple(world.marks[:4])  # from several poses they have a place
+
+
+def test_a_visit_that_shares_too_little_is_refused(space):
+    world = World(space, noise=1.0)
+    world.visit(range(3))
+    world.visit(range(2, 6))
+    with pytest.raises(SingularError, match="shares 1 landmarks"):
+        world.place(0, 1)
+    nothing = replace(
+        world.condensed(0), members=(), points=np.zeros((0, space.dimensions)), information=np.zeros((0, 0))
+    )
+    with pytest.raises(SingularError, match="shares 0"):
+        fused(space, Place.begun_by(nothing), world.condensed(1), space.identity)
+
+
+def test_elimination_is_that_of_the_textbook():
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((40, 40))
+    information = root @ root.T + np.eye(40)
+    kept = np.array([3, 17, 2, 30])
+    covariance = np.linalg.inv(information)
+    assert np.linalg.inv(marginal_information(information, kept)) == pytest.approx(covariance[np.ix_(kept, kept)])
+    assert square_root(information).T @ square_root(information) == pytest.approx(information)
+    with pytest.raises(SingularError, match="is not determined"):
+        square_root(np.diag([1.0, 0.0]))
