@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from graph_slam_ros.config.frontend import OdometryConfig
+from graph_slam_ros.config.config import Config
 from graph_slam_ros.graph import Gaussian
-from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
@@ -21,7 +20,7 @@ from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, Displaceme
 from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.odometry_hypotheses import Moved
-from graph_slam_ros.slam.slip_detector import SlipDetector
+from graph_slam_ros.slam.slip_detector import Doubt, SlipDetector
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Array, Numbers
@@ -114,6 +113,7 @@ class KidnapDetector:
     Parameters
     ----------
     segments : indices of the keyframes at which segments begin; one that begins in the past is appended
+    doubt : of ``SlipDetector``
 
     Attributes
     ----------
@@ -122,19 +122,20 @@ class KidnapDetector:
 
     def __init__(
         self,
-        space: Geometry,
-        odometry: OdometryConfig,
+        config: Config,
         backend: Backend,
         counters: Counters,
         segments: list[int],
+        doubt: Doubt,
     ) -> None:
+        space, odometry = config.space, config.odometry
         self._space, self._odometry, self._backend, self._counters = space, odometry, backend, counters
         self._segments = segments
         graph, solver = backend.graph, backend.solver
         self._history = LandmarkHistory(graph, backend.ledger)
         self._search = DisplacementSearch(space, graph, solver, backend.ledger, self._history)
         self._monitor = InnovationMonitor(solver, backend.decisions, self._history)
-        self._slips = SlipDetector(space, odometry, backend, counters, self._history)
+        self._slips = SlipDetector(space, odometry, backend, counters, self._history, doubt)
         self._next = graph.edge_count
         self._splits: list[_Split] = []  # of the present frame of odometry
         self._refuted: list[Numbers] = []  # where that frame does not lie: it was decided and taken back

@@ -9,8 +9,9 @@ is taken back, and everything is as before.
 """
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -54,6 +55,8 @@ _PART = 0.05  # of the views cause a comparison at most, but for so many that fo
 _BURST = 20.0
 _FACTOR = 1.5  # all noise may be larger than stated by this factor
 
+Doubt = Callable[[int, Callable[[float], Array] | None], None]
+
 
 @dataclass(slots=True)
 class _Link:
@@ -86,6 +89,7 @@ class SlipDetector:
     Parameters
     ----------
     history : from when on each landmark is well known
+    doubt : takes a stamp since when odometry has more noise, and the variances that so many seconds add; None: its own
 
     Attributes
     ----------
@@ -93,10 +97,16 @@ class SlipDetector:
     """
 
     def __init__(
-        self, space: Geometry, odometry: OdometryConfig, backend: Backend, counters: Counters, history: LandmarkHistory
+        self,
+        space: Geometry,
+        odometry: OdometryConfig,
+        backend: Backend,
+        counters: Counters,
+        history: LandmarkHistory,
+        doubt: Doubt,
     ) -> None:
         self._space, self._config, self._backend, self._counters = space, odometry, backend, counters
-        self._history = history
+        self._history, self._doubt = history, doubt
         self._links: deque[_Link] = deque(maxlen=_MOST_EDGES)
         self._views: deque[_View] = deque(maxlen=_VIEWS + 1)
         self._new: list[int] = []  # edges that came since the last check, whose innovation is not known yet
@@ -124,6 +134,7 @@ class SlipDetector:
         self._new = [edge for edge in self._new if any(edge in view.edges for view in self._views)]
         if (now := self.now) is not None:
             self.slips[-1] = replace(now, ended_ns=stamp_ns)
+            self._doubt(stamp_ns, None)
 
     def add_odometry(self, edge: int, vertices: Sequence[int], stamps_ns: tuple[int, int], keyframe: int) -> None:
         """Add the odometry edge from one keyframe to the next. During a slip it gets more noise."""
@@ -224,6 +235,7 @@ class SlipDetector:
         self._counters.count("odometry", "slip")
         self._replace(links, slip, keyframe)
         self._admit_since(vertex, keyframe)
+        self._doubt(began_ns, partial(self._added.variances, slip.kind))
 
     def _compare(self, moved: Moved | None, keyframes: StampedPoses[Keyframe]) -> Choice:
         """Compare the hypotheses on the window: odometry's noise, a slip from each view on, and that it was moved."""
@@ -336,6 +348,7 @@ class SlipDetector:
             self._counters.count("odometry", "slip_taken_back")
         outcome = "" if left else "taken back: later views agree with odometry"
         self.slips[-1] = replace(now, edges=left, ended_ns=stamp_ns, outcome=outcome)
+        self._doubt(stamp_ns, None)
 
     def review(self, keyframes: StampedPoses[Keyframe]) -> bool:
         """Take back the slips that all measurements together contradict. Returns whether there were any."""

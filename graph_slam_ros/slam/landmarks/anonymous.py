@@ -24,7 +24,7 @@ from graph_slam_ros.slam.frontend.odometry_integration import OdometryNoise
 from graph_slam_ros.slam.frontend.odometry_selector import Step
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.assignments import Assigned, Assignments
-from graph_slam_ros.slam.landmarks.beam import Beam, BeamSettings, Decision, changes
+from graph_slam_ros.slam.landmarks.beam import NOTHING, Beam, BeamSettings, Decision, changes
 from graph_slam_ros.slam.landmarks.belief import SolverBelief
 from graph_slam_ros.slam.landmarks.hindsight import Found, FrozenScans, Hindsight
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
@@ -86,6 +86,8 @@ class AnonymousLandmarks:
         self._scans: list[Scan] = []
         self._motions: list[Motion] = []
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
+        self._firsts: list[int] = []  # the first cluster of each scan
+        self._doubt: Callable[[float], Array] | None = None
 
     def restore(self) -> None:
         """Continue with the landmarks of a map."""
@@ -159,11 +161,12 @@ class AnonymousLandmarks:
             return []
         if self._scans:
             motion = motion_between(self._space, self._motion_noise, self._scans[-1].at, scan.at, self._jump)
-            self._motions.append(motion)
+            self._motions.append(self._doubted(motion))
         self._scans.append(scan)
         first = self.clusters.append(scan.clusters)
+        self._firsts.append(first)
         try:
-            now = self._explained(scan, first)
+            now = self._explained(scan, first, self._motions[-1] if self._motions else None)
         except (GraphSlamError, np.linalg.LinAlgError):  # no covariance now: the solve that failed is counted
             self._beam = self._leader = now = None
         changed = {c: self._same.get(k, k) for c, k in changes(self._leader, now).items()}
@@ -171,23 +174,58 @@ class AnonymousLandmarks:
         self.clusters.give({c: landmark for c, landmark in changed.items() if c < first})
         return self.clusters.begin(first, changed)
 
-    def _explained(self, scan: Scan, first: int) -> Decision | None:
-        """Explain the scan. Returns the leader's last decision."""
+    def _explained(self, scan: Scan, first: int, motion: Motion | None) -> Decision | None:
+        """Explain the scan after a motion. Returns the leader's last decision."""
         self._hand_over()
         beam, names = self._beam, self.clusters.names
-        if beam is None or (self._motions and self._motions[-1].is_broken):
+        if beam is None or motion is None or motion.is_broken:
             scales, sigma = self._hindsight.scales
             seed = self._belief.seed(scan, names, scales if beam is None else beam.scales[0], sigma)
             beam, self._leader = Beam(self._settings, seed), None
             beam.sorts, beam.sizes = self._sorts, self._sizes
         else:
-            beam.advance(self._motions[-1])
+            beam.advance(motion)
             self._belief.recall(beam, scan, names)
         decision = beam.explain(scan, first)
         if not beam.is_sound:
             raise GraphSlamError("the hypotheses are not finite")
         self._beam = beam
         return decision
+
+    def doubt(self, since_ns: int, added: Callable[[float], Array] | None) -> None:
+        """Use odometry with more noise, or as stated again. In the first case the scans since then are explained anew.
+
+        Parameters
+        ----------
+        added : variances (dof,) that so many seconds of motion add; None from now on
+        """
+        self._doubt = added
+        since = [k for k, scan in enumerate(self._scans) if k and scan.at.stamp_ns > since_ns]
+        if added is None or not since:
+            return
+        for k in since:
+            self._motions[k - 1] = self._doubted(self._motions[k - 1])
+        self.explain_since(since[0])
+
+    def _doubted(self, motion: Motion) -> Motion:
+        if self._doubt is None:
+            return motion
+        return replace(motion, covariance=motion.covariance + np.diag(self._doubt(motion.moving_s)))
+
+    def explain_since(self, first: int) -> None:
+        """Explain the scans anew from one on: what they were thought to be is forgotten."""
+        clusters = range(self._firsts[first], len(self.clusters.given))
+        self._hindsight.restart()
+        self.clusters.give(dict.fromkeys(clusters, NOTHING))
+        self._solver.update()
+        self._beam = self._leader = now = None
+        try:
+            for k in range(first, len(self._scans)):
+                now = self._explained(self._scans[k], self._firsts[k], self._motions[k - 1] if k else None)
+                self._leader = now
+        except (GraphSlamError, np.linalg.LinAlgError):  # as when they were new
+            self._beam = self._leader = None
+        self.clusters.give({c: self._same.get(k, k) for c, k in changes(None, now).items() if c in clusters})
 
     # -- afterwards --------------------------------------------------------------------------------------------------
 

@@ -144,6 +144,11 @@ class Hindsight:
         work = self._executor(lambda: explained(self._space, frozen, self._settings, self._costs))
         self._job = keyframes + self._after, work
 
+    def restart(self) -> None:
+        """Drop the explanation in the background, and start another soon: what it began with is wrong."""
+        if self._job is not None:
+            self._job, self._next = None, 0
+
     def outcome(self, keyframes: int) -> Found | None:
         """The explanation that is due at a keyframe. It waits for it."""
         if self._job is None or keyframes < self._job[0]:

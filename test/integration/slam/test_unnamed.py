@@ -8,12 +8,13 @@ import pytest
 from reliability import times
 
 from graph_slam_ros.graph import R2
-from graph_slam_ros.simulation import measurements
+from graph_slam_ros.simulation import Fault, faulty_recording, measurements
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.recording import drive
 from graph_slam_ros.simulation.sensing import RangeBearing
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
 from graph_slam_ros.slam.landmarks import hindsight
+from graph_slam_ros.slam.slip_review import Slip
 
 S = 1_000_000_000
 TICK_NS = S // 10
@@ -288,3 +289,17 @@ def test_landmarks_near_one_another_are_told_apart_by_their_class_or_size(by):
     assert count == 16
     assert nearest.max() < 0.6
     assert found(is_known=False)[0] < 16
+
+
+def test_where_odometry_slips_what_was_seen_since_is_explained_anew():
+    recording = park(3, laps=1)
+    lost, _ = faulty_recording(recording, [Fault.named("slip", at=0.4, lasting=0.08, factor=1.0 / 0.6)], seed=1)
+    until_ns = int(recording.stamps_ns[round(0.48 * len(recording.stamps_ns))]) + 5 * S
+    slam = pipeline("joint")
+    for m in measurements(lost):
+        if m.stamp_ns > until_ns:
+            break
+        slam.process(without_ids(m))
+    assert [type(one) for one in slam.alarms] == [Slip]
+    assert path_rmse(slam, recording) < 0.5
+    assert nearest_true(slam, recording)[1].max() < 1.0
