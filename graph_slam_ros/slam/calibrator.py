@@ -73,9 +73,11 @@ class Calibrator:
             self._admitted = {Parameter(*key) for key in start.calibration}
 
     @property
-    def is_first_trial_ahead(self) -> bool:
-        """Return whether no trial was used yet: until then a wrong calibration would pass for slips."""
-        return self._config.calibrate.is_on and not self.trials
+    def may_be_wrong(self) -> bool:
+        """Return whether odometry's factors are still to be found: until then they would pass for slips."""
+        factors = [one for one in self.findings.values() if one.parameter.name in ("distance", "turn")]
+        is_unknown = any(one.verdict in ("not_determined", "not_separable") for one in factors)
+        return self._config.calibrate.is_on and (not self.trials or is_unknown)
 
     def after_solve(self, keyframe: int, everything: Settings | None) -> Report | None:
         """Start a trial if it is due, and apply the outcome of an earlier one. Returns the report of a solve."""

@@ -224,7 +224,7 @@ class GraphSlam(MapView):
         self._landmarks.review(self.keyframes, everything=everything is not None)
         if everything is None:
             self.backend.update(keyframe)
-            self._kidnaps.check(self.keyframes, now_ns, doubts=not self._calibrator.is_first_trial_ahead)
+            self._kidnaps.check(self.keyframes, now_ns, doubts=not self._calibrator.may_be_wrong)
         else:
             report = self._kidnaps.optimize(self.keyframes, everything)
         report = self.backend.scale_noise(self.keyframes, everything) or report

@@ -5,6 +5,7 @@ import pytest
 from imperfect import Faults, driven, imperfect_drive
 
 from graph_slam_ros.slam import Odometry, Sightings
+from graph_slam_ros.slam.kidnap_detector import KidnapDetector
 
 ON = {"calibrate.groups": "auto"}
 
@@ -98,3 +99,16 @@ def test_a_robot_that_may_slide_does_not_tell_the_yaw_of_its_sensor():
     assert "odometry.lateral_density (sideways) is 0.6 of odometry.translation_density" in one["text"]
     assert "drive 10 m straight past" in one["text"]
     assert findings(driven(measurements, ON))["yaw"]["verdict"] != "refused"
+
+
+@pytest.mark.parametrize(("turns", "is_doubted"), [(0.0, False), (0.8, True)])
+def test_odometry_whose_factors_are_still_to_be_found_is_not_doubted(turns, is_doubted, monkeypatch):
+    """A wrong factor passes for a slip, which takes the motion from the trial that would find it."""
+    doubts, check = [], KidnapDetector.check
+    monkeypatch.setattr(
+        KidnapDetector, "check", lambda *given, **how: (doubts.append(how["doubts"]), check(*given, **how))[1]
+    )
+    slam = driven(imperfect_drive(Faults(), seconds=25.0, turns=turns), ON)
+    assert findings(slam)["turn"]["verdict"] == ("nothing_to_correct" if is_doubted else "not_determined")
+    assert doubts[0] is False
+    assert doubts[-1] is is_doubted
