@@ -1,0 +1,262 @@
+"""Condensing: the keyframes of a visit leave the problem, and an edge of the place has what they measured."""
+
+from collections.abc import Collection, Hashable, Sequence
+from dataclasses import dataclass, field
+
+from graph_slam_ros.chi_square import quantile
+from graph_slam_ros.errors import SingularError
+from graph_slam_ros.graph import Gaussian, place_edge
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.lifelong.elimination import square_root
+from graph_slam_ros.slam.lifelong.place import Fused, Place, fewest_shared, fused, visit_without
+from graph_slam_ros.slam.lifelong.surroundings import Motion, Surroundings, chained, motion_of, surroundings
+from graph_slam_ros.slam.lifelong.visit import Visit, visit_of
+from graph_slam_ros.solver import Solver
+from graph_slam_ros.typing import Array, Numbers
+
+LABEL = "places"
+_AHEAD = 3  # landmarks of places that the keyframes after a visit must see before odometry to it is cut
+_STRIKES = 2  # visits in a row that contradict a place in the same landmark: then that begins anew
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Limits of the size of places, and of what is believed.
+
+    Attributes
+    ----------
+    members : landmarks of one place, at most; places : of one cell, at most
+    gate : quantile of chi2 above which a visit contradicts itself or its place
+    """
+
+    members: int = 24
+    places: int = 4
+    gate: float = 0.9999
+
+
+@dataclass(slots=True)
+class PlaceEdge:
+    """A place, the vertex that it is seen from and its edge; ``strikes`` of each landmark that visits contradict."""
+
+    base: int
+    place: Place
+    edge: int
+    strikes: dict[int, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Condensed:
+    """The end of one visit.
+
+    Attributes
+    ----------
+    how : ``first`` (of a place), ``again`` (added to a place), ``composed`` (odometry is kept, sightings are lost),
+        ``waits`` (until the keyframes after it see enough places), ``kept`` (it cannot be condensed)
+    why : of ``composed`` and ``kept``
+    statistic, degrees : chi2 of the visit against all before in its place
+    without, anew : the landmark that contradicts the place and was left out, or that the place has anew
+    """
+
+    how: str
+    why: str = ""
+    statistic: float = 0.0
+    degrees: int = 0
+    without: int | None = None
+    anew: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RemovedPose:
+    """A removed keyframe relative to a vertex, which may have been removed after it."""
+
+    vertex: int
+    base: int
+    T_base_vertex: Numbers
+
+
+class Condenser:
+    """Condenses visits in a graph and its solver, in order of time. The caller updates the solver after each.
+
+    Attributes
+    ----------
+    places : by cell
+    removed : keyframes, in the order of their removal
+    """
+
+    def __init__(self, space: Geometry, solver: Solver, limits: Limits | None = None) -> None:
+        self.space, self.solver, self.limits = space, solver, limits or Limits()
+        self.places: dict[Hashable, list[PlaceEdge]] = {}
+        self.removed: list[RemovedPose] = []
+
+    def condense(self, visit: Sequence[int], after: int, cell: Hashable, ahead: Collection[int]) -> Condensed:
+        """Condense a visit. Where ``waits`` or ``kept`` is returned nothing was changed.
+
+        Parameters
+        ----------
+        visit : vertices of its keyframes, in order of time; after : the keyframe that follows
+        ahead : landmarks that the keyframes after the visit see
+        """
+        around = surroundings(self.space, self.solver, visit, after)
+        if around.unfit:
+            return Condensed("kept", around.unfit)
+        in_cell = self.places.get(cell, [])
+        seen = {edge.vertices[1] for edge in around.sightings.values()}
+        best = max(in_cell, key=lambda one: len(seen & set(one.place.members)), default=None)
+        fits = best is not None and len(seen | set(best.place.members)) <= self.limits.members
+        is_again = fits and best is not None and len(seen & set(best.place.members)) >= fewest_shared(self.space)
+        if is_again and len(self._known() & set(ahead)) < _AHEAD:
+            return Condensed("waits")
+        has_room = len(in_cell) < self.limits.places and len(seen) >= fewest_shared(self.space)
+        if not (is_again or has_room):
+            return self._composed(visit, after, around, "it sees too few landmarks, or the cell is full")
+        try:
+            base = visit[len(visit) // 2]
+            factors = around.factors if is_again else around.factors | _halved(around)
+            one = visit_of(self.space, self.solver.graph, self.solver.estimate, visit, base, factors)
+            if one.degrees > 0 and one.chi2 > quantile(self.limits.gate, one.degrees):
+                return self._composed(visit, after, around, "it contradicts itself")
+            if is_again and best is not None:
+                return self._again(visit, after, around, one, best)
+            return self._first(visit, after, around, one, cell)
+        except SingularError as error:
+            return self._composed(visit, after, around, str(error))
+
+    def poses(self) -> dict[int, Numbers]:
+        """Return the present estimate of each removed keyframe, by vertex."""
+        bases = sorted({one.base for one in self.removed} - {one.vertex for one in self.removed})
+        out: dict[int, Numbers] = {}
+        if bases:
+            out |= zip(bases, map(tuple, self.solver.estimate(bases).tolist()), strict=True)
+        for one in reversed(self.removed):
+            out[one.vertex] = tuple(map(float, self.space.group.compose(out[one.base], one.T_base_vertex)))
+        return {one.vertex: out[one.vertex] for one in self.removed}
+
+    # -- what becomes of a visit -------------------------------------------------------------------------------------
+
+    def _first(self, visit: Sequence[int], after: int, around: Surroundings, one: Visit, cell: Hashable) -> Condensed:
+        """Begin a place: half of the odometry is in its edge, the other half joins its base to what is around it."""
+        k = len(visit) // 2
+        if lonely := self._left_alone(around, one.members):
+            return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
+        root = square_root(one.information)
+        legs = [motion_of(edge, 0.5 * around.factors[edge.id]) for edge in around.steps]
+        onward = [motion_of(edge) for edge in around.onward.values()]
+        joins = [(edge.vertices[0], visit[k], [motion_of(edge), *legs[:k]]) for edge in around.into.values()]
+        added = self._join([*joins, (visit[k], after, [*legs[k:], *onward])])
+        begun = PlaceEdge(visit[k], Place.begun_by(one), self._place_edge(visit[k], Place.begun_by(one), root))
+        self.places.setdefault(cell, []).append(begun)
+        self._replace(visit, around, [*added, begun.edge], kept=visit[k], seen_from=visit[k])
+        return Condensed("first")
+
+    def _again(self, visit: Sequence[int], after: int, around: Surroundings, one: Visit, at: PlaceEdge) -> Condensed:
+        """Add a visit to a place, and cut the odometry on both sides of it."""
+        base, mine = self.solver.estimate([at.base, visit[len(visit) // 2]]).tolist()
+        guess = tuple(map(float, self.space.group.between(tuple(base), tuple(mine))))
+        done, without, place = self._fused(at.place, one, guess), None, at.place
+        if not self._passes(done):
+            without = self._contradicted(place, one, guess)
+            if without is None:
+                return self._composed(visit, after, around, "it contradicts its place", done)
+        anew = without if without is not None and at.strikes.get(without, 0) + 1 >= _STRIKES else None
+        result, used = done, one
+        if anew is not None:
+            result = self._fused(place.without(anew), one, guess)
+        elif without is not None:
+            used = visit_without(one, without)
+            result = self._fused(place, used, guess)
+        if lonely := self._left_alone(around, result.place.members):
+            return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
+        edge = self._place_edge(at.base, result.place, square_root(result.place.information))
+        self._replace(visit, around, [edge], kept=None, seen_from=at.base, also=[at.edge])
+        if without is None:
+            at.strikes = {mark: count for mark, count in at.strikes.items() if mark not in one.members}
+        elif anew is None:
+            at.strikes[without] = at.strikes.get(without, 0) + 1
+        else:
+            at.strikes.pop(anew, None)
+        at.place, at.edge = result.place, edge
+        return Condensed("again", "", done.statistic, done.degrees, None if anew else without, anew)
+
+    def _composed(
+        self, visit: Sequence[int], after: int, around: Surroundings, why: str, done: Fused | None = None
+    ) -> Condensed:
+        """Join what is before the visit to what is after it by its odometry alone."""
+        if lonely := self._left_alone(around, ()):
+            return Condensed("kept", f"{why}; landmark {lonely[0]} would be left without a measurement")
+        legs = [motion_of(edge) for edge in (*around.steps, *around.onward.values())]
+        added = self._join([(edge.vertices[0], after, [motion_of(edge), *legs]) for edge in around.into.values()])
+        self._replace(visit, around, added, kept=None, seen_from=after)
+        return Condensed("composed", why, done.statistic if done else 0.0, done.degrees if done else 0)
+
+    def _fused(self, place: Place, visit: Visit, guess: Numbers) -> Fused:
+        return fused(self.space, place, visit, guess)
+
+    def _passes(self, done: Fused) -> bool:
+        return done.degrees < 1 or done.statistic <= quantile(self.limits.gate, done.degrees)
+
+    def _contradicted(self, place: Place, visit: Visit, guess: Numbers) -> int | None:
+        """Return the landmark without which a visit fits its place best; None where it fits without none of them."""
+        shared, found = place.shared(visit), list[tuple[float, int]]()
+        if len(shared) <= fewest_shared(self.space):
+            return None
+        for mark in shared:
+            done = self._fused(place, visit_without(visit, mark), guess)
+            if self._passes(done):
+                found.append((done.statistic, mark))
+        return min(found)[1] if found else None
+
+    # -- edits of the graph ------------------------------------------------------------------------------------------
+
+    def _known(self) -> set[int]:
+        return {mark for in_cell in self.places.values() for one in in_cell for mark in one.place.members}
+
+    def _left_alone(self, around: Surroundings, members: Collection[int]) -> list[int]:
+        """Return the landmarks of a visit that would have no edge without it and are not among the members."""
+        seen = {edge.vertices[1] for edge in around.sightings.values()} - set(members) - self._known()
+        graph, out = self.solver.graph, []
+        for mark in sorted(seen):
+            others = (int(edge) for edge in self.solver.edges_on(mark) if int(edge) not in around.sightings)
+            if not any(graph.edge(edge).weight for edge in others):
+                out.append(mark)
+        return out
+
+    def _join(self, joins: Sequence[tuple[int, int, Sequence[Motion]]]) -> list[int]:
+        """Add edges of odometry, each of several motions."""
+        out = []
+        for first, last, motions in joins:
+            pose, covariance = chained(self.space, motions)
+            noise = Gaussian.from_covariance(covariance)
+            edge = self.solver.graph.add_edge(self.space.relative_pose, [first, last], pose, noise, "odometry")
+            out.append(edge)
+        return out
+
+    def _place_edge(self, base: int, place: Place, root: Array) -> int:
+        kind = place_edge(self.space.pose, len(place.members))
+        at = [base, *place.members]
+        return self.solver.graph.add_edge(kind, at, place.points.ravel(), Gaussian(root), LABEL)
+
+    def _replace(
+        self,
+        visit: Sequence[int],
+        around: Surroundings,
+        added: Sequence[int],
+        kept: int | None,
+        seen_from: int,
+        also: Sequence[int] = (),
+    ) -> None:
+        """Put edges in place of those of a visit, and remove its keyframes but ``kept``."""
+        gone = [vertex for vertex in visit if vertex != kept]
+        group, (base, *poses) = self.space.group, self.solver.estimate([seen_from, *gone]).tolist()
+        motions = [group.between(tuple(base), tuple(pose)) for pose in poses]
+        self.solver.add([], added)
+        for edge in (*around.all, *also):
+            self.solver.set_weight(edge, 0.0)
+        for vertex, motion in zip(gone, motions, strict=True):
+            self.solver.remove(vertex)
+            self.removed.append(RemovedPose(vertex, seen_from, tuple(map(float, motion))))
+
+
+def _halved(around: Surroundings) -> dict[int, float]:
+    """Return the factors of the odometry inside a visit, half of which joins the place to what is around it."""
+    steps = {edge.id for edge in around.steps}
+    return {number: 0.5 * around.factors[number] for number in steps}

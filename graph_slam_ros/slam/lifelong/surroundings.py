@@ -1,0 +1,103 @@
+"""The edges on the keyframes of a visit, by what becomes of them when the visit is condensed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from graph_slam_ros.graph import Edge
+from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.graph.losses import weight_and_cost
+from graph_slam_ros.slam.lifelong.elimination import product
+from graph_slam_ros.solver import Solver
+from graph_slam_ros.typing import Array, Numbers
+
+Motion = tuple[Numbers, Array]
+"""A relative pose and its covariance (dof, dof) in the tangent space at its end."""
+
+
+@dataclass(slots=True)
+class Surroundings:
+    """The edges that count on the keyframes of a visit, by id.
+
+    Attributes
+    ----------
+    inside : between its keyframes; sightings : of landmarks that are points
+    into : from elsewhere to the first keyframe; onward : from the last one to the keyframe after the visit
+    steps : of each keyframe but the last, the edge of odometry to the next
+    factors : of ``inside`` and ``sightings``: how much each counts, by its weight and loss
+    unfit : why these cannot be condensed; empty where they can
+    """
+
+    inside: dict[int, Edge] = field(default_factory=dict)
+    sightings: dict[int, Edge] = field(default_factory=dict)
+    into: dict[int, Edge] = field(default_factory=dict)
+    onward: dict[int, Edge] = field(default_factory=dict)
+    steps: list[Edge] = field(default_factory=list)
+    factors: dict[int, float] = field(default_factory=dict)
+    unfit: str = ""
+
+    @property
+    def all(self) -> list[int]:
+        """All of them, in order of id."""
+        return sorted({*self.inside, *self.sightings, *self.into, *self.onward})
+
+
+def surroundings(space: Geometry, solver: Solver, visit: Sequence[int], after: int) -> Surroundings:
+    """Return the edges on the keyframes of a visit.
+
+    Parameters
+    ----------
+    visit : vertices of its keyframes, in order of time; after : the keyframe that follows
+    """
+    graph, out = solver.graph, Surroundings()
+    on_it = sorted({int(edge) for vertex in visit for edge in solver.edges_on(vertex)})
+    edges = {number: edge for number in on_it if (edge := graph.edge(number)).weight}
+    members = set(visit)
+    for number, edge in edges.items():
+        first, last = edge.vertices[0], edge.vertices[-1]
+        if edge.type is space.relative_pose:
+            if members >= {first, last}:
+                out.inside[number] = edge
+            elif (first, last) == (visit[-1], after):
+                out.onward[number] = edge
+            elif last == visit[0] and first not in members:
+                out.into[number] = edge
+            else:
+                out.unfit = f"edge {number} leads from the visit to vertex {last if first in members else first}"
+        elif len(edge.vertices) == 2 and graph.kind_of(last) is space.point:
+            out.sightings[number] = edge
+        else:
+            out.unfit = f"edge {number} is a {edge.type.name}"
+    by_ends = {edge.vertices: edge for edge in reversed(out.inside.values())}
+    out.steps = [by_ends[ends] for ends in pairwise(visit) if ends in by_ends]
+    if len(out.steps) < len(visit) - 1 or len(out.onward) != 1:
+        out.unfit = out.unfit or "odometry does not join its keyframes one by one"
+    out.factors = _factors(solver, {**out.inside, **out.sightings})
+    return out
+
+
+def motion_of(edge: Edge, factor: float | None = None) -> Motion:
+    """Return what an edge of odometry measured, with its information times a factor, by default its weight."""
+    information = product(edge.sqrt_information.T, edge.sqrt_information) * (edge.weight if factor is None else factor)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    return tuple(edge.measured.tolist()), covariance
+
+
+def chained(space: Geometry, motions: Sequence[Motion]) -> Motion:
+    """Return motions one after the other as one."""
+    pose, covariance = motions[0]
+    for step, added in motions[1:]:
+        pose = tuple(map(float, space.group.compose(pose, step)))
+        covariance = space.group.propagate(covariance, step, added)
+    return space.normalized(pose), 0.5 * (covariance + covariance.T)
+
+
+def _factors(solver: Solver, edges: dict[int, Edge]) -> dict[int, float]:
+    chi2, _ = solver.chi2_of(list(edges))
+    out = {}
+    for (number, edge), one in zip(edges.items(), chi2.tolist(), strict=True):
+        loss = solver.settings.last_loss(edge.label, edge.source)
+        out[number] = edge.weight * float(weight_and_cost(loss.kind, loss.scale, edge.weight * one)[0])
+    return out

@@ -1,0 +1,135 @@
+"""A drive through a hall whose old visits are condensed, beside the same drive with all keyframes."""
+
+import numpy as np
+import pytest
+
+from benchmarks.lifelong import Robot, hall, rms
+from graph_slam_ros.chi_square import quantile
+from graph_slam_ros.graph import Gaussian
+from graph_slam_ros.graph.geometry import PLANAR, SPATIAL
+from graph_slam_ros.slam.lifelong.condenser import LABEL
+
+KEYFRAMES, WINDOW = 700, 40
+
+
+def driven(world, window=0, until=None):
+    robot = Robot(world, window)
+    for k in range(until or len(world.poses)):
+        robot.drive(k)
+    return robot
+
+
+@pytest.fixture(scope="module", params=[PLANAR, SPATIAL], ids=["plane", "space"])
+def both(request):
+    world = hall(2, KEYFRAMES, request.param)
+    return driven(world), driven(world, WINDOW)
+
+
+def test_visits_leave_the_problem_and_the_map_stays_as_good(both):
+    whole, bounded = both
+    assert bounded.ends["first"] > 5 and bounded.ends["again"] > 5
+    assert not bounded.ends.get("kept")
+    assert len(bounded.solver.vertices) < WINDOW + 60 + 2 * len(bounded.marks) < 0.5 * len(whole.solver.vertices)
+    assert len(bounded.solver.edges) < 0.5 * len(whole.solver.edges)
+    true = np.array([pose[: bounded.world.space.dimensions] for pose in bounded.world.poses])
+    assert len(bounded.path()) == KEYFRAMES
+    in_plane = bounded.world.space is PLANAR  # docs/lifelong.md has the limits, in space, too
+    assert rms(bounded.path(), true) < (1.25 if in_plane else 1.5) * rms(whole.path(), true)
+    assert rms(*bounded.landmarks()) < (1.15 if in_plane else 1.5) * rms(*whole.landmarks())
+
+
+def test_it_is_hardly_ever_surer_than_with_all_keyframes(both):
+    marks = sorted(both[0].marks)
+    ids = [[robot.vertices[-1], *(robot.marks[mark] for mark in marks)] for robot in both]
+    all_known, condensed = (robot.solver.joint_marginal(at) for robot, at in zip(both, ids, strict=True))
+    root = np.linalg.inv(np.linalg.cholesky(all_known))
+    ratios = np.linalg.eigvalsh(root @ condensed @ root.T)
+    in_plane = both[0].world.space is PLANAR
+    assert ratios[0] > (0.8 if in_plane else 0.5)
+    assert ratios[-1] < (4.0 if in_plane else 8.0)
+
+
+def test_later_visits_agree_with_those_before(both):
+    _, bounded = both
+    assert bounded.degrees > 50
+    assert bounded.statistics < 1.4 * bounded.degrees
+
+
+def test_a_place_is_a_single_edge_that_counts(both):
+    _, bounded = both
+    counting = {int(edge) for edge in bounded.solver.edges} & set(bounded.graph.edges_of(LABEL).tolist())
+    places = [one for in_cell in bounded.condenser.places.values() for one in in_cell]
+    assert counting == {one.edge for one in places}
+    assert sum(one.place.visits for one in places) == bounded.ends["first"] + bounded.ends["again"]
+
+
+def test_the_same_drive_gives_the_same_bytes():
+    world = hall(5, 300)
+    one, other = driven(world, 30), driven(world, 30)
+    assert one.solver.values.tobytes() == other.solver.values.tobytes()
+    assert one.path().tobytes() == other.path().tobytes()
+
+
+def wrong_id(world, keyframes, true, said):
+    """Sightings of one landmark under the id of another in some keyframes."""
+    for k in keyframes:
+        world.sightings[k] = [
+            (said if one[0] == true else one[0], *one[1:]) for one in world.sightings[k] if one[0] != said
+        ]
+    return world
+
+
+def test_a_visit_that_contradicts_itself_keeps_its_odometry_alone():
+    world = hall(2, KEYFRAMES)
+    seen = [{one[0] for one in here} for here in world.sightings]
+    k = next(k for k in range(400, 600) if len(seen[k]) >= 2 and seen[k] == seen[k] & seen[k + 1])
+    true, said = sorted(seen[k])[:2]
+    clean = driven(world, WINDOW)
+    noisy = driven(wrong_id(world, [k], true, said), WINDOW)
+    assert noisy.ends["composed"] > clean.ends.get("composed", 0)
+    assert rms(*noisy.landmarks()) < 1.5 * rms(*clean.landmarks())
+
+
+def test_a_landmark_that_moved_is_left_out_once_and_then_known_anew():
+    """Each place has its own strikes: the first visit leaves the landmark out, the second one begins it anew."""
+    world = hall(2, 1400)
+    mark = 17
+    from_here, shift = 700, np.array([0.6, 0.4])
+    for k in range(from_here, 1400):
+        turn = world.space.turn(world.poses[k])
+        world.sightings[k] = [
+            (one, seen + turn.T @ shift if one == mark else seen, covariance)
+            for one, seen, covariance in world.sightings[k]
+        ]
+    robot, told = Robot(world, WINDOW), []
+    condense = robot.condenser.condense
+    robot.condenser.condense = lambda *given: told.append(condense(*given)) or told[-1]
+    for k in range(1400):
+        robot.drive(k)
+    vertex = robot.marks[mark]
+    assert {one.without for one in told} <= {None, vertex}
+    assert vertex in {one.without for one in told}
+    assert vertex in {one.anew for one in told}
+    struck = [one for one in told if vertex in (one.without, one.anew)]
+    assert all(one.statistic > quantile(0.9999, one.degrees) for one in struck)
+
+
+def test_what_cannot_be_condensed_stays_and_says_why():
+    world = hall(1, 200)
+    robot = driven(world, 0, until=150)
+    visit = robot.vertices[1:20]
+    before = robot.solver.values
+    closure = robot.graph.add_edge(
+        world.space.relative_pose,
+        [visit[3], robot.vertices[100]],
+        world.steps[0],
+        Gaussian.from_sigmas(1, 1, 1),
+        "closures",
+    )
+    robot.solver.add([], [closure])
+    done = robot.condenser.condense(visit, robot.vertices[20], "here", ())
+    assert done.how == "kept" and done.why == f"edge {closure} leads from the visit to vertex {robot.vertices[100]}"
+    prior = robot.condenser.condense(robot.vertices[:4], robot.vertices[4], "here", ())
+    assert prior.how == "kept" and "pose prior" in prior.why
+    assert not robot.condenser.places and not robot.condenser.removed
+    assert robot.solver.values.tobytes() == before.tobytes()
