@@ -19,10 +19,11 @@ from graph_slam_ros.formats.durable import write_whole
 from graph_slam_ros.formats.files import opened, read_text
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.edits import AppliedEdit, Edit, edit_of
-from graph_slam_ros.runs.folder import CONFIG, RunError, check_room, discard, is_run, recording_of, run_config
+from graph_slam_ros.runs.folder import CONFIG, RunError, check_room, discard, recording_of, run_config
 from graph_slam_ros.runs.journal import INGEST, MAP, parts_of, read_measurements
 from graph_slam_ros.runs.map_journal import read_map, state_of
 from graph_slam_ros.runs.restore import record_run, restored, stopwatch
+from graph_slam_ros.runs.run_check import check_run
 from graph_slam_ros.slam import Control, GraphSlam
 
 FORMAT, VERSION = "graph_slam_ros edits", 1
@@ -123,8 +124,7 @@ def source_hash(folder: Path) -> str:
     RunError
         It is no run, or a file of it cannot be read.
     """
-    if not is_run(folder):
-        raise RunError(f"{folder}: not a run's folder")
+    check_run(folder)
     digest = hashlib.sha256()
     for file in (folder / CONFIG, *parts_of(folder, INGEST), *parts_of(folder, MAP)):
         try:

@@ -1,6 +1,6 @@
 """The contents of a report, read from a run folder. A part is left out only if its files are missing."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,10 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.report import drive, verdict
 from graph_slam_ros.report.groups import closure_groups
 from graph_slam_ros.report.packing import Packing, shown
-from graph_slam_ros.report.places import floor_plan, paths
+from graph_slam_ros.report.places import floor_plan, keyframe_paths, outside, paths
 from graph_slam_ros.report.sentences import effects, sentences
-from graph_slam_ros.runs.folder import COVARIANCES, RunError, changed_since, is_run, run_config, summary_of
+from graph_slam_ros.runs.folder import COVARIANCES, changed_since, run_config, summary_of
+from graph_slam_ros.runs.run_check import check_run
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
 from graph_slam_ros.runs.trajectory import read_covariances, read_tum
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
@@ -78,8 +79,7 @@ def read_contents(
     GraphSlamError
         The folder is not a run; or the truth, the other run or the floor plan, which were asked for, cannot be read.
     """
-    if not is_run(run):
-        raise RunError(f"{run}: not a run's folder")
+    check_run(run)
     out = Contents(run)
     summary = out.attempt(lambda: summary_of(run)) or {}
     known = read_truth(truth, topic, out.attempt(lambda: input_topics(run)) or set()) if truth else None
@@ -88,23 +88,28 @@ def read_contents(
     scores = evaluate(run, known, align=align) if known and saved else None
     out.data["run"] = shown(run.resolve().name)
     out.data["colours"] = {"light": LIGHT, "dark": DARK}
-    dimensions = saved.space.dimensions if saved else out.attempt(lambda: dimensions_of(run)) or 2
-    out.data["dimensions"] = dimensions
-    out.data["map"] = (
-        out.attempt(lambda: paths(out.packing, run, dimensions, known, other, align=align)) if saved else None
-    )
+    out.data["dimensions"] = saved.space.dimensions if saved else out.attempt(lambda: dimensions_of(run)) or 2
+    out.data["map"] = out.attempt(lambda: paths(out.packing, run, saved, known, other, align=align)) if saved else None
     out.data["plan"] = floor_plan(plan) if plan else None
     if saved:
+        out.beware += outside(plan, out.data["plan"], saved) if plan else []
         out.data["edges"] = _edges(out, saved)
         out.data["charts"] = _charts(out, saved)
         out.data["drive"] = out.attempt(lambda: _drive(out, saved))
         out.data["groups"] = out.attempt(lambda: closure_groups(saved)) or []
     _tables(out, summary, saved, scores, known)
     out.data["compared"] = _compared(run, other, out) if other else None
-    out.losses = list(dict.fromkeys(out.losses))
+    out.losses = _once(out.losses)
+    out.beware = [one for one in _once(out.beware) if not any(loss.endswith(one) for loss in out.losses)]
     out.data["sentences"] = out.attempt(lambda: verdict.verdict(run, summary, saved, scores, out.losses))
     out.data["losses"], out.data["beware"] = [[shown(one) for one in some] for some in (out.losses, out.beware)]
     return out
+
+
+def _once(lines: Sequence[str]) -> list[str]:
+    """Lines without those that stand in others: the same said of a file by its whole name."""
+    several = list(dict.fromkeys(lines))
+    return [one for one in several if not any(other != one and other.endswith(one) for other in several)]
 
 
 def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
@@ -246,7 +251,7 @@ def _chi2_histograms(saved: SavedGraph) -> Iterator[dict[str, Any]]:
 def _drive(out: Contents, saved: SavedGraph) -> dict[str, Any]:
     """The frames of the time slider, and the jumps of map -> odom."""
     frames = drive.frames(out.run, saved, out.losses)
-    odometry = read_tum(out.run / "path_odometry.tum")
+    odometry = keyframe_paths(out.run, saved)[1]
     found = drive.corrections(out.run, odometry.stamps_s, odometry.poses, out.losses)
     changed: dict[int, list[int]] = {}
     for change in saved.changes:
@@ -293,5 +298,10 @@ def _tables(out: Contents, summary: dict[str, Any], saved: Any, scores: Scores |
 def _compared(run: Path, other: Path, out: Contents) -> dict[str, Any]:
     from graph_slam_ros.maps.diff import diff
 
-    lines = [shown(line) for line in diff(run, other, out.losses).lines()]
+    found = diff(run, other, out.losses)
+    marks = found.landmarks
+    if not marks.both and (min(marks.a, marks.b) or not found.keyframes.both):
+        nothing = "no landmark is in both maps: are they of one place? Their frames need not be the same"
+        out.beware.append(f"--compare {other}: {nothing}")
+    lines = [shown(line) for line in found.lines()]
     return {"with": shown(other.resolve().name), "lines": lines}

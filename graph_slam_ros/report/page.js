@@ -89,7 +89,7 @@ function element(tag, text, attributes = {}) {
 
 const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
 const short = (text) => (text.length > 40 ? `${text.slice(0, 37)}...` : text);
-const number = (value) => (value === null || value === undefined ? "-" : Math.abs(value) < 1e-12 ? "0" : Number.isInteger(value) ? String(value) : general(value, 4));
+const number = (value) => (value === null || value === undefined ? "-" : Math.abs(value) < 1e-12 ? "0" : Number.isInteger(value) || (Math.abs(value) >= 1e4 && Math.abs(value) < 1e9) ? String(Math.round(value)) : general(value, 4));
 
 function table(id, head, rows, none = "none") {
   const place = byId(id);
@@ -125,8 +125,10 @@ function linkTo(kind, which, text) {
 // -- colours ---------------------------------------------------------------------------------------------------------
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
+const PAPER = {map: {width: 680, height: 560}, chart: {width: 680, height: 270}};  // [pixels] of CSS: A4 and Letter
+let onPaper = false;
 function colours() {
-  const d = dark.matches;
+  const d = dark.matches && !onPaper;
   return {
     ...data.colours[d ? "dark" : "light"],
     other: d ? "#2bd9b0" : "#00a884", then: d ? "#ffd24d" : "#9a6700", mark: d ? "#7ee787" : "#116329",
@@ -140,7 +142,7 @@ function layout(more) {
   const c = colours(), axis = {gridcolor: c.grid, zerolinecolor: c.grid, linecolor: c.grid};
   return {
     paper_bgcolor: c.paper, plot_bgcolor: c.paper, font: {color: c.ink, size: 12}, margin: {l: 55, r: 10, t: 10, b: 40},
-    legend: {orientation: "h", y: 1.02, yanchor: "bottom"}, modebar: {orientation: "v"}, xaxis: axis, yaxis: axis, ...more(axis),
+    legend: {orientation: "h", y: 1.02, yanchor: "bottom"}, modebar: {orientation: "v"}, xaxis: axis, yaxis: axis, ...(onPaper ? PAPER.chart : {}), ...more(axis),
   };
 }
 const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["toImage", "sendDataToCloud"]};
@@ -218,7 +220,7 @@ function edgeTraces() {
     if (isFaint) out.push(trace(plain(key), [[null], [null], [null]], colour, {visible, legendgroup: key}));  // what the legend shows
     out.push(trace(plain(key), axes, colour, {visible, isMany: true, opacity: isFaint ? faint : 0.8, legendgroup: key, showlegend: !isFaint}));
     out.push(trace("", middle, colour, {
-      visible, isMany: true, mode: "markers", marker: {color: colour, size: isIn ? 4 : 7, symbol: "diamond", opacity: isIn ? (isSighting ? faint : 0.35) : 0.9}, showlegend: false,
+      visible, isMany: true, mode: "markers", marker: {color: colour, size: (isIn ? 4 : 7) / (map.inSpace ? 2 : 1), symbol: "diamond", opacity: isIn ? (isSighting ? faint : 0.35) : 0.9}, showlegend: false,
       legendgroup: key, customdata: some, meta: "edge", hovertemplate: `edge %{customdata}: ${plain(key)}<extra></extra>`, hoverinfo: "all",
     }));
   }
@@ -250,7 +252,7 @@ function traces() {
   }
   out.push(trace("as known then", [[], [], []], c.then, {line: {color: c.then, width: 3}, visible: true, showlegend: false, meta: "then"}));
   out.push(trace("landmarks as known then", [[], [], []], c.then, {mode: "markers", marker: {symbol: map.inSpace ? "diamond" : "star", size: map.inSpace ? 4 : 11, color: c.then}, showlegend: false, meta: "marks then"}));
-  out.push(trace("chosen", [[], [], []], c.mark, {mode: "lines+markers", line: {color: c.mark, width: 5}, marker: {color: c.mark, size: 11}, showlegend: false, meta: "chosen"}));
+  out.push(trace("chosen", [[], [], []], c.mark, {mode: "lines+markers", line: {color: c.mark, width: 5}, marker: {color: c.mark, size: map.inSpace ? 7 : 11}, showlegend: false, meta: "chosen"}));
   return out;
 }
 
@@ -267,7 +269,7 @@ async function drawMap(isSame = false) {  // isSame: as it is zoomed
     xaxis: {...axis, title: {text: "x [m]"}}, yaxis: {...axis, title: {text: "y [m]"}, scaleanchor: "x", scaleratio: 1},
     dragmode: "pan", hovermode: "closest", images: image ? [image] : [], uirevision: "map",
   }));
-  const shape = map.inSpace ? {...layout(() => ({})), scene, uirevision: "space"} : flat;
+  const shape = {...(map.inSpace ? {...layout(() => ({})), scene, uirevision: "space"} : flat), ...(onPaper ? PAPER.map : {})};
   map.isThen = false;
   if (isSame) await Plotly.react("map", several, {...shape, ...zoom()}, {...CONFIG, scrollZoom: true});
   else await newMap(several, shape);
@@ -385,7 +387,7 @@ function edgeList(edges, body) {
   const list = element("ul"), e = data.edges;
   for (const k of edges.slice(0, 200)) {
     const item = element("li"), about = named(e.landmark, k);
-    item.append(linkTo("edge", k, `edge ${k}`), ` ${named(e.label, k)} ${short(about)}: ${verdictOf(k)}`);
+    item.append(linkTo("edge", k, `edge ${k}`), ` ${[named(e.label, k), short(about)].filter(Boolean).join(" ")}: ${verdictOf(k)}`);
     list.append(item);
   }
   body.append(list);
@@ -402,7 +404,7 @@ function showKeyframe(k, body) {
 function showLandmark(name, body) {
   const at = column(data.edges.landmark_names).indexOf(name), text = column(data.edges.landmark_lines)[at];
   const [first, ...rest] = text.split("\n");
-  body.append(element("h3", first), element("pre", rest.join("\n")));
+  body.append(element("h3", first), element("pre", rest.map((line) => line.replace(/(\S) {2,}/g, "$1  ")).join("\n")));
   edgeList(edgesAt(data.map.keyframes + at), body);
 }
 
@@ -517,7 +519,7 @@ const CHARTS = {
   },
   "chart-nees": (id) => {
     const [x, y] = data.nees.values.map(column), c = colours(), line = (name, value) => ({type: "scatter", mode: "lines", name, x: [0, data.map.keyframes], y: [value, value], line: {color: c.truth, width: 1, dash: "dot"}});
-    return Plotly.newPlot(id, [{type: "scattergl", mode: "markers", name: "NEES of poses", x, y, marker: {size: 3, color: c.estimate}}, line("95 % band", data.nees.band[0]), line("", data.nees.band[1])],
+    return Plotly.newPlot(id, [{type: "scattergl", mode: "markers", name: "NEES of poses", x, y, marker: {size: 3, color: c.estimate}}, line("95 % band", data.nees.band[0]), {...line("95 % band", data.nees.band[1]), showlegend: false}],
       layout((axis) => ({xaxis: {...axis, title: {text: "keyframe"}}, yaxis: {...axis, type: "log", title: {text: "NEES"}}})), CONFIG);
   },
 };
@@ -530,7 +532,7 @@ function histogram(id, one) {
   ], layout((axis) => ({bargap: 0, xaxis: {...axis, title: {text: plain(one.name)}}, yaxis: {...axis, title: {text: "edges"}}})), CONFIG);
 }
 
-const undrawn = new Map();
+const undrawn = new Map(), drawn = new Map();
 function drawWhenSeen(id, draw) {
   undrawn.set(id, draw);
   seen.observe(byId(id));
@@ -540,8 +542,21 @@ function drawNow(id) {
   const draw = undrawn.get(id);
   if (!draw) return;
   undrawn.delete(id);
+  drawn.set(id, draw);
   seen.unobserve(byId(id));
   draw(id);
+}
+
+async function drawAgain() {  // in other colours, or for paper: Plotly has drawn SVG when its call returns
+  for (const [id, draw] of drawn) draw(id);
+  if (data.map && data.edges) await drawMap(true);
+}
+
+async function print(isOn) {
+  if (isOn) [...undrawn.keys()].forEach(drawNow);
+  onPaper = isOn;
+  await drawAgain();
+  if (!isOn && byId("map").data) await Plotly.Plots.resize("map");
 }
 
 function startCharts() {
@@ -625,13 +640,14 @@ async function start() {
       await drawMap();
       if (frames.length) setTime();
     });
-    dark.addEventListener("change", () => drawMap());
   } else byId("map-section").hidden = true;
   if (!data.edges) byId("ledger").hidden = true;
   startCharts();
   if (extra) extra.start();
   addEventListener("hashchange", () => fromHash(true));
-  addEventListener("beforeprint", () => [...undrawn.keys()].forEach(drawNow));
+  dark.addEventListener("change", drawAgain);
+  addEventListener("beforeprint", () => print(true));
+  addEventListener("afterprint", () => print(false));
   fromHash(true);
   document.body.dataset.ready = "yes";
 }

@@ -36,8 +36,9 @@ def verdict(
     doubts = [*outcome.doubts(summary)] if _is_complete(summary) else []
     gates = [line for line in explain_run(saved) if line.startswith("warning: ")] if saved else []
     first = _state(summary, saved, scores, short, [*doubts, *gates], losses)
-    covariances = _covariances(saved, scores)
-    last = _next(run, (short, doubts, gates, covariances), losses, has_truth=scores is not None)
+    untrue = list(scores.warnings) if scores is not None else []
+    covariances = _covariances(saved, scores) if not untrue else []
+    last = _next(run, (untrue, short, doubts, gates, covariances), losses, summary, has_truth=scores is not None)
     return [first, _judged(saved), last]
 
 
@@ -55,14 +56,15 @@ def _state(
 ) -> str:
     if saved is None:
         return f"There is no map to show: {losses[0] if losses else 'the run holds no keyframe'}."
-    size = f"{len(saved.keyframes)} keyframes and {summary.get('landmarks', 0)} landmarks"
+    size = f"{len(saved.keyframes)} keyframes and {summary.get('landmarks', len(saved.landmarks))} landmarks"
     fit = _fit(saved)
     error = ""
     if scores is not None:
         error = f", {scores.estimate.position_m['rmse']:.3f} m from the truth (RMSE)"
         if scores.odometry is not None:
             error += f", dead reckoning {scores.odometry.position_m['rmse']:.3f} m"
-        error += f"; {_TOO_SMALL}" if _covariances(saved, scores) else ""
+        error += f"; {_TOO_SMALL}" if not scores.warnings and _covariances(saved, scores) else ""
+        error += "; whether that is a truth of this drive is not sure" if scores.warnings else ""
     if short:
         return f"Do not rely on this map yet: {size}{error}."
     if not summary.get("converged", True):
@@ -118,10 +120,14 @@ def _next(
     run: Path,
     several: Iterable[Sequence[str]],
     losses: Sequence[str],
+    summary: Mapping[str, Any],
     *,
     has_truth: bool,
 ) -> str:
     """The first of several kinds of sentences that has any."""
+    if summary.get("ended") is False:
+        again = f"If it was cut off, graph_slam recover {run.name} --out DIR writes its results"
+        return f"This run is still being written, or it was cut off: this is its map so far. {again}."
     if losses:
         again = f"graph_slam recover {run.name} --out DIR writes its results anew"
         return f"First get the run whole: {losses[0]} ({again})."

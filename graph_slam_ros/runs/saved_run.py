@@ -10,8 +10,9 @@ import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.files import read_text
-from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, RunError, changed_since, is_run, run_config
+from graph_slam_ros.runs.folder import COVARIANCES, SUMMARY, RunError, changed_since, run_config
 from graph_slam_ros.runs.ledger_file import Entry, read_ledger
+from graph_slam_ros.runs.run_check import check_run
 from graph_slam_ros.runs.trajectory import Trajectory, read_covariances, read_landmarks, read_tum
 from graph_slam_ros.slam import Config
 from graph_slam_ros.typing import Array
@@ -134,8 +135,7 @@ def load_run(folder: Path | str) -> SavedRun:
         It is no run, or its results were never written.
     """
     folder = Path(folder)
-    if not is_run(folder):
-        raise RunError(f"{folder}: not a run's folder")
+    check_run(folder)
     if not (folder / SUMMARY).is_file():
         raise RunError(f"{folder}: it has no results yet: graph_slam recover {folder} --out DIR")
     try:

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from faulty import faulty_run
+from pages import drive
 from PIL import Image
 
 from graph_slam_ros import cli
@@ -17,10 +18,11 @@ from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.analysis.explain import Numbers, remedy, statements, title
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.report import page, verdict
-from graph_slam_ros.report.contents import read_contents
+from graph_slam_ros.report import page, places, verdict
+from graph_slam_ros.report.contents import _once, read_contents
 from graph_slam_ros.report.packing import UNKNOWN, Packing, json_for_script, shown
 from graph_slam_ros.report.sentences import effects, sentences
+from graph_slam_ros.runs.folder import BEGUN
 from graph_slam_ros.slam import Config
 
 
@@ -190,9 +192,74 @@ def test_a_floor_plan_lies_where_its_file_says(run, tmp_path):
     assert [plan[name] for name in ("x", "y", "width", "height")] == [-3.0, 2.0, 20.0, 10.0]
     picture = Image.open(io.BytesIO(base64.b64decode(plan["url"].partition(",")[2])))
     assert picture.size == (40, 20)
-    (tmp_path / "map.yaml").write_text("image: hall.png\nresolution: 0.5\norigin: [0.0, 0.0, 0.3]\n")
-    with pytest.raises(GraphSlamError, match="is turned"):
-        read_contents(run, plan=tmp_path / "map.yaml")
+
+
+def test_a_floor_plan_that_is_turned_is_drawn_upright(tmp_path):
+    """A quarter turn about the lower left corner: it goes up and to the left from there, its first column below."""
+    pixels = np.full((20, 40), 255, np.uint8)
+    pixels[:, 0] = 0
+    Image.fromarray(pixels).save(tmp_path / "hall.png")
+    (tmp_path / "map.yaml").write_text(f"image: hall.png\nresolution: 0.5\norigin: [-3.0, 2.0, {np.pi / 2}]\n")
+    plan = places.floor_plan(tmp_path / "map.yaml")
+    picture = Image.open(io.BytesIO(base64.b64decode(plan["url"].partition(",")[2])))
+    assert [plan[name] for name in ("x", "y", "width", "height")] == pytest.approx([-13.0, 2.0, 10.0, 20.0], abs=0.6)
+    drawn = np.array(picture.convert("LA"))
+    dark = np.argwhere((drawn[..., 0] < 100) & (drawn[..., 1] > 200))
+    assert len(dark) >= 15
+    assert dark[:, 0].min() >= picture.height - 3
+
+
+def test_what_is_of_another_place_or_drive_is_doubted(run, tmp_path):
+    """A plan of elsewhere, a run that shares no landmark, a truth of another drive: no other advice is given."""
+    Image.new("L", (40, 20), 255).save(tmp_path / "hall.png")
+    (tmp_path / "map.yaml").write_text("image: hall.png\nresolution: 0.5\norigin: [500.0, 2.0, 0.0]\n")
+    other = drive(tmp_path / "other", ["elsewhere", "nowhere"])
+    stamps = np.loadtxt(run / "path.tum")[:, 0]
+    wrong = np.column_stack(
+        [stamps, *np.random.default_rng(1).normal(scale=30.0, size=(2, len(stamps))), *[0 * stamps] * 4]
+    )
+    np.savetxt(tmp_path / "wrong.tum", np.column_stack([wrong, 1 + 0 * stamps]), fmt="%.9f")
+    found = read_contents(run, str(tmp_path / "wrong.tum"), other, tmp_path / "map.yaml")
+    plan, truth, compared = found.data["beware"]
+    assert "443 of 443 keyframes are outside of the floor plan" in plan
+    assert "no landmark is in both maps" in compared
+    assert "check that the truth is of this robot and this drive" in truth
+    first, _, last = found.data["sentences"]
+    assert "not sure" in first
+    assert "covariances are too small" not in first
+    assert "check that the truth" in last
+
+
+def test_a_run_that_is_still_written_shows_its_map_so_far(run, tmp_path):
+    live = drive(tmp_path / "live", ["a", "b"])
+    before = read_contents(live)
+    (live / "run.json").write_bytes(BEGUN)
+    for file in live.iterdir():
+        if file.suffix in (".csv", ".tum", ".g2o"):
+            file.unlink()
+    made = read_contents(live)
+    assert "still being written" in made.data["sentences"][2]
+    assert "20 keyframes and 2 landmarks" in made.data["sentences"][0]
+    for name in ("odometry", "estimate"):
+        columns = [
+            [unpacked(one.packing, column) for column in one.data["map"]["paths"][name]] for one in (before, made)
+        ]
+        np.testing.assert_allclose(columns[1], columns[0], atol=2e-3)
+    names, points = (made.data["map"]["landmarks"][key] for key in ("names", "points"))
+    assert sorted(unpacked(made.packing, names)) == ["a", "b"]
+    assert np.isfinite([unpacked(made.packing, column) for column in points]).all()
+
+
+def test_results_of_an_earlier_save_are_not_drawn_with_a_later_map(tmp_path):
+    live = drive(tmp_path / "live", ["a", "b"])
+    lines = (live / "path.tum").read_text().splitlines(keepends=True)
+    (live / "path.tum").write_text("".join(lines[:-5]))
+    made = read_contents(live)
+    assert made.data["map"]["keyframes"] == 20 == len(made.saved.keyframes)
+
+
+def test_a_loss_is_said_once():
+    assert _once(["/a/b: map.mcap: cut off", "map.mcap: cut off", "c", "c"]) == ["/a/b: map.mcap: cut off", "c"]
 
 
 def test_a_damaged_run_shows_what_can_be_read_and_says_what_cannot(run, tmp_path, capsys):
@@ -209,7 +276,9 @@ def test_a_damaged_run_shows_what_can_be_read_and_says_what_cannot(run, tmp_path
 def test_what_cannot_be_a_report_is_refused(run, tmp_path, capsys):
     html = tmp_path / "a.html"
     for words, why in (
-        ((tmp_path,), "not a run"),
+        ((tmp_path / "none",), "there is nothing of that name"),
+        ((run / "map.mcap",), "but a file: graph_slam replay"),
+        ((run.parent,), f"in it there are runs: {run}"),
         ((run, "--out", tmp_path / "a.txt"), "a report is a .html file"),
         ((run, "--out", html, "--topic", "/x"), "no use for --topic"),
         ((run, "--out", html, "--truth", tmp_path / "none"), "none"),

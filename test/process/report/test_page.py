@@ -147,6 +147,19 @@ def test_space_charts_and_print_draw_without_a_fault(page, faulty):
     assert page.evaluate("() => getComputedStyle(document.body).backgroundColor") == "rgb(22, 25, 29)"
 
 
+def test_paper_is_light_and_as_wide_as_paper(page, faulty):
+    """The page is dark, and wider than paper."""
+    sizes = "() => [...document.querySelectorAll('.plot')].map((one) => [one.clientWidth, one._fullLayout.width])"
+    colour = "() => ['map', 'chart-verdicts'].map((id) => document.getElementById(id)._fullLayout.paper_bgcolor)"
+    page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
+    assert page.evaluate(colour) == ["#ffffff"] * 2
+    assert {drawn for _, drawn in page.evaluate(sizes)} == {680}
+    page.evaluate("() => dispatchEvent(new Event('afterprint'))")
+    page.wait_for_function("() => document.getElementById('map')._fullLayout.width !== 680")
+    assert "#ffffff" not in page.evaluate(colour)
+    assert all(abs(there - drawn) <= 2 for there, drawn in page.evaluate(sizes))
+
+
 def test_hostile_names_are_shown_as_text(opened, tmp_path, capsys):
     run = drive(tmp_path / "<b>&'run", HOSTILE)
     code, html = reported(run, tmp_path / "hostile.html")

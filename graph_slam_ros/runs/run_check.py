@@ -1,0 +1,27 @@
+"""The error of a folder that is not a run: what it is instead, and what may have been meant."""
+
+import itertools
+import os
+from pathlib import Path
+
+from graph_slam_ros.runs.folder import RunError, is_run
+
+_MOST_SEARCHED, _MOST_NAMED = 200, 3  # folders in one that is not a run
+
+
+def check_run(folder: Path) -> None:
+    """Raise RunError where a folder is not a run."""
+    if is_run(folder):
+        return
+    if not os.path.lexists(folder):
+        raise RunError(f"{folder}: not a run's folder: there is nothing of that name")
+    if not folder.is_dir():
+        made = f"graph_slam replay {folder} --out RUN makes a run of a recording"
+        raise RunError(f"{folder}: not a run's folder, but a file: {made}")
+    runs = []
+    try:
+        inside = itertools.islice(sorted(folder.iterdir()), _MOST_SEARCHED)
+        runs = [str(one) for one in inside if one.is_dir() and is_run(one)][:_MOST_NAMED]
+    except OSError:  # then none is named
+        pass
+    raise RunError(f"{folder}: not a run's folder" + (f"; in it there are runs: {', '.join(runs)}" if runs else ""))
