@@ -39,6 +39,7 @@ _WHY = {
     Reason.BY_HAND: "by hand",
     Reason.CONTRADICTED: "contradicted",
     Reason.SLIP: "slip",
+    Reason.MOVED: "landmark moved",
 }
 _KIND = {
     "closures": "a loop closure",
@@ -78,6 +79,7 @@ def explain_run(run: SavedGraph) -> Iterator[str]:
     yield from _gates(judged, run.changes, run.config)
     yield from (f"by hand: {one.text}" for one in run.edits)
     yield from _rivals(run.folder)
+    yield from summary_of(run.folder).get("landmark_events", ())
     yield from (one["text"] for one in summary_of(run.folder).get("displacements", ()) if "text" in one)
 
 
@@ -193,6 +195,8 @@ def _landmark(run: SavedGraph, name: str) -> Iterator[str]:
         there = ", ".join(names[:20]) + (", ..." if len(names) > 20 else "")
         raise GraphSlamError(f"{name}: neither the id of an edge nor a landmark; there are {there or 'no landmarks'}")
     yield from landmark_lines(run.folder, name, seen)
+    events = summary_of(run.folder).get("landmark_events", ())
+    yield from (one for one in events if one.startswith(f"landmark {name} ") or f" old place is {name}" in f"{one} ")
 
 
 def landmark_lines(folder: Path, name: str, seen: Sequence[Entry]) -> Iterator[str]:
@@ -296,6 +300,8 @@ def _decided(e: Entry, history: Sequence[VerdictChange], config: Config) -> str:
             return "not by its chi2: the plugin of its edge type failed at it; the log of the run has the error"
         case Reason.BY_HAND:
             return "not by its chi2: a user decided it by hand"
+        case Reason.MOVED:
+            return f"its landmark had moved: passes showed it elsewhere, where a new landmark begins; {numbers}"
         case Reason.DISPLACED:
             return (
                 f"{e.statistic:.0f} sightings more agreed on another pose of the robot than on this motion: it was"

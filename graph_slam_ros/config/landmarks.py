@@ -92,6 +92,11 @@ class LandmarksConfig:
         "keyframes",
         low=1,
     )
+    retire: bool = setting(
+        False,
+        "a landmark that is not seen any more from where it was seen before is retired; one that is seen elsewhere has "
+        "moved: its new place is a new landmark",
+    )
     determined_below: float = setting(
         0.2,
         "a landmark from ranges or bearings enters the map when its standard deviation is below this "

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.graph.vertices import GROUPS, R1
+from graph_slam_ros.slam.landmarks.presence import Presence
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
 
@@ -31,8 +32,11 @@ def fault_of(state: MapSnapshot) -> str:
     for name, mark in state.landmarks.items():
         if not all(map(is_index, (mark.vertex, mark.sightings), (len(kinds), 2**31))):
             return f"landmark {name} is none"
-        if not all(is_index(stamp_ns, 2**63) for stamp_ns in (mark.first_seen_ns, mark.last_seen_ns)):
+        if not all(is_index(ns, 2**63) for ns in (mark.first_seen_ns, mark.last_seen_ns, mark.retired_ns)):
             return f"landmark {name} was never seen"
+    for k, record in enumerate(state.passes):
+        if not (is_index(record[0], len(kinds)) and Presence.is_record(record[1:])):
+            return f"record {k} of the passes of landmarks is none"
     for name, vertex in state.range_offsets.items():
         if not (is_index(vertex, len(kinds)) and kinds[vertex] is R1):
             return f"the offset of {name} is none"

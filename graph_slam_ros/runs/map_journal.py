@@ -10,8 +10,9 @@ JSON records in mcap, as in the journal. The first is ``map`` with the version o
 * ``keyframes``: vertex, stamp, ``T_odom_base``; ``segments``: keyframes at which odometry began; ``drives``:
   the first keyframe of each drive; ``sightings``: keyframe, stamp, ``T_keyframe_base``;
 * ``landmarks``: by name, vertex, whether without identity, whether tentative, number of sightings, first and last
-  stamp, or null where it was given up; ``seen``: of those without identity, each sighting and its edge; ``offsets``: by
-  input, the vertex of what its ranges have in common;
+  stamp, and where it is retired since when, or null where it was given up; ``seen``: of those without identity, each
+  sighting and its edge; ``passes``: by vertex, what is known of when a landmark is seen (``Presence.record``);
+  ``offsets``: by input, the vertex of what its ranges have in common;
 * ``datum``: latitude, longitude and height that fixes are from; ``settings``: parameters that were changed on the way;
 * ``processed``: records of the ingest sequence that all of it came of; ``used``: stamp and input of the last odometry
   that was used by then;
@@ -77,7 +78,7 @@ class MapGrowth:
     def _begin(self) -> None:
         self._vertices = self._edges = self._judged = self._changes = 0
         self._keyframes = self._segments = self._sightings = self._landmarks = self._offsets = 0
-        self._edits = self._frozen = self._drives = self._rescaled = 0
+        self._edits = self._frozen = self._drives = self._rescaled = self._passes = 0
         self._noise: dict[Key, float] = {}
         self._calibration: Totals = {}
         self._recalibrated = 0
@@ -136,6 +137,7 @@ class MapGrowth:
         changed = a.recalibrations[self._recalibrated :] if first_edge else ()
         out["recalibrated"] = [one.present(graph).as_record() for one in changed]  # rescaled since, perhaps
         self._recalibrated = len(a.recalibrations)
+        out["passes"], self._passes = a.landmark_passes(self._passes), a.pass_changes
         out["edits"] = [one.record for one in a.edits[self._edits :]]
         if a.datum != self._datum:
             out["datum"] = self._datum = a.datum
@@ -266,7 +268,8 @@ def _as_json(number: float) -> float | str:
 
 def _landmark(mark: Landmark) -> list[Any]:
     stamps = mark.first_seen_ns, mark.last_seen_ns
-    return [mark.vertex, mark.is_unnamed, mark.is_tentative, mark.sightings, *stamps]
+    retired = [mark.retired_ns] * bool(mark.retired_ns)
+    return [mark.vertex, mark.is_unnamed, mark.is_tentative, mark.sightings, *stamps, *retired]
 
 
 def _newer(seen: Sequence[LandmarkEdge], first_edge: int) -> Iterable[LandmarkEdge]:

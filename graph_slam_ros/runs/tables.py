@@ -67,6 +67,7 @@ def summarize(slam: GraphSlam, earlier: Counters | None = None) -> dict[str, Any
             "keyframes": len(slam.keyframes),
             "landmarks": len(slam.landmarks),
             "waiting": slam.waiting,
+            **({"landmark_events": events} if (events := list(map(str, slam.landmark_events))) else {}),
             "segments": len(slam.segments),
             "drives": _drives(slam),
             "sightings": sum(landmark.sightings for landmark in slam.landmarks.values()),
@@ -217,11 +218,15 @@ def _covariance_table(slam: GraphSlam) -> str:
 def _landmark_table(slam: GraphSlam) -> str:
     space = slam.config.space
     rows = [f"id,kind,{_POSE[space.dof]},sightings,{','.join(f'cov_{a}{b}' for a, b in _upper(_TANGENT[space.dof]))}"]
+    has_retired = any(mark.retired_ns for mark in slam.landmarks.values())
+    rows[0] += ",retired_ns" * has_retired
     for name, value, covariance in results.landmark_estimates(slam):
         kind = "pose" if len(value) == space.pose.size else "point"
         at = [*map(repr, value), *[""] * (space.pose.size - len(value))]
         spread = [f"{covariance[i, j]:.9e}" if j < len(covariance) else "" for i, j in _upper(range(space.dof))]
-        rows.append(",".join([_csv(name), kind, *at, str(slam.landmarks[name].sightings), *spread]))
+        mark = slam.landmarks[name]
+        retired = [str(mark.retired_ns or "")] * has_retired
+        rows.append(",".join([_csv(name), kind, *at, str(mark.sightings), *spread, *retired]))
     return "\n".join(rows) + "\n"
 
 

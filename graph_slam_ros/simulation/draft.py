@@ -49,6 +49,7 @@ class Draft:
     landmarks : true places by id
     closures : of true places; false ones are added
     places : the poses that closures join
+    hidden : sightings that a fault leaves out, by number, with the fault
     wrong : what faults have made wrong, by what was measured and its number; of odometry the later pose's
     """
 
@@ -62,6 +63,7 @@ class Draft:
     closures: Closures
     places: Index
     wrong: dict[tuple[Measured, int], Wrong] = field(default_factory=dict)
+    hidden: dict[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.odometry)
@@ -80,6 +82,10 @@ class Draft:
         before = self.wrong.get(("sighting", number))
         self.wrong["sighting", number] = Wrong(_both(before, fault), self.true_id(number))
         self.sightings[number] = sighting
+
+    def hide(self, number: int, fault: str) -> None:
+        """Leave a sighting out."""
+        self.hidden[number] = fault
 
     def spoil_odometry(self, later: Sequence[int], fault: str) -> None:
         """Mark the motion up to some poses as wrong."""

@@ -67,6 +67,15 @@ class MovedLandmarks:
 
 
 @dataclass(frozen=True, slots=True)
+class RemovedLandmarks:
+    """Landmarks that are taken away, or first put up, at some time: no sighting of them after it, or before."""
+
+    count: int = option(1, "how many", "", 1, 1e4)
+    at: float = option(0.5, _HALFWAY, "", 0, 1)
+    put_up: bool = option(False, "they are there from then on, instead of until then")
+
+
+@dataclass(frozen=True, slots=True)
 class Outliers:
     """Sightings whose range is too long, as by an echo."""
 
@@ -149,6 +158,14 @@ def _moved_landmarks(draft: Draft, fault: MovedLandmarks, rng: Generator) -> Non
     for k in range(len(draft.sightings)):
         if draft.seen_at[k] >= begin and draft.true_id(k) in displaced:
             draft.spoil(k, "moved_landmarks", draft.seen_from(k, displaced[draft.true_id(k)]))
+
+
+def _removed_landmarks(draft: Draft, fault: RemovedLandmarks, rng: Generator) -> None:
+    begin = draft.pose_at(fault.at)
+    names = set(_some(rng, _seen_on_both_sides(draft, begin), fault.count, "removed_landmarks"))
+    for k in range(len(draft.sightings)):
+        if draft.true_id(k) in names and (draft.seen_at[k] < begin) == fault.put_up:
+            draft.hide(k, "removed_landmarks")
 
 
 def _outliers(draft: Draft, fault: Outliers, rng: Generator) -> None:
@@ -255,6 +272,7 @@ KINDS: dict[str, Kind] = {
     "swapped_ids": Kind(SwappedIds, _swapped_ids),
     "reused_ids": Kind(ReusedIds, _reused_ids),
     "moved_landmarks": Kind(MovedLandmarks, _moved_landmarks),
+    "removed_landmarks": Kind(RemovedLandmarks, _removed_landmarks),
     "outliers": Kind(Outliers, _outliers),
     "slip": Kind(Slip, _slip),
     "carried": Kind(Carried, _carried),

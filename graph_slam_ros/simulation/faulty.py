@@ -7,6 +7,7 @@ write_table("warehouse.faults.csv", WrongMessage, wrong)
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from graph_slam_ros.formats.graph_file import G2oFile
 from graph_slam_ros.graph import EdgeType, Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, SPATIAL, Geometry
 from graph_slam_ros.simulation.bag import ODOMETRY_TOPIC, recorded_names
-from graph_slam_ros.simulation.draft import Draft, WrongLine, WrongMessage
+from graph_slam_ros.simulation.draft import Draft, Wrong, WrongLine, WrongMessage
 from graph_slam_ros.simulation.false_closures import Closures
 from graph_slam_ros.simulation.faults import Fault, put_faults
 from graph_slam_ros.simulation.motion import space_of
@@ -50,9 +51,11 @@ def faulty_recording(recording: Recording, faults: Sequence[Fault], seed: int) -
     )
     put_faults(draft, faults, seed)
     starts = np.cumsum([0, *sizes]).tolist()
+    kept = [[k for k in range(start, end) if k not in draft.hidden] for start, end in pairwise(starts)]
     seen = tuple(
-        replace(one, sightings=tuple(draft.sightings[start : start + size]))
-        for one, start, size in zip(recording.seen, starts, sizes, strict=False)
+        replace(one, sightings=tuple(draft.sightings[k] for k in some))
+        for one, some in zip(recording.seen, kept, strict=True)
+        if some
     )
     closures, place = _recorded_closures(recording, draft)
     twist = recording.twist if draft.twist is None else draft.twist
@@ -66,12 +69,15 @@ def faulty_recording(recording: Recording, faults: Sequence[Fault], seed: int) -
             first = next(j for j, other in enumerate(closures) if other.stamp_ns == one.stamp_ns)
             return CLOSURES_TOPIC, one.stamp_ns, place[k] - first, str(one.from_stamp_ns)
         of = int(np.searchsorted(starts, k, side="right")) - 1
-        return LANDMARKS_TOPIC, recording.seen[of].stamp_ns, k - starts[of], names[draft.sightings[k].id]
+        if k in draft.hidden:
+            return LANDMARKS_TOPIC, recording.seen[of].stamp_ns, "", ""
+        return LANDMARKS_TOPIC, recording.seen[of].stamp_ns, kept[of].index(k), names[draft.sightings[k].id]
 
     names = recorded_names(recording)
+    hidden = {("sighting", k): Wrong(fault, draft.true_id(k)) for k, fault in draft.hidden.items()}
     rows = [
         WrongMessage(*message(what, k), wrong.fault, names.get(wrong.true_id, ""))
-        for (what, k), wrong in draft.wrong.items()
+        for (what, k), wrong in (draft.wrong | hidden).items()
     ]
     return faulty, sorted(rows, key=lambda row: (row.stamp_ns, row.topic, row.index or 0))
 
@@ -117,6 +123,8 @@ def faulty_graph(file: G2oFile, truth: Array, faults: Sequence[Fault], seed: int
     parts = _Parts(file, truth)
     draft = parts.draft()
     put_faults(draft, faults, seed)
+    if draft.hidden:
+        raise GraphSlamError(f"{next(iter(draft.hidden.values()))}: only in a recording: a graph keeps all its edges")
     out, edges = parts.graph_of(draft)
     tags = {tag_of(edge) for edge in out.graph.tables}
     text = graph_lines(out, values_of(out.graph, out.graph.initial.values))

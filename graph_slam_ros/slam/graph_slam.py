@@ -41,6 +41,7 @@ from graph_slam_ros.slam.landmarks.assignments import Assigned
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.robust.background import Executor, run_when_asked
+from graph_slam_ros.slam.robust.ledger import Reason
 from graph_slam_ros.slam.snapshot import MapSnapshot
 from graph_slam_ros.slam.solution import Solution, Solved
 from graph_slam_ros.slam.update import Update, UpdateLog
@@ -75,8 +76,9 @@ class GraphSlam(MapView):
         self.counters = counters = Counters()
         backend = Backend(config.robust, config.solver_settings(), executor, start, counters)
         landmarks = LandmarkFrontend(
-            *(config, backend.noise, backend.solver, counters),
+            *(config, backend.noise, backend.solver, counters, backend.ledger),
             withdraw=lambda edges: backend.withdraw(edges, len(self.keyframes) - 1),
+            set_aside=lambda edges: backend.withdraw(edges, len(self.keyframes) - 1, Reason.MOVED),
             hand_over=backend.hand_over,
             trusts_sightings=lambda: backend.trusts_sightings,
             executor=executor,
@@ -125,15 +127,12 @@ class GraphSlam(MapView):
     def _use(self, released: Iterable[Odometry | Observation]) -> None:
         for m in released:
             with self._faults:
-                if isinstance(m, Odometry):
-                    self._on_odometry(m)
-                else:
+                if not isinstance(m, Odometry):
                     self._on_observation(self._frontend.corrections.observation(m))
-
-    def _on_odometry(self, m: Odometry) -> None:
-        for step in self._frontend.steps(m):
-            with self._faults:
-                self._on_step(step)
+                    continue
+                for step in self._frontend.steps(m):
+                    with self._faults:
+                        self._on_step(step)
 
     def _on_step(self, step: Step) -> None:
         """Integrate odometry, use the observations that it has reached, and add a keyframe if one is due."""
@@ -291,7 +290,7 @@ class GraphSlam(MapView):
             raise GraphSlamError(f"the map is not in {self.space.dimensions} dimensions")
         frontend.restore(*start.path, start.continues_with, start.gyro_bias)
         self._anchor.restore()
-        self._landmarks.restore(start.landmarks, start.range_offsets)
+        self._landmarks.restore(start.landmarks, start.range_offsets, start.passes)
         report = self.backend.restore(start.vertices, start.values, start.held if localizes else (0, 0))
         self._solution.restore(report, self.keyframes[-1], len(self.keyframes))
         (frontend.covariance,) = self.solver.marginal([self.keyframes[-1].vertex])

@@ -24,6 +24,7 @@ from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.kidnap_detector import Alarm, KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark
+from graph_slam_ros.slam.landmarks.lifetimes import LandmarkEvent
 from graph_slam_ros.slam.noise_scale import NoiseScale
 from graph_slam_ros.slam.robust.ledger import Ledger
 from graph_slam_ros.slam.slip_review import Slip
@@ -258,6 +259,20 @@ class MapView:
     def landmark_changes(self) -> int:
         """The number of changes of landmarks."""
         return len(self._landmarks.map.touched)
+
+    @property
+    def landmark_events(self) -> Sequence[LandmarkEvent]:
+        """The events of landmarks, in order: which were retired, moved or returned."""
+        return self._landmarks.lifetimes.events
+
+    def landmark_passes(self, first: int) -> list[list[Any]]:
+        """The records of when landmarks are seen, after the first so many changes; after none of all landmarks."""
+        return self._landmarks.lifetimes.records(first)
+
+    @property
+    def pass_changes(self) -> int:
+        """The number of these changes."""
+        return self._landmarks.lifetimes.changes
 
     # -- covariances -----------------------------------------------------------------------------------------------
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from graph_slam_ros.slam.calibration.decision import Finding
 from graph_slam_ros.slam.kidnap_detector import Alarm
+from graph_slam_ros.slam.landmarks.lifetimes import LandmarkEvent
 from graph_slam_ros.slam.map_view import MapView
 from graph_slam_ros.slam.robust.ledger import VerdictChange
 from graph_slam_ros.slam.slip_review import Slip
@@ -26,6 +27,7 @@ class Update:
     correction : of the last solve
     changes : of verdicts, since the last update that told any
     calibrated : corrections by calibration
+    landmarks : what happened to them: which were retired, moved or returned
     alarms : that began, were decided or ended since then: the landmarks contradict odometry
     """
 
@@ -37,6 +39,7 @@ class Update:
     changes: tuple[VerdictChange, ...] = ()
     alarms: tuple[Alarm | Slip, ...] = ()
     calibrated: tuple[Finding, ...] = ()
+    landmarks: tuple[LandmarkEvent, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.keyframes) or self.solved
@@ -68,6 +71,7 @@ class UpdateLog:
         self._report: Report | None = None
         self._changes = len(view.ledger.history)  # of verdicts, that updates have reported
         self._alarms, self._corrections = view.alarms, len(view.corrected)
+        self._landmarks = len(view.landmark_events)
 
     def begin(self) -> None:
         """Mark the start of the next update."""
@@ -94,7 +98,12 @@ class UpdateLog:
             changes,
             tuple(one for one in self._alarms if _state(one) not in known),
             self._new_corrections(),
+            self._new_landmark_events(),
         )
+
+    def _new_landmark_events(self) -> tuple[LandmarkEvent, ...]:
+        first, self._landmarks = self._landmarks, len(self._view.landmark_events)
+        return tuple(self._view.landmark_events[first:])
 
     def _new_corrections(self) -> tuple[Finding, ...]:
         first, self._corrections = self._corrections, len(self._view.corrected)

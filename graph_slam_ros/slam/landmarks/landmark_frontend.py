@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.measurements.counters import Counters
@@ -16,6 +17,7 @@ from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.landmarks.assignments import Assigned
 from graph_slam_ros.slam.landmarks.landmark_map import Landmark, Landmarks
+from graph_slam_ros.slam.landmarks.lifetimes import Lifetimes, Verdicts
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Executor
 
@@ -70,15 +72,18 @@ class LandmarkFrontend:
     Parameters
     ----------
     edges : adds edges to the graph
+    verdicts : on all edges
     withdraw : takes edges out for good
     hand_over : gives the solver what is new in the graph
     trusts_sightings : whether new landmarks may begin: not so while an alarm cannot be decided
+    set_aside : takes edges out for good, since their landmark has moved
     executor : begins work in the background
 
     Attributes
     ----------
     map : the landmarks
     anonymous : the association of those without identity
+    lifetimes : decides which landmarks are gone
     """
 
     def __init__(
@@ -87,22 +92,33 @@ class LandmarkFrontend:
         edges: NoiseScales,
         solver: Solver,
         counters: Counters,
+        verdicts: Verdicts,
         *,
         withdraw: Callable[[Sequence[int]], None],
         hand_over: Callable[[], None],
         trusts_sightings: Callable[[], bool],
+        set_aside: Callable[[Sequence[int]], None],
         executor: Executor,
     ) -> None:
         self._config, self._space, self._counters = config.landmarks, config.space, counters
         self.map = Landmarks(config, edges, solver, counters, withdraw)
         self.anonymous = AnonymousLandmarks(config, self.map, solver, counters, hand_over, executor)
+        self.lifetimes = Lifetimes(
+            *(config.space, self.map, solver, verdicts, counters),
+            survey=config.survey if config.landmarks.retire else None,
+            set_aside=set_aside,
+            on_retired=self.anonymous.forget_belief,
+        )
         self._gates = GateChain[NamedSightings](
             (HeldMapGate(self.map), AlarmGate(self.map, trusts_sightings)), lambda m: len(m.named), counters
         )
 
-    def restore(self, landmarks: dict[str, Landmark], range_offsets: dict[str, int]) -> None:
+    def restore(
+        self, landmarks: dict[str, Landmark], range_offsets: dict[str, int], passes: Sequence[list[Any]]
+    ) -> None:
         """Continue with the landmarks of a map."""
         self.map.restore(landmarks, range_offsets)
+        self.lifetimes.restore(passes)
         self.anonymous.restore()
 
     def identified(self, m: Sightings, where: PoseAtStamp) -> list[Assigned]:
@@ -140,7 +156,8 @@ class LandmarkFrontend:
         return out
 
     def review(self, keyframes: StampedPoses[Keyframe], *, everything: bool) -> None:
-        """Review the landmarks without id. The next solve includes the changes."""
+        """Review the landmarks: which are gone, and those without id. The next solve includes the changes."""
+        self.lifetimes.review(keyframes)
         if self._is_anonymous and everything:
             self.anonymous.explain_all(keyframes)
         elif self._is_anonymous:

@@ -44,6 +44,7 @@ class Landmark:
     ----------
     is_unnamed : whether no sighting of it tells which it is
     is_tentative : whether it is too new to be believed: it may be given up
+    retired_ns : stamp since which it is known to be gone; 0 where it is there
     seen : its sightings that do not tell which it is: they may change hands
     stamps : of these; a landmark is never seen twice at once
     """
@@ -55,6 +56,7 @@ class Landmark:
     sightings: int = 0
     first_seen_ns: int = 0
     last_seen_ns: int = 0
+    retired_ns: int = 0
     seen: list[LandmarkEdge] = field(default_factory=list)
     stamps: set[int] = field(default_factory=set)
 
@@ -293,6 +295,11 @@ class Landmarks:
         for one in seen:
             self._counters.used[one.topic] -= 1
         self._withdraw([one.edge for one in seen])
+
+    def is_there(self, name: str) -> bool:
+        """Return whether a landmark is in the graph, and not retired."""
+        landmark = self.known.get(name)
+        return landmark is not None and not landmark.retired_ns
 
     def positions(self, vertices: Sequence[int]) -> Array:
         """Positions (k, n) of landmarks in map."""

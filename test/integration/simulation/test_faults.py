@@ -43,6 +43,7 @@ PUT = {
     "swapped_ids": {"pairs": 2},
     "reused_ids": {},
     "moved_landmarks": {"count": 2},
+    "removed_landmarks": {"count": 2},
     "outliers": {"rate": 0.1},
     "slip": {"lasting": 0.1},
     "carried": {"distance_m": 3.0},
@@ -64,7 +65,7 @@ def motions(recording):
     return np.stack(group.between(tuple(poses[:-1].T), tuple(poses[1:].T)), axis=1)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "removed_landmarks"])
 def test_the_table_names_what_is_wrong_and_all_else_is_as_it_was(recording, kind):
     faulty, wrong = faulty_recording(recording, [Fault.named(kind, **PUT[kind])], seed=5)
     assert {row.fault for row in wrong} == {kind}
@@ -200,6 +201,19 @@ def test_landmarks_have_moved_by_the_given_distance_from_then_on(recording):
         assert (key in table) == (s.id in names and key[0] >= halves(recording))
         if key in table:
             assert np.linalg.norm(np.subtract(after[key].measured, s.measured)[:n]) == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("put_up", [False, True])
+def test_landmarks_that_are_removed_are_not_seen_from_then_on_or_until_then(recording, put_up):
+    fault = Fault.named("removed_landmarks", count=2, at=0.5, put_up=put_up)
+    faulty, wrong = faulty_recording(recording, [fault], seed=2)
+    names = {row.true_id for row in wrong}
+    assert len(names) == 2
+    for before, now in ((s, {one.stamp_ns: one for one in faulty.seen}.get(s.stamp_ns)) for s in recording.seen):
+        is_hidden = (before.stamp_ns < halves(recording)) == put_up
+        left = tuple(one for one in before.sightings if not (is_hidden and one.id in names))
+        assert (now.sightings if now else ()) == left
+    assert len(wrong) == len(sightings(recording)) - len(sightings(faulty))
 
 
 def test_slipping_odometry_tells_a_longer_way_for_a_while_and_then_goes_on_as_it_would(recording):
@@ -424,4 +438,5 @@ def test_the_help_tells_every_fault_and_all_that_can_be_set(capsys):
         assert f"  {name}: {kind.about}" in out
         for option in options_of(kind.options):
             unit = f" [{option.unit}]" if option.unit else ""
-            assert f"    {option.name}={option.default}{unit}  {option.meaning}" in out
+            default = str(option.default).lower() if isinstance(option.default, bool) else option.default
+            assert f"    {option.name}={default}{unit}  {option.meaning}" in out
