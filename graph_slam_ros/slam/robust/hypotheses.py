@@ -7,7 +7,7 @@ is judged by its residual, until no verdict changes. A rejected candidate costs 
 squares).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -24,6 +24,7 @@ from graph_slam_ros.typing import Array, Index
 
 _ITERATIONS = 20  # of each stage of the losses, from another start
 _HOPELESS = 2.0  # times the least cost that was found: another explanation is none
+_SAME = 1e-4  # of a cost, that one explanation may differ by from itself: solves end a little off the optimum
 _STORY = 5  # closures that agree with one another and not with the map
 
 
@@ -112,7 +113,7 @@ def search_alternatives(config: RobustConfig, frozen: FrozenGraph, wanted: Cance
             return None
         with suppress(GraphSlamError, np.linalg.LinAlgError):  # what is believed there does not hold together
             hopeless = _HOPELESS * min((outcome.cost for outcome in found), default=np.inf)
-            found.append(_explained(name, config, frozen, start, inliers, hopeless))
+            found.append(_explained(name, config, frozen, start, inliers, hopeless, found))
         if name == "online" and found and not len(found[0].ledger.outside):
             break
     found = [outcome for outcome in found if np.isfinite(outcome.cost)]
@@ -159,11 +160,17 @@ def _starts(frozen: FrozenGraph) -> Iterator[tuple[str, Array, Index | None]]:
 
 
 def _explained(
-    name: str, config: RobustConfig, frozen: FrozenGraph, start: Array, inliers: Index | None, hopeless: float
+    name: str,
+    config: RobustConfig,
+    frozen: FrozenGraph,
+    start: Array,
+    inliers: Index | None,
+    hopeless: float,
+    found: Sequence[Outcome],
 ) -> Outcome:
     """Solve and judge in turn, starting with the verdicts of the ledger, or with these candidates.
 
-    It ends when no verdict changes, or when the cost is too high.
+    It ends when no verdict changes, when the cost is too high, or where one that was found before has ended.
     """
     graph, mine = frozen.graph.copy(), frozen.ledger.copy()
     solver = Solver(graph, frozen.settings)
@@ -179,12 +186,22 @@ def _explained(
     rounds = config.rounds if _cost(solver, mine) <= 2.0 * hopeless else 0
     for k in range(rounds):
         solver.optimize()
-        is_last = k + 1 == rounds or _cost(solver, mine) > hopeless
-        if is_last or not (decisions.reclassify(frozen.keyframe) or decisions.readmit_next(frozen.keyframe)):
+        if k + 1 == rounds or _cost(solver, mine) > hopeless:
+            break
+        if decisions.reclassify(frozen.keyframe):
+            continue
+        if _is_known(_cost(solver, mine), mine, found) or not decisions.readmit_next(frozen.keyframe):
             break
     judged = np.concatenate((mine.inside, mine.outside))
     mine.statistic.values[judged], _ = solver.chi2_of(judged)
     return Outcome(name, mine, solver.values, _cost(solver, mine), frozen)
+
+
+def _is_known(cost: float, ledger: Ledger, found: Sequence[Outcome]) -> bool:
+    """Return whether another start ended with the same verdicts at the same cost: the same optimum."""
+    return any(
+        abs(cost - one.cost) <= _SAME * one.cost and np.array_equal(ledger.inside, one.ledger.inside) for one in found
+    )
 
 
 def _cost(solver: Solver, ledger: Ledger) -> float:

@@ -12,6 +12,7 @@ from graph_slam_ros.typing import Array
 
 _ANGLES = {SE2: 1, SE3: 3}  # of a pose, its last coordinates
 _MOST_STEPS = 60  # of a search: with extreme numbers it would creep for seconds; the least it has found is taken
+_DIFFERENCE = float(np.finfo(float).eps ** 0.5)  # of numerical derivatives
 _LINEAR_RAD2 = 0.1  # of a direction: beyond, a linear prediction is none
 
 
@@ -54,26 +55,38 @@ def _least_cost(graph: Graph, x: Array, edge: Edge, joint: Array) -> float:
     first = np.cumsum([0] + [kind.dof for kind in kinds])
     before = [x[end.stored][None] for end in ends]
 
-    found: list[float] = []
+    ends_at = np.arange(len(sigmas) + 1)[:, None] * at[-1] + at[:-1]
+    found, evaluated = list[float](), 0
 
     def counted(units: Array) -> Array:
-        if len(found) >= _MOST_STEPS * (1 + len(sigmas)):
+        nonlocal evaluated
+        if evaluated >= _MOST_STEPS * (1 + len(sigmas)):
             raise _Enough
-        out = cost(units)
+        evaluated += 1
+        out: Array = costs(units[None])[0]
         found.append(float(out @ out))
         return out
 
-    def cost(units: Array) -> Array:
-        step = sigmas @ units
+    def derivative(units: Array) -> Array:
+        nonlocal evaluated
+        evaluated += len(units)
+        step = _DIFFERENCE * np.where(units < 0.0, -1.0, 1.0) * np.maximum(1.0, np.abs(units))
+        out = costs(np.vstack((units, units + np.diag(step))))
+        return np.asarray((out[1:] - out[0]).T / step)
+
+    def costs(units: Array) -> Array:
+        """The whitened step and the whitened residual, for rows of units at once."""
+        steps, count = units @ sigmas.T, len(units)
         moved = [
-            kind.retract(value, step[None, k : k + kind.dof])[0]
+            kind.retract(np.repeat(value, count, axis=0), steps[:, k : k + kind.dof])
             for kind, value, k in zip(kinds, before, first.tolist(), strict=False)
         ]
-        residual, _ = edge.type.linearize(np.concatenate(moved), at[None, :-1], edge.measured[None])
-        return np.concatenate((units, edge.sqrt_information @ residual[0]))
+        measured = np.repeat(edge.measured[None], count, axis=0)
+        residual, _ = edge.type.linearize(np.hstack(moved).ravel(), ends_at[:count], measured)
+        return np.hstack((units, residual @ edge.sqrt_information.T))
 
     try:
-        return float(2.0 * least_squares(counted, np.zeros(len(sigmas)), method="lm").cost)
+        return float(2.0 * least_squares(counted, np.zeros(len(sigmas)), jac=derivative, method="lm").cost)
     except _Enough:
         return min(found)
 

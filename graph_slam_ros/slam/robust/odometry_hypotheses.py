@@ -172,10 +172,9 @@ class OdometryFilter:
         if errors.jump == k and errors.jump_variances is not None:
             pose = errors.there
             added += np.diag(errors.jump_variances) / scale
-        transition = np.eye(len(state.covariance))
-        transition[:dof, :dof] = group.adjoint(group.inverse(motion))
-        transition[:dof, dof] = errors.shared[k]
-        state.covariance = transition @ state.covariance @ transition.T
+        moves = np.column_stack((group.adjoint(group.inverse(motion)), errors.shared[k]))  # of the pose, by it and a slip
+        state.covariance[:dof] = moves @ state.covariance[: dof + 1]
+        state.covariance[:, :dof] = state.covariance[:, : dof + 1] @ moves.T
         state.covariance[:dof, :dof] += added
         state.pose = step.vertices[1]
         x[self._graph.vertex(state.pose).stored] = pose
