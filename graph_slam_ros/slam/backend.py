@@ -1,12 +1,11 @@
 """The back-end: the graph, its solver, and what is believed of its edges, in step with one another."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from graph_slam_ros.config.robust import RobustConfig
-from graph_slam_ros.graph import Gaussian, Loss
+from graph_slam_ros.graph import Gaussian
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.plugin_edges import failed_edges
@@ -16,6 +15,7 @@ from graph_slam_ros.slam.frontend.noise_factors import NoiseScales
 from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.noise_scale import NoiseScale, estimate_noise, factors_of
+from graph_slam_ros.slam.robust.admission import Admission
 from graph_slam_ros.slam.robust.background import Background, Work, run_when_asked
 from graph_slam_ros.slam.robust.displacement import DisplacementHypothesis
 from graph_slam_ros.slam.robust.gating import OutlierGate
@@ -28,7 +28,6 @@ from graph_slam_ros.typing import Array, Executor, Numbers
 
 _MAX_PENDING = 200  # edges that are compared with all that is known at once, at most; reviews look at the others
 _NOISE_ROUNDS, _NOISE_ROUNDS_ONLINE = 8, 2  # of estimating the scale of the noise and solving with it
-_UPDATES = 6  # until what was let in fits, before everything is solved for it
 
 
 class Backend:
@@ -68,6 +67,7 @@ class Backend:
         self.noise = NoiseScales(self.graph, start.noise_factors)
         self.solver = Solver(self.graph, settings)
         self.decisions = OutlierGate(config, self.graph, self.solver, start.ledger)
+        self._admission = Admission(self.graph, self.solver, self.decisions)
         self.handed_over, self.frozen = (0, 0), start.frozen
         self.frozen_edges = start.ledger.final
         self.held = (0, 0)
@@ -325,7 +325,7 @@ class Backend:
     def _go_on(self, found: DisplacementHypothesis, keyframe: int) -> None:
         self._background.cancel(self.ledger.outside_count)
         self.holds_back = False
-        self._make_fit(list(found.fitting), keyframe)
+        self._admission.make_fit(list(found.fitting), keyframe)
 
     def _admit(self, keyframe: int) -> None:
         """Judge held-back edges by the joint covariance of the estimate."""
@@ -333,32 +333,7 @@ class Backend:
         admitted = self.decisions.admit_compatible(pending, keyframe)
         self._pending = []
         if admitted:
-            self._make_fit(admitted, keyframe)
-
-    def _make_fit(self, admitted: Sequence[int], keyframe: int) -> None:
-        """Solve until edges that were accepted despite a bad fit do fit. Those that still do not are rejected.
-
-        Their loss lets go of large residuals. Only while the accuracy of odometry is unknown may they have their full
-        weight, because later that would bend the map for false edges that are barely possible.
-        """
-        before = self.solver.values
-        for _ in range(_UPDATES):
-            self.solver.update()
-            if self.decisions.fit(admitted):
-                break
-        if self._rose_since(before):  # an update's steps may overshoot where much turns; everything at once does not
-            self.solver.start_at(before)
-        elif self.decisions.fit(admitted):
-            return
-        settings = self.solver.settings
-        pulling = [] if self.decisions.is_calibrated else [Loss()]
-        losses = {label: [*pulling, stages[-1]] for label, stages in settings.losses.items()}
-        self.solver.optimize(replace(settings, losses=losses))
-        if self.decisions.refuse_unfit(admitted, keyframe):
-            self.solver.update()
-
-    def _rose_since(self, before: Array) -> bool:
-        return self.solver.evaluate().cost_final > self.solver.evaluate(at=before).cost_final
+            self._admission.make_fit(admitted, keyframe, by_innovation=True)
 
     def _guarded(self, search: Work) -> Outcome | None:
         """The outcome of a search; None if it failed, which changes nothing."""

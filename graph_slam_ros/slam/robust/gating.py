@@ -6,7 +6,6 @@ compatibility test", 2001, eq. 2). One that fits badly loses weight, then is rem
 """
 
 from collections.abc import Sequence
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +17,11 @@ from graph_slam_ros.graph.losses import weight_and_cost
 from graph_slam_ros.slam.robust.innovation import innovation
 from graph_slam_ros.slam.robust.landmark_support import LandmarkSupport, landmark_of
 from graph_slam_ros.slam.robust.ledger import FINAL, Ledger, Reason, Verdict
+from graph_slam_ros.slam.robust.tightness import TIGHTEST, TYPICAL, Tightness
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
 CANDIDATES = ("landmarks", "fixes", "closures", "initialpose", "custom")
-_TYPICAL = 30  # residuals tell what all are like
-_SLACK = 10.0  # times the residuals that are typical of a class its gate may be, where they are small
-_TIGHTEST = 0.1  # part of a gate that is left
 _READMISSIONS = 50  # edges that are out and are tried again after everything was solved
 _REVIEWED_AT_ONCE = 1000  # accepted edges that one review looks at, besides as many of the newest
 
@@ -36,7 +33,7 @@ class OutlierGate:
         self._config, self._graph, self._solver = config, graph, solver
         self.ledger = Ledger() if ledger is None else ledger
         self._support = LandmarkSupport(graph, solver, self.ledger.inside)
-        self._tightness: dict[str, float] = {}  # of each class, by what its gate is smaller
+        self._tightness = Tightness(graph, solver)
         self.is_calibrated = False  # whether enough was measured twice to tell how good odometry is
         self._gate_scale = config.noise_factor**2  # of the gate of what all else predicts
         self._withdrawn: dict[int, Reason] = {}  # before they were taken
@@ -98,17 +95,16 @@ class OutlierGate:
             )
         return admitted
 
-    def fit(self, edges: Sequence[int]) -> bool:
-        """Return whether all of some edges fit at the present estimate."""
+    def unfit(self, edges: Sequence[int]) -> list[int]:
+        """Return those of some edges that do not fit at the present estimate."""
         chi2, _ = self._solver.chi2_of(edges)
-        return bool((chi2 <= self.ledger.threshold.values[edges]).all())
+        return [edges[k] for k in np.flatnonzero(chi2 > self.ledger.threshold.values[edges]).tolist()]
 
     def refuse_unfit(self, edges: Sequence[int], keyframe: int) -> bool:
         """Reject those of some edges that still do not fit. Returns whether there were any."""
-        chi2, _ = self._solver.chi2_of(edges)
-        unfit = np.flatnonzero(chi2 > self.ledger.threshold.values[edges])
-        for k in unfit.tolist():
-            self._reject(edges[k], keyframe, Reason.DOES_NOT_FIT, float(chi2[k]))
+        unfit = self.unfit(edges)
+        for edge, fit in zip(unfit, self._solver.chi2_of(unfit)[0].tolist(), strict=True):
+            self._reject(edge, keyframe, Reason.DOES_NOT_FIT, fit)
         return len(unfit) > 0
 
     # -- what was decided ---------------------------------------------------------------------------------------------
@@ -312,7 +308,7 @@ class OutlierGate:
         """Return the thresholds of chi2: the gate, or less if residuals of a class are far below their noise."""
         limit = {int(n): quantile(self._config.gate, int(n)) for n in np.unique(numbers)}
         out = np.array([limit[n] for n in numbers.tolist()], dtype=float)
-        for label, tightness in self._tightness.items():
+        for label, tightness in self._tightness.of_class.items():
             out[self._graph.has_label(edges, (label,))] *= tightness
         return out
 
@@ -324,23 +320,20 @@ class OutlierGate:
     def recalibrate(self) -> None:
         """Adapt the gates to the residuals: with a configured noise that is ten times too large they would accept all.
 
-        The median of accepted residuals is compared with that of chi2. False candidates do not change it.
+        The median of accepted residuals is compared with what is expected. False candidates do not change it.
         """
         inside, ledger, factor = self.ledger.inside, self.ledger, self._config.noise_factor**2
         chi2, numbers = self._solver.chi2_of(inside)
-        typical = chi2 / np.array([_median(n) for n in numbers.tolist()])
         for label in CANDIDATES:
             of_label = self._graph.has_label(inside, (label,))
-            if np.count_nonzero(of_label) >= _TYPICAL:
-                ratio = float(np.median(typical[of_label]))
-                self._tightness[label] = min(1.0, max(_TIGHTEST, _SLACK * ratio))
+            self._tightness.update(label, inside[of_label], chi2[of_label], numbers[of_label])
         freedom = self._solver.degrees_of_freedom
-        self.is_calibrated = freedom >= _TYPICAL
+        self.is_calibrated = freedom >= TYPICAL
         if self.is_calibrated:
             # estimated noise allows for errors that are alike, so residuals are smaller: that says nothing of odometry
             is_stated = self._config.noise_scale == "configured"
             noise_ratio = self._chi2_per_dof(freedom) if is_stated else 1.0
-            self._gate_scale = min(factor, max(_TIGHTEST, factor * noise_ratio))
+            self._gate_scale = min(factor, max(TIGHTEST, factor * noise_ratio))
         edges = np.concatenate((inside, ledger.outside))
         ledger.threshold.values[edges] = self._limits(edges, ledger.numbers.values[edges])
 
@@ -348,7 +341,7 @@ class OutlierGate:
         """Chi2 per degree of freedom, without parallel odometries: where these are alike it says nothing of noise."""
         report = self._solver.evaluate()
         parallel = report.classes.get("parallel")
-        if parallel is None or freedom - parallel.residuals < _TYPICAL:
+        if parallel is None or freedom - parallel.residuals < TYPICAL:
             return report.chi2_final / freedom
         return (report.chi2_final - parallel.chi2) / (freedom - parallel.residuals)
 
@@ -356,8 +349,3 @@ class OutlierGate:
 def _judged(ledger: Ledger, edge: int) -> tuple[float, float]:
     """The statistic and its threshold."""
     return float(ledger.statistic.values[edge]), float(ledger.threshold.values[edge])
-
-
-@cache
-def _median(numbers: int) -> float:
-    return quantile(0.5, numbers)
