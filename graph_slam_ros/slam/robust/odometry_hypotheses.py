@@ -172,7 +172,7 @@ class OdometryFilter:
         if errors.jump == k and errors.jump_variances is not None:
             pose = errors.there
             added += np.diag(errors.jump_variances) / scale
-        moves = np.column_stack((group.adjoint(group.inverse(motion)), errors.shared[k]))  # of the pose, by it and a slip
+        moves = np.column_stack((group.adjoint(group.inverse(motion)), errors.shared[k]))  # the pose
         state.covariance[:dof] = moves @ state.covariance[: dof + 1]
         state.covariance[:, :dof] = state.covariance[:, : dof + 1] @ moves.T
         state.covariance[:dof, :dof] += added
