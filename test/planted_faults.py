@@ -108,6 +108,8 @@ FAULTS = {
     "landmark clock -100 ms": (of("clock_offset:seconds=-0.1"), "clock_offset"),
     "landmark clock +400 ms": (of("clock_offset:seconds=0.4"), "clock_offset latency"),
     "landmark clock drifts 500 ppm": (of("clock_drift:ppm=500"), "clock_drift"),
+    "landmark clock set by 200 ms": (of("clock_jump:seconds=0.2"), "clock_jump"),
+    "landmark clock set by -400 ms": (of("clock_jump:seconds=-0.4"), "clock_jump"),
     "landmarks by uptime": (of("uptime"), "clock_domains no_overlap"),
     "zero stamps": (of("zero_stamps"), "zero_stamp"),
     "odometry recorded twice": (of("recorded_twice"), "duplicates"),

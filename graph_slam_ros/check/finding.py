@@ -59,6 +59,10 @@ KINDS: dict[str, Kind] = {
         "the clock of an input runs faster or slower than the recorder's",
         f"{_ONE_CLOCK}; a constant offset does not help",
     ),
+    "clock_jump": Kind(
+        "the stamps of an input step, and stay there: its clock was set, or its messages came later from then on",
+        f"{_ONE_CLOCK}; cut the recording there",
+    ),
     "no_overlap": Kind(
         "sightings are stamped before odometry begins or after it ends", f"{_ONE_CLOCK}; or set INPUT.offset_s", True
     ),

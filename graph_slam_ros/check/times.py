@@ -13,6 +13,7 @@ _FEW, _BACK_NS = 3, 1_000_000_000
 _CLOCKS_DIFFER_S, _EARLY_S, _DAY_S = 10.0, 0.15, 86400.0
 _WINDOWS, _APART, _LEAST_S, _LEAST_MESSAGES = 20, 5, 30.0, 200
 _DRIFT, _DRIFTED_S, _SCATTERS = 1e-4, 0.02, 4.0
+_JUMP_S, _PER_WINDOW, _SIDE = 0.05, 5, 3
 _DUPLICATES, _OUT_OF_ORDER = 0.01, 0.001
 _LONG_S, _VERY_LONG_S, _PERIODS, _MOVED_M, _TURNED = 1.0, 2.0, 10.0, 0.05, 0.05
 _SLOW_HZ, _BETWEEN_S = 5.0, 0.02
@@ -68,7 +69,33 @@ def _clocks(c: Columns, topics: dict[str, TopicColumns]) -> Iterator[Finding]:
             setting = _offset(c, topic, apart_s)
             yield Finding("latency", "warning", -apart_s, _EARLY_S, "s", text, settings=(setting,), **where)
         if topic.use in ("odometry", "landmarks") and abs(typical_s) < _DAY_S:  # else simulated time, or played again
-            yield from _drift(topic, lag_s, log_ns, stamp_ns)
+            jump = list(_jump(topic, lag_s, stamp_ns))
+            yield from jump or _drift(topic, lag_s, log_ns, stamp_ns)
+
+
+def _jump(topic: TopicColumns, lag_s: Array, stamp_ns: Index) -> Iterator[Finding]:
+    """A step of the shortest lags of windows, that stays: of the clock, or of what delays the messages."""
+    count = min(_WINDOWS, len(lag_s) // _PER_WINDOW)
+    if count < 2 * _APART:
+        return
+    parts = np.array_split(np.arange(len(lag_s)), count)
+    least_s = np.array([lag_s[part].min() for part in parts])
+
+    def spread_s(cut: int) -> float:
+        sides = least_s[:cut], least_s[cut:]
+        return max(float(np.quantile(np.abs(side - np.median(side)), 0.8)) for side in sides)
+
+    cut = min(range(_SIDE, count - _SIDE + 1), key=spread_s)
+    step_s = float(np.median(least_s[:cut]) - np.median(least_s[cut:]))
+    if not max(_JUMP_S, _SCATTERS * spread_s(cut)) < abs(step_s) < _CLOCKS_DIFFER_S:
+        return
+    at = int(stamp_ns[parts[cut][0]])
+    about = f"about {(at - int(stamp_ns[0])) * 1e-9:.0f} s after the first"
+    text = (
+        f"{topic.name}: from {about} its stamps are {step_s * 1e3:+.0f} ms off against the times of recording: "
+        "its clock was set, or its messages came with another delay"
+    )
+    yield Finding("clock_jump", "note", step_s, _JUMP_S, "s", text, topic.name, at, len(stamp_ns))
 
 
 def _offset(c: Columns, topic: TopicColumns, offset_s: float) -> str:

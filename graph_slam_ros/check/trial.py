@@ -14,6 +14,7 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import Control, Measurement, Odometry
 from graph_slam_ros.slam import Config, GraphSlam
 from graph_slam_ros.slam.calibration.decision import Finding as Fitted
+from graph_slam_ros.slam.calibration.fit import TrialFit
 from graph_slam_ros.typing import Array, Index
 
 _THIN_NS = 80_000_000
@@ -33,6 +34,7 @@ _LIMITS = {
 }
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
 _LOST = 0.25
+_JUMPED_S = 0.08
 _MOST, _SHIFTS = 0.9, 2.0
 
 
@@ -100,6 +102,7 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
         return
     for one in fitted:
         yield from _fitted(c, one)
+    yield from _clock_jumps(c, fit)
     yield from found
     for noise in scales if c.config.robust.noise_scale != "estimated" else ():
         limit = _ODOMETRY_OVER_CONFIDENT if noise.label == "odometry" else _OVER_CONFIDENT
@@ -154,6 +157,24 @@ def _fitted(c: Columns, one: Fitted) -> Iterator[Finding]:
     elif abs(one.value) > max(limit, sigmas * one.sigma) and one.verdict == "admitted":
         text, settings = _mended(c, one)
         yield Finding(code, "warning", one.value, limit, unit, f"{topic.name}: {text}", settings=settings, **where)
+
+
+def _clock_jumps(c: Columns, fit: TrialFit) -> Iterator[Finding]:
+    """Clocks that are not the same in both halves of the drive, beyond a limit and the sigma of either half."""
+    sigmas = np.sqrt(np.diag(fit.covariance))
+    for k, parameter in enumerate(fit.parameters):
+        halves, sigma = (float(fit.first[k]), float(fit.second[k])), 2.0**0.5 * float(sigmas[k])
+        limit = max(_JUMPED_S, 2.0**0.5 * _SIGMAS * sigma)
+        topic = next((t for t in c.topics.values() if parameter.source in t.inputs), None)
+        if parameter.name != "clock" or topic is None or abs(halves[1] - halves[0]) <= limit:
+            continue
+        before, after = (f"{half * 1e3:+.0f} ms" for half in halves)
+        text = (
+            f"{topic.name}: sightings agree with odometry best {before} from their stamps in one half of the drive, "
+            f"{after} in the other (sigma {sigma * 1e3:.0f} ms)"
+        )
+        where: Where = {"topic": topic.name, "first_ns": int(topic.stamp_ns[:1].sum()), "count": len(topic.stamp_ns)}
+        yield Finding("clock_jump", "warning", halves[1] - halves[0], limit, "s", text, **where)
 
 
 def _mended(c: Columns, one: Fitted) -> tuple[str, tuple[str, ...]]:

@@ -31,6 +31,14 @@ class ClockDrift:
 
 
 @dataclass(frozen=True, slots=True)
+class ClockJump:
+    """Landmarks whose clock is set on the way."""
+
+    seconds: float = option(0.2, "by so much", "s", -1e5, 1e5)
+    at: float = option(0.5, AT, "", 0, 1)
+
+
+@dataclass(frozen=True, slots=True)
 class Uptime:
     """Landmarks that are stamped by the time since their computer was started."""
 
@@ -244,6 +252,9 @@ MESSAGE_KINDS: dict[str, Kind] = {
     **ODOMETRY_KINDS,
     "clock_offset": Kind(ClockOffset, _stamped(lambda t, f, _: t + round(f.seconds * NS))),
     "clock_drift": Kind(ClockDrift, _stamped(lambda t, f, _: t + ((t - t[0]) * f.ppm * 1e-6).astype(np.int64))),
+    "clock_jump": Kind(
+        ClockJump, _stamped(lambda t, f, _: t + np.where(t > np.quantile(t, f.at), round(f.seconds * NS), 0))
+    ),
     "uptime": Kind(Uptime, _stamped(lambda t, f, _: t - t[0] + round(f.seconds * NS))),
     "zero_stamps": Kind(ZeroStamps, _stamped(lambda t, f, rng: np.where(rng.random(len(t)) < f.rate, 0, t))),
     "clock_set_back": Kind(ClockSetBack, _clock_set_back),

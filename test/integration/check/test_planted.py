@@ -169,6 +169,20 @@ def test_the_fit_finds_what_needs_an_estimate_and_its_settings_mend_it(
     assert code not in mended
 
 
+@pytest.mark.parametrize("seconds", [0.2, -0.2])
+def test_a_clock_that_is_set_on_the_way_is_found_by_the_fit_and_by_the_times_of_recording(laps, tmp_path, seconds):
+    faulty = Drive(laps)
+    spoil_messages(faulty, [Fault.named("clock_jump", seconds=seconds)], seed=1)
+    faulty.write(tmp_path / "faulty.mcap")
+    by = {one.severity: one for one in check(tmp_path / "faulty.mcap").findings if one.code == "clock_jump"}
+    assert by["warning"].value == pytest.approx(-seconds, abs=0.08)
+    assert by["note"].value == pytest.approx(seconds, abs=0.02)
+    landmarks = next(one for one in faulty.messages if one.topic == by["note"].topic)
+    middle_s = 0.5 * (faulty.messages[-1].log_ns - faulty.messages[0].log_ns) * 1e-9
+    assert (by["note"].first_ns - landmarks.stamp_ns) * 1e-9 == pytest.approx(middle_s, rel=0.3)
+    assert "clock_drift" not in {one.code for one in check(tmp_path / "faulty.mcap", quick=True).findings}
+
+
 ROUGH = "odometry_over_confident"
 
 
