@@ -14,6 +14,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.maps.alignment import Alignment, align, as_they_are, laid_on, positions
 from graph_slam_ros.runs.restore import restored
 from graph_slam_ros.slam import GraphSlam
+from graph_slam_ros.slam.landmarks.lifetimes import has_identity
 from graph_slam_ros.typing import Array, Numbers
 
 _SAME_M = 1e-3  # nobody calls that moved
@@ -173,12 +174,9 @@ def refuse_other_space(one: GraphSlam, two: GraphSlam, a: Path, b: Path) -> None
 
 
 def shared_landmarks(one: GraphSlam, two: GraphSlam) -> list[str]:
-    """The landmarks with the same id in both."""
-    return [
-        name
-        for name, mark in one.landmarks.items()
-        if name in two.landmarks and not (mark.is_unnamed or two.landmarks[name].is_unnamed)
-    ]
+    """The landmarks with the same id in both, but for old places of those that moved."""
+    named = [{name for name, mark in slam.landmarks.items() if has_identity(mark)} for slam in (one, two)]
+    return [name for name in one.landmarks if name in named[0] & named[1]]
 
 
 def _aligned(one: GraphSlam, two: GraphSlam, common: list[str]) -> tuple[Alignment, str, Numbers]:

@@ -25,6 +25,7 @@ from graph_slam_ros.slam import Control, GraphSlam
 from graph_slam_ros.slam.calibration.parameters import QUANTITIES, Parameter
 from graph_slam_ros.slam.edit_tools import HAND_MADE
 from graph_slam_ros.slam.landmarks.assignments import NAME, last_number
+from graph_slam_ros.slam.landmarks.lifetimes import OLD, name_of_old
 from graph_slam_ros.slam.robust.landmark_support import landmark_of
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
 from graph_slam_ros.slam.snapshot import MapSnapshot
@@ -251,13 +252,19 @@ class _Second:
         out: dict[str, Any] = {}
         known = self._one.touched_landmarks(0)
         number = last_number({*known, *landmarks})
-        for name, (vertex, is_unnamed, is_tentative, sightings, first_ns, last_ns) in landmarks.items():
+        for name, (vertex, is_unnamed, is_tentative, sightings, first_ns, last_ns, *retired) in landmarks.items():
+            retired_ns = retired[0] if retired else 0
             if name in self._shared:
                 mark = self._one.landmarks[name]
                 sightings += mark.sightings
                 first_ns, last_ns = min(first_ns, mark.first_seen_ns), max(last_ns, mark.last_seen_ns)
+                retired_ns = max(retired_ns, mark.retired_ns)
+            elif name in known and retired_ns and not is_unnamed:
+                name = name_of_old(name.partition(OLD)[0], {*known, *landmarks, *out})
             elif name in known:
                 number += 1
                 name = f"{NAME}{number}"
-            out[name] = [self._vertex[vertex], is_unnamed, is_tentative, sightings, first_ns, last_ns]
+            retired_ns *= retired_ns >= last_ns  # it was seen since
+            of_it = [is_unnamed, is_tentative, sightings, first_ns, last_ns]
+            out[name] = [self._vertex[vertex], *of_it, *[retired_ns] * bool(retired_ns)]
         return out

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from graph_slam_ros.graph.vertices import GROUPS, R1
+from graph_slam_ros.slam.landmarks.lifetimes import ALL_VOID
 from graph_slam_ros.slam.landmarks.presence import Presence
 from graph_slam_ros.slam.snapshot import MapSnapshot
 
@@ -35,7 +36,7 @@ def fault_of(state: MapSnapshot) -> str:
         if not all(is_index(ns, 2**63) for ns in (mark.first_seen_ns, mark.last_seen_ns, mark.retired_ns)):
             return f"landmark {name} was never seen"
     for k, record in enumerate(state.passes):
-        if not (is_index(record[0], len(kinds)) and Presence.is_record(record[1:])):
+        if record != [ALL_VOID] and not (is_index(record[0], len(kinds)) and Presence.is_record(record[1:])):
             return f"record {k} of the passes of landmarks is none"
     for name, vertex in state.range_offsets.items():
         if not (is_index(vertex, len(kinds)) and kinds[vertex] is R1):

@@ -69,7 +69,7 @@ class Edits:
         self._backend, self._frontend, self._landmarks, self._counters = backend, frontend, landmarks.map, counters
         self._tools = tools = EditTools(backend, landmarks.map, counters)
         self._of_landmarks = LandmarkEdits(tools, frontend)
-        on_moved = landmarks.anonymous.forget_belief, guard.note_moved
+        on_moved = landmarks.forget_where, guard.note_moved
         self._of_path = PathEdits(space, tools, frontend, anchor, on_moved)
         self._cut = DriveCut(space, tools, frontend, self._of_landmarks, self._of_path, anchor)
         self._landmarks.aliases = aliases(backend.edits)

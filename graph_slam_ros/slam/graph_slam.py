@@ -198,7 +198,7 @@ class GraphSlam(MapView):
 
     def _note_moved(self, topic: str) -> None:
         self.counters.count(topic, "map_moved")
-        self._landmarks.anonymous.forget_belief()
+        self._landmarks.forget_where()
         self._solution.guard.note_moved()
 
     def _solve_if_due(self) -> None:

@@ -139,6 +139,11 @@ class LandmarkFrontend:
         """Add a step of odometry. Returns the sightings of earlier scans that can be used now."""
         return self._passed(self.anonymous.travel(step)) if self._is_anonymous else []
 
+    def forget_where(self) -> None:
+        """Forget what depends on the axes of the map, because it has moved."""
+        self.anonymous.forget_belief()
+        self.lifetimes.forget()
+
     def end_scan(self) -> list[Assigned]:
         """End the scan. Returns its sightings that can be used."""
         return self._passed(self.anonymous.end_scan())

@@ -23,7 +23,19 @@ from graph_slam_ros.slam.landmarks.presence import Pass, Presence, views_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array
 
+ALL_VOID = -1  # in a record, instead of a vertex: the map was moved, so all records before it are void
+OLD = "#"  # in the name of an old place of a landmark that moved, before its number
 _LAG = 5  # keyframes after which the verdicts on the sightings from one are visited
+
+
+def name_of_old(name: str, known: Collection[str]) -> str:
+    """Return the name of an old place of a landmark, which is none of those that are known."""
+    return next(old for number in count(1) if (old := f"{name}{OLD}{number}") not in known)
+
+
+def has_identity(landmark: Landmark) -> bool:
+    """Return whether its name says which landmark it is; not so of an old place of one that moved."""
+    return not (landmark.is_unnamed or (landmark.retired_ns and OLD in landmark.name))
 
 
 class Verdicts(Protocol):
@@ -118,8 +130,18 @@ class Lifetimes:
     def restore(self, records: Sequence[list[Any]]) -> None:
         """Continue with what a map tells. Its keyframes were visited."""
         for vertex, *record in records:
+            if vertex == ALL_VOID:
+                self._known.clear()
+                continue
             self._known.setdefault(vertex, Presence()).read(record)
         self._log, self._edge, self._next = list(records), self._solver.graph.edge_count, -1
+
+    def forget(self) -> None:
+        """Forget all views, because the map has moved."""
+        if self._known:
+            self._known.clear()
+            self._passes.clear()
+            self._log.append([ALL_VOID])
 
     def records(self, first: int) -> list[list[Any]]:
         """The records for a map after the first so many changes; after none those of all landmarks."""
@@ -307,7 +329,7 @@ class Lifetimes:
         landmark = known[name]
         landmark.retired_ns = stamp_ns
         if begins_anew:
-            to = next(new for number in count(1) if (new := f"{name}#{number}") not in known)
+            to = name_of_old(name, known)
             landmark.name, known[to] = to, known.pop(name)
             touched.append(name)
         touched.append(to)

@@ -10,6 +10,7 @@ from graph_slam_ros.analysis.explain import explain_edge
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.lie import se2
+from graph_slam_ros.maps.merge import merge
 from graph_slam_ros.runs.restore import record_run, restored
 from graph_slam_ros.slam import Control, GraphSlam, Odometry, Sighting, Sightings
 
@@ -150,3 +151,23 @@ def test_a_second_run_and_its_map_know_the_same(tmp_path):
     text = "\n".join(explain_edge(SavedGraph(tmp_path / "run", []), "landmark:m3#1"))
     assert "landmark m3 moved from" in text
     assert "landmark moved" in text
+
+
+def test_merge_keeps_what_is_retired_and_never_takes_two_old_places_for_one(tmp_path):
+    for name, seed in (("a", 0), ("b", 1)):
+        record_run(tmp_path / name, config(), measurements(34, changed=14, seed=seed), [])
+    merge(tmp_path / "a", tmp_path / "b", tmp_path / "both")
+    marks = restored(tmp_path / "both", []).landmarks
+    assert {name for name, mark in marks.items() if mark.retired_ns} == {"m1", "m6", "m3#1", "m10#1", "m3#2", "m10#2"}
+    assert "retired_ns" in (tmp_path / "both" / "landmarks.csv").read_text()
+
+
+def test_a_map_that_is_moved_forgets_from_where_landmarks_were_seen():
+    slam = driven(measurements(4))
+    assert slam.landmark_passes(0)
+    by = {"name": "turn", "who": "a", "when": "2026-11-23T10:00:00Z", "why": "test", "do": "move_map"}
+    turn = by | {"pose": (1.0, 2.0, 1.5), "sigma_m": 0.1, "sigma_rad": 0.1}
+    slam.process(Control("edit", tuple(turn.items())))
+    assert slam.landmark_passes(0) == []
+    driven(measurements(2, start=4 * LAP), slam)
+    assert not slam.landmark_events
