@@ -157,7 +157,7 @@ lock:
 	echo setuptools | $(COMPILE) --generate-hashes --extra jazzy setup.py - -o requirements.txt
 	echo 'setuptools>=70.1' | $(COMPILE) --resolution lowest-direct setup.py - -o constraints-oldest.txt
 
-COMPILE = $(VENV)-lock/bin/uv pip compile --quiet --universal --python-version 3.10 --extra evaluate --extra report --extra view --extra test \
+COMPILE = $(VENV)-lock/bin/uv pip compile --quiet --universal --python-version 3.10 --extra evaluate --extra report --extra view --extra fleet --extra test \
   --no-emit-index-url --no-annotate --custom-compile-command 'make lock' $(LOCK)
 
 clean:

@@ -75,6 +75,14 @@ setup(
         # Tests compare our scores with its. GPL-3.0: never a requirement of the Apache-2.0 package itself.
         "evaluate": ["evo>=1.31.1"],
         "report": ["plotly>=7.1.0"],  # its JavaScript; of Python nothing is imported
+        "fleet": [
+            "dask>=2026.8",
+            "distributed>=2026.8",
+            "duckdb>=1.4",
+            "fsspec>=2025.9",
+            "optuna>=4.5",
+            "pyarrow>=21.0",
+        ],
         "view": ["plotly>=7.1.0", "starlette>=1.0", "uvicorn>=0.40"],
         "jazzy": [f"{line} ; {WHERE_JAZZY_HAS_WHEELS}" for line in JAZZY],
         "test": [

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from importlib import import_module
 
 from graph_slam_ros import __version__
-from graph_slam_ros.cli import audit, edit, graphs, maps, options, recordings, simulate, view
+from graph_slam_ros.cli import audit, edit, fleet, graphs, maps, options, recordings, simulate, view
 from graph_slam_ros.cli.usage import CommandParser
 
 
@@ -172,6 +172,13 @@ COMMANDS = {
         options.simulate,
         "simulate a recording with truth and, if asked, faults: pythonrobotics, manhattan, warehouse, flight",
         "warehouse --out world.mcap --seed 7",
+    ),
+    "fleet": Command(
+        fleet.fleet,
+        fleet.add_options,
+        "replay, compare and tune on many recordings at once, on all cores or many machines",
+        "replay drives/ --out fleet",
+        "compare last_week fleet --fail 'rmse>1.02x'",
     ),
     "params": Command(
         _later("params"),

@@ -111,6 +111,7 @@ WITHIN = {
         *("recordings", "runs", "maps", "analysis"),
     },
     "view": {"graph", "solver", "measurements", "slam", "slam/robust", "maps", "analysis", "report"},
+    "fleet": {"formats", "config", "runs", "analysis", "report"},
     "simulation": {
         "chi_square",
         "edge_tags",
@@ -129,7 +130,7 @@ WITHIN = {
     "cli": {
         *("progress", "warmup", "graph", "solver", "optimization", "certificate", "formats", "config"),
         *("slam", "messages/inputs", "recordings", "check", "runs", "maps", "analysis", "report", "simulation", "node"),
-        *("measurements", "view"),
+        *("measurements", "view", "fleet"),
     },
     "__init__.py": {
         *(
@@ -165,6 +166,7 @@ THIRD_PARTY = {
     "recordings": {"rosbags", "mcap", "lz4", "zstandard"},  # the last two are mcap's own
 }
 SERVES = {"view/guard.py", "view/server.py"}  # with the extra `view`, which may not be there
+DISTRIBUTES = {f"fleet/{name}.py" for name in ("recordings", "job", "table", "engine", "replay", "compare")}
 NOT_BELOW_MESSAGES = {"random", "secrets", "threading", "time", "uuid"}
 NEVER = {
     "graph": NOT_BELOW_MESSAGES | {"logging", "os", "pathlib"},
@@ -332,7 +334,9 @@ def test_everything_but_the_node_imports_without_ros():
     modules = [
         ".".join(["graph_slam_ros", *Path(name).with_suffix("").parts]).removesuffix(".__init__")
         for name in FILES
-        if name not in SPEAK_MESSAGES and (name not in SERVES or find_spec("uvicorn"))
+        if name not in SPEAK_MESSAGES
+        and (name not in SERVES or find_spec("uvicorn"))
+        and (name not in DISTRIBUTES or all(map(find_spec, ("distributed", "duckdb", "fsspec"))))
     ]
     script = f"""
 import importlib, sys

@@ -1,0 +1,162 @@
+"""The product of recordings and settings, replayed on all workers into one folder."""
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros.config import Config
+from graph_slam_ros.config.config import flatten
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.fleet.engine import Progress, Workers, connected, fingerprints, run_jobs
+from graph_slam_ros.fleet.job import Job
+from graph_slam_ros.fleet.recordings import Source, find_sources
+from graph_slam_ros.fleet.store import Row, Store, job_key
+from graph_slam_ros.fleet.table import write_table
+from graph_slam_ros.formats.parameters import parse_setting, read_parameters
+
+DEFAULTS = "defaults"
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """The work of a fleet.
+
+    Attributes
+    ----------
+    recordings : files, folders, addresses
+    out : the folder for the results
+    configs : files of parameters; each recording is replayed with each
+    settings : ``KEY=VALUE`` or ``KEY=V1,V2``: with each value
+    truth : as ``evaluate --truth``, with ``{path}``, ``{folder}`` and ``{stem}`` of the recording; empty without
+    limit_s : seconds for a job
+    memory : bytes for a job; 0 without limit
+    with_report : write a page for each run
+    """
+
+    recordings: Sequence[str]
+    out: Path
+    configs: Sequence[Path] = ()
+    settings: Sequence[str] = ()
+    truth: str = ""
+    limit_s: float = 3600.0
+    memory: int = 0
+    with_report: bool = False
+
+
+def settings_of(configs: Sequence[Path], settings: Sequence[str]) -> dict[str, Mapping[str, Any]]:
+    """Return the parameters of each configuration by its name: all files with all combinations of settings.
+
+    Raises
+    ------
+    GraphSlamError
+        A file or a setting that cannot be used.
+    """
+    files: dict[str, dict[str, Any]] = {}
+    for file in configs:
+        if file.stem in files:
+            raise GraphSlamError(f"--config: two files are named {file.stem}: rename one: the table has this name")
+        files[file.stem] = dict(flatten(read_parameters(file)))
+    choices = []
+    for text in settings:
+        key, found, values = text.partition("=")
+        if not found:
+            raise GraphSlamError(f"--set {text}: is not KEY=VALUE")
+        choices.append([(f"{key}={value}", parse_setting(f"{key}={value}")) for value in values.split(",")])
+    out: dict[str, Mapping[str, Any]] = {}
+    for name, values_of_file in (files or {"": {}}).items():
+        for chosen in itertools.product(*choices):
+            label = " ".join(part for part in (name, *(text for text, _ in chosen)) if part) or DEFAULTS
+            try:
+                config = Config.from_mapping(values_of_file | dict(pair for _, pair in chosen))
+            except GraphSlamError as error:
+                raise GraphSlamError(f"{label}: {error}") from None
+            out[label] = dict(flatten(config.as_mapping()))
+    return out
+
+
+def truth_of(pattern: str, source: Source) -> str:
+    """Return the truth of a recording: the pattern with the recording's ``{path}``, ``{folder}`` and ``{stem}``."""
+    path = Path(source.url) if "://" not in source.url else None
+    folder, name = (str(path.parent), path.name) if path else source.url.rsplit("/", 1)
+    try:
+        return pattern.format(path=source.url, folder=folder, stem=name.split(".")[0])
+    except (KeyError, IndexError, ValueError):
+        raise GraphSlamError(f"--truth {pattern}: knows {{path}}, {{folder}} and {{stem}} of a recording") from None
+
+
+def jobs_of(fleet: Fleet, sources: Sequence[Source], known: Mapping[str, str]) -> list[Job]:
+    """Return the jobs, those of the largest recordings first. A recording without fingerprint has none."""
+    out = []
+    settings = settings_of(fleet.configs, fleet.settings)
+    for source in sources:
+        if source.url not in known:
+            continue
+        truth = truth_of(fleet.truth, source)
+        for label, values in settings.items():
+            key = job_key(known[source.url], values, truth)
+            out.append(
+                Job(
+                    key,
+                    source.url,
+                    source.name,
+                    label,
+                    values,
+                    truth,
+                    str(fleet.out.absolute()),
+                    fleet.limit_s,
+                    fleet.memory,
+                    fleet.with_report,
+                )
+            )
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """The result of a fleet: all its rows, how many were there before, and recordings that could not be read."""
+
+    rows: list[Row]
+    reused: int
+    unreadable: list[str]
+
+
+def replay_all(
+    fleet: Fleet,
+    workers: Workers,
+    progress: Callable[[str], Progress] = lambda _: lambda items, _total: items,
+    on_start: Callable[[str], None] = lambda _: None,
+) -> Done:
+    """Run all jobs that are not in the folder yet, and write the table.
+
+    Parameters
+    ----------
+    progress : of a label, wraps a sequence
+    on_start : is called with the address of Dask's dashboard
+
+    Raises
+    ------
+    GraphSlamError
+        Nothing to replay, a setting that cannot be used, or another fleet in the folder.
+    """
+    settings_of(fleet.configs, fleet.settings)
+    sources = find_sources(fleet.recordings)
+    store = Store(fleet.out, new=True)
+    with store.locked():
+        store.forget_attempts()
+        rows: list[Row] = []
+        with connected(workers) as client:
+            on_start(client.dashboard_link)
+            known = fingerprints(client, store, sources, progress("hash"))
+            jobs = list({job.key: job for job in jobs_of(fleet, sources, known)}.values())
+            there = {job.key: row for job in jobs if (row := store.result(job.key)) and not row.get("retry")}
+            left = [job for job in jobs if job.key not in there]
+            store.discard(job.key for job in left)
+            rows += there.values()
+            try:
+                for row in run_jobs(client, left, progress("replay")):
+                    rows.append(row)
+            finally:
+                write_table(store.folder, store.rows())
+    return Done(rows, len(there), [one.name for one in sources if one.url not in known])

@@ -1,0 +1,170 @@
+"""The folder of a fleet: one folder for each job, written under another name first, and a table of all.
+
+fleet.json         what this folder is
+recordings.txt     identity and fingerprint of each recording
+jobs/KEY/          row.json, and run/ as replay writes it; report.html
+attempts/KEY.N     a job was begun for the Nth time
+table.parquet      the rows of all jobs
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import socket
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from graph_slam_ros import __version__
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.durable import write_whole
+
+MARK, FORMAT = "fleet.json", "graph_slam_ros fleet"
+ROW, RUN, REPORT, TABLE, RECORDINGS = "row.json", "run", "report.html", "table.parquet", "recordings.txt"
+JOBS, ATTEMPTS = "jobs", "attempts"
+MOST_ATTEMPTS = 3
+
+Row = dict[str, Any]
+
+
+def job_key(fingerprint: str, settings: Mapping[str, Any], truth: str) -> str:
+    """Return the name of a job: of the recording's bytes, all parameters, the truth with its time, and the version."""
+    changed = 0
+    with contextlib.suppress(OSError):
+        file = truth if os.path.exists(truth) else truth.rpartition(":")[0]  # BAG:TOPIC
+        changed = os.stat(file).st_mtime_ns
+    whole = json.dumps([fingerprint, settings, truth, changed, __version__], sort_keys=True)
+    return hashlib.sha256(whole.encode()).hexdigest()[:24]
+
+
+class Store:
+    """The folder of a fleet.
+
+    Raises
+    ------
+    GraphSlamError
+        The folder holds something else.
+    """
+
+    def __init__(self, folder: Path, *, new: bool = False) -> None:
+        self.folder = folder
+        try:
+            if new:
+                self._begin()
+            mark = json.loads((folder / MARK).read_text())
+        except FileNotFoundError:
+            raise GraphSlamError(f"{folder}: not the folder of a fleet: no {MARK} in it") from None
+        except (OSError, ValueError) as error:
+            raise GraphSlamError(f"{folder}: {error}") from None
+        if not isinstance(mark, dict) or mark.get("format") != FORMAT:
+            raise GraphSlamError(f"{folder}: not the folder of a fleet, by its {MARK}")
+
+    def _begin(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if not (self.folder / MARK).exists():
+            if any(one.name != ".lock" for one in self.folder.iterdir()):
+                raise GraphSlamError(f"{self.folder}: is not empty and not the folder of a fleet: choose another --out")
+            write_whole(self.folder / MARK, json.dumps({"format": FORMAT, "version": __version__}).encode())
+        for name in (JOBS, ATTEMPTS):
+            (self.folder / name).mkdir(exist_ok=True)
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder against another fleet.
+
+        Raises
+        ------
+        GraphSlamError
+            Another fleet has it; its machine and process are named.
+        """
+        fd = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                who = os.pread(fd, 200, 0).decode(errors="replace").strip() or "another process"
+                raise GraphSlamError(f"{self.folder}: another fleet writes into it ({who})") from None
+            os.ftruncate(fd, 0)
+            os.pwrite(fd, f"{socket.gethostname()}, process {os.getpid()}".encode(), 0)
+            yield
+        finally:
+            os.close(fd)
+
+    def result(self, key: str) -> Row | None:
+        """The row of a job that is done; None if it is not, or cannot be read."""
+        with contextlib.suppress(OSError, ValueError):
+            row = json.loads((self.folder / JOBS / key / ROW).read_text())
+            return row if isinstance(row, dict) else None
+        return None
+
+    def rows(self) -> list[Row]:
+        """The rows of all jobs, in order of their keys."""
+        keys = sorted(one.name for one in (self.folder / JOBS).iterdir() if not one.name.startswith("."))
+        return [row for key in keys if (row := self.result(key)) is not None]
+
+    def forget_attempts(self) -> None:
+        """Remove the marks of jobs that were begun: those of a fleet that was stopped do not count."""
+        for mark in (self.folder / ATTEMPTS).iterdir():
+            mark.unlink(missing_ok=True)
+        for left in (self.folder / JOBS).glob(".*"):
+            shutil.rmtree(left, ignore_errors=True)
+
+    def discard(self, keys: Iterable[str]) -> None:
+        """Remove the folders of jobs that are run again: they have no row, or one of a machine that failed."""
+        for key in keys:
+            shutil.rmtree(self.folder / JOBS / key, ignore_errors=True)
+
+    def fingerprints(self) -> dict[str, str]:
+        """Fingerprints of recordings by identity, as far as they are known."""
+        try:
+            lines = (self.folder / RECORDINGS).read_text().splitlines()
+        except OSError:
+            return {}
+        return {pair[0]: pair[1] for line in lines if len(pair := line.split()) == 2}
+
+    def keep_fingerprints(self, known: Mapping[str, str]) -> None:
+        """Save the fingerprints by identity."""
+        text = "".join(f"{identity} {value}\n" for identity, value in sorted(known.items()))
+        write_whole(self.folder / RECORDINGS, text.encode())
+
+
+def attempts(folder: Path, key: str) -> int:
+    """The number of times that a job was begun."""
+    return sum((folder / ATTEMPTS / f"{key}.{n}").exists() for n in range(1, MOST_ATTEMPTS + 1))
+
+
+def begin_attempt(folder: Path, key: str) -> int:
+    """Note that a job begins; returns how often it did, this time included.
+
+    Raises
+    ------
+    FileNotFoundError
+        The worker does not see the folder.
+    """
+    for n in range(1, MOST_ATTEMPTS + 1):
+        with contextlib.suppress(FileExistsError):
+            os.close(os.open(folder / ATTEMPTS / f"{key}.{n}", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644))
+            return n
+    return MOST_ATTEMPTS + 1
+
+
+def traces(folder: Path, key: str) -> Iterable[str]:
+    """Yield what the attempts of a job wrote before their process was ended."""
+    for n in range(1, MOST_ATTEMPTS + 1):
+        with contextlib.suppress(OSError):
+            yield (folder / ATTEMPTS / f"{key}.{n}").read_text(errors="replace")
+
+
+def keep(folder: Path, key: str, made: Path, row: Row) -> None:
+    """Move the results of a job to its folder, all at once. If another process was faster, its results stay."""
+    write_whole(made / ROW, json.dumps(row, indent=1).encode())
+    target = folder / JOBS / key
+    try:
+        made.rename(target)
+    except OSError:
+        if not (target / ROW).exists():
+            raise
+        shutil.rmtree(made, ignore_errors=True)

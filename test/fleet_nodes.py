@@ -1,0 +1,54 @@
+"""A Dask scheduler and workers of it, as processes that talk over TCP on the loopback."""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+PATIENCE_S = 60.0
+
+
+def wait_for(what, patience_s=PATIENCE_S):
+    """Poll until it holds."""
+    until = time.monotonic() + patience_s
+    while not what():
+        assert time.monotonic() < until, what
+        time.sleep(0.05)
+
+
+@contextlib.contextmanager
+def scheduler(folder: Path, workers: int):
+    """Start both, yield the scheduler's address, and end them."""
+    file = folder / "scheduler.json"
+    common = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+    environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "2"}
+    begun = []
+
+    def start(name, *options):
+        command = [
+            sys.executable,
+            "-m",
+            f"distributed.cli.dask_{name}",
+            "--scheduler-file",
+            str(file),
+            "--no-dashboard",
+        ]
+        begun.append(subprocess.Popen([*command, *options], env=environment, **common))
+
+    try:
+        start("scheduler", "--host", "127.0.0.1", "--port", "0")
+        wait_for(file.exists)
+        for _ in range(workers):
+            start("worker", "--nthreads", "1", "--host", "127.0.0.1", "--local-directory", str(folder))
+        yield json.loads(file.read_text())["address"]
+    finally:
+        for process in reversed(begun):
+            process.terminate()
+        for process in begun:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(10.0)
+            process.kill()
+            process.wait()

@@ -1,0 +1,164 @@
+"""A fleet on real workers: processes of this machine, and those of a scheduler over TCP, with faults."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("distributed", reason="the extra fleet is not installed")
+
+from distributed import Client
+from fleet_nodes import scheduler, wait_for
+
+from graph_slam_ros import cli
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.fleet.engine import Workers, connected
+from graph_slam_ros.fleet.replay import Fleet, replay_all
+from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.slam import Config
+
+HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv", "map.mcap")
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    """Three recordings with truth, and one that is damaged."""
+    folder = tmp_path_factory.mktemp("drives")
+    for seed in (1, 2, 3):
+        assert (
+            cli.main(["simulate", "pythonrobotics", "--out", str(folder / f"d{seed}.mcap"), "--seed", str(seed)]) == 0
+        )
+    (folder / "damaged.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def serial(drives, tmp_path_factory):
+    """Bytes of the results of each recording, replayed one by one in this process."""
+    out = tmp_path_factory.mktemp("serial")
+    for seed in (1, 2, 3):
+        replay(drives / f"d{seed}.mcap", out / f"d{seed}", Config())
+    return {f"d{seed}.mcap": contents(out / f"d{seed}") for seed in (1, 2, 3)}
+
+
+def contents(run):
+    return {name: (run / name).read_bytes() for name in HASHED}
+
+
+def equal_to_serial(out, rows, serial):
+    for row in rows:
+        if row["state"] == "done":
+            assert contents(out / "jobs" / row["key"] / "run") == serial[row["recording"]], row
+    return sum(row["state"] == "done" for row in rows)
+
+
+def fleet(*arguments):
+    command = [sys.executable, "-m", "graph_slam_ros.cli", "fleet", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_one_command_replays_all_and_the_second_time_nothing(drives, serial, tmp_path):
+    out = tmp_path / "out"
+    options = ("--out", out, "--truth", "{path}", "--workers", 2, "--report")
+    done = fleet("replay", drives, *options)
+    assert done.returncode == 3, done
+    assert "failed: damaged.mcap (defaults):" in done.stderr
+    assert "Traceback" not in done.stderr
+    rows = [json.loads(file.read_text()) for file in out.glob("jobs/*/row.json")]
+    assert equal_to_serial(out, rows, serial) == 3
+    for row in rows:
+        if row["state"] == "done":
+            assert 0.0 < row["rmse_m"] < 0.3
+            assert row["nees"] > 0.0
+            assert row["cpu_s"] > 0.0
+            assert f"jobs/{row['key']}/report.html" in (out / "index.html").read_text()
+    stamps = {file: file.stat().st_mtime_ns for file in out.glob("jobs/*/row.json")}
+    again = fleet("replay", drives, *options)
+    assert "of them 4 were there" in again.stdout
+    assert {file: file.stat().st_mtime_ns for file in out.glob("jobs/*/row.json")} == stamps
+    shown = fleet("table", out, "--where", "state = 'done'", "--order", "rmse_m DESC")
+    assert shown.stdout.count(".mcap") == 3
+    assert fleet("compare", out, out, "--fail", "rmse>1.02x").returncode == 0
+
+
+def test_over_tcp_a_worker_that_is_killed_changes_nothing(drives, serial, tmp_path):
+    out = tmp_path / "out"
+    with scheduler(tmp_path, 2) as address:
+        with Client(address, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+            pids = client.run(os.getpid)
+        victim = next(iter(pids.values()))
+
+        def kill_at_work():
+            wait_for(lambda: list(out.glob("attempts/*.1")))
+            os.kill(victim, signal.SIGKILL)
+
+        killer = threading.Thread(target=kill_at_work)
+        killer.start()
+        done = replay_all(Fleet([str(drives)], out), Workers(address))
+        killer.join()
+    assert equal_to_serial(out, done.rows, serial) == 3
+    assert [row["recording"] for row in done.rows if row["state"] == "failed"] == ["damaged.mcap"]
+    assert all(row["attempts"] <= 3 for row in done.rows)
+
+
+def test_a_job_beyond_its_limits_is_a_row_and_the_others_are_done(drives, tmp_path):
+    one = str(drives / "d1.mcap")
+    slow = replay_all(Fleet([one], tmp_path / "slow", limit_s=0.05), Workers(count=1))
+    assert [row["state"] for row in slow.rows] == ["failed"]
+    assert "limit of time" in slow.rows[0]["reason"]
+    large = replay_all(Fleet([one], tmp_path / "large", memory=2**20), Workers(count=1))
+    assert "out of memory: more than 1 MiB (--memory)" in large.rows[0]["reason"]
+    again = replay_all(Fleet([one], tmp_path / "slow", limit_s=60.0), Workers(count=1))
+    assert [row["state"] for row in again.rows] == ["done"], "a machine that failed is not the end of it"
+
+
+def test_stopped_by_a_signal_it_goes_on_where_it_was(drives, serial, tmp_path):
+    out = tmp_path / "out"
+    options = ["replay", str(drives), "--out", str(out), "--workers", "1"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "graph_slam_ros.cli", "fleet", *options], stderr=subprocess.PIPE, text=True
+    )
+    wait_for(lambda: list(out.glob("jobs/*/row.json")))
+    with pytest.raises(GraphSlamError, match="another fleet writes into it"):
+        replay_all(Fleet([str(drives)], out), Workers(count=1))
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    there = len(list(out.glob("jobs/*/row.json")))
+    assert process.returncode in (130, 3), said
+    done = replay_all(Fleet([str(drives)], out), Workers(count=1))
+    assert done.reused >= there - 1
+    assert equal_to_serial(out, done.rows, serial) == 3
+    assert not list(out.glob("jobs/.*")), "nothing half-written is left"
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
+def test_a_scheduler_that_does_not_answer_is_named(address):
+    with pytest.raises(GraphSlamError, match="no Dask scheduler answers"), connected(Workers(address)):
+        pass
+
+
+def test_a_scheduler_without_workers_is_named(tmp_path):
+    with scheduler(tmp_path, 0) as address:
+        refused = pytest.raises(GraphSlamError, match="has no worker")
+        with refused, connected(Workers(address)):
+            pass
+
+
+def test_mistakes_are_refused_in_one_line(drives, tmp_path):
+    for arguments, says in (
+        (("replay", tmp_path / "none", "--out", tmp_path / "o"), "no such file"),
+        (("replay", drives, "--out", tmp_path / "o", "--set", "keyframes.x=1"), "unknown parameter"),
+        (("table", drives), "not the folder of a fleet"),
+        (("compare", drives, drives), "no table.parquet"),
+    ):
+        done = fleet(*arguments)
+        assert done.returncode == 2, done
+        assert says in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+    assert not Path(tmp_path / "o").exists(), "nothing was begun"

@@ -1,0 +1,204 @@
+"""Settings, recordings and the folder of a fleet."""
+
+import pytest
+
+pytest.importorskip("distributed", reason="the extra fleet is not installed")
+
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.fleet import store
+from graph_slam_ros.fleet.compare import compare, markdown, parse_limit
+from graph_slam_ros.fleet.page import write_page
+from graph_slam_ros.fleet.recordings import find_sources, fingerprint, local_copy
+from graph_slam_ros.fleet.replay import settings_of, truth_of
+from graph_slam_ros.fleet.store import Store, begin_attempt, job_key, keep
+from graph_slam_ros.fleet.table import read_table, write_table
+
+
+def test_settings_are_the_product_of_files_and_values(tmp_path):
+    (tmp_path / "a.yaml").write_text("keyframes:\n  min_distance_m: 0.3\n")
+    (tmp_path / "b.yaml").write_text("keyframes:\n  min_distance_m: 0.4\n")
+    choices = ["robust.noise_scale=configured,estimated"]
+    found = settings_of([tmp_path / "a.yaml", tmp_path / "b.yaml"], choices)
+    assert list(found) == [
+        "a robust.noise_scale=configured",
+        "a robust.noise_scale=estimated",
+        "b robust.noise_scale=configured",
+        "b robust.noise_scale=estimated",
+    ]
+    assert found["b robust.noise_scale=estimated"]["keyframes.min_distance_m"] == 0.4
+    assert list(settings_of([], [])) == ["defaults"]
+
+
+@pytest.mark.parametrize(
+    ("configs", "settings", "says"),
+    [
+        ([], ["keyframes.min_distance=0.3"], "keyframes.min_distance"),
+        ([], ["keyframes.min_distance_m"], "KEY=VALUE"),
+        (["one/a.yaml", "two/a.yaml"], [], "two files are named a"),
+    ],
+)
+def test_a_setting_that_cannot_be_used_is_named(tmp_path, configs, settings, says):
+    files = [tmp_path / name for name in configs]
+    for file in files:
+        file.parent.mkdir()
+        file.write_text("{}")
+    with pytest.raises(GraphSlamError, match=says):
+        settings_of(files, settings)
+
+
+def test_recordings_are_found_in_folders_and_stores_the_largest_first(tmp_path):
+    import fsspec
+
+    (tmp_path / "split").mkdir()
+    for name, size in (("a.mcap", 10), ("split/metadata.yaml", 5), ("split/x_0.mcap", 20), ("notes.txt", 99)):
+        (tmp_path / name).write_bytes(b"x" * size)
+    memory = fsspec.filesystem("memory")
+    memory.pipe("/drives/b.mcap", b"x" * 15)
+    found = find_sources([str(tmp_path), "memory://drives"])
+    assert [(one.name, one.size) for one in found] == [("split", 25), ("b.mcap", 15), ("a.mcap", 10)]
+    assert fingerprint(str(tmp_path / "a.mcap")) != fingerprint(found[1].url)
+    copy = local_copy(found[1].url, tmp_path)
+    assert copy.read_bytes() == memory.cat("/drives/b.mcap")
+    before = found[2].identity
+    (tmp_path / "a.mcap").write_bytes(b"y" * 10)
+    assert find_sources([str(tmp_path / "a.mcap")])[0].identity != before
+    assert truth_of("{folder}/truth/{stem}.tum", found[2]) == f"{tmp_path}/truth/a.tum"
+    with pytest.raises(GraphSlamError, match=r"knows \{path\}"):
+        truth_of("{name}.tum", found[0])
+    memory.rm("/drives", recursive=True)
+
+
+@pytest.mark.parametrize("text", ["nothing", "empty", "unknown://x"])
+def test_what_has_no_recording_is_named(tmp_path, text):
+    (tmp_path / "empty").mkdir()
+    where = text if "://" in text else str(tmp_path / text)
+    with pytest.raises(GraphSlamError, match=text):
+        find_sources([where])
+
+
+def test_equal_names_are_told_apart_by_their_folders(tmp_path):
+    for folder in ("mon", "tue"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "drive.mcap").write_bytes(b"x")
+    assert {one.name for one in find_sources([str(tmp_path)])} == {"mon/drive.mcap", "tue/drive.mcap"}
+
+
+def test_a_folder_of_something_else_is_not_written_into(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(GraphSlamError, match="not empty"):
+        Store(tmp_path, new=True)
+    with pytest.raises(GraphSlamError, match="not the folder of a fleet"):
+        Store(tmp_path)
+    assert [one.name for one in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_two_fleets_in_one_folder_are_refused_by_name(tmp_path):
+    here = Store(tmp_path / "out", new=True)
+    refused = pytest.raises(GraphSlamError, match=r"another fleet writes into it .*process")
+    with here.locked(), refused, Store(tmp_path / "out", new=True).locked():
+        pass
+    with here.locked():
+        pass
+
+
+def test_the_name_of_a_job_depends_on_all_that_its_result_depends_on(tmp_path):
+    truth = tmp_path / "truth.tum"
+    truth.write_text("0 0 0 0 0 0 0 1\n")
+    keys = {
+        job_key("f", {"a": 1}, ""),
+        job_key("g", {"a": 1}, ""),
+        job_key("f", {"a": 2}, ""),
+        job_key("f", {"a": 1}, str(truth)),
+        job_key("f", {"a": 1}, f"{truth}:/topic"),
+    }
+    assert len(keys) == 5
+
+
+def test_results_that_are_there_stay(tmp_path):
+    Store(tmp_path / "out", new=True)
+    for value in (1, 2):
+        made = tmp_path / "out/jobs/.key.x"
+        made.mkdir()
+        keep(tmp_path / "out", "key", made, {"value": value})
+    assert Store(tmp_path / "out").rows() == [{"value": 1}]
+    assert [begin_attempt(tmp_path / "out", "key") for _ in range(4)] == [1, 2, 3, 4]
+    assert store.attempts(tmp_path / "out", "key") == 3
+
+
+def rows(factor=1.0, failed=(), count=8):
+    out = []
+    for k in range(count):
+        row = {"key": f"{k}", "recording": f"r{k}", "setting": "defaults", "state": "done", "reason": ""}
+        row |= {"rmse_m": (0.1 + 0.01 * k) * factor * (1.0 + 0.01 * (-1) ** k), "cpu_s": 1.0 + k}
+        if k in failed:
+            row = {**row, "state": "failed", "reason": "gone", "rmse_m": None}
+        out.append(row)
+    return out
+
+
+def tables(folder, old, new):
+    for name, content in (("old", old), ("new", new)):
+        (folder / name).mkdir()
+        write_table(folder / name, content)
+    return folder / "old", folder / "new"
+
+
+def test_a_regression_exceeds_its_limit_and_chance_does_not(tmp_path):
+    limits = [parse_limit("rmse>1.02x"), parse_limit("cpu>1.5x"), parse_limit("rmse_m>0.2")]
+    worse = compare(*tables(tmp_path, rows(), rows(1.1)), limits)
+    assert [line.split(":")[0] for line in worse.exceeded] == ["rmse>1.02x"]
+    change = {one.metric: one for one in worse.changes}["rmse_m"]
+    assert change.ratio == pytest.approx(1.1)
+    assert change.verdict == "worse"
+    by_chance = rows()
+    for k, row in enumerate(by_chance):
+        row["rmse_m"] *= 1.5 if k == 0 else 0.98 if k % 2 else 1.02
+    (tmp_path / "b").mkdir()
+    same = compare(*tables(tmp_path / "b", rows(), by_chance), limits)
+    change = {one.metric: one for one in same.changes}["rmse_m"]
+    assert change.ratio > 1.02
+    assert change.interval[0] < 1.0
+    assert change.verdict == "same"
+    assert not same.exceeded
+    assert change.worst == ("r0", pytest.approx(1.5))
+
+
+def test_a_recording_that_fails_now_is_named_whatever_the_limits(tmp_path):
+    done = compare(*tables(tmp_path, rows(failed=(2,)), rows(failed=(5,), count=9)))
+    assert done.lost == ["r5: gone"]
+    assert done.gained == ["r2"]
+    assert done.only_new == ["r8"]
+    assert "**Failed now, and not before**" in markdown(done)
+
+
+@pytest.mark.parametrize("text", ["rmse", "rmse<1", "rmse>x", "rmse>1.0y"])
+def test_a_limit_that_is_none_is_refused(text):
+    with pytest.raises(GraphSlamError, match="is not METRIC>NUMBER"):
+        parse_limit(text)
+
+
+def test_a_limit_on_what_nobody_measured_is_refused(tmp_path):
+    with pytest.raises(GraphSlamError, match="no recording has nees"):
+        compare(*tables(tmp_path, rows(), rows()), [parse_limit("nees>1.1x")])
+
+
+def test_the_table_is_filtered_with_sql_that_reaches_nothing_else(tmp_path):
+    write_table(tmp_path, rows(failed=(3,)))
+    found = read_table(tmp_path, "rmse_m > 0.15", "rmse_m DESC", ("recording",))
+    assert [row["recording"] for row in found] == ["r7", "r6"]
+    (tmp_path / "secret.csv").write_text("a\n1\n")
+    for where in (f"1 IN (SELECT a FROM '{tmp_path}/secret.csv')", "nothing > 1", "1=1; DROP TABLE rows"):
+        with pytest.raises(GraphSlamError, match=r"table\.parquet"):
+            read_table(tmp_path, where)
+    assert len(read_table(tmp_path)) == 8
+
+
+def test_hostile_names_are_text_on_the_page_and_in_markdown(tmp_path):
+    hostile = rows(count=2)
+    hostile[0] |= {"recording": "<script>alert(1)</script>|`x`", "state": "failed", "reason": "<b>'\"</b>"}
+    page = write_page(tmp_path, hostile).read_text()
+    assert "<script>" not in page
+    assert "<b>" not in page
+    (tmp_path / "c").mkdir()
+    assert "<script>" not in markdown(compare(*tables(tmp_path / "c", rows(count=2), rows(count=2))))
+    assert page.index("&lt;script&gt;") < page.index("r1<"), "failed ones are first"
