@@ -129,6 +129,20 @@ class SavedGraph:
     def solve(self, without: Iterable[int] = (), let_in: Sequence[int] = (), loss: Loss | None = None) -> Solver:
         """Solve the accepted edges without some, and with others at full weight, from the saved estimate.
 
+        Raises
+        ------
+        GraphSlamError
+            As ``problem``.
+        GaugeError, SingularError
+            What is left does not determine a vertex.
+        """
+        solver = self.problem(without, let_in, loss)
+        solver.optimize()
+        return solver
+
+    def problem(self, without: Iterable[int] = (), let_in: Sequence[int] = (), loss: Loss | None = None) -> Solver:
+        """The problem that ``solve`` solves, at the saved estimate.
+
         A landmark without edges is left out. A keyframe without edges is an error.
 
         Parameters
@@ -139,8 +153,6 @@ class SavedGraph:
         ------
         GraphSlamError
             There is no such edge, or one is both taken out and let in.
-        GaugeError, SingularError
-            What is left does not determine a vertex.
         """
         gone, let_in = {self.edge(e).edge for e in without}, list(dict.fromkeys(let_in))
         if gone & set(let_in):
@@ -158,7 +170,6 @@ class SavedGraph:
         solver.add(vertices, edges)
         for vertex in np.intersect1d(vertices, self.held).tolist():
             solver.hold(vertex)
-        solver.optimize()
         return solver
 
     def _ends(self, graph: Graph, edge: int) -> Sequence[int]:

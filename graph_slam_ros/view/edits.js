@@ -83,7 +83,14 @@ async function solve() {
   try {
     if (quick) {
       const of = (what) => edits.list.filter((one) => one.do === what).map((one) => one.edge);
-      await show(await ask("/solve", JSON.stringify({without: of("remove_edge"), let_in: of("let_in_edge"), loss})), loss ? "With this loss" : "Solved, other decisions as they are");
+      const solved = (first) => ask("/solve", JSON.stringify({without: of("remove_edge"), let_in: of("let_in_edge"), loss, first}));
+      let found = await solved(true);
+      if (!found.is_solved) {  // far away: the first steps, and then the solution
+        await show(found, "After the first steps, being solved");
+        lines.pop();
+        if (turn === edits.asked) found = await solved(false);
+      }
+      await show(found, loss ? "With this loss" : "Solved, other decisions as they are");
     }
     if (edits.list.length && turn === edits.asked && !loss) await show(await ask("/try", planWith("-", () => "-")), "As it would be saved, all judged again");
     if (loss && edits.list.length && turn === edits.asked) lines.push(element("p", "A loss is a question only: a saved run has the losses of its configuration.", {class: "quiet"}));

@@ -6,6 +6,7 @@ import os
 import shlex
 import threading
 from collections.abc import Set
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,8 @@ from graph_slam_ros.slam.robust.ledger import Verdict
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array
 
-_KEYS = {"without": list, "let_in": list, "loss": str}
+_KEYS = {"without": list, "let_in": list, "loss": str, "first": bool}
+_FIRST_STEPS = 3  # of an answer that is not to wait for the solution
 _DECIMALS = 5  # of positions [m]
 _MOST_CHANGES = 200
 _MOST_PATH = 10_000  # characters
@@ -97,7 +99,8 @@ class Workbench:
 
         Parameters
         ----------
-        body : JSON with ``without`` and ``let_in``, lists of edges, and ``loss``: NAME:SCALE, none, or empty: the run's
+        body : JSON with ``without`` and ``let_in``, lists of edges, and ``loss``: NAME:SCALE, none or empty;
+            ``first`` asks for the first steps, which are no solution where ``is_solved`` is false
 
         Raises
         ------
@@ -107,9 +110,12 @@ class Workbench:
         asked = _asked(body)
         with self._lock:
             run = self._saved
-            solver = run.solve(asked["without"], asked["let_in"], _loss(asked["loss"]))
+            solver = run.problem(asked["without"], asked["let_in"], _loss(asked["loss"]))
+            settings = solver.settings
+            report = solver.optimize(replace(settings, max_iterations=_FIRST_STEPS) if asked["first"] else settings)
             moved = run.moved(solver)
             return {
+                "is_solved": report.converged or not asked["first"],
                 "places": self._places(solver, set(run.keyframes)),
                 "landmarks": _landmarks(run.slam, solver),
                 "chi2": [moved.before.chi2_final, moved.after.chi2_final],

@@ -30,8 +30,8 @@ def faulty(tmp_path_factory):
     return SimpleNamespace(folder=folder, run=run, work=work, saved=saved, inside=inside, outside=outside)
 
 
-def what_if(without=(), let_in=(), loss=""):
-    return json.dumps({"without": list(without), "let_in": list(let_in), "loss": loss}).encode()
+def what_if(without=(), let_in=(), loss="", *, first=False):
+    return json.dumps({"without": list(without), "let_in": list(let_in), "loss": loss, "first": first}).encode()
 
 
 def plan(faulty, *edits, **more):
@@ -59,6 +59,14 @@ def test_a_what_if_is_that_of_solve(faulty, loss, capsys):
     assert cli.main([*words, *(["--loss", loss] if loss else [])]) == 0
     before, after = found["chi2"]
     assert f"chi2       {before:14.4f}  ->  {after:14.4f}" in capsys.readouterr().out
+
+
+def test_a_first_answer_says_whether_it_is_the_solution(faulty):
+    """Of edges that all else contradicts it is not: the solution costs less."""
+    work, far = faulty.work, faulty.outside
+    first, whole = work.solve(what_if(let_in=far, first=True)), work.solve(what_if(let_in=far))
+    assert (first["is_solved"], whole["is_solved"]) == (False, True)
+    assert whole["cost"][1] < first["cost"][1]
 
 
 def test_what_is_tried_is_what_is_saved_and_what_edit_writes(faulty):
@@ -143,15 +151,15 @@ def test_the_page_has_all_kinds_of_edits(faulty):
         b"\xff{}",
         b"[" * 100_000,
         b'{"without": [], "let_in": []}',
-        b'{"without": ["1"], "let_in": [], "loss": ""}',
-        b'{"without": [true], "let_in": [], "loss": ""}',
-        b'{"without": [-1], "let_in": [], "loss": ""}',
-        b'{"without": [99999999999999999999], "let_in": [], "loss": ""}',
-        b'{"without": [0], "let_in": [0], "loss": ""}',
-        b'{"without": [], "let_in": [], "loss": "huber:nan"}',
-        b'{"without": [], "let_in": [], "loss": "huber:x"}',
-        b'{"without": [], "let_in": [], "loss": "sharp:1"}',
-        b'{"without": [], "let_in": [], "loss": "", "out": "/tmp/x"}',
+        b'{"without": ["1"], "let_in": [], "loss": "", "first": false}',
+        b'{"without": [true], "let_in": [], "loss": "", "first": false}',
+        b'{"without": [-1], "let_in": [], "loss": "", "first": false}',
+        b'{"without": [99999999999999999999], "let_in": [], "loss": "", "first": false}',
+        b'{"without": [0], "let_in": [0], "loss": "", "first": false}',
+        b'{"without": [], "let_in": [], "loss": "huber:nan", "first": false}',
+        b'{"without": [], "let_in": [], "loss": "huber:x", "first": false}',
+        b'{"without": [], "let_in": [], "loss": "sharp:1", "first": false}',
+        b'{"without": [], "let_in": [], "loss": "", "first": false, "out": "/tmp/x"}',
     ],
 )
 def test_what_is_no_what_if_is_refused_in_one_line(faulty, body):

@@ -107,7 +107,7 @@ def asked(one, method="GET", path="/", body=None, **headers):
         connection.close()
 
 
-QUESTION = b'{"without": [], "let_in": [], "loss": "none"}'
+QUESTION = b'{"without": [], "let_in": [], "loss": "none", "first": false}'
 
 
 # -- who may ask -------------------------------------------------------------------------------------------------------
