@@ -193,7 +193,8 @@ def test_X5_the_token_opens_the_page_once(faulty, attacked):
 def test_X6_a_name_that_was_made_to_point_here_is_refused(attacked, host):
     host = host and host.format(port=attacked.port)
     for method, path in (("GET", "/"), ("GET", f"/?token={attacked.access.token}"), ("POST", "/solve")):
-        body = QUESTION if method == "POST" else None
+        # Without Host it is no HTTP/1.1: the server answers and closes before it reads a body, which may reset the answer.
+        body = QUESTION if method == "POST" and host is not None else None
         assert asked(attacked, method, path, body, host=host)[0] in (400, 403)
     assert asked(attacked, host=f"localhost:{attacked.port}")[0] == 200
 
