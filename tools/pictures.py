@@ -101,7 +101,7 @@ def repair(scratch: Path, browser: Any) -> None:
         solved()
         keep(page, "repair_4.png", 700)
         page.fill("#who", "Anna")
-        page.fill("#why-text", "the fourth aisle was taken for the second")
+        page.fill("#reason", "the fourth aisle was taken for the second")
         page.click("#save")
         page.wait_for_function("document.getElementById('saved').innerText.startsWith('Saved')")
         page.evaluate("""for (const one of document.querySelectorAll('#saved p')) one.textContent =

@@ -19,14 +19,15 @@ from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.edit_tools import HAND_MADE
 from graph_slam_ros.slam.robust.ledger import FINAL, Reason, Verdict, VerdictChange
 
-_STATE = {
+STATES = {
     Verdict.NOT_EVALUATED: "not judged",
     Verdict.ACCEPTED: "accepted",
     Verdict.DOWN_WEIGHTED: "down-weighted",
     Verdict.PENDING: "held back",
     Verdict.REJECTED: "rejected",
 }
-_WHY = {
+"""What a person reads of a verdict."""
+REASONS = {
     Reason.NONE: "",
     Reason.UNLIKELY: "unlikely",
     Reason.DOES_NOT_FIT: "does not fit",
@@ -337,7 +338,7 @@ def _what_if(run: SavedGraph, e: Entry) -> Iterator[str]:
 def remedy(e: Entry) -> str:
     """The remedy for an edge that is out."""
     if e.reason in FINAL:
-        return f"nothing in this run: {_WHY[e.reason]} is final; replay the run with another configuration"
+        return f"nothing in this run: {REASONS[e.reason]} is final; replay the run with another configuration"
     return (
         "it is accepted by itself as soon as the map agrees with it. If you know that it is true, a stated noise is too"
         f" small, its own or that of the edges against it: with all sigmas {e.sigma_factor:.3g} times as large it would"
@@ -349,7 +350,7 @@ def remedy(e: Entry) -> str:
 
 
 def _state(verdict: Verdict, reason: Reason) -> str:
-    return f"{_STATE[verdict]}: {_WHY[reason]}" if reason else _STATE[verdict]
+    return f"{STATES[verdict]}: {REASONS[reason]}" if reason else STATES[verdict]
 
 
 def _line(what: str, text: str) -> Iterator[str]:

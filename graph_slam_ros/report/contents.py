@@ -10,7 +10,7 @@ from scipy.special import gammainc
 
 from graph_slam_ros.analysis.consistency import nees_of_each
 from graph_slam_ros.analysis.evaluation import Scores, dimensions_of, evaluate, input_topics, scored_drive
-from graph_slam_ros.analysis.explain import landmark_lines
+from graph_slam_ros.analysis.explain import REASONS, STATES, landmark_lines
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.trajectories import Truth, read_truth
 from graph_slam_ros.analysis.what_if import SavedGraph
@@ -162,8 +162,8 @@ def _edges(out: Contents, saved: SavedGraph) -> dict[str, Any]:
         "landmark": coded([shown(e.landmark) for e in entries]),
         "verdict": pack.column([int(e.verdict) for e in entries], "u1"),
         "reason": pack.column([int(e.reason) for e in entries], "u1"),
-        "verdicts": [one.name.lower().replace("_", " ") for one in Verdict],
-        "reasons": ["" if one is Reason.NONE else one.name.lower().replace("_", " ") for one in Reason],
+        "verdicts": [STATES[one] for one in Verdict],
+        "reasons": [REASONS[one] for one in Reason],
         "landmark_lines": pack.texts(_landmark_texts(saved, [name for name in names if name])),
         "landmark_names": pack.texts([shown(name) for name in names if name]),
     }
@@ -206,7 +206,7 @@ def _charts(out: Contents, saved: SavedGraph) -> dict[str, Any]:
     for one in Verdict:
         if one:
             at = [e.keyframe for e in judged if e.verdict is one]
-            over[one.name.lower().replace("_", " ")] = np.histogram(at, edges)[0].tolist()
+            over[STATES[one]] = np.histogram(at, edges)[0].tolist()
     later = [c.keyframe for c in saved.changes]
     inside = sorted((e for e in judged if e.is_in), key=lambda e: -e.chi2 / e.dof)[:_SHOWN]
     outside = sorted((e for e in judged if not e.is_in), key=lambda e: -e.statistic / e.threshold)[:_SHOWN]

@@ -132,9 +132,9 @@ function colours() {
   return {
     ...data.colours[d ? "dark" : "light"],
     other: d ? "#2bd9b0" : "#00a884", then: d ? "#ffd24d" : "#9a6700", mark: d ? "#7ee787" : "#116329",
-    ink: d ? "#e6e8eb" : "#1f2328", grid: d ? "#30363d" : "#e6e8eb",
-    "not evaluated": "#9aa0a6", accepted: d ? "#8b9bab" : "#7a8794", "down weighted": "#56b4e9", pending: "#cc79a7",
-    rejected: d ? "#ff9e64" : "#c04000",
+    ink: d ? "#e6e8eb" : "#1f2328", quiet: d ? "#a3abb5" : "#57606a", grid: d ? "#30363d" : "#e6e8eb",
+    "not judged": "#9aa0a6", accepted: d ? "#8b9bab" : "#7a8794", "down-weighted": "#56b4e9", "held back": d ? "#b5c94c" : "#6b7a00",
+    rejected: d ? "#ff9e64" : "#c04000", "taken out (not saved)": d ? "#4dd0e1" : "#006d8f", "let in (not saved)": d ? "#4dd0e1" : "#006d8f",
   };
 }
 
@@ -149,6 +149,7 @@ const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["
 
 // -- the map ---------------------------------------------------------------------------------------------------------
 
+const CAMERA = {eye: {x: 1.2, y: -2.3, z: 1.8}};
 const MOST_SHOWN = 5000, MOST_DRAWN = 20000;  // edges of one class and verdict
 const map = {inSpace: false, points: null, moved: null};  // moved: {path, landmarks} of another solution
 
@@ -189,6 +190,7 @@ function thinned(axes, every) {
 function trace(name, axes, colour, more) {  // edges are many: they are drawn by WebGL, all else as SVG, which begins faster
   const [x, y, z] = axes, kind = map.inSpace ? {type: "scatter3d", z} : {type: more.isMany ? "scattergl" : "scatter"};
   const {isMany, ...rest} = more;
+  if (map.inSpace && rest.line) rest.line = {...rest.line, width: 2 * rest.line.width};  // they look thinner there
   return {name, x, y, mode: "lines", line: {color: colour, width: 1.5}, hoverinfo: "skip", ...kind, ...rest};
 }
 
@@ -197,13 +199,13 @@ function edgeTraces() {
   const label = column(e.label.of), verdict = column(e.verdict);
   for (let k = 0; k < e.count; k++) {
     if (from[k] < 0 || to[k] < 0 || e.label.names[label[k]] === "odometry") continue;
-    const key = `${e.label.names[label[k]]}, ${e.verdicts[verdict[k]]}`;
+    const key = `${e.label.names[label[k]]}, ${changeOf(k) || e.verdicts[verdict[k]]}`;
     if (!groups.has(key)) groups.set(key, []);
     groups.get(key).push(k);
   }
   const out = [];
   for (const [key, edges] of groups) {
-    const name = key.split(", ")[1], isIn = name === "accepted" || name === "not evaluated", isSighting = key.startsWith("landmarks");
+    const name = key.split(", ")[1], isIn = name === "accepted" || name === "not judged", isChanged = name.endsWith(UNSAVED), isSighting = key.startsWith("landmarks");
     const every = Math.max(1, Math.ceil(edges.length / MOST_DRAWN)), some = edges.filter((_, k) => k % every === 0);
     if (every > 1) map.notes.push(`one of ${every} edges of "${key}" is drawn (the ledger has all)`);
     const visible = isIn && edges.length > MOST_SHOWN ? "legendonly" : true;
@@ -216,11 +218,12 @@ function edgeTraces() {
     const middle = axes.map((line) => Float64Array.from(some, (_, at) => (line[3 * at] + line[3 * at + 1]) / 2));
     const faint = Math.max(0.02, Math.min(0.25, 80 / edges.length));  // many sightings would hide the path
     const colour = isIn && isSighting ? colours().landmarks : isIn ? colours().closures : colours()[name];
-    const isFaint = isIn && isSighting;
+    const isFaint = isIn && isSighting, dash = isIn || name === "down-weighted" || name.startsWith("let in") ? "solid" : name === "held back" ? "dot" : "dash";
+    const strength = map.moved && !isIn && !isChanged ? 0.3 : 0.9;  // while edits are tried, what is out stands back
     if (isFaint) out.push(trace(plain(key), [[null], [null], [null]], colour, {visible, legendgroup: key}));  // what the legend shows
-    out.push(trace(plain(key), axes, colour, {visible, isMany: true, opacity: isFaint ? faint : 0.8, legendgroup: key, showlegend: !isFaint}));
+    out.push(trace(plain(key), axes, colour, {visible, isMany: true, opacity: isFaint ? faint : strength, line: {color: colour, dash, width: isChanged ? 3 : isFaint ? 1.5 : 2}, legendgroup: key, showlegend: !isFaint}));
     out.push(trace("", middle, colour, {
-      visible, isMany: true, mode: "markers", marker: {color: colour, size: (isIn ? 4 : 7) / (map.inSpace ? 2 : 1), symbol: "diamond", opacity: isIn ? (isSighting ? faint : 0.35) : 0.9}, showlegend: false,
+      visible, isMany: true, mode: "markers", marker: {color: colour, size: (isIn ? 4 : 7) / (map.inSpace ? 2 : 1), symbol: name.startsWith("taken out") ? "x" : "diamond", opacity: isIn ? (isSighting ? faint : 0.35) : strength}, showlegend: false,
       legendgroup: key, customdata: some, meta: "edge", hovertemplate: `edge %{customdata}: ${plain(key)}<extra></extra>`, hoverinfo: "all",
     }));
   }
@@ -238,15 +241,17 @@ function traces() {
     out.push(trace(names[name], axes, c[name], isPath ? {
       meta: "keyframe", customdata: of,
       hovertemplate: "keyframe %{customdata}<extra></extra>", hoverinfo: "all", line: {color: c[name], width: 2},
-    } : {line: {color: c[name], width: name === "truth" ? 3 : 1.2}}));
+    } : {line: {color: c[name], width: name === "truth" ? 3 : 1.2}, opacity: map.moved && name === "odometry" ? 0.25 : 1}));
   }
+  out.push(trace("", [[], [], []], c["let in (not saved)"], {line: {color: c["let in (not saved)"], width: 7}, opacity: 0.5, showlegend: false, meta: "stretches"}));
+  if (!map.inSpace) out.push(keyframeNumbers(c));
   const marks = data.map.landmarks, labels = column(marks.names);
   if (labels.length) {
     const axes = map.moved ? placedNow(labels) : marks.points.map(column), text = labels.map((name) => plain(short(name)));
     if (!map.inSpace && !map.moved) out.push(trace("2 sigma", [...marks.ellipses.map(column), []], c.landmarks, {line: {color: c.landmarks, width: 1}}));
     out.push(trace("landmarks", axes, c.landmarks, {
       mode: labels.length > 400 ? "markers" : "markers+text", text, textposition: "top center", textfont: {size: 10, color: c.ink}, meta: "landmark",
-      marker: {symbol: map.inSpace ? "diamond" : "star", size: map.inSpace ? 4 : 11, color: c.landmarks}, customdata: labels,
+      marker: {symbol: map.inSpace ? "diamond" : "star", size: map.inSpace ? 3 : 11, color: c.landmarks}, customdata: labels,
       hovertemplate: "landmark %{text}<extra></extra>", hoverinfo: "all",
     }));
   }
@@ -256,6 +261,17 @@ function traces() {
   return out;
 }
 
+function keyframeNumbers(c) {  // about a dozen
+  const n = data.map.keyframes, step = [1, 2, 5].flatMap((one) => [0, 1, 2, 3, 4, 5, 6].map((power) => one * 10 ** power)).sort((a, b) => a - b).find((one) => n / one <= 20);
+  const some = Array.from({length: Math.ceil(n / step)}, (_, k) => k * step), at = estimate();
+  return trace("", at.map((axis) => some.map((k) => axis[k])), c.ink, {mode: "text", text: some.map(String), textposition: "bottom right", textfont: {size: 10, color: c.quiet}, showlegend: false});
+}
+
+function showStretches(ends) {  // the parts of the drive that a group of closures joins
+  const path = estimate(), join = (axis) => ends.flatMap(([first, last]) => [...axis.slice(first, last + 1), NaN]);
+  return restyle("stretches", path.map(join));
+}
+
 async function drawMap(isSame = false) {  // isSame: as it is zoomed
   map.notes = [];
   if (data.map.every > 1) map.notes.push(`one of ${data.map.every} keyframes is drawn`);
@@ -263,7 +279,7 @@ async function drawMap(isSame = false) {  // isSame: as it is zoomed
     source: data.plan.url, xref: "x", yref: "y", x: data.plan.x, y: data.plan.y, sizex: data.plan.width, sizey: data.plan.height,
     xanchor: "left", yanchor: "bottom", sizing: "stretch", layer: "below", opacity: 0.6,
   };
-  const c = colours(), scene = {aspectmode: "data", bgcolor: c.paper, camera: {eye: {x: 1.2, y: -2.3, z: 1.8}}};
+  const c = colours(), scene = {aspectmode: "data", bgcolor: c.paper, camera: CAMERA};
   for (const axis of ["xaxis", "yaxis", "zaxis"]) scene[axis] = {title: {text: `${axis[0]} [m]`}, gridcolor: c.grid, color: c.ink};
   const flat = layout((axis) => ({
     xaxis: {...axis, title: {text: "x [m]"}}, yaxis: {...axis, title: {text: "y [m]"}, scaleanchor: "x", scaleratio: 1},
@@ -277,9 +293,22 @@ async function drawMap(isSame = false) {  // isSame: as it is zoomed
   if (map.chosen) mark(...map.chosen);
 }
 
-function zoom() {
+function zoom() {  // as it is, unless the map has moved out of it
   const {xaxis, yaxis, scene} = byId("map").layout;
-  return map.inSpace ? {scene} : {xaxis, yaxis};
+  if (map.inSpace) return {scene};
+  const isFree = xaxis.autorange !== false && !isVisible(estimate());
+  const kept = (axis) => ({...axis, range: [...axis.range], autorange: isFree});
+  return {xaxis: kept(xaxis), yaxis: kept(yaxis)};
+}
+
+function isVisible(axes) {
+  const {xaxis, yaxis} = byId("map")._fullLayout;
+  return [xaxis, yaxis].every(({range: [low, high]}, at) => axes[at].every((value) => Number.isNaN(value) || (low <= value && value <= high)));
+}
+
+function showWhole() {
+  if (map.inSpace) return Plotly.relayout("map", {"scene.camera": CAMERA});
+  return Plotly.relayout("map", {"xaxis.autorange": true, "yaxis.autorange": true});
 }
 
 async function newMap(several, shape) {
@@ -307,9 +336,9 @@ function mark(kind, which, move = false) {
   map.chosen = [kind, which];
   const at = placesOf(kind, which), all = points(), axes = all.map((axis) => at.map((k) => axis[k]));
   restyle("chosen", axes);
-  if (move && !map.inSpace && at.length) {
+  if (move && !map.inSpace && at.length && !isVisible(axes)) {
     const width = Math.max(...axes[0]) - Math.min(...axes[0]), height = Math.max(...axes[1]) - Math.min(...axes[1]);
-    const x = (Math.max(...axes[0]) + Math.min(...axes[0])) / 2, y = (Math.max(...axes[1]) + Math.min(...axes[1])) / 2, r = 5 + Math.max(width, height);
+    const x = (Math.max(...axes[0]) + Math.min(...axes[0])) / 2, y = (Math.max(...axes[1]) + Math.min(...axes[1])) / 2, r = 2 + 0.6 * Math.max(width, height);
     Plotly.relayout("map", {"xaxis.range": [x - r, x + r], "yaxis.range": [y - r, y + r]});
   }
 }
@@ -364,8 +393,14 @@ function show(kind, which, move = false) {
 
 function showEdge(k, body) {
   const {title, lines} = explained(k), list = element("dl");
-  body.append(element("h3", title));
-  for (const [what, text] of lines) list.append(element("dt", what), element("dd", text));
+  const change = changeOf(k), group = (data.groups || []).find((one) => one.edges.length > 1 && one.edges.includes(k));
+  body.append(element("h3", change ? `${title.slice(0, title.length - verdictAndReason(k).length)}${change}` : title));
+  if (change) body.append(element("p", `Below is how the run judged it: ${verdictAndReason(k)}.`, {class: "state"}));
+  for (const [what, text] of lines) {
+    if (change && (what === "now" || what === "what if")) continue;
+    list.append(element("dt", what), element("dd", text));
+  }
+  if (group) list.append(element("dt", "group"), groupText(group));
   body.append(list);
   const also = element("p");
   for (const at of data.edges.places.map((one) => column(one)[k])) {
@@ -375,6 +410,13 @@ function showEdge(k, body) {
     also.append(linkTo(isKeyframe ? "keyframe" : "landmark", name, `${isKeyframe ? "keyframe" : "landmark"} ${short(String(name))}`));
   }
   body.append(also);
+}
+
+function groupText({edges, most}) {
+  const out = element("dd", `one of a group of ${edges.length} that agree with one another. Taken out together, `);
+  out.append(...(most ? [linkTo("keyframe", most[0], `keyframe ${most[0]}`), ` moves most, by ${general(most[1], 4)} m. `] : ["nothing else holds the map together. "]));
+  out.append(element("a", "The group", {href: "#groups-section"}));
+  return out;
 }
 
 function edgesAt(place) {
@@ -411,27 +453,44 @@ function showLandmark(name, body) {
 // -- the ledger ------------------------------------------------------------------------------------------------------
 
 const HEIGHT = 24;
-const verdictOf = (k) => {
+const UNSAVED = "(not saved)";
+const changeOf = (k) => (extra ? extra.changeOf(k) : "");  // what an edit makes of an edge: "taken out (not saved)"
+const verdictAndReason = (k) => {
   const e = data.edges, reason = e.reasons[column(e.reason)[k]];
   return e.verdicts[column(e.verdict)[k]] + (reason ? `: ${reason}` : "");
 };
+const verdictOf = (k) => changeOf(k) || verdictAndReason(k);
+const HINTS = {  // of verdicts and reasons
+  "not judged": "odometry and priors are not judged", accepted: "it is in the map", "down-weighted": "it is in the map, with little weight",
+  "held back": "it is not in the map, and is judged again whenever the map changes", rejected: "it is not in the map",
+  unlikely: "all else would have to move too far for it", "does not fit": "it was tried, and its error stayed too large",
+  outvoted: "more or better measurements say something else", contradicted: "measurements that came later say something else",
+  "by hand": "a person decided it",
+};
 const values = (name) => (k) => column(data.edges.columns[name])[k];
-const FIELDS = [
-  ["edge", (k) => k], ["class", (k) => named(data.edges.label, k)], ["about", (k) => named(data.edges.landmark, k)],
-  ["input", (k) => named(data.edges.source, k)], ["keyframe", values("keyframe")],
-  ["verdict", (k) => data.edges.verdicts[column(data.edges.verdict)[k]]], ["reason", (k) => data.edges.reasons[column(data.edges.reason)[k]]],
-  ["chi2", values("chi2")], ["dof", values("dof")], ["judged", values("statistic")], ["limit", values("threshold")],
-  ["weight %", values("percent")], ["last pose m", values("last_m")], ["its own m", values("end_m")],
+const FIELDS = [  // name, value, and what it is
+  ["edge", (k) => k, "its id"], ["class", (k) => named(data.edges.label, k), "what kind of measurement it is"],
+  ["about", (k) => named(data.edges.landmark, k), "its landmark"], ["input", (k) => named(data.edges.source, k), "where it came from"],
+  ["keyframe", values("keyframe"), "the keyframe at which it was judged first"],
+  ["verdict", (k) => changeOf(k) || data.edges.verdicts[column(data.edges.verdict)[k]], "whether it is in the map"],
+  ["reason", (k) => (changeOf(k) ? "" : data.edges.reasons[column(data.edges.reason)[k]]), "why it is not in the map"],
+  ["chi2", values("chi2"), "its squared error in the map of the run, in sigmas"], ["dof", values("dof"), "degrees of freedom: how many numbers it measures"],
+  ["judged chi2", values("statistic"), "its chi2 when it was judged"], ["limit", values("threshold"), "up to this judged chi2 it would have been accepted"],
+  ["weight %", (k) => (changeOf(k) ? (changeOf(k).startsWith("let in") ? 100 : 0) : values("percent")(k)), "how much of it counts"],
+  ["end moves m", values("last_m"), "how far the end of the drive moves without it (if it is out: with it) [m], to first order"],
+  ["own moves m", values("end_m"), "how far its own keyframe or landmark moves without it (if it is out: with it) [m], to first order"],
 ];
 const ledger = {order: null, sort: 0, up: true, chosen: -1};
 
 function startLedger() {
-  FIELDS.forEach(([name], at) => {
-    const button = element("button", name, {type: "button"}), cell = element("div", undefined, {role: "columnheader", "aria-sort": "none"});
+  FIELDS.forEach(([name, , hint], at) => {
+    const button = element("button", name, {type: "button", title: hint}), cell = element("div", undefined, {role: "columnheader", "aria-sort": "none"});
     button.addEventListener("click", () => sortBy(at));
     cell.append(button);
     byId("head").append(cell);
   });
+  const classes = data.edges.label.names;
+  byId("filter").value = classes.find((one) => one === "closures") || classes.find((one) => !["odometry", "prior", "priors"].includes(one)) || "";
   byId("filter").addEventListener("input", arrange);
   byId("rows").addEventListener("scroll", () => requestAnimationFrame(drawRows));
   byId("rows").addEventListener("keydown", (event) => {
@@ -439,7 +498,8 @@ function startLedger() {
     if (!step || !ledger.order.length) return;
     event.preventDefault();
     const at = ledger.order.indexOf(ledger.chosen);
-    go("edge", ledger.order[Math.min(ledger.order.length - 1, Math.max(0, at + step))]);
+    ledger.chosen = ledger.order[Math.min(ledger.order.length - 1, Math.max(0, at + step))];  // now: the next key may come before the page has moved
+    go("edge", ledger.chosen);
   });
   arrange();
 }
@@ -457,7 +517,7 @@ function arrange() {
   parts.push([lower(e.verdicts), column(e.verdict)], [lower(e.reasons), column(e.reason)]);
   const hits = words.map((word) => parts.map(([names, codes]) => [names.map((name) => name.includes(word)), codes]));
   for (let k = 0; k < e.count; k++) {
-    if (hits.every((of, w) => String(k) === words[w] || of.some(([has, codes]) => has[codes[k]]))) kept.push(k);
+    if (hits.every((of, w) => String(k) === words[w] || changeOf(k).includes(words[w]) || of.some(([has, codes]) => has[codes[k]]))) kept.push(k);
   }
   const of = FIELDS[ledger.sort][1], way = ledger.up ? 1 : -1, isSorted = !ledger.sort && ledger.up;
   const keys = isSorted ? null : new Map(kept.map((k) => [k, of(k)]));
@@ -483,16 +543,18 @@ function drawRows() {
     const k = ledger.order[at], row = element("div", undefined, {class: "row", role: "row", "aria-rowindex": at + 1, "data-edge": k, "aria-selected": k === ledger.chosen});
     row.style.top = `${(at + 1) * HEIGHT}px`;
     for (const [, of] of FIELDS) {
-      const value = of(k), cell = element("span", undefined, {role: "gridcell"});
+      const value = of(k), cell = element("span", undefined, {role: "gridcell", ...(HINTS[value] ? {title: HINTS[value]} : {})});
       cell.append(element("bdi", typeof value === "number" ? (Number.isNaN(value) ? "-" : number(value)) : value));
       row.append(cell);
     }
     if (extra) extra.decorate(row, k);
-    row.addEventListener("click", () => go("edge", k));
+    row.addEventListener("click", () => { go("edge", k); if (!isPinned()) byId("why").scrollIntoView({block: "nearest"}); });
     drawn.push(row);
   }
   byId("space").replaceChildren(...drawn);
 }
+
+const isPinned = () => getComputedStyle(byId("map-section")).position === "sticky";  // map and Why are always seen
 
 function choose(k) {
   ledger.chosen = k;
@@ -574,14 +636,21 @@ function startCharts() {
 
 // -- the page --------------------------------------------------------------------------------------------------------
 
+function writeVerdict() {
+  const [first, ...rest] = (data.sentences || []).map((one) => element("p", one)), place = byId("verdict");
+  if (!(data.groups || []).length) return place.append(...(first ? [first, ...rest] : []));
+  const steps = element("ol"), look = element("li"), more = element("details");
+  look.append("Look at ", element("a", "the groups of closures that are in", {href: "#groups-section"}), ".");
+  steps.append(look, element("li", extra ? "Take out one group at a time, and see what that does to the map." : `Take out one group at a time: graph_slam view ${data.run} shows the map without it.`),
+    element("li", "Save the map without the group that is wrong."));
+  more.append(element("summary", "What else is known"), ...rest);
+  place.append(...(first ? [first] : []), element("p", "Some closures contradict others, so some that are in may be wrong. To find them:"), steps, more);
+  addEventListener("beforeprint", () => { more.open = true; });
+}
+
 function writeText() {
   byId("title").textContent = document.title;
-  for (const one of data.sentences || []) byId("verdict").append(element("p", one));
-  if ((data.groups || []).length) {
-    const hint = element("p", "Some closures contradict others. To find the wrong ones: ");
-    hint.append(Object.assign(element("a", "the groups of closures that are in", {href: "#groups-section"})), ".");
-    byId("verdict").append(hint);
-  }
+  writeVerdict();
   const notes = [...data.losses.map((one) => `lost: ${one}`), ...data.beware.map((one) => `beware: ${one}`)];
   notes.forEach((one) => byId("notes").append(element("li", one)));
   byId("notes").hidden = !notes.length;
@@ -611,6 +680,10 @@ function writeGroups() {
   table("groups", ["closures", "join keyframes", "with", "chi2 with them", "without", "without them moves most", "by m", ...(extra ? ["what if"] : [])],
     data.groups.map((one) => [edgeLinks(one.edges), span(one.ends[0]), span(one.ends[1]), ...(one.chi2 ? one.chi2 : ["-", "-"]),
       one.most ? linkTo("keyframe", one.most[0], `keyframe ${one.most[0]}`) : "nothing else holds the map together", one.most ? one.most[1] : "-", ...(extra ? [extra.group(one.edges)] : [])]));
+  document.querySelectorAll("#groups tbody tr").forEach((row, at) => {
+    for (const event of ["mouseenter", "focusin"]) row.addEventListener(event, () => showStretches(data.groups[at].ends));
+    for (const event of ["mouseleave", "focusout"]) row.addEventListener(event, () => showStretches([]));
+  });
 }
 
 function writeEdges() {
@@ -633,6 +706,7 @@ async function start() {
     byId("time").disabled = !frames.length;
     if (frames.length) setTime();
     byId("time").addEventListener("input", setTime);
+    byId("whole").addEventListener("click", showWhole);
     byId("view").setAttribute("aria-pressed", map.inSpace);
     byId("view").addEventListener("click", async () => {
       map.inSpace = !map.inSpace;

@@ -13,7 +13,7 @@ from graph_slam_ros.report.contents import Contents
 from graph_slam_ros.report.packing import json_for_script, shown
 
 _HERE = Path(__file__).resolve().parent
-_PLACE = "<!-- panel -->"
+_BAR, _PANEL = "<!-- bar -->", "<!-- panel -->"
 _NO_PLOTLY = "the report draws with plotly: pip install 'graph_slam_ros[report]' or pip install 'plotly>=7.1'"
 
 
@@ -23,10 +23,12 @@ class Panel:
 
     Attributes
     ----------
-    html, css, script : of the part, which is below the map; the script is run before that of the page
+    bar, html : of the part, above the map and below it
+    css, script : of both; the script is run before that of the page
     data : as JSON, in the element ``panel-data``
     """
 
+    bar: str
     html: str
     css: str
     script: str
@@ -49,7 +51,9 @@ def whole_page(made: Contents, script: str, panel: Panel | None = None) -> str:
         )
     )
     title = html.escape(f"{shown(made.run.resolve().name)}: {'view' if panel else 'report'}")
-    body = (_HERE / "page.html").read_text(encoding="utf-8").replace(_PLACE, panel.html if panel else "")
+    body = (_HERE / "page.html").read_text(encoding="utf-8")
+    for place, part in ((_BAR, panel.bar), (_PANEL, panel.html)) if panel else ():
+        body = body.replace(place, part)
     return "\n".join(
         (
             "<!DOCTYPE html>",

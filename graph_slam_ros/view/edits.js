@@ -18,16 +18,17 @@ function put(what) {  // {do, ...arguments}
   edits.list.push({name, who: "", when, why: "", ...what});
 }
 
-const whyOf = (one) => one.why.trim() || byId("why-text").value.trim();
+const whyOf = (one) => one.why.trim() || byId("reason").value.trim();
 const planWith = (who, why) => JSON.stringify({...known.plan, edits: edits.list.map((one) => ({...one, who, why: why(one)}))}, null, 2) + "\n";
 const asPlan = () => planWith(byId("who").value.trim(), whyOf);
 
 function changed() {
   const list = byId("pending");
   list.replaceChildren(...edits.list.map((one, at) => {
-    const item = element("li"), out = element("button", "Remove", {type: "button", "aria-label": `Remove the edit: ${textOf(one)}`});
+    const back = one.do === "remove_edge" ? "Put back" : "Drop";
+    const item = element("li"), out = element("button", back, {type: "button", "aria-label": `${back}: ${textOf(one)}`});
     out.addEventListener("click", () => { edits.list.splice(at, 1); changed(); });
-    const why = element("input", undefined, {type: "text", maxlength: 2000, placeholder: "why, if not as above", "aria-label": `Why: ${textOf(one)}`});
+    const why = element("input", undefined, {type: "text", maxlength: 2000, placeholder: "reason, if another", "aria-label": `Reason: ${textOf(one)}`});
     why.value = one.why;
     why.addEventListener("input", () => { one.why = why.value; });
     item.append(element("bdi", textOf(one)), " ", why, out);
@@ -35,10 +36,22 @@ function changed() {
   }));
   byId("no-edits").hidden = edits.list.length > 0;
   for (const box of document.querySelectorAll("#groups input")) box.checked = box.dataset.edges.split(" ").every((k) => edits.list.some((one) => one.do === "remove_edge" && String(one.edge) === k));
+  byId("bar").hidden = !edits.list.length && !byId("saved").childNodes.length;
+  byId("sum").textContent = sumOf(edits.list);
   for (const id of ["undo", "download", "save"]) byId(id).disabled = !edits.list.length;
-  drawRows();
-  drawActions();
+  arrange();
+  fromHash(false);  // the sentences on what is chosen
   solve();
+}
+
+function sumOf(list) {  // "4 closures taken out"
+  const counted = new Map();
+  for (const one of list) {
+    const what = one.do === "remove_edge" ? "taken out" : one.do === "let_in_edge" ? "let in" : "";
+    const of = what ? named(data.edges.label, one.edge).replace(/e?s$/, (end) => (end === "es" ? "e" : "")) : "other edit", key = `${of}|${what}`;
+    counted.set(key, (counted.get(key) || 0) + 1);
+  }
+  return [...counted].map(([key, n]) => { const [of, what] = key.split("|"); return `${n} ${of}${n > 1 ? "s" : ""} ${what}`.trim(); }).join(", ") || "No edits";
 }
 
 function textOf(one) {
@@ -71,15 +84,19 @@ async function solve() {
     return;
   }
   const lines = [];
+  const numbersOf = (found) => `chi2 ${general(found.chi2[0], 6)} → ${general(found.chi2[1], 6)}; keyframe ${found.most[0]} moves most, by ${found.most[1].toFixed(3)} m; the last pose moves by ${found.final_m.toFixed(3)} m`;
   const show = async (found, title) => {
     if (turn !== edits.asked) return;
-    lines.push(element("p", `${title}: chi2 ${general(found.chi2[0], 6)} → ${general(found.chi2[1], 6)}; the last pose moves by ${found.final_m.toFixed(4)} m; keyframe ${found.most[0]} moves most, by ${found.most[1].toFixed(4)} m`));
+    if (edits.quick === numbersOf(found)) lines.pop();  // as solved: one line is enough
+    edits.quick = numbersOf(found);
+    lines.push(element("p", `${title}: ${edits.quick}`));
     for (const one of found.notes || []) lines.push(element("p", one));
     if (found.changes && found.changes.length) lines.push(changesText(found.changes));
     effect.replaceChildren(...lines);
     await moveTo(asMoved(found));
     await drawGhost();
   };
+  edits.quick = "";
   try {
     if (quick) {
       const of = (what) => edits.list.filter((one) => one.do === what).map((one) => one.edge);
@@ -118,9 +135,9 @@ function changesText(changes) {
 
 async function save() {
   const place = byId("saved");
-  for (const [id, name, isMissing] of [["who", "Who", !byId("who").value.trim()], ["why-text", "Why", edits.list.some((one) => !whyOf(one))]]) {
+  for (const [id, name, isMissing] of [["who", "Who", !byId("who").value.trim()], ["reason", "Reason", edits.list.some((one) => !whyOf(one))]]) {
     if (!isMissing) continue;
-    place.replaceChildren(element("p", `${name} is empty: an edit is kept with who made it, and why`, {class: "fault"}));
+    place.replaceChildren(element("p", `${name} is empty: an edit is kept with who made it, and the reason`, {class: "fault"}));
     return byId(id).focus();
   }
   byId("save").disabled = true;
@@ -129,7 +146,8 @@ async function save() {
     const found = await ask("/save", asPlan());
     place.replaceChildren(
       element("p", `Saved in ${found.folder}: chi2 ${general(found.chi2[0], 6)} → ${general(found.chi2[1], 6)}, the last pose moved by ${found.final_m.toFixed(4)} m. The run on this page is as it was.`),
-      element("p", `The same by command, with the plan: ${found.command}`), element("p", `Next: ${found.next}`),
+      ...(found.verdict ? [element("p", `The saved map: ${found.verdict}`)] : []),
+      element("p", `See it: ${found.next}`), element("p", `The same by command, with the plan: ${found.command}`),
       ...found.notes.map((one) => element("p", one)),
       ...found.losses.map((one) => element("p", `lost: ${one}`, {class: "fault"})),
     );
@@ -155,7 +173,8 @@ const READ = {  // by the kind of a field; the server judges what comes
 };
 
 function drawFields() {
-  const {fields, help} = kindOf(byId("kind").value), filled = edits.chosen ? [edits.chosen] : [];
+  const {fields, help} = kindOf(byId("kind").value), isEdited = edits.chosen && edits.chosen[0] === "edge" && pendingOf(edits.chosen[1]) >= 0;
+  const filled = edits.chosen && !isEdited ? [edits.chosen] : [];
   byId("kind-help").textContent = help;
   byId("fields").replaceChildren(...fields.map(({key, kind, text, is_needed}) => {
     const label = element("label", `${key.replace(/_/g, " ")} `), input = element("input", undefined, {name: key, type: "text", title: text, ...(is_needed ? {required: ""} : {placeholder: "or"})});
@@ -220,8 +239,8 @@ function fillPose() {
 
 // -- what can be done with what is chosen -----------------------------------------------------------------------------
 
-const isInside = (k) => ["accepted", "not evaluated", "down weighted"].includes(data.edges.verdicts[column(data.edges.verdict)[k]]);
-const pendingOf = (k) => edits.list.findIndex((one) => one.edge === k);
+const isInside = (k) => ["accepted", "not judged", "down-weighted"].includes(data.edges.verdicts[column(data.edges.verdict)[k]]);
+const pendingOf = (k) => edits.list.findIndex((one) => one.edge === k && (one.do === "remove_edge" || one.do === "let_in_edge"));
 const isOdometry = (k) => ["odometry", "prior"].includes(named(data.edges.label, k));
 
 function drawActions() {
@@ -240,6 +259,7 @@ function drawActions() {
     if (!fields.some((one) => one.kind === kind || (isSighting && one.kind === "edges")) || what.endsWith("_edge")) continue;
     const button = element("button", what.replace(/_/g, " "), {type: "button"});
     button.addEventListener("click", () => {
+      byId("more").open = true;
       byId("kind").value = what;
       drawFields();
       const rest = [...byId("fields").querySelectorAll("input")].filter((one) => !one.value);
@@ -281,9 +301,9 @@ const panel = {
     byId("kind").addEventListener("change", drawFields);
     byId("new-edit").addEventListener("submit", (event) => { event.preventDefault(); add(fromFields()); });
     byId("map").addEventListener("mousedown", dragGhost, {capture: true});
-    byId("undo").addEventListener("click", () => { edits.list.pop(); changed(); });
+    byId("undo").addEventListener("click", () => { edits.list.pop(); byId("saved").replaceChildren(); changed(); });
     byId("download").addEventListener("click", download);
-    byId("save").addEventListener("click", save);
+    byId("save-form").addEventListener("submit", (event) => { event.preventDefault(); save(); });
     byId("rows").addEventListener("keydown", (event) => {
       if (event.key !== " " || ledger.chosen < 0 || isOdometry(ledger.chosen)) return;
       event.preventDefault();
@@ -302,13 +322,17 @@ const panel = {
     drawFields();
     drawActions();
   },
-  groupsHow: "Take a group out: the map shows at once how it is without. To keep that, say who and why under Edits, and save.",
+  groupsHow: "Take a group out: the map shows at once how it is without. To keep that, fill in the reason above the map, and save.",
   group(edges) {
     const box = element("input", undefined, {type: "checkbox"}), label = element("label");
     box.dataset.edges = edges.join(" ");
-    box.addEventListener("change", () => { toggleAll(edges, box.checked); byId("map-section").scrollIntoView(); });
+    box.addEventListener("change", () => { toggleAll(edges, box.checked); if (!isPinned()) byId("map-section").scrollIntoView(); });
     label.append(box, " take out");
     return label;
+  },
+  changeOf(k) {
+    const at = pendingOf(k);
+    return at < 0 ? "" : `${edits.list[at].do === "remove_edge" ? "taken out" : "let in"} ${UNSAVED}`;
   },
   decorate(row, k) {
     if (pendingOf(k) >= 0) row.classList.add("edited");

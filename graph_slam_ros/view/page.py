@@ -11,5 +11,6 @@ _HERE = Path(__file__).resolve().parent
 
 def page_of(made: Contents, work: Workbench) -> str:
     """The whole HTML of the page. Raises GraphSlamError where plotly is not installed."""
-    html, css, script = ((_HERE / f"edits.{kind}").read_text(encoding="utf-8") for kind in ("html", "css", "js"))
-    return whole_page(made, plotly(), Panel(html, css, script, work.page_data))
+    names = "edits_bar.html", "edits.html", "edits.css", "edits.js"
+    bar, html, css, script = ((_HERE / name).read_text(encoding="utf-8") for name in names)
+    return whole_page(made, plotly(), Panel(bar, html, css, script, work.page_data))

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from graph_slam_ros.analysis.explain import STATES
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import FormatError, GaugeError, GraphSlamError, SingularError
 from graph_slam_ros.graph import Loss
@@ -21,8 +22,9 @@ from graph_slam_ros.maps.edit import FORMAT, VERSION, Edited, Rehearsal, edit, p
 from graph_slam_ros.measurements.edit_actions import ACTIONS
 from graph_slam_ros.report.contents import Contents
 from graph_slam_ros.report.packing import shown
+from graph_slam_ros.report.verdict import verdict
+from graph_slam_ros.runs.folder import summary_of
 from graph_slam_ros.slam.map_view import MapView
-from graph_slam_ros.slam.robust.ledger import Verdict
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array
 
@@ -156,6 +158,7 @@ class Workbench:
         return {
             "folder": shown(str(out), _MOST_PATH),
             "command": shown(shlex.join(words), _MOST_PATH),
+            "verdict": _verdict(out),
             "next": f"graph_slam view {_path(out)}",
             "losses": [shown(one) for one in edited.losses],
             **_effect(edited),
@@ -186,12 +189,8 @@ class Workbench:
         for e in self._saved.entries:
             after = ledger.verdict_of(e.edge)
             if after is not e.verdict and e.edge not in by_hand:
-                out.append([e.edge, _named(e.verdict), _named(after)])
+                out.append([e.edge, STATES[e.verdict], STATES[after]])
         return out[:_MOST_CHANGES]
-
-
-def _named(verdict: Verdict) -> str:
-    return verdict.name.lower().replace("_", " ")
 
 
 def _effect(edited: Edited) -> dict[str, Any]:
@@ -202,6 +201,16 @@ def _effect(edited: Edited) -> dict[str, Any]:
         "most": list(edited.moved),
         "notes": [shown(one) for one in (*(fit.text for fit in edited.by_hand), *edited.warnings)],
     }
+
+
+def _verdict(out: Path) -> str:
+    """The first sentence of the report on a run that was just written; empty where it cannot be read."""
+    losses: list[str] = []
+    try:
+        saved = SavedGraph(out, losses)
+        return verdict(out, summary_of(out), saved, None, losses)[0]
+    except (GraphSlamError, OSError):
+        return ""
 
 
 def _landmarks(slam: MapView, solver: Solver) -> dict[str, list[Any]]:
@@ -273,9 +282,10 @@ def _path(folder: Path) -> str:
 
 def _user() -> str:
     try:
-        return getpass.getuser()
+        name = getpass.getuser()
     except (KeyError, OSError, ImportError):
         return ""
+    return "" if name == "root" else name  # which is nobody's
 
 
 def readable(error: Exception) -> str:

@@ -15,7 +15,7 @@ from PIL import Image
 
 from graph_slam_ros import cli
 from graph_slam_ros.analysis.evaluation import evaluate
-from graph_slam_ros.analysis.explain import Numbers, remedy, statements, title
+from graph_slam_ros.analysis.explain import STATES, Numbers, remedy, statements, title
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.report import page, places, verdict
@@ -117,7 +117,7 @@ def test_the_columns_of_the_ledger_are_those_of_the_run(saved, made):
         expected = [getattr(e, name) for e in saved.entries]
         assert unpacked(made.packing, edges["columns"][name]) == pytest.approx(expected, rel=1e-6)
     verdicts = [edges["verdicts"][k] for k in unpacked(made.packing, edges["verdict"])]
-    assert verdicts == [e.verdict.name.lower().replace("_", " ") for e in saved.entries]
+    assert verdicts == [STATES[e.verdict] for e in saved.entries]
     names = [edges["landmark"]["names"][k] for k in unpacked(made.packing, edges["landmark"]["of"])]
     assert names == [e.landmark for e in saved.entries]
 

@@ -54,6 +54,10 @@ def why(page):
     return " ".join(page.inner_text("#why-body").split())
 
 
+def ranges(page):
+    return page.evaluate("() => ['xaxis', 'yaxis'].flatMap(one => byId('map')._fullLayout[one].range)")
+
+
 def test_a_page_says_why_as_explain_does(page, faulty):
     """By its address, by a row of the ledger, and by a click on the map."""
     false = next(e for e in read_ledger(faulty.run) if e.label == "closures" and not e.is_in)
@@ -62,9 +66,16 @@ def test_a_page_says_why_as_explain_does(page, faulty):
     assert why(page).startswith(before)
     assert f"graph_slam solve run --with {false.edge}" in why(page)
     page.fill("#filter", f"{false.edge + 1}")
+    before = ranges(page)
     page.click(f".row[data-edge='{false.edge + 1}']")
     other = faulty.saved.edge(false.edge + 1)
     assert title(other, other.landmark) in why(page)
+    assert ranges(page) == pytest.approx(before), "an edge that is seen does not move the map"
+    page.evaluate("() => Plotly.relayout('map', {'xaxis.range': [900, 910], 'yaxis.range': [900, 910]})")
+    page.evaluate("which => go('edge', which)", false.edge)
+    page.wait_for_function("() => byId('map')._fullLayout.xaxis.range[0] < 900")
+    page.click("#whole")
+    assert ranges(page) == pytest.approx(before)
     edge = next(e for e in read_ledger(faulty.run) if e.label == "landmarks")
     page.evaluate("which => go('edge', which)", edge.edge)  # as the map's click does
     ends = ["", ""]
@@ -117,7 +128,7 @@ def test_the_ledger_filters_sorts_and_is_walked_with_arrow_keys(page, faulty):
     entries = read_ledger(faulty.run)
     page.fill("#filter", "")
     assert page.inner_text("#count") == f"{len(entries)} of {len(entries)} edges"
-    page.fill("#filter", "closures pending")
+    page.fill("#filter", "closures held back")
     pending = [e.edge for e in entries if e.label == "closures" and e.verdict.name == "PENDING"]
     assert page.inner_text("#count") == f"{len(pending)} of {len(entries)} edges"
     page.click("#head button:has-text('judged')")
