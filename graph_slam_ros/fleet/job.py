@@ -31,6 +31,7 @@ from graph_slam_ros.fleet.store import (
     keep,
     traces,
 )
+from graph_slam_ros.formats.files import read_bytes
 
 _HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv")
 _TIMEOUT = "Timeout ("  # how faulthandler begins
@@ -207,5 +208,5 @@ def _map_hash(run: Path) -> str:
     """The hash of a run's graph, verdicts, path and landmarks: equal for equal results."""
     digest = hashlib.sha256()
     for name in _HASHED:
-        digest.update((run / name).read_bytes())
+        digest.update(read_bytes(run / name))
     return digest.hexdigest()[:16]

@@ -21,6 +21,7 @@ from typing import Any
 from graph_slam_ros import __version__
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
+from graph_slam_ros.formats.files import read_text
 
 MARK, FORMAT = "fleet.json", "graph_slam_ros fleet"
 ROW, RUN, REPORT, TABLE, RECORDINGS = "row.json", "run", "report.html", "table.parquet", "recordings.txt"
@@ -54,7 +55,7 @@ class Store:
         try:
             if new:
                 self._begin()
-            mark = json.loads((folder / MARK).read_text())
+            mark = json.loads(read_text(folder / MARK))
         except FileNotFoundError:
             raise GraphSlamError(f"{folder}: not the folder of a fleet: no {MARK} in it") from None
         except (OSError, ValueError) as error:
@@ -96,7 +97,7 @@ class Store:
     def result(self, key: str) -> Row | None:
         """The row of a job that is done; None if it is not, or cannot be read."""
         with contextlib.suppress(OSError, ValueError):
-            row = json.loads((self.folder / JOBS / key / ROW).read_text())
+            row = json.loads(read_text(self.folder / JOBS / key / ROW))
             return row if isinstance(row, dict) else None
         return None
 
@@ -120,7 +121,7 @@ class Store:
     def fingerprints(self) -> dict[str, str]:
         """Fingerprints of recordings by identity, as far as they are known."""
         try:
-            lines = (self.folder / RECORDINGS).read_text().splitlines()
+            lines = read_text(self.folder / RECORDINGS).splitlines()
         except OSError:
             return {}
         return {pair[0]: pair[1] for line in lines if len(pair := line.split()) == 2}
@@ -155,7 +156,7 @@ def traces(folder: Path, key: str) -> Iterable[str]:
     """Yield what the attempts of a job wrote before their process was ended."""
     for n in range(1, MOST_ATTEMPTS + 1):
         with contextlib.suppress(OSError):
-            yield (folder / ATTEMPTS / f"{key}.{n}").read_text(errors="replace")
+            yield read_text(folder / ATTEMPTS / f"{key}.{n}")
 
 
 def keep(folder: Path, key: str, made: Path, row: Row) -> None:

@@ -105,6 +105,7 @@ async function solve() {
       if (!found.is_solved) {  // far away: the first steps, and then the solution
         await show(found, "After the first steps, being solved");
         lines.pop();
+        edits.quick = "";
         if (turn === edits.asked) found = await solved(false);
       }
       await show(found, loss ? "With this loss" : "Solved, other decisions as they are");

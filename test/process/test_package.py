@@ -110,7 +110,7 @@ WITHIN = {
         *("chi_square", "graph", "lie", "formats", "measurements", "config", "slam", "slam/landmarks", "slam/robust"),
         *("recordings", "runs", "maps", "analysis"),
     },
-    "view": {"graph", "solver", "measurements", "slam", "slam/robust", "maps", "analysis", "report"},
+    "view": {"graph", "solver", "measurements", "slam", "slam/robust", "runs", "maps", "analysis", "report"},
     "fleet": {"formats", "config", "runs", "analysis", "report"},
     "simulation": {
         "chi_square",

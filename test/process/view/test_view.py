@@ -193,7 +193,7 @@ def test_X5_the_token_opens_the_page_once(faulty, attacked):
 def test_X6_a_name_that_was_made_to_point_here_is_refused(attacked, host):
     host = host and host.format(port=attacked.port)
     for method, path in (("GET", "/"), ("GET", f"/?token={attacked.access.token}"), ("POST", "/solve")):
-        # Without Host it is no HTTP/1.1: the server answers and closes before it reads a body, which may reset the answer.
+        # Without Host the server answers and closes before it reads a body, whose rest may reset the answer.
         body = QUESTION if method == "POST" and host is not None else None
         assert asked(attacked, method, path, body, host=host)[0] in (400, 403)
     assert asked(attacked, host=f"localhost:{attacked.port}")[0] == 200
@@ -375,7 +375,8 @@ def test_a_map_is_repaired_by_what_the_page_says(browser, tmp_path):
         assert page.locator(".row:has-text('taken out (not saved)')").count() == 4
         page.evaluate("() => byId('rows').scrollIntoView({block: 'end'})")
         for seen in ("#map", "#why", "#save"):
-            assert page.evaluate("which => { const {top, bottom} = document.querySelector(which).getBoundingClientRect(); return top >= 0 && bottom <= innerHeight; }", seen), seen
+            box = page.evaluate("which => document.querySelector(which).getBoundingClientRect().toJSON()", seen)
+            assert box["top"] >= 0 and box["bottom"] <= page.evaluate("innerHeight"), seen
         page.fill("#who", "Anna")
         page.fill("#reason", "the fourth aisle was taken for the second")
         page.click("#save")
