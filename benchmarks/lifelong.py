@@ -19,12 +19,15 @@ if not __package__:  # run as a script: what it imports is in the repository, no
 
 from graph_slam_ros.graph import Gaussian, Graph
 from graph_slam_ros.graph.geometry import PLANAR, Geometry
-from graph_slam_ros.slam.lifelong.condenser import Condenser
+from graph_slam_ros.slam.lifelong.compaction import compacted
+from graph_slam_ros.slam.lifelong.condenser import Condenser, RemovedPose, poses_of
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array
 
 STEP_M, REACH_M, SEEN = 0.5, 8.0, 0.5
 CELL_M, LONGEST = 10.0, 60
+_COLUMNS = ("id", "vertices", "measured", "sqrt_information", "label", "source", "weight")
+DEAD = 8  # edges in the tables for each that counts: then these are made anew
 SIGMA_ALONG, SIGMA_TURN, SIGMA_RANGE, SIGMA_BEARING = 0.01, 0.005, 0.05, np.deg2rad(1.0)
 _X, _Y = np.array([6.0, 18.0, 30.0, 42.0, 54.0]), np.array([6.0, 20.0, 34.0])
 
@@ -105,15 +108,16 @@ class Robot:
 
     Attributes
     ----------
-    vertices : of the keyframes; marks : of the landmarks
+    vertices : of the keyframes that are in the problem; marks : of the landmarks
+    removed : the other keyframes: their number, that of their base, and the pose between them
     first : the oldest keyframe that was not condensed; ends : how often a visit ended how
     statistics, degrees : of the visits that were added to a place, together
     """
 
     world: Hall
     window: int = 0
-    graph: Graph = field(default_factory=Graph)
-    vertices: list[int] = field(default_factory=list)
+    vertices: dict[int, int] = field(default_factory=dict)
+    removed: list[RemovedPose] = field(default_factory=list)
     marks: dict[int, int] = field(default_factory=dict)
     first: int = 1
     ends: dict[str, int] = field(default_factory=dict)
@@ -125,7 +129,7 @@ class Robot:
     condenser: Condenser = field(init=False)
 
     def __post_init__(self) -> None:
-        self.solver = Solver(self.graph)
+        self.solver = Solver(Graph())
         self.condenser = Condenser(self.world.space, self.solver)
 
     def drive(self, keyframe: int) -> None:
@@ -135,7 +139,7 @@ class Robot:
         if not keyframe:
             pose = world.poses[0]
         else:
-            (before,) = self.solver.estimate([self.vertices[-1]]).tolist()
+            (before,) = self.solver.estimate([self.vertices[keyframe - 1]]).tolist()
             pose = tuple(map(float, space.group.compose(tuple(before), world.steps[keyframe - 1])))
         vertex = graph.add_vertex(space.pose, space.normalized(pose))
         new.append(vertex)
@@ -143,7 +147,7 @@ class Robot:
             noise = Gaussian.from_sigmas(*[1e-3] * space.dof)
             edges.append(graph.add_edge(space.pose_prior, [vertex], pose, noise, "priors"))
         else:
-            noise, ends = Gaussian.from_sigmas(*world.sigmas), [self.vertices[-1], vertex]
+            noise, ends = Gaussian.from_sigmas(*world.sigmas), [self.vertices[keyframe - 1], vertex]
             edges.append(graph.add_edge(space.relative_pose, ends, world.steps[keyframe - 1], noise, "odometry"))
         for mark, seen, covariance in world.sightings[keyframe]:
             if mark not in self.marks:
@@ -151,7 +155,7 @@ class Robot:
                 new.append(self.marks[mark])
             noise, ends = Gaussian.from_covariance(covariance), [vertex, self.marks[mark]]
             edges.append(graph.add_edge(space.sightings["position"], ends, seen, noise, "landmarks"))
-        self.vertices.append(vertex)
+        self.vertices[keyframe] = vertex
         self.solver.add(new, edges)
         self._update()
         if self.window and keyframe >= self.first + self.window:
@@ -164,21 +168,43 @@ class Robot:
 
     def _condense(self, newest: int) -> None:
         began, first = time.thread_time(), self.first
-        at = self.solver.estimate(self.vertices[first : min(first + LONGEST, newest)])
+        at = self.solver.estimate([self.vertices[k] for k in range(first, min(first + LONGEST, newest))])
         cells: list[Hashable] = list(map(tuple, np.floor(at[:, : self.world.space.dimensions] / CELL_M).tolist()))
         length = next((k for k, cell in enumerate(cells) if cell != cells[0]), len(cells))
         end = first + length
         if end + self.window > newest:
             return
         ahead = {self.marks[one[0]] for seen in self.world.sightings[end : newest + 1] for one in seen}
-        done = self.condenser.condense(self.vertices[first:end], self.vertices[end], cells[0], ahead)
+        done = self.condenser.condense(
+            [self.vertices[k] for k in range(first, end)], self.vertices[end], cells[0], ahead
+        )
         self.condense_s.append(time.thread_time() - began)
         self.ends[done.how] = self.ends.get(done.how, 0) + 1
         self.statistics, self.degrees = self.statistics + done.statistic, self.degrees + done.degrees
         if done.how != "waits":
             self.first = end
+        number = {vertex: k for k, vertex in self.vertices.items()}
+        self.removed += [RemovedPose(number[one.vertex], number[one.base], one.T_base_vertex) for one in done.removed]
+        for one in done.removed:
+            del self.vertices[number[one.vertex]]
         if done.how not in ("waits", "kept"):
             self._update()
+        if self.graph.edge_count > DEAD * len(self.solver.edges):
+            self.compact()
+
+    def compact(self) -> None:
+        """Make graph and solver anew without what was removed."""
+        anew = compacted(self.solver)
+        self.solver = anew.solver
+        self.condenser.renumber(anew)
+        self.vertices = {k: anew.vertices[vertex] for k, vertex in self.vertices.items()}
+        self.marks = {mark: anew.vertices[vertex] for mark, vertex in self.marks.items()}
+        self._update()
+
+    @property
+    def graph(self) -> Graph:
+        """The present graph."""
+        return self.solver.graph
 
     def landmarks(self) -> tuple[Array, Array]:
         """Estimated and true positions of the landmarks."""
@@ -187,14 +213,20 @@ class Robot:
 
     def path(self) -> Array:
         """Estimated positions of all keyframes, those that were removed included."""
-        n, removed = self.world.space.dimensions, self.condenser.poses()
-        kept = [vertex for vertex in self.vertices if vertex not in removed]
-        poses = removed | dict(zip(kept, self.solver.estimate(kept).tolist(), strict=True))
-        return np.array([poses[vertex][:n] for vertex in self.vertices])
+        n, kept = self.world.space.dimensions, list(self.vertices)
+        at = map(tuple, self.solver.estimate([self.vertices[k] for k in kept]).tolist())
+        poses = poses_of(self.world.space, self.removed, dict(zip(kept, at, strict=True)))
+        return np.array([poses[k][:n] for k in sorted(poses)])
+
+    def megabytes(self) -> float:
+        """Memory of the tables of the graph and of the arrays of its solver."""
+        tables = [getattr(table, name) for table in self.graph.tables.values() for name in _COLUMNS]
+        columns = [self.graph.kind, self.graph.offset, self.graph.initial, *tables]
+        return 1e-6 * (sum(len(c) * c.values[:1].nbytes for c in columns) + sum(a.nbytes for a in self.solver._tree))
 
     def newest(self) -> tuple[float, float, float]:
         """Return the error of the newest pose [m], its NEES, and that of the landmarks."""
-        space, k, n = self.world.space, len(self.vertices) - 1, self.world.space.dimensions
+        space, k, n = self.world.space, max(self.vertices), self.world.space.dimensions
         (pose,) = self.solver.estimate([self.vertices[k]])
         there, true = self.landmarks()
         turn, shift = fitted(there, true)
@@ -222,13 +254,18 @@ def rms(estimated: Array, true: Array) -> float:
     return float(np.sqrt((((estimated @ turn.T + shift) - true) ** 2).sum(axis=1).mean()))
 
 
-def driven(world: Hall, window: int, every: int = 40, warm: int = 640) -> tuple[Robot, dict[str, float]]:
+def driven(world: Hall, window: int, every: int = 40, warm: int = 640, tell: int = 0) -> tuple[Robot, dict[str, float]]:
     """Drive through a hall; returns the robot and its figures."""
     robot, looks = Robot(world, window), []
     for k in range(len(world.poses)):
         robot.drive(k)
         if k >= warm and k % every == 0:
             looks.append(robot.newest())
+        if tell and k and k % tell == 0:
+            recent = 1e3 * np.array(robot.update_s[-tell:])
+            size = f"{len(robot.solver.vertices)} vertices, {len(robot.solver.edges)} edges, {robot.megabytes():.2f} MB"
+            times = f"median {np.median(recent):.2f}, p99 {np.quantile(recent, 0.99):.1f}, worst {recent.max():.0f} ms"
+            print(f"{k}: {size}, {times}", flush=True)
     error, nees, of_marks = np.array(looks).T
     recent = 1e3 * np.array(robot.update_s[len(robot.update_s) // 2 :])
     n = world.space.dimensions
@@ -253,10 +290,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--keyframes", type=int, default=1600)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--windows", type=int, nargs="+", default=[0, 60], help="keyframes; 0 keeps all")
+    parser.add_argument("--tell", type=int, default=0, help="print sizes and times each so many keyframes")
     given = parser.parse_args(arguments)
     for seed in range(given.seeds):
         for window in given.windows:
-            robot, figures = driven(hall(seed, given.keyframes), window)
+            robot, figures = driven(hall(seed, given.keyframes), window, tell=given.tell)
             words = " ".join(f"{name}={value:.4g}" for name, value in figures.items())
             print(f"seed={seed} window={window} {words} {robot.ends}", flush=True)
 

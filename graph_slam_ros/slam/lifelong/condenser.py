@@ -1,12 +1,13 @@
 """Condensing: the keyframes of a visit leave the problem, and an edge of the place has what they measured."""
 
-from collections.abc import Collection, Hashable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.errors import SingularError
 from graph_slam_ros.graph import Gaussian, place_edge
 from graph_slam_ros.graph.geometry import Geometry
+from graph_slam_ros.slam.lifelong.compaction import Compacted
 from graph_slam_ros.slam.lifelong.elimination import square_root
 from graph_slam_ros.slam.lifelong.place import Fused, Place, fewest_shared, fused, visit_without
 from graph_slam_ros.slam.lifelong.surroundings import Motion, Surroundings, chained, motion_of, surroundings
@@ -34,6 +35,15 @@ class Limits:
     gate: float = 0.9999
 
 
+@dataclass(frozen=True, slots=True)
+class RemovedPose:
+    """A removed keyframe relative to another vertex, which may be removed later."""
+
+    vertex: int
+    base: int
+    T_base_vertex: Numbers
+
+
 @dataclass(slots=True)
 class PlaceEdge:
     """A place, the vertex that it is seen from and its edge; ``strikes`` of each landmark that visits contradict."""
@@ -55,6 +65,7 @@ class Condensed:
     why : of ``composed`` and ``kept``
     statistic, degrees : chi2 of the visit against all before in its place
     without, anew : the landmark that contradicts the place and was left out, or that the place has anew
+    removed : the keyframes that left the problem, in order of time
     """
 
     how: str
@@ -63,15 +74,7 @@ class Condensed:
     degrees: int = 0
     without: int | None = None
     anew: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class RemovedPose:
-    """A removed keyframe relative to a vertex, which may have been removed after it."""
-
-    vertex: int
-    base: int
-    T_base_vertex: Numbers
+    removed: tuple[RemovedPose, ...] = ()
 
 
 class Condenser:
@@ -80,13 +83,11 @@ class Condenser:
     Attributes
     ----------
     places : by cell
-    removed : keyframes, in the order of their removal
     """
 
     def __init__(self, space: Geometry, solver: Solver, limits: Limits | None = None) -> None:
         self.space, self.solver, self.limits = space, solver, limits or Limits()
         self.places: dict[Hashable, list[PlaceEdge]] = {}
-        self.removed: list[RemovedPose] = []
 
     def condense(self, visit: Sequence[int], after: int, cell: Hashable, ahead: Collection[int]) -> Condensed:
         """Condense a visit. Where ``waits`` or ``kept`` is returned nothing was changed.
@@ -121,15 +122,13 @@ class Condenser:
         except SingularError as error:
             return self._composed(visit, after, around, str(error))
 
-    def poses(self) -> dict[int, Numbers]:
-        """Return the present estimate of each removed keyframe, by vertex."""
-        bases = sorted({one.base for one in self.removed} - {one.vertex for one in self.removed})
-        out: dict[int, Numbers] = {}
-        if bases:
-            out |= zip(bases, map(tuple, self.solver.estimate(bases).tolist()), strict=True)
-        for one in reversed(self.removed):
-            out[one.vertex] = tuple(map(float, self.space.group.compose(out[one.base], one.T_base_vertex)))
-        return {one.vertex: out[one.vertex] for one in self.removed}
+    def renumber(self, compacted: Compacted) -> None:
+        """Go on in a compacted problem."""
+        self.solver, vertices = compacted.solver, compacted.vertices
+        for one in (one for in_cell in self.places.values() for one in in_cell):
+            one.base, one.edge = vertices[one.base], compacted.edges[one.edge]
+            one.place = replace(one.place, members=tuple(vertices[mark] for mark in one.place.members))
+            one.strikes = {vertices[mark]: count for mark, count in one.strikes.items() if mark in vertices}
 
     # -- what becomes of a visit -------------------------------------------------------------------------------------
 
@@ -145,8 +144,8 @@ class Condenser:
         added = self._join([*joins, (visit[k], after, [*legs[k:], *onward])])
         begun = PlaceEdge(visit[k], Place.begun_by(one), self._place_edge(visit[k], Place.begun_by(one), root))
         self.places.setdefault(cell, []).append(begun)
-        self._replace(visit, around, [*added, begun.edge], kept=visit[k], seen_from=visit[k])
-        return Condensed("first")
+        removed = self._replace(visit, around, [*added, begun.edge], kept=visit[k], seen_from=visit[k])
+        return Condensed("first", removed=removed)
 
     def _again(self, visit: Sequence[int], after: int, around: Surroundings, one: Visit, at: PlaceEdge) -> Condensed:
         """Add a visit to a place, and cut the odometry on both sides of it."""
@@ -167,7 +166,7 @@ class Condenser:
         if lonely := self._left_alone(around, result.place.members):
             return Condensed("kept", f"landmark {lonely[0]} would be left without a measurement")
         edge = self._place_edge(at.base, result.place, square_root(result.place.information))
-        self._replace(visit, around, [edge], kept=None, seen_from=at.base, also=[at.edge])
+        removed = self._replace(visit, around, [edge], kept=None, seen_from=at.base, also=[at.edge])
         if without is None:
             at.strikes = {mark: count for mark, count in at.strikes.items() if mark not in one.members}
         elif anew is None:
@@ -175,7 +174,7 @@ class Condenser:
         else:
             at.strikes.pop(anew, None)
         at.place, at.edge = result.place, edge
-        return Condensed("again", "", done.statistic, done.degrees, None if anew else without, anew)
+        return Condensed("again", "", done.statistic, done.degrees, None if anew else without, anew, removed)
 
     def _composed(
         self, visit: Sequence[int], after: int, around: Surroundings, why: str, done: Fused | None = None
@@ -185,8 +184,9 @@ class Condenser:
             return Condensed("kept", f"{why}; landmark {lonely[0]} would be left without a measurement")
         legs = [motion_of(edge) for edge in (*around.steps, *around.onward.values())]
         added = self._join([(edge.vertices[0], after, [motion_of(edge), *legs]) for edge in around.into.values()])
-        self._replace(visit, around, added, kept=None, seen_from=after)
-        return Condensed("composed", why, done.statistic if done else 0.0, done.degrees if done else 0)
+        removed = self._replace(visit, around, added, kept=None, seen_from=after)
+        statistic, degrees = (done.statistic, done.degrees) if done else (0.0, 0)
+        return Condensed("composed", why, statistic, degrees, removed=removed)
 
     def _fused(self, place: Place, visit: Visit, guess: Numbers) -> Fused:
         return fused(self.space, place, visit, guess)
@@ -243,17 +243,30 @@ class Condenser:
         kept: int | None,
         seen_from: int,
         also: Sequence[int] = (),
-    ) -> None:
+    ) -> tuple[RemovedPose, ...]:
         """Put edges in place of those of a visit, and remove its keyframes but ``kept``."""
         gone = [vertex for vertex in visit if vertex != kept]
         group, (base, *poses) = self.space.group, self.solver.estimate([seen_from, *gone]).tolist()
-        motions = [group.between(tuple(base), tuple(pose)) for pose in poses]
+        motions = [tuple(map(float, group.between(tuple(base), tuple(pose)))) for pose in poses]
         self.solver.add([], added)
         for edge in (*around.all, *also):
             self.solver.set_weight(edge, 0.0)
-        for vertex, motion in zip(gone, motions, strict=True):
+        for vertex in gone:
             self.solver.remove(vertex)
-            self.removed.append(RemovedPose(vertex, seen_from, tuple(map(float, motion))))
+        return tuple(RemovedPose(vertex, seen_from, motion) for vertex, motion in zip(gone, motions, strict=True))
+
+
+def poses_of(space: Geometry, removed: Sequence[RemovedPose], kept: Mapping[int, Numbers]) -> dict[int, Numbers]:
+    """Return the present poses of keyframes, removed ones included.
+
+    Parameters
+    ----------
+    removed : in the order of their removal; kept : the present poses of all others that are a base
+    """
+    out = dict(kept)
+    for one in reversed(removed):
+        out[one.vertex] = tuple(map(float, space.group.compose(out[one.base], one.T_base_vertex)))
+    return out
 
 
 def _halved(around: Surroundings) -> dict[int, float]:
