@@ -7,6 +7,7 @@ import numpy as np
 from graph_slam_ros.check.columns import Columns
 from graph_slam_ros.check.finding import Finding, in_order, worst
 from graph_slam_ros.check.frames import check_frames
+from graph_slam_ros.check.gyro import check_gyro
 from graph_slam_ros.check.odometry import check_odometry
 from graph_slam_ros.check.pairs import check_pairs
 from graph_slam_ros.check.refusals import check_refusals, check_unnamed
@@ -19,6 +20,7 @@ CHECKS: tuple[Check, ...] = (
     check_frames,
     check_times,
     check_odometry,
+    check_gyro,
     check_unnamed,
     check_pairs,
 )

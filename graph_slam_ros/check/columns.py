@@ -14,7 +14,7 @@ import numpy as np
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import Control, Measured, Odometry, Sighting, Sightings
+from graph_slam_ros.measurements.types import AngularVelocity, Control, Measured, Odometry, Sighting, Sightings
 from graph_slam_ros.messages.from_msg import TF, TF_STATIC
 from graph_slam_ros.messages.inputs import uses
 from graph_slam_ros.messages.inputs.transforms import Transforms, pose
@@ -117,6 +117,8 @@ class Columns:
     assumed : parameters that were chosen for the recording, and that nobody has set
     path_ns, path : (m,) and (m, 7) T_odom_base, as a replay uses odometry
     tf_ns, tf_path : (m,) and (m, 7) the transform from odometry's frame to its child on /tf
+    gyro_ns, gyro : (g,) stamps and turn rate about the robot's z [rad/s] of the gyro that is used
+    gyro_frame, T_base_gyro : its frame, and where that is on the robot; None where it is not fixed or not known
     """
 
     config: Config
@@ -130,6 +132,10 @@ class Columns:
     tf_path: Array
     counters: Counters
     assumed: Mapping[str, Any] = field(default_factory=dict)
+    gyro_ns: Index = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    gyro: Array = field(default_factory=lambda: np.empty(0))
+    gyro_frame: str = ""
+    T_base_gyro: se3.Pose | None = None
 
 
 class _Topic:
@@ -232,6 +238,7 @@ class Collector:
         self._odometry_ns, self._numbers = array("q"), array("d")
         self._path_ns, self._path = array("q"), array("d")
         self._tf_ns, self._tf_path = array("q"), array("d")
+        self._gyro_ns, self._gyro, self._gyro_frame = array("q"), array("d"), ""
         self._links: dict[tuple[str, str, bool], Link] = {}
         self._first: dict[tuple[str, str], se3.Pose] = {}
         self._transforms = Transforms()
@@ -257,6 +264,9 @@ class Collector:
                 if m.source.partition("#")[0] == self._main and len(self._path_ns) < MOST:
                     self._path_ns.append(m.stamp_ns)
                     self._path.extend(m.T_odom_base)
+            elif isinstance(m, AngularVelocity) and len(self._gyro_ns) < MOST:
+                self._gyro_ns.append(m.stamp_ns)
+                self._gyro.append(m.rate[-1])
             elif isinstance(m, Sightings) and m.topic in self._sightings:
                 if message is not None and self._config.world.dimensions == 2:
                     heights = heights or _heights(message, self._sightings[m.topic].T_base_frame)
@@ -272,6 +282,8 @@ class Collector:
                 self._add_transforms(message, fixed=name == TF_STATIC)
             elif name in self._sightings and not self._sightings[name].frame:
                 self._place(self._sightings[name], message)
+            elif name == self._config.gyro_input and not self._gyro_frame:
+                self._gyro_frame = self._frame_of[name] or _frame(message)
 
     def _add_odometry(self, m: Any) -> None:
         if len(self._odometry_ns) >= MOST:
@@ -306,12 +318,13 @@ class Collector:
         own = self._frame_of[found.input] or _frame(message)
         if not own:
             return
-        found.frame = own
-        mounted = next(one for one in self._config.sources if one.name == found.input).numbers("mount", 6)
-        known = self._transforms.lookup(self._config.frames.base, own)
-        if known is None and mounted:
-            known = se3.from_xyz_rpy(mounted)
-        found.T_base_frame = se3.IDENTITY if known is None else known
+        found.frame, found.T_base_frame = own, self._T_base(found.input, own) or se3.IDENTITY
+
+    def _T_base(self, name: str, frame: str) -> se3.Pose | None:
+        """The fixed pose of an input's frame on the robot, by TF, else as configured; None where neither has it."""
+        known = self._transforms.lookup(self._config.frames.base, frame)
+        mounted = next((one.numbers("mount", 6) for one in self._config.sources if one.name == name), ())
+        return se3.from_xyz_rpy(mounted) if known is None and mounted else known
 
     def columns(self, counters: Counters) -> Columns:
         """Everything that was collected, and what the converters have counted."""
@@ -327,6 +340,10 @@ class Collector:
             np.array(self._tf_path).reshape(-1, 7),
             counters,
             self._assumed,
+            _index(self._gyro_ns),
+            np.array(self._gyro),
+            self._gyro_frame,
+            self._T_base(self._config.gyro_input, self._gyro_frame),
         )
 
     def _poses(self, numbers: "array[float]") -> Array:

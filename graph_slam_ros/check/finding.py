@@ -110,6 +110,16 @@ KINDS: dict[str, Kind] = {
     "covariance_negative": Kind("a variance of the twist is negative or not a number", _DENSITY),
     "covariance_tiny": Kind("the covariance of the twist is smaller than any wheels can be", _DENSITY),
     "covariance_useless": Kind("the standard deviation of the twist is larger than the speed", _DENSITY),
+    # -- a gyro that is used as part of odometry
+    "gyro_scale": Kind(
+        "the gyro turns more or less than odometry, or the other way",
+        "correct its driver (rad/s), or its transform; or set odometry.turn_factor or INPUT.mount",
+    ),
+    "gyro_bias": Kind(
+        "the gyro turns where odometry does not, by more than its bias may be",
+        "let the robot stand when its gyro starts; or set gyro.bias_sigma",
+    ),
+    "gyro_unrelated": Kind("the gyro's turns are not those of odometry", "check its topic, its frame and its clock"),
     # -- sightings and odometry
     "mirrored": Kind("sightings and odometry turn in opposite directions", _DRIVER, True),
     "axes": Kind(

@@ -227,17 +227,19 @@ def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, where: Where) -> Fin
         return None
     if_so = f"but by {others[what]:.2f} m if the axes are {what}"
     text = f"{s.topic}: two sightings of a landmark differ by {now_m:.2f} m, {if_so}"
-    settings = () if what == EXCHANGED else turned_mount(s, (0.0, 0.0, 0.0, *TURNS[what]))
+    settings = (
+        () if what == EXCHANGED else turned_mount(s.input, s.frame, s.T_base_frame, (0.0, 0.0, 0.0, *TURNS[what]))
+    )
     value = now_m / max(others[what], 1e-9)
     return Finding("axes", "error", value, 1.0 / _HALF, "times", text, settings=settings, **where)
 
 
-def turned_mount(s: SightingColumns, T_frame_true: se3.Pose) -> tuple[str, ...]:
+def turned_mount(name: str, frame: str, T_base_frame: se3.Pose, T_frame_true: se3.Pose) -> tuple[str, ...]:
     """Settings that place an input's sensor elsewhere than its frame is, by a frame of its own name."""
-    T = se3.compose(tuple(s.T_base_frame), T_frame_true)
+    T = se3.compose(tuple(T_base_frame), T_frame_true)
     numbers = " ".join(f"{0.0 if abs(x) < 5e-7 else x:.6g}" for x in (*T[:3], *_rpy(tuple(T[3:]))))
-    name = s.frame if s.frame.endswith(_CORRECTED) else f"{s.frame or 'sensor'}{_CORRECTED}"
-    return assignment(f"{s.input}.frame", name), assignment(f"{s.input}.mount", numbers)
+    corrected = frame if frame.endswith(_CORRECTED) else f"{frame or 'sensor'}{_CORRECTED}"
+    return assignment(f"{name}.frame", corrected), assignment(f"{name}.mount", numbers)
 
 
 def _rpy(q: so3.Quaternion) -> tuple[float, float, float]:

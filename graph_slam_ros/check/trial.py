@@ -127,7 +127,7 @@ def _absurd(c: Columns, factor: float) -> Finding:
     where: Where = {"topic": s.topic, "first_ns": int(s.stamp_ns[0]), "count": len(s.stamp_ns)}
     text = f"the robot would have to drive {factor:.2f} m for each metre of {c.odometry.topic}"
     if abs(factor + 1.0) < _BACKWARDS:
-        settings = turned_mount(s, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0))
+        settings = turned_mount(s.input, s.frame, s.T_base_frame, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0))
         text = f"{s.topic}: {text}: does the sensor look backwards?"
         return Finding("axes", "error", factor, -1.0, "times", text, settings=settings, **where)
     return Finding("unrelated", "error", factor, 1.0 + _ABSURD, "times", f"{s.topic}: {text}", **where)

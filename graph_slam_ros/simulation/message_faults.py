@@ -10,10 +10,13 @@ from numpy.random import Generator
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.cdr import NS
 from graph_slam_ros.lie import se3
+from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.simulation.drive import Drive, Message, Sightings
 from graph_slam_ros.simulation.odometry_faults import AT, CHANGED, ODOMETRY_KINDS
 from graph_slam_ros.simulation.options import Kind, option
 from graph_slam_ros.typing import Array
+
+_IMU = "sensor_msgs/msg/Imu"
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +118,15 @@ class RandomIds:
     """Landmarks with ids of other landmarks, at random."""
 
     rate: float = option(1.0, "of all sightings", "", 0, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class WrongGyro:
+    """An IMU whose turn rates are wrong."""
+
+    factor: float = option(1.2, "so many times as large", "", -1e3, 1e3)
+    bias_rad_s: float = option(0.0, "larger by so much, about each axis", "rad/s", -10, 10)
+    axes: str = option("kept", "which", choices=("kept", "exchanged"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +255,17 @@ def _new_ids(drive: Drive, fault: NewIds, _rng: Generator) -> None:
     _each(drive, change)
 
 
+def _wrong_gyro(drive: Drive, fault: WrongGyro, _rng: Generator) -> None:
+    decode, found = decoder(_IMU), [m for m in drive.messages if m.type == _IMU]
+    if not found:
+        raise GraphSlamError("wrong_gyro: needs an IMU")
+    for m in found:
+        m.content = decode(m.content) if isinstance(m.content, bytes) else m.content
+        w = m.content.angular_velocity
+        rates = (w.x, w.y, w.z) if fault.axes == "kept" else (w.z, w.x, w.y)
+        w.x, w.y, w.z = (fault.factor * rate + fault.bias_rad_s for rate in rates)
+
+
 def _blind(drive: Drive, fault: Blind, _rng: Generator) -> None:
     at_ns = np.quantile(drive.odometry_ns, fault.after)
     drive.drop([m for m in drive.landmarks if m.stamp_ns > at_ns])
@@ -267,6 +290,7 @@ MESSAGE_KINDS: dict[str, Kind] = {
     "track_ids": Kind(TrackIds, _track_ids),
     "random_ids": Kind(RandomIds, _random_ids),
     "new_ids": Kind(NewIds, _new_ids),
+    "wrong_gyro": Kind(WrongGyro, _wrong_gyro),
     "blind": Kind(Blind, _blind),
 }
 """Faults that any recording can have; those of worlds (``faults.KINDS``) need its truth."""

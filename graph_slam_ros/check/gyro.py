@@ -1,0 +1,105 @@
+"""Checks of a gyro that is used as part of odometry, against odometry's turns."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from graph_slam_ros.check.columns import Columns
+from graph_slam_ros.check.finding import Finding, Severity, Where, assignment
+from graph_slam_ros.check.pairs import path_of, poses_at, turned_mount
+from graph_slam_ros.lie import se3, so3
+from graph_slam_ros.typing import Array
+
+_WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3
+_TURNING_RAD, _LEAST_TURNING = 0.1, 10
+_SCALE, _GROSS, _UNEXPLAINED, _BIAS_SIGMAS = 0.1, 0.4, 0.5, 3.0
+_ROUNDS = 15
+_MOST_BIAS = 1.0  # [rad/s] that gyro.bias_sigma may be
+
+
+def check_gyro(c: Columns) -> Iterator[Finding]:
+    """Scale, sign, axis and bias of a gyro: both must turn alike over each second."""
+    topic = next((t for t in c.topics.values() if c.config.gyro_input in t.inputs), None)
+    odometry, gyro = _turns(c)
+    if topic is None or len(gyro) < _LEAST_WINDOWS:
+        return
+    factor, bias, left = _line(odometry, gyro)
+    where: Where = {"topic": topic.name, "first_ns": int(c.gyro_ns.min()), "count": len(c.gyro_ns)}
+    limit = _BIAS_SIGMAS * c.config.gyro.bias_sigma
+    is_turning = np.abs(odometry) > _TURNING_RAD
+    if np.count_nonzero(is_turning) >= _LEAST_TURNING:
+        size = float(np.median(np.abs(factor * odometry[is_turning])))
+        unexplained = float(np.median(np.abs(left[is_turning]))) / max(size, 1e-9)
+        if abs(factor - 1.0) > _SCALE:
+            yield _scale(c, factor, where)
+            if abs(factor - 1.0) >= _GROSS:  # its offset means nothing
+                return
+        elif unexplained > _UNEXPLAINED:
+            text = f"{topic.name}: odometry's turns do not explain {unexplained:.0%} of those of the gyro"
+            yield Finding("gyro_unrelated", "warning", unexplained, _UNEXPLAINED, "part", text, **where)
+    if abs(bias) > limit:
+        text = f"{topic.name}: its gyro turns by {bias:.3f} rad/s where odometry does not"
+        settings = (assignment("gyro.bias_sigma", round(abs(bias), 3)),) if abs(bias) < _MOST_BIAS else ()
+        yield Finding("gyro_bias", "warning", bias, limit, "rad/s", text, settings=settings, **where)
+
+
+def _turns(c: Columns) -> tuple[Array, Array]:
+    """The turns [rad] about the robot's z over each second, by odometry and by the gyro."""
+    path_ns, path = path_of(c)
+    stamp_ns, first = np.unique(c.gyro_ns, return_index=True)
+    if len(path_ns) < 2 or len(stamp_ns) < 2:
+        return np.empty(0), np.empty(0)
+    rate, began_ns = c.gyro[first], max(path_ns[0], stamp_ns[0])
+    edges = np.arange(began_ns, min(path_ns[-1], stamp_ns[-1]), _WINDOW_NS)
+    if len(edges) < 2:
+        return np.empty(0), np.empty(0)
+    poses = poses_at(edges, path_ns, path)
+    motion = se3.between(tuple(poses[:-1].T), tuple(poses[1:].T))
+    odometry = so3.log(tuple(motion[3:]))[2] * c.config.odometry.turn_factor
+    step_s = np.diff(stamp_ns) * 1e-9
+    angle = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step_s)])
+    gyro = np.diff(np.interp((edges - began_ns) * 1e-9, (stamp_ns - began_ns) * 1e-9, angle))
+    is_there = np.diff(np.searchsorted(stamp_ns, edges)) >= _LEAST_SAMPLES
+    is_there &= np.diff(np.searchsorted(path_ns, edges)) >= _LEAST_SAMPLES
+    return np.asarray(odometry)[is_there], gyro[is_there]
+
+
+def _line(x: Array, y: Array) -> tuple[float, float, Array]:
+    """Robust slope and offset of y over x, and what they leave."""
+    rows: Array = np.stack([x, np.ones(len(x))], axis=1)
+    weight: Array = np.ones(len(x))
+    solution: Array = np.zeros(2)
+    left: Array = y
+    for _ in range(_ROUNDS):
+        solution = np.asarray(np.linalg.lstsq(rows * weight[:, None], y * weight, rcond=None)[0], dtype=np.float64)
+        left = y - rows @ solution
+        scale = 1.48 * float(np.median(np.abs(left))) + 1e-6
+        weight = 1.0 / np.sqrt(1.0 + (left / (3.0 * scale)) ** 2)
+    return float(solution[0]), float(solution[1]), left
+
+
+def _scale(c: Columns, factor: float, where: Where) -> Finding:
+    """A gyro that turns another way, or by another amount, and what mends it."""
+    text = f"{where['topic']}: its gyro turns {factor:.3g} times as much as odometry"
+    severity: Severity = "error"
+    settings: tuple[str, ...] = ()
+    if abs(factor - 1.0) < _GROSS:
+        severity, now = "warning", c.config.odometry.turn_factor
+        text += ": the track width is wrong, or the scale of the gyro"
+        settings = (assignment("odometry.turn_factor", round(now * factor, 4)),)
+    elif abs(factor + 1.0) < _GROSS:
+        text += ": its sensor is upside down, or odometry turns the wrong way"
+        if c.config.world.dimensions == 2 and c.T_base_gyro is not None:  # in space x or y points the other way, too
+            settings = _turned_over(c, c.T_base_gyro)
+    elif abs(factor) < _GROSS:
+        text += ": another of its axes points upwards, or its driver sends zeros"
+    elif abs(factor) > 1.0 / _GROSS:
+        text += ": are these degrees?"
+    return Finding("gyro_scale", severity, factor, 1.0 + _SCALE, "times", text, settings=settings, **where)
+
+
+def _turned_over(c: Columns, T_base_gyro: se3.Pose) -> tuple[str, ...]:
+    """The settings of a gyro turned over about the robot's x. Of its TF or mount only the rotation has a part."""
+    R_base_gyro = se3.rotation(T_base_gyro)
+    x, y, z, w = so3.compose(so3.compose(so3.inverse(R_base_gyro), (1.0, 0.0, 0.0, 0.0)), R_base_gyro)
+    return turned_mount(c.config.gyro_input, c.gyro_frame, T_base_gyro, (0.0, 0.0, 0.0, x, y, z, w))

@@ -1,0 +1,76 @@
+"""A gyro that is wrong is found against odometry, and the setting that is printed mends it."""
+
+import pytest
+
+from graph_slam_ros.formats.parameters import parse_setting
+from graph_slam_ros.runs.check import check
+from graph_slam_ros.simulation import Drive, Fault, simulate, spoil_messages, write_bag
+from graph_slam_ros.simulation.instruments import Instruments, with_instruments
+
+SETTINGS = {
+    "inputs.names": "odom detections imu",
+    "imu.type": "sensor_msgs/msg/Imu",
+    "imu.topic": "/imu/data",
+    "imu.use": "gyro",
+}
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    file = tmp_path_factory.mktemp("gyro") / "drive.mcap"
+    recording = simulate("warehouse", 3, aisles=2, aisle_m=4.0, laps=1)
+    write_bag(with_instruments(recording, 3, Instruments(imu=50.0)), file)
+    return file
+
+
+def of_the_gyro(bag, settings):
+    findings = check(bag, SETTINGS | settings, odometry="/odom", landmarks="/landmarks", quick=True).findings
+    return {one.code: one for one in findings if one.code.startswith("gyro")}
+
+
+def test_a_gyro_that_is_right_has_no_finding(bag):
+    assert of_the_gyro(bag, {}) == {}
+
+
+@pytest.mark.parametrize(
+    ("fault", "code", "value", "has_setting"),
+    [
+        ({"factor": 1.2}, "gyro_scale", 1.2, True),
+        ({"factor": -1.0}, "gyro_scale", -1.0, True),
+        ({"factor": 57.3}, "gyro_scale", 57.3, False),
+        ({"factor": 0.0}, "gyro_scale", 0.0, False),
+        ({"factor": 1.0, "axes": "exchanged"}, "gyro_scale", 0.0, False),
+        ({"factor": 1.0, "bias_rad_s": 0.15}, "gyro_bias", 0.15, True),
+    ],
+)
+def test_a_gyro_that_is_wrong_is_found_and_its_setting_mends_it(bag, tmp_path, fault, code, value, has_setting):
+    drive = Drive(bag)
+    spoil_messages(drive, [Fault.named("wrong_gyro", **fault)], seed=1)
+    drive.write(tmp_path / "faulty.mcap")
+    found = of_the_gyro(tmp_path / "faulty.mcap", {})
+    assert found.keys() == {code}
+    assert found[code].value == pytest.approx(value, rel=0.1, abs=0.05)
+    assert bool(found[code].settings) == has_setting
+    if has_setting:
+        assert of_the_gyro(tmp_path / "faulty.mcap", dict(map(parse_setting, found[code].settings))) == {}
+
+
+def test_a_gyro_that_is_tilted_and_upside_down_is_turned_over_about_the_robots_axes(bag, tmp_path):
+    drive = Drive(bag)
+    spoil_messages(drive, [Fault.named("wrong_gyro", factor=1.0, axes="exchanged")], seed=1)
+    drive.write(tmp_path / "faulty.mcap")
+    tilted = {"imu.frame": "tilted", "imu.mount": "0 0 0 0 1.2 0"}
+    found = of_the_gyro(tmp_path / "faulty.mcap", tilted)["gyro_scale"]
+    assert found.value == pytest.approx(-1.0, abs=0.1)
+    settings = dict(map(parse_setting, found.settings))
+    assert settings["imu.frame"] == "tilted_corrected"
+    assert of_the_gyro(tmp_path / "faulty.mcap", settings) == {}
+
+
+def test_in_space_no_setting_is_printed_for_a_gyro_that_is_upside_down(bag, tmp_path):
+    drive = Drive(bag)
+    spoil_messages(drive, [Fault.named("wrong_gyro", factor=-1.0)], seed=1)
+    drive.write(tmp_path / "faulty.mcap")
+    found = of_the_gyro(tmp_path / "faulty.mcap", {"world.dimensions": 3})
+    assert found["gyro_scale"].value == pytest.approx(-1.0, abs=0.1)
+    assert found["gyro_scale"].settings == ()
