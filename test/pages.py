@@ -52,7 +52,7 @@ def pages(browser, *, offline=True):
     yield go
     for context in contexts:
         context.close()
-    assert wrong == []
+    assert wrong == [], wrong
 
 
 def violations(page):

@@ -25,7 +25,9 @@ def fleet(args: argparse.Namespace) -> int:
 def add_options(sub: CommandParser) -> None:
     """Add the commands of ``fleet`` and their options."""
     sub.codes = f"{CODES} 4: worse than --fail allows."
-    commands = sub.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
+    commands = sub.add_subparsers(
+        required=True, metavar="COMMAND", parser_class=CommandParser, help="fleet COMMAND --help has its options"
+    )
     _add_replay(commands)
     _add_table(commands)
     _add_compare(commands)

@@ -7,9 +7,9 @@ reason. What is wrong with the machine is an exception, or the end of the proces
 import contextlib
 import faulthandler
 import hashlib
+import platform
 import resource
 import shutil
-import socket
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -80,7 +80,7 @@ def run_job(job: Job) -> Row:
         return failed(job, why_it_died(out, job.key))
     made = Path(tempfile.mkdtemp(prefix=f".{job.key}.", dir=out / JOBS))
     try:
-        row = _head(job) | {"attempts": attempt, "worker": socket.gethostname()}
+        row = _head(job) | {"attempts": attempt, "worker": platform.node()}
         with open(out / ATTEMPTS / f"{job.key}.{attempt}", "w") as trace, _limits(job, trace):
             try:
                 row |= _results(job, made)

@@ -12,8 +12,8 @@ import fcntl
 import hashlib
 import json
 import os
+import platform
 import shutil
-import socket
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -89,7 +89,7 @@ class Store:
                 who = os.pread(fd, 200, 0).decode(errors="replace").strip() or "another process"
                 raise GraphSlamError(f"{self.folder}: another fleet writes into it ({who})") from None
             os.ftruncate(fd, 0)
-            os.pwrite(fd, f"{socket.gethostname()}, process {os.getpid()}".encode(), 0)
+            os.pwrite(fd, f"{platform.node()}, process {os.getpid()}".encode(), 0)
             yield
         finally:
             os.close(fd)
