@@ -32,8 +32,7 @@ class SolveConfig:
     )
     relinearize_every: int = setting(
         _SOLVER.relinearize_every,
-        "relinearisation is checked at least at every so many updates, more often while it lowers the cost by much "
-        "(at each update for ten times the threshold)",
+        "relinearisation is checked at every so many updates (at each update for ten times the threshold)",
         "updates",
         low=1,
         high=1_000_000,

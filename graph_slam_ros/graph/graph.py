@@ -227,7 +227,7 @@ class Graph:
             raise GraphSlamError(
                 f"{edge.name}: measurement {measured[row].tolist()} at vertices {at[row].tolist()} is not finite"
             )
-        if len(at) and at.view(np.uint64).max() >= self.vertex_count:  # below zero is large without a sign
+        if len(at) and (at.min() < 0 or at.max() >= self.vertex_count):
             missing = int(at.max() if at.max() >= self.vertex_count else at.min())
             raise GraphSlamError(f"{edge.name}: vertex {missing} does not exist")
         for other, slot in combinations(range(at.shape[1]), 2):
@@ -235,8 +235,6 @@ class Graph:
             if itself.any():
                 raise GraphSlamError(f"{edge.name}: edge from vertex {int(at[itself, slot][0])} to itself")
         for slot, kinds in enumerate(edge.accepts):
-            if all(kind in kinds for kind in self.kinds):
-                continue
             fits = np.array([kind in kinds for kind in self.kinds])[self.kind.values[at[:, slot]]]
             if not fits.all():
                 vertex = int(at[~fits, slot][0])

@@ -57,8 +57,8 @@ class Settings:
         and the last from then on
     relinearize_above : online, a vertex is linearised anew when a component of its step is larger [m, rad]
     relinearize_error : or when its step squared is more than so many standard deviations of its strongest measurement
-    relinearize_every : that is looked for at least at every so many updates, or after two thirds of these at one that
-        closes a loop, and more often while it lowers the cost by much; steps ten times as large are at any
+    relinearize_every : that is looked for at every so many updates, or after two thirds of these at one that closes a
+        loop; steps ten times as large are at any
     relinearize_passes : how often at most within one update; after the first time for steps as large as that
     tolerance : online, changes of a step up to this are not followed [m, rad]
     tolerance_sigmas : nor are those up to so many standard deviations of the vertex given its neighbours
@@ -69,10 +69,10 @@ class Settings:
     step_tolerance: float = 1e-6
     cost_tolerance: float = 1e-6
     losses: Mapping[Any, Sequence[Loss]] = field(default_factory=dict)
-    relinearize_above: float = 0.03
-    relinearize_error: float = 0.05
+    relinearize_above: float = 0.05
+    relinearize_error: float = 0.1
     relinearize_every: int = 10
-    relinearize_passes: int = 1
+    relinearize_passes: int = 5
     tolerance: float = 1e-5
     tolerance_sigmas: float = 1e-3
 

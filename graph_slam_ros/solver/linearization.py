@@ -1,6 +1,5 @@
 """Linearisation of edges to whitened blocks: only here the solver uses an edge type, and only calls it."""
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -202,7 +201,7 @@ def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:
 
 def refuse_nonfinite(block: Block) -> None:
     """Raise GraphSlamError if numbers are so large that a cost overflows; it names the first such edge."""
-    if math.isfinite(block.cost.sum()):
+    if np.isfinite(block.cost.sum()):
         return
     bad = np.flatnonzero(~np.isfinite(block.cost))
     row = block.rows[bad[0] if len(bad) else int(block.cost.argmax())]

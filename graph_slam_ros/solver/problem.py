@@ -195,8 +195,8 @@ class Problem:
         graph, known = self.graph, self._vertices
         if graph.vertex_count > known:
             count, size = graph.vertex_count, len(graph.initial)
-            numbers = dict.fromkeys(("diagonal", "step", "value", "estimate"), size)
-            self._tree = with_room(self._tree, vertex=count, region=2 * count, tail=2 * count, **numbers)
+            self._tree = with_room(self._tree, vertex=count, region=2 * count, tail=2 * count)
+            self._tree = with_room(self._tree, diagonal=size, step=size, value=size, estimate=size)
             self._inside, self._held = longer(self._inside, count), longer(self._held, count)
             self._kept = longer(self._kept, len(self._tree.estimate))
             first = int(graph.offset.values[known])

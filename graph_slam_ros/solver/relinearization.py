@@ -7,22 +7,15 @@ from graph_slam_ros.solver.pending import NONE
 from graph_slam_ros.typing import Index
 
 BY_FAR = 10.0  # times the threshold: steps that are linearised anew at once
-MUCH, LITTLE = 2e-4, 4e-5  # of the cost, by which a pass lowers it: the next search comes sooner, or later
 
 
 class RelinearizationSchedule:
-    """Counts updates, and collects the vertices that moved until all are searched for large steps.
-
-    How many updates it waits is decided by the cost: what a pass gains is what the estimate lacked before it. Clean
-    graphs gain next to nothing. With large noise the estimate would be some thousandths above the optimum.
-    """
+    """Counts updates, and collects the vertices that moved until all are searched for large steps."""
 
     def __init__(self) -> None:
         self._moved: list[Index] = []
         self._unseen = NONE
         self._updates = 0
-        self._period = np.inf
-        self._is_whole = False
 
     def note(self, moved: Index) -> None:
         """Note vertices that moved after an update's last search; the next update searches them."""
@@ -41,19 +34,9 @@ class RelinearizationSchedule:
         """
         self._moved.append(moved)
         self._updates += 1
-        self._period = min(self._period, float(every))
-        self._is_whole = self._updates * (3 if len(moved) > TAIL_LEAST else 2) >= 2 * self._period
-        if not self._is_whole:
+        if self._updates * (3 if len(moved) > TAIL_LEAST else 2) < 2 * every:
             unseen, self._unseen = self._unseen, NONE
             return np.union1d(moved, unseen) if len(unseen) else moved, BY_FAR
         moved = np.unique(np.concatenate(self._moved))
         self._moved, self._unseen, self._updates = [], NONE, 0
         return moved, 1.0
-
-    def learn(self, gain: float) -> None:
-        """Adapt the number of updates to the share of the cost by which the first pass after a search lowered it."""
-        if self._is_whole and gain > MUCH:
-            self._period = max(1.0, 0.5 * self._period)
-        elif self._is_whole and gain < LITTLE:
-            self._period *= 2.0
-        self._is_whole = False

@@ -35,8 +35,6 @@ from graph_slam_ros.solver.relinearization import BY_FAR, RelinearizationSchedul
 from graph_slam_ros.solver.report import Change, Report
 from graph_slam_ros.typing import Array, Index
 
-_TINY = 1e-12  # a cost of zero, up to rounding
-
 
 class Solver(Problem):
     """Maximum-likelihood estimate of the vertices it was given, online and in batch; it owns their estimates.
@@ -154,10 +152,7 @@ class Solver(Problem):
         if not len(at):
             return np.empty((0, 0))
         graph = self.graph
-        first = int(at[0])
-        if not 0 <= first < self._vertices:
-            existing(at[:1], self._vertices, "vertex")
-        size = graph.kind_of(first).size
+        size = graph.kind_of(existing(at[:1], self._vertices, "vertex")[0]).size
         unfit, out = incremental.gather(self._tree.estimate, graph.kind.values, graph.offset.values, at, size)
         if unfit != NOTHING:
             existing(at, self._vertices, "vertex")
@@ -323,26 +318,14 @@ class Solver(Problem):
                 self._tree, moved, far * settings.relinearize_above, far**2 * settings.relinearize_error
             )
             if not len(edges):
-                self._schedule.learn(0.0)
                 return
-            before = self._cost_of(edges)
             self._linearize(edges)
             failed, moved = incremental.renumber(self._tree, edges, settings.tolerance, settings.tolerance_sigmas)
             if failed != NOTHING:
                 raise undetermined(failed)
             self._schedule.note(moved)
-            after = self._cost_of(edges)
-            self._schedule.learn((before - after) * len(edges) / max(after * len(self._edge_inside), _TINY))
             far = BY_FAR
             yield len(edges), moved
-
-    def _cost_of(self, edges: Index) -> float:
-        """Cost of edges at the estimate."""
-        cost = 0.0
-        for ids, losses in self._stages.of(edges, self.settings):
-            for b in linearize(self.graph, self._tree.estimate, rows_of(self.graph, ids), losses):
-                cost += float(b.cost.sum())
-        return cost
 
     def _forget_numbers(self) -> None:
         """Set the sums to zero, because all edges are about to be linearised."""
