@@ -89,7 +89,7 @@ def test_odometry_in_its_own_frame_is_not_corrected(wrong, calibrated):
     """Whoever publishes odom -> base publishes it uncorrected: map -> odom has to fit that."""
     odometry = {m.stamp_ns: m.T_odom_base for m in wrong if not hasattr(m, "sightings")}
     keyframes = [k for k in calibrated.keyframes if k.stamp_ns in odometry]
-    assert len(keyframes) > 20
+    assert len(keyframes) >= 20  # as many as are compared
     for one in keyframes[-20:]:
         np.testing.assert_allclose(one.T_odom_base[:2], odometry[one.stamp_ns][:2], atol=2e-3)
 
