@@ -3,6 +3,7 @@
 ``make soak`` tries more (``GRAPH_SLAM_SOAK``).
 """
 
+import json
 import os
 from collections import Counter, defaultdict
 
@@ -16,11 +17,18 @@ def times(quick, long):
 
 
 def tell(name, *, worst=None, **numbers):
-    """Add to the numbers of a line; of ``worst`` the largest is told."""
-    _TOLD[name].update({key: number.item() if hasattr(number, "item") else number for key, number in numbers.items()})
-    for key, value in (worst or {}).items():
-        number = float(value)  # numbers of NumPy could not go to another process
+    """Add to the numbers of a line; of ``worst`` the largest is told.
+
+    What cannot go to another process fails here, in its test: at the end of a session it would end the session.
+    """
+    _TOLD[name].update(_plain(numbers))
+    for key, number in _plain(worst or {}).items():
         _WORST[name][key] = max(number, _WORST[name].get(key, number))
+
+
+def _plain(numbers):
+    """The same without types of NumPy."""
+    return json.loads(json.dumps(numbers, default=lambda number: number.item()))
 
 
 def told():

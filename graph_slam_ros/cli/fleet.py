@@ -127,6 +127,8 @@ def _replay(args: argparse.Namespace) -> int:
     from graph_slam_ros.fleet.page import write_page
     from graph_slam_ros.fleet.replay import Fleet, replay_all
 
+    if args.scheduler and args.workers:
+        raise GraphSlamError("fleet replay: no use for --workers with --scheduler: its workers are there already")
     work = Fleet(
         args.recordings,
         args.out,

@@ -153,16 +153,18 @@ def _results(job: Job, made: Path) -> Row:
     with tempfile.TemporaryDirectory(prefix="graph_slam_fleet_") as scratch:
         source = local_copy(job.url, Path(scratch))
         done = replay(source, made / RUN, Config.from_mapping(dict(job.values)))
-        row = columns(done.summary)
+        row, lost = columns(done.summary), [*shortcomings(done.summary), *done.losses]
         if job.truth:
-            row |= _scores(made / RUN, job.truth)
+            try:
+                row |= _scores(made / RUN, job.truth)
+            except GraphSlamError as error:
+                lost.append(f"not compared with the truth: {error}")
     if not done.summary["keyframes"]:
         raise GraphSlamError("no odometry of it could be used: graph_slam info says what is in it")
     if job.with_report:
         from graph_slam_ros.report import write_report
 
         write_report(made / RUN, made / REPORT)
-    lost = [*shortcomings(done.summary), *done.losses]
     return row | {
         "state": "incomplete" if lost else "done",
         "reason": " ".join(lost[0].split()) if lost else "",

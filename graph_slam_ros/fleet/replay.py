@@ -142,6 +142,8 @@ def replay_all(
     """
     settings_of(fleet.configs, fleet.settings)
     sources = find_sources(fleet.recordings)
+    for source in sources:
+        truth_of(fleet.truth, source)
     store = Store(fleet.out, new=True)
     with store.locked():
         store.forget_attempts()

@@ -132,11 +132,6 @@ class Store:
         write_whole(self.folder / RECORDINGS, text.encode())
 
 
-def attempts(folder: Path, key: str) -> int:
-    """The number of times that a job was begun."""
-    return sum((folder / ATTEMPTS / f"{key}.{n}").exists() for n in range(1, MOST_ATTEMPTS + 1))
-
-
 def begin_attempt(folder: Path, key: str) -> int:
     """Note that a job begins; returns how often it did, this time included.
 

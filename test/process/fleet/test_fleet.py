@@ -118,6 +118,16 @@ def test_a_job_beyond_its_limits_is_a_row_and_the_others_are_done(drives, tmp_pa
     assert [row["state"] for row in again.rows] == ["done"], "a machine that failed is not the end of it"
 
 
+def test_without_its_truth_a_run_is_kept_and_says_so(drives, tmp_path):
+    truth = "{folder}/{stem}.tum"
+    done = replay_all(Fleet([str(drives / "d1.mcap")], tmp_path / "out", truth=truth), Workers(count=1))
+    (row,) = done.rows
+    assert row["state"] == "incomplete"
+    assert "not compared with the truth" in row["reason"]
+    assert "d1.tum" in row["reason"]
+    assert (tmp_path / "out/jobs" / row["key"] / "run/path.tum").is_file()
+
+
 def test_stopped_by_a_signal_it_goes_on_where_it_was(drives, serial, tmp_path):
     out = tmp_path / "out"
     options = ["replay", str(drives), "--out", str(out), "--workers", "1"]
@@ -154,6 +164,11 @@ def test_mistakes_are_refused_in_one_line(drives, tmp_path):
     for arguments, says in (
         (("replay", tmp_path / "none", "--out", tmp_path / "o"), "no such file"),
         (("replay", drives, "--out", tmp_path / "o", "--set", "keyframes.x=1"), "unknown parameter"),
+        (("replay", drives, "--out", tmp_path / "o", "--truth", "{bag}.tum"), "knows {path}, {folder} and {stem}"),
+        (
+            ("replay", drives, "--out", tmp_path / "o", "--scheduler", "tcp://x:1", "--workers", 2),
+            "no use for --workers",
+        ),
         (("table", drives), "not the folder of a fleet"),
         (("compare", drives, drives), "no table.parquet"),
     ):

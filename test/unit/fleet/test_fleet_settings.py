@@ -5,7 +5,6 @@ import pytest
 pytest.importorskip("distributed", reason="the extra fleet is not installed")
 
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.fleet import store
 from graph_slam_ros.fleet.compare import compare, markdown, parse_limit
 from graph_slam_ros.fleet.page import write_page
 from graph_slam_ros.fleet.recordings import find_sources, fingerprint, local_copy
@@ -122,7 +121,6 @@ def test_results_that_are_there_stay(tmp_path):
         keep(tmp_path / "out", "key", made, {"value": value})
     assert Store(tmp_path / "out").rows() == [{"value": 1}]
     assert [begin_attempt(tmp_path / "out", "key") for _ in range(4)] == [1, 2, 3, 4]
-    assert store.attempts(tmp_path / "out", "key") == 3
 
 
 def rows(factor=1.0, failed=(), count=8):
