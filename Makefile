@@ -39,7 +39,7 @@ demo: install
 	@$(BIN)/graph_slam demo --force
 
 # Four on two cores, too: tests of nodes wait for half of their time.
-PYTEST := $(BIN)/python -m pytest -q -n 4 --dist worksteal --durations=25 --durations-min=2
+PYTEST := $(BIN)/python -m pytest -q -n 4 --dist worksteal --durations=25 --durations-min=2 --timeout=900
 
 check: lint $(VENV)/kernels.stamp
 	$(PYTEST) -m unit

@@ -91,6 +91,7 @@ setup(
             "mypy>=1.8",
             "playwright>=1.65.2",  # with an installed Chromium, for the report
             "pytest>=7.4",
+            "pytest-timeout>=2.3",  # a test that hangs fails, and says where
             "pytest-xdist>=3.5",
             "ruff>=0.6",
             "types-PyYAML>=6.0",
