@@ -13,10 +13,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 from graph_slam_ros import cli
 from graph_slam_ros.fleet.engine import Workers, connected, run_jobs
+from graph_slam_ros.fleet.isolation import run_isolated
 from graph_slam_ros.fleet.job import Job
 from graph_slam_ros.fleet.replay import Fleet, replay_all
 
@@ -55,7 +57,7 @@ def overhead(scratch: Path) -> None:
     jobs = [Job(f"{k}", "", f"{k}", "", {}, "", str(scratch), 1.0, 0, with_report=False) for k in range(NOTHING)]
     begun, cpu = time.perf_counter(), _cpu_s()
     with connected(Workers(count=2)) as client:
-        rows = list(run_jobs(client, jobs, lambda items, _: items, _nothing))
+        rows = list(run_jobs(client, jobs, lambda items, _: items, partial(run_isolated, function=_nothing)))
     spent, took = _cpu_s() - cpu, time.perf_counter() - begun
     print(
         f"{len(rows)} jobs of no work: {took:.0f} s (asked 300), "

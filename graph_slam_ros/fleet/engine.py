@@ -12,7 +12,8 @@ from distributed import Client, LocalCluster, as_completed
 
 from graph_slam_ros import __version__
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.fleet.job import Job, failed, run_job, why_it_died
+from graph_slam_ros.fleet.isolation import run_isolated
+from graph_slam_ros.fleet.job import Job, failed, why_it_died
 from graph_slam_ros.fleet.recordings import Source, fingerprint
 from graph_slam_ros.fleet.store import MOST_ATTEMPTS, Row, Store
 
@@ -24,6 +25,7 @@ _SETTINGS = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": False,  # a job has its own limit
     "distributed.scheduler.work-stealing": False,
+    "distributed.scheduler.no-workers-timeout": "300s",  # jobs fail then, instead of waiting for ever
     "distributed.admin.log-format": "%(message)s",
     "logging.distributed": "critical",
 }
@@ -112,12 +114,11 @@ def fingerprints(client: Client, store: Store, sources: Sequence[Source], progre
 
 
 def run_jobs(
-    client: Client, jobs: Sequence[Job], progress: Progress, function: Callable[[Job], Row] = run_job
+    client: Client, jobs: Sequence[Job], progress: Progress, function: Callable[[Job], Row] = run_isolated
 ) -> Iterator[Row]:
     """Run jobs in their order, and yield the row of each when it is done.
 
-    A job whose worker ends is begun again, on another one where there is one, three times in all. Then its row has the
-    reason.
+    A job whose process ends, or whose worker does, is begun again, three times in all. Then its row has the reason.
     """
     futures = client.map(function, jobs, key=[f"{job.recording} {job.key}" for job in jobs], pure=False, retries=2)
     by_future = dict(zip(futures, jobs, strict=True))
@@ -131,8 +132,8 @@ def run_jobs(
 
 
 def _lost(job: Job, future: Any) -> Row:
-    """The row of a job that no worker ended."""
+    """The row of a job that no worker could finish."""
     error = future.exception()
-    if type(error).__name__ == "KilledWorker":
+    if type(error).__name__ in ("KilledWorker", "ProcessEndedError"):
         return failed(job, why_it_died(Path(job.out), job.key))
-    return failed(job, f"{type(error).__name__}: {error}")
+    return failed(job, str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}")
