@@ -95,7 +95,8 @@ def memory():  # type: ignore[no-untyped-def]
 
 
 def pytest_sessionfinish(session) -> None:  # type: ignore[no-untyped-def]
-    """One of several processes hands over what was tried in it."""
+    """One of several processes hands over what was tried in it. Without unfreezing, DuckDB reports leaks at the end."""
+    gc.unfreeze()
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["reliability"] = reliability.told()
 

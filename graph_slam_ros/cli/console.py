@@ -120,13 +120,13 @@ def report_losses(losses: Sequence[str], warnings: Sequence[str] = ()) -> int:
     return LOSSES if losses else DONE
 
 
-def progress(label: str) -> Any:
+def progress(label: str, unit: str = "msg") -> Any:
     """Wrap an iterable in a progress bar on standard error, if that is a terminal."""
     from tqdm import tqdm
 
     def bar(items: Iterable[Any], total: int) -> Iterable[Any]:
         quiet = None if os.environ.get("GRAPH_SLAM_PROGRESS") is None else False
-        return tqdm(items, desc=label, total=total or None, unit="msg", leave=False, disable=quiet, file=sys.stderr)
+        return tqdm(items, desc=label, total=total or None, unit=unit, leave=False, disable=quiet, file=sys.stderr)
 
     return bar
 

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -140,13 +141,15 @@ def _replay(args: argparse.Namespace) -> int:
         args.report,
     )
     try:
-        done = replay_all(work, Workers(args.scheduler, args.workers), console.progress, _name_dashboard)
+        done = replay_all(work, Workers(args.scheduler, args.workers), _progress, _name_dashboard)
     except KeyboardInterrupt:
         console.warn(f"stopped: what is done is in {args.out}, and the same command goes on from there")
         return console.INTERRUPTED
     page = write_page(args.out, done.rows)
     for name in done.unreadable:
         console.warn(f"lost: {name}: cannot be read")
+    for name, first in done.copies.items():
+        console.warn(f"not replayed: {name}: a copy of {first}, which has the row")
     failed = [row for row in done.rows if row["state"] == "failed"]
     for row in failed:
         console.warn(f"failed: {row['recording']} ({row['setting']}): {row['reason']}", most=console.SENTENCE)
@@ -159,6 +162,20 @@ def _replay(args: argparse.Namespace) -> int:
     )
     console.then(f"{console.command('fleet', 'table', args.out, '--order', 'rmse_m DESC')} (the worst first)")
     return console.LOSSES if failed or incomplete or done.unreadable else console.DONE
+
+
+def _progress(label: str) -> Any:
+    """Return what wraps hashes or rows in a progress bar, which counts failed ones."""
+
+    def bar(items: Iterable[Any], total: int) -> Iterator[Any]:
+        failed, shown = 0, console.progress(label, " recordings" if label == "hash" else " runs")(items, total)
+        for item in shown:
+            if isinstance(item, dict) and item["state"] == "failed":
+                failed += 1
+                shown.set_postfix_str(f"{failed} failed")
+            yield item
+
+    return bar
 
 
 def _name_dashboard(link: str) -> None:

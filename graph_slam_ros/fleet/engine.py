@@ -1,6 +1,7 @@
 """Runs jobs on the workers of Dask: processes of this machine, or those of a scheduler that is there already."""
 
 import contextlib
+import itertools
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -120,20 +121,34 @@ def run_jobs(
 
     A job whose process ends, or whose worker does, is begun again, three times in all. Then its row has the reason.
     """
-    futures = client.map(function, jobs, key=[f"{job.recording} {job.key}" for job in jobs], pure=False, retries=2)
-    by_future = dict(zip(futures, jobs, strict=True))
-    for future in progress(as_completed(futures, loop=client.loop), len(jobs)):
-        job = by_future.pop(future)
-        if future.status == "finished":
-            yield future.result()
-        else:
-            yield _lost(job, future)
+    yield from progress(_rows(client, jobs, function), len(jobs))
+
+
+def _rows(client: Client, jobs: Sequence[Job], function: Callable[[Job], Row]) -> Iterator[Row]:
+    """The rows of jobs. The scheduler has one job for each thread of a worker.
+
+    So a worker that ends takes no job with it that it has not begun, and a million jobs need no memory there.
+    """
+    left, at_work, done = iter(jobs), dict[Any, Job](), as_completed(loop=client.loop)
+
+    def fill() -> None:
+        room = max(sum(client.nthreads().values()), 1) - len(at_work)
+        for job in itertools.islice(left, max(room, 0)):
+            future = client.submit(function, job, key=f"{job.recording} {job.key}", pure=False, retries=2)
+            at_work[future] = job
+            done.add(future)
+
+    fill()
+    for future in done:
+        job = at_work.pop(future)
+        row = future.result() if future.status == "finished" else _lost(job, future.exception())
         future.release()
+        fill()
+        yield row
 
 
-def _lost(job: Job, future: Any) -> Row:
+def _lost(job: Job, error: BaseException) -> Row:
     """The row of a job that no worker could finish."""
-    error = future.exception()
     if type(error).__name__ in ("KilledWorker", "ProcessEndedError"):
         return failed(job, why_it_died(Path(job.out), job.key))
     return failed(job, str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}")

@@ -5,8 +5,10 @@ reason. What is wrong with the machine is an exception, or the end of the proces
 """
 
 import contextlib
+import errno
 import faulthandler
 import hashlib
+import os
 import platform
 import resource
 import shutil
@@ -34,6 +36,7 @@ from graph_slam_ros.fleet.store import (
 from graph_slam_ros.formats.files import read_bytes
 
 _HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv")
+_OF_THE_MACHINE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ESTALE, errno.EMFILE, errno.ENFILE}
 _TIMEOUT = "Timeout ("  # how faulthandler begins
 
 
@@ -85,6 +88,7 @@ def run_job(job: Job) -> Row:
             try:
                 row |= _results(job, made)
             except (GraphSlamError, MemoryError) as error:
+                _check_machine(out, error)
                 row |= {"state": "failed", "reason": _reason(job, error)}
         keep(out, job.key, made, row)
     finally:
@@ -96,11 +100,21 @@ def _head(job: Job) -> Row:
     return {"key": job.key, "recording": job.recording, "setting": job.setting, "url": job.url, "truth": job.truth}
 
 
+def _check_machine(out: Path, error: BaseException) -> None:
+    """Raise the error of the operating system behind ``error`` if it says nothing about the recording."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in _OF_THE_MACHINE:
+            raise OSError(cause.errno, os.strerror(cause.errno), str(out)) from None
+        cause = cause.__cause__ or cause.__context__
+
+
 def failed(job: Job, reason: str) -> Row:
-    """Write and return the row of a job that did not end."""
+    """Return the row of a job that did not end, and write it where there is room."""
     row = _head(job) | {"state": "failed", "reason": reason, "attempts": MOST_ATTEMPTS, "retry": True}
-    made = Path(tempfile.mkdtemp(prefix=f".{job.key}.", dir=Path(job.out) / JOBS))
-    keep(Path(job.out), job.key, made, row)
+    with contextlib.suppress(OSError):  # without the row it is run again, too
+        made = Path(tempfile.mkdtemp(prefix=f".{job.key}.", dir=Path(job.out) / JOBS))
+        keep(Path(job.out), job.key, made, row)
     return row
 
 

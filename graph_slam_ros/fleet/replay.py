@@ -115,11 +115,20 @@ def jobs_of(fleet: Fleet, sources: Sequence[Source], known: Mapping[str, str]) -
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """The result of a fleet: all its rows, how many were there before, and recordings that could not be read."""
+    """The result of a fleet.
+
+    Attributes
+    ----------
+    rows : of all its jobs
+    reused : how many were there before
+    unreadable : recordings that could not be read
+    copies : recordings with the bytes and the truth of another one, which has the row, by their name
+    """
 
     rows: list[Row]
     reused: int
     unreadable: list[str]
+    copies: dict[str, str]
 
 
 def replay_all(
@@ -151,7 +160,10 @@ def replay_all(
         with connected(workers) as client:
             on_start(client.dashboard_link)
             known = fingerprints(client, store, sources, progress("hash"))
-            jobs = list({job.key: job for job in jobs_of(fleet, sources, known)}.values())
+            every = jobs_of(fleet, sources, known)
+            first = {job.key: job for job in reversed(every)}
+            jobs = [job for job in every if first[job.key] is job]
+            copies = {job.recording: first[job.key].recording for job in every if first[job.key] is not job}
             there = {job.key: row for job in jobs if (row := store.result(job.key)) and not row.get("retry")}
             left = [job for job in jobs if job.key not in there]
             store.discard(job.key for job in left)
@@ -161,4 +173,4 @@ def replay_all(
                     rows.append(row)
             finally:
                 write_table(store.folder, store.rows())
-    return Done(rows, len(there), [one.name for one in sources if one.url not in known])
+    return Done(rows, len(there), [one.name for one in sources if one.url not in known], copies)

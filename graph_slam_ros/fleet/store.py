@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -27,6 +28,7 @@ MARK, FORMAT = "fleet.json", "graph_slam_ros fleet"
 ROW, RUN, REPORT, TABLE, RECORDINGS = "row.json", "run", "report.html", "table.parquet", "recordings.txt"
 JOBS, ATTEMPTS = "jobs", "attempts"
 MOST_ATTEMPTS = 3
+_ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/")  # as Path leaves s3://
 
 Row = dict[str, Any]
 
@@ -52,6 +54,8 @@ class Store:
 
     def __init__(self, folder: Path, *, new: bool = False) -> None:
         self.folder = folder
+        if _ADDRESS.match(str(folder)):
+            raise GraphSlamError(f"{folder}: a fleet writes into a folder that all its machines see, not into a store")
         try:
             if new:
                 self._begin()

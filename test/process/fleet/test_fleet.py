@@ -17,7 +17,8 @@ from fleet_nodes import scheduler, wait_for
 
 from graph_slam_ros import cli
 from graph_slam_ros.errors import GraphSlamError
-from graph_slam_ros.fleet.engine import Workers, connected
+from graph_slam_ros.fleet.engine import Workers, connected, run_jobs
+from graph_slam_ros.fleet.job import Job
 from graph_slam_ros.fleet.replay import Fleet, replay_all
 from graph_slam_ros.runs.replay import replay
 from graph_slam_ros.slam import Config
@@ -83,6 +84,7 @@ def test_one_command_replays_all_and_the_second_time_nothing(drives, serial, tmp
     assert {file: file.stat().st_mtime_ns for file in out.glob("jobs/*/row.json")} == stamps
     shown = fleet("table", out, "--where", "state = 'done'", "--order", "rmse_m DESC")
     assert shown.stdout.count(".mcap") == 3
+    assert not shown.stderr
     assert fleet("compare", out, out, "--fail", "rmse>1.02x").returncode == 0
 
 
@@ -160,6 +162,39 @@ def test_a_scheduler_without_workers_is_named(tmp_path):
             pass
 
 
+def test_a_full_disk_is_named_and_with_room_the_same_command_goes_on(drives, serial, tmp_path):
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "none", tmp_path], check=False).returncode:
+        pytest.skip("needs the right to mount a small file system")
+    try:
+        full = fleet("replay", drives / "d1.mcap", "--out", tmp_path / "out", "--workers", 1)
+        assert full.returncode in (2, 3), full
+        assert "No space left on device" in full.stderr
+        assert "Traceback" not in full.stderr
+        subprocess.run(["mount", "-o", "remount,size=20m", tmp_path], check=True)
+        done = replay_all(Fleet([str(drives / "d1.mcap")], tmp_path / "out"), Workers(count=1))
+        assert equal_to_serial(tmp_path / "out", done.rows, serial) == 1
+    finally:
+        subprocess.run(["umount", "--lazy", tmp_path], check=False)
+
+
+def test_a_copy_of_a_recording_is_named(drives, tmp_path):
+    (tmp_path / "same.mcap").write_bytes((drives / "damaged.mcap").read_bytes())
+    both = (drives / "damaged.mcap", tmp_path / "same.mcap")
+    done = fleet("replay", *both, "--out", tmp_path / "out", "--workers", 1)
+    assert "not replayed: same.mcap: a copy of damaged.mcap, which has the row" in done.stderr
+    assert "runs              1 " in done.stdout
+
+
+def test_a_worker_has_no_job_but_the_one_that_it_runs():
+    jobs = [Job(f"{k}", "", f"{k}", "", {}, "", "", 10.0, 0, with_report=False) for k in range(9)]
+    with connected(Workers(count=2)) as client:
+        most = 0
+        for row in run_jobs(client, jobs, lambda items, _: items, lambda job: {"key": job.key}):
+            most = max(most, *map(len, client.processing().values()))
+            assert row["key"] in {job.key for job in jobs}
+    assert most <= 1
+
+
 def test_mistakes_are_refused_in_one_line(drives, tmp_path):
     for arguments, says in (
         (("replay", tmp_path / "none", "--out", tmp_path / "o"), "no such file"),
@@ -169,6 +204,7 @@ def test_mistakes_are_refused_in_one_line(drives, tmp_path):
             ("replay", drives, "--out", tmp_path / "o", "--scheduler", "tcp://x:1", "--workers", 2),
             "no use for --workers",
         ),
+        (("replay", drives, "--out", "s3://bucket/out"), "writes into a folder that all its machines see"),
         (("table", drives), "not the folder of a fleet"),
         (("compare", drives, drives), "no table.parquet"),
     ):
