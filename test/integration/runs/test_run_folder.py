@@ -359,6 +359,7 @@ OF_FILES = {
     "report/page.py": {f"(_HERE / 'page.{kind}').read_text" for kind in ("css", "html", "js")} | {"file.read_text"},
     "fleet/store.py": {"os.open", "mark.unlink", "shutil.rmtree", "made.rename"},  # its own jobs and marks
     "fleet/job.py": {"open", "shutil.rmtree", "Path('/proc/self/clear_refs').write_text"},
+    "fleet/isolation.py": {"os.fdopen"},
     "view/page.py": {"(_HERE / f'edits.{kind}').read_text", "(_HERE / name).read_text"},
     "report/places.py": {"Image.open"},  # from memory
 }
