@@ -12,6 +12,7 @@ from graph_slam_ros.errors import GraphSlamError
 
 _NEEDED = ("dask", "distributed", "fsspec", "pyarrow", "duckdb")
 _MIB = 2**20
+_MOST_NAMED = 20
 
 
 def fleet(args: argparse.Namespace) -> int:
@@ -99,6 +100,7 @@ def _add_table(commands: Any) -> None:
     sub.add_argument("folder", type=Path, metavar="DIR", help="folder of the fleet")
     sub.add_argument("--where", default="", metavar="SQL", help="condition on the columns")
     sub.add_argument("--order", default="", metavar="SQL", help="columns to sort by")
+    sub.add_argument("--most", type=values.count, default=1000, metavar="N", help="rows to print (default: 1000)")
     sub.add_argument("--columns", default="", metavar="A,B", help="columns to print; all prints all")
 
 
@@ -151,8 +153,10 @@ def _replay(args: argparse.Namespace) -> int:
     for name, first in done.copies.items():
         console.warn(f"not replayed: {name}: a copy of {first}, which has the row")
     failed = [row for row in done.rows if row["state"] == "failed"]
-    for row in failed:
+    for row in failed[:_MOST_NAMED]:
         console.warn(f"failed: {row['recording']} ({row['setting']}): {row['reason']}", most=console.SENTENCE)
+    if len(failed) > _MOST_NAMED:
+        console.warn(f"failed: {len(failed) - _MOST_NAMED} more: graph_slam fleet table --where \"state = 'failed'\"")
     incomplete = [row for row in done.rows if row["state"] == "incomplete"]
     console.show(
         f"runs       {len(done.rows):8d}   of them {done.reused} were there",
@@ -189,7 +193,10 @@ def _table(args: argparse.Namespace) -> int:
 
     Store(args.folder)
     names = () if args.columns == "all" else args.columns.split(",") if args.columns else FIRST
-    rows = read_table(args.folder, args.where, args.order, names)
+    rows = read_table(args.folder, args.where, args.order, names, args.most + 1)
+    if len(rows) > args.most:
+        rows.pop()
+        console.warn(f"these are {args.most} rows, and there are more: --most N prints N")
     if not rows:
         console.show("no rows")
         return console.DONE

@@ -19,11 +19,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from graph_slam_ros.config.config import flatten
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.fleet.recordings import local_copy
 from graph_slam_ros.fleet.store import (
     ATTEMPTS,
+    ERRORS,
     JOBS,
     MOST_ATTEMPTS,
     REPORT,
@@ -37,6 +40,7 @@ from graph_slam_ros.formats.files import read_bytes
 
 _HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv")
 _OF_THE_MACHINE = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.ESTALE, errno.EMFILE, errno.ENFILE}
+_PARTS = 40
 _TIMEOUT = "Timeout ("  # how faulthandler begins
 
 
@@ -203,9 +207,15 @@ def columns(summary: Mapping[str, Any]) -> Row:
 
 def _scores(run: Path, truth: str) -> Row:
     """The errors of a run against the truth."""
-    from graph_slam_ros.analysis.evaluation import evaluate
+    from graph_slam_ros.analysis.evaluation import dimensions_of, evaluate, input_topics, scored_drive
+    from graph_slam_ros.analysis.path_error import matched
+    from graph_slam_ros.analysis.trajectories import read_truth
 
-    scores = evaluate(run, truth).as_dict()
+    known = read_truth(truth, "", input_topics(run))
+    scores = evaluate(run, known).as_dict()
+    path = scored_drive(run, known.trajectory).estimate
+    errors = matched(path, known.trajectory, dimensions_of(run)).position_errors_m
+    parts = np.array_split(errors, min(len(errors), _PARTS))
     flat = dict(flatten(scores))
     drift = scores["drift"].get("per_m") or {}
     angle = scores.get("heading_rad") or scores.get("angle_rad") or {}
@@ -216,6 +226,7 @@ def _scores(run: Path, truth: str) -> Row:
         "rpe_m_per_m": (drift.get("position_m_per_m") or {}).get("rmse"),
         "map_rmse_m": flat.get("map_m.rmse"),
         "nees": flat.get("consistency.poses.mean"),
+        ERRORS: [round(float(np.sqrt(np.mean(part**2))), 4) for part in parts],
         "odometry_rmse_m": flat.get("odometry.position_m.rmse"),
     }
 

@@ -7,8 +7,9 @@ from typing import Any
 from urllib.parse import quote
 
 from graph_slam_ros import __version__
-from graph_slam_ros.fleet.store import JOBS, REPORT
+from graph_slam_ros.fleet.store import ERRORS, JOBS, REPORT
 from graph_slam_ros.formats.durable import write_whole
+from graph_slam_ros.report.page import style
 
 PAGE = "index.html"
 _COLUMNS = (
@@ -21,15 +22,12 @@ _COLUMNS = (
     ("memory_mib", "memory [MiB]", 0),
 )
 _STYLE = """
-:root { color-scheme: light dark }
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 90rem; padding: 0 1rem }
-table { border-collapse: collapse; width: 100% }
-th, td { padding: .25rem .6rem; text-align: left; border-bottom: 1px solid #8886; vertical-align: top }
-td.n, th.n { text-align: right; font-variant-numeric: tabular-nums }
+table { width: 100% } td { overflow-wrap: anywhere }
 .failed { color: light-dark(#a40000, #ff8a80) } .incomplete { color: light-dark(#7a4a00, #ffc46b) }
 svg { vertical-align: middle; fill: none; stroke: currentColor }
 """
 _WIDTH, _HEIGHT = 120.0, 20.0
+_MOST = 1000  # a browser shows as many at once
 
 
 def write_page(folder: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
@@ -42,18 +40,31 @@ def write_page(folder: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
         "<meta http-equiv=Content-Security-Policy content=\"default-src 'none'; style-src 'unsafe-inline'\">",
-        f"<title>{escape(folder.name)}</title><style>{_STYLE}</style><main><h1>{escape(folder.name)}</h1><p>{head}.</p>",
+        f"<title>{escape(folder.name)}</title><style>{style()}{_STYLE}</style><main><h1>{escape(folder.name)}</h1><p>{head}.</p>",
         "<h2>Settings</h2>",
         _table(["setting", "runs", "error [m], mean", "errors, sorted"], [_setting(s, rows) for s in settings]),
         "<h2>Runs, the worst first</h2>",
+        _more(folder, rows),
         _table(
-            ["recording", "setting", "state", *(title for _, title, _ in _COLUMNS), "why"],
-            [_run(folder, row) for row in ordered],
+            ["recording", "setting", "state", *(title for _, title, _ in _COLUMNS), "error over the drive", "why"],
+            [_run(folder, row) for row in ordered[:_MOST]],
         ),
         f"<p>graph_slam_ros {escape(__version__)}</p></main></html>",
     ]
     write_whole(folder / PAGE, "\n".join(parts).encode())
     return folder / PAGE
+
+
+def _more(folder: Path, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Say what the table of runs lacks, and how to get it."""
+    lines = []
+    if len(rows) > _MOST:
+        lines.append(f"These are {_MOST} of {len(rows)} runs. graph_slam fleet table {folder} prints the others.")
+    if not any((folder / JOBS / row["key"] / REPORT).is_file() for row in rows):
+        lines.append("The runs have no reports: fleet replay --report writes them.")
+    if not any(row.get("rmse_m") is not None for row in rows):
+        lines.append("Nothing was compared with a truth: fleet replay --truth gives errors.")
+    return "".join(f"<p class=note>{escape(line)}</p>" for line in lines)
 
 
 def _badness(row: Mapping[str, Any]) -> tuple[int, float, str, str]:
@@ -82,12 +93,13 @@ def _run(folder: Path, row: Mapping[str, Any]) -> list[str]:
         f"<td>{escape(row['setting'])}",
         f"<td class={escape(state)}>{escape(state)}",
         *numbers,
+        f"<td>{_sparkline(row.get(ERRORS) or ())}",
         f"<td>{escape(row.get('reason') or '')}",
     ]
 
 
 def _number(text: str) -> str:
-    return f"<td class=n>{text}"
+    return f"<td class=number>{text}"
 
 
 def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -101,7 +113,7 @@ def _sparkline(values: Sequence[float]) -> str:
         return ""
     step, top = _WIDTH / (len(values) - 1), max(values)
     points = " ".join(f"{k * step:.1f},{_HEIGHT - 1 - (_HEIGHT - 2) * v / top:.1f}" for k, v in enumerate(values))
-    label = f"{values[0]:.3f} to {values[-1]:.3f} m"
+    label = f"{values[0]:.3f} m to {values[-1]:.3f} m, at most {top:.3f} m"
     return (
         f"<svg width={_WIDTH:.0f} height={_HEIGHT:.0f} role=img aria-label='{label}'><title>{label}</title>"
         f"<polyline points='{points}'/></svg>"

@@ -27,6 +27,8 @@ from graph_slam_ros.formats.files import read_text
 MARK, FORMAT = "fleet.json", "graph_slam_ros fleet"
 ROW, RUN, REPORT, TABLE, RECORDINGS = "row.json", "run", "report.html", "table.parquet", "recordings.txt"
 JOBS, ATTEMPTS = "jobs", "attempts"
+ERRORS = "errors_m"
+"""Errors of parts of a drive, in its order. The page draws them."""
 MOST_ATTEMPTS = 3
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.-]+:/")  # as Path leaves s3://
 
@@ -105,10 +107,10 @@ class Store:
             return row if isinstance(row, dict) else None
         return None
 
-    def rows(self) -> list[Row]:
-        """The rows of all jobs, in order of their keys."""
+    def rows(self) -> Iterator[Row]:
+        """Yield the rows of all jobs, in order of their keys."""
         keys = sorted(one.name for one in (self.folder / JOBS).iterdir() if not one.name.startswith("."))
-        return [row for key in keys if (row := self.result(key)) is not None]
+        return (row for key in keys if (row := self.result(key)) is not None)
 
     def forget_attempts(self) -> None:
         """Remove the marks of jobs that were begun: those of a fleet that was stopped do not count."""

@@ -35,6 +35,11 @@ class Panel:
     data: Any
 
 
+def style() -> str:
+    """Return the style of the pages."""
+    return (_HERE / "page.css").read_text(encoding="utf-8")
+
+
 def whole_page(made: Contents, script: str, panel: Panel | None = None) -> str:
     """The whole HTML file; ``script`` is that of plotly."""
     own = (_HERE / "page.js").read_text(encoding="utf-8")
@@ -61,7 +66,7 @@ def whole_page(made: Contents, script: str, panel: Panel | None = None) -> str:
             f'<meta http-equiv="Content-Security-Policy" content="{html.escape(rules)}">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<title>{title}</title>",
-            f"<style>{(_HERE / 'page.css').read_text(encoding='utf-8')}{panel.css if panel else ''}</style></head>",
+            f"<style>{style()}{panel.css if panel else ''}</style></head>",
             body.strip(),
             f'<script type="application/json" id="data">{json_for_script(made.data)}</script>',
             f'<script type="text/plain" id="columns">{made.packing.block()}</script>',

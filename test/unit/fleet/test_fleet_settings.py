@@ -1,9 +1,15 @@
 """Settings, recordings and the folder of a fleet."""
 
+import shlex
+
 import pytest
+import yaml
+from places import ROOT
 
 pytest.importorskip("distributed", reason="the extra fleet is not installed")
 
+from graph_slam_ros import cli
+from graph_slam_ros.cli.parser import parser
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.fleet.compare import compare, markdown, parse_limit
 from graph_slam_ros.fleet.page import write_page
@@ -119,7 +125,7 @@ def test_results_that_are_there_stay(tmp_path):
         made = tmp_path / "out/jobs/.key.x"
         made.mkdir()
         keep(tmp_path / "out", "key", made, {"value": value})
-    assert Store(tmp_path / "out").rows() == [{"value": 1}]
+    assert list(Store(tmp_path / "out").rows()) == [{"value": 1}]
     assert [begin_attempt(tmp_path / "out", "key") for _ in range(4)] == [1, 2, 3, 4]
 
 
@@ -191,6 +197,28 @@ def test_the_table_is_filtered_with_sql_that_reaches_nothing_else(tmp_path):
     assert len(read_table(tmp_path)) == 8
 
 
+def test_a_table_of_many_rows_is_read_in_parts_and_printed_in_part(tmp_path, capsys):
+    write_table(tmp_path, ({"rare": 2.5 if k == 29_999 else None, **row} for k, row in enumerate(rows(count=30_000))))
+    assert [row["rare"] for row in read_table(tmp_path, "rare > 1")] == [2.5]
+    assert read_table(tmp_path, columns=("cpu_s",), order="cpu_s DESC", most=1) == [{"cpu_s": 30_000.0}]
+    (tmp_path / "fleet.json").write_text('{"format": "graph_slam_ros fleet"}')
+    assert cli.main(["fleet", "table", str(tmp_path), "--most", "3"]) == 0
+    said = capsys.readouterr()
+    assert len(said.out.splitlines()) == 4
+    assert "these are 3 rows, and there are more" in said.err
+
+
+def test_the_page_draws_the_error_over_the_drive_and_has_a_bounded_number_of_runs(tmp_path):
+    many = rows(count=1500)
+    many[1499] |= {"errors_m": [0.1, 0.4, 0.2]}
+    page = write_page(tmp_path, many).read_text()
+    assert page.index("r1498<") < page.index("r1499<") < page.index("r1497<"), "the worst first"
+    assert page.count("at most 0.400 m") == 2, "a label and a title"
+    assert "These are 1000 of 1500 runs" in page
+    assert "r100<" not in page
+    assert "no reports" in page
+
+
 def test_hostile_names_are_text_on_the_page_and_in_markdown(tmp_path):
     hostile = rows(count=2)
     hostile[0] |= {"recording": "<script>alert(1)</script>|`x`", "state": "failed", "reason": "<b>'\"</b>"}
@@ -200,3 +228,17 @@ def test_hostile_names_are_text_on_the_page_and_in_markdown(tmp_path):
     (tmp_path / "c").mkdir()
     assert "<script>" not in markdown(compare(*tables(tmp_path / "c", rows(count=2), rows(count=2))))
     assert page.index("&lt;script&gt;") < page.index("r1<"), "failed ones are first"
+
+
+def test_the_example_of_a_workflow_has_commands_that_are_there():
+    example = yaml.safe_load((ROOT / "docs/examples/fleet.yml").read_text())
+    (job,) = example["jobs"].values()
+    lines = [step["run"] for step in job["steps"] if step.get("run", "").startswith("graph_slam ")]
+    commands = [parser().parse_args(shlex.split(line.partition("||")[0])[1:]) for line in lines]
+    replayed, compared = commands
+    assert replayed.truth == "{path}:/ground_truth"
+    assert compared.new == replayed.out
+    assert [parse_limit(text).metric for text in compared.fail] == ["rmse_m", "cpu_s"]
+    (installed,) = [step["run"] for step in job["steps"] if "pip install" in step.get("run", "")]
+    assert "[fleet,report]" in installed
+    assert str(compared.markdown) in " ".join(step.get("run", "") for step in job["steps"] if "SUMMARY" in str(step))
