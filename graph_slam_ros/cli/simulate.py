@@ -47,12 +47,9 @@ def simulate(args: argparse.Namespace) -> int:
 
 
 def _write_bag(args: argparse.Namespace, faults: "list[Fault]") -> None:
-    from graph_slam_ros.simulation import WrongMessage, faulty_recording, write_bag, write_table
+    from graph_slam_ros.simulation import WrongMessage, write_faulty_bag, write_table
 
-    recording, wrong = faulty_recording(_recorded(args), faults, args.seed)
-    write_bag(recording, args.out)
-    if any(fault.is_of_messages for fault in faults):
-        _spoil_messages(args.out, args.out, faults, args.seed)
+    wrong = write_faulty_bag(_recorded(args), args.out, faults, args.seed)
     console.show(f"wrote {args.out}")
     if faults:
         write_table(_companion(args.out, ".faults.csv"), WrongMessage, wrong)
@@ -65,6 +62,8 @@ def _is_recording(path: Path) -> bool:
 
 def _spoil_recording(args: argparse.Namespace, faults: "list[Fault]") -> int:
     """A recording of the user with faults in its messages."""
+    from graph_slam_ros.simulation import spoil_bag
+
     for what, given in (("--set", args.set), ("--closures", args.closures), ("--poses", args.poses)):
         if given:
             raise GraphSlamError(f"{args.scenario}: no use for {what}: it is no world")
@@ -74,18 +73,10 @@ def _spoil_recording(args: argparse.Namespace, faults: "list[Fault]") -> int:
     if not faults:
         raise GraphSlamError(f"{args.scenario}: no --fault, so nothing to do")
     console.check_file(args.out, force=args.force, source=Path(args.scenario))
-    _spoil_messages(Path(args.scenario), args.out, faults, args.seed)
+    spoil_bag(Path(args.scenario), args.out, faults, args.seed)
     console.show(f"wrote {args.out}")
     console.then(console.command("check", args.out))
     return console.DONE
-
-
-def _spoil_messages(source: Path, out: Path, faults: "list[Fault]", seed: int) -> None:
-    from graph_slam_ros.simulation import Drive, spoil_messages
-
-    drive = Drive(source)
-    spoil_messages(drive, faults, seed)
-    drive.write(out)
 
 
 def _write_graph(args: argparse.Namespace, faults: "list[Fault]") -> None:

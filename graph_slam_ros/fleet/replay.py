@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from distributed import Client
+
 from graph_slam_ros.config import Config
 from graph_slam_ros.config.config import flatten
 from graph_slam_ros.errors import GraphSlamError
@@ -156,7 +158,6 @@ def replay_all(
     store = Store(fleet.out, new=True)
     with store.locked():
         store.forget_attempts()
-        rows: list[Row] = []
         with connected(workers) as client:
             on_start(client.dashboard_link)
             known = fingerprints(client, store, sources, progress("hash"))
@@ -164,13 +165,19 @@ def replay_all(
             first = {job.key: job for job in reversed(every)}
             jobs = [job for job in every if first[job.key] is job]
             copies = {job.recording: first[job.key].recording for job in every if first[job.key] is not job}
-            there = {job.key: row for job in jobs if (row := store.result(job.key)) and not row.get("retry")}
-            left = [job for job in jobs if job.key not in there]
-            store.discard(job.key for job in left)
-            rows += there.values()
             try:
-                for row in run_jobs(client, left, progress("replay")):
-                    rows.append(row)
+                by_key, reused = run_missing(client, store, jobs, progress("replay"))
             finally:
                 write_table(store.folder, store.rows())
-    return Done(rows, len(there), [one.name for one in sources if one.url not in known], copies)
+    unreadable = [one.name for one in sources if one.url not in known]
+    return Done(list(by_key.values()), reused, unreadable, copies)
+
+
+def run_missing(client: Client, store: Store, jobs: Sequence[Job], progress: Progress) -> tuple[dict[str, Row], int]:
+    """Run the jobs that have no result yet. Returns the rows of all by key, and how many were there."""
+    by_key = {job.key: job for job in jobs}
+    rows = {key: row for key in by_key if (row := store.result(key)) and not row.get("retry")}
+    reused, left = len(rows), [job for key, job in by_key.items() if key not in rows]
+    store.discard(job.key for job in left)
+    rows |= {row["key"]: row for row in run_jobs(client, left, progress)}
+    return rows, reused

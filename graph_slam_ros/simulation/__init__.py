@@ -4,8 +4,9 @@ recording = simulate("warehouse", seed=7, aisles=5)
 write_bag(recording, "warehouse.mcap")
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from graph_slam_ros.errors import GraphSlamError
@@ -50,15 +51,36 @@ def simulate(world: str, /, seed: int, **options: Any) -> Recording:
     GraphSlamError
         Unknown world or option (those that exist are named), wrong type, or a value out of bounds.
     """
+    of_world, of_instruments = check_options(world, seed, options)
+    return with_instruments(WORLDS[world].drive(seed, of_world), seed, of_instruments)
+
+
+def check_options(world: str, seed: int, options: Mapping[str, Any]) -> tuple[Any, Instruments]:
+    """Return the options of a world and of its instruments; as ``simulate``, which drives through it."""
     if world not in WORLDS:
         raise GraphSlamError(f"no world {world!r}; there are {', '.join(WORLDS)}")
     if seed < 0:
         raise GraphSlamError(f"seed {seed} is negative")
-    of_world, of_instruments = WORLDS[world].options, {o.name for o in options_of(Instruments)}
+    of_instruments = {o.name for o in options_of(Instruments)}
     chosen = {name: value for name, value in options.items() if name in of_instruments}
     rest = {name: value for name, value in options.items() if name not in of_instruments}
-    recording = WORLDS[world].drive(seed, fill(world, of_world, rest, [*of_instruments]))
-    return with_instruments(recording, seed, fill(world, Instruments, chosen))
+    return fill(world, WORLDS[world].options, rest, [*of_instruments]), fill(world, Instruments, chosen)
+
+
+def write_faulty_bag(recording: Recording, path: Path, faults: Sequence[Fault], seed: int) -> list[WrongMessage]:
+    """Write a bag of a recording with faults. Returns the measurements that are wrong."""
+    faulty, wrong = faulty_recording(recording, faults, seed)
+    write_bag(faulty, path)
+    if any(fault.is_of_messages for fault in faults):
+        spoil_bag(path, path, faults, seed)
+    return wrong
+
+
+def spoil_bag(source: Path, out: Path, faults: Sequence[Fault], seed: int) -> None:
+    """Write a copy of a recording, with faults in its messages."""
+    drive = Drive(source)
+    spoil_messages(drive, faults, seed)
+    drive.write(out)
 
 
 __all__ = [
@@ -73,6 +95,7 @@ __all__ = [
     "World",
     "WrongLine",
     "WrongMessage",
+    "check_options",
     "city_graph",
     "faulty_graph",
     "faulty_recording",
@@ -80,9 +103,11 @@ __all__ = [
     "measurements",
     "options_of",
     "simulate",
+    "spoil_bag",
     "spoil_messages",
     "with_closures",
     "write_bag",
+    "write_faulty_bag",
     "write_graph",
     "write_table",
 ]

@@ -20,6 +20,7 @@ from graph_slam_ros.slam.frontend.gyro import GyroState, SavedBias
 from graph_slam_ros.slam.frontend.keyframe_frontend import KeyframeFrontend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe, SightingPose
 from graph_slam_ros.slam.frontend.noise_factors import Key, Rescaling
+from graph_slam_ros.slam.frontend.sighting_edges import SightingEdges
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.kidnap_detector import Alarm, KidnapDetector
 from graph_slam_ros.slam.landmarks.landmark_frontend import LandmarkFrontend
@@ -128,6 +129,11 @@ class MapView:
     def _at_sightings(self, keyframe_poses: Array) -> Array:
         keyframes = keyframe_poses[self.sighting_poses.ids]
         return np.stack(self.space.group.compose(tuple(keyframes.T), tuple(self.sighting_poses.poses.T)), axis=-1)
+
+    @property
+    def sighting_origins(self) -> SightingEdges:
+        """The stamp and the place of each sighting that is an edge."""
+        return self._landmarks.map.origins
 
     @property
     def T_map_odom(self) -> Numbers:

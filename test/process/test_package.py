@@ -111,7 +111,6 @@ WITHIN = {
         *("recordings", "runs", "maps", "analysis"),
     },
     "view": {"graph", "solver", "measurements", "slam", "slam/robust", "runs", "maps", "analysis", "report"},
-    "fleet": {"formats", "config", "runs", "analysis", "report"},
     "simulation": {
         "chi_square",
         "edge_tags",
@@ -123,6 +122,7 @@ WITHIN = {
         "messages/inputs",
         "recordings",
     },
+    "fleet": {"graph", "solver", "formats", "config", "slam", "runs", "analysis", "report", "simulation"},
     "node": {
         *("graph", "warmup", "formats", "measurements", "config", "slam", "slam/frontend", "slam/robust"),
         *("messages", "messages/inputs", "recordings", "runs"),
@@ -166,7 +166,10 @@ THIRD_PARTY = {
     "recordings": {"rosbags", "mcap", "lz4", "zstandard"},  # the last two are mcap's own
 }
 SERVES = {"view/guard.py", "view/server.py"}  # with the extra `view`, which may not be there
-DISTRIBUTES = {f"fleet/{name}.py" for name in ("recordings", "job", "table", "engine", "replay", "compare")}
+DISTRIBUTES = {  # with the extra `fleet`
+    *(f"fleet/{name}.py" for name in ("recordings", "job", "table", "engine", "replay", "compare", "simulate")),
+    *(f"fleet/{name}.py" for name in ("search", "fit", "tune", "tuned")),
+}
 NOT_BELOW_MESSAGES = {"random", "secrets", "threading", "time", "uuid"}
 NEVER = {
     "graph": NOT_BELOW_MESSAGES | {"logging", "os", "pathlib"},
@@ -227,7 +230,7 @@ BULK = {  # the stored numbers of many vertices, or the noise of many edges, at 
     *("slam/calibration/model.py", "slam/calibration/rows.py"),
     *("slam/backend.py", "slam/robust/pairwise_consistency.py", "slam/robust/landmark_support.py"),
     *("runs/map_growth.py", "runs/ledger_file.py", "analysis/what_if.py", "simulation/pose_graph.py"),
-    "slam/lifelong/compaction.py",
+    *("slam/lifelong/compaction.py", "fleet/held_out.py"),
 }
 
 
@@ -337,7 +340,7 @@ def test_everything_but_the_node_imports_without_ros():
         for name in FILES
         if name not in SPEAK_MESSAGES
         and (name not in SERVES or find_spec("uvicorn"))
-        and (name not in DISTRIBUTES or all(map(find_spec, ("distributed", "duckdb", "fsspec"))))
+        and (name not in DISTRIBUTES or all(map(find_spec, ("distributed", "duckdb", "fsspec", "optuna"))))
     ]
     script = f"""
 import importlib, sys
