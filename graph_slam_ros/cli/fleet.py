@@ -220,6 +220,8 @@ def _replay(args: argparse.Namespace) -> int:
     page = write_page(args.out, done.rows)
     for name in done.unreadable:
         console.warn(f"lost: {name}: cannot be read")
+    for line in done.unreported:
+        console.warn(f"no report: {line}", most=console.SENTENCE)
     for name, first in done.copies.items():
         console.warn(f"not replayed: {name}: a copy of {first}, which has the row")
     failed = [row for row in done.rows if row["state"] == "failed"]

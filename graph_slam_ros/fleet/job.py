@@ -110,6 +110,21 @@ def run_job(job: Job) -> Row:
     return row
 
 
+def report_on(job: Job) -> Row:
+    """Write the report on a run that is there; returns which one.
+
+    Raises
+    ------
+    OSError
+        The disk or the store fails.
+    """
+    from graph_slam_ros.report import write_report
+
+    folder = Path(job.out) / JOBS / job.key
+    write_report(folder / RUN, folder / REPORT)
+    return _head(job) | {"state": "done"}
+
+
 def _head(job: Job) -> Row:
     about = {"key": job.key, "recording": job.recording, "setting": job.setting, "url": job.url, "truth": job.truth}
     return about | world_of(job.url)

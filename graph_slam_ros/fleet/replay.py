@@ -2,7 +2,8 @@
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ from graph_slam_ros.config import Config
 from graph_slam_ros.config.config import flatten
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.fleet.engine import Progress, Workers, connected, fingerprints, run_jobs
-from graph_slam_ros.fleet.job import Job
+from graph_slam_ros.fleet.isolation import run_isolated
+from graph_slam_ros.fleet.job import Job, report_on
 from graph_slam_ros.fleet.recordings import Source, find_sources
-from graph_slam_ros.fleet.store import Row, Store, job_key
+from graph_slam_ros.fleet.store import JOBS, REPORT, Row, Store, job_key
 from graph_slam_ros.fleet.table import write_table
 from graph_slam_ros.formats.parameters import parse_setting, read_parameters
 
@@ -115,6 +117,11 @@ def jobs_of(fleet: Fleet, sources: Sequence[Source], known: Mapping[str, str]) -
     return out
 
 
+def _lacks_report(store: Store, job: Job, row: Row) -> bool:
+    """Return whether a run is to have a report, and has none: it was there before without."""
+    return job.with_report and row["state"] != "failed" and not (store.folder / JOBS / job.key / REPORT).is_file()
+
+
 @dataclass(frozen=True, slots=True)
 class Done:
     """The result of a fleet.
@@ -124,6 +131,7 @@ class Done:
     rows : of all its jobs
     reused : how many were there before
     unreadable : recordings that could not be read
+    unreported : runs that were there and got no report, with the reason
     copies : recordings with the bytes and the truth of another one, which has the row, by their name
     """
 
@@ -131,6 +139,7 @@ class Done:
     reused: int
     unreadable: list[str]
     copies: dict[str, str]
+    unreported: list[str] = field(default_factory=list)
 
 
 def replay_all(
@@ -167,14 +176,17 @@ def replay_all(
             copies = {job.recording: first[job.key].recording for job in every if first[job.key] is not job}
             try:
                 by_key, reused = run_missing(client, store, jobs, progress("replay"))
+                bare = [job for job in jobs if _lacks_report(store, job, by_key[job.key])]
+                reported = list(run_jobs(client, bare, progress("report"), partial(run_isolated, function=report_on)))
             finally:
                 write_table(store.folder, store.rows())
     unreadable = [one.name for one in sources if one.url not in known]
-    return Done(list(by_key.values()), reused, unreadable, copies)
+    unreported = [f"{row['recording']}: {row['reason']}" for row in reported if row["state"] == "failed"]
+    return Done(list(by_key.values()), reused, unreadable, copies, unreported)
 
 
 def run_missing(client: Client, store: Store, jobs: Sequence[Job], progress: Progress) -> tuple[dict[str, Row], int]:
-    """Run the jobs that have no result yet. Returns the rows of all by key, and how many were there."""
+    """Run the jobs that have no result yet. Return the rows of all by key, and how many were there."""
     by_key = {job.key: job for job in jobs}
     rows = {key: row for key in by_key if (row := store.result(key)) and not row.get("retry")}
     reused, left = len(rows), [job for key, job in by_key.items() if key not in rows]
