@@ -101,8 +101,8 @@ class Surface:
             free[worst] = False
         return free
 
-    def offset(self, free: NDArray[np.bool_], without: int | None = None) -> Array:
-        """Return where the sum is least, (p,) from the centre, at most ``LONGEST`` in each parameter.
+    def offset(self, free: NDArray[np.bool_], without: int | None = None, longest: float = LONGEST) -> Array:
+        """Return where the sum is least, (p,) from the centre, at most ``longest`` in each parameter.
 
         Parameters
         ----------
@@ -113,8 +113,8 @@ class Surface:
         curvature = curvature[np.ix_(free, free)]
         out = np.zeros(len(free))
         if free.any():
-            step = -np.linalg.solve(curvature, gradient) if _is_bowl(curvature) else -np.sign(gradient) * LONGEST
-            out[free] = np.clip(step, -LONGEST, LONGEST)
+            step = -np.linalg.solve(curvature, gradient) if _is_bowl(curvature) else -np.sign(gradient) * longest
+            out[free] = np.clip(step, -longest, longest)
         return out
 
 
