@@ -89,7 +89,7 @@ def faults(scratch: Path, *, count: int = 60, workers: int = 16, period_s: float
     bags = recordings(scratch / "sixty", count)
     for seed in range(DAMAGED):
         file = bags / f"{seed * 11:03d}.mcap"
-        file.write_bytes(file.read_bytes()[:200] if seed % 2 else b"nothing")
+        file.write_bytes(file.read_bytes()[:200] if seed % 2 else b"nothing %d" % seed)
     serial = replay_all(Fleet([str(bags)], scratch / "serial"), Workers(count=1))
     killed, over = [], threading.Event()
     with scheduler(scratch, workers) as address, Client(address, set_as_default=False) as client:

@@ -52,3 +52,10 @@ def scheduler(folder: Path, workers: int):
                 process.wait(10.0)
             process.kill()
             process.wait()
+
+
+def children(pid: int) -> list[int]:
+    """Return the processes that a process has started."""
+    with contextlib.suppress(FileNotFoundError):
+        return [int(one) for file in Path(f"/proc/{pid}/task").glob("*/children") for one in file.read_text().split()]
+    return []

@@ -47,6 +47,7 @@ PROGRAMMES = {
     "fuzzing": tests("test_fuzzing.py"),
     "kernels": tests("test_kernels.py"),
     "drives": tests(*(f"test_{name}.py" for name in DRIVES)),
+    "fleet": tests("test_fleet_faults.py"),
     "odd_files": tests("test_odd_files.py"),
     **{f"guided_{name}": guided(name) for name in ("g2o", "yaml", "cdr", "journal")},
     "planted_faults": [sys.executable, "test/planted_faults.py"],

@@ -1,0 +1,151 @@
+"""Random faults of a fleet: every result has the bytes of a serial run, and the same command goes on."""
+
+import contextlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+pytest.importorskip("distributed", reason="the extra fleet is not installed")
+
+from distributed import Client
+from fleet_nodes import children, scheduler
+from reliability import tell, times
+
+from graph_slam_ros import cli
+from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.fleet.engine import Workers
+from graph_slam_ros.fleet.replay import Fleet, replay_all
+from graph_slam_ros.runs.replay import replay
+from graph_slam_ros.slam import Config
+
+HASHED = ("graph.g2o", "ledger.csv", "path.tum", "landmarks.csv", "map.mcap")
+COUNT = times(2, 12)
+DAMAGE = (b"", b"nothing", b"\x89MCAP0\r\n" + bytes(100))
+SOAK = pytest.mark.skipif(not times(0, 1), reason="takes minutes: make soak")
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    """Recordings, and three that are damaged, one of them cut off."""
+    folder = tmp_path_factory.mktemp("drives")
+    for seed in range(COUNT):
+        assert cli.main(["simulate", "pythonrobotics", "--out", str(folder / f"{seed}.mcap"), "--seed", str(seed)]) == 0
+    for k, content in enumerate(DAMAGE):
+        (folder / f"damaged{k}.mcap").write_bytes(content)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def serial(drives, tmp_path_factory):
+    """Bytes of the results, replayed one by one in this process."""
+    out = tmp_path_factory.mktemp("serial")
+    for seed in range(COUNT):
+        replay(drives / f"{seed}.mcap", out / f"{seed}", Config())
+    return {f"{seed}.mcap": contents(out / f"{seed}") for seed in range(COUNT)}
+
+
+def contents(run):
+    return {name: (run / name).read_bytes() for name in HASHED}
+
+
+def check(out, rows, serial):
+    """No result is wrong; return the recordings that have one."""
+    done = {row["recording"]: contents(out / "jobs" / row["key"] / "run") for row in rows if row["state"] == "done"}
+    assert done == {name: serial[name] for name in done}
+    assert all(row["attempts"] <= 3 for row in rows)
+    assert all(row["reason"] for row in rows if row["state"] != "done")
+    return set(done)
+
+
+def whole(drives, out, serial, workers=2):
+    """The same command again has all results, and leaves nothing half-written."""
+    rows = replay_all(Fleet([str(drives)], out), Workers(count=workers)).rows
+    assert check(out, rows, serial) == set(serial)
+    assert sum(row["state"] == "failed" for row in rows) == len(DAMAGE)
+    assert not list(out.glob("jobs/.*"))
+
+
+def begun(drives, out, *options):
+    command = [sys.executable, "-m", "graph_slam_ros.cli", "fleet", "replay", str(drives), "--out", str(out), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_a_fleet_that_is_killed_at_any_moment_goes_on(drives, serial, tmp_path):
+    stops = times(1, 10)
+    for seed in range(stops):
+        process = begun(drives, tmp_path / "out", "--workers", "2")
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.communicate(timeout=random.Random(seed).uniform(2.0, 6.0))
+        process.kill()
+        process.communicate()
+    whole(drives, tmp_path / "out", serial)
+    tell("fleets killed, and begun again", killed=stops)
+
+
+@SOAK
+def test_of_two_fleets_that_begin_together_one_is_refused(drives, serial, tmp_path):
+    for k in range(times(0, 5)):
+        both = [begun(drives, tmp_path / f"{k}", "--workers", "1") for _ in range(2)]
+        ends = [(*process.communicate(timeout=300), process.returncode) for process in both]
+        (refused,) = [said for _, said, code in ends if code == 2]
+        assert "another fleet writes into it" in refused
+        whole(drives, tmp_path / f"{k}", serial)
+
+
+@SOAK
+@pytest.mark.parametrize("seed", range(times(0, 5)))
+def test_random_faults_of_workers_over_tcp_change_no_result(drives, serial, tmp_path, seed):
+    """Workers and runs are killed, and runs are stopped, which is a hang; the limit of time is 8 s."""
+    chance, over, faults = random.Random(seed), threading.Event(), []
+    with scheduler(tmp_path, 4) as address, Client(address, set_as_default=False) as client:
+        client.wait_for_workers(4, timeout=120)
+
+        def disturb():
+            while not over.wait(chance.uniform(0.5, 4.0)):
+                worker = chance.choice(list(client.run(os.getpid).values()))
+                kind, victims = chance.choice(["worker", "run", "hang"]), children(worker)
+                victim = worker if kind == "worker" or not victims else chance.choice(victims)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(victim, signal.SIGSTOP if kind == "hang" and victim != worker else signal.SIGKILL)
+                    faults.append(kind)
+
+        disturber = threading.Thread(target=disturb)
+        disturber.start()
+        try:
+            rows = replay_all(Fleet([str(drives)], tmp_path / "out", limit_s=8.0), Workers(address)).rows
+        finally:
+            over.set()
+            disturber.join()
+    check(tmp_path / "out", rows, serial)
+    assert len(rows) == COUNT + len(DAMAGE), "none is without a row"
+    whole(drives, tmp_path / "out", serial)
+    tell("faults of workers over TCP", **{kind: faults.count(kind) for kind in set(faults)})
+
+
+@SOAK
+def test_any_limit_of_memory_and_any_full_disk_leave_nothing_wrong(drives, serial, tmp_path):
+    chance = random.Random(1)
+    for k in range(times(0, 8)):
+        memory = chance.randrange(1, 200) * 2**20
+        rows = replay_all(Fleet([str(drives)], tmp_path / f"m{k}", memory=memory), Workers(count=2)).rows
+        check(tmp_path / f"m{k}", rows, serial)
+        for row in rows:
+            assert row["state"] == "done" or row["recording"].startswith("damaged") or "memory" in row["reason"], row
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    for _ in range(times(0, 8)):
+        size = f"size={chance.randrange(50, 5000)}k"
+        if subprocess.run(["mount", "-t", "tmpfs", "-o", size, "none", disk], check=False).returncode:
+            pytest.skip("needs the right to mount a small file system")
+        try:
+            with contextlib.suppress(GraphSlamError, OSError):
+                check(disk / "out", replay_all(Fleet([str(drives)], disk / "out"), Workers(count=2)).rows, serial)
+            subprocess.run(["mount", "-o", "remount,size=50m", disk], check=True)
+            whole(drives, disk / "out", serial)
+        finally:
+            subprocess.run(["umount", "--lazy", disk], check=False)
