@@ -127,7 +127,7 @@ class Reference:
             there = (folder / name).read_bytes() if (folder / name).is_file() else None
             before = ([BEGUN] if name == "run.json" else [None]) if not saves else []
             known = [state[name] for state in self.saved[max(saves - 1, 0) :]] + before
-            if name == "run.json":  # when the journal is flushed depends on the time, and so do its bytes
+            if name == "run.json":  # when the journal is flushed, and CPU and memory, depend on the time
                 there, *known = map(without_marks, (there or b"{}", *known))
             assert there in known, f"{name} is neither the old nor the new one"
         for earlier in earlier_runs(folder).values():
@@ -135,9 +135,10 @@ class Reference:
 
 
 def without_marks(summary):
-    """A run.json but for the marks of the recordings."""
+    """A run.json but for the marks of the recordings, and what the process has cost."""
     told = json.loads(summary)
-    told.pop("recorded", None)
+    for name in ("recorded", "load"):
+        told.pop(name, None)
     return told
 
 

@@ -285,6 +285,7 @@ def _tables(out: Contents, summary: dict[str, Any], saved: Any, scores: Scores |
         "edits": [[shown(str(e)) for e in (one.name, one.text, one.who, one.when, one.why)] for one in edits],
         "classes": out.attempt(lambda: list(verdict.classes(summary))) or [],
     }
+    out.data["load"] = out.attempt(lambda: verdict.load(summary))
     out.data["waiting"] = [[shown(str(n)), shown(str(why))] for n, why in dict(summary.get("waiting") or {}).items()]
     out.data["chi2_per_dof"] = out.attempt(lambda: verdict.chi2_per_dof(saved)) if saved else None
     out.data["scores"] = str(scores).splitlines() if scores else None

@@ -579,6 +579,20 @@ const CHARTS = {
     return Plotly.newPlot(id, [{type: "scattergl", mode: "lines", x, y, line: {color: colours().estimate, width: 1}}],
       layout((axis) => ({xaxis: {...axis, title: {text: "keyframe"}}, yaxis: {...axis, title: {text: "the robot is moved by [m]"}}})), CONFIG);
   },
+  "chart-load": (id) => {
+    const {keyframes: x, ...of} = data.load, c = colours(), waited = of.backlog.some(Boolean);
+    const line = (name, y, colour, axis) => ({type: "scatter", mode: "lines", name, x, y, yaxis: axis, line: {color: colour, width: 1.5}});
+    const several = [line("CPU time of a keyframe [ms]", of.cpu_ms, c.estimate, "y"), line("memory [MiB]", of.memory_mib, c.truth, "y2")];
+    if (waited) several.push(line("backlog [measurements]", of.backlog, c.ink, "y3"));
+    return Plotly.newPlot(id, several, layout((axis) => {
+      const right = {...axis, overlaying: "y", side: "right", showgrid: false, rangemode: "tozero", tickmode: "auto"};
+      return {
+        margin: {l: 55, r: 65, t: 10, b: 40}, xaxis: {...axis, title: {text: "keyframe"}, domain: [0, waited ? 0.9 : 1]},
+        yaxis: {...axis, title: {text: "ms"}, rangemode: "tozero"}, yaxis2: {...right, title: {text: "MiB"}},
+        ...(waited ? {yaxis3: {...right, anchor: "free", position: 1, title: {text: "backlog"}}} : {}),
+      };
+    }), CONFIG);
+  },
   "chart-nees": (id) => {
     const [x, y] = data.nees.values.map(column), c = colours(), line = (name, value) => ({type: "scatter", mode: "lines", name, x: [0, data.map.keyframes], y: [value, value], line: {color: c.truth, width: 1, dash: "dot"}});
     return Plotly.newPlot(id, [{type: "scattergl", mode: "markers", name: "NEES of poses", x, y, marker: {size: 3, color: c.estimate}}, line("95 % band", data.nees.band[0]), {...line("95 % band", data.nees.band[1]), showlegend: false}],
@@ -627,6 +641,7 @@ function startCharts() {
     drawWhenSeen("chart-jumps", CHARTS["chart-jumps"]);
   } else byId("chart-jumps").replaceWith(element("p", "the run folder has no poses as they were published", {class: "quiet"}));
   if (data.drive) table("jumps", ["keyframe", "moved m", "turned deg", "edges judged there"], data.drive.jumps.map(([k, m, deg, edges]) => [linkTo("keyframe", k, String(k)), m, deg, edgeLinks(edges)]));
+  if (data.load) { byId("chart-load").hidden = false; drawWhenSeen("chart-load", CHARTS["chart-load"]); }
   if (data.nees) { byId("chart-nees").hidden = false; drawWhenSeen("chart-nees", CHARTS["chart-nees"]); }
   (data.charts ? data.charts.chi2 : []).forEach((one, at) => {
     byId("chi2-plots").append(element("div", undefined, {id: `chi2-${at}`, class: "plot"}));

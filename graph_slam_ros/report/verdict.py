@@ -191,7 +191,7 @@ def versions(run: Path, summary: Mapping[str, Any]) -> list[Row]:
 
 
 def timing(summary: Mapping[str, Any]) -> list[Row]:
-    """Time and backlog of the run, as its summary has them; its folder holds nothing of memory."""
+    """Time, memory and backlog of the run, as its summary has them."""
     rows: list[Row] = []
     if "time_s" in summary:
         rows.append(["time", f"{summary['time_s']:.1f} s"])
@@ -210,8 +210,24 @@ def timing(summary: Mapping[str, Any]) -> list[Row]:
         rows.append(["backlog at the end", f"{summary['unprocessed']} measurements accepted and not processed"])
     elif "unprocessed" in summary:
         rows.append(["backlog at the end", "none"])
-    rows.append(["memory", "not in a run folder: /diagnostics of the node has it"])
+    load = dict(summary.get("load") or {})
+    if load:
+        rows.append(["largest backlog", f"{max(load['backlog'])} measurements"])
+        rows.append(["memory, at most", f"{max(load['memory_mib']):.0f} MiB, with Python and its libraries"])
+    else:
+        rows.append(["memory", "not in this run folder: it was not ended, or is of an earlier version"])
     return rows
+
+
+def load(summary: Mapping[str, Any]) -> dict[str, list[float]] | None:
+    """CPU time for each keyframe [ms], memory [MiB] and backlog over the keyframes; None if the summary has no two."""
+    rows = dict(summary.get("load") or {})
+    at = [float(k) for k in rows.get("keyframes", ())]
+    if len(at) < 2:
+        return None
+    cpu = [float(s) for s in rows["cpu_s"]]
+    each = [1e3 * (b - a) / max(1.0, n - m) for a, b, m, n in zip(cpu, cpu[1:], at, at[1:], strict=False)]
+    return {"keyframes": at[1:], "cpu_ms": each, "memory_mib": rows["memory_mib"][1:], "backlog": rows["backlog"][1:]}
 
 
 def noise(summary: Mapping[str, Any]) -> list[Row]:

@@ -28,6 +28,7 @@ from graph_slam_ros.runs.folder import (
     summary_of,
 )
 from graph_slam_ros.runs.journal import BEGINS_IN_A_MAP, INGEST, MAP, MEASUREMENT, Parts, close_all, part_name, parts_of
+from graph_slam_ros.runs.load import Load
 from graph_slam_ros.runs.map_journal import GROWTH, MapGrowth
 from graph_slam_ros.runs.tables import counted, noise_summary, result_texts, summarize
 from graph_slam_ros.slam import Config, Counters, GraphSlam, Measurement, Update
@@ -78,6 +79,7 @@ class RunRecorder:
         self._bags = 0
         self._ended_bags: list[AppendedFile] = []
         self._next_path_at = 1.0
+        self._load = Load()
         self._room = ExitStack()
         self._room.enter_context(room(self.folder, force=force))
         try:
@@ -177,6 +179,7 @@ class RunRecorder:
         """Append what an update changed: the map, pose and TF, and the path and the landmarks when they have grown."""
         if not update or not slam.keyframes:
             return
+        self._load.add(len(slam.keyframes), max(0, self.accepted - slam.processed))
         with self._writing:
             if not self._is_ended:
                 self._record(slam)
@@ -207,7 +210,7 @@ class RunRecorder:
                 self._end_parts()
                 parts = self._ended_parts()
             unprocessed = max(0, self.accepted - slam.processed)
-            contents = (summary or {}) | parts | {"unprocessed": unprocessed}
+            contents = (summary or {}) | parts | {"unprocessed": unprocessed, "load": self._load.as_dict()}
             save_results(self.folder, slam, contents, self._refuse_if_ended)
         except OSError as error:
             raise RunError(f"{self.folder}: {error.strerror}") from None

@@ -154,6 +154,11 @@ def test_space_charts_and_print_draw_without_a_fault(page, faulty):
     page.evaluate("() => dispatchEvent(new Event('beforeprint'))")
     page.wait_for_function("() => [...document.querySelectorAll('#charts .plot')].every(one => one.data)")
     assert page.evaluate("() => byId('chi2-plots').children.length") > 1
+    assert page.evaluate("() => byId('chart-load').data.map((one) => one.name)")[:2] == [
+        "CPU time of a keyframe [ms]",
+        "memory [MiB]",
+    ]
+    assert "MiB, with Python and its libraries" in page.inner_text("#timing")
     assert "RMSE" in page.inner_text("#verdict")
     assert page.evaluate("() => getComputedStyle(document.body).backgroundColor") == "rgb(22, 25, 29)"
 
