@@ -22,7 +22,7 @@ def drives(tmp_path_factory):
     folder = tmp_path_factory.mktemp("drives")
     for name, seed, fault in (("a", 1, "noisy:factor=2"), ("b", 2, "noisy:factor=2"), ("blind", 3, "blind:after=0.05")):
         words = ["simulate", "pythonrobotics", "--out", str(folder / f"{name}.mcap"), "--seed", str(seed)]
-        assert cli.main([*words, "--fault", fault]) == 0
+        assert cli.main([*words, "--fault", fault, "--set", "poses=25"]) == 0
     return folder
 
 
@@ -37,9 +37,9 @@ def stamps(out):
 
 def test_a_noise_that_is_too_small_is_found_and_nothing_runs_twice(drives, tmp_path):
     out = tmp_path / "out"
-    options = ("--parameters", f"{ADDED},odometry.tilt_density", "--set", f"{ADDED}=0.15", "--trials", 4)
-    words = ("tune", drives, *options, "--truth", "{path}", "--workers", 2, "--out", out)
-    done = fleet(*words)
+    options = ("--parameters", f"{ADDED},odometry.tilt_density", "--set", f"{ADDED}=0.15", "--trials", 2)
+    words = ("tune", drives, *options, "--truth", "{path}", "--out", out, "--workers")
+    done = fleet(*words, 2)
     assert done.returncode == 3, done
     assert "not tuned on: blind.mcap: no held-out likelihood" in done.stderr
     found = dict(flatten(read_parameters(out / "tuned.yaml")))
@@ -49,13 +49,13 @@ def test_a_noise_that_is_too_small_is_found_and_nothing_runs_twice(drives, tmp_p
     assert "each with the values of the others" in done.stdout
     assert "rmse_m" in done.stdout
     assert not list(out.glob("jobs/*/run")), "of a tuning the rows are enough"
-    refused = fleet(*words)
+    refused = fleet(*words, 2)
     assert refused.returncode == 2
     assert "tuned.yaml: exists already, and is not replaced" in refused.stderr
     text = (out / "tuned.yaml").read_text()
     (out / "tuned.yaml").rename(out / "first.yaml")
     before = stamps(out)
-    assert fleet(*words).returncode == 3
+    assert fleet(*words, 1).returncode == 3
     assert (out / "tuned.yaml").read_text() == text
     assert stamps(out) == before, "every run was there"
 
@@ -81,7 +81,7 @@ def test_mistakes_of_a_tuning_are_refused_in_one_line(drives, tmp_path, capsys):
 def test_worlds_are_simulated_where_they_are_replayed_and_scored_by_their_truth(tmp_path):
     out = tmp_path / "out"
     words = ("simulate", "pythonrobotics", "--seeds", 2, "--fault", "wrong_ids:rate=0.05", "wrong_gyro")
-    options = ("--set", "poses=30", "--set", "robust.decide=true,false", "--workers", 1, "--out", out)
+    options = ("--set", "poses=30", "--set", "robust.decide=true", "--workers", 1, "--out", out)
     done = fleet(*words, *options)
     assert done.returncode == 3, done
     assert "failed: pythonrobotics poses=30 wrong_gyro seed 0 (robust.decide=true): wrong_gyro: needs" in done.stderr
@@ -90,7 +90,7 @@ def test_worlds_are_simulated_where_they_are_replayed_and_scored_by_their_truth(
         ("pythonrobotics poses=30", fault, seed) for fault in ("none", "wrong_ids:rate=0.05") for seed in (0, 1)
     }
     assert all(row["rmse_m"] > 0.0 and row["nees"] > 0.0 for row in rows)
-    by_seed = {(row["fault"], row["seed"]): row for row in rows if row["setting"] == "robust.decide=true"}
+    by_seed = {(row["fault"], row["seed"]): row for row in rows}
     bag = tmp_path / "alone.mcap"
     assert cli.main(["simulate", "pythonrobotics", "--out", str(bag), "--seed", "1", "--set", "poses=30"]) == 0
     assert cli.main(["replay", str(bag), "--out", str(tmp_path / "alone")]) == 0
