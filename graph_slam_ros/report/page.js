@@ -628,7 +628,12 @@ async function drawAgain() {  // in other colours, or for paper: Plotly has draw
   if (data.map && data.edges) await drawMap(true);
 }
 
-async function print(isOn) {
+let printing = Promise.resolve();
+function print(isOn) {  // the browser prints when the call returns; its end may come while the map is still being drawn
+  printing = isOn ? drawFor(true) : printing.then(() => drawFor(false));
+}
+
+async function drawFor(isOn) {
   if (isOn) [...undrawn.keys()].forEach(drawNow);
   onPaper = isOn;
   await drawAgain();

@@ -85,7 +85,7 @@ class GraphSlam(MapView):
         )
         solution = Solution(config.space, backend, FailureGuard(backend, counters, landmarks.map.forget))
         frontend = KeyframeFrontend(config, backend.noise, counters, solution.pose, start.datum if start else ())
-        kidnaps = KidnapDetector(config, backend, counters, frontend.path.segments, landmarks.anonymous.doubt)
+        kidnaps = KidnapDetector(config, backend, counters, frontend.path.segments, landmarks.anonymous)
         super().__init__(config, backend, frontend, landmarks, kidnaps, solution)
         self.settings, self._anchor = dict[str, Value](), Anchor(config, backend)
         self._sink, self._faults = sink or (lambda measurement: None), Faults(counters)

@@ -16,11 +16,12 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.frontend.keyframes import Keyframe
 from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
+from graph_slam_ros.slam.landmarks.anonymous import AnonymousLandmarks
 from graph_slam_ros.slam.robust.displacement import SAME_M, SAME_RAD, DisplacementHypothesis, DisplacementSearch
 from graph_slam_ros.slam.robust.innovation_monitor import InnovationMonitor
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.odometry_hypotheses import Moved
-from graph_slam_ros.slam.slip_detector import Doubt, SlipDetector
+from graph_slam_ros.slam.slip_detector import SlipDetector
 from graph_slam_ros.slam.slip_review import Slip
 from graph_slam_ros.solver import Report, Settings
 from graph_slam_ros.typing import Array, Numbers
@@ -72,6 +73,7 @@ class Alarm:
         why = f"{self.evidence} sightings more than not"
         if not self.evidence:
             why = f"{self.held_back} of the last {self.tested} sightings contradict odometry"
+            why = why if self.held_back else "what should be seen there is not"
         if self.ended_ns is None:
             remedy = (
                 "" if self.determines_pose else "; ranges or bearings alone do not determine the pose: give initialpose"
@@ -113,7 +115,7 @@ class KidnapDetector:
     Parameters
     ----------
     segments : indices of the keyframes at which segments begin; one that begins in the past is appended
-    doubt : of ``SlipDetector``
+    anonymous : the association of landmarks without identities
 
     Attributes
     ----------
@@ -126,7 +128,7 @@ class KidnapDetector:
         backend: Backend,
         counters: Counters,
         segments: list[int],
-        doubt: Doubt,
+        anonymous: AnonymousLandmarks,
     ) -> None:
         space, odometry = config.space, config.odometry
         self._space, self._odometry, self._backend, self._counters = space, odometry, backend, counters
@@ -135,7 +137,8 @@ class KidnapDetector:
         self._history = LandmarkHistory(graph, backend.ledger)
         self._search = DisplacementSearch(space, graph, solver, backend.ledger, self._history)
         self._monitor = InnovationMonitor(solver, backend.decisions, self._history)
-        self._slips = SlipDetector(space, odometry, backend, counters, self._history, doubt)
+        self._slips = SlipDetector(space, odometry, backend, counters, self._history, anonymous.doubt)
+        self._anonymous = anonymous
         self._next = graph.edge_count
         self._splits: list[_Split] = []  # of the present frame of odometry
         self._refuted: list[Numbers] = []  # where that frame does not lie: it was decided and taken back
@@ -204,7 +207,9 @@ class KidnapDetector:
         vertices = keyframes.ids
         if not self._backend.decides:
             return
+        self._search.keeps_from = self._anonymous.elsewhere.keeps_from
         found = self._significant(int(vertices[-1]))
+        found = found and self._search.begun_at(found, self._anonymous.elsewhere.fits_from)
         is_decided = found is not None and self._is_decided(found)
         if doubts and self._slips.check(keyframes, stamp_ns, self._moved_to(found), is_decided=is_decided):
             found = None
@@ -257,11 +262,12 @@ class KidnapDetector:
     def _note(self, found: DisplacementHypothesis | None, stamp_ns: int) -> None:
         """Begin an alarm, go on with it, or end it."""
         now, sum_of = self.now, self._monitor.contradiction()
-        is_contradicted = sum_of is not None and sum_of.is_significant
+        is_elsewhere = self._anonymous.elsewhere.since is not None
+        is_contradicted = is_elsewhere or (sum_of is not None and sum_of.is_significant)
         evidence = found.evidence if found else 0
         if now is None and (found or is_contradicted):
             counts = (sum_of.held_back, sum_of.count) if sum_of else (0, 0)
-            determines_pose = found is not None or self._search.held_back_count > 0
+            determines_pose = found is not None or is_elsewhere or self._search.held_back_count > 0
             self.alarms.append(Alarm(stamp_ns, evidence, None, None, 0.0, 0.0, *counts, determines_pose))
         elif now is not None and evidence > now.evidence:
             self.alarms[-1] = replace(now, evidence=evidence)
@@ -316,6 +322,7 @@ class KidnapDetector:
         self._search.begin(found.first)
         self._monitor.begin(found.first)
         self._slips.begin(stamp_ns, found.first)
+        self._anonymous.displaced(found.first)
         now, alarm = self.now, Alarm(stamp_ns, found.evidence, None, index, distance_m, angle_rad)
         if now is not None and now.segment is None:
             self.alarms[-1] = replace(alarm, began_ns=now.began_ns)

@@ -26,6 +26,8 @@ from graph_slam_ros.slam.frontend.stamped_poses import StampedPoses
 from graph_slam_ros.slam.landmarks.assignments import Assigned, Assignments
 from graph_slam_ros.slam.landmarks.beam import NOTHING, Beam, BeamSettings, Decision, changes
 from graph_slam_ros.slam.landmarks.belief import SolverBelief
+from graph_slam_ros.slam.landmarks.elsewhere import Seen as AllSeen
+from graph_slam_ros.slam.landmarks.elsewhere import UnnamedDisplacement
 from graph_slam_ros.slam.landmarks.hindsight import Found, FrozenScans, Hindsight
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.scans import (
@@ -51,6 +53,11 @@ class AnonymousLandmarks:
     ----------
     hand_over : gives the solver what is new in the graph, so that its covariances are of all of it
     executor : begins work in the background
+
+    Attributes
+    ----------
+    clusters : with their landmarks
+    elsewhere : whether the newest scans contradict the pose
     """
 
     def __init__(
@@ -88,6 +95,8 @@ class AnonymousLandmarks:
         self._same: dict[int, int] = {}  # landmarks of the beam that are others in the graph
         self._firsts: list[int] = []  # the first cluster of each scan
         self._doubt: Callable[[float], Array] | None = None
+        self._compared = 0  # scans
+        self.elsewhere = UnnamedDisplacement(landmarks, solver)
 
     def restore(self) -> None:
         """Continue with the landmarks of a map."""
@@ -212,6 +221,32 @@ class AnonymousLandmarks:
             return motion
         return replace(motion, covariance=motion.covariance + np.diag(self._doubt(motion.moving_s)))
 
+    def _propose(self) -> None:
+        """Assign the newest scans, where they contradict the pose, to the landmarks that they fit elsewhere."""
+        elsewhere, thought = self.elsewhere, np.array(self.clusters.given, dtype=np.int64)
+        if len(self._scans) in (0, self._compared):
+            return
+        self._compared = len(self._scans)
+        thought[list(elsewhere.proposed)] = list(elsewhere.proposed.values())
+        seen = AllSeen(self._scans, self._firsts, thought, self.clusters.names)
+        elsewhere.update(seen)
+        proposed = elsewhere.proposal(seen)
+        elsewhere.proposed |= {cluster: int(thought[cluster]) for cluster in proposed}
+        self.clusters.give(proposed)
+
+    def displaced(self, first: int) -> None:
+        """Begin anew at a keyframe, by its vertex: the robot was moved there."""
+        self._beam = None
+        self._hindsight.restart()
+        k = next((k for k, scan in enumerate(self._scans) if scan.where.vertex >= first), len(self._scans))
+        if 0 < k < len(self._scans):
+            m = self._motions[k - 1]
+            self._motions[k - 1] = replace(m, covariance=m.covariance + self._jump, is_broken=True)
+        if (since := self.elsewhere.since) is not None:  # what was begun at the wrong place
+            lost = [c for c in range(since, len(self.clusters.given)) if c not in self.elsewhere.proposed]
+            self.clusters.give(dict.fromkeys((c for c in lost if self.clusters.given[c] >= since), NOTHING))
+        self.elsewhere.end()
+
     def explain_since(self, first: int) -> None:
         """Explain the scans anew from one on: what they were thought to be is forgotten."""
         clusters = range(self._firsts[first], len(self.clusters.given))
@@ -235,6 +270,7 @@ class AnonymousLandmarks:
             self.clusters.finish()
             return
         count = len(keyframes)
+        self._propose()
         self._adopt(self._guarded(lambda: self._hindsight.outcome(count)), keyframes)
         if self._hindsight.is_due(len(self._scans)):
             self._hindsight.start(self._frozen(), count)

@@ -94,15 +94,14 @@ class Landmarks:
         withdraw: Callable[[Sequence[int]], None],
     ) -> None:
         self.known: dict[str, Landmark] = {}
-        self.begins_new = True
         self.undetermined: dict[str, UndeterminedLandmark] = {}
         self._config, self._space = config, config.space
-        self._edges, self._graph = edges, edges.graph
-        self._solver, self._counters, self._withdraw = solver, counters, withdraw
+        self._edges, self._graph, self._solver = edges, edges.graph, solver
+        self._counters, self._withdraw, self.begins_new = counters, withdraw, True
         if config.landmarks.surveyed_file and not config.landmarks.surveyed:
             raise ConfigError(f"landmarks.surveyed_file: {config.landmarks.surveyed_file} has not been read")
         self._survey = config.survey
-        for name, known in self._survey.items():
+        for name, known in config.survey.items():
             if known.orientation:
                 self._noise_of_pose(name, known)
         self.offsets: dict[str, int] = {}
@@ -292,14 +291,12 @@ class Landmarks:
         self.touched.append(name)
 
     def _withdraw_sightings(self, seen: Sequence[LandmarkEdge]) -> None:
-        for one in seen:
-            self._counters.used[one.topic] -= 1
+        self._counters.used.subtract(one.topic for one in seen)
         self._withdraw([one.edge for one in seen])
 
     def is_there(self, name: str) -> bool:
         """Return whether a landmark is in the graph, and not retired."""
-        landmark = self.known.get(name)
-        return landmark is not None and not landmark.retired_ns
+        return name in self.known and not self.known[name].retired_ns
 
     def positions(self, vertices: Sequence[int]) -> Array:
         """Positions (k, n) of landmarks in map."""
@@ -310,6 +307,11 @@ class Landmarks:
             if some.any():
                 out[some] = self._solver.estimate(at[some])[:, :n]
         return out
+
+    def seen_from(self, where: PoseAtStamp, points: Array) -> Array:
+        """Return points (k, n) of map in the base frame at a stamp."""
+        pose = self._space.group.compose(self._pose(where), where.T_keyframe_base)
+        return np.asarray((points - np.array(pose[: self._space.dimensions])) @ self._space.turn(pose))
 
     def axes(self, landmark: Landmark) -> Array:
         """The rotation from a landmark's tangent space to the map's axes, for its position."""
@@ -375,9 +377,8 @@ class Landmarks:
             return f"{1 + len(others)} places fit: {fits}"
         n = self._space.dimensions
         distance = min(float(np.linalg.norm(best.position - np.array(g.T_map_sensor[:n]))) for g in glances)
-        sigma = (
-            float(np.sqrt(np.linalg.eigvalsh(best.covariance)[-1])) if np.isfinite(best.covariance).all() else np.inf
-        )
+        is_finite = np.isfinite(best.covariance).all()
+        sigma = float(np.sqrt(np.linalg.eigvalsh(best.covariance)[-1])) if is_finite else np.inf
         if sigma > settings.determined_below * distance:
             return f"sigma {sigma:.2f} m at {distance:.2f} m: more than {settings.determined_below:g} of the distance"
         return ""

@@ -20,9 +20,9 @@ from graph_slam_ros.chi_square import quantile
 from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
+from graph_slam_ros.slam.landmarks.rigid_alignment import aligned, are_spread
 from graph_slam_ros.slam.robust.landmark_history import LandmarkHistory
 from graph_slam_ros.slam.robust.ledger import Ledger
-from graph_slam_ros.slam.robust.rigid_alignment import aligned, are_spread
 from graph_slam_ros.slam.robust.seen_point import seen_heading, seen_point, seen_variance
 from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index, Numbers
@@ -108,6 +108,10 @@ class DisplacementSearch:
     Parameters
     ----------
     graph, solver, ledger : of the back-end
+
+    Attributes
+    ----------
+    keeps_from : the keyframe, by its vertex, from which on odometry is remembered, however much was seen since
     """
 
     def __init__(self, space: Geometry, graph: Graph, solver: Solver, ledger: Ledger, history: LandmarkHistory) -> None:
@@ -120,6 +124,7 @@ class DisplacementSearch:
         self._links: dict[int, int] = {}  # odometry's edge to each of them
         self._poses: dict[int, list[int]] = {}  # edges of initial poses, by their keyframe
         self._first = 0  # vertex of the segment's first keyframe
+        self.keeps_from: int | None = None
         self._is_supported = False  # whether a sighting of a landmark that was known is believed since then
 
     # -- what came -----------------------------------------------------------------------------------------------
@@ -140,7 +145,8 @@ class DisplacementSearch:
             self._drift[vertices[1]] = self._drift.get(vertices[0], np.zeros(2)) + self._drift_of(edge)
             self._stamps_ns[vertices[1]] = stamp_ns
         if len(self._seen) == WINDOW:
-            self._forget_before(self._seen[0].keyframe)
+            oldest = self._seen[0].keyframe
+            self._forget_before(oldest if self.keeps_from is None else min(oldest, self.keeps_from))
 
     def _forget_before(self, keyframe: int) -> None:
         """Only what is compared is kept."""
@@ -371,6 +377,12 @@ class DisplacementSearch:
         since, n = self._drift[keyframe] - variances, self._space.dimensions
         lever = float(np.linalg.norm(np.subtract(self._chain[keyframe][:n], chain[:n])))
         return float(np.sqrt(since[0] + since[1] * lever**2)), float(np.sqrt(since[1]))
+
+    def begun_at(self, found: DisplacementHypothesis, first: int | None) -> DisplacementHypothesis:
+        """Return a hypothesis that begins at an earlier keyframe, by its vertex, if odometry since is remembered."""
+        if first is None or first >= found.first or not self._chain:
+            return found
+        return replace(found, first=max(first, self._first, next(iter(self._chain))))
 
     def chained(self, first: int) -> list[int]:
         """Vertices of the keyframes from one on, in order."""

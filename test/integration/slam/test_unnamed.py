@@ -8,6 +8,7 @@ import pytest
 from reliability import times
 
 from graph_slam_ros.graph import R2
+from graph_slam_ros.lie import se2
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements
 from graph_slam_ros.simulation.motion import VelocityNoise
 from graph_slam_ros.simulation.recording import drive
@@ -303,3 +304,37 @@ def test_where_odometry_slips_what_was_seen_since_is_explained_anew():
     assert [type(one) for one in slam.alarms] == [Slip]
     assert path_rmse(slam, recording) < 0.5
     assert nearest_true(slam, recording)[1].max() < 1.0
+
+
+def put_back(recording, from_ns, to_ns):
+    """The measurements of a robot that is put where it was before, while its odometry notices nothing."""
+    first, last = (int(np.searchsorted(recording.stamps_ns, one)) for one in (to_ns, from_ns))
+    back = se2.compose(tuple(recording.T_odom_base[last]), se2.inverse(tuple(recording.T_odom_base[first])))
+    before = [m for m in measurements(recording) if m.stamp_ns <= from_ns]
+    again = [replace(m, stamp_ns=m.stamp_ns + from_ns - to_ns) for m in measurements(recording) if m.stamp_ns > to_ns]
+    return before, [
+        replace(m, T_odom_base=se2.compose(back, m.T_odom_base)) if isinstance(m, Odometry) else m for m in again
+    ]
+
+
+def test_a_robot_that_was_carried_is_found_by_what_it_sees_as_a_whole():
+    recording = park(1, laps=1)
+    begin_ns = int(recording.stamps_ns[0])
+    before, again = put_back(recording, begin_ns + 45 * S, begin_ns + 20 * S)
+    slam = pipeline("joint")
+    for m in before:
+        slam.process(without_ids(m))
+    assert not slam.alarms
+    for m in again:
+        slam.process(without_ids(m))
+        if m.stamp_ns > begin_ns + 53 * S:
+            break
+    (alarm,) = slam.alarms
+    assert alarm.began_ns < begin_ns + 50 * S
+    assert len(slam.segments) == 2
+    stamps_ns = slam.keyframes.stamps_ns
+    after = np.flatnonzero(stamps_ns > begin_ns + 46 * S)
+    same = np.searchsorted(stamps_ns, stamps_ns[after] - 25 * S)  # it was there before, and sees the same
+    path = slam.trajectory()[:, :2]
+    assert np.linalg.norm(path[after] - path[same], axis=1).max() < 0.6
+    assert len(slam.landmarks) <= len(recording.landmarks)
