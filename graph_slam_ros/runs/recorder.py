@@ -245,6 +245,7 @@ class RunRecorder:
                 "ended": True,
                 "is_incomplete": bool(unprocessed or keyframes),
                 "unprocessed": unprocessed,
+                "load": self._load.as_dict(),
             }
             contents = summary_of(self.folder) | now | counted(counters) | self._ended_parts()
             _put(self.folder, SUMMARY, json.dumps(contents, indent=2) + "\n")

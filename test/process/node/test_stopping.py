@@ -73,6 +73,7 @@ def check_left(run, told):
     summary = json.loads((run / "run.json").read_text())
     assert summary["ended"]
     assert summary["unprocessed"] > 0
+    assert max(summary["load"]["backlog"]) > 0
     assert is_incomplete(run)
     assert not is_cut_off(run), "somebody ended it"
     return odometry
