@@ -120,6 +120,10 @@ KINDS: dict[str, Kind] = {
         "let the robot stand when its gyro starts; or set gyro.bias_sigma",
     ),
     "gyro_unrelated": Kind("the gyro's turns are not those of odometry", "check its topic, its frame and its clock"),
+    "gyro_unchecked": Kind(
+        "the gyro cannot be compared with odometry, or not its scale",
+        "publish odometry at 10 Hz or more; record a drive with turns",
+    ),
     # -- sightings and odometry
     "mirrored": Kind("sightings and odometry turn in opposite directions", _DRIVER, True),
     "axes": Kind(

@@ -21,13 +21,21 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
     """Scale, sign, axis and bias of a gyro: both must turn alike over each second."""
     topic = next((t for t in c.topics.values() if c.config.gyro_input in t.inputs), None)
     odometry, gyro = _turns(c)
-    if topic is None or len(gyro) < _LEAST_WINDOWS:
+    if topic is None or not len(c.gyro_ns):
+        return
+    where: Where = {"topic": topic.name, "first_ns": int(c.gyro_ns.min()), "count": len(c.gyro_ns)}
+    if len(gyro) < _LEAST_WINDOWS:
+        text = f"{topic.name}: its gyro is not compared with odometry: {len(gyro)} seconds have three messages of both"
+        yield Finding("gyro_unchecked", "note", len(gyro), _LEAST_WINDOWS, "seconds", text, **where)
         return
     factor, bias, left = _line(odometry, gyro)
-    where: Where = {"topic": topic.name, "first_ns": int(c.gyro_ns.min()), "count": len(c.gyro_ns)}
     limit = _BIAS_SIGMAS * c.config.gyro.bias_sigma
     is_turning = np.abs(odometry) > _TURNING_RAD
-    if np.count_nonzero(is_turning) >= _LEAST_TURNING:
+    turning = int(np.count_nonzero(is_turning))
+    if turning < _LEAST_TURNING:
+        text = f"{topic.name}: the scale of its gyro is not checked: the robot turns in {turning} seconds only"
+        yield Finding("gyro_unchecked", "note", turning, _LEAST_TURNING, "seconds", text, **where)
+    else:
         size = float(np.median(np.abs(factor * odometry[is_turning])))
         unexplained = float(np.median(np.abs(left[is_turning]))) / max(size, 1e-9)
         if abs(factor - 1.0) > _SCALE:

@@ -55,6 +55,16 @@ def test_a_gyro_that_is_wrong_is_found_and_its_setting_mends_it(bag, tmp_path, f
         assert of_the_gyro(tmp_path / "faulty.mcap", dict(map(parse_setting, found[code].settings))) == {}
 
 
+def test_a_gyro_beside_slow_odometry_is_not_compared_and_that_is_said(bag, tmp_path):
+    drive = Drive(bag)
+    spoil_messages(drive, [Fault.named("slow_odometry"), Fault.named("wrong_gyro", factor=1.2)], seed=1)
+    drive.write(tmp_path / "slow.mcap")
+    found = of_the_gyro(tmp_path / "slow.mcap", {})
+    assert found.keys() == {"gyro_unchecked"}
+    assert found["gyro_unchecked"].severity == "note"
+    assert "is not compared with odometry" in found["gyro_unchecked"].text
+
+
 def test_a_gyro_that_is_tilted_and_upside_down_is_turned_over_about_the_robots_axes(bag, tmp_path):
     drive = Drive(bag)
     spoil_messages(drive, [Fault.named("wrong_gyro", factor=1.0, axes="exchanged")], seed=1)
