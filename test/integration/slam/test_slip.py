@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from reliability import tell, times
 
-from graph_slam_ros.lie import se2
+from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.measurements.types import Odometry
 from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
@@ -98,6 +98,26 @@ def assert_replaced(slam, slips, tmp_path):
         assert np.linalg.det(graph.edge(wider).sqrt_information) < np.linalg.det(own.sqrt_information)
     again = map_of(tmp_path / "run", [])
     assert again.ledger.reason.values.tolist() == ledger.reason.values.tolist()
+
+
+@pytest.mark.parametrize("seed", times([2], range(1, 21)))
+def test_in_space_a_slip_is_found_and_ends(seed):
+    clean = simulate("flight", seed=seed, laps=2)
+    recording, begin_ns = slipping(clean, at=0.6, seconds=8.0)
+    slam = GraphSlam(Config.from_mapping({"world.dimensions": 3}))
+    for m in [*measurements(recording), Control("end")]:
+        slam.process(m)
+    slips = [one for one in slam.alarms if isinstance(one, Slip)]
+    assert {one.kind for one in slips} == {"translation"}
+    assert (slips[0].decided_ns - begin_ns) * 1e-9 < 5.0
+    assert slam.displaced is None
+    assert (slips[-1].ended_ns - begin_ns) * 1e-9 < 8.0 + 5.0
+    first = se3.compose(tuple(clean.T_odom_base[0]), se3.inverse(tuple(clean.T_world_base[0])))
+    stamps_ns = slam.keyframes.stamps_ns
+    at = np.searchsorted(clean.stamps_ns, stamps_ns, side="right") - 1
+    true = np.array([se3.compose(first, tuple(pose)) for pose in clean.T_world_base[at]])
+    wrong = np.linalg.norm((slam.trajectory() - true)[:, :3], axis=1)
+    assert rms(wrong[stamps_ns > begin_ns]) < 1.2 * rms(wrong[stamps_ns <= begin_ns]) + 0.05
 
 
 @pytest.mark.parametrize("seed", times([], range(1, 21)))
