@@ -76,7 +76,6 @@ setup(
         "evaluate": ["evo>=1.31.1"],
         "report": ["plotly>=7.1.0"],  # its JavaScript; of Python nothing is imported
         "fleet": [
-            "cloudpickle>=3.1",
             "dask>=2026.8",
             "distributed>=2026.8",
             "duckdb>=1.4",

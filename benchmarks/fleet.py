@@ -55,16 +55,12 @@ def speedup(scratch: Path) -> None:
     print(f"{seconds[1] / seconds[2]:.2f} times as many a minute with two workers (asked 1.8)")
 
 
-def _nothing(job: Job) -> dict:
-    return {"key": job.key, "state": "done"}
-
-
 def overhead(scratch: Path) -> None:
     """CPU of scheduler, client and workers for jobs of no work."""
     jobs = [Job(f"{k}", "", f"{k}", "", {}, "", str(scratch), 1.0, 0, with_report=False) for k in range(NOTHING)]
     begun, cpu = time.perf_counter(), _cpu_s()
     with connected(Workers(count=2)) as client:
-        rows = list(run_jobs(client, jobs, lambda items, _: items, partial(run_isolated, function=_nothing)))
+        rows = list(run_jobs(client, jobs, lambda items, _: items, partial(run_isolated, task="nothing")))
     spent, took = _cpu_s() - cpu, time.perf_counter() - begun
     print(
         f"{len(rows)} jobs of no work: {took:.0f} s (asked 300), "

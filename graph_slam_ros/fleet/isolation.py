@@ -6,21 +6,19 @@ loop. The process serves one job after another. It ends with its worker.
 
 import json
 import os
-import pickle
 import queue
 import select
 import subprocess
 import sys
 import threading
-from base64 import b64decode, b64encode
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
-import cloudpickle
-
-from graph_slam_ros.fleet.job import Job, run_job
+from graph_slam_ros.fleet.job import Job, head, report_on, run_job
 from graph_slam_ros.fleet.store import Row
 
+_TASKS: dict[str, Callable[[Job], Row]] = {"run": run_job, "report": report_on, "nothing": head}
 _GRACE_S = 60.0  # to start, to copy traces: after the limit of time a process that does not answer is killed
 
 
@@ -38,11 +36,11 @@ class _Process:
     def is_alive(self) -> bool:
         return self._popen.poll() is None
 
-    def run(self, function: Callable[[Job], Row], job: Job) -> Row:
+    def run(self, task: str, job: Job) -> Row:
         assert self._popen.stdin is not None
         assert self._popen.stdout is not None
         try:
-            self._popen.stdin.write(b64encode(cloudpickle.dumps((function, job))) + b"\n")
+            self._popen.stdin.write(json.dumps([task, asdict(job)]).encode() + b"\n")
             self._popen.stdin.flush()
             answers, _, _ = select.select([self._popen.stdout], [], [], job.limit_s + _GRACE_S)
             line = self._popen.stdout.readline() if answers else b""
@@ -65,8 +63,12 @@ class _Process:
 _of_this_thread = threading.local()
 
 
-def run_isolated(job: Job, function: Callable[[Job], Row] = run_job) -> Row:
+def run_isolated(job: Job, task: str = "run") -> Row:
     """Run a job in the process beside this one; returns its row.
+
+    Parameters
+    ----------
+    task : ``run`` it, write the ``report`` on its run, or ``nothing``: what remains is the cost of jobs
 
     Raises
     ------
@@ -78,7 +80,7 @@ def run_isolated(job: Job, function: Callable[[Job], Row] = run_job) -> Row:
     process = getattr(_of_this_thread, "process", None)
     if process is None or not process.is_alive:
         process = _of_this_thread.process = _Process()
-    row = process.run(function, job)
+    row = process.run(task, job)
     if row.get("state") == "failed":
         process.end()  # nothing of what went wrong reaches the next job
     return row
@@ -95,9 +97,9 @@ def _serve() -> None:
     lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(lines,), daemon=True).start()
     while True:
-        function, job = pickle.loads(b64decode(lines.get()))
+        task, job = json.loads(lines.get())
         try:
-            answer = {"row": function(job)}
+            answer: dict[str, Any] = {"row": _TASKS[task](Job(**job))}
         except Exception as error:
             answer = {"error": f"{type(error).__name__}: {error}"}
         answers.write(json.dumps(answer) + "\n")

@@ -95,7 +95,7 @@ def run_job(job: Job) -> Row:
         return failed(job, why_it_died(out, job.key))
     made = Path(tempfile.mkdtemp(prefix=f".{job.key}.", dir=out / JOBS))
     try:
-        row = _head(job) | {"attempts": attempt, "worker": platform.node()}
+        row = head(job) | {"attempts": attempt, "worker": platform.node()}
         with open(out / ATTEMPTS / f"{job.key}.{attempt}", "w") as trace, _limits(job, trace):
             try:
                 row |= _results(job, made)
@@ -122,10 +122,11 @@ def report_on(job: Job) -> Row:
 
     folder = Path(job.out) / JOBS / job.key
     write_report(folder / RUN, folder / REPORT)
-    return _head(job) | {"state": "done"}
+    return head(job) | {"state": "done"}
 
 
-def _head(job: Job) -> Row:
+def head(job: Job) -> Row:
+    """Return the columns that say which job it is."""
     about = {"key": job.key, "recording": job.recording, "setting": job.setting, "url": job.url, "truth": job.truth}
     return about | world_of(job.url)
 
@@ -141,7 +142,7 @@ def _check_machine(out: Path, error: BaseException) -> None:
 
 def failed(job: Job, reason: str) -> Row:
     """Return the row of a job that did not end, and write it where there is room."""
-    row = _head(job) | {"state": "failed", "reason": reason, "attempts": MOST_ATTEMPTS, "retry": True}
+    row = head(job) | {"state": "failed", "reason": reason, "attempts": MOST_ATTEMPTS, "retry": True}
     with contextlib.suppress(OSError):  # without the row it is run again, too
         made = Path(tempfile.mkdtemp(prefix=f".{job.key}.", dir=Path(job.out) / JOBS))
         keep(Path(job.out), job.key, made, row)

@@ -14,7 +14,7 @@ from graph_slam_ros.config.config import flatten
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.fleet.engine import Progress, Workers, connected, fingerprints, run_jobs
 from graph_slam_ros.fleet.isolation import run_isolated
-from graph_slam_ros.fleet.job import Job, report_on
+from graph_slam_ros.fleet.job import Job
 from graph_slam_ros.fleet.recordings import Source, find_sources
 from graph_slam_ros.fleet.store import JOBS, REPORT, Row, Store, job_key
 from graph_slam_ros.fleet.table import write_table
@@ -177,7 +177,7 @@ def replay_all(
             try:
                 by_key, reused = run_missing(client, store, jobs, progress("replay"))
                 bare = [job for job in jobs if _lacks_report(store, job, by_key[job.key])]
-                reported = list(run_jobs(client, bare, progress("report"), partial(run_isolated, function=report_on)))
+                reported = list(run_jobs(client, bare, progress("report"), partial(run_isolated, task="report")))
             finally:
                 write_table(store.folder, store.rows())
     unreadable = [one.name for one in sources if one.url not in known]
