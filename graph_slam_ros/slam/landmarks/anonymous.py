@@ -96,7 +96,8 @@ class AnonymousLandmarks:
         self._firsts: list[int] = []  # the first cluster of each scan
         self._doubt: Callable[[float], Array] | None = None
         self._compared = 0  # scans
-        self.elsewhere = UnnamedDisplacement(landmarks, solver)
+        self._displaced: int | None = None  # the scan from which on all are explained anew
+        self.elsewhere = UnnamedDisplacement(space, landmarks)
 
     def restore(self) -> None:
         """Continue with the landmarks of a map."""
@@ -245,14 +246,19 @@ class AnonymousLandmarks:
         if (since := self.elsewhere.since) is not None:  # what was begun at the wrong place
             lost = [c for c in range(since, len(self.clusters.given)) if c not in self.elsewhere.proposed]
             self.clusters.give(dict.fromkeys((c for c in lost if self.clusters.given[c] >= since), NOTHING))
+            self._displaced = k
         self.elsewhere.end()
 
     def explain_since(self, first: int) -> None:
         """Explain the scans anew from one on: what they were thought to be is forgotten."""
+        self.clusters.give(dict.fromkeys(range(self._firsts[first], len(self.clusters.given)), NOTHING))
+        self._solver.update()
+        self._explain_from(first)
+
+    def _explain_from(self, first: int) -> None:
+        """Explain the scans anew from one on, by the map and the path as they are."""
         clusters = range(self._firsts[first], len(self.clusters.given))
         self._hindsight.restart()
-        self.clusters.give(dict.fromkeys(clusters, NOTHING))
-        self._solver.update()
         self._beam = self._leader = now = None
         try:
             for k in range(first, len(self._scans)):
@@ -270,6 +276,9 @@ class AnonymousLandmarks:
             self.clusters.finish()
             return
         count = len(keyframes)
+        if self._displaced is not None:  # it is solved now
+            self._explain_from(self._displaced)
+            self._displaced = None
         self._propose()
         self._adopt(self._guarded(lambda: self._hindsight.outcome(count)), keyframes)
         if self._hindsight.is_due(len(self._scans)):

@@ -1,5 +1,6 @@
 """Sightings without identities contradict the pose: what should be seen is not, and what is seen is not in the map.
 
+That is so where the map knows the ground, and where all that was followed from scan to scan is lost at once.
 The newest scans are then compared with the whole map as a constellation. If they fit it at one other pose only, and
 not by chance, their clusters are proposed to be of the landmarks there. Whether that is so the displacement search
 decides, as for landmarks with identities.
@@ -7,17 +8,19 @@ decides, as for landmarks with identities.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
+from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.lie import se2
 from graph_slam_ros.slam.landmarks.beam import NOTHING
 from graph_slam_ros.slam.landmarks.landmark_map import Landmarks
 from graph_slam_ros.slam.landmarks.rigid_alignment import aligned
 from graph_slam_ros.slam.landmarks.scans import Scan
-from graph_slam_ros.solver import Solver
 from graph_slam_ros.typing import Array, Index
 
 _SCANS, _CLUSTERS = 6, 8  # the newest, and at least so many in them
@@ -25,6 +28,11 @@ _LOST, _FOUND = 0.25, 0.5  # part of them that is of landmarks of the map
 _KNOWN = 4  # clusters of a landmark that is well known
 _MISSING, _MISSING_LANDMARKS = 4, 2  # landmarks that should be seen and are not, over the scans, and different ones
 _COMPARED = (6, 9, 12, 18, 24)  # newest scans that are compared with the map
+_AFTER, _NEW = 3, 6  # scans since what was followed is lost, and at least so many clusters in them
+_VIEW = 12  # scans before them, which show the field of view
+_GOES_ON = 0.25  # part of them that is of landmarks seen before
+_MISSED_BY_CHANCE = 1e-5  # probability
+_SLIP = 0.5  # part of the way by which odometry may err: that is a slip
 _SAME_DIRECTION_RAD = 0.3  # what is nearer than something seen in about this direction should be seen
 _FIT_M, _MOST = 0.5, 0.9  # and the part that fits since the robot was moved
 _MOST_GROUPS, _MOST_MOTIONS = 12, 4000
@@ -61,8 +69,8 @@ class UnnamedDisplacement:
     proposed : clusters that were proposed to be of other landmarks since then, with those that the beam says
     """
 
-    def __init__(self, landmarks: Landmarks, solver: Solver) -> None:
-        self._landmarks, self._solver = landmarks, solver
+    def __init__(self, space: Geometry, landmarks: Landmarks) -> None:
+        self._space, self._landmarks = space, landmarks
         self.since: int | None = None
         self.keeps_from: int | None = None
         self.fits_from: int | None = None
@@ -85,6 +93,9 @@ class UnnamedDisplacement:
         is_unknown = part <= _LOST and len(seen.thought) - recent >= _CLUSTERS
         if self.since is None and is_unknown and self._are_missing(seen, places):
             self.since, self.keeps_from = before, seen.scans[-2 * _SCANS].where.vertex
+        if self.since is None and self._is_lost(seen):
+            self.since, self.keeps_from = seen.firsts[-_AFTER], seen.scans[-_AFTER].where.vertex
+            self.fits_from = self.keeps_from  # it was moved just then, wherever it is found again
 
     def _known(self, seen: Seen, before: int) -> tuple[Index, Array]:
         """Numbers and places (L, n) of the landmarks that were well known before a cluster."""
@@ -100,13 +111,34 @@ class UnnamedDisplacement:
         """Return whether landmarks of the map should be seen from the newest scans and are not."""
         missing = np.zeros(len(places), dtype=np.int64)
         for scan in seen.scans[-_SCANS:]:
-            in_base = self._landmarks.seen_from(scan.where, places)
-            points = np.array([one.point for one in scan.clusters])
-            near, far = (np.linalg.norm(one, axis=1) + 1e-9 for one in (in_base, points))
-            is_in_view = (in_base / near[:, None]) @ (points / far[:, None]).T > np.cos(_SAME_DIRECTION_RAD)
-            is_seen = np.linalg.norm(in_base[:, None] - points[None], axis=2).min(axis=1) < _FIT_M
-            missing += (is_in_view & (near[:, None] < far)).any(axis=1) & ~is_seen
-        return bool(missing.sum() >= _MISSING and np.count_nonzero(missing) >= _MISSING_LANDMARKS)
+            points = scan.points
+            missing += _is_missing(self._landmarks.seen_from(scan.where, places), points, points)
+        return _are_gone(seen, missing)
+
+    def _is_lost(self, seen: Seen) -> bool:
+        """Return whether all that was followed from scan to scan is lost at once, while other things are seen.
+
+        This needs no map: a robot that is carried to new ground sees nothing again of what it has just seen.
+        """
+        if len(seen.scans) < _VIEW + _AFTER or len({scan.at.segment for scan in seen.scans[-2 * _AFTER :]}) > 1:
+            return False
+        first, last = seen.firsts[-_AFTER], seen.scans[-_AFTER - 1]
+        after, before = seen.thought[first:], seen.thought[:first]
+        if len(after) < _NEW or np.mean(np.isin(after, before[before != NOTHING])) > _GOES_ON:
+            return False
+        now = before[seen.firsts[-_AFTER - 1] :]
+        is_followed = np.isin(now, before[seen.firsts[-2 * _AFTER] : seen.firsts[-_AFTER - 1]]) & (now != NOTHING)
+        if np.count_nonzero(is_followed) < _MISSING_LANDMARKS:
+            return False
+        group, space = self._space.group, self._space
+        view = np.concatenate([scan.points for scan in seen.scans[-_VIEW - _AFTER : -_AFTER]])
+        missing = np.zeros(np.count_nonzero(is_followed), dtype=np.int64)
+        for scan in seen.scans[-_AFTER:]:
+            moved = group.between(scan.at.pose, last.at.pose)
+            in_base = last.points[is_followed] @ space.turn(moved).T + np.array(moved[: space.dimensions])
+            fit_m = _FIT_M + _SLIP * float(np.linalg.norm(moved[: space.dimensions]))
+            missing += _is_missing(in_base, view, scan.points, fit_m)
+        return _are_gone(seen, missing)
 
     def proposal(self, seen: Seen) -> dict[int, int]:
         """Clusters of the newest scans, and the landmarks that they are of at the only other pose that fits."""
@@ -132,12 +164,51 @@ class UnnamedDisplacement:
         points = np.array([se2.act(one.at.pose, tuple(c.point)) for one in seen.scans[k:] for c in one.clusters])
         away, of = KDTree(places).query(points @ motion[0].T + motion[1])
         begins = np.array(seen.firsts[k:]) - self.since
-        for one, begin in zip(seen.scans[k:], begins.tolist(), strict=True):
+        is_known = self.fits_from is not None and self.fits_from == self.keeps_from
+        for one, begin in zip([] if is_known else seen.scans[k:], begins.tolist(), strict=False):
             if begin < len(away) and np.mean(away[begin:] < _FIT_M) >= _MOST:
                 self.fits_from = one.where.vertex
                 break
         fits = np.flatnonzero((away < _FIT_M) & ~np.isin(which, numbers))
         return {self.since + c: int(numbers[of[c]]) for c in fits.tolist()}
+
+
+def _are_gone(seen: Seen, missing: Index) -> bool:
+    """Return whether so many landmarks are missing that the sensor does not only miss them by chance.
+
+    Parameters
+    ----------
+    missing : (L,) scans in which each landmark should be seen and is not
+    """
+    count = int(missing.sum())
+    is_enough = count >= _MISSING and np.count_nonzero(missing) >= _MISSING_LANDMARKS
+    return bool(is_enough) and _missed_part(seen) ** count < _MISSED_BY_CHANCE
+
+
+def _missed_part(seen: Seen) -> float:
+    """The part of landmarks seen in a scan and in the next but one that the scan between does not see, with a prior."""
+    numbers = [set(seen.thought[a:b].tolist()) for a, b in pairwise(seen.firsts[-_VIEW - _AFTER : -_AFTER + 1])]
+    count = missed = 0
+    for before, between, after in zip(numbers, numbers[1:], numbers[2:], strict=False):
+        both = before & after - {NOTHING}
+        count, missed = count + len(both), missed + len(both - between)
+    return (missed + 1) / (count + 2)
+
+
+def _is_missing(in_base: Array, view: Array, points: Array, fit_m: float = _FIT_M) -> NDArray[np.bool_]:
+    """Return which of the landmarks should be seen and are not.
+
+    Parameters
+    ----------
+    in_base : (L, n) where they should be seen, in the base frame [m]
+    view : (V, n) what shows the field of view: what is nearer than a point in about the same direction is in view
+    points : (P, n) what is seen
+    fit_m : what is nearer to a landmark than this is the landmark
+    """
+    near, far = (np.linalg.norm(one, axis=1) + 1e-9 for one in (in_base, view))
+    is_in_view = (in_base / near[:, None]) @ (view / far[:, None]).T > np.cos(_SAME_DIRECTION_RAD)
+    is_seen = np.linalg.norm(in_base[:, None] - points[None], axis=2).min(axis=1) < fit_m
+    return np.asarray((is_in_view & (near[:, None] < far)).any(axis=1) & ~is_seen)
 
 
 def only_motion(points: Array, places: Array, here: tuple[float, ...]) -> tuple[Array, Array] | None:

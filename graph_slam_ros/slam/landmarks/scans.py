@@ -193,6 +193,11 @@ class Scan:
     where: PoseAtStamp
     clusters: tuple[Cluster, ...]
 
+    @property
+    def points(self) -> Array:
+        """The clusters' points (k, n) in the base frame."""
+        return np.array([one.point for one in self.clusters])
+
 
 @dataclass(frozen=True, slots=True)
 class _Glimpse:

@@ -317,6 +317,60 @@ def put_back(recording, from_ns, to_ns):
     ]
 
 
+@pytest.mark.parametrize("seed", [1, 2, 4, 5])
+def test_a_robot_that_was_carried_to_new_ground_is_noticed(seed):
+    recording = park(seed, laps=1)
+    begin_ns = int(recording.stamps_ns[0])
+    before, again = put_back(recording, begin_ns + 20 * S, begin_ns + 45 * S)
+    slam = pipeline("joint")
+    for m in before:
+        slam.process(without_ids(m))
+    assert not slam.alarms
+    for m in again:
+        slam.process(without_ids(m))
+        if m.stamp_ns > begin_ns + 25 * S:
+            break
+    (alarm,) = slam.alarms
+    assert alarm.began_ns < begin_ns + 23 * S
+    assert "what should be seen there is not" in str(alarm) or "contradict odometry" in str(alarm)
+
+
+def test_a_robot_that_was_carried_to_new_ground_is_found_when_it_knows_the_ground_again():
+    recording = park(4)
+    begin_ns = int(recording.stamps_ns[0])
+    before, again = put_back(recording, begin_ns + 20 * S, begin_ns + 40 * S)
+    slam = pipeline("joint")
+    for m in [*before, *again]:
+        slam.process(without_ids(m))
+    (alarm,) = slam.alarms
+    assert alarm.began_ns < begin_ns + 23 * S
+    stamps_ns = slam.keyframes.stamps_ns
+    assert len(slam.segments) == 2
+    assert abs(int(stamps_ns[slam.segments[1]]) - begin_ns - 20 * S) < 2 * S
+    true_ns = np.where(stamps_ns <= begin_ns + 20 * S, stamps_ns, stamps_ns + 20 * S)
+    truth = recording.T_world_base[np.searchsorted(recording.stamps_ns, true_ns)]
+    T_first = tuple(truth[0])
+    expected = np.array([se2.between(T_first, tuple(one))[:2] for one in truth])
+    away = np.linalg.norm(slam.trajectory()[:, :2] - expected, axis=1)
+    assert away[slam.segments[1] :].max() < 1.0
+    assert len(slam.landmarks) == len(recording.landmarks)
+
+
+@pytest.mark.parametrize("seed", [40, 51])
+def test_a_sensor_that_misses_a_third_raises_no_alarm(seed):
+    rng = np.random.default_rng(seed)
+    recording = park(seed, laps=1, clutter=lambda t_s: (20.0 * np.cos(t_s / 3.0), 20.0 * np.sin(t_s / 3.0)))
+    slam = pipeline("joint")
+    for m in measurements(recording):
+        if isinstance(m, Sightings):
+            seen = tuple(s for s in without_ids(m).sightings if rng.random() < 0.7)
+            if not seen:
+                continue
+            m = replace(m, sightings=seen)
+        slam.process(m)
+    assert not slam.alarms
+
+
 def test_a_robot_that_was_carried_is_found_by_what_it_sees_as_a_whole():
     recording = park(1, laps=1)
     begin_ns = int(recording.stamps_ns[0])
