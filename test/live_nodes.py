@@ -142,7 +142,7 @@ class Robot:
         self._executor.add_node(self.node)
         self._is_closed = False
         self._hears = threading.Thread(target=self._hear, daemon=True)
-        self._of, self._clients = of, {}
+        self._of, self._clients, self._is_known = of, {}, set()
         qos = QoSProfile(depth=1000, reliability=reliability)
         kinds = {"/odom": Odometry, "/landmarks": Detection3DArray}
         self.publishers = {topic: self.node.create_publisher(kinds[topic], topic.lstrip("/"), qos) for topic in sends}
@@ -233,6 +233,26 @@ class Robot:
             self._clients[name] = self.node.create_client(kind, f"{self._of}/{name}")
         return self._clients[name]
 
+    def _introduce(self, name):
+        """Wait until the node knows where to send the answers of a service: before that, it drops them after 0.1 s.
+
+        Endpoints are announced in the order they are made. So the node knows this client when it answers a later one.
+        """
+        if name in self._is_known:
+            return
+        deadline = time.monotonic() + lenient(6 * PATIENCE_S)
+        while True:
+            probe = self.node.create_client(GetState, f"{self._of}/get_state")
+            until(probe.service_is_ready, self.spin, "service ~/get_state")
+            future, again = probe.call_async(GetState.Request()), time.monotonic() + 2.0
+            while not future.done() and time.monotonic() < again:
+                self.spin(0.005)
+            self.node.destroy_client(probe)
+            if future.done():
+                self._is_known.update(self._clients)
+                return
+            assert time.monotonic() < deadline, "no answer of ~/get_state"
+
     def spin(self, seconds=0.02):
         """Leave a thread of its own the time to hear."""
         time.sleep(seconds)
@@ -250,6 +270,7 @@ class Robot:
         for topic, publisher in self.publishers.items():
             until(lambda p=publisher: p.get_subscription_count(), self.spin, f"subscriber of {topic}")
         until(self._save.service_is_ready, self.spin, "service ~/save")
+        self._is_known.clear()  # the node may be another one now
         self.call("resume", patience_s=60.0)  # the worker answers, so its kernels are loaded
 
     def send(self, topic, cdr):
@@ -266,6 +287,7 @@ class Robot:
         """Call a service of the SLAM node: a future."""
         client = self.client(name, kind)
         until(client.service_is_ready, self.spin, f"service ~/{name}")
+        self._introduce(name)
         return client.call_async(request or kind.Request())
 
     def call(self, name, kind=Trigger, request=None, patience_s=PATIENCE_S):
