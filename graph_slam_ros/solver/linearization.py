@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from typing import TypeAlias
 
 import numpy as np
@@ -193,6 +194,8 @@ def information(graph: Graph, x: Array, rows: Mapping[EdgeTable, Index], free: I
 def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:
     """Edges, by id, as rows of their tables."""
     rows = graph.row_of_edge.values[edges]
+    if len(edges) == 1:
+        return {graph.row(edges[0])[0]: rows}
     if len(graph.tables) == 1:
         return dict.fromkeys(graph.tables.values(), rows)
     codes = graph.table_of_edge.values[edges]
@@ -201,7 +204,7 @@ def rows_of(graph: Graph, edges: Index) -> dict[EdgeTable, Index]:
 
 def refuse_nonfinite(block: Block) -> None:
     """Raise GraphSlamError if numbers are so large that a cost overflows; it names the first such edge."""
-    if np.isfinite(block.cost.sum()):
+    if isfinite(block.cost[0] if len(block.cost) == 1 else block.cost.sum()):
         return
     bad = np.flatnonzero(~np.isfinite(block.cost))
     row = block.rows[bad[0] if len(bad) else int(block.cost.argmax())]

@@ -65,8 +65,8 @@ class Problem:
                 raise GraphSlamError(f"an edge needs vertex {missing}, which was not added")
         for table, chosen in rows.items():
             self._record(table, chosen)
-        there = (self._tree.vertex[new, KEY] != NOTHING).any()  # removed before: they are in the order still
-        self._pending.broken |= bool(there)
+        there = np.count_nonzero(self._tree.vertex[new, KEY] != NOTHING)
+        self._pending.broken |= bool(there)  # removed before: they are in the order still
         self._pending.add(new, new_edges)
         self._inside[new], self._edge_inside[new_edges] = True, True
 
@@ -193,8 +193,9 @@ class Problem:
     def _grow(self) -> None:
         """Follow the graph's growth: new vertices start at their initial values."""
         graph, known = self.graph, self._vertices
-        if graph.vertex_count > known:
-            count, size = graph.vertex_count, len(graph.initial)
+        count = len(graph.kind)
+        if count > known:
+            size = len(graph.initial)
             self._tree = with_room(self._tree, vertex=count, region=2 * count, tail=2 * count)
             self._tree = with_room(self._tree, diagonal=size, step=size, value=size, estimate=size)
             self._inside, self._held = longer(self._inside, count), longer(self._held, count)
@@ -205,8 +206,8 @@ class Problem:
             incremental.append_vertices(
                 self._tree, known, graph.offset.values[known:], graph.initial.values, shapes[graph.kind.values[known:]]
             )
-            self._vertices = graph.vertex_count
-        if graph.edge_count > len(self._edge_inside):
+            self._vertices = count
+        if len(graph.row_of_edge) > len(self._edge_inside):
             self._tree = with_room(self._tree, edge=graph.edge_count)
             self._edge_inside = longer(self._edge_inside, graph.edge_count)
 
@@ -231,7 +232,7 @@ class Problem:
         """The edges among these that have a weight."""
         for table, rows in rows_of(self.graph, edges).items():
             weight = table.weight.values[rows]
-            if not weight.all():
+            if np.count_nonzero(weight) < len(weight):  # faster than ``all`` on a few numbers
                 edges = np.setdiff1d(edges, table.id.values[rows[weight == 0.0]])
         return edges
 
@@ -247,7 +248,7 @@ class Problem:
         pending, tree = self._pending, self._tree
         vertices, edges = pending.vertices, self._weighted(pending.edges())
         wanted = self._inside[vertices] & ~self._held[vertices]
-        if not wanted.all():
+        if np.count_nonzero(wanted) < len(wanted):
             vertices = vertices[wanted]
         if (
             surely
@@ -299,7 +300,7 @@ def existing(ids: ArrayLike, count: int, what: str) -> Index:
     """Ids as an array; raises GraphSlamError for one that is not below ``count``."""
     at = whole_numbers(ids, what).ravel()
     strange = (at < 0) | (at >= count)
-    if strange.any():
+    if np.count_nonzero(strange):
         raise GraphSlamError(f"{what} {int(at[strange][0])} does not exist")
     return at
 
