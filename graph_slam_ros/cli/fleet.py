@@ -64,7 +64,13 @@ def _add_replay(commands: Any) -> None:
     )
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results of the fleet")
     sub.add_argument(
-        "--config", type=Path, nargs="+", default=[], metavar="YAML", help="replay with each of these files"
+        "--config",
+        type=Path,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="YAML",
+        help="replay with each of these files",
     )
     sub.add_argument(
         "--set",
@@ -157,10 +163,21 @@ def _add_simulate(commands: Any) -> None:
     sub.add_argument("--seeds", type=values.count, default=10, metavar="N", help="drives of each (default: 10)")
     sub.add_argument("--seed", type=int, default=0, metavar="N", help="the first seed (default: 0)")
     sub.add_argument(
-        "--fault", nargs="+", default=[], metavar="KIND", help="KIND or KIND:KEY=VALUE,...; also without any"
+        "--fault",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KIND",
+        help="KIND or KIND:KEY=VALUE,...; also without any",
     )
     sub.add_argument(
-        "--config", type=Path, nargs="+", default=[], metavar="YAML", help="replay with each of these files"
+        "--config",
+        type=Path,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="YAML",
+        help="replay with each of these files",
     )
     sub.add_argument(
         "--set",

@@ -75,6 +75,8 @@ def calibrate(
         given = chosen.settings | given
         odometry, landmarks = odometry or chosen.topics.get("odom"), landmarks or chosen.topics.get("detections")
     config = with_survey(Config.from_mapping(given))
+    if not config.calibrate.is_on:
+        raise GraphSlamError("calibrate.groups: none leaves nothing to estimate; without this setting it is auto")
     if config.calibrate.drift:
         raise GraphSlamError("calibrate.drift: settings are constant; graph_slam replay with it corrects what changes")
     inputs = choose_inputs(bag, config, odometry, landmarks)

@@ -187,7 +187,7 @@ class _Fit:
         block -= block.min()
         by_landmark = np.where(rows.landmark >= 0, rows.landmark, int(rows.landmark.max()) + 1 + block)
         both = [_scatter(scores, clusters) for clusters in (block, by_landmark)]
-        scale = np.linalg.norm(scores, axis=0) + 1e-300
+        scale = np.maximum(np.linalg.norm(scores, axis=0), np.finfo(float).tiny ** 0.5)
         return max(both, key=lambda meat: float(np.sum(np.diag(meat) / scale**2)))
 
     def _halves(self, rest: Array, scores: Array, theta: Array, stamps_ns: Index) -> tuple[Array, Array]:
