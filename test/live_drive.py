@@ -33,6 +33,7 @@ class Drive:
         self.sees = True
         self.claims = {}  # positions in its own frame of tags that are not there
         self.steps = 0
+        self._trail = {}  # stamp to true pose, of each step that was sent
 
     def odometry(self):
         """Of now."""
@@ -59,10 +60,22 @@ class Drive:
 
     def step(self, robot):
         """Send what there is now, and go on."""
+        self._trail[self.stamp_ns] = self.truth
         robot.send("/odom", self.odometry())
         if self.sees and self.steps % 3 == 0:
             robot.send("/landmarks", self.seen())
         self.move()
+
+    def off_by(self, robot):
+        """How far the newest pose that was heard is from where the robot was at the pose's stamp.
+
+        A busy machine publishes it some steps later, so where the robot is now says nothing.
+        """
+        message = robot.heard["pose"][-1]
+        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        sent = min(self._trail, key=lambda ns: abs(ns - stamp_ns), default=None)
+        at = message.pose.pose.position
+        return distance((at.x, at.y), self.truth if sent is None else self._trail[sent])
 
     def go(self, robot, steps, every=10):
         """So many steps, not more than a few unheard."""

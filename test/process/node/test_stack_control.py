@@ -13,7 +13,7 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from live_drive import TAGS, Drive, distance, earlier_run
+from live_drive import TAGS, Drive, earlier_run
 from live_nodes import ENVIRONMENT, MODULE, lenient, node, often, own_domain, replayed, results, robot, server, until
 from messages import detection, detections, pose
 from rcl_interfaces.msg import Parameter, ParameterValue
@@ -54,12 +54,6 @@ def is_repeated(run, tmp_path):
     place = tmp_path / f"of_{run.name}"
     place.mkdir()
     return replayed(run, place) == results(run)
-
-
-def off_by(r, drive):
-    """How far the newest pose is from where the robot was then, which is where it is but for a step."""
-    at = r.heard["pose"][-1].pose.pose.position
-    return distance((at.x, at.y), drive.truth)
 
 
 # -- lifecycle ---------------------------------------------------------------------------------------------------------
@@ -338,7 +332,7 @@ def test_P2_P12_killed_it_goes_on_in_its_map_and_where_it_was_if_odometry_goes_o
         drive.stamp_ns += 10**9
         until(lambda: r.heard["tf"] and r.heard["pose"], drive.pace(r), "transform without any landmark")
         assert transform(r) == pytest.approx(before, abs=0.1), "as it was"
-        until(lambda: off_by(r, drive) < 0.5, drive.pace(r), "the pose of now")
+        until(lambda: drive.off_by(r) < 0.5, drive.pace(r), "the pose of now")
         assert r.heard["pose"][-1].pose.covariance[0] > 10.0, "as far as odometry can be trusted over a restart"
         r.until_it_says("DEGRADED", RESUMED, "drive past known landmarks", spin=drive.pace(r))
         until(lambda: r.heard["path"], drive.pace(r), "path")
@@ -347,7 +341,7 @@ def test_P2_P12_killed_it_goes_on_in_its_map_and_where_it_was_if_odometry_goes_o
         assert {m.text for m in r.heard["landmarks"][-1].markers if m.text} == set(TAGS)
         drive.sees = True
         r.until_it_says("OK", spin=drive.pace(r))
-        until(lambda: off_by(r, drive) < 0.5, drive.pace(r), "the pose of now")
+        until(lambda: drive.off_by(r) < 0.5, drive.pace(r), "the pose of now")
         assert n.stop()[0] == 0
     assert "the last run was never ended: going on in its map" in n.said
     assert is_repeated(tmp_path / "run", tmp_path)
@@ -370,7 +364,7 @@ def test_P2_P12_killed_with_its_odometry_it_claims_no_pose_until_a_landmark_is_r
         assert not (r.heard["pose"] or r.heard["tf"] or r.heard["odometry"])
         drive.sees = True
         until(lambda: r.heard["pose"] and r.heard["tf"], drive.pace(r), "place in the map")
-        until(lambda: off_by(r, drive) < 0.5, drive.pace(r), "the pose of now")
+        until(lambda: drive.off_by(r) < 0.5, drive.pace(r), "the pose of now")
         assert n.stop()[0] == 0
     assert is_repeated(tmp_path / "run", tmp_path)
 
@@ -445,7 +439,7 @@ def test_P15_of_parameters_that_are_set_together_all_or_none_change_and_the_run_
         assert r.set({name: p.default for name, p in LIVE.items()}) == (True, "")
         r.until_it_says("OK", spin=drive.pace(r))
         r.settle()
-        assert off_by(r, drive) < 1.0
+        assert drive.off_by(r) < 1.0
         assert n.stop()[0] == 0
     assert "Traceback" not in n.said
     assert [m.event for m in accepted(tmp_path / "run") if isinstance(m, Control)].count("set") == done + 1
@@ -522,7 +516,7 @@ def test_P12_of_a_loaded_map_nothing_is_claimed_until_a_landmark_is_recognised(t
         elsewhere.sees = True
         until(lambda: r.heard["pose"] and r.heard["tf"] and r.heard["odometry"], elsewhere.pace(r), "place in the map")
         r.until_it_says("OK", spin=elsewhere.pace(r))
-        until(lambda: off_by(r, elsewhere) < 0.5, elsewhere.pace(r), "the pose of now")
+        until(lambda: elsewhere.off_by(r) < 0.5, elsewhere.pace(r), "the pose of now")
         assert r.graph()["landmarks"] == len(TAGS)
         assert n.stop()[0] == 0
     assert is_repeated(tmp_path / "run", tmp_path)
@@ -603,7 +597,7 @@ def test_closures_bend_the_path_until_they_are_cleared_and_optimize_says_how_muc
         until(lambda: r.heard["pose"][-1].pose.pose.position.x < 0.8 * straight, drive.pace(r), "correction")
         answer = r.call("clear_closures")
         assert answer.success
-        until(lambda: off_by(r, drive) < 0.2, drive.pace(r), "straight path again")
+        until(lambda: drive.off_by(r) < 0.2, drive.pace(r), "straight path again")
         answer = r.call("optimize")
         r.until_it_says("OK", spin=drive.pace(r))
         assert answer.success
@@ -630,7 +624,7 @@ def test_a_pose_that_somebody_gives_begins_a_segment_or_is_weighed(tmp_path, use
         said.pose.covariance = (1e-4 * np.eye(6)).ravel()
         drive.truth = 2.0, -1.0, 0.0
         given.publish(said)
-        until(lambda: off_by(r, drive) < 0.4, drive.pace(r), "pose where it was told to be")
+        until(lambda: drive.off_by(r) < 0.4, drive.pace(r), "pose where it was told to be")
         r.until_it_says("OK", spin=drive.pace(r))
         assert r.graph()["segments"] == segments
         assert n.stop()[0] == 0

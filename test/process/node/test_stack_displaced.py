@@ -8,13 +8,8 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from live_drive import Drive, distance
+from live_drive import Drive
 from live_nodes import node, replayed, results, robot, until
-
-
-def off_by(r, drive):
-    at = r.heard["pose"][-1].pose.pose.position
-    return distance((at.x, at.y), drive.truth)
 
 
 def is_repeated(run, tmp_path):
@@ -48,13 +43,13 @@ def test_a_robot_that_is_elsewhere_is_degraded_until_it_is_found(tmp_path, how):
             said.pose.pose.position.x, said.pose.pose.orientation.w = 48.0, 1.0
             said.pose.covariance = (1e-2 * np.eye(6)).ravel()
             given.publish(said)
-            until(lambda: off_by(r, drive) > 10.0, drive.pace(r), "the pose that was given")
+            until(lambda: drive.off_by(r) > 10.0, drive.pace(r), "the pose that was given")
         r.until_it_says("DEGRADED", "elsewhere", spin=slowly(r, drive))
         r.until_it_says("OK", spin=drive.pace(r))
-        until(lambda: off_by(r, drive) < 0.5, drive.pace(r), "the pose that the landmarks show")
+        until(lambda: drive.off_by(r) < 0.5, drive.pace(r), "the pose that the landmarks show")
         assert r.graph()["segments"] == 2
         told = [s for m in r.heard["events"] for s in m.status if s.name == "graph_slam: displaced"]
         assert any("segment" in {v.key for v in s.values} for s in told)
         assert n.stop()[0] == 0
     assert is_repeated(tmp_path / "run", tmp_path)
-    assert math.isfinite(off_by(r, drive))
+    assert math.isfinite(drive.off_by(r))

@@ -5,7 +5,7 @@ import json
 import time
 
 import pytest
-from live_drive import TAGS, Drive, distance
+from live_drive import TAGS, Drive
 from live_nodes import ENVIRONMENT, node, often, own_domain, replayed, results, robot, until
 from rclpy.clock import ClockType, JumpThreshold
 from rclpy.context import Context
@@ -64,12 +64,6 @@ def is_ascending(numbers):
     return all(b > a for a, b in itertools.pairwise(numbers))
 
 
-def off_by(r, drive):
-    """How far the newest pose is from where the robot was then, which is where it is but for a step."""
-    at = r.heard["pose"][-1].pose.pose.position
-    return distance((at.x, at.y), drive.truth)
-
-
 def numbers(folder):
     return json.loads((folder / "run.json").read_text())
 
@@ -96,7 +90,7 @@ def test_B7_when_the_clock_jumps_back_the_map_stays_a_segment_begins_and_transfo
         until(lambda: len(r.heard["pose"]) > 20, played.step, "poses after the jump")
         r.until_it_says("OK", spin=played.step)
         assert r.graph()["segments"] == 2
-        assert off_by(r, played.drive) < 1.0, "still in the same map"
+        assert played.drive.off_by(r) < 1.0, "still in the same map"
         r.settle()
         after = stamps(r)
         assert n.stop()[0] == 0
@@ -124,7 +118,7 @@ def test_messages_of_before_the_jump_that_come_after_it_hold_nothing_up(tmp_path
             played.step()
         r.heard["pose"].clear()
         until(lambda: len(r.heard["pose"]) > 10, played.step, "poses after the jump")
-        assert off_by(r, played.drive) < 1.0
+        assert played.drive.off_by(r) < 1.0
         r.heard["tf"].clear()
         until(lambda: len(stamps(r)) > 5, played.step, "transforms after the jump")
         assert played.drive.stamp_ns < begin_ns + 30 * NS, "at once"
@@ -174,7 +168,7 @@ def test_B7_where_no_clock_tells_that_stamps_have_gone_back_odometry_does(tmp_pa
         until(lambda: len(r.heard["pose"]) > 10 and len(stamps(r)) > 5, drive.pace(r), "poses and transforms")
         r.until_it_says("OK", spin=drive.pace(r))
         assert r.graph()["segments"] == 2
-        assert off_by(r, drive) < 1.0, "still in the same map"
+        assert drive.off_by(r) < 1.0, "still in the same map"
         assert is_ascending(stamps(r))
         assert begin_ns < min(stamps(r)) < max(stamps(r)) < drive.stamp_ns + NS
         assert n.stop()[0] == 0
@@ -194,7 +188,7 @@ def test_B14_where_another_clock_is_used_a_segment_begins_and_the_map_stays(tmp_
         r.until_it_says("OK", spin=played.step)
         until(lambda: len(r.heard["pose"]) > 10, played.step, "poses by the other clock")
         assert r.graph()["segments"] == 2
-        assert off_by(r, played.drive) < 1.0, "still in the same map"
+        assert played.drive.off_by(r) < 1.0, "still in the same map"
         assert n.stop()[0] == 0
     assert replayed(tmp_path / "run", tmp_path) == results(tmp_path / "run")
 
@@ -308,7 +302,7 @@ def test_B25_stamps_at_both_ends_of_time_count_and_the_robot_goes_on_by_a_clock_
         played.go(40)
         r.until_it_says("OK", spin=played.step)
         assert r.save().success
-        assert off_by(r, drive) < 1.0
+        assert drive.off_by(r) < 1.0
         assert n.stop()[0] == 0
         assert "Traceback" not in n.said
     counters = numbers(tmp_path / "run")["counters"]
@@ -352,7 +346,7 @@ def test_B11_a_recording_that_is_played_again_and_again_adds_segments_to_one_map
             r.until_it_says("OK")
         r.settle()
         assert r.graph()["segments"] == loops
-        assert off_by(r, played.drive) < 1.0
+        assert played.drive.off_by(r) < 1.0
         assert n.stop()[0] == 0
     told = numbers(tmp_path / "run")
     assert (told["segments"], told["landmarks"]) == (loops, len(TAGS))
