@@ -20,6 +20,7 @@ from graph_slam_ros.runs.tables import numbered
 from graph_slam_ros.solver import Report, Solver
 from graph_slam_ros.typing import Array
 
+MOST_STEPS = 200  # an edge that all else contradicts needs more than a run's own map does
 _ACCEPTED = "believed"  # the class of what is let in: it has no loss
 
 
@@ -49,7 +50,7 @@ class Influence:
     Attributes
     ----------
     first_order_m : by one Gauss-Newton step
-    exact_m : by solving again; inf if a vertex is undetermined without the edge
+    exact_m : by solving again; inf if a vertex is undetermined without the edge, NaN if the solver does not converge
     """
 
     edge: int
@@ -159,6 +160,7 @@ class SavedGraph:
             raise GraphSlamError(f"edge {min(gone & set(let_in))}: cannot be taken out and let in at once")
         edges = [e.edge for e in self.entries if e.is_in and e.edge not in gone]
         graph, settings = self.graph, self.config.solver_settings()
+        settings = replace(settings, max_iterations=max(settings.max_iterations, MOST_STEPS))
         if let_in:
             graph = graph.copy()
             edges += [_accepted(graph, self.edge(e)) for e in let_in]
@@ -201,11 +203,12 @@ class SavedGraph:
         for k in np.argsort(-first, kind="stable")[:count].tolist():
             edge = judged[k]
             try:
-                exact_m = self.moved(self.solve([edge])).final[0]
+                solver = self.problem([edge])
+                exact_m = self.moved(solver).final[0] if solver.optimize().converged else np.nan
             except (GaugeError, SingularError):
                 exact_m = np.inf
             out.append(Influence(edge, float(first[k]), exact_m))
-        return sorted(out, key=lambda one: -one.exact_m)
+        return sorted(out, key=lambda one: -np.nan_to_num(one.exact_m, nan=one.first_order_m))
 
     def first_order(self, edge: int) -> Array:
         """The step (dof,) of the last keyframe, in its tangent space, if an edge is removed."""

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from graph_slam_ros.analysis.what_if import MovedVertex, SavedGraph
 
 _SHOWN = 10  # edges that fit worse
+_NO_SOLUTION = "not a solution: the solver did not converge. What was let in contradicts all else"
 
 
 def explain(args: argparse.Namespace) -> int:
@@ -42,11 +43,14 @@ def solve(args: argparse.Namespace) -> int:
     losses: list[str] = []
     run = SavedGraph(args.run_folder, losses)
     start = time.process_time()
-    solver = run.solve(args.without, args.let_in, args.loss)
+    solver = run.problem(args.without, args.let_in, args.loss)
+    report = solver.optimize()
     elapsed_s = time.process_time() - start
-    console.show(*_moved_text(run, run.moved(solver)), f"solved in {1e3 * elapsed_s:.0f} ms of CPU time")
+    state = "solved in" if report.converged else f"NOT converged ({report.stop}) after"
+    console.show(*_moved_text(run, run.moved(solver)), f"{state} {1e3 * elapsed_s:.0f} ms of CPU time")
     console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (why the run judged an edge as it did)")
-    return console.report_losses(losses)
+    code = console.report_losses(losses, () if report.converged else (_NO_SOLUTION,))
+    return code if report.converged else console.LOSSES
 
 
 def influence(args: argparse.Namespace) -> int:
@@ -60,11 +64,15 @@ def influence(args: argparse.Namespace) -> int:
         f"  {'edge':<8s} {'':24s} {'first order':>12s} {'solved again':>12s}",
     )
     for one in run.influences(args.count):
-        exact = f"{one.exact_m:10.4f} m" if math.isfinite(one.exact_m) else "undetermined"
+        exact = f"{one.exact_m:10.4f} m" if math.isfinite(one.exact_m) else _without_number(one.exact_m)
         text = f"{one.first_order_m:10.4f} m {exact}"
         console.show(f"  {one.edge:<8d} {run.edge(one.edge).about:24s} {text}")
     console.then(f"{console.command('explain', args.run_folder, 'EDGE')} (all about one of them)")
     return console.report_losses(losses)
+
+
+def _without_number(exact_m: float) -> str:
+    return "not converged" if math.isnan(exact_m) else "undetermined"
 
 
 def _moved_text(run: "SavedGraph", moved: "MovedVertex") -> Iterable[str]:

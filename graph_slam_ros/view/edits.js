@@ -108,7 +108,8 @@ async function solve() {
         edits.quick = "";
         if (turn === edits.asked) found = await solved(false);
       }
-      await show(found, loss ? "With this loss" : "Solved, other decisions as they are");
+      if (!found.is_solved) lines.push(element("p", "Not a solution: the solver did not converge. The edges that were let in contradict all else.", {class: "fault"}));
+      await show(found, !found.is_solved ? "After the last step, not converged" : loss ? "With this loss" : "Solved, other decisions as they are");
     }
     if (edits.list.length && turn === edits.asked && !loss) await show(await ask("/try", planWith("-", () => "-")), "As it would be saved, all judged again");
     if (loss && edits.list.length && turn === edits.asked) lines.push(element("p", "A loss is a question only: a saved run has the losses of its configuration.", {class: "quiet"}));

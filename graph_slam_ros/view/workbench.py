@@ -102,7 +102,7 @@ class Workbench:
         Parameters
         ----------
         body : JSON with ``without`` and ``let_in``, lists of edges, and ``loss``: NAME:SCALE, none or empty;
-            ``first`` asks for the first steps, which are no solution where ``is_solved`` is false
+            ``first`` asks for the first steps. Where ``is_solved`` is false, the answer is no solution
 
         Raises
         ------
@@ -117,7 +117,7 @@ class Workbench:
             report = solver.optimize(replace(settings, max_iterations=_FIRST_STEPS) if asked["first"] else settings)
             moved = run.moved(solver)
             return {
-                "is_solved": report.converged or not asked["first"],
+                "is_solved": report.converged,
                 "places": self._places(solver, set(run.keyframes)),
                 "landmarks": _landmarks(run.slam, solver),
                 "chi2": [moved.before.chi2_final, moved.after.chi2_final],

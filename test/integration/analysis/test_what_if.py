@@ -7,12 +7,15 @@ import pytest
 from faulty import faulty_run
 
 from graph_slam_ros import cli
+from graph_slam_ros.analysis import what_if
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import Loss
+from graph_slam_ros.report.contents import read_contents
 from graph_slam_ros.runs.ledger_file import read_ledger
 from graph_slam_ros.runs.recorder import RunRecorder
 from graph_slam_ros.slam import Config, Control, GraphSlam, Odometry, Sighting, Sightings
+from graph_slam_ros.view.workbench import Workbench
 
 
 @pytest.fixture(scope="module")
@@ -125,6 +128,18 @@ def test_influence_tells_which_edges_cannot_be_done_without(tmp_path, capsys):
     assert len(landmarks) == 2
     code, out, err = told(capsys, "influence", run)
     assert (code, out.count("undetermined"), err) == (0, 2, "")
+
+
+def test_what_does_not_converge_is_no_solution_and_is_said(replayed, saved, capsys, monkeypatch):
+    """Closures that all else contradicts, and few steps."""
+    run, out = replayed[1], [e.edge for e in saved.entries if not e.is_in and e.label == "closures"]
+    asked = json.dumps({"without": [], "let_in": out, "loss": "", "first": False}).encode()
+    assert told(capsys, "solve", run, "--with", *out)[0] == 0
+    assert Workbench(read_contents(run), 3.0).solve(asked)["is_solved"]
+    monkeypatch.setattr(what_if, "MOST_STEPS", 1)  # then the run's own limit counts
+    code, said, err = told(capsys, "solve", run, "--with", *out)
+    assert (code, "NOT converged (max_iterations) after" in said, "not a solution" in err) == (3, True, True)
+    assert not Workbench(read_contents(run), 3.0).solve(asked)["is_solved"]
 
 
 def test_the_commands_say_what_moves(replayed, saved, capsys):
