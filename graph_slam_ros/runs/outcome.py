@@ -31,6 +31,10 @@ _CONTRADICT = (
     "is larger than stated: --set {0}.noise=sigmas --set {0}.sigma_m=..."
 )
 _ON_JUMP = "--set time.on_jump=segment goes on in the same map, reset in another run"
+_NOT_CONVERGED = (
+    "the estimate is not at its optimum: --set solve.max_iterations=1000. If that does not help, measurements that are "
+    "believed contradict each other: graph_slam explain RUN lists those that fit worst"
+)
 _EXTREME = "distances or noise that no robot means do that: --set INPUT.max_distance_m=... or INPUT.noise=sigmas"
 
 
@@ -145,6 +149,8 @@ def shortcomings(summary: Summary) -> Iterator[str]:
     yield from checked(summary, "error")
     if summary.get("failing"):
         yield f"the last solve failed ({summary['failing']}), and the estimate is the one before it: {_EXTREME}"
+    elif not summary.get("converged", True):
+        yield f"the last solve did not converge ({summary['stop']}): {_NOT_CONVERGED}"
     if stopped := sum(reasons.get("stopped", 0) for reasons in summary["counters"].values()):
         yield f"time jumped back, and time.on_jump is stop: {stopped} measurements after it were refused: {_ON_JUMP}"
     for name, counts in inputs.items():

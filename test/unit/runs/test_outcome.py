@@ -50,3 +50,10 @@ def test_what_is_counted_is_said_with_the_input_in_its_remedy():
     assert "vo.sigma_factor below 1" in lines
     lines = " ".join(" ".join(text(summary({"vo": {"not_in_use": 200}}, vo=used(0, "odometry")))).split())
     assert "-> odometry.fusion=parallel uses all of them at once" in lines
+
+
+def test_a_solve_that_did_not_converge_is_a_shortcoming_with_the_parameter():
+    (said,) = shortcomings(summary({}) | {"converged": False, "stop": "max_iterations"})
+    assert said.startswith("the last solve did not converge (max_iterations): ")
+    assert "--set solve.max_iterations=" in said
+    assert not [*shortcomings(summary({}) | {"converged": True, "stop": "cost"})]
