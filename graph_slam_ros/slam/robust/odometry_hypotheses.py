@@ -12,14 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpotrs
 
 from graph_slam_ros.chi_square import quantile
-from graph_slam_ros.graph import Graph
+from graph_slam_ros.graph import Edge, EdgeType, Graph
 from graph_slam_ros.graph.geometry import Geometry
 from graph_slam_ros.solver import Solver
-from graph_slam_ros.solver.linearization import linearized
-from graph_slam_ros.typing import Array, Numbers
+from graph_slam_ros.typing import Array, Index, Numbers
 
 TIGHT, CARRIED = "tight", "carried"
 SLIPS = ("translation", "rotation")
@@ -70,15 +69,46 @@ class Stretch:
 class _State:
     """The newest pose, the shared error and all that was seen: stored values, and the joint covariance of errors.
 
-    The cost is minus twice the logarithm of the likelihood so far; observations that do not fit are counted.
+    ``x`` begins with the pose. The cost is minus twice the logarithm of the likelihood so far; observations that do not
+    fit are counted.
     """
 
     x: Array
-    pose: int
     shared: float
     covariance: Array
     cost: float = 0.0
     unfit: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """An edge of odometry: its measurement, and the covariance of its noise with the factors."""
+
+    measured: Numbers
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """An observation from the newest pose, which is the same under each hypothesis.
+
+    Attributes
+    ----------
+    what : it is of
+    at : (1, k) where its vertices begin in ``_State.x``
+    columns : of its vertices in the covariance
+    noise : (m, m) covariance
+    log_root : logarithm of the determinant of the square root of the information
+    """
+
+    what: int | str
+    type: EdgeType
+    at: Index
+    measured: Array
+    columns: Index
+    noise: Array
+    log_root: float
+    cap: float
 
 
 class OdometryFilter:
@@ -95,24 +125,51 @@ class OdometryFilter:
     """
 
     def __init__(self, space: Geometry, graph: Graph, solver: Solver, stretch: Stretch) -> None:
-        self._space, self._graph, self._stretch = space, graph, stretch
-        self._steps = [graph.edge(link) for link in stretch.links]
-        chain = {vertex for step in self._steps for vertex in step.vertices}
-        first = self._steps[0].vertices[0]
+        self._space, self._stretch = space, stretch
+        links = [graph.edge(link) for link in stretch.links]
+        chain = {vertex for link in links for vertex in link.vertices}
+        first = links[0].vertices[0]
         edges = [edge for seen in stretch.seen.values() for edge, _ in seen]
-        self._others = sorted({vertex for edge in edges for vertex in graph.edge(edge).vertices} - chain)
-        joint = solver.joint_marginal([first, *self._others])
-        dof = space.dof
-        self._columns, at = dict[int, slice](), dof + 1
-        for vertex in self._others:
-            self._columns[vertex] = slice(at, at + graph.kind_of(vertex).dof)
-            at += graph.kind_of(vertex).dof
-        covariance = np.zeros((at, at))
-        kept = np.r_[0:dof, dof + 1 : at]
+        others = sorted({vertex for edge in edges for vertex in graph.edge(edge).vertices} - chain)
+        joint = solver.joint_marginal([first, *others])
+        dof, kinds = space.dof, [graph.kind_of(vertex) for vertex in others]
+        begins = dof + 1 + np.concatenate(([0], np.cumsum([kind.dof for kind in kinds], dtype=np.int64)))
+        stored = space.pose.size + np.concatenate(([0], np.cumsum([kind.size for kind in kinds], dtype=np.int64)))
+        self._columns = {v: np.arange(begins[k], begins[k + 1]) for k, v in enumerate(others)}
+        self._stored = {v: np.arange(stored[k], stored[k + 1]) for k, v in enumerate(others)}
+        self._kinds = [
+            (
+                kind,
+                np.stack([self._stored[v] for v, one in zip(others, kinds, strict=True) if one is kind]),
+                np.stack([self._columns[v] for v, one in zip(others, kinds, strict=True) if one is kind]),
+            )
+            for kind in dict.fromkeys(kinds)
+        ]
+        covariance = np.zeros((begins[-1], begins[-1]))
+        kept = np.r_[0:dof, dof + 1 : begins[-1]]
         covariance[np.ix_(kept, kept)] = joint
         covariance[dof, dof] = 1.0 / stretch.noise_factor**2
-        self._start = _State(solver.values, first, 0.0, covariance)
+        x = np.concatenate([solver.values[graph.vertex(vertex).stored] for vertex in (first, *others)])
+        self._start = _State(x, 0.0, covariance)
+        scale = np.outer(stretch.factors, stretch.factors)
+        self._steps = [_Step(tuple(link.measured.tolist()), _covariance(link) * scale) for link in links]
+        self._ends = [link.vertices[1] for link in links]
+        self._seen = [self._observations(graph, vertex) for vertex in self._ends]
         self._tight = list[_State]()  # before each edge, with odometry's own noise
+
+    def _observations(self, graph: Graph, pose: int) -> list[_Seen]:
+        """Return what was seen from a keyframe, without what is between two keyframes of the stretch."""
+        out, dof = list[_Seen](), self._space.dof
+        for edge, what in self._stretch.seen.get(pose, ()):
+            one = graph.edge(edge)
+            if any(vertex != pose and vertex not in self._columns for vertex in one.vertices):
+                continue
+            at = np.array([[0 if v == pose else self._stored[v][0] for v in one.vertices]])
+            columns = np.concatenate([np.arange(dof) if v == pose else self._columns[v] for v in one.vertices])
+            noise, log_root = _covariance(one), float(np.linalg.slogdet(one.sqrt_information)[1])
+            cap = quantile(_CAP, len(noise))
+            out.append(_Seen(what, one.type, at, one.measured[None], columns, noise, log_root, cap))
+        return out
 
     @property
     def size(self) -> int:
@@ -121,8 +178,7 @@ class OdometryFilter:
 
     def seen_since(self, first: int) -> list[int | str]:
         """Landmarks, by vertex, and other classes that were seen after an edge, by its place."""
-        vertices = [step.vertices[1] for step in self._steps[first:]]
-        return sorted({what for v in vertices for _, what in self._stretch.seen.get(v, ())}, key=str)
+        return sorted({what for v in self._ends[first:] for _, what in self._stretch.seen.get(v, ())}, key=str)
 
     def log_likelihood(self, errors: Errors, first: int, without: int | str | None = None) -> float:
         """Return the logarithm of the likelihood of what was seen, but for a constant.
@@ -141,7 +197,7 @@ class OdometryFilter:
         """Return the part of what was seen after an edge that fits."""
         begin = self._tight[first]
         end = self._filtered(begin, first, errors, first)
-        count = sum(len(self._stretch.seen.get(step.vertices[1], ())) for step in self._steps[first:])
+        count = sum(len(self._stretch.seen.get(vertex, ())) for vertex in self._ends[first:])
         return 1.0 - (end.unfit - begin.unfit) / max(1, count)
 
     def _filtered(
@@ -153,22 +209,20 @@ class OdometryFilter:
                 self._tight.append(state)
             state = replace(state, x=state.x.copy(), covariance=state.covariance.copy())
             self._move(state, k, errors)
-            for edge, what in self._stretch.seen.get(self._steps[k].vertices[1], ()):
-                if what != without:
-                    self._observe(state, edge)
+            for one in self._seen[k]:
+                if one.what != without:
+                    self._observe(state, one)
         return state
 
     def _move(self, state: _State, k: int, errors: Errors) -> None:
         """Move the pose along one edge of odometry."""
         space, step, dof, scale = self._space, self._steps[k], self._space.dof, self._stretch.noise_factor**2
-        group, x = space.group, state.x
-        before = tuple(x[self._graph.vertex(state.pose).stored].tolist())
+        group, size = space.group, space.pose.size
+        before = tuple(state.x[:size].tolist())
         slid = tuple((errors.shared[k] * state.shared).tolist())
-        motion = group.retract(tuple(step.measured.tolist()), slid)
+        motion = group.retract(step.measured, slid)
         pose = group.compose(before, motion)
-        root = step.sqrt_information
-        added = np.linalg.inv(root.T @ root) * np.outer(self._stretch.factors, self._stretch.factors)
-        added += np.diag(errors.variances[k]) / scale
+        added = step.covariance + np.diag(errors.variances[k]) / scale
         if errors.jump == k and errors.jump_variances is not None:
             pose = errors.there
             added += np.diag(errors.jump_variances) / scale
@@ -176,37 +230,35 @@ class OdometryFilter:
         state.covariance[:dof] = moves @ state.covariance[: dof + 1]
         state.covariance[:, :dof] = state.covariance[:, : dof + 1] @ moves.T
         state.covariance[:dof, :dof] += added
-        state.pose = step.vertices[1]
-        x[self._graph.vertex(state.pose).stored] = pose
+        state.x[:size] = pose
 
-    def _observe(self, state: _State, edge: int) -> None:
+    def _observe(self, state: _State, one: _Seen) -> None:
         """Add an observation. The state follows it if it fits."""
-        one, dof = self._graph.edge(edge), self._space.dof
-        if any(vertex != state.pose and vertex not in self._columns for vertex in one.vertices):
-            return  # it is between two keyframes of the stretch
-        columns = np.concatenate([np.r_[slice(0, dof) if v == state.pose else self._columns[v]] for v in one.vertices])
-        residual, jacobian = linearized(self._graph, state.x, one.type, one.vertices, one.measured)
-        root = one.sqrt_information
-        noise = np.linalg.inv(root.T @ root)
-        gain = state.covariance[:, columns] @ jacobian.T
-        spread = jacobian @ gain[columns] + noise
-        factor = np.linalg.cholesky(spread)
-        solved = cho_solve((factor, True), residual)
-        statistic, cap = float(residual @ solved) / self._stretch.noise_factor**2, quantile(_CAP, len(residual))
-        if statistic > cap:
-            state.cost += cap
+        residuals, jacobians = one.type.linearize(state.x, one.at, one.measured)
+        residual, jacobian = residuals[0], jacobians[0]
+        gain = state.covariance[:, one.columns] @ jacobian.T
+        factor = np.linalg.cholesky(jacobian @ gain[one.columns] + one.noise)
+        solved, _ = dpotrs(factor, residual, lower=True)
+        statistic = float(residual @ solved) / self._stretch.noise_factor**2
+        if statistic > one.cap:
+            state.cost += one.cap
             state.unfit += 1
             return
         self._correct(state, -gain @ solved)
-        state.covariance -= gain @ cho_solve((factor, True), gain.T)
-        state.cost += statistic + 2.0 * float(np.log(np.diag(factor)).sum() + np.linalg.slogdet(root)[1])
+        state.covariance -= gain @ dpotrs(factor, gain.T, lower=True)[0]
+        state.cost += statistic + 2.0 * float(np.log(factor.diagonal()).sum() + one.log_root)
 
     def _correct(self, state: _State, step: Array) -> None:
-        x, dof = state.x, self._space.dof
-        state.shared += float(step[dof])
-        for vertex, columns in ((state.pose, slice(0, dof)), *self._columns.items()):
-            one = self._graph.vertex(vertex)
-            x[one.stored] = one.kind.retract(x[one.stored][None], step[columns][None])[0]
+        x, space = state.x, self._space
+        state.shared += float(step[space.dof])
+        x[: space.pose.size] = space.pose.retract(x[None, : space.pose.size], step[None, : space.dof])[0]
+        for kind, stored, columns in self._kinds:
+            x[stored] = kind.retract(x[stored], step[columns])
+
+
+def _covariance(edge: Edge) -> Array:
+    """The covariance (m, m) of the noise of an edge."""
+    return np.asarray(np.linalg.inv(edge.sqrt_information.T @ edge.sqrt_information), dtype=float)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,108 @@
+"""CPU time of a replay beside that of merely reading its recording: ``python -m benchmarks.replay [BAG ...]``.
+
+Reading is what ``rosbags`` needs to open the recording and to deserialise all its messages, without its start. The
+replay is the whole command, its start included. The two take turns, and their medians are compared. With ``--command``
+another command is compared, e.g. ``check`` or ``calibrate``. Without a recording, robot 5 of MR.CLAM 7 is converted
+first.
+"""
+
+import argparse
+import os
+import resource
+import shlex
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from benchmarks.fresh import ROOT
+from benchmarks.options import say
+from graph_slam_ros.cli import values
+
+_READ = """
+import sys, time
+from pathlib import Path
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+store, began_s, count = get_typestore(Stores.ROS2_JAZZY), time.process_time(), 0
+with AnyReader([Path(sys.argv[1])], default_typestore=store) as reader:
+    for connection, _, data in reader.messages():
+        reader.deserialize(data, connection.msgtype)
+        count += 1
+print(count, time.process_time() - began_s)
+"""
+_ROBOT = 5
+
+
+def read(bag: Path) -> tuple[int, float]:
+    """Return the number of messages in a recording, and the CPU time to read and deserialise them [s]."""
+    done = subprocess.run([sys.executable, "-c", _READ, bag], check=True, capture_output=True, text=True)
+    count, cpu_s = done.stdout.split()
+    return int(count), float(cpu_s)
+
+
+def commanded(words: list[str]) -> float:
+    """Run a command of ``graph_slam``; return its CPU time [s]. Raises SystemExit where it is refused."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; from graph_slam_ros.cli import main; sys.exit(main())", *words],
+        cwd=ROOT,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode not in (0, 3):
+        raise SystemExit(f"graph_slam {shlex.join(words)}: exit code {done.returncode}\n{done.stderr}")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def compare(bag: Path, command: str, options: list[str], reps: int) -> str:
+    """Let reading and the command take turns; return a line with their medians and the ratio."""
+    reading_s, command_s, count = list[float](), list[float](), 0
+    with tempfile.TemporaryDirectory(prefix="replay-") as folder:
+        out = ["--out", f"{folder}/run", "--force"] if command == "replay" else []
+        commanded(["warmup"])
+        for _ in range(reps):
+            count, cpu_s = read(bag)
+            reading_s.append(cpu_s)
+            command_s.append(commanded([command, str(bag.resolve()), *out, *options]))
+    reading, whole = statistics.median(reading_s), statistics.median(command_s)
+    spread = ", ".join(f"{a:.1f}/{b:.2f}" for a, b in zip(command_s, reading_s, strict=True))
+    return (
+        f"{bag.name}: {command} {whole:.2f} s of CPU, reading {count} messages {reading:.2f} s:"
+        f" {whole / reading:.1f} times ({spread})"
+    )
+
+
+def _usual(folder: str) -> Iterator[Path]:
+    """A recorded robot, if the data sets are there."""
+    datasets = Path(os.environ.get("GRAPH_SLAM_DATASETS", ROOT.parent / "shared/datasets"))
+    converter, set_7 = datasets.parent / "tools/mrclam_to_mcap.py", datasets / "recorded/mrclam7"
+    for path in (converter, set_7):
+        if not path.exists():
+            say(f"no {path}: set GRAPH_SLAM_DATASETS, or name a recording")
+            return
+    bag = Path(folder) / f"mrclam7_{_ROBOT}"
+    words = [sys.executable, str(converter), str(set_7), str(_ROBOT), str(bag), "--map"]
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+    yield bag
+
+
+def main() -> None:
+    """Compare, and print a line for each recording."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("bags", nargs="*", type=Path, metavar="BAG", help="recordings (default: MR.CLAM 7, robot 5)")
+    parser.add_argument("--reps", type=values.count, default=3, metavar="N", help="repetitions (default: 3)")
+    parser.add_argument("--command", default="replay", metavar="NAME", help="of graph_slam (default: replay)")
+    parser.add_argument("--options", default="", metavar="TEXT", help="more options of the command, in one word")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="recording-") as folder:
+        for bag in args.bags or _usual(folder):
+            print(compare(bag, args.command, shlex.split(args.options), args.reps), flush=True)
+
+
+if __name__ == "__main__":
+    main()
