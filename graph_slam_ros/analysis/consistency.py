@@ -6,7 +6,7 @@ distributed, with as many degrees of freedom as e has components. This number is
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BAND = (0.025, 0.975)
 _ESTIMATED = "robust.noise_scale=estimated"
 _WORTH_SAYING = 0.2  # log of a factor of a sigma
+_ALIKE = 1.5  # design effect: errors of a pass have more in common than chance gives
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +78,11 @@ class Consistency:
     advice: str = ""
     frame: str = ""
 
+    @property
+    def over_confidence(self) -> str:
+        """Return which errors are larger than the covariances say; empty if none are."""
+        return over_confidence(self.last_pose, self.poses, self.landmarks)
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
         return asdict(self) | {"noise": [one.as_dict() for one in self.noise]}
@@ -102,7 +108,7 @@ class Consistency:
         for one in self.noise:
             name = " ".join(filter(None, (one.label, one.source, one.part)))
             per_dof = f"{one.per_dof:.3f}" if np.isfinite(one.per_dof) else "-"
-            should = f"not known: {one.reason}" if one.reason else f"{one.factor:.3g} times as large{_growth(one)}"
+            should = should_be(one, self.over_confidence)
             lines.append(f"{name:40s}{one.dof:8.0f}{per_dof:>10s}{one.design_effect:10.2f}   {should}")
         lines += [self.advice] if self.advice else []
         return "\n".join(lines)
@@ -194,20 +200,73 @@ def landmark_errors(
     return (true - positions)[:, :dimensions], relative
 
 
-def noise_advice(noise: Sequence[NoiseScale], *, is_applied: bool, config: Config | None = None) -> str:
+def over_confidence(last_pose: Nees | None, poses: Nees | None, landmarks: Nees | None) -> str:
+    """Return which errors against the truth are larger than the covariances say; empty if none are."""
+    named = {"the last pose": last_pose, "poses": poses, "landmarks": landmarks}
+    beyond = {name: nees for name, nees in named.items() if nees is not None and nees.mean > nees.band[1]}
+    return ", ".join(f"NEES of {name} {nees.mean:.1f} of {nees.dof}" for name, nees in beyond.items())
+
+
+def should_be(one: NoiseScale, over_confident: str = "") -> str:
+    """What the configured sigmas of a group should be, for a person.
+
+    Parameters
+    ----------
+    over_confident : which errors against the truth are larger than the covariances say; empty where none are known
+    """
+    if one.reason:
+        return f"not known: {one.reason}"
+    why = _not_smaller(one, over_confident)
+    return f"not smaller{_growth(one)}: {why}" if why else f"{one.factor:.3g} times as large{_growth(one)}"
+
+
+def noise_advice(
+    noise: Sequence[NoiseScale], *, is_applied: bool, config: Config | None = None, over_confident: str = ""
+) -> str:
     """The advice if residuals contradict the configured sigmas; else empty.
+
+    Smaller sigmas are not advised where residuals cannot show them: where errors of a pass are alike, or where errors
+    against the truth are larger than the covariances say.
 
     Parameters
     ----------
     is_applied : whether the run used the factors already
     config : parameters of the run; with these, parameters of odometry that say what was found
+    over_confident : which errors against the truth are larger than the covariances say; empty where none are known
     """
     wrong = [one for one in noise if not one.reason and _is_wrong(one)]
     if not wrong:
         return ""
-    out = "the run used these factors" if is_applied else f"replay with --set {_ESTIMATED} to use these factors"
-    line = motion_setting([one for one in wrong if one.label == "odometry"], config) if config else ""
+    kept = [" ".join(filter(None, one.key)) for one in noise if _not_smaller(one, over_confident)]
+    if kept:
+        out = f"no smaller sigmas are advised ({'; '.join(kept)})"
+        out += (
+            f": errors against the truth are larger than the covariances say ({over_confident})"
+            if over_confident
+            else ""
+        )
+        out += "; the run used these factors" if is_applied else ""
+    else:
+        out = "the run used these factors" if is_applied else f"replay with --set {_ESTIMATED} to use these factors"
+    of_odometry = [_not_below(one) if over_confident else one for one in wrong if one.label == "odometry"]
+    line = motion_setting([one for one in of_odometry if _is_wrong(one)], config) if config else ""
     return f"{out}\nnoise of this odometry in every run: {line}" if line else out
+
+
+def _not_smaller(one: NoiseScale, over_confident: str) -> str:
+    """Return why smaller sigmas of a group are not advised; empty if they may be, or if they are not smaller."""
+    if one.reason or one.factor >= 1.0:
+        return ""
+    if over_confident:
+        return "the covariances are too small as it is"
+    return "errors of a pass are alike" if one.design_effect > _ALIKE else ""
+
+
+def _not_below(one: NoiseScale) -> NoiseScale:
+    """The noise of a part of odometry whose configured variance is not made smaller."""
+    if one.factor >= 1.0:
+        return one
+    return replace(one, factor=1.0, per_s=one.per_s / one.factor**2)
 
 
 def _is_wrong(one: NoiseScale) -> bool:

@@ -10,7 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from graph_slam_ros.analysis.consistency import Consistency, Nees, landmark_nees, noise_advice, pose_nees
+from graph_slam_ros.analysis.consistency import (
+    Consistency,
+    Nees,
+    landmark_nees,
+    noise_advice,
+    over_confidence,
+    pose_nees,
+)
 from graph_slam_ros.analysis.path_error import interpolated
 from graph_slam_ros.analysis.relative_covariance import RelativeCovariances
 from graph_slam_ros.analysis.trajectories import Truth
@@ -47,9 +54,9 @@ def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool)
     is_held, noise = _noise(run)
     config = run_config(run)
     is_applied = config.robust.noise_scale == "estimated"
-    advice = noise_advice(noise, is_applied=is_applied, config=config)
     reason = _why_no_nees(known, true, is_first=is_first, is_held=is_held, is_planar=is_planar)
     if reason:
+        advice = noise_advice(noise, is_applied=is_applied, config=config)
         return Consistency(None, None, None, noise, {"poses and landmarks": reason}, advice)
     landmarks = read_landmarks(run / "landmarks.csv")
     drive = _Compared(run, path, true, landmarks, known)
@@ -59,6 +66,7 @@ def consistency_of(run: Path, known: Truth, keyframes: slice, *, is_first: bool)
         found, frame = drive.poses(0, covariances, [one.covariance for one in landmarks.values()]), ""
     else:
         found, frame = drive.later()
+    advice = noise_advice(noise, is_applied=is_applied, config=config, over_confident=over_confidence(*found))
     return Consistency(*found, noise, _left_out(*found, known, len(landmarks)), advice, frame)
 
 

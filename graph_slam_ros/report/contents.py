@@ -281,7 +281,7 @@ def _tables(out: Contents, summary: dict[str, Any], saved: Any, scores: Scores |
         "configuration": out.attempt(lambda: verdict.configuration(config)) if config else [],
         "versions": out.attempt(lambda: verdict.versions(out.run, summary)) or [],
         "timing": out.attempt(lambda: verdict.timing(summary)) or [],
-        "noise": out.attempt(lambda: verdict.noise(summary)) or [],
+        "noise": out.attempt(lambda: verdict.noise(summary, scores)) or [],
         "edits": [[shown(str(e)) for e in (one.name, one.text, one.who, one.when, one.why)] for one in edits],
         "classes": out.attempt(lambda: list(verdict.classes(summary))) or [],
     }

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from graph_slam_ros import __version__
+from graph_slam_ros.analysis.consistency import should_be
 from graph_slam_ros.analysis.explain import explain_run
 from graph_slam_ros.analysis.what_if import SavedGraph
 from graph_slam_ros.config.config import Config, flatten, parameters
@@ -14,6 +15,7 @@ from graph_slam_ros.measurements.reasons import Effect, explain, remedy
 from graph_slam_ros.report.packing import shown
 from graph_slam_ros.runs import outcome
 from graph_slam_ros.runs.tables import INPUT_COLUMNS
+from graph_slam_ros.slam.noise_scale import NoiseScale
 
 Row = list[Any]
 _FINE = 0.5, 2.0  # chi2 per degree of freedom
@@ -79,7 +81,8 @@ def _covariances(saved: SavedGraph | None, scores: Any) -> list[str]:
     poses = scores.consistency.poses if scores is not None and scores.consistency else None
     if saved is None or poses is None or poses.mean < _MOST_NEES * poses.dof:
         return []
-    estimated = "" if saved.config.robust.noise_scale == "estimated" else "; try --set robust.noise_scale=estimated"
+    advised = [line for line in scores.consistency.advice.splitlines() if "--set" in line]
+    estimated = f"; {'; '.join(advised)}" if advised else ""
     return [f"{_TOO_SMALL}: NEES of poses {poses.mean:.1f}, where {poses.dof} is expected{estimated}"]
 
 
@@ -230,14 +233,19 @@ def load(summary: Mapping[str, Any]) -> dict[str, list[float]] | None:
     return {"keyframes": at[1:], "cpu_ms": each, "memory_mib": rows["memory_mib"][1:], "backlog": rows["backlog"][1:]}
 
 
-def noise(summary: Mapping[str, Any]) -> list[Row]:
-    """Chi2 per degree of freedom and the factor that sigmas should have, by class, input and part."""
-    rows = []
+def noise(summary: Mapping[str, Any], scores: Any = None) -> list[Row]:
+    """Chi2 per degree of freedom and the factor that sigmas should have, by class, input and part.
+
+    Parameters
+    ----------
+    scores : of the evaluation, None without truth
+    """
+    rows, over_confident = [], scores.consistency.over_confidence if scores is not None and scores.consistency else ""
     for one in summary.get("noise", ()):
         name = " ".join(filter(None, (one["label"], one["source"], one["part"])))
         per_dof = one["per_dof"] if one["per_dof"] is not None and math.isfinite(one["per_dof"]) else None
-        should = one["reason"] if one["reason"] else f"{one['factor']:.3g} times as large"
-        rows.append([shown(name), one["dof"], per_dof, one["design_effect"], should])
+        scale = NoiseScale(**one | {"per_dof": math.nan if per_dof is None else per_dof})
+        rows.append([shown(name), one["dof"], per_dof, one["design_effect"], should_be(scale, over_confident)])
     return rows
 
 

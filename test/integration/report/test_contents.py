@@ -299,10 +299,13 @@ def test_without_plotly_the_command_that_installs_it_is_named(run, tmp_path, mon
 
 def test_covariances_that_the_truth_contradicts_are_named():
     poses = SimpleNamespace(mean=11.0, dof=3)
-    scores = SimpleNamespace(consistency=SimpleNamespace(poses=poses))
+    advice = "replay with --set robust.noise_scale=estimated to use these factors"
+    scores = SimpleNamespace(consistency=SimpleNamespace(poses=poses, advice=advice))
     saved = SimpleNamespace(config=Config())
     (said,) = verdict._covariances(saved, scores)
-    assert "NEES of poses 11.0, where 3 is expected; try --set robust.noise_scale=estimated" in said
+    assert "NEES of poses 11.0, where 3 is expected; replay with --set robust.noise_scale=estimated" in said
+    scores.consistency.advice = "no smaller sigmas are advised (landmarks detections position)"
+    assert "--set" not in verdict._covariances(saved, scores)[0]
     poses.mean = 5.9
     assert verdict._covariances(saved, scores) == []
     assert "odometry" not in verdict._judged(None)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from graph_slam_ros.analysis.consistency import noise_advice
+from graph_slam_ros.analysis.consistency import Consistency, Nees, noise_advice
 from graph_slam_ros.analysis.evaluation import evaluate
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.errors import SingularError
@@ -135,6 +135,48 @@ def test_parameters_that_say_the_estimated_noise_of_odometry_are_printed():
     assert by_twist.endswith(f"noise of this odometry in every run: {expected}")
     by_motion = noise_advice(found, is_applied=False, config=Config.from_mapping({"odometry.noise": "motion"}))
     assert "turn_per_rad=0.045 --set odometry.turn_per_m=0.0025 --set odometry.turn_per_s=5e-05" in by_motion
+
+
+SMALLER = NoiseScale("landmarks", "detections", "position", 100, 900.0, 0.2, 1.0, 0.45)
+LARGER = NoiseScale("landmarks", "detections", "rotation", 100, 900.0, 4.0, 1.0, 2.0)
+
+
+@pytest.mark.parametrize("which", ["last_pose", "poses", "landmarks"])
+def test_smaller_sigmas_are_not_advised_where_errors_are_larger_than_the_covariances_say(which):
+    parts = dict.fromkeys(("last_pose", "poses", "landmarks"), Nees(6.0, 6, (5.7, 6.3), 0.95, 400, 0))
+    fine = Consistency(*parts.values(), (SMALLER,), {}, "")
+    assert (fine.over_confidence, "0.45 times as large" in str(fine)) == ("", True)
+    parts[which] = Nees(11.4, 6, (5.7, 6.3), 0.4, 400, 0)
+    wrong = Consistency(*parts.values(), (SMALLER, LARGER), {}, "")
+    assert f"NEES of {which.replace('_', ' ').replace('last', 'the last')} 11.4 of 6" in wrong.over_confidence
+    assert "0.45 times" not in str(wrong)
+    assert "not smaller: the covariances are too small" in str(wrong)
+    assert "2 times as large" in str(wrong)
+    for noise in ((SMALLER,), (SMALLER, LARGER)):
+        advice = noise_advice(noise, is_applied=False, config=Config(), over_confident=wrong.over_confidence)
+        assert "no smaller sigmas are advised (landmarks detections position)" in advice
+        assert "--set" not in advice
+    larger = noise_advice((LARGER,), is_applied=False, over_confident=wrong.over_confidence)
+    assert "--set robust.noise_scale=estimated" in larger
+
+
+def test_odometry_is_not_made_better_than_configured_where_errors_are_larger_than_the_covariances_say():
+    rotation = NoiseScale("odometry", "odom", "rotation", 100, 300.0, 0.5, 1.0, 0.5, "", 0.04, 0.0, 0.0005)
+    better = NoiseScale("odometry", "odom", "position", 100, 300.0, 0.5, 1.0, 0.5, "", 0.0, 0.0, 0.0005)
+    motion = Config.from_mapping({"odometry.noise": "motion"})
+    for config, per_s in ((Config(), 0.002), (motion, motion.odometry.turn_per_s)):
+        said = noise_advice(
+            (rotation, better), is_applied=False, config=config, over_confident="NEES of poses 9.0 of 3"
+        )
+        assert f"odometry.turn_per_s={per_s:.2g}" in said
+        assert "odometry.way" not in said
+
+
+def test_smaller_sigmas_are_not_advised_where_errors_of_a_pass_are_alike():
+    alike = NoiseScale("landmarks", "detections", "range", 100, 900.0, 0.1, 3.8, 0.6)
+    said = noise_advice((alike,), is_applied=False)
+    assert ("--set" in said, "no smaller sigmas" in said) == (False, True)
+    assert "errors of a pass are alike" in str(Consistency(None, None, None, (alike,)))
 
 
 def test_gates_are_not_made_smaller_by_noise_that_is_made_larger_for_errors_that_are_alike(drive):
