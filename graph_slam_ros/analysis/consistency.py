@@ -208,7 +208,7 @@ def over_confidence(last_pose: Nees | None, poses: Nees | None, landmarks: Nees 
 
 
 def should_be(one: NoiseScale, over_confident: str = "") -> str:
-    """What the configured sigmas of a group should be, for a person.
+    """Return what the configured sigmas of a group should be, for a person.
 
     Parameters
     ----------

@@ -6,7 +6,7 @@ docs/check.md explains each row of ``KINDS``. A refusal that is counted is a fin
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 from graph_slam_ros.formats.parameters import parse_setting
@@ -113,7 +113,7 @@ KINDS: dict[str, Kind] = {
     # -- a gyro that is used as part of odometry
     "gyro_scale": Kind(
         "the gyro turns more or less than odometry, or the other way",
-        "correct its driver (rad/s), or its transform; or set odometry.turn_factor or INPUT.mount",
+        "correct its driver (rad/s), or its transform; or set odometry.turn_factor, INPUT.mount or INPUT.use=none",
     ),
     "gyro_bias": Kind(
         "the gyro turns where odometry does not, by more than its bias may be",
@@ -229,6 +229,19 @@ def assignment(key: str, value: str | float) -> str:
 def in_order(findings: list[Finding]) -> list[Finding]:
     """Errors first, then warnings, then notes, each in the order found."""
     return sorted(findings, key=lambda one: SEVERITIES.index(one.severity))
+
+
+def with_one_value(findings: list[Finding]) -> list[Finding]:
+    """Findings that give each parameter one value: a later one that has another value for it prints no settings."""
+    values, out = dict[str, Any](), list[Finding]()
+    for one in findings:
+        own = dict(parse_setting(text) for text in one.settings)
+        if any(values.get(key, value) != value for key, value in own.items()):
+            out.append(replace(one, settings=(), text=f"{one.text} (mend what is above first, then check again)"))
+        else:
+            values |= own
+            out.append(one)
+    return out
 
 
 def worst(findings: list[Finding]) -> Finding | None:

@@ -1,6 +1,7 @@
 """Checks of a gyro that is used as part of odometry, against odometry's turns."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +15,8 @@ _WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3
 _TURNING_RAD, _LEAST_TURNING = 0.1, 10
 _SCALE, _GROSS, _UNEXPLAINED, _BIAS_SIGMAS = 0.1, 0.4, 0.5, 3.0
 _ROUNDS = 15
+_EXPLAINED = 0.5  # of a wrong heading: more than that is left where the gyro alone does not explain it
+_EITHER = ": the track width is wrong, or the scale of the gyro"
 _MOST_BIAS = 1.0  # [rad/s] that gyro.bias_sigma may be
 
 
@@ -93,7 +96,7 @@ def _scale(c: Columns, factor: float, where: Where) -> Finding:
     settings: tuple[str, ...] = ()
     if abs(factor - 1.0) < _GROSS:
         severity, now = "warning", c.config.odometry.turn_factor
-        text += ": the track width is wrong, or the scale of the gyro"
+        text += _EITHER
         settings = (assignment("odometry.turn_factor", round(now * factor, 4)),)
     elif abs(factor + 1.0) < _GROSS:
         text += ": its sensor is upside down, or odometry turns the wrong way"
@@ -104,6 +107,24 @@ def _scale(c: Columns, factor: float, where: Where) -> Finding:
     elif abs(factor) > 1.0 / _GROSS:
         text += ": are these degrees?"
     return Finding("gyro_scale", severity, factor, 1.0 + _SCALE, "times", text, settings=settings, **where)
+
+
+def of_gyro_or_wheels(findings: list[Finding], gyro_input: str) -> list[Finding]:
+    """Findings in which landmarks have decided whether a gyro or odometry turns by a wrong amount.
+
+    With a gyro, the heading is that of the gyro. Where the gyro turns k times as much as odometry, and the robot 1 / k
+    times as much as the heading says, odometry is right.
+    """
+    gyro = next((one for one in findings if one.code == "gyro_scale" and one.severity == "warning"), None)
+    turn = next((one for one in findings if one.code == "turn_scale"), None)
+    if gyro is None or turn is None:
+        return findings
+    rest = [one for one in findings if one is not turn]
+    if abs((1.0 + turn.value) * gyro.value - 1.0) > _EXPLAINED * abs(turn.value):
+        return rest  # both are wrong: the gyro's finding says by how much they differ
+    text = f"{gyro.text.removesuffix(_EITHER)}: landmarks agree with odometry, so the scale of the gyro is wrong"
+    mended = replace(gyro, text=text, settings=(assignment(f"{gyro_input}.use", "none"),))
+    return [mended if one is gyro else one for one in rest]
 
 
 def _turned_over(c: Columns, T_base_gyro: se3.Pose) -> tuple[str, ...]:

@@ -3,12 +3,13 @@
 import argparse
 import json
 import textwrap
+from pathlib import Path
 
 from graph_slam_ros.cli import console
-from graph_slam_ros.config.config import flatten
+from graph_slam_ros.cli.check import lines, settings_of
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.formats.durable import write_whole
-from graph_slam_ros.formats.parameters import parameters_text, parse_setting, read_parameters
+from graph_slam_ros.formats.parameters import parameters_text
 from graph_slam_ros.runs.calibrate import Calibrated
 from graph_slam_ros.runs.calibrate import calibrate as calibrated
 
@@ -23,8 +24,7 @@ def calibrate(args: argparse.Namespace) -> int:
         raise GraphSlamError(f"{args.bag}: a run folder; calibrate its recording")
     if args.out:
         console.check_file(args.out, force=args.force)
-    settings = dict(flatten(read_parameters(args.config, follow=True))) if args.config else {}
-    settings |= dict(parse_setting(text) for text in args.set)
+    settings = settings_of(args)
     topics = {"odometry": args.odom, "landmarks": args.landmarks}
     done = calibrated(args.bag, settings, **topics, progress=console.progress("calibrate"))
     if args.out:
@@ -33,22 +33,24 @@ def calibrate(args: argparse.Namespace) -> int:
         console.show(
             json.dumps(
                 {"settings": done.settings, "parameters": done.parameters, "rounds": done.rounds}
-                | {"refused": done.refused}
+                | {"refused": done.refused, "fault": done.fault and done.fault.as_dict()}
             )
         )
     else:
-        _show(done)
+        _show(done, args.bag)
     lost = console.report_losses(done.losses, done.warnings)
     if lost or not done.is_complete or not _is_determined(done):
         return console.LOSSES
     return console.FOUND if done.settings else console.DONE
 
 
-def _show(done: Calibrated) -> None:
+def _show(done: Calibrated, bag: Path) -> None:
     for name, value in done.settings.items():
         console.show(f"{name}={value}")
     for one in done.parameters:
         console.show(*textwrap.wrap(one["text"], _WIDTH, initial_indent="  ", subsequent_indent="    "))
+    if done.fault:
+        console.show(*lines(done.fault))
     if done.refused:
         console.warn(done.refused, most=console.SENTENCE)
     elif not _is_determined(done):
@@ -57,7 +59,8 @@ def _show(done: Calibrated) -> None:
         console.show("nothing to correct")
     elif not done.is_complete:
         console.warn(f"after {done.rounds} replays something is still left: run it again with these settings")
-    console.then(done.command)
+    is_wrong = done.fault is not None and done.fault.severity == "error"
+    console.then(console.command("check", bag) if is_wrong else done.command)
 
 
 def _is_determined(done: Calibrated) -> bool:

@@ -5,25 +5,26 @@ import json
 import shlex
 import textwrap
 from collections.abc import Iterator
+from typing import Any
 
 from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.cli import console
+from graph_slam_ros.config.config import flatten
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.parameters import parse_setting, read_parameters
 
 _WIDTH = 100
 
 
 def check(args: argparse.Namespace) -> int:
     """Check a recording; returns 4 if there is a finding above a note."""
-    from graph_slam_ros.formats.parameters import parse_setting
     from graph_slam_ros.runs.check import check as checked
     from graph_slam_ros.runs.folder import is_run
 
     if is_run(args.bag):
         raise GraphSlamError(f"{args.bag}: a run folder; check its recording, or graph_slam explain {args.bag}")
-    settings = dict(parse_setting(text) for text in args.set)
+    settings = settings_of(args)
     topics = {"odometry": args.odom, "landmarks": args.landmarks}
-    own = [f"--set {shlex.quote(text)}" for text in args.set]
     done = checked(args.bag, settings, **topics, quick=args.quick, progress=console.progress("check"))
     if args.json:
         console.show(
@@ -36,12 +37,25 @@ def check(args: argparse.Namespace) -> int:
             console.show(*lines(one))
         counts = {s: sum(one.severity == s for one in done.findings) for s in ("error", "warning", "note")}
         console.show(", ".join(f"{n} {s}{'' if n == 1 else 's'}" for s, n in counts.items()))
-        mend = [
-            f"--set {shlex.quote(text)}" for one in done.findings if one.severity != "note" for text in one.settings
-        ]
-        console.then(" ".join([done.command, *own, *mend]) if done.command else console.command("info", args.bag))
+        mend = [text for one in done.findings if one.severity != "note" for text in one.settings]
+        last = {parse_setting(text)[0]: text for text in [*args.set, *mend]}  # of several, the last one counts
+        own = [f"--config {shlex.quote(str(args.config))}"] if args.config else []
+        more = [f"--set {shlex.quote(text)}" for text in last.values()]
+        console.then(" ".join([done.command, *own, *more]) if done.command else console.command("info", args.bag))
     console.report_losses(done.losses, done.warnings)
     return console.DONE if done.is_clean else console.FOUND
+
+
+def settings_of(args: argparse.Namespace) -> dict[str, Any]:
+    """The parameters of ``--config`` and ``--set``, by dotted name.
+
+    Raises
+    ------
+    GraphSlamError
+        The file or a setting cannot be read.
+    """
+    settings = dict(flatten(read_parameters(args.config, follow=True))) if args.config else {}
+    return settings | dict(parse_setting(text) for text in args.set)
 
 
 def lines(one: Finding) -> Iterator[str]:

@@ -78,8 +78,9 @@ def check(sub: CommandParser, *, of_check: bool = True) -> None:
     sub.add_argument("bag", type=Path, metavar="BAG", help="file or folder of a recording")
     sub.add_argument("--odom", metavar="TOPIC", help="odometry topic (default: as info chooses)")
     sub.add_argument("--landmarks", metavar="TOPIC", help="landmark topic (default: as info chooses)")
+    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file; its values come before info's")
     sub.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="set one parameter, before what info chooses"
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="set one parameter, before the file's"
     )
     if of_check:
         sub.add_argument("--quick", action="store_true", help="leave out what needs a replay and a fit")
@@ -90,7 +91,6 @@ def calibrate(sub: CommandParser) -> None:
     """Add the options of ``calibrate``."""
     check(sub, of_check=False)
     sub.codes = f"{CODES} 4: something is to be corrected."
-    sub.add_argument("--config", type=Path, metavar="FILE", help="parameter file")
     sub.add_argument("--out", type=Path, metavar="FILE", help="write the settings as a parameter file, too")
     sub.add_argument("--force", action="store_true", help="replace an existing file")
 

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from graph_slam_ros.check.checks import worst_of_replay
+from graph_slam_ros.check.columns import Collector
+from graph_slam_ros.check.finding import Finding
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.messages.survey import with_survey
 from graph_slam_ros.recordings.bag import open_bag
@@ -33,6 +36,7 @@ class Calibrated:
     rounds : replays
     is_complete : whether the last replay found nothing more
     refused : why what was found is not among the settings; empty if it is
+    fault : the worst that ``check`` finds without a fit; with an error nothing is among the settings
     losses, warnings : what could not be read
     """
 
@@ -42,6 +46,7 @@ class Calibrated:
     rounds: int
     is_complete: bool
     refused: str
+    fault: Finding | None
     losses: list[str]
     warnings: list[str]
 
@@ -74,24 +79,18 @@ def calibrate(
     if not chosen.trouble and "inputs.names" not in given:
         given = chosen.settings | given
         odometry, landmarks = odometry or chosen.topics.get("odom"), landmarks or chosen.topics.get("detections")
-    config = with_survey(Config.from_mapping(given))
-    if not config.calibrate.is_on:
-        raise GraphSlamError("calibrate.groups: none leaves nothing to estimate; without this setting it is auto")
-    if config.calibrate.drift:
-        raise GraphSlamError("calibrate.drift: settings are constant; graph_slam replay with it corrects what changes")
+    config = _config(given)
     inputs = choose_inputs(bag, config, odometry, landmarks)
     warmup(dimensions=config.world.dimensions)
     total = sum(bag.topics[topic].count for topic in inputs.by_topic())
     report: Mapping[str, Any] = {"settings": {"": 0.0}}
+    fault: Finding | None = None
     rounds, kept, before, refused = 0, dict[str, float | str](), (0, 0), ""
+    columns, counters = Collector(config, inputs.topics), Counters()
     while report["settings"] and rounds < _ROUNDS:
         rounds, now = rounds + 1, config.changed(found)
-        slam = GraphSlam(now)
-        for _, some in progress(RecordedRuns(bag, inputs, now, Counters()), total):
-            for one in some:
-                slam.process(one)
-        for event in END:
-            slam.process(event)
+        counted, collected = (counters, columns) if rounds == 1 else (Counters(), None)
+        slam = _replayed(progress(RecordedRuns(bag, inputs, now, counted, columns=collected), total), now)
         if not slam.keyframes:
             raise GraphSlamError(f"{path}: no odometry of it could be used: graph_slam info {path}")
         accepted = _accepted(slam)
@@ -99,11 +98,35 @@ def calibrate(
             refused, found = _harm(found, kept, before, accepted), kept
             break
         report, kept, before = slam.calibration_report, dict(found), accepted
+        if rounds == 1:
+            fault = worst_of_replay(columns.columns(counters))
+        if fault is not None and fault.severity == "error":  # what is fitted to it means nothing
+            refused, report = f"nothing is calibrated: mend {fault.code} first", {"settings": {}, "parameters": []}
+            break
         found |= report["settings"]
     losses, warnings = list(dict.fromkeys(bag.losses)), list(dict.fromkeys(bag.warnings))
     command = chosen.command(found | dict(settings or {}) | found)
     complete = not report["settings"] and not refused
-    return Calibrated(found, report["parameters"], command, rounds, complete, refused, losses, warnings)
+    return Calibrated(found, report["parameters"], command, rounds, complete, refused, fault, losses, warnings)
+
+
+def _config(given: Mapping[str, Any]) -> Config:
+    config = with_survey(Config.from_mapping(given))
+    if not config.calibrate.is_on:
+        raise GraphSlamError("calibrate.groups: none leaves nothing to estimate; without this setting it is auto")
+    if config.calibrate.drift:
+        raise GraphSlamError("calibrate.drift: settings are constant; graph_slam replay with it corrects what changes")
+    return config
+
+
+def _replayed(runs: Iterable[Any], config: Config) -> GraphSlam:
+    slam = GraphSlam(config)
+    for _, some in runs:
+        for one in some:
+            slam.process(one)
+    for event in END:
+        slam.process(event)
+    return slam
 
 
 def _accepted(slam: GraphSlam) -> tuple[int, int]:

@@ -9,7 +9,8 @@ import numpy as np
 
 from graph_slam_ros.check.checks import check_columns
 from graph_slam_ros.check.columns import Collector, Columns
-from graph_slam_ros.check.finding import Finding, Severity, in_order
+from graph_slam_ros.check.finding import Finding, Severity, in_order, with_one_value
+from graph_slam_ros.check.gyro import of_gyro_or_wheels
 from graph_slam_ros.check.trial import check_trial, replayed
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.measurements.types import Measured
@@ -103,8 +104,9 @@ def check(
     found += check_columns(columns)
     if not quick and not any(one.ends for one in found):
         found += _trial(columns, _in_time(columns, [some for number, some in measured if number == 0]))
-    command = suggestion.command() if not suggestion.trouble else ""
-    return Checked(in_order(found), command, bag.losses, bag.warnings)
+    command = "" if suggestion.trouble else suggestion.command(without=suggestion.settings.keys() - assumed.keys())
+    found = of_gyro_or_wheels(found, config.gyro_input)
+    return Checked(with_one_value(in_order(found)), command, bag.losses, bag.warnings)
 
 
 def _in_time(columns: Columns, measured: list[Measurements]) -> list[Measurements]:

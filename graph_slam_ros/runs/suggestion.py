@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,13 +73,14 @@ class Suggestion:
             self._finish()
             self.trouble = self._refused(bag)
 
-    def command(self, more: Mapping[str, Any] | None = None) -> str:
-        """The command to paste into a shell, with additional settings."""
+    def command(self, more: Mapping[str, Any] | None = None, without: Collection[str] = ()) -> str:
+        """The command to paste into a shell, with additional settings, and without some of its own."""
         path = str(self._path)
         words = ["graph_slam", "replay", f"./{path}" if path.startswith("-") else path]
         for option, name in (("--odom", "odom"), ("--landmarks", "detections")):
             words += [option, self.topics[name]] if name in self.topics else []
-        for key, value in (self.settings | dict(more or {})).items():
+        own = {key: value for key, value in self.settings.items() if key not in without}
+        for key, value in (own | dict(more or {})).items():
             words += ["--set", _assignment(key, value)]
         return shlex.join([*words, "--out", str(suggested_out(self._path))])
 

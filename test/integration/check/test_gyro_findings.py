@@ -55,6 +55,34 @@ def test_a_gyro_that_is_wrong_is_found_and_its_setting_mends_it(bag, tmp_path, f
         assert of_the_gyro(tmp_path / "faulty.mcap", dict(map(parse_setting, found[code].settings))) == {}
 
 
+@pytest.fixture(scope="module")
+def laps(tmp_path_factory):
+    """Long enough for landmarks to decide whether the gyro or odometry is wrong."""
+    file = tmp_path_factory.mktemp("gyro") / "laps.mcap"
+    recording = simulate("warehouse", 3, aisles=2, aisle_m=6.0, laps=2)
+    write_bag(with_instruments(recording, 3, Instruments(imu=50.0)), file)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("fault", "setting"),
+    [
+        (Fault.named("wrong_gyro", factor=1.2), "imu.use=none"),
+        (Fault.named("wrong_scale", distance=1.0, turn=1.15), "odometry.turn_factor="),
+    ],
+)
+def test_landmarks_decide_which_of_gyro_and_odometry_is_wrong_and_one_value_is_printed(laps, tmp_path, fault, setting):
+    bag, drive = tmp_path / "faulty.mcap", Drive(laps)
+    spoil_messages(drive, [fault], seed=1)
+    drive.write(bag)
+    found = [one for one in check(bag, SETTINGS).findings if one.severity != "note"]
+    assert [one.code for one in found] == ["gyro_scale"]
+    (text,) = found[0].settings
+    assert text.startswith(setting)
+    mended = check(bag, SETTINGS | dict([parse_setting(text)])).findings
+    assert [one.code for one in mended if one.severity != "note"] == []
+
+
 def test_a_gyro_beside_slow_odometry_is_not_compared_and_that_is_said(bag, tmp_path):
     drive = Drive(bag)
     spoil_messages(drive, [Fault.named("slow_odometry"), Fault.named("wrong_gyro", factor=1.2)], seed=1)

@@ -90,10 +90,11 @@ def test_a_planted_fault_is_found_and_its_settings_mend_it(drive, tmp_path, name
 
 
 def test_each_finding_that_prints_a_setting_is_planted():
-    source = "".join(file.read_text() for file in (ROOT / "graph_slam_ros/check").glob("*.py"))
+    sources = [file.read_text() for file in (ROOT / "graph_slam_ros/check").glob("*.py")]
     printing = {"frame_unlinked", "axes", "odometry_scale", "turn_scale", "mount_yaw", "clock_offset", "over_confident"}
     printing.add("odometry_over_confident")
-    printing |= set(re.findall(r'Finding\(\s*"(\w+)"(?:(?!Finding\().)*?settings=', source, re.DOTALL))
+    for source in sources:
+        printing |= set(re.findall(r'Finding\(\s*"(\w+)"(?:(?!Finding\().)*?settings=', source, re.DOTALL))
     printing -= {"gyro_scale", "gyro_bias"}  # test_gyro_findings.py
     mended = {code for _, codes, _ in PLANTED.values() for code in codes} | {code for _, code, *_ in FITTED} | {ROUGH}
     assert printing - mended == set()
@@ -114,6 +115,22 @@ def test_faults_can_be_put_into_a_recording_of_a_user_but_not_those_that_need_th
     assert main(["simulate", str(drive), "--out", str(drive), "--fault", "gap", "--force"]) == 2
     assert main(["simulate", "city", "--out", str(tmp_path / "c.g2o"), "--fault", "gap"]) == 2
     assert "a graph has no messages" in capsys.readouterr().err
+
+
+def test_a_parameter_file_counts_as_in_the_other_commands_and_settings_come_before_it(drive, tmp_path, capsys):
+    bag, file = planted(drive, tmp_path / "bad.mcap", "twist sigma 1e-6"), tmp_path / "own file.yaml"
+    file.write_text("odometry:\n  noise: density\n")
+    assert main(["check", str(bag), "--quick"]) == 4
+    assert "covariance_tiny" in capsys.readouterr().out
+    assert main(["check", str(bag), "--quick", "--config", str(file)]) == 0
+    assert f"next: graph_slam replay {bag}" in (said := capsys.readouterr().out)
+    assert said.endswith(f" --config '{file}'\n")
+    assert main(["check", str(bag), "--quick", "--config", str(file), "--set", "odometry.noise=twist"]) == 4
+    (last,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("next:")]
+    assert (last.count("odometry.noise"), "odometry.noise=density" in last) == (1, True)
+    file.write_text("odometry:\n  nose: density\n")
+    assert main(["check", str(bag), "--config", str(file)]) == 2
+    assert "nose" in capsys.readouterr().err
 
 
 def contents(file):

@@ -53,6 +53,23 @@ def test_settings_with_which_less_is_believed_are_not_printed(tmp_path, monkeypa
     assert "not used: detections.mount_correction=0 0 0 0 0 2.0: with it " in err
 
 
+@pytest.mark.parametrize(("how", "code"), [("mirrored", "mirrored"), ("backwards", "axes")])
+def test_a_recording_that_is_wrong_in_itself_is_not_calibrated_and_says_what_is_wrong(tmp_path, capsys, how, code):
+    bag, faulty = str(tmp_path / "drive.mcap"), str(tmp_path / "faulty.mcap")
+    write_bag(simulate("warehouse", 1, aisles=2, aisle_m=6.0, laps=2), bag)
+    assert main(["simulate", bag, "--out", faulty, "--fault", f"wrong_axes:how={how}"]) == 0
+    capsys.readouterr()
+    assert main(["calibrate", faulty]) == 3
+    out, err = capsys.readouterr()
+    assert out.startswith(f"[error] {code}: /landmarks: ")
+    assert "nothing to correct" not in out
+    assert out.endswith(f"next: graph_slam check {faulty}\n")
+    assert err == f"graph_slam: nothing is calibrated: mend {code} first\n"
+    assert main(["calibrate", faulty, "--json"]) == 3
+    said = json.loads(capsys.readouterr().out)
+    assert (said["settings"], said["parameters"], said["fault"]["code"]) == ({}, [], code)
+
+
 def test_constant_settings_of_what_changes_are_refused(capsys):
     assert main(["calibrate", DEMO, "--set", "calibrate.drift=1"]) == 2
     assert "calibrate.drift: settings are constant; graph_slam replay with it" in capsys.readouterr().err
