@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from graph_slam_ros.errors import GraphSlamError
+from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.lie import se3
 from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.runs.check import check
@@ -92,6 +93,43 @@ def displaced(drive):
             seen.store()
 
 
+def six_moved(drive):
+    """Landmarks of which six stand elsewhere from the middle on, each by its own way."""
+    places = Places(drive)
+    names = sorted(places.on_both, key=lambda name: -places.on_both[name])[:6]
+    if len(names) < 6 or places.on_both[names[-1]] < 6:
+        raise GraphSlamError("fewer than six landmarks are seen often enough")
+    angles = np.arange(6.0)
+    for m in drive.landmarks:
+        seen = Sightings(m)
+        if m.stamp_ns > places.middle and set(names) & set(seen.ids):
+            *_, heading = places.pose(m.stamp_ns)
+            for k, name in enumerate(seen.ids):
+                if name in names:
+                    angle = angles[names.index(name)] - heading
+                    seen.points[k, :2] += 2.0 * np.array([np.cos(angle), np.sin(angle)])
+            seen.store()
+
+
+def carried(drive):
+    """Odometry that notices nothing of the part of the drive from half to 0.6."""
+    poses = drive.poses
+    first, last = len(poses) // 2, round(0.6 * len(poses))
+    moved = _moved(poses, last, tuple(poses[first].tolist()))
+    moved[first:last] = poses[first]
+    drive.poses = moved
+
+
+def echoes(drive):
+    """Sightings of which one in twenty is too far away."""
+    rng = np.random.default_rng(1)
+    for m in drive.landmarks:
+        seen = Sightings(m)
+        for k in np.flatnonzero(rng.random(len(seen.ids)) < 0.05):
+            seen.points[k] *= 1.0 + rng.uniform(1.0, 5.0) / np.linalg.norm(seen.points[k])
+        seen.store()
+
+
 def jumped(drive):
     poses = drive.poses
     at = len(poses) // 2
@@ -155,6 +193,21 @@ FAULTS = {
     "all ids new each 15 s": (of("new_ids"), "no_closure"),
     "nothing seen after a quarter": (of("blind"), "silent"),
     "NaN in odometry": (of("not_a_number"), "nonfinite"),
+    "a tenth of the drive": (of("brief"), "not_observable"),
+    "file cut off": (of("cut_off"), "damaged"),
+    "no landmarks": (of("missing"), "no_landmarks"),
+    "no odometry": (of("missing:what=odometry"), "no_odometry"),
+    "landmarks of another definition": (of("unreadable"), "input_unused"),
+    "/tf of another odometry": (of("other_tf"), "tf_differs"),
+    "sensor's transform changes": (of("static_changes"), "static_changes"),
+    "an id twice in a message": (of("same_ids"), "id_twice"),
+    "twist variance 0": (of("twist_variance:variance=0.0"), "covariance_zero"),
+    "an id for each sighting": (of("track_ids:sightings=1"), "no_parallax"),
+    "nothing seen after a fiftieth": (of("blind:after=0.02"), "few_sightings"),
+    "wheels slip for a twentieth": (of("wrong_scale:distance=1.5,begin=0.5,lasting=0.05"), "odometry_slips"),
+    "carried for a tenth": (carried, "odometry_slips"),
+    "six landmarks moved by 2 m": (six_moved, "map_breaks"),
+    "5 % of sightings too far": (echoes, "outliers"),
 }
 """By name: what is planted, and the codes of which one is to be found."""
 
@@ -176,14 +229,24 @@ def cut(bag, target, seconds):
     return target
 
 
+def mended(file, hits, *, quick=False):
+    """The codes that are still found with the settings of their finding."""
+    left = []
+    for one in hits:
+        if one.settings:
+            found = check(file, dict(parse_setting(text) for text in one.settings), quick=quick).findings
+            left += [one.code] if one.code in {other.code for other in found} else []
+    return left
+
+
 def table(bag, names, *, quick=False):
-    """Rows of what was found in a recording with each fault, and the number that was not."""
+    """Rows of what was found in a recording with each fault; names of what was not, or is there with its settings."""
     before = {one.code: one for one in check(bag, quick=quick).findings}
     print(
         f"## {bag.name}\n\nwithout a fault: {', '.join(f'{f.severity} {c}' for c, f in before.items()) or 'nothing'}\n"
     )
     print("| planted | found as | value | other errors and warnings | CPU [s] |\n|---|---|---|---|---|", flush=True)
-    missed = []
+    missed, unmended = [], []
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             codes = FAULTS[name][1].split()
@@ -198,15 +261,19 @@ def table(bag, names, *, quick=False):
             hits = [one for one in found if one.code in codes]
             others = {f.code for f in found if f.severity != "note"} - set(codes) - before.keys()
             values = ", ".join(f"{one.value:.4g} {one.unit}" for one in hits)
+            left = mended(file, hits, quick=quick)
+            unmended += [name] if left else []
+            others |= {f"**not mended: {code}**" for code in left}
             if not hits:
                 missed.append(name)
             named = ", ".join(one.code for one in hits) or "**missed**"
             print(f"| {name} | {named} | {values} | {', '.join(sorted(others))} | {took_s:.1f} |", flush=True)
     print(
-        f"\n{len(names) - len(missed)} of {len(names)} found{'; missed: ' if missed else ''}{', '.join(missed)}\n",
+        f"\n{len(names) - len(missed)} of {len(names)} found{'; missed: ' if missed else ''}{', '.join(missed)}; not "
+        f"mended: {', '.join(unmended) or 'none'}\n",
         flush=True,
     )
-    return missed
+    return missed, unmended
 
 
 def worlds(folder):
@@ -230,10 +297,11 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         bags = [cut(bag, Path(folder) / bag.name, args.seconds) for bag in args.bags] or list(worlds(folder))
         names = args.only or list(FAULTS)
-        missed = [one for bag in bags for one in table(bag, names, quick=args.quick)]
+        rows = [table(bag, names, quick=args.quick) for bag in bags]
+        missed, unmended = ([name for row in rows for name in row[k]] for k in (0, 1))
     tried = len(names) * len(bags)
-    print(f"RELIABILITY planted_faults tried={tried} found={tried - len(missed)}", flush=True)
-    return 1 if len(missed) > MOST_MISSED * tried else 0
+    print(f"RELIABILITY planted_faults tried={tried} found={tried - len(missed)} unmended={len(unmended)}", flush=True)
+    return 1 if len(missed) > MOST_MISSED * tried or unmended else 0
 
 
 if __name__ == "__main__":

@@ -160,6 +160,10 @@ KINDS: dict[str, Kind] = {
         "the residuals of an input are larger than its noise says", "set robust.noise_scale=estimated"
     ),
     "odometry_over_confident": Kind("odometry is worse than its noise says", "set robust.noise_scale=estimated"),
+    "odometry_slips": Kind(
+        "in a stretch odometry drives or turns far more or less than the map shows",
+        "look at the ground and the tyres there; a run finds slips (odometry.doubt); a gyro helps in turns",
+    ),
     "id_reused": Kind("two landmarks have the same id", _ID),
     "ids_unsure": Kind(
         "many ids are seen at more than one place", "correct the detector, or set landmarks.association=joint"

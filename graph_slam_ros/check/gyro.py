@@ -14,6 +14,7 @@ from graph_slam_ros.typing import Array
 _WINDOW_NS, _LEAST_WINDOWS, _LEAST_SAMPLES = 1_000_000_000, 20, 3
 _TURNING_RAD, _LEAST_TURNING = 0.1, 10
 _SCALE, _GROSS, _UNEXPLAINED, _BIAS_SIGMAS = 0.1, 0.4, 0.5, 3.0
+_OF_NOTHING = 0.2  # of odometry's turns: a gyro that measures none of them, but others
 _ROUNDS = 15
 _EXPLAINED = 0.5  # of a wrong heading: more than that is left where the gyro alone does not explain it
 _EITHER = ": the track width is wrong, or the scale of the gyro"
@@ -39,15 +40,17 @@ def check_gyro(c: Columns) -> Iterator[Finding]:
         text = f"{topic.name}: the scale of its gyro is not checked: the robot turns in {turning} seconds only"
         yield Finding("gyro_unchecked", "note", turning, _LEAST_TURNING, "seconds", text, **where)
     else:
-        size = float(np.median(np.abs(factor * odometry[is_turning])))
-        unexplained = float(np.median(np.abs(left[is_turning]))) / max(size, 1e-9)
+        size = max(1.0, abs(factor)) * float(np.median(np.abs(odometry[is_turning])))
+        unexplained = float(np.median(np.abs(left[is_turning]))) / size
+        most = _UNEXPLAINED if abs(factor) > _GROSS else _OF_NOTHING
+        if unexplained > most:
+            text = f"{topic.name}: odometry's turns do not explain {unexplained:.0%} of those of the gyro"
+            yield Finding("gyro_unrelated", "warning", unexplained, most, "part", text, **where)
+            return
         if abs(factor - 1.0) > _SCALE:
             yield _scale(c, factor, where)
             if abs(factor - 1.0) >= _GROSS:  # its offset means nothing
                 return
-        elif unexplained > _UNEXPLAINED:
-            text = f"{topic.name}: odometry's turns do not explain {unexplained:.0%} of those of the gyro"
-            yield Finding("gyro_unrelated", "warning", unexplained, _UNEXPLAINED, "part", text, **where)
     if abs(bias) > limit:
         text = f"{topic.name}: its gyro turns by {bias:.3f} rad/s where odometry does not"
         settings = (assignment("gyro.bias_sigma", round(abs(bias), 3)),) if abs(bias) < _MOST_BIAS else ()

@@ -14,7 +14,7 @@ from graph_slam_ros.lie import se3
 from graph_slam_ros.typing import Array, Index, Mask
 
 _LEAST, _NEAR_M, _SIGMAS, _OF_MEDIAN = 5, 0.5, 4.0, 1.48
-_OUTLIERS = 0.12
+_OUTLIERS, _NOTED = 0.12, 0.02  # part of the sightings: a run leaves out a few that contradict its map
 _FITS, _APART_NS, _FEWEST = 3.0, 1_000_000_000, 5
 _TURNED_RAD = np.linspace(0.5, 2.0 * np.pi - 0.5, 16)
 _LEAST_CHANCE, _FALSE_RATE = 0.01, 1e-5
@@ -75,10 +75,12 @@ def check_outliers(
     if wrong is not None:
         yield _wrong(s, wrong, config)
     rest = len(far) - (wrong.count if wrong is not None else 0)
-    if rest > _OUTLIERS * len(compared):
-        share = len(far) / len(compared)
-        text = f"{s.topic}: {share:.0%} of the sightings are far from their landmark"
-        yield Finding("outliers", "warning", share, _OUTLIERS, "part", text, s.topic, int(s.stamp_ns[0]), len(far))
+    if rest > _NOTED * len(compared):
+        share, first_ns = len(far) / len(compared), int(s.stamp_ns[far].min())
+        severity: Severity = "warning" if rest > _OUTLIERS * len(compared) else "note"
+        limit = _OUTLIERS if severity == "warning" else _NOTED
+        text = f"{s.topic}: {share:.1%} of the sightings are far from their landmark"
+        yield Finding("outliers", severity, share, limit, "part", text, s.topic, first_ns, len(far))
 
 
 def _places(s: SightingColumns, points: Array, inside: Mask) -> Places:

@@ -145,7 +145,7 @@ def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array)
         return
     where["count"] = len(pairs.a)
     noise_m = 1.5 * (float(np.median(s.sigmas[pairs.a])) * 2.0**0.5 + _TYPICAL_M)
-    found = _mirrored(c, s, pairs, noise_m, where) or _axes(s, pairs, noise_m, where)
+    found = _mirrored(c, s, pairs, noise_m, where) or _axes(s, pairs, noise_m, use, where)
     if found is not None:
         yield found
         return
@@ -153,18 +153,18 @@ def _contradictions(c: Columns, s: SightingColumns, path_ns: Index, path: Array)
     lever_m = np.linalg.norm(pairs.motion[:, :3], axis=1) + pairs.turned * np.minimum(distance_m[pairs.a], 1e3)
     share = residual_m / float(np.median(lever_m))
     if share > _UNRELATED and residual_m > _UNRELATED_NOISES * noise_m and len(pairs.a) > _UNRELATED_PAIRS:
-        if residual_m < _RELATED * _of_others(s, pairs, use):
+        if residual_m < _RELATED * _of_others(s.points, pairs, use):
             yield from noisier(s, pairs)
             return
         text = f"{s.topic}: odometry does not explain {share:.0%} of the motion between two sightings of a landmark"
         yield Finding("unrelated", "error", share, _UNRELATED, "part", text, **where)
 
 
-def _of_others(s: SightingColumns, pairs: Pairs, use: Mask) -> float:
+def _of_others(points: Array, pairs: Pairs, use: Mask) -> float:
     """The median distance between two landmarks, whatever their identities: what chance would give."""
     chosen = np.flatnonzero(use)
     shifted = Pairs(pairs.a, np.roll(chosen, len(chosen) // 2)[np.searchsorted(chosen, pairs.b)], pairs.motion)
-    return float(np.median(Pairs(shifted.a, shifted.b, shifted.motion, pairs.dimensions).residuals(s.points)))
+    return float(np.median(Pairs(shifted.a, shifted.b, shifted.motion, pairs.dimensions).residuals(points)))
 
 
 def noisier(s: SightingColumns, pairs: Pairs) -> Iterator[Finding]:
@@ -218,12 +218,14 @@ def _mirrored(c: Columns, s: SightingColumns, pairs: Pairs, noise_m: float, wher
     return None
 
 
-def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, where: Where) -> Finding | None:
-    now_m = float(np.median(pairs.residuals(s.points)))
-    others = {what: float(np.median(pairs.residuals(points))) for what, points in _hypotheses(s).items()}
+def _axes(s: SightingColumns, pairs: Pairs, noise_m: float, use: Mask, where: Where) -> Finding | None:
+    now_m, hypotheses = float(np.median(pairs.residuals(s.points))), _hypotheses(s)
+    others = {what: float(np.median(pairs.residuals(points))) for what, points in hypotheses.items()}
     del others[MIRRORED]
     what = min(others, key=lambda one: others[one])
     if others[what] >= _HALF * now_m or now_m <= _NOISES * noise_m:
+        return None
+    if others[what] >= _RELATED * _of_others(hypotheses[what], pairs, use):  # in the plane some axes hide any distance
         return None
     if_so = f"but by {others[what]:.2f} m if the axes are {what}"
     text = f"{s.topic}: two sightings of a landmark differ by {now_m:.2f} m, {if_so}"

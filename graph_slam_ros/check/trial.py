@@ -9,6 +9,7 @@ from graph_slam_ros.check.finding import Finding, Where, assignment
 from graph_slam_ros.check.identities import at_two_places, check_identities, points_in_map
 from graph_slam_ros.check.outliers import check_outliers
 from graph_slam_ros.check.pairs import noisier, pairs_of, path_of, poses_at, turned_mount
+from graph_slam_ros.check.slips import check_slips
 from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.types import Control, Measurement, Odometry
@@ -35,6 +36,7 @@ _LIMITS = {
 _OVER_CONFIDENT, _ODOMETRY_OVER_CONFIDENT, _LEAST_DOF = 2.0, 6.0**0.5, 100.0
 _LOST = 0.25
 _JUMPED_S = 0.08
+_OF_A_BREAK = ("ids_unsure", "map_breaks")  # what a robot that was carried makes of identities that are right
 _MOST, _SHIFTS = 0.9, 2.0
 
 
@@ -103,7 +105,10 @@ def check_trial(c: Columns, slam: GraphSlam) -> Iterator[Finding]:
     for one in fitted:
         yield from _fitted(c, one)
     yield from _clock_jumps(c, fit)
-    yield from found
+    slips = list(check_slips(c, slam))
+    is_displaced = any(one.severity == "warning" for one in slips)
+    yield from slips
+    yield from (one for one in found if not (is_displaced and one.code in _OF_A_BREAK))
     for noise in scales if c.config.robust.noise_scale != "estimated" else ():
         limit = _ODOMETRY_OVER_CONFIDENT if noise.label == "odometry" else _OVER_CONFIDENT
         factor = float(np.sqrt(noise.per_dof))

@@ -106,7 +106,7 @@ def check(
         found += _trial(columns, _in_time(columns, [some for number, some in measured if number == 0]))
     command = "" if suggestion.trouble else suggestion.command(without=suggestion.settings.keys() - assumed.keys())
     found = of_gyro_or_wheels(found, config.gyro_input)
-    return Checked(with_one_value(in_order(found)), command, bag.losses, bag.warnings)
+    return Checked(with_one_value(in_order(list(dict.fromkeys(found)))), command, bag.losses, bag.warnings)
 
 
 def _in_time(columns: Columns, measured: list[Measurements]) -> list[Measurements]:

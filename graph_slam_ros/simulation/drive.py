@@ -3,6 +3,7 @@
 The topics are those of ``write_bag``, or the only one of their type. All other messages stay bytes.
 """
 
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from graph_slam_ros.simulation.bag import ODOMETRY_TOPIC
 from graph_slam_ros.simulation.recording import LANDMARKS_TOPIC
 from graph_slam_ros.typing import Array, Index
 
-_ODOMETRY, _TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
+_ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 DETECTIONS, POINTS = "vision_msgs/msg/Detection3DArray", "sensor_msgs/msg/PointCloud2"
 _DOUBLE = 8  # of sensor_msgs/PointField
 
@@ -63,6 +64,7 @@ class Drive:
     Attributes
     ----------
     messages : all of them; faults change, drop and add some
+    part_of_file : so much of the file is left by ``write``
 
     Raises
     ------
@@ -77,6 +79,7 @@ class Drive:
         self.landmarks_topic = _only(types, LANDMARKS_TOPIC, (DETECTIONS, POINTS))
         changed = {self.odometry_topic, self.landmarks_topic}
         decode = {name: decoder(types[name]) for name in changed}
+        self.part_of_file = 1.0
         self.messages = [
             Message(m.topic, types[m.topic], m.log_ns, decode[m.topic](m.cdr) if m.topic in changed else m.cdr)
             for m in bag.messages(set(bag.topics))
@@ -89,8 +92,8 @@ class Drive:
 
     @property
     def landmarks(self) -> list[Message]:
-        """The messages of landmarks."""
-        return [m for m in self.messages if m.topic == self.landmarks_topic]
+        """The messages of landmarks that can be decoded."""
+        return [m for m in self.messages if m.topic == self.landmarks_topic and not isinstance(m.content, bytes)]
 
     @property
     def poses(self) -> Array:
@@ -127,13 +130,17 @@ class Drive:
         """Add a message on /tf_static, recorded first."""
         first_ns = self.messages[0].log_ns
         content = transform(first_ns, parent, child, pose)
-        self.messages.insert(0, Message("/tf_static", _TRANSFORMS, first_ns, content))
+        self.messages.insert(0, Message("/tf_static", TRANSFORMS, first_ns, content))
 
     def write(self, path: Path | str) -> None:
         """Write the recording as mcap, completely or not at all."""
-        with replaced(Path(path)) as new, BagWriter(new) as bag:
-            for m in self.messages:
-                bag.write(m.topic, m.type, m.log_ns, m.content if isinstance(m.content, bytes) else encode(m.content))
+        with replaced(Path(path)) as new:
+            with BagWriter(new) as bag:
+                for m in self.messages:
+                    content = m.content if isinstance(m.content, bytes) else encode(m.content)
+                    bag.write(m.topic, m.type, m.log_ns, content)
+            if self.part_of_file < 1.0:
+                os.truncate(new, int(self.part_of_file * Path(new).stat().st_size))
 
 
 def _only(types: dict[str, str], usual: str, wanted: tuple[str, ...]) -> str:

@@ -14,6 +14,7 @@ from graph_slam_ros.messages.from_msg import decoder
 from graph_slam_ros.simulation.drive import Drive, Message, Sightings
 from graph_slam_ros.simulation.odometry_faults import AT, CHANGED, ODOMETRY_KINDS
 from graph_slam_ros.simulation.options import Kind, option
+from graph_slam_ros.simulation.recording_faults import RECORDING_KINDS
 from graph_slam_ros.typing import Array
 
 _IMU = "sensor_msgs/msg/Imu"
@@ -126,6 +127,8 @@ class WrongGyro:
 
     factor: float = option(1.2, "so many times as large", "", -1e3, 1e3)
     bias_rad_s: float = option(0.0, "larger by so much, about each axis", "rad/s", -10, 10)
+    noise_rad_s: float = option(0.0, "wrong by so much at random, for a second at a time", "rad/s", 0, 100)
+    late_s: float = option(0.0, "stamped too late by so much", "s", -1e5, 1e5)
     axes: str = option("kept", "which", choices=("kept", "exchanged"))
 
 
@@ -255,24 +258,29 @@ def _new_ids(drive: Drive, fault: NewIds, _rng: Generator) -> None:
     _each(drive, change)
 
 
-def _wrong_gyro(drive: Drive, fault: WrongGyro, _rng: Generator) -> None:
+def _wrong_gyro(drive: Drive, fault: WrongGyro, rng: Generator) -> None:
     decode, found = decoder(_IMU), [m for m in drive.messages if m.type == _IMU]
     if not found:
         raise GraphSlamError("wrong_gyro: needs an IMU")
+    errors: dict[int, float] = {}
     for m in found:
         m.content = decode(m.content) if isinstance(m.content, bytes) else m.content
         w = m.content.angular_velocity
         rates = (w.x, w.y, w.z) if fault.axes == "kept" else (w.z, w.x, w.y)
-        w.x, w.y, w.z = (fault.factor * rate + fault.bias_rad_s for rate in rates)
+        second, error = m.log_ns // NS, fault.noise_rad_s * rng.standard_normal() if fault.noise_rad_s else 0.0
+        wrong = fault.bias_rad_s + errors.setdefault(second, error)
+        w.x, w.y, w.z = (fault.factor * rate + wrong for rate in rates)
+        m.stamp_ns += round(fault.late_s * NS)
 
 
 def _blind(drive: Drive, fault: Blind, _rng: Generator) -> None:
     at_ns = np.quantile(drive.odometry_ns, fault.after)
-    drive.drop([m for m in drive.landmarks if m.stamp_ns > at_ns])
+    drive.drop([m for m in drive.landmarks if m.stamp_ns >= at_ns])
 
 
 MESSAGE_KINDS: dict[str, Kind] = {
     **ODOMETRY_KINDS,
+    **RECORDING_KINDS,
     "clock_offset": Kind(ClockOffset, _stamped(lambda t, f, _: t + round(f.seconds * NS))),
     "clock_drift": Kind(ClockDrift, _stamped(lambda t, f, _: t + ((t - t[0]) * f.ppm * 1e-6).astype(np.int64))),
     "clock_jump": Kind(

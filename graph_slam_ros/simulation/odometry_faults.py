@@ -57,6 +57,8 @@ class WrongScale:
 
     distance: float = option(1.05, "distance in odometry for each metre driven", "", -1e6, 1e6)
     turn: float = option(1.0, "and turn for each radian turned", "", -1e3, 1e3)
+    begin: float = option(0.0, AT, "", 0, 1)
+    lasting: float = option(1.0, "for how long, as a part of the messages", "", 0, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,8 +162,18 @@ def _twists(drive: Drive, change: Callable[[Array, Array, Array], tuple[Array, A
 def _wrong_scale(drive: Drive, fault: WrongScale, _rng: Generator) -> None:
     poses = drive.poses
     moved, turned = _steps(poses)
-    drive.poses = _chained(poses[0], moved * fault.distance, turned * fault.turn)
-    _twists(drive, lambda v, w, _: (v * fault.distance, w * fault.turn))
+    number = np.arange(len(poses))
+    first, last = fault.begin * len(poses), (fault.begin + fault.lasting) * len(poses)
+    is_wrong = ((number >= first) & (number <= last))[:, None]
+    distance, turn = np.where(is_wrong, fault.distance, 1.0), np.where(is_wrong, fault.turn, 1.0)
+    drive.poses = _chained(poses[0], moved * distance[1:], turned * turn[1:])
+    factors = iter(zip(distance[:, 0].tolist(), turn[:, 0].tolist(), strict=True))
+
+    def changed(v: Array, w: Array, _: Array) -> tuple[Array, Array]:
+        of_way, of_turn = next(factors)
+        return v * of_way, w * of_turn
+
+    _twists(drive, changed)
 
 
 def _wrong_twist(drive: Drive, fault: WrongTwist, _rng: Generator) -> None:

@@ -41,6 +41,8 @@ def test_a_gyro_that_is_right_has_no_finding(bag):
         ({"factor": 0.0}, "gyro_scale", 0.0, False),
         ({"factor": 1.0, "axes": "exchanged"}, "gyro_scale", 0.0, False),
         ({"factor": 1.0, "bias_rad_s": 0.15}, "gyro_bias", 0.15, True),
+        ({"factor": 1.0, "noise_rad_s": 0.6}, "gyro_unrelated", None, False),
+        ({"factor": 1.0, "late_s": 4.0}, "gyro_unrelated", None, False),
     ],
 )
 def test_a_gyro_that_is_wrong_is_found_and_its_setting_mends_it(bag, tmp_path, fault, code, value, has_setting):
@@ -49,7 +51,7 @@ def test_a_gyro_that_is_wrong_is_found_and_its_setting_mends_it(bag, tmp_path, f
     drive.write(tmp_path / "faulty.mcap")
     found = of_the_gyro(tmp_path / "faulty.mcap", {})
     assert found.keys() == {code}
-    assert found[code].value == pytest.approx(value, rel=0.1, abs=0.05)
+    assert value is None or found[code].value == pytest.approx(value, rel=0.1, abs=0.05)
     assert bool(found[code].settings) == has_setting
     if has_setting:
         assert of_the_gyro(tmp_path / "faulty.mcap", dict(map(parse_setting, found[code].settings))) == {}

@@ -8,11 +8,12 @@ from places import ROOT
 from planted_faults import FAULTS, planted
 from recordings import short_drive
 
+from graph_slam_ros.check.finding import KINDS
 from graph_slam_ros.cli import main
 from graph_slam_ros.formats.parameters import parse_setting
 from graph_slam_ros.recordings.bag import open_bag
 from graph_slam_ros.runs.check import check
-from graph_slam_ros.simulation import Drive, Fault, simulate, spoil_messages, write_bag
+from graph_slam_ros.simulation import Drive, Fault, simulate, spoil_messages, write_bag, write_faulty_bag
 from graph_slam_ros.simulation.drive import Sightings
 from graph_slam_ros.simulation.message_faults import MESSAGE_KINDS
 
@@ -35,6 +36,16 @@ SELECTED = (
     "identities of tracks",
     "odometry stands",
     "NaN in odometry",
+    "file cut off",
+    "no landmarks",
+    "no odometry",
+    "landmarks of another definition",
+    "/tf of another odometry",
+    "sensor's transform changes",
+    "an id twice in a message",
+    "twist variance 0",
+    "an id for each sighting",
+    "nothing seen after a fiftieth",
 )
 
 
@@ -143,7 +154,7 @@ def contents(file):
 def test_every_kind_changes_a_recording_and_leaves_it_readable(tmp_path):
     drive, out = short_drive(tmp_path / "drive.mcap"), tmp_path / "out.mcap"
     before = contents(drive)
-    for kind in MESSAGE_KINDS.keys() - {"wrong_gyro"}:  # it needs an IMU
+    for kind in MESSAGE_KINDS.keys() - {"wrong_gyro", "cut_off"}:  # one needs an IMU, of one little can be read
         changed = Drive(drive)
         spoil_messages(changed, [Fault.named(kind)], seed=1)
         changed.write(out)
@@ -165,6 +176,11 @@ FITTED = (
     ("track width 8 % wrong", "turn_scale", -0.074, 0.02, {}),
     ("noise 8 times its covariance", "over_confident", None, None, {}),
     ("3 % of ids wrong", "ids_wrong", 0.03, 0.01, {"robust.decide": False}),
+    ("a tenth of the drive", "not_observable", None, None, {}),
+    ("wheels slip for a twentieth", "odometry_slips", 1.0, 0.5, {}),
+    ("carried for a tenth", "odometry_slips", None, None, {}),
+    ("six landmarks moved by 2 m", "map_breaks", None, None, {}),
+    ("5 % of sightings too far", "outliers", 0.05, 0.015, {}),
 )
 
 
@@ -185,6 +201,40 @@ def test_the_fit_finds_what_needs_an_estimate_and_its_settings_mend_it(
     if value is not None:
         assert found.value == pytest.approx(value, abs=within)
     assert code not in mended
+
+
+def test_a_fit_of_ranges_of_which_many_are_too_long_is_not_trusted(tmp_path):
+    bag = tmp_path / "ranges.mcap"
+    world = simulate("warehouse", 3, aisles=2, laps=2, sensor="range")
+    write_faulty_bag(world, bag, [Fault.named("outliers", rate=0.4, most_m=2.0)], 3)
+    found = {one.code: one for one in check(bag).findings}
+    assert found["fit_unsure"].severity == "warning"
+    assert {"clock_offset", "mount_yaw", "odometry_scale", "turn_scale"} & found.keys() == set()
+
+
+def test_random_identities_are_no_wrong_axes(laps, tmp_path):
+    """In the plane, a sensor whose axes were turned upwards would see everything near itself."""
+    drive = Drive(laps)
+    spoil_messages(drive, [Fault.named("random_ids", rate=0.6)], seed=1)
+    drive.write(tmp_path / "faulty.mcap")
+    errors = [one.code for one in check(tmp_path / "faulty.mcap", quick=True).findings if one.severity == "error"]
+    assert errors == ["unrelated"]
+
+
+def test_each_finding_is_said_once(laps, tmp_path):
+    """Noise is seen by pairs of sightings, and again by those that a fit does not believe."""
+    drive = Drive(laps)
+    spoil_messages(drive, [Fault.named("noisy", factor=12.0)], seed=1)
+    drive.write(tmp_path / "faulty.mcap")
+    found = check(tmp_path / "faulty.mcap").findings
+    assert len(found) == len(set(found)) > 0
+
+
+def test_each_finding_is_planted():
+    elsewhere = {"gyro_scale", "gyro_bias", "gyro_unrelated", "gyro_unchecked"}  # test_gyro_findings.py
+    elsewhere |= {"range_scale", "fit_unsure", ROUGH}  # test_recordings.py, and above
+    tested = {code for _, codes, _ in PLANTED.values() for code in codes}
+    assert KINDS.keys() - {code for _, codes in FAULTS.values() for code in codes.split()} - tested == elsewhere
 
 
 @pytest.mark.parametrize("seconds", [0.2, -0.2])
