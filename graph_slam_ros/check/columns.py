@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from graph_slam_ros.check.located import located
 from graph_slam_ros.config.config import Config
 from graph_slam_ros.lie import se3
 from graph_slam_ros.measurements.counters import Counters
-from graph_slam_ros.measurements.types import AngularVelocity, Control, Measured, Odometry, Sighting, Sightings
-from graph_slam_ros.messages.from_msg import TF, TF_STATIC
+from graph_slam_ros.measurements.types import AngularVelocity, Control, Measured, Odometry, Sightings
+from graph_slam_ros.messages.from_msg import TF, TF_STATIC, OwnDecoder
 from graph_slam_ros.messages.inputs import uses
+from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes
 from graph_slam_ros.messages.inputs.transforms import Transforms, pose
 from graph_slam_ros.typing import Array, Index
 
@@ -146,12 +148,14 @@ class _Topic:
 
     def add(self, log_ns: int, message: Any) -> None:
         header = getattr(message, "header", None)
-        if header is None or len(self.log_ns) >= MOST:
+        if header is not None:
+            self.add_stamp(log_ns, header.stamp.sec * 1_000_000_000 + header.stamp.nanosec, header.frame_id)
+
+    def add_stamp(self, log_ns: int, stamp_ns: int, frame: str) -> None:
+        if len(self.log_ns) >= MOST:
             return
-        stamp_ns = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
         self.log_ns.append(log_ns)
         self.stamp_ns.append(stamp_ns + self.offset_ns if stamp_ns else 0)
-        frame = header.frame_id
         self.frames[frame] = self.frames.get(frame, 0) + 1
 
     def columns(self) -> TopicColumns:
@@ -191,27 +195,6 @@ class _Sightings:
         )
 
 
-def located(one: Sighting) -> tuple[tuple[float, float, float], float]:
-    """The point of a sighting in the base frame, NaN where it has none, and the standard deviation of it."""
-    m, c = one.measured, one.covariance
-    size = round(len(c) ** 0.5)
-    if one.kind in ("position", "pose"):
-        n = len(m) if one.kind == "position" else 2 if len(m) == 3 else 3
-        sigma = (sum(c[i * (size + 1)] for i in range(n)) / n) ** 0.5
-        return (m[0], m[1], m[2] if n == 3 else 0.0), sigma
-    if one.kind != "range_bearing":
-        return (np.nan, np.nan, np.nan), c[0] ** 0.5
-    elevation = m[2] if len(m) == 3 else 0.0
-    level = m[0] * np.cos(elevation)
-    seen = (level * np.cos(m[1]), level * np.sin(m[1]), m[0] * np.sin(elevation))
-    at = one.T_base_sensor
-    if at is not None:
-        T = tuple(at) if len(at) == 7 else tuple(se3.in_space(np.array([at]))[0])
-        seen = se3.act(T, seen)
-    sigma = ((c[0] + m[0] ** 2 * sum(c[i * (size + 1)] for i in range(1, size))) / size) ** 0.5
-    return (float(seen[0]), float(seen[1]), float(seen[2])), float(sigma)
-
-
 class Collector:
     """Collects the columns of a recording while its messages are converted.
 
@@ -243,9 +226,12 @@ class Collector:
         self._first: dict[tuple[str, str], se3.Pose] = {}
         self._transforms = Transforms()
         self._last: Any = None
+        self._twist_bytes, self._twist_variances = b"", tuple[float, ...]()
 
     def decoder(self, decode: Decoder) -> Decoder:
         """The same decoder, of which the message is remembered until it is collected."""
+        if isinstance(decode, OwnDecoder):
+            return OwnDecoder(decode.type, self._remember)
 
         def decoded(cdr: bytes) -> Any:
             self._last = decode(cdr)
@@ -253,11 +239,16 @@ class Collector:
 
         return decoded
 
+    def _remember(self, message: Any) -> None:
+        self._last = message
+
     def add(self, topic: str, names: Iterable[str], log_ns: int, measured: Iterable[Measured | Control]) -> None:
         """Collect a message: the one that was decoded last, of these inputs, and what became of it."""
         message, self._last = self._last, None
         heights: dict[str, float] = {}
-        if message is not None:
+        if type(message) is OdometryBytes:
+            self._add_bytes(topic, log_ns, message)
+        elif message is not None:
             self._add_message(topic, names, log_ns, message)
         for m in measured:
             if isinstance(m, Odometry):
@@ -285,16 +276,28 @@ class Collector:
             elif name == self._config.gyro_input and not self._gyro_frame:
                 self._gyro_frame = self._frame_of[name] or _frame(message)
 
+    def _add_bytes(self, topic: str, log_ns: int, m: OdometryBytes) -> None:
+        """Collect odometry that was not decoded."""
+        if topic in self._topics:
+            self._topics[topic].add_stamp(log_ns, m.sec * 1_000_000_000 + m.nanosec, m.frame_id)
+        if topic == self._odometry_topic:
+            if m.twist_covariance != self._twist_bytes:  # drivers repeat the same one
+                flat = np.frombuffer(m.twist_covariance, dtype="<f8")
+                self._twist_bytes, self._twist_variances = m.twist_covariance, tuple(flat[list(_TWIST)].tolist())
+            self._add_numbers(m.frame_id, m.child_frame_id, m.numbers + self._twist_variances)
+
     def _add_odometry(self, m: Any) -> None:
+        p, q, v, w = m.pose.pose.position, m.pose.pose.orientation, m.twist.twist.linear, m.twist.twist.angular
+        numbers, c = (p.x, p.y, p.z, q.x, q.y, q.z, q.w, v.x, v.y, v.z, w.x, w.y, w.z), m.twist.covariance
+        self._add_numbers(m.header.frame_id, m.child_frame_id, (*numbers, *(c[k] for k in _TWIST)))
+
+    def _add_numbers(self, frame: str, child: str, numbers: tuple[float, ...]) -> None:
         if len(self._odometry_ns) >= MOST:
             return
         if not self._frame:
-            self._frame, self._child = m.header.frame_id.lstrip("/"), m.child_frame_id.lstrip("/")
+            self._frame, self._child = frame.lstrip("/"), child.lstrip("/")
         self._odometry_ns.append(self._topics[self._odometry_topic].stamp_ns[-1])
-        p, q, v, w = m.pose.pose.position, m.pose.pose.orientation, m.twist.twist.linear, m.twist.twist.angular
-        self._numbers.extend((p.x, p.y, p.z, q.x, q.y, q.z, q.w, v.x, v.y, v.z, w.x, w.y, w.z))
-        c = m.twist.covariance
-        self._numbers.extend([c[k] for k in _TWIST])
+        self._numbers.extend(numbers)
 
     def _add_transforms(self, message: Any, *, fixed: bool) -> None:
         for t in message.transforms:

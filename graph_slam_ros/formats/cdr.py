@@ -85,3 +85,16 @@ class CdrReader:
         (length,) = self.numbers("I")
         self._at += length
         return bytes(self._data[self._at - length : self._at]).rstrip(b"\0")
+
+    def terminated(self) -> bytes:
+        """A string, without its terminating zero. Raises ValueError where it has none, or another zero."""
+        (length,) = self.numbers("I")
+        self._at += length
+        text = bytes(self._data[self._at - length : self._at])
+        if len(text) != length or text.find(b"\0") != length - 1:
+            raise ValueError("a string without its terminating zero")
+        return text[:-1]
+
+    def aligned(self, size: int) -> int:
+        """Return where the next number of a size begins, in bytes after the encapsulation."""
+        return self._at + -self._at % size

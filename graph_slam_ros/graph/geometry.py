@@ -51,6 +51,11 @@ class Geometry:
         """Standard deviations (dof,) of a pose, one for all lengths [m] and one for all angles [rad]."""
         return [sigma_m] * self.dimensions + [sigma_rad] * (self.dof - self.dimensions)
 
+    def square(self, pose: Numbers) -> float:
+        """Squared distance [m^2] of a pose from its parent's origin."""
+        square = pose[0] * pose[0] + pose[1] * pose[1]
+        return float(square if self.dimensions == 2 else square + pose[2] * pose[2])
+
     def angle(self, pose: Numbers) -> float:
         """Angle [rad] by which a pose is turned, about whatever axis."""
         if self.dimensions == 2:

@@ -19,6 +19,7 @@ from graph_slam_ros.measurements.counters import Counters
 from graph_slam_ros.measurements.types import InitialPose, Measured, Odometry
 from graph_slam_ros.messages.inputs import checks, converters, fixes, odometry, uses
 from graph_slam_ros.messages.inputs.checks import MessageError
+from graph_slam_ros.messages.inputs.odometry_bytes import OdometryReader
 from graph_slam_ros.messages.inputs.plugins import PluginFault
 from graph_slam_ros.messages.inputs.source import InputContext, NotYet, Origin
 from graph_slam_ros.messages.inputs.transforms import Transforms, pose
@@ -32,10 +33,28 @@ TF_STATIC, TF, INITIAL_POSE = "tf_static", "tf", "initialpose"
 _POSE_NUMBERS = 7 + 36  # of a geometry_msgs/PoseWithCovariance
 
 
-def decoder(type_name: str) -> Decoder:
+class OwnDecoder:
+    """A decoder from CDR bytes to a message object of our own type store.
+
+    Parameters
+    ----------
+    note : called with each message, and with what was read of one that was not decoded
+    """
+
+    def __init__(self, type_name: str, note: Callable[[Any], object] = lambda message: None) -> None:
+        self.type, self.note = type_name, note
+        self._store = typestore()
+
+    def __call__(self, cdr: bytes) -> Any:
+        """Decode a message."""
+        message = self._store.deserialize_cdr(cdr, self.type)
+        self.note(message)
+        return message
+
+
+def decoder(type_name: str) -> OwnDecoder:
     """A decoder from CDR bytes to a message object of our own type store."""
-    store = typestore()
-    return lambda cdr: store.deserialize_cdr(cdr, type_name)
+    return OwnDecoder(type_name)
 
 
 def is_correction(cdr: bytes, map_frame: str) -> bool:
@@ -112,23 +131,32 @@ class MessageConverter:
             self._convert[name] = partial(self._transforms_of, source, add)
         self._add_initial_pose()
         known = typestore().types
-        ours = {name: decoder(name) for name in self._types.values() if name in known}
+        ours: dict[str, Decoder] = {name: decoder(name) for name in self._types.values() if name in known}
         self._decode = ours | dict(decoders or {})
+        self._readers: dict[str, tuple[OdometryReader, OwnDecoder]] = {}
+        own = self._decode.get(odometry.TYPE)
+        if isinstance(own, OwnDecoder):  # else its bytes may have other places
+            of_type = (name for name in self._publishers if self._types[name] == odometry.TYPE)
+            self._readers = {name: (OdometryReader(), own) for name in of_type}
 
     def convert(self, name: str, cdr: bytes) -> list[Measured]:
         """Convert one message; returns its measurements and those that its transforms complete."""
         source = self._sources[name]
         self._counters.received[name] += 1
-        try:
-            message = self._decode[self._types[name]](cdr)
-        except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors
-            self._counters.count(name, "undecodable")
-            return []
-        out = self._converted(source, message)
+        out = self._by_bytes(source, cdr) if name in self._readers else None
+        if out is None:
+            try:
+                message = self._decode[self._types[name]](cdr)
+            except Exception:  # of damaged bytes rosbags raises struct, index, unicode and assertion errors
+                self._counters.count(name, "undecodable")
+                return []
+            out = self._converted(source, message)
         if source.use == "odometry":
-            publishers = self._publishers[name]
-            out = [one for m in out if isinstance(m, Odometry) for one in publishers.accept(m)]
-            self._transforms.now_ns = max([*(m.stamp_ns for m in out), self._transforms.now_ns or 0]) or None
+            accept = self._publishers[name].accept
+            out = [one for m in out if isinstance(m, Odometry) for one in accept(m)]
+            for m in out:
+                if m.stamp_ns > (self._transforms.now_ns or 0):
+                    self._transforms.now_ns = m.stamp_ns
         if name == TF or source.use == "odometry":
             for _ in range(len(self._pending)):
                 out += self._converted(*self._pending.popleft())
@@ -183,9 +211,21 @@ class MessageConverter:
         source.hurried = before
         return out
 
+    def _by_bytes(self, source: InputContext, cdr: bytes) -> list[Any] | None:
+        """The odometry of a message without a fault that does not have to be decoded; None: as any other message."""
+        reader, own = self._readers[source.name]
+        read = reader.read(cdr)
+        m = None if read is None else odometry.of_bytes(source, read)
+        if m is None:
+            return None
+        if source.tally:
+            self._count_tally(source)
+        own.note(read)
+        return [m]
+
     @np.errstate(invalid="ignore")  # a signalling NaN warns where it is compared; it is refused by name
-    def _converted(self, source: InputContext, message: Any) -> list[Measured]:
-        out: list[Measured] = []
+    def _converted(self, source: InputContext, message: Any) -> list[Any]:
+        out: list[Any] = []
         try:
             out += self._convert[source.name](message)
         except NotYet:
@@ -199,10 +239,13 @@ class MessageConverter:
         except MessageError as reason:
             source.count(str(reason))
         if source.tally:
-            for why, times in source.tally.items():
-                self._counters.count(source.name, why, times)
-            source.tally.clear()
+            self._count_tally(source)
         return out
+
+    def _count_tally(self, source: InputContext) -> None:
+        for why, times in source.tally.items():
+            self._counters.count(source.name, why, times)
+        source.tally.clear()
 
     def _add_initial_pose(self) -> None:
         defaults = self._config.initialpose

@@ -120,6 +120,8 @@ class OnePublisher:
 
     def accept(self, m: Odometry) -> list[Odometry]:
         """Accept a message. Returns those that may be used now, in order of arrival."""
+        if self._goes_on(m):
+            return [m]
         newest_ns, room_ns = m.stamp_ns, _GAP_NS
         if self._tracks and (used := self._tracks[0]).past:
             newest_ns = min(m.stamp_ns, used.newest_ns)
@@ -129,6 +131,23 @@ class OnePublisher:
             for _, one in self._leap.accept(m.stamp_ns, m, newest_ns, room_ns)
             for out in self._follow_publisher(one)
         ]
+
+    def _goes_on(self, m: Odometry) -> bool:
+        """Return whether a message, now part of it, goes on with the only track, soon and where it leads.
+
+        This is what ``_follow_publisher`` does of nearly all messages, without the questions that have one answer then.
+        """
+        if len(self._tracks) != 1 or self._held or self._leap.holds or self._labels > _MOST_LABELS:
+            return False
+        used = self._tracks[0]
+        if used.label != m.source or not used.past or not -_BACK_NS <= m.stamp_ns - used.newest_ns <= _GAP_NS:
+            return False
+        misfit = used.misfit(m)
+        if misfit > min(max(1.0, _NOISY * self._usual), _NOISIEST):
+            return False
+        self._usual += 0.1 * (misfit - self._usual)
+        used.add(m)
+        return True
 
     def _follow_publisher(self, m: Odometry) -> list[Odometry]:
         if self._labels > _MOST_LABELS:

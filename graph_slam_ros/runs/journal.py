@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 from graph_slam_ros.edge_tags import map_edge_of
 from graph_slam_ros.errors import FormatError
 from graph_slam_ros.formats.durable import AppendedFile
-from graph_slam_ros.measurements.types import EVENTS, CustomEdge, Measurement, from_record
+from graph_slam_ros.measurements.types import EVENTS, CustomEdge, Measurement, Odometry, from_record, to_record
 from graph_slam_ros.recordings.mcap_records import LIBRARY, records
 
 _ENCODE = json.JSONEncoder(separators=(",", ":"), check_circular=False, allow_nan=False).encode
@@ -45,8 +45,8 @@ class RecordWriter:
         self._twist: Any = None
         self._twist_text = "null"
 
-    def write(self, several: Iterable[Mapping[str, Any]]) -> None:
-        """Append records as one chunk. A record without a stamp gets the last stamp."""
+    def write(self, several: Iterable[Mapping[str, Any] | Odometry]) -> None:
+        """Append records, and odometry as it is, as one chunk. A record without a stamp gets the last stamp."""
         *others, last = several
         for record in others:
             self._add(record)
@@ -54,28 +54,29 @@ class RecordWriter:
         self._add(last)
         self._chunk.is_full = False
 
-    def _add(self, record: Mapping[str, Any]) -> None:
-        kind = record["type"]
+    def _add(self, record: Mapping[str, Any] | Odometry) -> None:
+        if isinstance(record, Odometry):
+            kind, self._stamp_ns, text = "odometry", record.stamp_ns, self._odometry_text(record)
+        else:
+            kind, self._stamp_ns, text = record["type"], record.get("stamp_ns", self._stamp_ns), _ENCODE(record)
         if kind not in self._channels:
             self._channels[kind] = self._writer.register_channel(kind, "json", self._schema)
-        self._stamp_ns = record.get("stamp_ns", self._stamp_ns)
-        data = (self._odometry_text(record) if kind == "odometry" else _ENCODE(record)).encode()
-        self._writer.add_message(self._channels[kind], self._stamp_ns, data, self._stamp_ns, self._sequence)
+        self._writer.add_message(self._channels[kind], self._stamp_ns, text.encode(), self._stamp_ns, self._sequence)
         self._sequence += 1
 
-    def _odometry_text(self, record: Mapping[str, Any]) -> str:
+    def _odometry_text(self, m: Odometry) -> str:
         """The JSON of odometry, of which there is most, as the encoder writes it in three times the time."""
         try:
-            pose = ",".join(map(float.__repr__, record["T_odom_base"]))
+            pose = ",".join(map(float.__repr__, m.T_odom_base))
         except TypeError:  # whole numbers, in a journal that others wrote
-            return _ENCODE(record)
+            return _ENCODE(to_record(m))
         if "n" in pose:  # not finite: the encoder refuses it
-            return _ENCODE(record)
-        if record["twist_covariance"] is not self._twist:  # drivers repeat the same one
-            self._twist_text = _ENCODE(record["twist_covariance"])
-            self._twist = record["twist_covariance"]
-        ends = f'"twist_covariance":{self._twist_text},"source":{_text(record["source"])}'
-        return f'{{"type":"odometry","stamp_ns":{record["stamp_ns"]},"T_odom_base":[{pose}],{ends}}}'
+            return _ENCODE(to_record(m))
+        if m.twist_covariance is not self._twist:  # drivers repeat the same one
+            self._twist_text = _ENCODE(m.twist_covariance)
+            self._twist = m.twist_covariance
+        ends = f'"twist_covariance":{self._twist_text},"source":{_text(m.source)}'
+        return f'{{"type":"odometry","stamp_ns":{m.stamp_ns},"T_odom_base":[{pose}],{ends}}}'
 
     def end(self) -> AppendedFile:
         """Append the index. Returns the file, which the caller closes."""
@@ -105,7 +106,7 @@ class Parts:
             self._present = RecordWriter(self._folder / part_name(self._name, self._part), self._schema)
         return self._present
 
-    def write(self, several: Sequence[Mapping[str, Any]]) -> None:
+    def write(self, several: Sequence[Mapping[str, Any] | Odometry]) -> None:
         """Append records. They are kept until ``flush``."""
         if several:
             self.begin().write(several)

@@ -13,7 +13,7 @@ from typing import Any
 
 from graph_slam_ros.formats.durable import AppendedFile, write_whole
 from graph_slam_ros.formats.parameters import parameters_text
-from graph_slam_ros.measurements.types import to_record
+from graph_slam_ros.measurements.types import Odometry, to_record
 from graph_slam_ros.messages import results
 from graph_slam_ros.recordings.bag import BagWriter
 from graph_slam_ros.runs.folder import (
@@ -145,7 +145,7 @@ class RunRecorder:
 
     def _fill_journal(self) -> None:
         accepted = [self._accepted.popleft() for _ in range(len(self._accepted))]
-        self._journal.write([to_record(measurement) for measurement in accepted])
+        self._journal.write([m if isinstance(m, Odometry) else to_record(m) for m in accepted])
 
     def _fill(self) -> None:
         self._fill_journal()

@@ -32,6 +32,16 @@ def stamp_ns(stamp: Any) -> int:
     return int(out)
 
 
+def is_sound(x: float, y: float, z: float) -> bool:
+    """Return whether ``point`` accepts the coordinates."""
+    return -_FARTHEST_M <= x <= _FARTHEST_M and -_FARTHEST_M <= y <= _FARTHEST_M and -_FARTHEST_M <= z <= _FARTHEST_M
+
+
+def is_unit(x: float, y: float, z: float, w: float) -> bool:
+    """Return whether ``quaternion`` returns the numbers as they are."""
+    return abs(math.sqrt(x * x + y * y + z * z + w * w) - 1.0) <= _NORM_EXACT
+
+
 def point(v: Any) -> tuple[float, float, float]:
     """Finite coordinates of a Point or Vector3 of plausible size."""
     if not (math.isfinite(v.x) and math.isfinite(v.y) and math.isfinite(v.z)):

@@ -10,16 +10,19 @@ from graph_slam_ros.lie import se3, so3
 from graph_slam_ros.measurements.types import AngularVelocity, Odometry
 from graph_slam_ros.messages.inputs import checks
 from graph_slam_ros.messages.inputs.checks import MessageError
+from graph_slam_ros.messages.inputs.odometry_bytes import OdometryBytes
 from graph_slam_ros.messages.inputs.source import InputContext
 from graph_slam_ros.messages.inputs.transforms import pose
 from graph_slam_ros.typing import Numbers
 
+TYPE = "nav_msgs/msg/Odometry"
 _MOST_SIMILAR, _LONGEST = 3, 80  # transforms that are named, and letters of a frame's name
+_SLASHED = ("/", "")
 _UNUSED = 1e6  # [m^2/s^2, rad^2/s^2]: what drivers of wheels write for what these do not measure
 
 
 def odometry(source: InputContext, m: Any) -> Iterator[Odometry]:
-    """nav_msgs/Odometry."""
+    """nav_msgs/Odometry, decoded; ``of_bytes`` does the same for nearly all messages."""
     stamp_ns = source.stamp_ns(m.header.stamp)
     p, parent = m.pose.pose, source.frame(m.header.frame_id)
     at = _in_odom(source, parent, _named(source, m.child_frame_id), p.position, p.orientation)
@@ -27,6 +30,31 @@ def odometry(source: InputContext, m: Any) -> Iterator[Odometry]:
     if source.config.odometry.noise == "twist" and m.child_frame_id.lstrip("/") == source.config.frames.base:
         twist = _twist_covariance(source, m.twist.covariance)  # that of another point of the robot says nothing
     yield Odometry(stamp_ns, at, twist, source.name)
+
+
+def of_bytes(source: InputContext, read: OdometryBytes) -> Odometry | None:
+    """The odometry of a message in which nothing is refused or repaired but its covariance; else None."""
+    frames, parent, child = source.config.frames, source.settings.frame or read.frame_id, read.child_frame_id
+    if parent != frames.odom or child != frames.base or parent == child or child[:1] in _SLASHED or parent[:1] == "/":
+        return None
+    stamp_ns = source.valid_stamp_ns(read.sec, read.nanosec)
+    x, y, z, qx, qy, qz, qw = numbers = read.numbers[:7]
+    if not stamp_ns or not checks.is_sound(x, y, z) or not checks.is_unit(qx, qy, qz, qw):
+        return None
+    at = source.of_robot_in_plane(numbers)
+    if at is None:
+        return None
+    twist = None
+    if source.config.odometry.noise == "twist":
+        if read.twist_covariance != source.state.get("raw"):
+            return None  # another than before: it is judged when the message is decoded
+        covariance, repairs = source.state["judged"]
+        if isinstance(covariance, MessageError):
+            return None
+        for repair in repairs:
+            source.count(repair)
+        twist = covariance
+    return Odometry(stamp_ns, at, twist, source.name)
 
 
 def pose_stamped(source: InputContext, m: Any) -> Iterator[Odometry]:

@@ -19,6 +19,7 @@ from graph_slam_ros.typing import Array, Numbers
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _BEYOND_MEANING = 1e12  # [m^2, rad^2]: larger numbers could not be turned into other axes
 _FLAT = 0.5  # the horizontal part of an x axis that is too short to have a heading
+_LITTLE = 0.1  # of a quaternion's x and y: a robot that leans less is upright
 _LEVEL_M, _UPRIGHT = 0.5, math.cos(math.radians(20.0))  # of a robot that moves in a plane
 
 
@@ -77,6 +78,13 @@ class InputContext:
         if not 0 < out <= LATEST_NS:
             raise MessageError("bad_stamp")
         return out
+
+    def valid_stamp_ns(self, sec: int, nanosec: int) -> int:
+        """The same of its two numbers; 0 where it would be refused."""
+        if sec < 0 or not 0 <= nanosec < 1_000_000_000 or not (sec or nanosec):
+            return 0
+        out = sec * 1_000_000_000 + nanosec + self._offset_ns
+        return out if 0 < out <= LATEST_NS else 0
 
     # -- frames ------------------------------------------------------------------------------------------------------
 
@@ -178,6 +186,17 @@ class InputContext:
             up = so3.act(se3.rotation(T), (0.0, 0.0, 1.0))
             if abs(T[2] - self.state.setdefault("height", T[2])) > _LEVEL_M or up[2] < _UPRIGHT:
                 self.count("out_of_plane")
+        return self.projected(T)
+
+    def of_robot_in_plane(self, T: Any) -> Numbers | None:
+        """The same for a pose of floats that is not the first one, and that counts as nothing; else None."""
+        if self.space.dimensions == 3:
+            return tuple(T)
+        height = self.state.get("height")
+        if height is None or abs(T[2] - height) > _LEVEL_M:
+            return None
+        if abs(T[3]) + abs(T[4]) > _LITTLE and so3.act(se3.rotation(T), (0.0, 0.0, 1.0))[2] < _UPRIGHT:
+            return None
         return self.projected(T)
 
     def has_heading(self, T: se3.Pose) -> bool:

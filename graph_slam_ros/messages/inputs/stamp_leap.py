@@ -21,6 +21,11 @@ class StampLeap(Generic[Item]):
         self._refuse = refuse
         self._held: list[tuple[int, Item]] = []
 
+    @property
+    def holds(self) -> bool:
+        """Return whether items are held."""
+        return bool(self._held)
+
     def accept(self, stamp_ns: int, item: Item, newest_ns: int, room_ns: float) -> list[tuple[int, Item]]:
         """Accept an item. Returns those that may be used now, with their stamps, in order of arrival.
 

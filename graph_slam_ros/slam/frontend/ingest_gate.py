@@ -14,7 +14,7 @@ _SURE_NS, _SURE = 1_000_000_000, 3  # of stamps, and messages: a burst that was 
 _AGAIN_NS = 10_000_000_000  # what has been told not longer ago is told again where nothing new comes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Passage:
     """The gate's decision on one message.
 
@@ -110,10 +110,11 @@ class TimeJumpDetector:
 
     def is_jump(self, measured: Iterable[Measured]) -> bool:
         """Return whether stamps jumped back with one of these measurements, in their order of arrival."""
-        jumped = [
-            self._has_jumped(m) for m in measured if isinstance(m, Odometry)
-        ]  # all of them, whatever the first tells
-        return any(jumped)
+        jumped = False
+        for m in measured:  # all of them, whatever the first tells
+            if isinstance(m, Odometry) and self._has_jumped(m):
+                jumped = True
+        return jumped
 
     def forget(self) -> None:
         """Forget all stamps, because the next belong to another time."""

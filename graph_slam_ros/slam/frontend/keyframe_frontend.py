@@ -218,11 +218,11 @@ class KeyframeFrontend:
 
     def is_due(self) -> bool:
         """Return whether the motion since the last keyframe is large enough for another."""
-        motion, due, n = self.path.motion, self.config.keyframes, self._space.dimensions
+        motion, due, space = self.path.motion, self.config.keyframes, self._space
         if motion is None or self.held_covariance is not None:
             return motion is not None
         at = motion.now.T_keyframe_base
-        far = sum(x * x for x in at[:n]) >= due.min_distance_m**2 or self._space.angle(at) >= due.min_angle_rad
+        far = space.square(at) >= due.min_distance_m**2 or space.angle(at) >= due.min_angle_rad
         return far or motion.is_long or (motion.moving_ns >= due.max_interval_s * 1e9 and not self._noise.is_jitter(at))
 
     # -- keyframes -------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ _REST_NS = 10**9  # for so long a robot must have stood before what its odometry
 _MOST = 10_000  # odometry messages that one motion remembers
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class OdometrySample:
     """``T_keyframe_base`` at a stamp, and its covariance (dof, dof) in right tangent coordinates."""
 
@@ -58,14 +58,14 @@ class OdometryNoise:
         c = self._config
         slow_m, slow_rad = c.still_m_s * dt, c.still_rad_s * dt
         if self._space.dimensions == 2:
-            return step[0] ** 2 + step[1] ** 2 < slow_m**2 and abs(step[2]) < slow_rad
+            return step[0] * step[0] + step[1] * step[1] < slow_m * slow_m and abs(step[2]) < slow_rad
         turn = 2.0 * (step[3] ** 2 + step[4] ** 2 + step[5] ** 2) ** 0.5  # of a small rotation
         return step[0] ** 2 + step[1] ** 2 + step[2] ** 2 < slow_m**2 and turn < slow_rad
 
     def is_jitter(self, moved: Numbers) -> bool:
         """Return whether a motion is small enough to be odometry's jitter, whatever its duration."""
-        c, n = self._config, self._space.dimensions
-        return bool(sum(x * x for x in moved[:n]) < c.still_m**2 and self._space.angle(moved) < c.still_rad)
+        c = self._config
+        return self._space.square(moved) < c.still_m**2 and self._space.angle(moved) < c.still_rad
 
     def of(
         self, step: Numbers, dt: float, twist_covariance: Numbers | None, turn_variance: Numbers | None = None
@@ -118,7 +118,7 @@ class StationaryDetector:
         if self._T_odom_base is None or step.broken or step.slips:
             self._begin(step)
             return stands and not step.broken
-        moved = self._space.group.between(self._T_odom_base, step.T_odom_base)
+        moved = self._space.group.between_one(self._T_odom_base, step.T_odom_base)
         elapsed_ns, is_jitter = step.stamp_ns - self._since_ns, self._noise.is_jitter(moved)
         if self.is_on:
             stands = stands or is_jitter
@@ -212,7 +212,7 @@ class IntegratedOdometry:
         return self._moved[-2].stamp_ns if len(self._moved) > 1 else self.start_ns
 
     def _after(self, step: Step, stands: bool) -> OdometrySample:
-        to = self._space.group.compose(self.now.T_keyframe_base, step.T_last_base)
+        to = self._space.group.compose_one(self.now.T_keyframe_base, step.T_last_base)
         return self._extended(self.now, to, step, stands)
 
     def _extended(self, a: OdometrySample, to: Numbers, step: Step, stands: bool) -> OdometrySample:

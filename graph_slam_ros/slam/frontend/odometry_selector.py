@@ -3,7 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from graph_slam_ros.config.frontend import OdometryConfig
 from graph_slam_ros.graph.geometry import Geometry
@@ -14,7 +14,7 @@ from graph_slam_ros.typing import Numbers
 _REMEMBERED = 1000  # messages of a source that is not in use, to take over from where the one in use fell silent
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Step:
     """The motion since the step before.
 
@@ -80,9 +80,12 @@ class OdometrySelector:
 
     def steps(self, m: Odometry) -> list[Step]:
         """Return the steps that a message completes: none if its odometry is not in use."""
+        if int in map(type, m.T_odom_base):  # the compiled functions need floats
+            m = replace(m, T_odom_base=tuple(map(float, m.T_odom_base)))
         if m.source not in self._order:
             self._order.append(m.source)
-        self._past.setdefault(m.source, deque(maxlen=_REMEMBERED))
+        if m.source not in self._past:
+            self._past[m.source] = deque(maxlen=_REMEMBERED)
         past, used = self._past[m.source], self._used
         if past and past[-1].stamp_ns == m.stamp_ns:
             self._counters.count(m.source, "duplicate" if past[-1] == m else "duplicate_stamp")
@@ -135,7 +138,7 @@ class OdometrySelector:
         return out
 
     def _follow(self, a: Odometry, b: Odometry) -> Step:
-        step = self._space.group.between(a.T_odom_base, b.T_odom_base)
+        step = self._space.group.between_one(a.T_odom_base, b.T_odom_base)
         if self._is_reset(step, b):
             return self._use(b, step, broken="reset_to_zero")
         return self._use(b, step, broken="jump" if self._jumps(step, (b.stamp_ns - a.stamp_ns) * 1e-9) else "")
@@ -153,7 +156,7 @@ class OdometrySelector:
 
         The pause may have any length, because nothing arrives while a driver starts.
         """
-        if max(self._size(to.T_odom_base)) > _AT_ZERO:
+        if abs(to.T_odom_base[0]) > _AT_ZERO or max(self._size(to.T_odom_base)) > _AT_ZERO:
             return False
         (far_m, far_rad), (usual_m, usual_rad) = self._size(step), self._size(self._last_step)
         return far_m > max(_RESET_M, _UNUSUAL * usual_m) or far_rad > max(_RESET_RAD, _UNUSUAL * usual_rad)
@@ -164,8 +167,7 @@ class OdometrySelector:
 
     def _jumps(self, step: Numbers, dt: float) -> bool:
         """Return whether no robot moves like this: odometry was reset, or is wrong by a lap."""
-        n = self._space.dimensions
-        return sum(x * x for x in step[:n]) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
+        return self._space.square(step) > (self._config.max_speed_m_s * max(dt, _LEAST_S)) ** 2
 
 
 _AT_ZERO = 1e-9  # [m, rad]

@@ -230,6 +230,15 @@ def test_noise_during_is_the_plain_formula(kind):
         assert both == pytest.approx(se2.propagate(a_covariance(0.5, 4), step, j @ of_twist @ j.T), rel=1e-12)
 
 
+@pytest.mark.parametrize("group", [se2, se3])
+def test_single_poses_are_computed_alike_compiled_and_not(group):
+    rng, size = np.random.default_rng(3), len(group.IDENTITY)
+    for _ in range(200):
+        a, b = (tuple(rng.normal(0.0, 5.0, size).tolist()) for _ in range(2))
+        assert group.between_one(a, b) == pytest.approx(group.between(a, b), rel=1e-14, abs=1e-12)
+        assert group.compose_one(a, b) == pytest.approx(group.compose(a, b), rel=1e-14, abs=1e-12)
+
+
 def test_the_noise_of_a_step_is_that_of_its_parts_fully_correlated():
     whole, of_twist, count = (1.0, 0.3, 0.5), np.diag([0.04, 0.01, 0.02]), 400
     part, j = tuple(np.array(whole) / count), np.zeros((3, 3))

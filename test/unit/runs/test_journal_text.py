@@ -22,7 +22,7 @@ SEVERAL = [
 
 def written(file, several):
     writer = RecordWriter(file)
-    writer.write([to_record(m) for m in several])
+    writer.write(several)
     writer.close()
     return [one.data.decode() for one in records(file, []) if isinstance(one, Message)]
 

@@ -1,0 +1,116 @@
+"""Odometry that is read by the places of its bytes is what a decoder makes of it, with the same counters."""
+
+import math
+
+import numpy as np
+import pytest
+from messages import STAMP_NS, TWIST, border, odometry, pose, quaternion
+
+from graph_slam_ros.messages.from_msg import decoder
+from graph_slam_ros.messages.inputs.odometry import TYPE
+from graph_slam_ros.messages.inputs.odometry_bytes import OdometryReader
+
+TILTED = {"roll": 0.02, "pitch": -0.01}
+NAN_TWIST = np.full((6, 6), np.nan)
+ODD = {
+    "a stamp of zero": {"sec": 0, "nanosec": 0},
+    "a negative stamp": {"sec": -1},
+    "too many nanoseconds": {"nanosec": 1_000_000_000},
+    "a position that is not finite": {"at": pose(math.nan, 1.0)},
+    "an infinite position": {"at": pose(1.0, -math.inf)},
+    "a position too far away": {"at": pose(1e10, 1.0)},
+    "a quaternion of another length": {"at": pose(1.0, 1.0, q=quaternion(yaw=1.0, norm=1.05))},
+    "a quaternion of no length": {"at": pose(1.0, 1.0, q=quaternion(norm=0.0))},
+    "a robot that is higher up": {"at": pose(1.0, 1.0, 0.9)},
+    "a robot that has fallen over": {"at": pose(1.0, 1.0, q=quaternion(roll=1.5))},
+    "a robot that leans": {"at": pose(1.0, 1.0, q=quaternion(roll=0.3))},
+    "another parent": {"frame": "world"},
+    "another child": {"child": "wheel"},
+    "names with a slash": {"frame": "/odom", "child": "/base_link"},
+    "no names": {"frame": "", "child": ""},
+    "a name in another alphabet": {"frame": "\u00f6dom"},
+    "a frame in itself": {"frame": "base_link"},
+    "another covariance": {"twist": 4.0 * TWIST},
+    "no covariance": {"twist": np.zeros((3, 3))},
+    "a covariance that is none": {"twist": -TWIST},
+    "a covariance that is not finite": {"twist": NAN_TWIST},
+}
+
+
+def drive(count, **others):
+    """Messages of a robot that drives in a bend; with words of ``odometry``."""
+    for k in range(count):
+        at = pose(0.02 * k, 1e-3 * k, 0.01, quaternion(yaw=0.01 * k, **TILTED))
+        yield odometry(**({"at": at, "stamp_ns": STAMP_NS + 20_000_000 * k} | others))
+
+
+def converted(messages, monkeypatch, *, decoded, **sections):
+    """What is made of messages and what is counted, read by bytes or all decoded; and how many were decoded."""
+    with monkeypatch.context() as patched:
+        calls = []
+        if decoded:
+            patched.setattr(OdometryReader, "read", lambda self, cdr: None)
+        own = decoder(TYPE)
+        own.note = lambda message: calls.append(hasattr(message, "header"))
+        out = border(decoders={TYPE: own}, **sections)
+        measured = [out.convert("odom", cdr) for cdr in messages]
+        return [*measured, out.finish()], out._counters.as_dict(), sum(calls)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+@pytest.mark.parametrize("what", ODD)
+def test_a_message_is_read_as_it_is_decoded(what, dimensions, monkeypatch):
+    messages = [*drive(5), *drive(1, **ODD[what]), *drive(8), *drive(8, **ODD[what]), *drive(3)]
+    sections = {"world": {"dimensions": dimensions}}
+    by_bytes = converted(messages, monkeypatch, decoded=False, **sections)
+    assert by_bytes[:2] == converted(messages, monkeypatch, decoded=True, **sections)[:2]
+
+
+@pytest.mark.parametrize(
+    "sections",
+    [{"odometry": {"noise": "density"}}, {"odom": {"frame": "odom"}}, {"odom": {"offset_s": -0.25}}],
+    ids=str,
+)
+def test_settings_of_the_input_are_followed(sections, monkeypatch):
+    messages = [*drive(5), *drive(5, frame="elsewhere"), *drive(2, child="wheel")]
+    by_bytes = converted(messages, monkeypatch, decoded=False, **sections)
+    assert by_bytes[:2] == converted(messages, monkeypatch, decoded=True, **sections)[:2]
+
+
+def test_nearly_all_messages_are_not_decoded(monkeypatch):
+    messages = [*drive(50)]
+    measured, _, decoded = converted(messages, monkeypatch, decoded=False)
+    assert decoded == 1  # the first: it says how high the robot is, and its covariance is judged
+    assert [len(some) for some in measured] == [1] * 50 + [0]
+    assert converted(messages, monkeypatch, decoded=True)[2] == 50
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        lambda cdr: cdr[:-1],
+        lambda cdr: cdr[:40],
+        lambda cdr: cdr[:5],
+        lambda cdr: b"",
+        lambda cdr: cdr + b"\0\0\0",
+        lambda cdr: cdr + b"\0\0\0\0",
+        lambda cdr: b"\x00\x00" + cdr[2:],
+        lambda cdr: b"\x00\x07" + cdr[2:],
+        lambda cdr: cdr[:12] + b"\xff\xff\xff\xff" + cdr[16:],
+        lambda cdr: cdr[:12] + b"\x00\x00\x00\x00" + cdr[16:],
+        lambda cdr: cdr.replace(b"odom\0", b"odomm"),
+        lambda cdr: cdr.replace(b"odom\0", b"od\0m\0"),
+    ],
+)
+def test_damaged_bytes_are_left_to_the_decoder(damaged, monkeypatch):
+    whole = [*drive(4)]
+    messages = [whole[0], damaged(whole[1]), whole[2], damaged(whole[3]), damaged(whole[3])]
+    by_bytes = converted(messages, monkeypatch, decoded=False)
+    assert by_bytes[:2] == converted(messages, monkeypatch, decoded=True)[:2]
+
+
+def test_a_recording_whose_messages_have_another_layout_is_decoded(monkeypatch):
+    own = decoder(TYPE)
+    out = border(decoders={TYPE: lambda cdr: own(cdr[:-8])})  # as if a field came after ours
+    monkeypatch.setattr(OdometryReader, "read", lambda self, cdr: pytest.fail("its bytes have other places"))
+    assert [len(out.convert("odom", cdr + bytes(8))) for cdr in drive(3)] == [1, 1, 1]
