@@ -170,7 +170,8 @@ def _explained(
 ) -> Outcome:
     """Solve and judge in turn, starting with the verdicts of the ledger, or with these candidates.
 
-    It ends when no verdict changes, when the cost is too high, or where one that was found before has ended.
+    It ends when no verdict changes, when the verdicts are again those of an earlier round (a candidate that was
+    accepted on trial does not fit after all), when the cost is too high, or where one that was found before has ended.
     """
     graph, mine = frozen.graph.copy(), frozen.ledger.copy()
     solver = Solver(graph, frozen.settings)
@@ -184,12 +185,17 @@ def _explained(
         solver.optimize(replace(frozen.settings, losses=decisions.cautious_losses(), max_iterations=_ITERATIONS))
         decisions.reclassify(frozen.keyframe)
     rounds = config.rounds if _cost(solver, mine) <= 2.0 * hopeless else 0
+    solved = dict[bytes, Array]()  # values by verdicts
     for k in range(rounds):
         solver.optimize()
         if k + 1 == rounds or _cost(solver, mine) > hopeless:
             break
+        solved[mine.inside.tobytes()] = solver.values
         if decisions.reclassify(frozen.keyframe):
-            continue
+            if (values := solved.get(mine.inside.tobytes())) is None:
+                continue
+            solver.start_at(values)
+            break
         if _is_known(_cost(solver, mine), mine, found) or not decisions.readmit_next(frozen.keyframe):
             break
     judged = np.concatenate((mine.inside, mine.outside))

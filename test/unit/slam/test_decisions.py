@@ -11,8 +11,11 @@ from graph_slam_ros.node.threads import run_in_thread
 from graph_slam_ros.slam import Config
 from graph_slam_ros.slam.backend import Backend
 from graph_slam_ros.slam.robust.background import run_when_asked
+from graph_slam_ros.slam.robust.gating import OutlierGate
+from graph_slam_ros.slam.robust.hypotheses import search_alternatives
 from graph_slam_ros.slam.robust.innovation import innovation
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
+from graph_slam_ros.solver import Solver
 
 SIGMAS = (0.05, 0.05, 0.02)
 NOISE = Gaussian.from_sigmas(*SIGMAS)
@@ -235,6 +238,34 @@ def test_a_second_look_decides_the_same_whether_it_is_taken_in_a_thread_or_when_
     assert histories[0] == histories[1]
     poses = [run.backend.solver.estimate(range(100)) for run in runs]
     assert poses[0].tobytes() == poses[1].tobytes()
+
+
+def test_a_search_ends_where_a_candidate_on_trial_does_not_fit_after_all(monkeypatch):
+    drive = Drive(rounds=10).go(60, lambda d, k: d.close(k - 20, k, (0.0, 0.0, 1.5)) if k == 50 else None)
+    (wrong,) = drive.false
+    solves = []
+
+    def tried(gate, keyframe):
+        gate._readmit(wrong, keyframe, 0.0)
+        return True
+
+    def solved(solver, *settings, optimize=Solver.optimize):
+        report = optimize(solver, *settings)
+        solves.append(report)
+        return report
+
+    monkeypatch.setattr(OutlierGate, "readmit_next", tried)
+    monkeypatch.setattr(Solver, "optimize", solved)
+    backend = drive.backend
+    outcome = search_alternatives(Config().robust, backend._frozen(59, drive.settings))
+    assert len(solves) <= 8, "the same two sets of verdicts were solved again and again"
+    assert outcome is not None and wrong in outcome.ledger.outside and set(drive.closures) <= {*outcome.ledger.inside}
+    without = Solver(outcome.frozen.graph, drive.settings.until_still())
+    without.add(outcome.frozen.vertices, range(len(outcome.ledger)))
+    for edge in outcome.ledger.outside.tolist():
+        without.set_weight(edge, 0.0)
+    without.start_at(outcome.values)
+    assert without.optimize().iterations[0].step < 1e-3, "the values are not those of the verdicts"
 
 
 def test_P7_where_memory_is_short_no_second_look_is_begun():
