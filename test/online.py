@@ -94,7 +94,27 @@ def check_tree(solver, *, regions_separate=False):
             assert owner == min(ends, key=lambda v: key[v])
             assert set(ends) <= set(members[int(vertex[owner, t.CLIQUE])])
     assert (vertex[: solver._vertices, t.LOCAL] == t.NOTHING).all()
+    _check_lists(tree, {c: members[c][len(frontals[c]) :] for c in in_use})
     _check_regions(solver, free, separate=regions_separate)
+
+
+def _check_lists(tree, separators):
+    """What has to be solved or shown is in its list, once."""
+    vertex, clique, state = tree.vertex, tree.clique, tree.state
+    for column, count in ((t.SHIFTED, t.SHIFTED_COUNT), (t.STALE, t.STALE_COUNT), (t.DEFERRED, t.DEFERRED_COUNT)):
+        listed = tree.listed[: state[count], column]
+        assert len(set(listed.tolist())) == len(listed)
+        if column == t.DEFERRED:
+            assert (clique[listed, t.IN_DEFERRED] == 1).all()
+        else:
+            bit = t.IS_SHIFTED if column == t.SHIFTED else t.IS_STALE
+            assert set(np.flatnonzero(vertex[:, t.NOTED] & bit)) == set(listed.tolist())
+    for c, separator in separators.items():
+        assert clique[c, t.SEEN] <= state[t.SOLUTIONS], f"clique {c} was never solved"
+        if (vertex[separator, t.CHANGED] > clique[c, t.SEEN]).any():
+            while c != t.NOTHING and clique[c, t.IN_DEFERRED] == 0:  # what is above comes first
+                c = int(clique[c, t.PARENT])
+            assert c != t.NOTHING
 
 
 def _check_memory(tree, in_use, vacant):

@@ -203,6 +203,7 @@ class Config:
             relinearize_every=s.relinearize_every,
             tolerance=s.tolerance,
             tolerance_sigmas=s.tolerance_sigmas,
+            at_once=True,  # a replay need not read what the node reads, and when
         )
 
 

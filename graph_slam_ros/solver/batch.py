@@ -11,13 +11,13 @@ from graph_slam_ros.graph import Graph, Loss
 from graph_slam_ros.graph.tables import EdgeTable
 from graph_slam_ros.solver.clique_tree.numeric import (
     accept_steps,
-    back_substitute,
     curvature,
     eliminate,
     gradient,
     step_by,
 )
 from graph_slam_ros.solver.clique_tree.storage import NOTHING, Tree
+from graph_slam_ros.solver.clique_tree.substitution import forget, step_all
 from graph_slam_ros.solver.clique_tree.symbolic import mark
 from graph_slam_ros.solver.gauge import undetermined
 from graph_slam_ros.solver.linearization import Losses, LossKey, costs, linearize, refuse_nonfinite, store
@@ -62,6 +62,8 @@ class Settings:
     relinearize_passes : how often at most within one update; after the first time for steps as large as that
     tolerance : online, changes of a step up to this are not followed [m, rad]
     tolerance_sigmas : nor are those up to so many standard deviations of the vertex given its neighbours
+    at_once : an update computes the estimates of all vertices that it moves. Else those that nobody reads wait; then
+        what is read, and when, decides digits below the tolerances
     """
 
     method: str = "gn"
@@ -75,6 +77,7 @@ class Settings:
     relinearize_passes: int = 5
     tolerance: float = 1e-5
     tolerance_sigmas: float = 1e-3
+    at_once: bool = False
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -154,7 +157,7 @@ class BatchProblem:
         vertex = eliminate(self.tree, self._cliques, damping)
         if vertex != NOTHING:
             raise undetermined(vertex)
-        back_substitute(self.tree, self._cliques, -1.0, -1.0)
+        step_all(self.tree, self._cliques)
         return self.largest_step()
 
     def largest_step(self) -> float:
@@ -172,7 +175,7 @@ class BatchProblem:
     def back_to(self, here: Array) -> None:
         """Restore linearisation points, without a step. The linearisation is not restored."""
         self.tree.value[: self._size] = self.tree.estimate[: self._size] = here
-        self.tree.step[:] = 0.0
+        forget(self.tree)
 
     def saved(self) -> _Saved:
         """Return linearisation points and the linearisation there, for ``restore``."""

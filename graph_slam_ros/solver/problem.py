@@ -10,6 +10,7 @@ from graph_slam_ros.errors import GraphSlamError
 from graph_slam_ros.graph import SE2, SE3, Graph
 from graph_slam_ros.graph.graph import whole_numbers
 from graph_slam_ros.graph.tables import EdgeTable
+from graph_slam_ros.solver.batch import Settings
 from graph_slam_ros.solver.clique_tree import incremental
 from graph_slam_ros.solver.clique_tree.numeric import accept_steps
 from graph_slam_ros.solver.clique_tree.storage import (
@@ -21,6 +22,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     NOTHING,
     SE2_KIND,
     SE3_KIND,
+    SUBSTITUTED,
     TAIL_END,
     TAIL_FIRST,
     VECTOR,
@@ -28,6 +30,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     longer,
     with_room,
 )
+from graph_slam_ros.solver.clique_tree.substitution import forget, show_all
 from graph_slam_ros.solver.gauge import check_gauge, fix_the_whole
 from graph_slam_ros.solver.linearization import rows_of
 from graph_slam_ros.solver.pending import NONE, PendingChanges
@@ -42,15 +45,16 @@ class Problem:
     Edits are pending until an update integrates them. An update that fails leaves them pending.
     """
 
-    def __init__(self, graph: Graph) -> None:
+    def __init__(self, graph: Graph, settings: Settings | None = None) -> None:
         self.graph = graph
+        self.settings = settings or Settings()
         self._tree = empty_tree()
         self._vertices = 0  # of the graph, that have a record in the tree
         self._inside = np.zeros(0, dtype=bool)  # vertices of the problem
         self._held = np.zeros(0, dtype=bool)
         self._edge_inside = np.zeros(0, dtype=bool)  # edges of the problem
         self._pending = PendingChanges()
-        self._kept = np.zeros(0)  # the estimate that the last call left
+        self._kept = np.zeros(0)  # the estimate that the last call left, of what was read since it changed
 
     def add(self, vertices: ArrayLike, edges: ArrayLike) -> None:
         """Add vertices (at their initial values) and edges of the graph to the problem, by id, each once."""
@@ -180,15 +184,20 @@ class Problem:
         if (self._inside & self._held).any():
             return True
         rows = rows_of(self.graph, self.edges)
-        return fix_the_whole(self.graph, self._tree.estimate, rows)
+        return fix_the_whole(self.graph, self._estimates(), rows)
 
     @property
     def values(self) -> Array:
         """The estimates of all vertices, in the layout of ``Graph.initial``; ``start_at`` accepts them."""
         self._grow()
-        return self._tree.estimate[: len(self.graph.initial)].copy()
+        return self._estimates()[: len(self.graph.initial)].copy()
 
     # -- for the solution --------------------------------------------------------------------------------------------
+
+    def _estimates(self) -> Array:
+        """Return the estimates of all vertices, none of them waiting; they stay the tree's."""
+        show_all(self._tree, self._kept, self.settings.tolerance, self.settings.tolerance_sigmas)
+        return self._tree.estimate
 
     def _grow(self) -> None:
         """Follow the graph's growth: new vertices start at their initial values."""
@@ -196,8 +205,8 @@ class Problem:
         count = len(graph.kind)
         if count > known:
             size = len(graph.initial)
-            self._tree = with_room(self._tree, vertex=count, region=2 * count, tail=2 * count)
-            self._tree = with_room(self._tree, diagonal=size, step=size, value=size, estimate=size)
+            self._tree = with_room(self._tree, vertex=count, region=2 * count, tail=2 * count, listed=count)
+            self._tree = with_room(self._tree, diagonal=size, step=size, reference=size, value=size, estimate=size)
             self._inside, self._held = longer(self._inside, count), longer(self._held, count)
             self._kept = longer(self._kept, len(self._tree.estimate))
             first = int(graph.offset.values[known])
@@ -266,11 +275,14 @@ class Problem:
         After an error the tree is rebuilt at the next update, because its numbers are half old and half new.
         """
         pending, tree = self._pending, self._tree
+        substituted = int(tree.state[SUBSTITUTED])
         try:
             incremental.enter(tree, vertices, edges)
             yield
         except BaseException:
             pending.broken = True
+            if tree.state[SUBSTITUTED] == substituted:
+                self._estimates()  # what waits still can be solved
             tree.state[TAIL_FIRST] = tree.state[TAIL_END] = 0  # it is filled anew with the tree
             self._set_estimate(self._kept)
             incremental.leave(self._tree, vertices, edges)  # the last: it needs memory
@@ -279,6 +291,7 @@ class Problem:
 
     def _fix_at_estimate(self, one: Index) -> None:
         """Remove a vertex from the unknowns; it stays at its estimate."""
+        self._estimates()
         accept_steps(self._tree, one)
         if self._tree.vertex[one[0], FREE]:
             self._pending.touch(incremental.leave(self._tree, one, NONE))
@@ -286,7 +299,7 @@ class Problem:
     def _set_estimate(self, values: Array) -> None:
         for array in (self._tree.value, self._tree.estimate, self._kept):
             array[: len(values)] = values
-        self._tree.step[:] = 0.0
+        forget(self._tree)
 
     def _refuse_floating(self) -> None:
         """Raise GaugeError if nothing fixes a part of the problem, with all pending changes."""

@@ -30,7 +30,7 @@ class Change:
     ----------
     eliminated : vertices that were eliminated again, the new ones included
     linearized : edges that were linearised, the new ones included
-    moved : vertices whose estimate changed
+    moved : vertices whose step was computed again; others may follow when they are read
     """
 
     eliminated: int = 0

@@ -11,9 +11,9 @@ from graph_slam_ros.graph import Graph
 from graph_slam_ros.graph.graph import whole_numbers
 from graph_slam_ros.solver.batch import BatchProblem, Settings, minimise
 from graph_slam_ros.solver.clique_tree import incremental
-from graph_slam_ros.solver.clique_tree.numeric import keep
 from graph_slam_ros.solver.clique_tree.pools import compact
-from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, NOTHING
+from graph_slam_ros.solver.clique_tree.storage import AFFECTED, CLIQUE, DOF, NOTHING, SUBSTITUTED
+from graph_slam_ros.solver.clique_tree.substitution import forget, read, show
 from graph_slam_ros.solver.covariance import joint, marginals
 from graph_slam_ros.solver.edge_covariance import EdgeCovariances
 from graph_slam_ros.solver.gauge import undetermined
@@ -45,8 +45,7 @@ class Solver(Problem):
     """
 
     def __init__(self, graph: Graph, settings: Settings | None = None) -> None:
-        super().__init__(graph)
-        self.settings = settings or Settings()
+        super().__init__(graph, settings)
         self._stages = LossStages(graph)
         self._numbers_current = True  # the tree's numbers are those at its linearisation points
         self._unfinished = False  # a batch stopped before the optimum
@@ -78,16 +77,19 @@ class Solver(Problem):
         eliminated = int(self._tree.state[AFFECTED])
         arriving = self._arriving()
         with self._transaction(*arriving):
-            moved, linearized = self._integrate(*arriving)
+            solved, linearized = self._integrate(*arriving)
             if self._unfinished:
-                moved = self._continue_batch()
-            changed = [moved]
-            for edges, these in self._relinearized(moved):
+                solved = self._continue_batch()
+            found = [solved]
+            for edges, these in self._relinearized(solved):
                 linearized += edges
-                changed.append(these)
-        for moved in changed:
-            self._keep(moved)
-        return Change(int(self._tree.state[AFFECTED]) - eliminated, linearized, sum(map(len, changed)))
+                found.append(these)
+        if self.settings.at_once:
+            self._estimates()
+        else:
+            for these in found:
+                show(self._tree, self._kept, these)
+        return Change(int(self._tree.state[AFFECTED]) - eliminated, linearized, sum(map(len, found)))
 
     def optimize(self, settings: Settings | None = None) -> Report:
         """Minimise the cost over everything, from the present estimate, until converged.
@@ -102,7 +104,9 @@ class Solver(Problem):
         if self._solved_with == settings and not self._pending:
             return self.evaluate(settings)
         arriving = self._arriving(surely=True)
+        self._estimates()
         with self._transaction(*arriving):
+            self._tree.state[SUBSTITUTED] += 1  # from here on, steps are those of the batch
             self._forget_numbers()
             self._restructure(*arriving)
             unknowns = self._unknowns()
@@ -110,6 +114,7 @@ class Solver(Problem):
                 report = minimise(BatchProblem(self.graph, self._tree, self._active_rows(), unknowns), settings)
             else:
                 report = self.evaluate(settings)
+        forget(self._tree)
         self._kept[:] = self._tree.estimate
         self._numbers_current, self._stages.young = not len(unknowns), NONE
         self._solved_with = settings if report.converged else None
@@ -123,7 +128,7 @@ class Solver(Problem):
         """
         self._grow()
         losses = Losses(self.graph, (settings or self.settings).stages()[-1])
-        where = self._tree.estimate if at is None else at
+        where = self._estimates() if at is None else at
         now = costs(self.graph, linearize(self.graph, where, self._active_rows(), losses))
         return Report("gn", "nothing_to_do", now.chi2, now.chi2, now.cost, now.cost, (), now.classes)
 
@@ -133,14 +138,14 @@ class Solver(Problem):
         ids = whole_numbers(edges, "edge").ravel()
         if len(ids):
             existing(ids, self.graph.edge_count, "edge")
-        return chi2_of(self.graph, self._tree.estimate, ids)
+        return chi2_of(self.graph, self._estimates(), ids)
 
     def residuals_of(self, edges: ArrayLike) -> Array:
         """Residuals of edges at the estimate, not whitened, in the units of their types, end to end."""
         self._grow()
         ids = whole_numbers(edges, "edge").ravel()
         out: list[list[float]] = [[]] * len(ids)
-        for some, residual, _ in residuals_of(self.graph, self._tree.estimate, ids):
+        for some, residual, _ in residuals_of(self.graph, self._estimates(), ids):
             for k, of_one in zip(some.tolist(), residual.tolist(), strict=True):
                 out[k] = of_one
         return np.array([x for of_one in out for x in of_one])
@@ -153,7 +158,8 @@ class Solver(Problem):
             return np.empty((0, 0))
         graph = self.graph
         size = graph.kind_of(existing(at[:1], self._vertices, "vertex")[0]).size
-        unfit, out = incremental.gather(self._tree.estimate, graph.kind.values, graph.offset.values, at, size)
+        tolerances = self.settings.tolerance, self.settings.tolerance_sigmas
+        unfit, out = read(self._tree, self._kept, graph.kind.values, graph.offset.values, at, size, *tolerances)
         if unfit != NOTHING:
             existing(at, self._vertices, "vertex")
             raise GraphSlamError("estimate: the vertices are not of one kind")
@@ -211,7 +217,7 @@ class Solver(Problem):
         self._grow()
         free = np.flatnonzero(self._inside & ~self._held)
         losses = self._stages.losses(self.settings)[-1]
-        return information(self.graph, self._tree.estimate, rows_of(self.graph, self.edges), free, losses)
+        return information(self.graph, self._estimates(), rows_of(self.graph, self.edges), free, losses)
 
     def compact(self) -> None:
         """Move the fronts in use together in memory; memory is not returned to the system.
@@ -245,10 +251,8 @@ class Solver(Problem):
             if self._pending:
                 self.update()
             elif not self._numbers_current:
-                arriving = self._arriving()
-                with self._transaction(*arriving):
-                    moved, _ = self._integrate(*arriving)
-                self._keep(moved)
+                with self._transaction(*self._arriving()):
+                    self._renumber_after_batch()
             if (self._tree.vertex[wanted[~self._held[wanted]], CLIQUE] == NOTHING).any():
                 raise GraphSlamError("a covariance was asked for within an update")
         return wanted
@@ -272,60 +276,70 @@ class Solver(Problem):
             self._pending.broken = True
             raise
 
-    def _keep(self, moved: Index) -> None:
-        """Save the estimates of vertices, to restore them after an error."""
-        if len(moved):
-            keep(self._tree.vertex, self._tree.estimate, self._kept, moved)
-
     def _integrate(self, vertices: Index, edges: Index) -> tuple[Index, int]:
-        """Solve with all that enters; return the vertices that moved, and how many edges were linearised."""
-        pending, settings = self._pending, self.settings
+        """Solve with all that enters; return the vertices that were solved, and how many edges were linearised."""
+        pending = self._pending
         if not self._numbers_current and not pending.broken:
             self._renumber_after_batch()
-        young = self._stages.young
-        if not pending and not len(young):
+        settings, young = self.settings, self._stages.young
+        again = self._relinearized_first(edges)
+        if not pending and not len(young) and not len(again):
             return NONE, 0
         fresh = np.union1d(edges, young) if len(young) else edges
         self._stages.begin(edges, settings)
         if pending.broken:
             self._forget_numbers()
-            fresh = self._active()
-        self._linearize(fresh)
+            fresh, again = self._active(), NONE
+        both = np.union1d(fresh, again) if len(again) else fresh
+        self._linearize(both)
         cliques = self._restructure(vertices, fresh)
-        failed, moved = incremental.solve(self._tree, cliques, settings.tolerance, settings.tolerance_sigmas)
+        if len(again):
+            cliques = incremental.with_those_of(self._tree, cliques, again)
+        failed, solved = incremental.solve(self._tree, cliques, *self._limits())
         if failed != NOTHING:
             self._refuse_floating()
             raise undetermined(failed)
         self._stages.mature(self._tree.value, settings)
         self._solved_with, self._numbers_current = None, True
-        return moved, len(fresh)
+        return solved, len(both)
 
     def _continue_batch(self) -> Index:
-        """Step on from where a batch stopped before the optimum; return the vertices that moved."""
-        settings, self._unfinished = self.settings, False
-        failed, moved = incremental.renumber(self._tree, self._active(), settings.tolerance, settings.tolerance_sigmas)
+        """Step on from where a batch stopped before the optimum; return the vertices that were solved."""
+        self._unfinished = False
+        failed, solved = incremental.renumber(self._tree, self._active(), *self._limits())
         if failed != NOTHING:
             raise undetermined(failed)
-        self._schedule.hasten(settings.relinearize_every)
-        return moved
+        self._schedule.hasten(self.settings.relinearize_every)
+        return solved
 
-    def _relinearized(self, moved: Index) -> Iterator[tuple[int, Index]]:
-        """Relinearise pass after pass; yields the number of edges linearised and the vertices that moved."""
-        settings = self.settings
-        moved, far = self._schedule.after_update(moved, settings.relinearize_every)
-        for _ in range(settings.relinearize_passes):
-            edges = incremental.relinearize(
-                self._tree, moved, far * settings.relinearize_above, far**2 * settings.relinearize_error
-            )
+    def _relinearized_first(self, edges: Index) -> Index:
+        """Search all vertices for large steps, if it is time before these edges enter; return edges to linearise."""
+        settings, pending = self.settings, self._pending
+        closes = bool(len(edges)) and not pending.broken and incremental.reach_back(self._tree, edges)
+        if not self._schedule.is_due(settings.relinearize_every, closes=closes) or pending.broken:
+            return NONE
+        tolerances, limits = self._limits()[:2], (settings.relinearize_above, settings.relinearize_error)
+        return incremental.relinearize_changed(self._tree, *tolerances, *limits)
+
+    def _limits(self) -> tuple[float, float, float, float]:
+        """The tolerances of steps, and the limits above which a step is far (``substitute``)."""
+        s = self.settings
+        return s.tolerance, s.tolerance_sigmas, BY_FAR * s.relinearize_above, BY_FAR**2 * s.relinearize_error
+
+    def _relinearized(self, solved: Index) -> Iterator[tuple[int, Index]]:
+        """Relinearise what moved far, pass after pass; yields how many edges, and the vertices that were solved."""
+        limits = self._limits()
+        solved = self._schedule.after_update(solved)
+        for _ in range(self.settings.relinearize_passes):
+            edges = incremental.relinearize(self._tree, solved, *limits[2:])
             if not len(edges):
                 return
             self._linearize(edges)
-            failed, moved = incremental.renumber(self._tree, edges, settings.tolerance, settings.tolerance_sigmas)
+            failed, solved = incremental.renumber(self._tree, edges, *limits)
             if failed != NOTHING:
                 raise undetermined(failed)
-            self._schedule.note(moved)
-            far = BY_FAR
-            yield len(edges), moved
+            self._schedule.note(solved)
+            yield len(edges), solved
 
     def _forget_numbers(self) -> None:
         """Set the sums to zero, because all edges are about to be linearised."""
@@ -336,14 +350,16 @@ class Solver(Problem):
         """Order and group what new vertices and edges touch; return the cliques whose numbers are to be computed."""
         if self._pending.broken:
             vertices = self._unknowns()
+            self._estimates()
             incremental.reset(self._tree, vertices)
-        self._tree, cliques = incremental.restructure(self._tree, edges, self._pending.touched, vertices)
+        touched, tolerances = self._pending.touched, self._limits()[:2]
+        self._tree, cliques = incremental.restructure(self._tree, edges, touched, vertices, *tolerances)
         return cliques
 
     def _renumber_after_batch(self) -> None:
         """Compute the numbers of the tree at the result of a batch. The result stays."""
         self._linearize(self._active())
-        failed, _ = incremental.renumber(self._tree, self._active(), np.inf, 0.0)
+        failed, _ = incremental.renumber(self._tree, self._active(), np.inf, 0.0, np.inf, np.inf)
         if failed != NOTHING:
             self._pending.broken = True
         self._numbers_current = True

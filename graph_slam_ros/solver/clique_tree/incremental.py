@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.clique_tree.indices import in_order, lengthened
-from graph_slam_ros.solver.clique_tree.numeric import accept_steps, back_substitute, clear_block, eliminate
+from graph_slam_ros.solver.clique_tree.indices import in_order, joined, lengthened
+from graph_slam_ros.solver.clique_tree.numeric import accept_steps, clear_block, eliminate
 from graph_slam_ros.solver.clique_tree.ordering import dissect, ends_of, key_of, move_tail, neighbourhood
 from graph_slam_ros.solver.clique_tree.pools import compact, release, room_for
 from graph_slam_ros.solver.clique_tree.storage import (
@@ -13,10 +13,12 @@ from graph_slam_ros.solver.clique_tree.storage import (
     AFFECTED,
     BLOCK,
     BLOCKS_TOP,
+    CHANGED,
     CLIQUE,
     CLIQUES,
     CLIQUES_WANTED,
     COUNT,
+    DEFERRED_COUNT,
     DOF,
     FLOPS,
     FREE,
@@ -26,6 +28,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     FRONTS_TOP,
     FRONTS_WANTED,
     FULL_DOF,
+    IN_DEFERRED,
     KEY,
     KIND,
     LINK,
@@ -37,10 +40,12 @@ from graph_slam_ros.solver.clique_tree.storage import (
     LIVE,
     LIVE_MADE,
     LOCAL,
+    MARK,
     MARKED,
     MEMBERS_TOP,
     MEMBERS_WANTED,
     NEXT,
+    NOTED,
     NOTHING,
     OWNER,
     R_COUNT,
@@ -57,10 +62,12 @@ from graph_slam_ros.solver.clique_tree.storage import (
     Tree,
     with_room,
 )
+from graph_slam_ros.solver.clique_tree.substitution import find_changed, is_large, solve_marked, substitute
 from graph_slam_ros.solver.clique_tree.symbolic import build, cliques_of, collect, mark, structure
 from graph_slam_ros.typing import Array, Index
 
 SPARSE = 1.2  # of the memory of fronts, as a multiple of those in use: then it is compacted, not lengthened
+MUCH = 0.2  # of the threshold above which a vertex is linearised anew: changes below are not followed for that
 FEW = 64  # new vertices whose anchorage is looked for; more are said to be loose, which is then looked into
 
 
@@ -72,7 +79,7 @@ def append_vertices(t: Tree, first: int, offset: Index, initial: Array, shapes: 
     for k in range(len(offset)):
         v = first + k
         vertex[v, :] = NOTHING
-        vertex[v, FREE] = 0
+        vertex[v, FREE] = vertex[v, CHANGED] = vertex[v, NOTED] = 0
         dof, size, kind = shapes[k]
         vertex[v, DOF], vertex[v, KIND] = dof, kind
         vertex[v, STEP], vertex[v, VALUE] = step, offset[k]
@@ -113,19 +120,6 @@ def outside(rows: Index, ends: Index, weight: Array, inside: NDArray[np.bool_], 
     for v in new:
         inside[v] = False
     return found
-
-
-@kernel
-def gather(estimate: Array, kind: Index, offset: Index, ids: Index, size: int) -> tuple[int, Array]:
-    """Return stored numbers (n, size) of vertices of the first one's kind, and the index of an unfit id or NOTHING."""
-    out = np.empty((len(ids), size))
-    for k in range(len(ids)):
-        if ids[k] < 0 or ids[k] >= len(kind) or kind[ids[k]] != kind[ids[0]]:
-            return k, out
-        at = offset[ids[k]]
-        for i in range(size):
-            out[k, i] = estimate[at + i]
-    return NOTHING, out
 
 
 @kernel
@@ -201,6 +195,7 @@ def reset(t: Tree, unknowns: Index) -> None:
     region[0, :] = NOTHING
     region[0, R_DEPTH] = region[0, R_COUNT] = region[0, R_MADE] = 0
     t.vacant[:] = NOTHING
+    t.clique[:, IN_DEFERRED] = state[DEFERRED_COUNT] = 0
     state[TAIL_FIRST] = state[TAIL_END] = 0
     vertex[:, CLIQUE] = NOTHING
     vertex[:, REGION] = NOTHING
@@ -253,12 +248,13 @@ def edges_of(vertex: Index, link: Index, v: int) -> Index:
 
 
 @kernel
-def _regroup(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
+def _regroup(t: Tree, touched: Index, new: Index, tolerance: float, sigmas: float) -> tuple[bool, Index]:
     """Apply changes of the structure to the tree: eliminate what they touch again, and group it into cliques.
 
     Parameters
     ----------
     touched : vertices whose surroundings changed; new : vertices that are not in it yet
+    tolerance, sigmas : of the steps that are computed first, as the fronts go (``substitute``)
 
     Returns
     -------
@@ -267,6 +263,7 @@ def _regroup(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
     """
     clique, state = t.clique, t.state
     marked = mark(t, touched)
+    solve_marked(t, marked, tolerance, sigmas)
     order, orphans = collect(t, marked, new)
     start, later = structure(t, order, orphans)
     group, last, size = cliques_of(t, order, start, later)
@@ -287,34 +284,43 @@ def _regroup(t: Tree, touched: Index, new: Index) -> tuple[bool, Index]:
     return True, cliques
 
 
-def restructure(tree: Tree, edges: Index, touched: Index, new: Index) -> tuple[Tree, Index]:
+def restructure(
+    tree: Tree, edges: Index, touched: Index, new: Index, tolerance: float, sigmas: float
+) -> tuple[Tree, Index]:
     """Return the tree after changes of the structure, and its new cliques, whose numbers are not computed yet.
 
     Parameters
     ----------
     edges : that are new or have changed
     touched : other vertices whose surroundings changed; new : vertices that are not in it yet
+    tolerance, sigmas : see ``substitute``
     """
     while True:
         touched, overgrown = move_tail(tree, edges, touched)
         edges = edges[:0]
         if overgrown != NOTHING:
             touched = np.concatenate((touched, dissect(tree, overgrown)))
-        done, cliques = _regroup(tree, touched, new)
+        done, cliques = _regroup(tree, touched, new, tolerance, sigmas)
         if done:
             return tree, cliques
         state = tree.state
         if state[FRONTS_TOP] > SPARSE * state[LIVE]:
             compact(tree)
             continue
-        tree = with_room(tree, clique=state[CLIQUES_WANTED], members=state[MEMBERS_WANTED], fronts=state[FRONTS_WANTED])
+        tree = with_room(
+            tree,
+            clique=state[CLIQUES_WANTED],
+            listed=state[CLIQUES_WANTED],
+            members=state[MEMBERS_WANTED],
+            fronts=state[FRONTS_WANTED],
+        )
 
 
 @kernel
-def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float) -> tuple[int, Index]:
-    """Compute the numbers of cliques, children before parents, and the step.
+def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: float, error: float) -> tuple[int, Index]:
+    """Compute the numbers of cliques, children before parents, and the steps that matter (``substitute``).
 
-    Returns a vertex that has no pivot, or NOTHING, and the vertices that moved.
+    Returns a vertex that has no pivot, or NOTHING, and the vertices that were solved.
     """
     clique, state = t.clique, t.state
     for c in cliques:
@@ -322,31 +328,38 @@ def solve(t: Tree, cliques: Index, tolerance: float, sigmas: float) -> tuple[int
     failed = eliminate(t, cliques, 0.0)
     if failed != NOTHING:
         return failed, cliques[:0].copy()
-    return failed, back_substitute(t, cliques, tolerance, sigmas)
-
-
-def renumber(t: Tree, edges: Index, tolerance: float, sigmas: float) -> tuple[int, Index]:
-    """Solve after a change of the edges' numbers alone."""
-    return solve(t, mark(t, ends_of(t, edges)), tolerance, sigmas)
+    return failed, substitute(t, cliques, tolerance, sigmas, far, error)
 
 
 @kernel
-def relinearize(t: Tree, moved: Index, threshold: float, error: float) -> Index:
-    """Move the linearisation points of vertices whose step is too large; return all edges on them.
+def with_those_of(t: Tree, cliques: Index, edges: Index) -> Index:
+    """Return new cliques, and before them those whose numbers depend on edges, children before parents."""
+    clique = t.clique
+    for c in cliques:
+        clique[c, MARK] = 1
+    more = mark(t, ends_of(t, edges))
+    for c in cliques:
+        clique[c, MARK] = 0
+    return joined(more, cliques)
 
-    A step is too large above the threshold. It also is where the neglected term of the linearisation (the square of the
-    step) exceeds ``error`` standard deviations of the strongest measurement.
+
+@kernel
+def renumber(t: Tree, edges: Index, tolerance: float, sigmas: float, far: float, error: float) -> tuple[int, Index]:
+    """Solve after a change of the edges' numbers alone."""
+    return solve(t, mark(t, ends_of(t, edges)), tolerance, sigmas, far, error)
+
+
+@kernel
+def relinearize(t: Tree, searched: Index, threshold: float, error: float) -> Index:
+    """Move the linearisation points of those vertices whose step is too large; return all edges on them.
+
+    A step is too large above the threshold, or where the neglected term of the linearisation is (``is_large``).
     """
-    vertex, edge, link, t_step, t_diagonal = t.vertex, t.edge, t.link, t.step, t.diagonal
-    edges, moving = np.empty(64, np.int64), np.empty(len(moved), np.int64)
+    vertex, edge, link, step, diagonal = t.vertex, t.edge, t.link, t.step, t.diagonal
+    edges, moving = np.empty(64, np.int64), np.empty(len(searched), np.int64)
     count, many = ZERO, 0
-    for v in moved:
-        step = t_step[vertex[v, STEP] : vertex[v, STEP] + vertex[v, DOF]]
-        largest = information = 0.0
-        for i in range(len(step)):
-            largest = max(largest, abs(step[i]))
-            information = max(information, t_diagonal[vertex[v, STEP] + i])
-        if largest <= threshold and largest * largest * np.sqrt(information) <= error:
+    for v in searched:
+        if not is_large(step, diagonal, vertex[v, STEP], vertex[v, DOF], threshold, error):
             continue
         moving[many] = v
         many += 1
@@ -364,3 +377,19 @@ def relinearize(t: Tree, moved: Index, threshold: float, error: float) -> Index:
         edge[e, MARKED] = 0
     accept_steps(t, moving[:many])
     return in_order(edges[:count])
+
+
+@kernel
+def relinearize_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, error: float) -> Index:
+    """Search all vertices that have moved much since the last time, and relinearise: return the edges."""
+    much = find_changed(t, tolerance, sigmas, MUCH * threshold, MUCH * MUCH * error)
+    return relinearize(t, much, threshold, error)
+
+
+@kernel
+def reach_back(t: Tree, edges: Index) -> bool:
+    """Return whether one of the edges reaches a vertex that has left the tail: it closes a loop."""
+    back = False
+    for v in ends_of(t, edges):
+        back = back or t.vertex[v, REGION] != NOTHING
+    return back

@@ -1,4 +1,4 @@
-"""The numbers of the clique tree: assembly and elimination, back-substitution, steps.
+"""The numbers of the clique tree: assembly and elimination, steps.
 
 Kernels take the arrays out of the tree once: each access through the tuple would count references.
 """
@@ -7,8 +7,7 @@ import numpy as np
 
 from graph_slam_ros.lie import se2, se3
 from graph_slam_ros.lie.jit import kernel
-from graph_slam_ros.solver.clique_tree.dense import partial_cholesky, solve_upper
-from graph_slam_ros.solver.clique_tree.indices import lengthened
+from graph_slam_ros.solver.clique_tree.dense import partial_cholesky
 from graph_slam_ros.solver.clique_tree.rounding import JUST_MADE, UNKNOWN, is_rounding, suspect_row
 from graph_slam_ros.solver.clique_tree.storage import (
     BLOCK,
@@ -18,7 +17,6 @@ from graph_slam_ros.solver.clique_tree.storage import (
     FREE,
     FRONT_DOF,
     FRONTALS,
-    FULL_DOF,
     KIND,
     LINK,
     LINK_EDGE,
@@ -27,11 +25,9 @@ from graph_slam_ros.solver.clique_tree.storage import (
     LINKED,
     LOCAL,
     MAGNITUDES,
-    MARK,
     MEMBERS,
     NOTHING,
     OWNER,
-    PARENT,
     SE2_KIND,
     SE3_KIND,
     SIBLING,
@@ -39,13 +35,11 @@ from graph_slam_ros.solver.clique_tree.storage import (
     STEP,
     VALUE,
     WIDTH,
-    ZERO,
     Tree,
     front_of,
 )
 from graph_slam_ros.typing import Array, Index
 
-MOVED = -2  # in LOCAL: its step has changed
 CANCELLED = 1e-4  # of what is taken off a sum: less than that left has lost digits
 
 
@@ -161,98 +155,16 @@ def _add_contribution(vertex: Index, clique: Index, members: Index, fronts: Arra
 
 
 @kernel
-def back_substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float) -> Index:
-    """Compute steps from the root down, through given cliques (children before parents) and below where they matter.
-
-    A step is kept if it changes by no more than the tolerance [m, rad], or by so many standard deviations of the vertex
-    given its neighbours. Then all that depends on it alone is kept, so errors do not add up. Returns the vertices whose
-    step changed; their estimates are updated.
-    """
-    vertex, clique, members, fronts, step = t.vertex, t.clique, t.members, t.fronts, t.step
-    value, estimate, diagonal = t.value, t.estimate, t.diagonal
-    limit = sigmas * abs(sigmas)
-    moved, count = np.empty(256, np.int64), ZERO
-    stack, top = np.empty(256, np.int64), ZERO
-    x = np.empty(256)
-    for c in cliques:
-        clique[c, MARK] = 1
-        if clique[c, PARENT] == NOTHING:
-            if top == len(stack):
-                stack = lengthened(stack, top)
-            stack[top] = c
-            top += 1
-    while top:
-        top -= 1
-        c = stack[top]
-        to_solve = clique[c, MARK] == 1
-        clique[c, MARK] = 0
-        full, frontal, low = clique[c, FULL_DOF], clique[c, FRONT_DOF], clique[c, MEMBERS]
-        if len(x) < full:
-            x = np.empty(2 * full)
-        at = frontal
-        for m in range(low + clique[c, FRONTALS], low + clique[c, SIZE]):
-            v = members[m]
-            to_solve = to_solve or vertex[v, LOCAL] == MOVED
-            for i in range(vertex[v, DOF]):
-                x[at + i] = step[vertex[v, STEP] + i]
-            at += vertex[v, DOF]
-        if not to_solve:
-            continue
-        solve_upper(front_of(clique, fronts, c), frontal, x)
-        if count + clique[c, FRONTALS] > len(moved):
-            moved = lengthened(moved, count + clique[c, FRONTALS])
-        frontals = members[low : low + clique[c, FRONTALS]]
-        count = _move(vertex, frontals, x, step, diagonal, tolerance, limit, moved, count)
-        k = clique[c, CHILD]
-        while k != NOTHING:
-            if top == len(stack):
-                stack = lengthened(stack, top)
-            stack[top] = k
-            top += 1
-            k = clique[k, SIBLING]
-    for c in cliques:
-        clique[c, MARK] = 0
-    for v in moved[:count]:
-        vertex[v, LOCAL] = NOTHING
-        _retract(vertex, value, step, estimate, v)
-    return moved[:count]
-
-
-@kernel
-def _move(
-    vertex: Index,
-    frontals: Index,
-    x: Array,
-    step: Array,
-    diagonal: Array,
-    tolerance: float,
-    limit: float,
-    moved: Index,
-    count: int,
-) -> int:
-    """Set the steps x of vertices unless the change is within the tolerances; return how many have moved so far."""
-    at = 0
-    for v in frontals:
-        first, dof = vertex[v, STEP], vertex[v, DOF]
-        change = error = 0.0
-        for i in range(dof):
-            d = abs(step[first + i] - x[at + i])
-            change, error = max(change, d), max(error, d * d * diagonal[first + i])
-        if not (change <= tolerance or error <= limit):
-            for i in range(dof):
-                step[first + i] = x[at + i]
-            vertex[v, LOCAL] = MOVED
-            moved[count] = v
-            count += 1
-        at += dof
-    return count
-
-
-@kernel
-def _retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -> None:
+def retract(vertex: Index, value: Array, step: Array, estimate: Array, v: int) -> None:
     """The estimate of a vertex: its linearisation point [+] its step."""
-    kind, x, d = vertex[v, KIND], vertex[v, VALUE], vertex[v, STEP]
-    if kind == SE2_KIND:
+    kind, x, d, dof = vertex[v, KIND], vertex[v, VALUE], vertex[v, STEP], vertex[v, DOF]
+    moved = False
+    for i in range(d, d + dof):
+        moved = moved or step[i] != 0.0
+    if not moved:
+        for i in range(7 if kind == SE3_KIND else dof):
+            estimate[x + i] = value[x + i]
+    elif kind == SE2_KIND:
         pose = se2.retract((value[x], value[x + 1], value[x + 2]), (step[d], step[d + 1], step[d + 2]))
         for i in range(3):
             estimate[x + i] = pose[i]
@@ -319,22 +231,14 @@ def _add_up_diagonal(t: Tree, v: int) -> None:
 
 
 @kernel
-def keep(vertex: Index, estimate: Array, kept: Array, vertices: Index) -> None:
-    """Copy the estimates of vertices."""
-    for v in vertices:
-        x = vertex[v, VALUE]
-        for i in range(7 if vertex[v, KIND] == SE3_KIND else vertex[v, DOF]):
-            kept[x + i] = estimate[x + i]
-
-
-@kernel
 def accept_steps(t: Tree, vertices: Index) -> None:
     """Make the estimates of vertices their linearisation points."""
-    vertex, step, value, estimate = t.vertex, t.step, t.value, t.estimate
+    vertex, step, reference, value, estimate = t.vertex, t.step, t.reference, t.value, t.estimate
     for v in vertices:
+        retract(vertex, value, step, estimate, v)
         x, d, dof = vertex[v, VALUE], vertex[v, STEP], vertex[v, DOF]
         for i in range(dof):
-            step[d + i] = 0.0
+            step[d + i] = reference[d + i] = 0.0
         for i in range(7 if vertex[v, KIND] == SE3_KIND else dof):
             value[x + i] = estimate[x + i]
 
@@ -345,7 +249,7 @@ def step_by(t: Tree, vertices: Index, step: Array) -> None:
     for v in vertices:
         for i in range(t.vertex[v, STEP], t.vertex[v, STEP] + t.vertex[v, DOF]):
             t.step[i] = step[i]
-        _retract(t.vertex, t.value, t.step, t.estimate, v)
+        retract(t.vertex, t.value, t.step, t.estimate, v)
 
 
 @kernel

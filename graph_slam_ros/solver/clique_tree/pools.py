@@ -22,6 +22,7 @@ from graph_slam_ros.solver.clique_tree.storage import (
     MEMBERS_TOP,
     NOTHING,
     SIBLING,
+    SIZE,
     Tree,
 )
 from graph_slam_ros.typing import Index
@@ -83,6 +84,7 @@ def release(t: Tree, cliques: Index) -> None:
         clique[c, SIBLING] = vacant[k]
         vacant[k] = c
         t.state[LIVE] -= numbers_of(k)
+        clique[c, SIZE] = clique[c, FRONTALS] = 0  # it may be in the list of those that wait still
 
 
 @kernel

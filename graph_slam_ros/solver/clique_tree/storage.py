@@ -22,12 +22,15 @@ from graph_slam_ros.lie.jit import kernel
 from graph_slam_ros.typing import Array, Index
 
 NOTHING = -1
+NEVER = 1 << 62  # later than any solution
 ZERO: Any = np.int64(0)  # no literal: a kernel that is called with one is compiled for it alone
 
 # vertex: degrees of freedom; begin in ``step`` and in ``value``; kind (below); key: the order of elimination;
 # the clique it is frontal in; first link to its edges; its region and the next vertex there; 1 where it is an unknown;
-# scratch, NOTHING between uses
-DOF, STEP, VALUE, KIND, KEY, CLIQUE, LINK, REGION, NEXT, FREE, LOCAL, VERTEX_COLUMNS = range(12)
+# scratch, NOTHING between uses; the solution (``substitution``) that last changed its step; in which lists it is
+DOF, STEP, VALUE, KIND, KEY, CLIQUE, LINK, REGION, NEXT, FREE, LOCAL, CHANGED, NOTED, VERTEX_COLUMNS = range(14)
+# bits of NOTED; the last two: its step is far from the linearisation point; has changed much since the last search
+IS_SHIFTED, IS_STALE, IS_FAR, IS_MUCH = 1, 2, 4, 8
 
 # edge: how many vertices, 0 where it is not known yet; its first link, the others follow, one for each vertex in the
 # order of its slots; degrees of freedom of the vertices; where its block begins; 1 where it is in the structure; which
@@ -39,10 +42,28 @@ LINK_EDGE, LINK_END, LINK_NEXT, LINK_COLUMNS = range(4)
 
 # clique: its place in the tree; where its members begin, how many are frontal, how many there are; the same in
 # degrees of freedom; where its front begins; its size class; 1 where an update has marked it; whether the magnitudes of
-# its subtree are known (``rounding``)
-PARENT, CHILD, SIBLING, MEMBERS, FRONTALS, SIZE, FRONT_DOF, FULL_DOF, FRONT, CLASS, MARK, MAGNITUDES, CLIQUE_COLUMNS = (
-    range(13)
-)
+# its subtree are known (``rounding``); the number of its last solution (``substitution``); 1 where it is listed
+(
+    PARENT,
+    CHILD,
+    SIBLING,
+    MEMBERS,
+    FRONTALS,
+    SIZE,
+    FRONT_DOF,
+    FULL_DOF,
+    FRONT,
+    CLASS,
+    MARK,
+    MAGNITUDES,
+    SEEN,
+    IN_DEFERRED,
+    CLIQUE_COLUMNS,
+) = range(15)
+
+# list: vertices whose step has changed since all were searched for large ones; whose estimate is not computed yet;
+# cliques that may have to be solved. ``state`` has how many there are
+SHIFTED, STALE, DEFERRED, LIST_COLUMNS = range(4)
 
 # region of the nested dissection: its place in the binary tree; vertices in its subtree, now and when it was made;
 # the first vertex of its own
@@ -73,8 +94,13 @@ R_PARENT, R_DEPTH, R_LEFT, R_RIGHT, R_COUNT, R_MADE, R_FIRST, REGION_COLUMNS = r
     MEMBERS_WANTED,
     FRONTS_WANTED,
     CHECKED,
+    SOLUTIONS,
+    SUBSTITUTED,
+    SHIFTED_COUNT,
+    STALE_COUNT,
+    DEFERRED_COUNT,
     STATE_COLUMNS,
-) = range(24)
+) = range(29)
 
 VECTOR, SE2_KIND, SE3_KIND = range(3)
 
@@ -98,6 +124,8 @@ class Tree(NamedTuple):
     blocks : of each edge (D, D + 1): its share of the information matrix, J'J, and of the gradient, J'r
     diagonal : of the information matrix, all edges together
     step : of each unknown, from its linearisation point ``value``; ``estimate`` is ``value [+] step``
+    reference : the step when a search for large ones last found the vertex
+    listed : lists of vertices and cliques, a column each
     tail : the newest vertices, eliminated last and in order of time
     reach : how far back the recent closures reached, in vertices
     vacant : by size class, the first of the cliques that may be used again
@@ -113,10 +141,12 @@ class Tree(NamedTuple):
     reach: Index
     vacant: Index
     state: Index
+    listed: Index
     fronts: Array
     blocks: Array
     diagonal: Array
     step: Array
+    reference: Array
     value: Array
     estimate: Array
 
@@ -145,10 +175,12 @@ def empty_tree() -> Tree:
         reach=np.full(RECENT, FAR),
         vacant=np.full(len(CAPACITIES), NOTHING, dtype=np.int64),
         state=state,
+        listed=np.zeros((0, LIST_COLUMNS), dtype=np.int64),
         fronts=np.zeros(0),
         blocks=np.zeros(0),
         diagonal=np.zeros(0),
         step=np.zeros(0),
+        reference=np.zeros(0),
         value=np.zeros(0),
         estimate=np.zeros(0),
     )

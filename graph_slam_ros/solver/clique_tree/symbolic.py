@@ -24,10 +24,12 @@ from graph_slam_ros.solver.clique_tree.storage import (
     LOCAL,
     MARK,
     MEMBERS,
+    NEVER,
     NOTHING,
     OWNER,
     PARENT,
     REGION,
+    SEEN,
     SIBLING,
     SIZE,
     ZERO,
@@ -263,6 +265,7 @@ def build(
         clique[c, SIZE] = frontals[j] + start[k + 1] - start[k]
         clique[c, FULL_DOF] = size[j]
         clique[c, FRONT_DOF] = 0
+        clique[c, SEEN] = NEVER
         clique[c, PARENT] = clique[c, CHILD] = clique[c, SIBLING] = NOTHING
         fill[j] = clique[c, MEMBERS]
         separator = fill[j] + frontals[j]

@@ -1,0 +1,400 @@
+"""Back-substitution: the steps of the vertices, computed when somebody asks for them.
+
+A clique is solved from its front and the steps of its separator. An update solves the cliques that it eliminated, and
+those below whose separator is far from its linearisation point. The others wait until they are read, or until a search
+for large steps finds that their separator has moved much since the last one (``find_changed``). Solutions are numbered.
+A clique waits if a step of its separator changed after its own solution.
+"""
+
+import numpy as np
+
+from graph_slam_ros.lie.jit import kernel
+from graph_slam_ros.solver.clique_tree.dense import solve_upper
+from graph_slam_ros.solver.clique_tree.indices import in_order, lengthened
+from graph_slam_ros.solver.clique_tree.numeric import retract
+from graph_slam_ros.solver.clique_tree.storage import (
+    CHANGED,
+    CHILD,
+    CLIQUE,
+    DEFERRED,
+    DEFERRED_COUNT,
+    DOF,
+    FRONT_DOF,
+    FRONTALS,
+    FULL_DOF,
+    IN_DEFERRED,
+    IS_FAR,
+    IS_MUCH,
+    IS_SHIFTED,
+    IS_STALE,
+    KIND,
+    MARK,
+    MEMBERS,
+    NOTED,
+    NOTHING,
+    PARENT,
+    SE3_KIND,
+    SEEN,
+    SHIFTED,
+    SHIFTED_COUNT,
+    SIBLING,
+    SIZE,
+    SOLUTIONS,
+    STALE,
+    STALE_COUNT,
+    STEP,
+    SUBSTITUTED,
+    VALUE,
+    ZERO,
+    Tree,
+    front_of,
+)
+from graph_slam_ros.typing import Array, Index
+
+FEW = 8  # vertices that are read one by one; for more all that waits is solved
+
+
+@kernel
+def substitute(t: Tree, cliques: Index, tolerance: float, sigmas: float, far: float, error: float) -> Index:
+    """Solve cliques (children before parents) from the root down, and those below whose separator moved far.
+
+    Others whose separator moved wait. Returns the frontal vertices of all that were solved.
+
+    Parameters
+    ----------
+    tolerance, sigmas : a step is kept if it changes by no more than so many m or rad, or standard deviations of the
+        vertex given its neighbours. Then all that depends on it alone is kept, so errors do not add up
+    far, error : a step is far that is larger, or whose square exceeds so many standard deviations of the strongest
+        measurement (``relinearize``)
+    """
+    vertex, clique, members, step, diagonal = t.vertex, t.clique, t.members, t.step, t.diagonal
+    solved, count = np.empty(256, np.int64), ZERO
+    stack, top = np.empty(256, np.int64), ZERO
+    x = np.empty(256)
+    t.state[SUBSTITUTED] += 1
+    for c in cliques:
+        clique[c, MARK] = 1
+        if clique[c, PARENT] == NOTHING:
+            if top == len(stack):
+                stack = lengthened(stack, top)
+            stack[top] = c
+            top += 1
+    while top:
+        top -= 1
+        c = stack[top]
+        clique[c, MARK] = 0
+        if len(x) < clique[c, FULL_DOF]:
+            x = np.empty(2 * clique[c, FULL_DOF])
+        visit(t, c, x, tolerance, sigmas)
+        low, frontals = clique[c, MEMBERS], clique[c, FRONTALS]
+        if count + frontals > len(solved):
+            solved = lengthened(solved, count + frontals)
+        for m in range(low, low + frontals):
+            v = members[m]
+            solved[count] = v
+            count += 1
+            if is_large(step, diagonal, vertex[v, STEP], vertex[v, DOF], far, error):
+                vertex[v, NOTED] |= IS_FAR
+            else:
+                vertex[v, NOTED] &= ~IS_FAR
+        k = clique[c, CHILD]
+        while k != NOTHING:
+            if clique[k, MARK] == 1 or _is_noted(vertex, clique, members, k, IS_FAR):
+                if top == len(stack):
+                    stack = lengthened(stack, top)
+                stack[top] = k
+                top += 1
+            elif needs(vertex, clique, members, k):
+                _defer(t, k)
+            k = clique[k, SIBLING]
+    return solved[:count]
+
+
+@kernel
+def is_large(step: Array, diagonal: Array, first: int, dof: int, threshold: float, error: float) -> bool:
+    """Return whether a step is above the threshold, or its square above ``error`` standard deviations.
+
+    These are those of the strongest measurement; the square of the step is what the linearisation neglects.
+    """
+    largest = information = 0.0
+    for i in range(first, first + dof):
+        largest, information = max(largest, abs(step[i])), max(information, diagonal[i])
+    return largest > threshold or largest * largest * np.sqrt(information) > error
+
+
+@kernel
+def visit(t: Tree, c: int, x: Array, tolerance: float, sigmas: float) -> None:
+    """Solve one clique; ``x`` is scratch, as long as its degrees of freedom."""
+    vertex, clique, members, step, state = t.vertex, t.clique, t.members, t.step, t.state
+    diagonal, listed = t.diagonal, t.listed
+    limit = sigmas * abs(sigmas)
+    state[SOLUTIONS] += 1
+    clique[c, SEEN] = state[SOLUTIONS]
+    low, frontal = clique[c, MEMBERS], clique[c, FRONT_DOF]
+    at = frontal
+    for m in range(low + clique[c, FRONTALS], low + clique[c, SIZE]):
+        first = vertex[members[m], STEP]
+        for i in range(vertex[members[m], DOF]):
+            x[at + i] = step[first + i]
+        at += vertex[members[m], DOF]
+    solve_upper(front_of(clique, t.fronts, c), frontal, x)
+    at = 0
+    for m in range(low, low + clique[c, FRONTALS]):
+        v = members[m]
+        first, dof = vertex[v, STEP], vertex[v, DOF]
+        change = error = 0.0
+        for i in range(dof):
+            d = abs(step[first + i] - x[at + i])
+            change, error = max(change, d), max(error, d * d * diagonal[first + i])
+        if not (change <= tolerance or error <= limit):
+            for i in range(dof):
+                step[first + i] = x[at + i]
+            vertex[v, CHANGED] = state[SOLUTIONS]
+            if vertex[v, NOTED] & IS_SHIFTED == 0:
+                listed[state[SHIFTED_COUNT], SHIFTED] = v
+                state[SHIFTED_COUNT] += 1
+            if vertex[v, NOTED] & IS_STALE == 0:
+                listed[state[STALE_COUNT], STALE] = v
+                state[STALE_COUNT] += 1
+            vertex[v, NOTED] |= IS_SHIFTED | IS_STALE
+        at += dof
+
+
+@kernel
+def needs(vertex: Index, clique: Index, members: Index, c: int) -> bool:
+    """Return whether a step of a clique's separator changed after the clique was solved."""
+    seen = clique[c, SEEN]
+    for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
+        if vertex[members[m], CHANGED] > seen:
+            return True
+    return False
+
+
+@kernel
+def _is_noted(vertex: Index, clique: Index, members: Index, c: int, bit: int) -> bool:
+    """Return whether a vertex of a clique's separator has a bit of ``NOTED``."""
+    for m in range(clique[c, MEMBERS] + clique[c, FRONTALS], clique[c, MEMBERS] + clique[c, SIZE]):
+        if vertex[members[m], NOTED] & bit:
+            return True
+    return False
+
+
+@kernel
+def _defer(t: Tree, c: int) -> None:
+    """Let a clique wait."""
+    if t.clique[c, IN_DEFERRED] == 0:
+        t.clique[c, IN_DEFERRED] = 1
+        t.listed[t.state[DEFERRED_COUNT], DEFERRED] = c
+        t.state[DEFERRED_COUNT] += 1
+
+
+@kernel
+def solve_deferred(t: Tree, tolerance: float, sigmas: float) -> None:
+    """Solve all cliques that wait, and what is below them where it matters."""
+    vertex, clique, members, listed, state = t.vertex, t.clique, t.members, t.listed, t.state
+    stack, top = np.empty(256, np.int64), ZERO
+    x = np.empty(256)
+    for i in range(state[DEFERRED_COUNT] - 1, -1, -1):  # the last first: it may be above an earlier one
+        stack[0], top = listed[i, DEFERRED], ZERO + 1
+        clique[stack[0], IN_DEFERRED] = 0
+        while top:
+            top -= 1
+            c = stack[top]
+            if not needs(vertex, clique, members, c):
+                continue
+            if len(x) < clique[c, FULL_DOF]:
+                x = np.empty(2 * clique[c, FULL_DOF])
+            visit(t, c, x, tolerance, sigmas)
+            k = clique[c, CHILD]
+            while k != NOTHING:
+                if top == len(stack):
+                    stack = lengthened(stack, top)
+                stack[top] = k
+                top += 1
+                k = clique[k, SIBLING]
+    state[DEFERRED_COUNT] = 0
+
+
+@kernel
+def solve_way(t: Tree, c: int, way: Index, tolerance: float, sigmas: float) -> Index:
+    """Solve what waits from the root down to a clique; ``way`` is scratch, which is returned, perhaps longer."""
+    vertex, clique, members = t.vertex, t.clique, t.members
+    count, first = ZERO, NOTHING
+    while c != NOTHING:
+        if count == len(way):
+            way = lengthened(way, count)
+        way[count] = c
+        if needs(vertex, clique, members, c):
+            first = count
+        count += 1
+        c = clique[c, PARENT]
+    if first == NOTHING:
+        return way
+    x = np.empty(256)
+    for i in range(first, -1, -1):
+        c = way[i]
+        if not needs(vertex, clique, members, c):
+            continue
+        if len(x) < clique[c, FULL_DOF]:
+            x = np.empty(2 * clique[c, FULL_DOF])
+        visit(t, c, x, tolerance, sigmas)
+        k = clique[c, CHILD]
+        while k != NOTHING:
+            if needs(vertex, clique, members, k):
+                _defer(t, k)
+            k = clique[k, SIBLING]
+    return way
+
+
+@kernel
+def solve_marked(t: Tree, marked: Index, tolerance: float, sigmas: float) -> None:
+    """Solve those of marked cliques (children before parents) that wait, before they are eliminated again."""
+    way = np.empty(64, np.int64)
+    for k in range(len(marked) - 1, -1, -1):
+        if needs(t.vertex, t.clique, t.members, marked[k]):
+            way = solve_way(t, marked[k], way, tolerance, sigmas)
+
+
+@kernel
+def show(t: Tree, kept: Array, vertices: Index) -> None:
+    """Compute the estimates of vertices from their steps, and copy them to ``kept``."""
+    vertex, value, step, estimate = t.vertex, t.value, t.step, t.estimate
+    for v in vertices:
+        retract(vertex, value, step, estimate, v)
+        x = vertex[v, VALUE]
+        for i in range(7 if vertex[v, KIND] == SE3_KIND else vertex[v, DOF]):
+            kept[x + i] = estimate[x + i]
+
+
+@kernel
+def show_all(t: Tree, kept: Array, tolerance: float, sigmas: float) -> None:
+    """Solve all that waits, and compute all estimates that have changed."""
+    vertex, state = t.vertex, t.state
+    if state[DEFERRED_COUNT]:
+        solve_deferred(t, tolerance, sigmas)
+    stale = t.listed[: state[STALE_COUNT], STALE]
+    for v in stale:
+        vertex[v, NOTED] &= ~IS_STALE
+    show(t, kept, stale.copy())
+    state[STALE_COUNT] = 0
+
+
+@kernel
+def read(
+    t: Tree, kept: Array, kind: Index, offset: Index, ids: Index, size: int, tolerance: float, sigmas: float
+) -> tuple[int, Array]:
+    """Return stored numbers (n, size) of vertices of the first one's kind, and the index of an unfit id or NOTHING."""
+    vertex, estimate = t.vertex, t.estimate
+    out = np.empty((len(ids), size))
+    for k in range(len(ids)):
+        if ids[k] < 0 or ids[k] >= len(kind) or kind[ids[k]] != kind[ids[0]]:
+            return k, out
+    if len(ids) > FEW:
+        show_all(t, kept, tolerance, sigmas)
+    elif t.state[STALE_COUNT] or t.state[DEFERRED_COUNT]:
+        way = np.empty(64, np.int64)
+        for v in ids:
+            way = solve_way(t, vertex[v, CLIQUE], way, tolerance, sigmas)
+            if vertex[v, NOTED] & IS_STALE:  # and stays in the list
+                show(t, kept, np.full(1, v, np.int64))
+    for k in range(len(ids)):
+        at = offset[ids[k]]
+        for i in range(size):
+            out[k, i] = estimate[at + i]
+    return NOTHING, out
+
+
+@kernel
+def find_changed(t: Tree, tolerance: float, sigmas: float, threshold: float, error: float) -> Index:
+    """Return the vertices, in order, whose steps have changed much since they were last returned.
+
+    What waits is solved where a step of its separator has changed much; below that, changes are no larger.
+
+    Parameters
+    ----------
+    threshold, error : a change is much that is larger (``is_large``)
+    """
+    vertex, clique, members, listed, state = t.vertex, t.clique, t.members, t.listed, t.state
+    step, reference = t.step, t.reference
+    for k in range(state[SHIFTED_COUNT]):
+        _note_if_much(vertex, step, reference, t.diagonal, listed[k, SHIFTED], threshold, error)
+    stack, top, x = np.empty(256, np.int64), ZERO, np.empty(256)
+    for k in range(state[DEFERRED_COUNT]):
+        stack[0], top = listed[k, DEFERRED], ZERO + 1
+        while top:
+            top -= 1
+            c = stack[top]
+            if not needs(vertex, clique, members, c):
+                continue
+            if not _is_noted(vertex, clique, members, c, IS_MUCH):
+                _defer(t, c)
+                continue
+            if len(x) < clique[c, FULL_DOF]:
+                x = np.empty(2 * clique[c, FULL_DOF])
+            visit(t, c, x, tolerance, sigmas)
+            for m in range(clique[c, MEMBERS], clique[c, MEMBERS] + clique[c, FRONTALS]):
+                _note_if_much(vertex, step, reference, t.diagonal, members[m], threshold, error)
+            child = clique[c, CHILD]
+            while child != NOTHING:
+                if top == len(stack):
+                    stack = lengthened(stack, top)
+                stack[top] = child
+                top += 1
+                child = clique[child, SIBLING]
+    count = kept = 0
+    for k in range(state[DEFERRED_COUNT]):
+        c = listed[k, DEFERRED]
+        if needs(vertex, clique, members, c):
+            listed[kept, DEFERRED] = c
+            kept += 1
+        else:
+            clique[c, IN_DEFERRED] = 0
+    state[DEFERRED_COUNT], kept = kept, 0
+    out = np.empty(state[SHIFTED_COUNT], np.int64)
+    for k in range(state[SHIFTED_COUNT]):
+        v = listed[k, SHIFTED]
+        if vertex[v, NOTED] & IS_MUCH:
+            for i in range(vertex[v, STEP], vertex[v, STEP] + vertex[v, DOF]):
+                reference[i] = step[i]
+            vertex[v, NOTED] &= ~(IS_SHIFTED | IS_MUCH)
+            out[count] = v
+            count += 1
+        else:
+            listed[kept, SHIFTED] = v
+            kept += 1
+    state[SHIFTED_COUNT] = kept
+    return in_order(out[:count])
+
+
+@kernel
+def _note_if_much(
+    vertex: Index, step: Array, reference: Array, diagonal: Array, v: int, threshold: float, error: float
+) -> None:
+    """Note a vertex whose step has changed much since a search last found it."""
+    largest = information = 0.0
+    for i in range(vertex[v, STEP], vertex[v, STEP] + vertex[v, DOF]):
+        largest, information = max(largest, abs(step[i] - reference[i])), max(information, diagonal[i])
+    if largest > threshold or largest * largest * np.sqrt(information) > error:
+        vertex[v, NOTED] |= IS_MUCH
+
+
+@kernel
+def step_all(t: Tree, cliques: Index) -> None:
+    """Solve cliques (children before parents) from the root down, to the last digit; estimates are not computed."""
+    clique, x = t.clique, np.empty(256)
+    for j in range(len(cliques) - 1, -1, -1):
+        c = cliques[j]
+        if len(x) < clique[c, FULL_DOF]:
+            x = np.empty(2 * clique[c, FULL_DOF])
+        visit(t, c, x, -1.0, -1.0)
+
+
+@kernel
+def forget(t: Tree) -> None:
+    """Forget all steps, and what waits: the estimates are the linearisation points."""
+    t.step[:] = 0.0
+    t.reference[:] = 0.0
+    t.vertex[:, NOTED] = 0
+    t.clique[:, IN_DEFERRED] = 0
+    t.clique[:, SEEN] = t.state[SOLUTIONS]
+    t.state[SHIFTED_COUNT] = t.state[STALE_COUNT] = t.state[DEFERRED_COUNT] = 0
