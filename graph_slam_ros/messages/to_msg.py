@@ -96,9 +96,8 @@ def pose_stamped(stamp_ns: int, frame: str, p: Numbers) -> bytes:
 
 
 def pose_with_covariance_stamped(stamp_ns: int, frame: str, p: Numbers, covariance: Array, unused: float) -> bytes:
-    """geometry_msgs/PoseWithCovarianceStamped; see ``pose_with_covariance``."""
-    inner = pose_with_covariance(p, covariance, unused)
-    return encode(make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(stamp_ns, frame), pose=inner))
+    """geometry_msgs/PoseWithCovarianceStamped; see ``pose_with_covariance``. It is fast, as ``odometry`` is."""
+    return b"".join((HEADER, stamp(stamp_ns), _frames(8, frame), *_numbers(p, covariance, unused)))
 
 
 def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Numbers) -> bytes:
@@ -118,10 +117,15 @@ def odometry(
     unused : variance of what a pose in the plane does not have
     twist : geometry_msgs/TwistWithCovariance as ``from_msg.twist_of`` gives it
     """
-    space = PLANAR if len(p) == 3 else SPATIAL
-    numbers = se3.in_space(p).tobytes(), covariance6(space.in_parent_axes(p, covariance), unused).tobytes()
+    numbers = _numbers(p, covariance, unused)
     moving = _unknown_twist(UNKNOWN) if twist is None else twist
     return b"".join((HEADER, stamp(stamp_ns), _frames(8, frame, child), *numbers, moving))
+
+
+def _numbers(p: Numbers, covariance: Array, unused: float) -> tuple[bytes, bytes]:
+    """geometry_msgs/PoseWithCovariance, as ``pose_with_covariance`` makes it."""
+    space = PLANAR if len(p) == 3 else SPATIAL
+    return se3.in_space(p).tobytes(), covariance6(space.in_parent_axes(p, covariance), unused).tobytes()
 
 
 @cache

@@ -7,6 +7,11 @@ _SUPPORT, _FIRST = 4, 20  # accepted sightings, of the first so many, that make 
 _DOUBTED = 0.3  # part of them that may be held back: else the landmark itself stands at the wrong place
 
 
+_Judged = tuple[tuple[int, int], list[int], list[int]]
+"""Of a landmark's first sightings: changes of the ledger and the number of those judged; keyframes of those that are
+accepted; edges of those that are held back."""
+
+
 class LandmarkHistory:
     """The first sightings of each landmark.
 
@@ -20,6 +25,7 @@ class LandmarkHistory:
         self._start = graph.vertex_count  # landmarks of a map that was loaded are known
         self._surveyed: set[int] = set()
         self._earliest: dict[int, list[tuple[int, int]]] = {}  # (edge, keyframe) of each landmark's first sightings
+        self._known: dict[int, _Judged] = {}
 
     def add_survey(self, landmark: int) -> None:
         """Note a landmark, by its vertex, whose position is surveyed."""
@@ -40,11 +46,24 @@ class LandmarkHistory:
         """
         if landmark < self._start or landmark in self._surveyed:
             return -1
-        count = len(self._ledger)
-        judged = [(edge, k) for edge, k in self._earliest[landmark] if edge < count]
-        are_inside = self._ledger.are_inside(edge for edge, _ in judged)
-        accepted = [k for (_, k), is_inside in zip(judged, are_inside, strict=True) if is_inside]
-        doubted = sum(edge < newest and not is_inside for (edge, _), is_inside in zip(judged, are_inside, strict=True))
+        _, accepted, held_back = self._judged(landmark)
+        doubted = sum(edge < newest for edge in held_back)
         if doubted > _DOUBTED * (doubted + len(accepted)):
             return self._graph.vertex_count
         return accepted[_SUPPORT - 1] if len(accepted) >= _SUPPORT else self._graph.vertex_count
+
+    def _judged(self, landmark: int) -> _Judged:
+        """The verdicts on the first sightings of a landmark, looked up only where some may have changed."""
+        earliest, count = self._earliest[landmark], len(self._ledger)
+        judged = len(earliest)
+        while judged and earliest[judged - 1][0] >= count:
+            judged -= 1
+        as_of = self._ledger.changes, judged
+        known = self._known.get(landmark)
+        if known is None or known[0] != as_of:
+            are_inside = self._ledger.are_inside(edge for edge, _ in earliest[:judged])
+            verdicts = list(zip(earliest, are_inside, strict=False))
+            accepted = [k for (_, k), is_inside in verdicts if is_inside]
+            known = as_of, accepted, [edge for (edge, _), is_inside in verdicts if not is_inside]
+            self._known[landmark] = known
+        return known

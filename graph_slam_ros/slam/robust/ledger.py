@@ -71,6 +71,7 @@ class Ledger:
     statistic, threshold : chi2 that was last judged, and what it was held against
     numbers : how many numbers were measured, the statistic's degrees of freedom
     keyframe : at which it was judged first
+    changes : how often a verdict was set after an edge was entered
     final : verdicts of the first so many edges stay: they are of a map that is frozen
     history : every change after the first verdict, and first verdicts that are not ``ACCEPTED``, in order
     """
@@ -81,7 +82,7 @@ class Ledger:
         self.numbers, self.keyframe = Column(np.int64), Column(np.int64)
         self._residual, self._residual_at = Column(np.float64), Column(np.int64)
         self.history: list[VerdictChange] = []
-        self.final = 0
+        self.final = self.changes = 0
         self._out: set[int] = set()
 
     def finish(self, edges: int) -> None:
@@ -138,6 +139,7 @@ class Ledger:
 
     def put(self, edge: int, verdict: Verdict, reason: Reason) -> None:
         """Set a verdict without adding to the history."""
+        self.changes += 1
         self.verdict.values[edge], self.reason.values[edge] = verdict, reason
         if verdict in (Verdict.PENDING, Verdict.REJECTED) and reason not in FINAL:
             self._out.add(edge)

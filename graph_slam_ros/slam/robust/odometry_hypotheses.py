@@ -24,6 +24,7 @@ TIGHT, CARRIED = "tight", "carried"
 SLIPS = ("translation", "rotation")
 _LOG_ODDS_MOVED = float(np.log(1e-2))  # of a robot that was moved, relative to one that slipped
 _LEAST_FITTING = 0.6  # part of what was seen since then that a slip must explain
+_ROUNDING = 1e-6  # of a cost
 _CAP = 0.9999  # an observation beyond this quantile does not fit
 
 
@@ -180,18 +181,21 @@ class OdometryFilter:
         """Landmarks, by vertex, and other classes that were seen after an edge, by its place."""
         return sorted({what for v in self._ends[first:] for _, what in self._stretch.seen.get(v, ())}, key=str)
 
-    def log_likelihood(self, errors: Errors, first: int, without: int | str | None = None) -> float:
+    def log_likelihood(
+        self, errors: Errors, first: int, without: int | str | None = None, above: float = -np.inf
+    ) -> float:
         """Return the logarithm of the likelihood of what was seen, but for a constant.
 
         Parameters
         ----------
         first : the first edge that has more errors than its noise, by its place
         without : what is left out
+        above : a value up to this is of no interest; it may be returned as minus infinity
         """
         state, begin = self._start, 0
         if without is None and len(self._tight) > first:
             state, begin = self._tight[first], first
-        return -0.5 * self._filtered(state, begin, errors, first, without).cost
+        return -0.5 * self._filtered(state, begin, errors, first, without, -2.0 * above).cost
 
     def fitting(self, errors: Errors, first: int) -> float:
         """Return the part of what was seen after an edge that fits."""
@@ -201,10 +205,18 @@ class OdometryFilter:
         return 1.0 - (end.unfit - begin.unfit) / max(1, count)
 
     def _filtered(
-        self, state: _State, begin: int, errors: Errors, first: int, without: int | str | None = None
+        self,
+        state: _State,
+        begin: int,
+        errors: Errors,
+        first: int,
+        without: int | str | None = None,
+        most: float = np.inf,
     ) -> _State:
-        """Filter what was seen from an edge on."""
+        """Filter what was seen from an edge on. The cost never falls, so one above ``most`` is not followed further."""
         for k in range(begin, len(self._steps)):
+            if state.cost > most + _ROUNDING:
+                return replace(state, cost=np.inf)
             if without is None and first == len(self._steps):
                 self._tight.append(state)
             state = replace(state, x=state.x.copy(), covariance=state.covariance.copy())
@@ -330,7 +342,8 @@ class HypothesisTest:
         self._add(CARRIED, first, errors, self._log_odds + _LOG_ODDS_MOVED)
 
     def _add(self, kind: str, first: int, errors: Errors, log_odds: float) -> None:
-        gain = self._filter.log_likelihood(errors, first) - self._likelihood + log_odds
+        above = self._best[0] - log_odds + self._likelihood
+        gain = self._filter.log_likelihood(errors, first, above=above) - self._likelihood + log_odds
         self._best = max(self._best, (gain, kind, first, errors), key=lambda one: one[0])
 
     def choice(self) -> Choice:

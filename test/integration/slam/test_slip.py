@@ -12,6 +12,7 @@ from graph_slam_ros.runs.restore import map_of, record_run
 from graph_slam_ros.simulation import Fault, faulty_recording, measurements, simulate
 from graph_slam_ros.slam import Config, Control, GraphSlam
 from graph_slam_ros.slam.robust.ledger import Reason, Verdict
+from graph_slam_ros.slam.robust.odometry_hypotheses import HypothesisTest, OdometryFilter
 from graph_slam_ros.slam.slip_review import Slip
 
 LONG = times(False, True)
@@ -170,6 +171,31 @@ def test_a_burst_of_wrong_identities_and_a_moved_landmark_are_no_slip():
     slam = driven(replace(moved, seen=tuple(map(spoiled, moved.seen))))
     assert slam.counters[SLIP] == 0
     assert slam.segments == [0]
+
+
+def test_a_hypothesis_is_left_only_where_the_best_so_far_is_likelier(monkeypatch):
+    recording, _ = slipping(world(3))
+    whole, left, added = OdometryFilter.log_likelihood, [], HypothesisTest._add
+
+    def compared(filtered, errors, first, without=None, above=-np.inf):
+        found = whole(filtered, errors, first, without, above)
+        if above > -np.inf:
+            everything = whole(filtered, errors, first)
+            assert found == everything or (found == -np.inf and everything <= above + 1e-6)
+            left.append(found == -np.inf)
+        return found
+
+    def known(test, kind, first, errors, log_odds):
+        before = test._best
+        added(test, kind, first, errors, log_odds)
+        gain = whole(test._filter, errors, first) - test._likelihood + log_odds
+        assert test._best[0] == max(before[0], gain)
+
+    monkeypatch.setattr(OdometryFilter, "log_likelihood", compared)
+    monkeypatch.setattr(HypothesisTest, "_add", known)
+    slam = driven(recording)
+    assert any(isinstance(one, Slip) for one in slam.alarms)
+    assert 0.2 < np.mean(left) < 1.0
 
 
 def test_a_slip_that_was_none_is_taken_back_and_leaves_no_trace():
